@@ -21,11 +21,15 @@ def why(error: OSError) -> str:
     return os.strerror(error.errno) if error.errno else "the library that writes it failed"
 
 
-def check_output(path: str | Path, suffix: str, stale: float = 24 * 3600.0) -> Path:
+STALE = 24 * 3600.0
+"""Another machine's unfinished file is a left-over after so long [s]: whoever writes, writes every few minutes."""
+
+
+def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: bool = True) -> Path:
     """The path of a file that can be written, its folder made; asked before long work, so that none is lost.
 
-    What an earlier run of the same output left behind when it was killed is removed. Another machine's unfinished file
-    is such a left-over after `stale` seconds: whoever writes, writes every few minutes.
+    What an earlier run of the same output left behind when it was killed is removed, unless not to `sweep` saves
+    listing a folder of very many files. Another machine's unfinished file is such a left-over after `stale` seconds.
 
     Raises
     ------
@@ -41,7 +45,8 @@ def check_output(path: str | Path, suffix: str, stale: float = 24 * 3600.0) -> P
         raise InputError(f"{path}: its folder cannot be made ({why(error)}). Choose another folder.") from error
     if path.is_dir():
         raise InputError(f"{path}: cannot be written, it is a folder. Choose another name.")
-    _sweep(path, stale)
+    if sweep:
+        remove_left_overs(path.parent, path.name, stale)
     probe = _partial(path)
     try:  # permissions alone do not tell: a file system may be read-only, or make no files
         probe.touch()
@@ -52,16 +57,43 @@ def check_output(path: str | Path, suffix: str, stale: float = 24 * 3600.0) -> P
     return path
 
 
+def remove_left_overs(folder: Path, name: str | None = None, stale: float = STALE) -> None:
+    """Remove what dead processes of this machine left unfinished in a folder, and what others have not touched lately.
+
+    Parameters
+    ----------
+    name
+        Of the file whose left-overs are meant; None means all files.
+    stale
+        How long others need not have touched theirs [s].
+    """
+    form = re.compile(rf"\.sulcus-([0-9a-f]{{8}})-(\d{{1,9}})-{'.+' if name is None else re.escape(name)}")
+    try:
+        for left in list(folder.iterdir()):
+            found = form.fullmatch(left.name)
+            if found is None:
+                continue
+            dead = not _alive(int(found[2])) if found[1] == _host() else time.time() - left.stat().st_mtime > stale
+            if dead and left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            elif dead:
+                left.unlink(missing_ok=True)
+    except OSError:  # a folder that may not be listed, or a left-over that may not be removed, stops no work
+        return
+
+
 @contextmanager
-def written_whole(path: str | Path, suffix: str) -> Iterator[Path]:
+def written_whole(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Path]:
     """A name beside `path`, of the same ending, to write under; it takes the name `path` when the block ends well.
+
+    `sweep` is that of `check_output`.
 
     Raises
     ------
     InputError
         As `check_output`; and where writing fails.
     """
-    path = check_output(path, suffix)
+    path = check_output(path, suffix, sweep=sweep)
     partial = _partial(path)
     try:
         yield partial
@@ -73,7 +105,7 @@ def written_whole(path: str | Path, suffix: str) -> Iterator[Path]:
 
 
 @contextmanager
-def written_stream(path: str | Path, suffix: str) -> Iterator[Stream]:
+def written_stream(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Stream]:
     """As `written_whole`, but an open binary file; for HDF5, which ends the process where a write of its own fails.
 
     Raises
@@ -81,7 +113,7 @@ def written_stream(path: str | Path, suffix: str) -> Iterator[Stream]:
     InputError
         As `written_whole`.
     """
-    with written_whole(path, suffix) as partial, partial.open("w+b", buffering=0) as raw:
+    with written_whole(path, suffix, sweep) as partial, partial.open("w+b", buffering=0) as raw:
         stream = Stream(raw)
         try:
             yield stream
@@ -190,21 +222,6 @@ def unfinished_path(path: Path) -> Path:
 def _partial(path: Path) -> Path:
     """The hidden name under which this process writes `path`."""
     return path.with_name(f".sulcus-{_host()}-{os.getpid()}-{path.name}")
-
-
-def _sweep(path: Path, stale: float) -> None:
-    """Remove what dead processes of this machine left of `path`, and what others have not touched for `stale` [s]."""
-    form = re.compile(rf"\.sulcus-([0-9a-f]{{8}})-(\d{{1,9}})-{re.escape(path.name)}")
-    try:
-        for left in list(path.parent.iterdir()):
-            found = form.fullmatch(left.name)
-            if found is None:
-                continue
-            dead = not _alive(int(found[2])) if found[1] == _host() else time.time() - left.stat().st_mtime > stale
-            if dead:
-                left.unlink(missing_ok=True)
-    except OSError:  # a folder that may not be listed, or a left-over that may not be removed, stops no work
-        return
 
 
 def _alive(process: int) -> bool:

@@ -1,0 +1,234 @@
+"""`sulcus episodes`: thousands of scripted surgeries by many processes, each in a file of its own."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim.errors import InputError
+
+from .interrupt import INTERRUPTED, terminated_as_interrupted
+from .json_line import json_line
+from .outputs import claimed_folder
+
+if TYPE_CHECKING:
+    from ..episodes.engine import Heard, Tally
+    from ..episodes.plan import Plan
+    from ..episodes.workers import Workers
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("plan", metavar="PLAN", help="a plan that ships with sulcus, or your own .toml")
+    parser.add_argument("--count", required=True, type=_positive, help="episodes that are wanted")
+    parser.add_argument("--seed", type=_natural, default=0, help="seed of all draws (default %(default)s)")
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="their folder; an unfinished one goes on")
+    parser.add_argument("--first", type=_natural, default=0, metavar="K", help="number of the first (default 0)")
+    who = parser.add_mutually_exclusive_group()
+    who.add_argument(
+        "--workers", type=_positive, metavar="K",
+        help="processes of this machine (default: one for each core, or for each card)",
+    )  # fmt: skip
+    who.add_argument("--scheduler", metavar="ADDRESS", help="the workers of a running Dask scheduler: tcp://HOST:PORT")
+    parser.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), default="auto",
+        help="what episodes are made on. auto: what the folder was begun on, else cuda if there is a card",
+    )  # fmt: skip
+    parser.add_argument("--again", action="store_true", help="try those again, too, that failed for good")
+    parser.add_argument(
+        "--force", action="store_true",
+        help="work in a folder that holds other files, or that other versions of sulcus began",
+    )  # fmt: skip
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument(
+        "--estimate", action="store_true", help="make nothing: print time and disk, from what was made in DIR before"
+    )
+    instead.add_argument(
+        "--slurm", type=_positive, metavar="MACHINES", help="make nothing: print a script for sbatch, for so many"
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+
+
+def _whole(text: str, least: int) -> int:
+    try:
+        number = int(text)
+    except ValueError:
+        number = least - 1
+    if number < least:
+        raise argparse.ArgumentTypeError(f"{text!r:.40} is no whole number from {least} on")
+    return number
+
+
+def _positive(text: str) -> int:
+    return _whole(text, 1)
+
+
+def _natural(text: str) -> int:
+    return _whole(text, 0)
+
+
+def _plan(args: argparse.Namespace) -> str:
+    """What the plan is called from any folder."""
+    return str(Path(args.plan).absolute()) if args.plan.endswith(".toml") else args.plan
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make what is missing; 1 if an episode failed."""
+    out = claimed_folder(args.out, "episodes").absolute()
+    if args.slurm:
+        return _print_script(args, out)
+    from ..episodes.plan import load_plan
+
+    plan = load_plan(_plan(args))  # its bodies may lie beside it, and workers elsewhere
+    if args.estimate:
+        return _print_estimate(args, plan, out)
+    try:
+        with terminated_as_interrupted():
+            return _made(args, plan, out)
+    except KeyboardInterrupt:
+        print(f"stopped; the same command goes on in {out}", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _made(args: argparse.Namespace, plan: Plan, out: Path) -> int:
+    from ..episodes.engine import make_all, still_missing
+    from ..episodes.make import body_of, make_body, make_episode
+    from ..episodes.run_folder import Run, begin, read_run, versions_here
+    from ..episodes.tasks import Work
+
+    before = read_run(out)
+    device = before.device if before and args.device == "auto" else args.device
+    with _workers(args, device) as workers:
+        run = Run(plan.name, plan.digest, args.seed, workers.device, versions_here())
+        first_client = begin(out, run, plan.text, args.force)
+        there, missing = still_missing(out, range(args.first, args.first + args.count), first_client, args.again)
+        given = out, plan, args.seed
+        work = Work(
+            partial(body_of, plan, args.seed),
+            partial(make_body, *given, device=workers.device),
+            partial(make_episode, *given, device=workers.device),
+        )
+        begun = time.perf_counter()
+        with _progress(out, there, args.count) as heard:
+            tally = make_all(work, out, run, missing, workers, heard, there)
+        _report(args, out, tally, time.perf_counter() - begun, workers.where)
+    return int(tally.failed + tally.lost > 0)
+
+
+def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Workers]:
+    from dask.system import CPU_COUNT
+
+    from ..episodes.workers import own_workers, scheduled_workers
+
+    if args.scheduler:
+        return scheduled_workers(args.scheduler, device)
+    from sim.runtime.device import device_names, find_device
+
+    if find_device(device, "float32").on_cuda:
+        cards = device_names("all")
+        count = args.workers or len(cards)
+        return own_workers([cards[number % len(cards)] for number in range(count)])
+    return own_workers(["cpu"] * (args.workers or CPU_COUNT))
+
+
+@contextmanager
+def _progress(out: Path, there: Tally, total: int) -> Iterator[Heard]:
+    """A bar of episodes, with frames a second and what failed; and what each task took, into the folder."""
+    from tqdm import tqdm
+
+    from ..episodes.engine import BODY
+    from ..episodes.rates import written_rates
+    from ..episodes.tasks import Outcome
+
+    done, begun = there, time.perf_counter()
+    pause = 0.5 if sys.stderr.isatty() else 30.0
+    words = {
+        "total": total, "initial": there.skipped + there.failed, "unit": "episode", "file": sys.stderr,
+        "mininterval": pause, "maxinterval": pause, "smoothing": 0.05,
+    }  # fmt: skip
+    with written_rates(out) as written, tqdm(**words) as bar:
+
+        def heard(kind: str, outcome: Outcome | None, workers: int) -> None:
+            nonlocal done
+            if outcome is None:
+                bar.set_description(f"{workers} workers" if workers else "waits for workers")
+                return
+            written(kind, outcome)
+            if kind == BODY:
+                return
+            done = done.plus(outcome)
+            rate = done.frames / (time.perf_counter() - begun)
+            bar.set_postfix_str(f"{rate:.3g} frames/s, {done.failed + done.lost} failed", refresh=False)
+            bar.update()
+
+        yield heard
+
+
+def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, where: str) -> None:
+    failed = tally.failed + tally.lost
+    if args.json:
+        said = {
+            "out": str(out),
+            "asked": args.count,
+            "there": tally.made + tally.skipped,
+            "made": tally.made,
+            "failed": tally.failed,
+            "lost": tally.lost,
+            "frames": tally.frames,
+            "bytes": tally.bytes,
+            "seconds": seconds,
+            "where": where,
+        }
+        print(json_line(said))
+        return
+    print(f"{out}: {tally.made + tally.skipped} of {args.count} episodes are there; {tally.made} were made now.")
+    if tally.made:
+        print(
+            f"{tally.frames} frames, {tally.bytes / 1e6:.3g} MB in {seconds:.3g} s by {where}: "
+            f"{tally.made / seconds:.3g} episodes and {tally.frames / seconds:.3g} frames a second."
+        )
+    if failed:
+        print(
+            f"{failed} failed: {out / 'failed'} says why of each. {tally.lost} of them are tried again by the same "
+            "command; with --again all are."
+        )
+
+
+def _print_estimate(args: argparse.Namespace, plan: Plan, out: Path) -> int:
+    from ..episodes.estimate import estimated, lines
+    from ..episodes.make import body_of
+    from ..episodes.rates import read_rates
+    from ..episodes.run_folder import read_run
+
+    found = read_run(out)
+    if found is not None and found.digest != plan.digest:
+        raise InputError(f"{out}: holds episodes of another plan, {found.plan}: choose another folder.")
+    numbers = range(args.first, args.first + args.count)
+    bodies = len({body_of(plan, args.seed, number) for number in numbers})
+    estimate = estimated(read_rates(out), args.count, bodies)
+    if args.json:
+        from dataclasses import asdict
+
+        print(json_line(asdict(estimate)))
+    else:
+        print("\n".join(lines(estimate)))
+    return 0
+
+
+def _print_script(args: argparse.Namespace, out: Path) -> int:
+    from ..episodes.slurm import sbatch_script
+
+    if args.device == "auto":
+        raise InputError("--slurm needs to know what its machines have: give --device cpu, or --device cuda.")
+    if args.workers or args.scheduler:
+        raise InputError("--slurm gives each machine its workers: leave --workers and --scheduler out.")
+    words = ["--count", args.count, "--seed", args.seed, "--first", args.first, "--out", out, "--device", args.device]
+    command = [sys.executable, "-m", "scenes.cli", "episodes", _plan(args), *map(str, words)]
+    print(sbatch_script(command, args.slurm, args.device, f"sulcus-{Path(args.plan).stem}"), end="")
+    return 0

@@ -1,0 +1,180 @@
+"""Episodes made by many workers: each that is not there is handed out, in any order, until all are there or failed."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from time import monotonic
+from typing import Protocol
+from uuid import uuid4
+
+from distributed import Future
+from distributed.scheduler import KilledWorker
+
+from sim.errors import InputError
+
+from .run_folder import Failure, Run, episode_name, failures, finished, mark_failed, unmark
+from .tasks import Made, Outcome, Work, attempted
+from .workers import MOST_DEATHS, Workers, scheduler_ended
+
+RETRIES = 3
+"""How often a task that raises an error is tried again."""
+AHEAD = 3
+"""Episodes handed out for each worker: one is made while others wait, so that none is idle."""
+POLL = 1.0
+"""How often workers are counted [s]."""
+EPISODE, BODY = "episode", "body"
+"""Kinds of tasks."""
+
+
+class Heard(Protocol):
+    """Who hears of each task that ends, and how many workers there are; nothing ended where `outcome` is None."""
+
+    def __call__(self, kind: str, outcome: Outcome | None, workers: int) -> object:
+        """Take note."""
+        ...
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What a run has done: episodes made now, there before, failed for good, lost for now; frames and bytes made."""
+
+    made: int = 0
+    skipped: int = 0
+    failed: int = 0
+    lost: int = 0
+    frames: int = 0
+    bytes: int = 0
+
+    def plus(self, outcome: Outcome) -> Tally:
+        """With one more episode."""
+        if outcome.failed:
+            return replace(self, lost=self.lost + 1) if outcome.lost else replace(self, failed=self.failed + 1)
+        if outcome.skipped:
+            return replace(self, skipped=self.skipped + 1)
+        frames, size = self.frames + outcome.frames, self.bytes + outcome.bytes
+        return replace(self, made=self.made + 1, frames=frames, bytes=size)
+
+
+def still_missing(folder: Path, numbers: range, first_client: bool, again: bool = False) -> tuple[Tally, list[int]]:
+    """What is there of some episodes or has failed for good, and what is missing, in the order of its turn.
+
+    The first client goes upwards. Who comes later goes in a random order, so that two in one folder seldom make the
+    same episode at the same time; if they do, one writes over the other's file the same bytes.
+
+    Parameters
+    ----------
+    again
+        Whether to try those again that failed for good.
+    """
+    there = finished(folder).intersection(numbers)
+    failed = {one.number for one in failures(folder).values() if not one.lost and not again}
+    failed = failed.intersection(numbers) - there
+    missing = [number for number in numbers if number not in there and number not in failed]
+    if not first_client:
+        random.shuffle(missing)
+    return Tally(skipped=len(there), failed=len(failed)), missing
+
+
+def make_all(
+    work: Work, folder: Path, run: Run, numbers: Sequence[int], workers: Workers, heard: Heard, before: Tally
+) -> Tally:
+    """Make episodes that are missing, each after its body; failures are noted in the folder. What was done in all.
+
+    Parameters
+    ----------
+    before
+        What was done before.
+
+    Raises
+    ------
+    InputError
+        A worker that cannot work in this folder, a full disk, a scheduler that ended.
+    """
+    ended: SimpleQueue[Future] = SimpleQueue()
+    busy: dict[str, tuple[str, int, Future]] = {}
+    bodies: dict[int, Future] = {}
+    failed_before, token = set(failures(folder)), uuid4().hex
+    tally, count, counted = before, workers.count(), monotonic()
+
+    def hand_out(kind: str, number: int, make: Callable[[int], Made], *needed: Future) -> Future:
+        future = workers.client.submit(
+            attempted, make, number, folder, run, *needed,
+            key=f"{kind}-{number}-{token}", retries=RETRIES, resources=workers.needs,
+        )  # fmt: skip
+        busy[future.key] = kind, number, future
+        future.add_done_callback(ended.put)
+        return future
+
+    def note(kind: str, outcome: Outcome) -> None:
+        nonlocal tally
+        if outcome.halt:
+            raise InputError(outcome.halt)
+        heard(kind, outcome, count)
+        if kind == BODY:
+            return
+        tally = tally.plus(outcome)
+        if outcome.failed:
+            mark_failed(folder, Failure(outcome.number, outcome.failed, outcome.lost))
+        elif outcome.number in failed_before:
+            unmark(folder, outcome.number)
+
+    def missing() -> Iterator[int]:
+        for number in numbers:
+            if (folder / episode_name(number)).exists():  # another client made it meanwhile
+                note(EPISODE, Outcome(number, skipped=True))
+            else:
+                yield number
+
+    waiting = missing()
+    try:
+        while True:
+            handed_out = sum(kind == EPISODE for kind, _, _ in busy.values())
+            for number in islice(waiting, max(0, AHEAD * max(count, 1) - handed_out)):
+                body = work.body_of(number)
+                if body not in bodies:
+                    bodies[body] = hand_out(BODY, body, work.make_body)
+                hand_out(EPISODE, number, work.make_episode, bodies[body])
+            if not busy:
+                return tally
+            for future, outcome in _outcomes(_drained(ended), workers):
+                kind, number, _ = busy.pop(future.key)
+                note(kind, replace(outcome, number=number))
+            if monotonic() - counted > POLL:
+                count, counted = workers.count(), monotonic()
+                heard(EPISODE, None, count)
+    finally:
+        if workers.client.status == "running":
+            workers.client.cancel([future for _, _, future in busy.values()])
+
+
+def _drained(ended: SimpleQueue[Future]) -> list[Future]:
+    """All that have ended, after a while at the latest."""
+    found = []
+    try:
+        found.append(ended.get(timeout=POLL))
+        while True:
+            found.append(ended.get_nowait())
+    except Empty:
+        return found
+
+
+def _outcomes(futures: Sequence[Future], workers: Workers) -> Iterator[tuple[Future, Outcome]]:
+    """What came of tasks that ended; the results are fetched together."""
+    good = [future for future in futures if future.status == "finished"]
+    yield from zip(good, workers.client.gather(good), strict=True)
+    for future in futures:
+        if future.status == "error":
+            yield future, Outcome(0, failed=_reason(future.exception()), lost=True)
+        elif future.status != "finished":  # what a client makes of all when its scheduler is gone
+            raise scheduler_ended(workers.where)
+
+
+def _reason(error: BaseException | None) -> str:
+    if isinstance(error, KilledWorker):
+        return f"its worker was ended {MOST_DEATHS} times, for want of memory most likely"
+    return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"

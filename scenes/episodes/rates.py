@@ -1,0 +1,57 @@
+"""What tasks took: kept beside the episodes and never in them, whose bytes are the same whoever makes them."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from .run_folder import RATES
+from .tasks import Outcome
+
+COLUMNS = "kind,number,frames,bytes,seconds"
+
+
+@dataclass(frozen=True)
+class Rate:
+    """One task: "episode" or "body", its number, frames and bytes, and the seconds of one worker."""
+
+    kind: str
+    number: int
+    frames: int
+    bytes: int
+    seconds: float
+
+
+@contextmanager
+def written_rates(folder: Path) -> Iterator[Callable[[str, Outcome], None]]:
+    """What writes down each task that was done, into a file of this process alone."""
+    now = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
+    path = folder / RATES / f"{now}-{platform.node()}-{os.getpid()}.csv"
+    with path.open("a", buffering=1) as file:
+        file.write(COLUMNS + "\n")
+
+        def note(kind: str, one: Outcome) -> None:
+            if not (one.failed or one.skipped):
+                file.write(f"{kind},{one.number},{one.frames},{one.bytes},{one.seconds:.4f}\n")
+
+        yield note
+
+
+def read_rates(folder: Path) -> list[Rate]:
+    """All that was written down; a line that was torn by a kill is passed over."""
+    found = []
+    for path in sorted((folder / RATES).glob("*.csv")):
+        for line in path.read_text(errors="replace").splitlines(keepends=True):
+            words = line.rstrip("\n").split(",")
+            try:
+                if line.endswith("\n"):
+                    kind, number, frames, size, seconds = words
+                    found.append(Rate(kind, int(number), int(frames), int(size), float(seconds)))
+            except ValueError:
+                continue
+    return found

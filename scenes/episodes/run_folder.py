@@ -1,0 +1,205 @@
+"""The state of a run on disk: whose folder it is, which episodes are there, which failed.
+
+The folder is the state, and nothing else is: an episode is made if its file is there, and a file appears whole.
+Whoever works in the folder needs no word with others. Two that make the same episode write the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+from sim.errors import InputError
+from sim.runtime.atomic_files import remove_left_overs, why, written_whole
+
+FORMAT = "sulcus run 1"
+PLAN, RUN, FAILED, BODIES, RATES = "plan.toml", "run.json", "failed", "bodies", "rates"
+"""What a folder holds beside its episodes."""
+EPISODE = re.compile(r"episode_(\d{6,})\.(?:h5|json)")
+PARTS = ("h5py", "numpy", "scipy", "sulcus", "warp-lang")
+"""Packages whose version is part of an episode's bytes."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Whose folder it is: all that decides the bytes of an episode, but for its number.
+
+    Parameters
+    ----------
+    plan, digest
+        Name of the plan, and the digest of its text.
+    device
+        "cpu" or "cuda": answers of one differ from the other's in their last digits.
+    versions
+        Of the packages in `PARTS`.
+    """
+
+    plan: str
+    digest: str
+    seed: int
+    device: str
+    versions: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An episode that could not be made, and why; `lost` if it is tried again by the next run."""
+
+    number: int
+    reason: str
+    lost: bool
+
+
+@cache
+def versions_here() -> Mapping[str, str]:
+    """The versions of this process's packages."""
+    return {name: version(name) for name in PARTS}
+
+
+def episode_name(number: int) -> str:
+    """The name of an episode's file."""
+    return f"episode_{number:06d}.h5"
+
+
+def begin(folder: Path, run: Run, text: str, force: bool = False) -> bool:
+    """Make a folder a run's own, or find that it is; tell whether no other run was there before.
+
+    What dead processes left of unfinished files is removed.
+
+    Parameters
+    ----------
+    text
+        The plan as it is written beside the episodes.
+    force
+        Whether a folder with other files, or of other versions, is worked in all the same.
+
+    Raises
+    ------
+    InputError
+        A folder of another plan, seed or device; without `force`, of other versions, or with files but no run.
+    """
+    for inner in (folder, folder / FAILED, folder / BODIES, folder / RATES):
+        remove_left_overs(inner)
+    found = read_run(folder)
+    if found is None:
+        _demand_empty(folder, force)
+    else:
+        _demand_same(folder, found, run, force)
+    if found is None or found.versions != run.versions:
+        _write_json(folder / RUN, {"format": FORMAT, **asdict(run)})
+    if not (folder / PLAN).exists():
+        with written_whole(folder / PLAN, ".toml") as partial:
+            partial.write_text(text)
+    try:  # of clients that come at once one is the first
+        (folder / RATES).mkdir()
+    except FileExistsError:
+        return False
+    return True
+
+
+def read_run(folder: Path) -> Run | None:
+    """Whose folder it is, if it is one's.
+
+    Raises
+    ------
+    InputError
+        A file of the name that no run wrote.
+    """
+    path = folder / RUN
+    try:
+        found = json.loads(path.read_text())
+        if found.pop("format") != FORMAT:
+            raise ValueError
+        return Run(**found)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({why(error)}). Choose another folder.") from error
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
+        raise InputError(f"{path}: is not what `sulcus episodes` writes. Choose another folder.") from error
+
+
+def finished(folder: Path) -> set[int]:
+    """Numbers of the episodes that are there."""
+    return {number for number, ending in _numbered(folder) if ending == ".h5"}
+
+
+def failures(folder: Path) -> dict[int, Failure]:
+    """The episodes that could not be made, by number."""
+    found = {}
+    for number, _ in _numbered(folder / FAILED):
+        with suppress(OSError, ValueError, TypeError):  # of another client, who removes it just now
+            found[number] = Failure(**json.loads(_failed_path(folder, number).read_text()))
+    return found
+
+
+def mark_failed(folder: Path, failure: Failure) -> None:
+    """Note that an episode could not be made."""
+    _write_json(_failed_path(folder, failure.number), asdict(failure))
+
+
+def unmark(folder: Path, number: int) -> None:
+    """An episode is there after all."""
+    _failed_path(folder, number).unlink(missing_ok=True)
+
+
+def _failed_path(folder: Path, number: int) -> Path:
+    return folder / FAILED / f"episode_{number:06d}.json"
+
+
+def _numbered(folder: Path) -> Iterator[tuple[int, str]]:
+    """Numbers and endings of a folder's episodes: by name alone, as there may be a million."""
+    with suppress(FileNotFoundError), os.scandir(folder) as entries:
+        for entry in entries:
+            found = EPISODE.fullmatch(entry.name)
+            if found:
+                yield int(found[1]), os.path.splitext(entry.name)[1]
+
+
+def _write_json(path: Path, value: Mapping) -> None:
+    with written_whole(path, ".json") as partial:
+        partial.write_text(json.dumps(value) + "\n")
+
+
+def _demand_empty(folder: Path, force: bool) -> None:
+    other = next((path.name for path in sorted(folder.glob("*")) if not path.name.startswith(".")), None)
+    if other and not force:
+        raise InputError(
+            f"{folder}: holds {other}, and no run was begun there. Choose another folder, or give --force to work in "
+            "it all the same."
+        )
+
+
+def _demand_same(folder: Path, found: Run, run: Run, force: bool) -> None:
+    if found.digest != run.digest:
+        other = f"of the plan {found.plan}" if found.plan != run.plan else f"of another text of the plan {run.plan}"
+        raise InputError(
+            f"{folder}: holds episodes {other}; its {PLAN} has what they were made by. Choose another folder."
+        )
+    if found.seed != run.seed:
+        raise InputError(
+            f"{folder}: holds episodes of the seed {found.seed}. Give --seed {found.seed}, or choose another folder."
+        )
+    if found.device != run.device:
+        raise InputError(
+            f"{folder}: holds episodes that were made on {found.device}, whose last digits differ. Give --device "
+            f"{found.device}, or choose another folder."
+        )
+    other = unlike(found.versions, run.versions)
+    if other and not force:
+        raise InputError(
+            f"{folder}: was begun with {other}: episodes may differ. Choose another folder, or give --force to go on."
+        )
+
+
+def unlike(others: Mapping[str, str], ours: Mapping[str, str]) -> str:
+    """The packages of other versions in words; none if all are alike."""
+    names = [name for name in sorted({*others, *ours}) if others.get(name) != ours.get(name)]
+    return ", ".join(f"{name} {others.get(name, 'none')} and not {ours.get(name, 'none')}" for name in names)

@@ -1,0 +1,148 @@
+"""What a worker does: one body or one episode, and what came of it in words and numbers."""
+
+from __future__ import annotations
+
+import errno
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from sim.errors import InputError
+from sim.runtime.threads import one_thread
+
+from .run_folder import Run, read_run, unlike, versions_here
+
+FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+"""What no other episode gets round."""
+
+
+class Made(Protocol):
+    """What a maker gives: frames, bytes, and why it failed, if it did; `skipped` if it was there."""
+
+    @property
+    def frames(self) -> int:
+        """Frames in the file."""
+        ...
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the file."""
+        ...
+
+    @property
+    def failed(self) -> str:
+        """Why there is none; empty if there is one."""
+        ...
+
+    @property
+    def skipped(self) -> bool:
+        """Whether it was there before."""
+        ...
+
+
+@dataclass(frozen=True)
+class Work:
+    """What is made: functions of modules, so that workers find them, and partial functions of these.
+
+    Parameters
+    ----------
+    body_of
+        The number of the body that an episode needs.
+    make_body, make_episode
+        Make the one of a number, or find it there.
+    """
+
+    body_of: Callable[[int], int]
+    make_body: Callable[[int], Made]
+    make_episode: Callable[[int], Made]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one task.
+
+    Parameters
+    ----------
+    seconds
+        That it took.
+    failed
+        Why there is none.
+    lost
+        Whether another run may have more luck.
+    skipped
+        Whether it was there.
+    halt
+        Why nothing else can be made either.
+    """
+
+    number: int
+    frames: int = 0
+    bytes: int = 0
+    seconds: float = 0.0
+    failed: str = ""
+    lost: bool = False
+    skipped: bool = False
+    halt: str = ""
+
+
+class _Process:
+    """Whether this process's card has failed: then all that it would answer may be wrong."""
+
+    spoilt = False
+
+
+def attempted(
+    make: Callable[[int], Made], number: int, folder: Path, run: Run, body: Outcome | None = None
+) -> Outcome:
+    """Make the one of a number, by a worker that sees the run's folder and has its versions.
+
+    Raises
+    ------
+    Exception
+        As `make`; it may go better another time. On a card what is not the input's fault spoils the process, which
+        ends itself at its next task.
+    """
+    if _Process.spoilt:
+        os._exit(1)
+    halt = _unfit(folder, run)
+    if halt:
+        return Outcome(number, halt=halt)
+    if body is not None and (body.failed or body.halt):
+        return Outcome(number, failed=body.failed and f"its body {body.number}: {body.failed}", halt=body.halt)
+    begun = time.perf_counter()
+    try:
+        with one_thread():
+            made = make(number)
+    except Exception as error:
+        if _is_full(error):
+            return Outcome(number, halt=str(error))
+        _Process.spoilt = run.device == "cuda" and not isinstance(error, InputError | OSError)
+        raise
+    seconds = time.perf_counter() - begun
+    return Outcome(number, made.frames, made.bytes, seconds, made.failed, skipped=made.skipped)
+
+
+def _unfit(folder: Path, run: Run) -> str:
+    """Why this worker can make nothing of the run; empty if it can."""
+    here = platform.node()
+    other = unlike(versions_here(), run.versions)
+    if other:
+        return f"the worker on {here} has {other}. Install the same there."
+    found = read_run(folder)
+    if found is None:
+        return f"the worker on {here} does not see {folder}. Give all machines one folder under the same name."
+    if (found.digest, found.seed) != (run.digest, run.seed):
+        return f"{folder}: is that of another plan or seed by now, as the worker on {here} sees it."
+    return ""
+
+
+def _is_full(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in FULL:
+            return True
+        error = error.__cause__ or error.__context__
+    return False

@@ -1,0 +1,195 @@
+"""Thousands of episodes by many processes: what is there is skipped, what fails is kept, marked and counted."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import ExitStack
+
+import pytest
+from tiny_work import Made, Trouble, body_path, held, played, tiny_run, tried
+
+from scenes.episodes.engine import Tally, still_missing
+from scenes.episodes.run_folder import begin, failures, finished, read_run, unlike
+from scenes.episodes.tasks import attempted
+from scenes.episodes.workers import own_workers, scheduled_workers
+from sim.errors import InputError
+from sim.runtime.atomic_files import remove_left_overs
+
+PLAN = 'title = "tiny"\n'
+
+
+@pytest.fixture(scope="module")
+def workers():
+    with own_workers(["cpu", "cpu"]) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def undisturbed(workers, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("undisturbed")
+    assert played(folder, workers, 12) == Tally(made=12, frames=36, bytes=sum(map(len, held(folder).values())))
+    return held(folder)
+
+
+def test_what_is_there_is_skipped_and_any_order_gives_the_same_bytes(workers, undisturbed, tmp_path):
+    assert len(undisturbed) == 12
+    assert played(tmp_path, workers, 3).made == 3  # upwards
+    assert played(tmp_path, workers, 12).made == 9  # in a random order
+    assert held(tmp_path) == undisturbed
+    before = len(tried(tmp_path))
+    assert played(tmp_path, workers, 12) == Tally(skipped=12) and len(tried(tmp_path)) == before
+    assert (tmp_path / "plan.toml").read_text() == PLAN and read_run(tmp_path) == tiny_run()
+
+
+def test_what_another_client_makes_meanwhile_is_not_made_again(workers, undisturbed, tmp_path):
+    def others(kind, outcome, count):
+        for name, content in undisturbed.items():
+            (tmp_path / name).write_bytes(content)
+
+    tally = played(tmp_path, workers, 12, heard=others)
+    assert tally.made + tally.skipped == 12 and tally.skipped >= 5 and held(tmp_path) == undisturbed
+
+
+def test_failures_are_kept_marked_and_counted(workers, tmp_path):
+    trouble = Trouble({1: "does not converge", 2: "broken"}, {1: "does not mesh"})
+    tally = played(tmp_path, workers, 11, trouble)
+    assert (tally.made, tally.failed, tally.lost) == (4, 6, 1)
+    found = failures(tmp_path)
+    assert found[1].reason == "does not converge" and not found[1].lost
+    assert found[2].reason == "RuntimeError: the card has failed" and found[2].lost
+    assert sum(line.startswith("2 ") for line in tried(tmp_path)) == 1 + 3  # retries
+    assert all(found[number].reason == "its body 1: does not mesh" for number in range(5, 10))
+    assert finished(tmp_path) == {0, 3, 4, 10}
+    assert json.loads((tmp_path / "failed/episode_000001.json").read_text())["reason"] == "does not converge"
+    tally = played(tmp_path, workers, 11)  # what was lost has more luck, what failed is not tried again
+    assert (tally.made, tally.skipped, tally.failed, tally.lost) == (1, 4, 6, 0) and sorted(failures(tmp_path)) == [1, *range(5, 10)]
+    tally = played(tmp_path, workers, 11, again=True)
+    assert (tally.made, tally.skipped, tally.failed) == (6, 5, 0) and not failures(tmp_path)
+
+
+def test_a_full_disk_ends_the_run_and_says_so(workers, tmp_path):
+    with pytest.raises(InputError, match="No space left on device"):
+        played(tmp_path, workers, 12, Trouble({1: "full"}))
+    assert sum(line.startswith("1 ") for line in tried(tmp_path)) == 1 and not failures(tmp_path)
+    assert played(tmp_path, workers, 12).failed == 0 and len(held(tmp_path)) == 12
+
+
+def test_each_process_has_a_card_of_its_own_and_is_replaced_if_it_fails(undisturbed, tmp_path):
+    """A card that has failed answers nothing any more; the number of an episode that broke it is tried anew."""
+    with own_workers(["cuda:0", "cuda:1"]) as workers:
+        tally = played(tmp_path, workers, 12, Trouble({3: "broken once"}, seconds=0.05))
+    assert tally.made == 12 and tally.failed == tally.lost == 0 and held(tmp_path) == undisturbed
+    lines = [line.split() for line in tried(tmp_path)]
+    assert {card for _, _, card in lines} == {"0", "1"}
+    (first, broken), (second, fresh) = [(at, line[1]) for at, line in enumerate(lines) if line[0] == "3"]
+    assert broken not in [line[1] for line in lines[first + 1 :]] and fresh != broken and second > first
+
+
+def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path):
+    address = "tcp://127.0.0.1:9"
+    with pytest.raises(InputError, match=f"--scheduler {address}: no Dask scheduler answers"):
+        scheduled_workers(address, "cpu", patience=0.5).__enter__()
+    counts, added = [], []
+    with ExitStack() as closing, own_workers(["cpu"]) as own:
+        address = own.client.scheduler.address
+        command = [sys.executable, "-m", "dask", "worker", address, "--nthreads", "1", "--host", "127.0.0.1"]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+        def heard(kind, outcome, count):
+            if not added:
+                quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+                added.append(closing.enter_context(subprocess.Popen(command, env=environment, cwd=tmp_path, **quiet)))
+                closing.callback(added[0].terminate)
+            counts.append(count)
+
+        with scheduled_workers(address, "auto") as workers:
+            assert workers.device == "cpu" and workers.count() == 1
+            folder = tmp_path / "more"
+            assert played(folder, workers, 30, Trouble(seconds=0.2), heard).made == 30
+        assert max(counts) == 2 and len({line.split()[1] for line in tried(folder)}) == 2
+        assert {name: held(folder)[name] for name in undisturbed} == undisturbed
+
+        def ending(kind, outcome, count):
+            own.client.cluster.close()
+
+        folder = tmp_path / "ended"
+        with scheduled_workers(address, "cpu", patience=0.5) as workers, pytest.raises(InputError, match="scheduler ended"):
+            played(folder, workers, 30, Trouble(seconds=0.1), ending)
+
+
+def test_a_folder_is_one_runs_own(tmp_path):
+    folder = tmp_path / "new"
+    assert begin(folder, tiny_run(), PLAN) and not begin(folder, tiny_run(), PLAN)
+    for changed, words in (
+        ({"digest": "other"}, "of another text of the plan tiny"),
+        ({"seed": 2}, "Give --seed 1"),
+        ({"device": "cuda"}, "Give --device cpu"),
+        ({"versions": {**tiny_run().versions, "numpy": "3.0"}}, r"numpy .* and not 3\.0.*--force"),
+    ):
+        with pytest.raises(InputError, match=words):
+            begin(folder, tiny_run(**changed), PLAN)
+    assert read_run(folder) == tiny_run()
+    newer = tiny_run(versions={**tiny_run().versions, "numpy": "3.0"})
+    assert not begin(folder, newer, PLAN, force=True) and read_run(folder) == newer
+    (tmp_path / "mine.txt").write_text("mine")
+    for words in (r"holds mine\.txt, and no run was begun",):
+        shutil.rmtree(folder)
+        with pytest.raises(InputError, match=words):
+            begin(tmp_path, tiny_run(), PLAN)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+    assert begin(tmp_path, tiny_run(), PLAN, force=True)
+    (tmp_path / "run.json").write_text("mine")
+    with pytest.raises(InputError, match="is not what `sulcus episodes` writes"):
+        begin(tmp_path, tiny_run(), PLAN)
+
+
+def test_a_worker_that_does_not_fit_makes_nothing(tmp_path):
+    def make(number):
+        raise AssertionError
+
+    assert f"does not see {tmp_path}" in attempted(make, 0, tmp_path, tiny_run()).halt
+    begin(tmp_path, tiny_run(), PLAN)
+    newer = tiny_run(versions={**tiny_run().versions, "sulcus": "9"})
+    assert "and not 9. Install the same there" in attempted(make, 0, tmp_path, newer).halt
+    assert "of another plan or seed" in attempted(make, 0, tmp_path, tiny_run(seed=2)).halt
+    assert attempted(lambda number: Made(tmp_path, 7), 0, tmp_path, tiny_run()).frames == 7
+    assert unlike({"a": "1"}, {"a": "1", "b": "2"}) == "b none and not 2" and not unlike({"a": "1"}, {"a": "1"})
+
+
+def test_left_overs_of_dead_processes_are_removed_and_others_are_not(tmp_path):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    remove = tmp_path / "probe.h5"
+    from sim.runtime.atomic_files import written_whole
+
+    with written_whole(remove, ".h5") as partial:
+        partial.write_text("mine")
+        own = partial.name
+        machine = own.split("-")[1]
+        names = {
+            own: True,
+            f".sulcus-{machine}-{dead.pid}-episode_000001.h5": False,
+            f".sulcus-00000000-{dead.pid}-episode_000002.h5": True,  # of another machine
+            ".sulcus-notes": True,
+        }
+        for name in names:
+            (tmp_path / name).touch()
+        (tmp_path / f".sulcus-{machine}-{dead.pid}-0003").mkdir()
+        (tmp_path / f".sulcus-{machine}-{dead.pid}-0003" / "body.vtu").touch()
+        begin(tmp_path, tiny_run(), PLAN)
+        assert {name for name, stays in names.items() if stays} == {p.name for p in tmp_path.glob(".*")}
+    remove_left_overs(tmp_path, stale=-1.0)
+    assert [path.name for path in tmp_path.glob(".*")] == [".sulcus-notes"]
+
+
+def test_what_is_missing_is_known_by_name_alone(tmp_path):
+    for number in (1, 3, 1234567):
+        (tmp_path / f"episode_{number:06d}.h5").touch()
+    (tmp_path / ".sulcus-0-0-episode_000002.h5").touch()
+    assert still_missing(tmp_path, range(5), True) == (Tally(skipped=2), [0, 2, 4])
+    assert still_missing(tmp_path, range(1234567, 1234568), True)[1] == []
+    there, shuffled = still_missing(tmp_path, range(100, 200), False)
+    assert sorted(shuffled) == list(range(100, 200)) != shuffled and there == Tally()
+    assert not body_path(tmp_path, 0).exists()

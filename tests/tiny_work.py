@@ -1,0 +1,112 @@
+"""Bodies and episodes of a few numbers, for tests of what makes thousands of them."""
+
+import errno
+import os
+import time
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from scenes.episodes.engine import make_all, still_missing
+from scenes.episodes.run_folder import BODIES, Run, begin, episode_name, versions_here
+from scenes.episodes.tasks import Work
+from sim.runtime.atomic_files import written_stream
+
+PER_BODY = 5
+CARD = "CUDA_VISIBLE_DEVICES"
+
+
+@dataclass(frozen=True)
+class Made:
+    path: Path
+    frames: int = 0
+    bytes: int = 0
+    seconds: float = 0.0
+    failed: str = ""
+    skipped: bool = False
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """What goes wrong, by number of an episode: words of a failure, or the kind of an error; and of bodies."""
+
+    episodes: dict = field(default_factory=dict)
+    bodies: dict = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+def body_of(number):
+    return number // PER_BODY
+
+
+def write(path, values):
+    with written_stream(path, path.suffix, sweep=False) as stream, h5py.File(stream, "w") as file:
+        for name, value in values.items():
+            file[name] = value
+    return Made(path, len(values), path.stat().st_size)
+
+
+def body_path(folder, number):
+    return folder / BODIES / f"{number:04d}" / "body.h5"
+
+
+def make_body(folder, seed, trouble, number):
+    path = body_path(folder, number)
+    if number in trouble.bodies:
+        return Made(path, failed=trouble.bodies[number])
+    if path.exists():
+        return Made(path, skipped=True)
+    return write(path, {"body": np.random.default_rng([seed, number]).random(50)})
+
+
+def make_episode(folder, seed, trouble, number):
+    path = folder / episode_name(number)
+    if path.exists():
+        return Made(path, skipped=True)
+    wrong = trouble.episodes.get(number, "")
+    with (folder / "tried.txt").open("a") as file:
+        file.write(f"{number} {os.getpid()} {os.environ.get(CARD)}\n")
+    if wrong == "full":
+        raise OSError(errno.ENOSPC, "No space left on device")
+    if wrong == "broken":
+        raise RuntimeError("the card has failed")
+    if wrong == "broken once" and sum(line.startswith(f"{number} ") for line in tried(folder)) == 1:
+        raise RuntimeError("the card has failed")
+    if wrong.startswith("does not"):
+        return Made(path, failed=wrong)
+    with h5py.File(body_path(folder, body_of(number))) as file:
+        body = np.asarray(file["body"])
+    time.sleep(trouble.seconds)
+    frames = np.random.default_rng([seed, number]).random((3, 4096)) + body[0]
+    return write(path, {f"frame{k}": frame for k, frame in enumerate(frames)})
+
+
+def tried(folder):
+    """What was tried: number, process and card of each attempt."""
+    return (folder / "tried.txt").read_text().splitlines()
+
+
+def tiny_work(folder, trouble=None, seed=1):
+    given = folder, seed, trouble or Trouble()
+    return Work(body_of, partial(make_body, *given), partial(make_episode, *given))
+
+
+def tiny_run(seed=1, device="cpu", **changed):
+    usual = {"digest": "0123456789abcdef", "seed": seed, "device": device, "versions": versions_here()}
+    return Run("tiny", **{**usual, **changed})
+
+
+def played(folder, workers, count, trouble=None, heard=lambda *words: None, again=False):
+    """A run as the command makes one."""
+    run = tiny_run(device=workers.device)
+    first = begin(folder, run, 'title = "tiny"\n')
+    there, missing = still_missing(folder, range(count), first, again)
+    return make_all(tiny_work(folder, trouble), folder, run, missing, workers, heard, there)
+
+
+def held(folder):
+    """Every episode's bytes, by name."""
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("episode_*.h5"))}
