@@ -15,7 +15,7 @@ from scenes.episodes.run_folder import begin, failures, finished, read_run, unli
 from scenes.episodes.tasks import attempted
 from scenes.episodes.workers import own_workers, scheduled_workers
 from sim.errors import InputError
-from sim.runtime.atomic_files import remove_left_overs
+from sim.runtime.atomic_files import remove_left_overs, written_whole
 
 PLAN = 'title = "tiny"\n'
 
@@ -64,7 +64,8 @@ def test_failures_are_kept_marked_and_counted(workers, tmp_path):
     assert finished(tmp_path) == {0, 3, 4, 10}
     assert json.loads((tmp_path / "failed/episode_000001.json").read_text())["reason"] == "does not converge"
     tally = played(tmp_path, workers, 11)  # what was lost has more luck, what failed is not tried again
-    assert (tally.made, tally.skipped, tally.failed, tally.lost) == (1, 4, 6, 0) and sorted(failures(tmp_path)) == [1, *range(5, 10)]
+    assert (tally.made, tally.skipped, tally.failed, tally.lost) == (1, 4, 6, 0)
+    assert sorted(failures(tmp_path)) == [1, *range(5, 10)]
     tally = played(tmp_path, workers, 11, again=True)
     assert (tally.made, tally.skipped, tally.failed) == (6, 5, 0) and not failures(tmp_path)
 
@@ -105,7 +106,7 @@ def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path
             counts.append(count)
 
         with scheduled_workers(address, "auto") as workers:
-            assert workers.device == "cpu" and workers.count() == 1
+            assert workers.device == "cpu"
             folder = tmp_path / "more"
             assert played(folder, workers, 30, Trouble(seconds=0.2), heard).made == 30
         assert max(counts) == 2 and len({line.split()[1] for line in tried(folder)}) == 2
@@ -115,8 +116,9 @@ def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path
             own.client.cluster.close()
 
         folder = tmp_path / "ended"
-        with scheduled_workers(address, "cpu", patience=0.5) as workers, pytest.raises(InputError, match="scheduler ended"):
-            played(folder, workers, 30, Trouble(seconds=0.1), ending)
+        with scheduled_workers(address, "cpu", patience=0.5) as workers:
+            with pytest.raises(InputError, match="scheduler ended"):
+                played(folder, workers, 30, Trouble(seconds=0.1), ending)
 
 
 def test_a_folder_is_one_runs_own(tmp_path):
@@ -134,10 +136,9 @@ def test_a_folder_is_one_runs_own(tmp_path):
     newer = tiny_run(versions={**tiny_run().versions, "numpy": "3.0"})
     assert not begin(folder, newer, PLAN, force=True) and read_run(folder) == newer
     (tmp_path / "mine.txt").write_text("mine")
-    for words in (r"holds mine\.txt, and no run was begun",):
-        shutil.rmtree(folder)
-        with pytest.raises(InputError, match=words):
-            begin(tmp_path, tiny_run(), PLAN)
+    shutil.rmtree(folder)
+    with pytest.raises(InputError, match=r"holds mine\.txt, and no run was begun"):
+        begin(tmp_path, tiny_run(), PLAN)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
     assert begin(tmp_path, tiny_run(), PLAN, force=True)
     (tmp_path / "run.json").write_text("mine")
@@ -162,8 +163,6 @@ def test_left_overs_of_dead_processes_are_removed_and_others_are_not(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     remove = tmp_path / "probe.h5"
-    from sim.runtime.atomic_files import written_whole
-
     with written_whole(remove, ".h5") as partial:
         partial.write_text("mine")
         own = partial.name

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plan", metavar="PLAN", help="a plan that ships with sulcus, or your own .toml")
     parser.add_argument("--count", required=True, type=_positive, help="episodes that are wanted")
     parser.add_argument("--seed", type=_natural, default=0, help="seed of all draws (default %(default)s)")
-    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="their folder; an unfinished one goes on")
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="their folder; unfinished, it goes on")
     parser.add_argument("--first", type=_natural, default=0, metavar="K", help="number of the first (default 0)")
     who = parser.add_mutually_exclusive_group()
     who.add_argument(

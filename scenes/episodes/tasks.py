@@ -95,9 +95,7 @@ class _Process:
     spoilt = False
 
 
-def attempted(
-    make: Callable[[int], Made], number: int, folder: Path, run: Run, body: Outcome | None = None
-) -> Outcome:
+def attempted(make: Callable[[int], Made], number: int, folder: Path, run: Run, body: Outcome | None = None) -> Outcome:
     """Make the one of a number, by a worker that sees the run's folder and has its versions.
 
     Raises

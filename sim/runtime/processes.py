@@ -160,7 +160,7 @@ def _started(device: str, make: Callable[..., Any], given: tuple[Any, ...], clos
     context = get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs, device, make, given), name=device, daemon=True)
-    with _uninterrupted():
+    with uninterrupted():
         process.start()
     theirs.close()
     child = Child(device, process, ours)
@@ -169,7 +169,7 @@ def _started(device: str, make: Callable[..., Any], given: tuple[Any, ...], clos
 
 
 @contextmanager
-def _uninterrupted() -> Iterator[None]:
+def uninterrupted() -> Iterator[None]:
     """What is started here does not hear Ctrl-C, which the terminal gives to all: this process ends it."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -189,7 +189,7 @@ def _end(child: Child) -> None:
 
 def _serve(pipe: Any, device: str, make: Callable[..., Any], given: tuple[Any, ...]) -> None:
     """Make, and do tasks until the pipe ends; errors are answers too."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         made = _tried(make, seen_as(device), *given)
         pipe.send(made if isinstance(made, Exception) else None)
@@ -207,7 +207,8 @@ def _tried(function: Callable[..., Any], *given: Any) -> Any:
         return error
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """End this process when the one that started it ends; for a thread of its own."""
     parent = parent_process()
     if parent is not None:
         wait([parent.sentinel])
