@@ -116,9 +116,9 @@ def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path
             own.client.cluster.close()
 
         folder = tmp_path / "ended"
-        with scheduled_workers(address, "cpu", patience=0.5) as workers:
-            with pytest.raises(InputError, match="scheduler ended"):
-                played(folder, workers, 30, Trouble(seconds=0.1), ending)
+        ended = pytest.raises(InputError, match="scheduler ended")
+        with scheduled_workers(address, "cpu", patience=0.5) as workers, ended:
+            played(folder, workers, 30, Trouble(seconds=0.1), ending)
 
 
 def test_a_folder_is_one_runs_own(tmp_path):

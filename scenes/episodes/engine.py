@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from asyncio import CancelledError
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -141,7 +142,7 @@ def make_all(
                 hand_out(EPISODE, number, work.make_episode, bodies[body])
             if not busy:
                 return tally
-            for future, outcome in _outcomes(_drained(ended), workers):
+            for future, outcome in _outcomes(_drained(ended), workers, ended):
                 kind, number, _ = busy.pop(future.key)
                 note(kind, replace(outcome, number=number))
             if monotonic() - counted > POLL:
@@ -163,15 +164,22 @@ def _drained(ended: SimpleQueue[Future]) -> list[Future]:
         return found
 
 
-def _outcomes(futures: Sequence[Future], workers: Workers) -> Iterator[tuple[Future, Outcome]]:
-    """What came of tasks that ended; the results are fetched together."""
-    good = [future for future in futures if future.status == "finished"]
-    yield from zip(good, workers.client.gather(good), strict=True)
+def _outcomes(
+    futures: Sequence[Future], workers: Workers, ended: SimpleQueue[Future]
+) -> Iterator[tuple[Future, Outcome]]:
+    """What came of tasks that ended; those whose worker took its answer with it will end once more."""
     for future in futures:
         if future.status == "error":
             yield future, Outcome(0, failed=_reason(future.exception()), lost=True)
-        elif future.status != "finished":  # what a client makes of all when its scheduler is gone
-            raise scheduler_ended(workers.where)
+            continue
+        try:  # not for long, as the worker that is to answer may have to be started again
+            outcome = future.result(timeout=POLL)
+        except TimeoutError:
+            future.add_done_callback(ended.put)
+        except CancelledError as error:  # what a client makes of all when its scheduler is gone
+            raise scheduler_ended(workers.where) from error
+        else:
+            yield future, outcome
 
 
 def _reason(error: BaseException | None) -> str:

@@ -1,0 +1,135 @@
+"""Dask workers as processes of this machine, which are started again whenever they end.
+
+Dask's own nanny gives up on a worker that is killed while it starts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+
+from distributed import Worker
+
+from sim.errors import InputError
+from sim.runtime.processes import VISIBLE, end_with_parent, uninterrupted
+
+HERE = "127.0.0.1"
+"""Where a scheduler and workers of our own listen: nobody outside this machine reaches them."""
+CARD = "GPU"
+"""What a worker with a card of its own offers, by Dask's custom."""
+ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""One thread a process: as many processes as cores, and the same sums whoever adds them."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Started:
+    process: BaseProcess
+    said: Connection  # something, once it is connected
+    times: int
+
+
+@contextmanager
+def started_processes(address: str, devices: Sequence[str], starts: int) -> Iterator[Callable[[], None]]:
+    """Workers of the scheduler at an address, one for each device, killed at the end; gives what tends them.
+
+    Whoever calls that now and then has those started again that ended.
+
+    Raises
+    ------
+    InputError
+        When they are tended: one that has ended `starts` times in a row without having been connected.
+    """
+    shown = [_card(name) for name in devices]
+    crew = [_start(address, card, 1) for card in shown]
+
+    def tend() -> None:
+        for place, one in enumerate(crew):
+            if one.process.is_alive():
+                continue
+            times = 1 if _has_served(one) else one.times + 1
+            if times > starts:
+                raise InputError(
+                    f"a process on {devices[place]} has ended {starts} times as it started "
+                    f"(exit code {one.process.exitcode}). Give fewer --workers, or look for want of memory."
+                )
+            _close(one)
+            crew[place] = _start(address, shown[place], times)
+
+    try:
+        yield tend
+    finally:  # nobody waits for what they compute just then
+        for one in crew:
+            one.process.kill()
+        for one in crew:
+            one.process.join()
+            _close(one)
+
+
+def _card(device: str) -> str | None:
+    """The card of a device, as a process is shown it; None on the CPU."""
+    kind, _, number = device.partition(":")
+    if kind != "cuda":
+        return None
+    seen = os.environ.get(VISIBLE, "")
+    return seen.split(",")[int(number or 0)] if seen else number or "0"
+
+
+def _start(address: str, card: str | None, times: int) -> _Started:
+    context = get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_serve, args=(address, card, theirs), name="worker", daemon=True)
+    more = ALONE if card is None else {**ALONE, VISIBLE: card}
+    with _environment(more), uninterrupted():
+        process.start()
+    theirs.close()
+    return _Started(process, ours, times)
+
+
+def _has_served(one: _Started) -> bool:
+    try:
+        return one.said.poll() and one.said.recv_bytes() is not None
+    except (EOFError, OSError):
+        return False
+
+
+def _close(one: _Started) -> None:
+    one.process.close()
+    one.said.close()
+
+
+def _serve(address: str, card: str | None, connected: Connection) -> None:
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    for name in ("distributed", "tornado"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    asyncio.run(_work(address, card, connected))
+
+
+async def _work(address: str, card: str | None, connected: Connection) -> None:
+    resources = None if card is None else {CARD: 1}
+    # Without a limit: a worker that is paused near its share of memory never goes on, as its memory is not Dask's.
+    async with Worker(address, nthreads=1, host=HERE, memory_limit=0, resources=resources) as worker:
+        connected.send_bytes(b"yes")
+        await worker.finished()
+
+
+@contextmanager
+def _environment(more: Mapping[str, str]) -> Iterator[None]:
+    """Variables that a process to come finds before it imports anything."""
+    before = {name: os.environ.get(name) for name in more}
+    os.environ.update(more)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

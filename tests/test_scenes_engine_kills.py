@@ -1,0 +1,99 @@
+"""Whoever is killed, and whenever: no finished episode is lost, none is made twice, and no half file looks whole."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import h5py
+import pytest
+from tiny_episodes import held, played
+
+from scenes.episodes.run_folder import failures
+from scenes.episodes.workers import own_workers
+
+COUNT, KILLS = 120, 100
+CLIENT = """
+import sys
+from pathlib import Path
+from scenes.episodes.workers import own_workers
+from tiny_episodes import Trouble, played
+
+if __name__ == "__main__":
+    with own_workers(["cpu", "cpu"], {"distributed.scheduler.allowed-failures": 1000}, 1000) as workers:
+        played(Path(sys.argv[1]), workers, int(sys.argv[2]), Trouble(seconds=0.05))
+"""
+
+
+def started(script, folder):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, str(script), str(folder), str(COUNT)]
+    return subprocess.Popen(command, env=environment, start_new_session=True)
+
+
+def processes_of(client):
+    """The workers of a client: its children that were spawned."""
+    found = []
+    with suppress(OSError):
+        for task in Path(f"/proc/{client.pid}/task").glob("*/children"):
+            found += [int(number) for number in task.read_text().split()]
+        return [one for one in found if b"spawn_main" in Path(f"/proc/{one}/cmdline").read_bytes()]
+    return []
+
+
+def ended(client, all_at_once):
+    if all_at_once:
+        os.killpg(client.pid, signal.SIGKILL)
+    client.kill()
+    client.wait()
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:  # its workers notice that it is gone
+        try:
+            os.killpg(client.pid, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.02)
+    raise AssertionError("workers outlived their client")
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds children by the system's table of processes")
+def test_a_hundred_kills_lose_nothing_and_double_nothing(tmp_path):
+    script, folder = tmp_path / "client.py", tmp_path / "killed"
+    script.write_text(CLIENT)
+    chance, kills = random.Random(0), {"worker": 0, "client": 0}
+    client = started(script, folder)
+    seen = {}
+    try:
+        while sum(kills.values()) < KILLS:
+            time.sleep(chance.uniform(0.0, 0.05 if chance.random() < 0.8 else 1.2))
+            seen_now = {path.name: path.stat().st_ino for path in folder.glob("episode_*.h5")}
+            assert seen.items() <= seen_now.items()  # what was there is there, and is the same file
+            seen = seen_now
+            for path in random.sample(sorted(folder.glob("episode_*.h5")), min(3, len(seen))):
+                with h5py.File(path) as file:
+                    assert len(file) == 3
+            workers = processes_of(client)
+            assert client.poll() is None
+            if sum(kills.values()) % 10 == 9:
+                ended(client, chance.random() < 0.7)
+                kills["client"] += 1
+                client = started(script, folder)
+            elif workers:
+                with suppress(ProcessLookupError):
+                    os.kill(chance.choice(workers), signal.SIGKILL)
+                    kills["worker"] += 1
+    finally:
+        ended(client, False)
+    assert kills == {"worker": 90, "client": 10} and COUNT > len(seen) > 10
+    whole = tmp_path / "undisturbed"
+    with own_workers(["cpu"]) as workers:
+        tally = played(folder, workers, COUNT)
+        assert tally.made + tally.skipped == COUNT and tally.skipped >= len(seen) and not failures(folder)
+        assert played(whole, workers, COUNT).made == COUNT
+    assert held(folder) == held(whole) and len(held(folder)) == COUNT
+    made = {path.name for path in whole.iterdir()}
+    assert {path.name for path in folder.iterdir()} == made  # nothing unfinished is left
