@@ -35,6 +35,7 @@ COMMANDS = {
     "demo": "play a scene on a page in the browser",
     "render": "write the frames of a scene as pictures, without display",
     "collect": "write a scene as one episode: pictures, depth, segmentation, forces, tumour",
+    "episodes": "make thousands of scripted surgeries, drawn from a plan, by many processes and machines",
     "convert": "write episodes as LeRobot, robomimic, pictures and tables or XDMF, or the card of a data set",
     "validate": "look whether episodes are whole: their arrays, pictures, checksums and silhouettes",
     "markers": "write the pages to print: markers of tool and patient, and the board that calibrates cameras",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from tiny_episodes import held, played
+from tiny_work import held, played
 
 from scenes.episodes.run_folder import failures
 from scenes.episodes.workers import own_workers
@@ -21,7 +21,7 @@ CLIENT = """
 import sys
 from pathlib import Path
 from scenes.episodes.workers import own_workers
-from tiny_episodes import Trouble, played
+from tiny_work import Trouble, played
 
 if __name__ == "__main__":
     with own_workers(["cpu", "cpu"], {"distributed.scheduler.allowed-failures": 1000}, 1000) as workers:

@@ -47,6 +47,7 @@ FOLDERS = {
     "scenes": (["scenes", "--anatomy", "none.vtu"], "sheet.png"),
     "report": (["report", "--data", "none.h5"], "index.html"),
     "render": (["render", "press", "--anatomy", "none.vtu"], None),
+    "episodes": (["episodes", "none", "--count", "1"], None),
 }
 ALL = {**WRITING, **{name: (words, "x") for name, (words, _) in FOLDERS.items()}}
 

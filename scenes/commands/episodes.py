@@ -157,7 +157,9 @@ def _progress(out: Path, there: Tally, total: int) -> Iterator[Heard]:
         def heard(kind: str, outcome: Outcome | None, workers: int) -> None:
             nonlocal done
             if outcome is None:
-                bar.set_description(f"{workers} workers" if workers else "waits for workers")
+                bar.set_description(
+                    f"{workers} workers" if workers else "waits for workers", refresh=sys.stderr.isatty()
+                )
                 return
             written(kind, outcome)
             if kind == BODY:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import random
-from asyncio import CancelledError
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path

@@ -155,7 +155,7 @@ def collect(
     total = len(player.scene.times)
     demand_space(path, int(total * PIXEL_BYTES * player.camera.width * player.camera.height))
     right = replace(player.stage) if player.scene.viewpoint.eye == "left" else None
-    with written_stream(path, ".h5") as stream, h5py.File(stream, "w") as file:
+    with written_stream(path, ".h5", sweep=False) as stream, h5py.File(stream, "w") as file:
         pictures = file.create_group("pictures")
         stores: dict[str, h5py.Dataset] = {}
         rows, loads = [], []  # a frame itself holds seven megabytes

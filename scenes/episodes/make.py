@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import socket
 import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,16 +13,15 @@ from typing import Any
 import numpy as np
 
 from sim.errors import InputError
+from sim.runtime.atomic_files import partial_path
 
 from .bodies import ABOUT, NO_LEARNER, read_body, write_body
 from .draws import random_of
 from .episode import Recording, collect
 from .plan import Plan
+from .run_folder import BODIES, episode_name
 from .scripted import drawn_episode, scene_of
 from .sensing import noisy, sensed
-
-BODIES = "bodies"
-"""The folder of a data set's bodies."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +50,7 @@ class Made:
 
 def episode_path(folder: Path, number: int) -> Path:
     """The file of an episode."""
-    return folder / f"episode_{number:06d}.h5"
+    return folder / episode_name(number)
 
 
 def body_path(folder: Path, number: int) -> Path:
@@ -69,13 +66,13 @@ def body_of(plan: Plan, seed: int, number: int) -> int:
 def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "auto") -> Made:
     """Make a body, unless it is there; what cannot be made is said in `Made.failed`.
 
-    It is made under another name, `0003.partial.HOST.PID`, so that a folder of its name is whole. Who comes second
+    It is made under another name, so that a folder of its name is whole. Who comes second
     throws his own away: both are alike.
     """
     path, began = body_path(folder, number), clock.perf_counter()
     if (path / ABOUT).is_file():
         return Made(path, skipped=True)
-    partial = path.with_name(f"{path.name}.partial.{socket.gethostname()}.{os.getpid()}")
+    partial = partial_path(path)
     try:
         rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
@@ -83,6 +80,8 @@ def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "a
         if not path.exists():
             partial.rename(path)
     except InputError as error:
+        if isinstance(error.__cause__, OSError):  # the disk's fault, and not the body's
+            raise
         return Made(path, seconds=clock.perf_counter() - began, failed=str(error))
     except OSError:
         if not (path / ABOUT).is_file():  # somebody else was faster
@@ -104,6 +103,8 @@ def make_episode(folder: Path, plan: Plan, seed: int, number: int, device: str =
     try:
         report = _collected(path, plan, seed, number, body_path(folder, body_of(plan, seed, number)), device)
     except InputError as error:
+        if isinstance(error.__cause__, OSError):  # the disk's fault, and not the episode's
+            raise
         return Made(path, seconds=clock.perf_counter() - began, failed=str(error))
     return Made(path, int(str(report["frames"])), path.stat().st_size, clock.perf_counter() - began)
 

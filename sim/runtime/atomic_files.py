@@ -47,7 +47,7 @@ def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: boo
         raise InputError(f"{path}: cannot be written, it is a folder. Choose another name.")
     if sweep:
         remove_left_overs(path.parent, path.name, stale)
-    probe = _partial(path)
+    probe = partial_path(path)
     try:  # permissions alone do not tell: a file system may be read-only, or make no files
         probe.touch()
     except OSError as error:
@@ -94,9 +94,11 @@ def written_whole(path: str | Path, suffix: str, sweep: bool = True) -> Iterator
         As `check_output`; and where writing fails.
     """
     path = check_output(path, suffix, sweep=sweep)
-    partial = _partial(path)
+    partial = partial_path(path)
     try:
         yield partial
+        with partial.open("rb") as file:  # whole on the disk, before it takes a name that says so
+            os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({why(error)}). {REMEDY}") from error
@@ -219,8 +221,8 @@ def unfinished_path(path: Path) -> Path:
     return path.with_name(path.name + ".partial")
 
 
-def _partial(path: Path) -> Path:
-    """The hidden name under which this process writes `path`."""
+def partial_path(path: Path) -> Path:
+    """The hidden name under which this process writes `path`, a file or a folder; `remove_left_overs` knows it."""
     return path.with_name(f".sulcus-{_host()}-{os.getpid()}-{path.name}")
 
 

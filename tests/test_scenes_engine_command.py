@@ -1,0 +1,111 @@
+"""`sulcus episodes`: what it refuses, how it stops, what it plans on paper, and its script for a cluster."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from tiny_work import tiny_run
+
+from scenes.cli import main
+from scenes.episodes.estimate import estimated, lines
+from scenes.episodes.plan import load_plan
+from scenes.episodes.rates import Rate, read_rates, written_rates
+from scenes.episodes.run_folder import begin
+from scenes.episodes.slurm import sbatch_script
+from scenes.episodes.tasks import Outcome
+from sim.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["none"], "no plan is called 'none': choose"),
+        (["small", "--scheduler", "tcp://127.0.0.1:9x"], "no Dask scheduler answers there"),
+        (["small", "--estimate"], "no episode was measured there"),
+        (["small", "--slurm", "2"], "give --device cpu, or --device cuda"),
+        (["small", "--slurm", "2", "--device", "cpu", "--workers", "2"], "leave --workers and --scheduler out"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_leaves_nothing(words, said, tmp_path, capsys):
+    out = tmp_path / "data"
+    assert main(["episodes", *words, "--count", "2", "--out", str(out)]) == 2
+    assert said in (error := capsys.readouterr().err) and error.count("\n") == 1
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("words", [["--count", "0"], ["--count", "2.5"], ["--count", "2", "--first", "-1"]])
+def test_counts_are_whole_numbers(words, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["episodes", "small", *words, "--out", str(tmp_path / "data")])
+    assert "is no whole number from" in capsys.readouterr().err
+
+
+def test_a_folder_of_another_seed_is_refused_by_the_command(tmp_path, capsys):
+    digest = load_plan("small").digest
+    begin(tmp_path, tiny_run(digest=digest), "")
+    assert main(["episodes", "small", "--count", "1", "--seed", "7", "--out", str(tmp_path), "--workers", "1"]) == 2
+    assert "Give --seed 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_all_processes_at_once_and_leaves_what_can_go_on(number, tmp_path):
+    command = [sys.executable, "-m", "scenes.cli", "episodes", "small", "--count", "5", "--workers", "1"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    folder = tmp_path / "data"
+    client = subprocess.Popen(
+        [*command, "--out", str(folder)], stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while not (folder / "rates").exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        os.killpg(client.pid, number) if number == signal.SIGINT else client.send_signal(number)
+        error = client.communicate(timeout=20)[1]
+    finally:
+        client.kill()
+    assert client.returncode == 130 and "the same command goes on in" in error and "Traceback" not in error
+    assert (folder / "run.json").exists() and not list(folder.glob("episode_*"))
+
+
+def test_a_run_is_planned_from_what_was_measured(tmp_path):
+    (tmp_path / "rates").mkdir()
+    with written_rates(tmp_path) as note:
+        for number, seconds in enumerate((10.0, 14.0)):
+            note("episode", Outcome(number, 100, 5000, seconds))
+        note("body", Outcome(0, 0, 2000, 60.0))
+        note("episode", Outcome(9, failed="no"))
+        note("episode", Outcome(8, skipped=True))
+    with next((tmp_path / "rates").glob("*.csv")).open("a") as file:
+        file.write("episode,7,100,50")  # torn by a kill
+    rates = read_rates(tmp_path)
+    assert len(rates) == 3 and rates[2] == Rate("body", 0, 0, 2000, 60.0)
+    found = estimated(rates, 1000, 10)
+    assert found.seconds.mean == 12_000 + 600 and found.bytes.mean == 5_000_000 + 20_000
+    assert found.frames.mean == 100_000 and found.frames.error == 0.0 and np.isnan(found.seconds.error)
+    found = estimated([rate for rate in rates if rate.kind == "episode"], 1000, 10)
+    assert found.seconds.error == pytest.approx(1000 * np.sqrt(8.0) / np.sqrt(2.0))
+    text = "\n".join(lines(found))
+    assert "1000 episodes on 10 bodies, as measured of 2 episodes, and no body" in text
+    assert "work of one process    3.33 ± 0.56 h" in text and "processes for one day  1" in text
+    with pytest.raises(InputError, match="no episode was measured"):
+        estimated([], 1, 1)
+
+
+def test_a_clusters_script_is_one_command_for_all_machines(tmp_path, capsys):
+    """Run by bash, with a program that prints what it was given."""
+    words = ["episodes", "small", "--count", "9", "--out", str(tmp_path / "a b"), "--device"]
+    assert main([*words, "cuda", "--slurm", "3"]) == 0
+    text = capsys.readouterr().out
+    assert "#SBATCH --array=1-3\n" in text and "#SBATCH --gpus-per-task=1\n" in text and "--workers" not in text
+    assert f"exec {sys.executable} -m scenes.cli episodes small" in text and not (tmp_path / "a b").exists()
+    program = [sys.executable, "-c", "import sys, json; print(json.dumps(sys.argv[1:]))", "--out", "a b"]
+    script = sbatch_script(program, 4, "cpu", "mine")
+    environment = {**os.environ, "SLURM_CPUS_PER_TASK": "16"}
+    done = subprocess.run(["bash"], input=script, capture_output=True, text=True, env=environment, check=True)
+    assert json.loads(done.stdout) == ["--out", "a b", "--workers", "16"]
+    assert script.startswith("#!/bin/bash\n#SBATCH --job-name=mine\n") and "--requeue" in script
