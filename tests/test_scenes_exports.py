@@ -243,6 +243,13 @@ def test_what_does_not_go_together_is_a_sentence_and_leaves_nothing(folder, box,
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
 
 
+def test_what_is_interrupted_leaves_nothing(tmp_path):
+    with pytest.raises(KeyboardInterrupt), written_folder(tmp_path / "out", 10) as partial:
+        (partial / "a").write_text("a")
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
 def test_a_full_disk_is_said_and_nothing_stays(tmp_path):
     with pytest.raises(InputError, match="No space left"), written_folder(tmp_path / "out", 10) as partial:

@@ -64,6 +64,8 @@ def test_what_was_not_solved_is_nan(folder):
     assert window["outcome_fem"] == ["", "CONVERGED", "", "", "CONVERGED"]
     assert read_episodes(folder, ["tumour_fem"], window=2).at(1, 1)["fem_known"].tolist() == [False, False]
     assert read_episodes(folder, ["tumour_fem"], window=7).at(0, 0)["fem_known"].all()
+    apart = read_episodes(folder, ["tumour_fem", "tumour_predicted"], window=2, step=6).at(1, 0)
+    assert np.allclose(apart["tumour_fem"] - apart["tumour_predicted"], [0.0, 0.0, 1e-4])
 
 
 def test_batches_are_stacked_and_shuffled_by_a_seed(folder, box, tmp_path):

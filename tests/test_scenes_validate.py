@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import time
 
 import h5py
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 from tiny_episodes import Wanted, packed, write_episode
 
 from scenes.cli import main
+from scenes.episodes.checksums import seal
+from scenes.episodes.reading.again import solved_again
 from scenes.episodes.reading.apart import validated
-from scenes.episodes.reading.validation import validate_episode
+from scenes.episodes.reading.validation import Report, validate_episode
 
 
 def changed(name, rows):
@@ -93,6 +96,23 @@ def test_what_is_wrong_is_named(name, whole, tmp_path):
     assert len(problems) == 1 and words in problems[0]
 
 
+def test_content_that_is_not_what_was_written_is_named(whole, tmp_path):
+    path = tmp_path / whole.name
+    path.write_bytes(whole.read_bytes())
+    with h5py.File(path, "a") as file:
+        seal(file)
+    assert validate_episode(path).problems == [] and "checksums: it states none" not in validate_episode(path).skipped
+    with h5py.File(path, "a") as file:
+        file["force"][2, 1] += 1e-9
+    assert validate_episode(path).problems == ["/force: is not as it was written."]
+
+
+def test_frames_are_not_solved_again_without_a_plan(whole):
+    report = solved_again(validate_episode(whole), 2, "cpu")
+    assert not report.problems and any("solved again: it states no" in words for words in report.skipped)
+    assert report.again == 0 and report.again_mm is None
+
+
 def test_a_mask_without_its_anatomy_is_said_to_be_skipped(whole, tmp_path):
     path = tmp_path / whole.name
     path.write_bytes(whole.read_bytes())
@@ -112,6 +132,20 @@ def test_the_command_names_broken_files_and_ends_with_one(whole, tmp_path, capsy
     assert "cannot be read as an episode" in said["files"][1]["problems"][0]
     assert main(["validate", str(tmp_path / "none.h5")]) == 2 and "no such file" in capsys.readouterr().err
     assert main(["validate", str(whole), "--workers", "0"]) == 2
+
+
+def slow(path):
+    """What takes long."""
+    time.sleep(0.5)
+    return Report(path)
+
+
+def test_who_wants_no_more_waits_for_what_has_begun_alone(tmp_path):
+    reports = validated([tmp_path / f"{number}.h5" for number in range(200)], 1, slow)
+    assert next(reports).problems == []
+    began = time.perf_counter()
+    reports.close()
+    assert time.perf_counter() - began < 20.0  # of a hundred seconds
 
 
 def end(path):

@@ -29,10 +29,14 @@ def validated(
     left = list(dict.fromkeys(paths))
     try:
         with _pool(workers) as pool:
-            for done in as_completed([pool.submit(_looked_at, look, path) for path in left]):
-                report = done.result()
-                left.remove(report.path)
-                yield report
+            try:
+                for done in as_completed([pool.submit(_looked_at, look, path) for path in left]):
+                    report = done.result()
+                    left.remove(report.path)
+                    yield report
+            except BaseException:  # Ctrl-C, or a reader that wants no more: what has not begun is not begun
+                pool.shutdown(cancel_futures=True)
+                raise
     except BrokenProcessPool:
         for path in left:
             yield _alone(look, path)
