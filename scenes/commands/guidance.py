@@ -73,8 +73,8 @@ next: make broken episodes anew, or remove them""",
     "episodes": """examples:
   sulcus episodes small --count 8 --out data
   sulcus episodes small --count 1000000 --out data --estimate
-  sulcus episodes small --count 1000000 --out data --device cuda --slurm 20 > run.sh
-next: sbatch run.sh; or the same command on every machine that sees the folder""",
+  sulcus episodes small --count 1000000 --out data --device cuda --slurm 20
+next: give the same command on every machine that sees the folder""",
     "markers": """example:
   sulcus markers --out markers
 next: print markers/markers.pdf at 100 %, measure its rulers, glue; then film the board for sulcus calibrate""",

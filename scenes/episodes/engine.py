@@ -65,7 +65,7 @@ def still_missing(folder: Path, numbers: range, first_client: bool, again: bool 
     """What is there of some episodes or has failed for good, and what is missing, in the order of its turn.
 
     The first client goes upwards. Who comes later goes in a random order, so that two in one folder seldom make the
-    same episode at the same time; if they do, one writes over the other's file the same bytes.
+    same episode at the same time. If they do, one writes over the other's file the same bytes.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def make_all(
             attempted, make, number, folder, run, *needed,
             key=f"{kind}-{number}-{token}", retries=RETRIES, resources=workers.needs,
         )  # fmt: skip
-        busy[future.key] = kind, number, future
+        busy[str(future.key)] = kind, number, future
         future.add_done_callback(ended.put)
         return future
 
@@ -143,7 +143,7 @@ def make_all(
             if not busy:
                 return tally
             for future, outcome in _outcomes(_drained(ended), workers, ended):
-                kind, number, _ = busy.pop(future.key)
+                kind, number, _ = busy.pop(str(future.key))
                 note(kind, replace(outcome, number=number))
             if monotonic() - counted > POLL:
                 count, counted = workers.count(), monotonic()
@@ -182,7 +182,7 @@ def _outcomes(
             yield future, outcome
 
 
-def _reason(error: BaseException | None) -> str:
+def _reason(error: object) -> str:
     if isinstance(error, KilledWorker):
         return f"its worker was ended {MOST_DEATHS} times, for want of memory most likely"
     return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"

@@ -298,7 +298,8 @@ def write_motion(
     columns |= {"outcome_fem": outcomes, "fem_frames": numbers, **how.sensed(columns)}
     for name, values in columns.items():
         text = h5py.string_dtype() if isinstance(values[0], str) else None
-        file.create_dataset(name, data=np.asarray(values, text), compression="gzip")
+        made = file.create_dataset(name, data=np.asarray(values, text), compression="gzip")
+        made.flush()  # its place in the file is this one, even if a profiler's look at this frame keeps it open
     if "seconds" in file:
         file["seconds"].attrs["stages"] = STAGES
     for of, which in (("tumour", nodes), ("cortex", cortex)):

@@ -66,9 +66,14 @@ def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
         return Amount(sum(part.mean for part in parts), float(np.hypot.reduce([part.error for part in parts])))
 
     both = (EPISODE, BODY)
-    measured = [len(own[kind]) for kind in both]
     return Estimate(
-        episodes, bodies, *measured, amount("seconds", both), amount("frames", [EPISODE]), amount("bytes", both)
+        episodes,
+        bodies,
+        len(own[EPISODE]),
+        len(own[BODY]),
+        amount("seconds", both),
+        amount("frames", [EPISODE]),
+        amount("bytes", both),
     )
 
 

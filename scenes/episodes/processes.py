@@ -13,9 +13,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from typing import Any
 
+from dask import config
 from distributed import Worker
 
 from sim.errors import InputError
@@ -32,7 +33,7 @@ ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS":
 @dataclass(frozen=True, eq=False)
 class _Started:
     process: BaseProcess
-    said: Connection  # something, once it is connected
+    said: Any  # a pipe, whose class is another on Windows: something comes once it is connected
     times: int
 
 
@@ -105,15 +106,16 @@ def _close(one: _Started) -> None:
     one.said.close()
 
 
-def _serve(address: str, card: str | None, connected: Connection) -> None:
+def _serve(address: str, card: str | None, connected: Any) -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
     for name in ("distributed", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    asyncio.run(_work(address, card, connected))
+    with config.set({"distributed.worker.profile.enabled": False}):  # it holds on to what a task has closed
+        asyncio.run(_work(address, card, connected))
 
 
-async def _work(address: str, card: str | None, connected: Connection) -> None:
-    resources = None if card is None else {CARD: 1}
+async def _work(address: str, card: str | None, connected: Any) -> None:
+    resources = None if card is None else {CARD: 1.0}
     # Without a limit: a worker that is paused near its share of memory never goes on, as its memory is not Dask's.
     async with Worker(address, nthreads=1, host=HERE, memory_limit=0, resources=resources) as worker:
         connected.send_bytes(b"yes")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 
 from dask import config
@@ -92,7 +92,7 @@ def own_workers(
             logging.getLogger(name).setLevel(logging.CRITICAL)
         scheduler = {"cls": Scheduler, "options": {"host": HERE, "port": 0, "dashboard_address": f"{HERE}:0"}}
         with (
-            SpecCluster({}, scheduler, silence_logs=logging.CRITICAL, name=f"sulcus-{os.getpid()}") as cluster,
+            closing(SpecCluster({}, scheduler, name=f"sulcus-{os.getpid()}")) as cluster,
             Client(cluster, set_as_default=False) as client,
             started_processes(cluster.scheduler_address, devices, starts) as tend,
         ):
