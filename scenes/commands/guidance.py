@@ -73,7 +73,6 @@ next: make broken episodes anew, or remove them""",
     "episodes": """examples:
   sulcus episodes small --count 8 --out data
   sulcus episodes small --count 1000000 --out data --estimate
-  sulcus episodes small --count 1000000 --out data --device cuda --slurm 20
 next: give the same command on every machine that sees the folder""",
     "markers": """example:
   sulcus markers --out markers
