@@ -78,7 +78,9 @@ def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
 
 
 def _sum(values: Sequence[float], count: int) -> Amount:
-    """Of `count` as these, whose mean is known to its standard error only."""
+    """Of `count` as these, whose mean is known to its standard error only; exactly where all were measured."""
+    if len(values) >= count:
+        return Amount(count * float(np.mean(values)), 0.0)
     error = float(np.std(values, ddof=1)) / np.sqrt(len(values)) if len(values) > 1 else np.nan
     return Amount(count * float(np.mean(values)), count * error)
 
