@@ -19,8 +19,10 @@ from ar.tracking.pose_stream import AHEAD, DAY, LONGEST, stream_of
 from ar.tracking.rigid import moved_about
 from ar.tracking.targets import patient_reference
 from scenes.cli import main
+from scenes.play.overlay.agreement import Agreement
 from scenes.play.overlay.elsewhere import Elsewhere, Eye
 from scenes.play.overlay.follower import Follower, State
+from scenes.play.overlay.plausible import buried
 from scenes.play.overlay.run import timed
 from scenes.play.overlay.tool_motion import ToolMotion
 from scenes.script.calibration_file import read_calibration, read_intrinsic_covariance
@@ -201,6 +203,85 @@ def test_a_picture_without_poses_is_stale(follower, bodies):
     assert [state for state, _ in said[:4]] == [State.REST] * 4
     assert said[5] == (State.NO_TOOL, "tool stale, no pose for 0.2 s: the tumour as 0.3 s ago")
     assert said[4][0] is State.NO_REFERENCE  # the film is over-exposed there
+
+
+def followed(follower, other, until=1.0):
+    """What is known of the film's first pictures, by another tracker, and with a brain that does not move."""
+    one, known, out = replace(follower, elsewhere=other), None, []
+    one = replace(one, motion=replace(one.motion, deformer=Still()))
+    for each in timed(film_of(FILM / "film.mp4", 30.0)):
+        if each.picture.time > until:
+            break
+        known = one.step(each.picture.grey, each.picture.time, known)
+        out.append(known)
+    return [known for known in out if known.state is not State.NO_REFERENCE]
+
+
+def test_poses_are_held_against_the_targets_that_pictures_show(follower, bodies, stage):
+    times = np.arange(-0.5, 3.5, 0.025)
+    tool, patient = (sampled(bodies[name], times) for name in ("tool", "patient"))
+    right = Elsewhere(tool, patient)
+    known = followed(follower, right)
+    assert {each.state for each in known} <= {State.GOOD, State.REST} and len(known) > 5
+    np.testing.assert_allclose(known[-1].agreement.places["tool"], 0.0, atol=1.5e-3)
+    for each in followed(follower, right.swapped):
+        assert each.state is State.UNSURE and each.band is None
+        assert "mm from its poses: are the two files of --poses swapped?" in each.words
+    aside = moved_about(
+        np.eye(4), np.zeros(3), np.array([0.05, 0.0, -0.03, 0.4, 0.0, 0.0])
+    )  # bodies beside their cubes
+    mounted = replace(right, tool=sampled(lambda time: bodies["tool"](time) @ aside, times))
+    assert all(each.relied for each in followed(follower, mounted))
+    far = replace(
+        right,
+        tool=sampled(
+            lambda time: (
+                bodies["tool"](time) @ moved_about(np.eye(4), np.zeros(3), np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.0]))
+            ),
+            times,
+        ),
+    )
+    assert "is seen 400 mm from its poses" in followed(follower, far, 0.2)[-1].words
+    quick = replace(right, tool=sampled(lambda time: bodies["tool"](0.8 + 8.0 * (time - 0.8)), times))
+    assert "moves by" in followed(follower, quick)[-1].words
+    eye = Eye(np.linalg.inv(truth_of_camera(stage) @ np.linalg.inv(bodies["head"](0.0))), NOISE)
+    looked = replace(right, eye=eye)
+    agreed = looked.agreed(0.0, known[0].tracked.poses, Agreement())
+    assert not agreed.doubt and set(agreed.places) == {"patient", "tool"}
+    assert "swapped" in looked.swapped.agreed(0.0, known[0].tracked.poses, Agreement()).doubt
+
+
+def truth_of_camera(stage):
+    return read_truth(FILM / "truth.npz", stage.anatomy.digest, len(stage.tumour_vertices)).T_camera_scan[0]
+
+
+def test_poses_of_another_clock_say_by_how_much_it_differs(follower, bodies):
+    times = np.arange(-0.5, 3.5, 0.025)
+    tool, patient = (
+        sampled(bodies[name], times, offset=offset) for name, offset in (("tool", 0.0), ("patient", 100.0))
+    )
+    last = followed(follower, Elsewhere(tool, patient), 0.2)[-1]
+    assert last.state is State.NO_TOOL
+    assert last.words.startswith("tool not known, the patient's poses begin 99.4 s after this picture (see --clock)")
+    late = followed(follower, Elsewhere(tool, replace(patient, times=times - 100.0)), 0.2)[-1]
+    assert "the patient's poses end 96." in late.words
+    assert (
+        followed(follower, Elsewhere(tool, patient, Clock(100.0)), 0.2)[-1].words.count("the tool's poses end 96.") == 1
+    )
+
+
+def test_a_tool_deep_in_the_brain_is_of_other_poses(stage, follower):
+    nodes = stage.anatomy.mesh.nodes
+    pose = np.eye(4)
+    pose[:3, 3] = nodes.mean(axis=0)
+    pose[:3, 2] *= -1.0
+    pose[:3, 0] *= -1.0
+    assert "tip would be" in buried(follower.tool, pose, stage)
+    away = pose @ follower.tool.T_cube_tool  # markers in the middle of the brain
+    assert "markers would be" in buried(follower.tool, away, stage)
+    pose[:3, 3] = stage.site.origin + 0.02 * stage.site.axis  # a tip 20 mm into the opening
+    pose[:3, :3] = np.column_stack([stage.site.right, stage.site.up, -stage.site.axis])
+    assert not buried(follower.tool, pose, stage)
 
 
 class Still:

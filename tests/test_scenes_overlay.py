@@ -141,7 +141,7 @@ def test_a_registration_of_another_patient_is_noticed(follower, stage):
     long = follower.tool.T_cube_tool @ [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.4], [0, 0, 0, 1.0]]
     away = replace(follower, tool=replace(follower.tool, T_cube_tool=long))
     known = away.step(first.grey, 0.0)
-    assert known.state is State.UNSURE and "no nearer to the head than 200 mm" in known.words and not known.near
+    assert known.state is State.UNSURE and "never nearer than 200" in known.words and not known.near
     assert near.near and away.step(first.grey, 0.1, near).near  # it has been there
     assert "head" not in away.step(first.grey, 0.1, near).words
 

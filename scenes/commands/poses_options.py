@@ -94,7 +94,28 @@ def elsewhere_of(args: argparse.Namespace, calibration: Calibration) -> Elsewher
     if args.hand_eye is not None:
         body = None if args.camera_poses is None else read_stream(args.camera_poses)
         eye = Eye(*read_hand_eye(args.hand_eye), body)
-    return Elsewhere(tool, patient, _clock_of(args, calibration, tool, patient), eye)
+    elsewhere = Elsewhere(tool, patient, _clock_of(args, calibration, tool, patient), eye)
+    _say_apart(args, elsewhere)
+    return elsewhere
+
+
+def _say_apart(args: argparse.Namespace, elsewhere: Elsewhere) -> None:
+    """Say when poses and pictures are, if the film begins where there are no poses."""
+    from ar.tracking.pictures import film_of
+
+    from ..play.overlay.run import timed
+
+    first = next(timed(film_of(Path(args.pictures), args.rate))).picture.time
+    outside = elsewhere.outside(first)
+    if not outside:
+        return
+    when = [
+        f"the {name}'s poses of {each.times[0]:.2f} to {each.times[-1]:.2f} s"
+        for name, each in elsewhere.streams.items()
+    ]
+    clock = f"; --clock is {elsewhere.clock.offset:g} s" if elsewhere.clock.offset else ""
+    said = f"{outside}. It is of {first:.2f} s, {', '.join(when)}{clock}. Give --clock S, or {AUTO}"
+    print(f"sulcus overlay: {said}", file=sys.stderr)
 
 
 def _clock_of(args: argparse.Namespace, calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,6 +16,10 @@ from ar.tracking.rigid import cross_matrices, turn_vectors
 from ar.tracking.targets import patient_reference, tool_cube
 
 from ...script.followed import rows_of
+from .agreement import Agreement
+
+# Poses that begin or end so far from a picture [s] are of another clock, or of another time.
+FAR = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +68,49 @@ class Elsewhere:
         """The reference in the camera's frame in the picture of a time [s]; None where nobody says it."""
         return self._at(time, self._in_camera)
 
+    @property
+    def swapped(self) -> Elsewhere:
+        """The same poses with the tool's taken for the reference's."""
+        return replace(self, tool=self.patient, patient=self.tool)
+
+    def agreed(self, time: float, seen: Mapping[str, Pose], before: Agreement) -> Agreement:
+        """What printed targets that are seen in the picture of a time [s] say of these poses.
+
+        `seen` has the targets in the camera's frame, by name. Where pictures say where the camera is beside the
+        reference, the tool's alone can be compared.
+        """
+        reference, tool = (seen.get(target().name) for target in (patient_reference, tool_cube))
+        if self.eye is None:
+            body, other = self.beside(time), self.swapped.beside(time)
+            if tool is None or reference is None or body is None:
+                return before
+            return before.seen(tool_cube().name, tool.seen_from(reference), body, other)
+        body, other = self.reference(time), self.swapped.reference(time)
+        for each, target, a, b in (("patient", reference, body, other), ("tool", tool, other, body)):
+            before = before if target is None or a is None else before.seen(each, target, a, b)
+        return before
+
+    @property
+    def streams(self) -> dict[str, PoseStream]:
+        """All poses, by whose they are."""
+        camera = {} if self.eye is None or self.eye.body is None else {"camera": self.eye.body}
+        return {"tool": self.tool, "patient": self.patient, **camera}
+
+    def outside(self, time: float) -> str:
+        """Say whose poses are all far from the picture of a time [s], and by how much; empty: nobody's."""
+        for name, stream in self.streams.items():
+            at = stream.in_its_day(time + self.clock.offset)
+            first, last = stream.times[[0, -1]].tolist()
+            if at < first - FAR:
+                return f"the {name}'s poses begin {first - at:.1f} s after this picture"
+            if at > last + FAR:
+                return f"the {name}'s poses end {at - last:.1f} s before this picture"
+        return ""
+
     def age(self, time: float) -> float | None:
         """How old the poses of a picture's time [s] are [s]; None where there are some for it."""
         time = time + self.clock.offset
-        streams = [self.tool, self.patient, *([self.eye.body] if self.eye is not None and self.eye.body else [])]
-        missing = [each.age(time) for each in streams if each.at(time) is None]
+        missing = [each.age(time) for each in self.streams.values() if each.at(time) is None]
         return max(missing) if missing else None
 
     def _at(self, time: float, pose_at: Callable[[float], Pose | None]) -> Pose | None:

@@ -20,8 +20,9 @@ from ar.tracking.track import Tracked, Tracker
 
 from ...script.tracked_tool import TrackedTool
 from ...script.uncertainty import DEVIATIONS, LEVEL
+from .agreement import Agreement
 from .elsewhere import Elsewhere
-from .plausible import NEAR, from_head, implausible
+from .plausible import NEAR, buried, from_head, implausible
 from .tool_motion import Motion, ToolMotion
 
 # So long a picture's overlay stays where it was when the reference is lost: in a hand's picture it is off by less than
@@ -86,6 +87,8 @@ class Known:
         Whether the tool has been near the head: until then its place may be due to another patient's registration.
     pace
         How fast the brain has moved across the picture lately [m/s]; None: not known.
+    agreement
+        What printed targets in the pictures say of another tracker's poses.
     """
 
     time: float
@@ -103,6 +106,7 @@ class Known:
     interval: float = SLOWEST
     near: bool = False
     pace: float | None = None
+    agreement: Agreement = field(default_factory=Agreement)
 
     @property
     def relied(self) -> bool:
@@ -141,8 +145,7 @@ class Follower:
     @cached_property
     def tracker(self) -> Tracker:
         """Of the targets that are wanted."""
-        cube = self.tool is not None and self.elsewhere is None
-        wanted = (patient_reference(), tool_cube()) if cube else (patient_reference(),)
+        wanted = (patient_reference(),) if self.tool is None else (patient_reference(), tool_cube())
         return Tracker(self.calibration.camera(np.eye(4)), wanted)
 
     def step(self, grey: np.ndarray, time: float, before: Known | None = None) -> Known:
@@ -153,12 +156,22 @@ class Follower:
         ValueError
             As `Tracker.track`.
         """
-        known = self._looked(grey, time, before)
+        known = self._agreeing(self._looked(grey, time, before), before)
         if before is None:
             return known
         apart = time - before.time
         known = replace(known, near=known.near or before.near)
         return replace(known, interval=min(before.interval, apart) if apart > 0.0 else before.interval)
+
+    def _agreeing(self, known: Known, before: Known | None) -> Known:
+        """With what printed targets say of another tracker's poses, which may make the tumour's place not known."""
+        if self.elsewhere is None:
+            return known
+        agreement = Agreement() if before is None else before.agreement
+        known = replace(known, agreement=self.elsewhere.agreed(known.time, known.tracked.poses, agreement))
+        if not known.agreement.doubt or not (known.relied or known.state is State.UNSURE):
+            return known
+        return replace(known, state=State.UNSURE, words=known.agreement.doubt, band=None, parts={})
 
     def _looked(self, grey: np.ndarray, time: float, before: Known | None) -> Known:
         """As `step`, whatever the intervals are."""
@@ -201,8 +214,13 @@ class Follower:
         away = 0.0 if tool is None else from_head(tool[:3, 3], stage)
         near = near or (tool is not None and away <= NEAR)
         doubt = implausible(self.registration, stage, camera)
+        theirs = "is this its registration?" if self.elsewhere is None else "are these its poses and registration?"
         if not doubt and away > NEAR and not near:
-            doubt = f"the tool has been no nearer to the head than {1e3 * NEAR:.0f} mm: is this its registration?"
+            doubt = (
+                f"the tool is {1e3 * away:.0f} mm from the head, and was never nearer than {1e3 * NEAR:.0f}: {theirs}"
+            )
+        if not doubt and tool is not None and self.tool is not None and (deep := buried(self.tool, tool, stage)):
+            doubt = f"{deep}: {theirs}"
         return doubt, near
 
     def _without_reference(self, tracked: Tracked, time: float, before: Known | None) -> Known:
@@ -239,7 +257,7 @@ class Follower:
             if self.motion.deformer is None:
                 return Known(time, State.UNKNOWN, UNKNOWN, tracked, self.motion.rest, felt=felt)
             if felt is None or last is None:
-                words = "tool not seen yet: the tumour as in the scan"
+                words = f"tool {self._late(time) or 'not seen yet'}: the tumour as in the scan"
                 return Known(time, State.NO_TOOL, words, tracked, self.motion.rest)
             words = f"tool {self._late(time) or 'lost'}: the tumour as {time - felt:.1f} s ago"
             return Known(time, State.NO_TOOL, words, tracked, last, felt=felt)
@@ -262,8 +280,10 @@ class Follower:
     def _late(self, time: float) -> str:
         """How old the poses of another tracker are, where they are what is missing; else empty."""
         age = None if self.elsewhere is None else self.elsewhere.age(time)
-        if age is None:
+        if self.elsewhere is None or age is None:
             return ""
+        if outside := self.elsewhere.outside(time):
+            return f"not known, {outside} (see --clock)"
         return f"stale, no pose for {age:.1f} s" if np.isfinite(age) else "not seen yet by the other tracker"
 
     def _tip_covariance(self, beside: Pose) -> np.ndarray:

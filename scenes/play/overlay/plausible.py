@@ -7,11 +7,14 @@ import numpy as np
 from ar.optics.camera import Camera
 from ar.tracking.registration import Registration
 from ar.tracking.targets import patient_reference
+from sim.geometry.surface import encloses
 
+from ...script.tracked_tool import TrackedTool
 from ..stage import Stage
 
-# A reference is no farther from the opening, and a tool that works is at some time no farther from the head [m].
-REACH, NEAR = 0.3, 0.2
+# A reference is no farther from the opening, and a tool that works is at some time no farther from the head [m]. Nor
+# are its tip or its markers deeper inside the brain: no model knows of such a cut.
+REACH, NEAR, DEEP = 0.3, 0.2, 0.03
 
 
 def implausible(registration: Registration, stage: Stage, camera: Camera) -> str:
@@ -30,3 +33,15 @@ def from_head(tip: np.ndarray, stage: Stage) -> float:
     """How far a tool's tip (3,) [m] is from the box round the head's mesh [m]."""
     nodes = stage.anatomy.mesh.nodes
     return float(np.linalg.norm(tip - np.clip(tip, nodes.min(axis=0), nodes.max(axis=0))))
+
+
+def buried(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stage) -> str:
+    """Say that a tool at a pose (4, 4) [m] is where none can be, with its tip or its markers deep inside; empty: no."""
+    mesh = stage.anatomy.mesh
+    for what, place in (("tip", np.zeros(3)), ("markers", np.linalg.inv(tool.T_cube_tool)[:3, 3])):
+        point = T_scan_tool[:3, :3] @ place + T_scan_tool[:3, 3]
+        corners = mesh.nodes[mesh.surface]
+        depth = float(np.linalg.norm(corners.reshape(-1, 3) - point, axis=1).min())
+        if depth > DEEP and encloses(corners, point):
+            return f"the tool's {what} would be {1e3 * depth:.0f} mm deep in the brain"
+    return ""
