@@ -146,6 +146,14 @@ def test_a_registration_of_another_patient_is_noticed(follower, stage):
     assert "head" not in away.step(first.grey, 0.1, near).words
 
 
+def test_a_registration_that_does_not_say_whose_it_is_is_not_relied_on(follower):
+    first = next(iter(pictures())).picture
+    other = replace(follower, registration=replace(follower.registration, scanned=None))
+    known = other.step(first.grey, 0.0)
+    assert known.state is State.UNSURE and "not checked whose registration" in known.words
+    assert known.band == follower.step(first.grey, 0.0).band
+
+
 def test_a_tool_s_error_is_in_the_band_by_what_a_deeper_one_does(follower, truth, stage):
     class Falling(Recorded):
         def deform(self, loads, start=None, at=None):

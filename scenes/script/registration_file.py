@@ -89,7 +89,7 @@ def other_mesh(registration: Registration, anatomy: Anatomy, path: str | Path) -
     made, here = registration.scanned, scanned_of(anatomy)
     if made is None:
         return (
-            f"{path} does not say of which anatomy it is, so that another patient's would hardly be noticed. "
+            f"{path} does not say of which anatomy it is: whether it is this patient's is not checked. "
             "`sulcus register --anatomy` writes it"
         )
     if made.digest == here.digest:

@@ -40,6 +40,7 @@ UNKNOWN = "as in the scan, and nobody says how it moved: do not rely on it"
 SKEW, LEVER = 0.5, 2.0
 # What is left after a second of how fast a hand was.
 CALMS = 0.1
+UNCHECKED = "not checked whose registration this is: make one by `sulcus register --anatomy`"
 NO_PACE = "a rolling shutter, and how the camera moves is not known yet: do not rely on it"
 TOOL, PATIENT = tool_cube().name, patient_reference().name
 
@@ -196,6 +197,8 @@ class Follower:
         known = replace(known, near=near)
         if known.relied and pace is None and self.calibration.readout > 0.0:
             known = replace(known, state=State.UNSURE, words=NO_PACE)
+        if known.relied and self.registration.scanned is None:
+            known = replace(known, state=State.UNSURE, words=UNCHECKED)
         if doubt:
             known = replace(known, state=State.UNSURE, words=doubt)
         if doubt or known.state is State.UNKNOWN:
