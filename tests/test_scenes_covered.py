@@ -1,5 +1,6 @@
 """Masks of what lies in front in a real picture: the overlay is not drawn there, and the picture says so."""
 
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -69,6 +70,12 @@ def test_what_is_frozen_is_hidden_too(parts):
 def test_there_is_one_mask_for_each_picture_of_its_size():
     black = Named("a.png", np.zeros((720, 960), np.uint8))
     assert [each.covered.any() for each in timed(film(2), iter([black, black]))] == [False, False]
+    ones = black.grey.copy()
+    ones[100:200] = 1  # a mask of 0 and 1
+    (shown,) = timed(film(1), iter([Named("a.PNG", ones)]))
+    np.testing.assert_array_equal(shown.covered, ones > 0)
+    soft = replace(black, name="frame 0", grey=np.full_like(ones, 16))  # a video's black
+    assert not next(timed(film(1), iter([soft]))).covered.any()
     with pytest.raises(ValueError, match="frame 1 has no mask"):
         list(timed(film(2), iter([black])))
     with pytest.raises(ValueError, match="more masks than pictures"):

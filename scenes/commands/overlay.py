@@ -63,8 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--table", type=Path, metavar="ROWS.csv", help="a row for each picture: state, place, error")
     parser.add_argument(
         "--covered", type=Path, metavar="MASKS",
-        help="a video or a folder of PNG masks, one for each picture in order. White is what lies in front, as a hand: "
-        "nothing is drawn over it",
+        help="a video or a folder of PNG masks, one for each picture in order. What is not black lies in front, as "
+        "a hand: nothing is drawn over it",
     )  # fmt: skip
     add_style(parser)
     parser.add_argument("--rate", type=float, default=30.0, help="pictures a second, of a folder (default %(default)s)")
@@ -268,6 +268,8 @@ def _scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
 
 def _deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool) -> tuple[Deformer | None, str]:
     """Who says how the brain lies, and that in words."""
+    from ..play.deformers import GUARDED
+
     still = "nobody: the brain stays as in the scan"
     if not tooled:
         return None, still
@@ -280,6 +282,9 @@ def _deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: 
     if name == REST:
         return None, still
     name = name or theatre.usual(scene)
+    names = (*theatre.names(scene), REST)
+    if name not in (*names, *theatre.models, GUARDED):
+        raise InputError(f"no deformer is called {name!r} here: choose one of {', '.join(names)}.")
     return theatre.deformer(name, scene), theatre.described(name, scene)
 
 

@@ -20,8 +20,8 @@ from .picture import Painter
 EDGES = (0, 20, 40, 60, 80, 100, 150, 200, 300, 500, 1000)
 # A picture that is so much older than its overlay is not the view any more [s].
 OLD = 0.2
-# A mask's grey level from which something lies in front: video makes edges soft.
-WHITE = 128
+# A video's grey level from which something lies in front: black is not quite black there. In a file all above 0 does.
+FAINT = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class Timed:
 
 
 def timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> Iterator[Timed]:
-    """Pictures with the times that they hold, and with their masks: white is what lies in front.
+    """Pictures with the times that they hold, and with their masks: all that is not black lies in front.
 
     A clock of 24 hours goes on at midnight.
 
@@ -103,7 +103,7 @@ def _mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
         raise ValueError(f"{picture.name} has no mask: there are {number}. Give one for each picture, in order.")
     if mask.grey.shape != picture.grey.shape:
         raise ValueError(f"the mask {mask.name} is {mask.grey.shape}, its picture {picture.grey.shape}.")
-    return mask.grey >= WHITE
+    return mask.grey >= (1 if mask.name.lower().endswith(".png") else FAINT)
 
 
 def paced(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
