@@ -142,9 +142,10 @@ def test_a_small_locator_has_no_result_of_every_vertex(files, body, tmp_path, ca
     words = ["locate", str(folder / "box.vtu"), str(folder / "vessels.csv"), "--locator", str(path)]
     assert main([*words, "--out", str(tmp_path / "out.vtu")]) == 2
     assert "is small" in capsys.readouterr().err and not (tmp_path / "out.vtu").exists()
-    assert main(words) == 2
-    assert "give --out RESULT.vtu, or --json for the tumour alone" in capsys.readouterr().err
-    assert main([*words, "--json"]) == 0  # for which it is enough
+    assert main(words) == 0  # for the tumour alone it is enough
+    said = capsys.readouterr().out
+    assert "The middle of the tumour has moved by" in said and "written" not in said
+    assert main([*words, "--json"]) == 0
     alone = json.loads(capsys.readouterr().out)
     whole = [*words[:-1], str(folder / "box.locator.npz"), "--json", "--out", str(tmp_path / "out.vtu")]
     assert main(whole) == 0

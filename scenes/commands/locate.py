@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.arguments import at_least
-from sim.errors import InputError
 
 from .json_line import json_line
 from .locator import located_by
@@ -47,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="RESULT.vtu",
-        help="mean motion, deviation and covariance of every vertex. With --json it may be left out: then a small "
-        "locator is enough",
+        help="mean motion, deviation and covariance of every vertex. Left out, the tumour alone is said, for which a "
+        "small locator is enough",
     )
     parser.add_argument(
         "--locator",
@@ -78,8 +77,6 @@ def run(args: argparse.Namespace) -> int:
     from surrogate.locating.observation import placed
     from surrogate.locating.observed_files import read_observation
 
-    if args.out is None and not args.json:
-        raise InputError("give --out RESULT.vtu, or --json for the tumour alone.")
     out = (
         None
         if args.out is None
@@ -154,4 +151,4 @@ def _sentences(found: Location, out: Path | None) -> str:
         lines.append(f"Left out, off the open cortex or without support by other points: rows {rows} of the file.")
     for number in found.tips_left_out:
         lines.append(f"Left out, as the points do not support it: tip {number + 1}.")
-    return "\n".join([*lines, f"written: {out}"])
+    return "\n".join(lines if out is None else [*lines, f"written: {out}"])

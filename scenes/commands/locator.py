@@ -30,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--small",
         action="store_true",
-        help="keep open cortex and tumour alone, a tenth of the file: enough for scenes and `sulcus fit`, "
-        "not for `sulcus locate`",
+        help="keep open cortex and tumour alone, a tenth of the file: enough for scenes, `sulcus fit`, and "
+        "`sulcus locate` without --out",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="from which causes are drawn (default %(default)s)")
@@ -89,8 +89,8 @@ def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) 
         locator = load_locator(path, anatomy)
         if locator.prior.nodes is not None and not small:
             raise InputError(
-                f"{path}: is small, and knows nothing of most vertices that a result has. Name another file by "
-                "--locator: a whole one is made there."
+                f"{path}: is small, and knows nothing of most vertices that a result has. Leave out --out for the "
+                "tumour alone, or name another file by --locator: a whole one is made there."
             )
         return locator
     path = claimed(path, ".npz", KIND, args.force)
