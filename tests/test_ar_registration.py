@@ -86,6 +86,10 @@ def test_what_determines_no_registration_is_refused():
     wrong[4] += [0.0, 0.03, 0.0]
     with pytest.raises(ValueError, match=r"pair 5 \(below the header\) fits worse"):
         registered(SCAN, wrong)
+    crossed = patient + 3e-4 * np.random.default_rng(1).normal(size=patient.shape)
+    crossed[[1, 4]] = crossed[[4, 1]]
+    with pytest.raises(ValueError, match=r"pairs 2 and 5 \(below the header\) are swapped: .* fit to 0\.\d mm"):
+        registered(SCAN, crossed)
     with pytest.raises(ValueError, match=r"stay .* apart"):
         registered(SCAN, patient[::-1])
     with pytest.raises(ValueError, match="3 points of the surface are too few"):

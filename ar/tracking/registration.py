@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy.stats import chi2, f
@@ -96,8 +97,8 @@ def registered(scan: np.ndarray, patient: np.ndarray) -> Registration:
     Raises
     ------
     ValueError
-        Fewer than three pairs, points on a line, or two sets of different size. A mirrored set, a pair that fits far
-        worse than the others, or pairs that fit no rigid motion.
+        Fewer than three pairs, points on a line, or two sets of different size. A mirrored set, two pairs that are
+        swapped, one that fits far worse than the others, or pairs that fit no rigid motion.
     """
     _demand_shape(scan, patient)
     T, off = _fitted(scan, patient)
@@ -172,7 +173,13 @@ def _demand_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray) -> None:
         raise ValueError("the scan's points fit their mirror image only: one frame is left-handed. Give RAS.")
     if len(scan) > FEWEST_PAIRS + 1:
         others = [_rms(_fitted(*(np.delete(p, row, axis=0) for p in (scan, patient)))[1]) for row in range(len(scan))]
-        row = int(np.argmin(others))
+        row, swaps = int(np.argmin(others)), _if_swapped(scan, patient)
+        one, other = min(swaps, key=lambda pair: swaps[pair])
+        if rms > MOST / 2 and CLEARLY * max(swaps[one, other], LEAST) < rms and swaps[one, other] < others[row]:
+            raise ValueError(
+                f"pairs {one + 1} and {other + 1} (below the header) are swapped: the other way round all fit to "
+                f"{1e3 * swaps[one, other]:.1f} mm. Exchange their px,py,pz."
+            )
         if rms > MOST / 2 and CLEARLY * max(others[row], LEAST) < rms:
             raise ValueError(
                 f"pair {row + 1} (below the header) fits worse than the others, which are {1e3 * others[row]:.1f} mm "
@@ -183,6 +190,16 @@ def _demand_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray) -> None:
             f"the pairs stay {1e3 * rms:.1f} mm apart (rms), and up to {1e3 * MOST:.0f} are taken: see whether "
             "each row names the same place twice."
         )
+
+
+def _if_swapped(scan: np.ndarray, patient: np.ndarray) -> dict[tuple[int, int], float]:
+    """What is left (rms) [m] if the patient's points of two pairs change places, by these two pairs."""
+    out = {}
+    for pair in combinations(range(len(scan)), 2):
+        other = patient.copy()
+        other[list(pair)] = patient[list(pair[::-1])]
+        out[pair] = _rms(_fitted(scan, other)[1])
+    return out
 
 
 def _fitted(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
