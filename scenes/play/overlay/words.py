@@ -74,7 +74,9 @@ def overlay_error(known: Known) -> str:
     """How far off the outline may be across the view, and by what."""
     if not known.relied or known.band is None:
         return "<p>Error of the overlay: not known.</p>"
-    parts = ", ".join(f"{name} {bound_words(length, 1)}" for name, length in known.parts.items())
+    stated = [f"{name} {bound_words(length, 2)}" for name, length in known.parts.items() if length > 0.0]
+    none = ", ".join(name for name, length in known.parts.items() if not length > 0.0)
+    parts = ", ".join([*stated, *([f"none stated of {none}"] if none else [])])
     return (
         f"<p>Error of the overlay: 95 of 100 times the tumour is within {bound_words(known.band, 1)} of where it is "
         f"drawn, across the view ({parts}).</p>"
