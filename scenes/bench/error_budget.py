@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -22,11 +22,12 @@ from ..script.priors import MESH, OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION
 from ..script.site import Site
 from ..script.uncertainty import LEVEL, SURROGATE
 from ..script.viewpoint import Viewpoint
-from .tracking_errors import CORNER, changed, corners_in
+from .tracking_errors import CORNER, after_middle, changed, corners_in, seen_by_rows
 from .uncertainty import Motions, off_by
 
-CALIBRATION, MARKERS, LATENCY, PARAMETERS = "calibration", "markers", "latency x motion", "tissue, skull, tool's place"
-TECHNICAL = (CALIBRATION, MARKERS, LATENCY, SURROGATE, MESH)
+CALIBRATION, MARKERS, LATENCY, SHUTTER = "calibration", "markers", "latency x motion", "rolling shutter"
+PARAMETERS = "tissue, skull, tool's place"
+TECHNICAL = (CALIBRATION, MARKERS, LATENCY, SHUTTER, SURROGATE, MESH)
 """What the system itself is off by."""
 CLINICAL = (*TECHNICAL, REGISTRATION, SEGMENTATION, PARAMETERS)
 """With what nobody measures of the patient."""
@@ -158,8 +159,7 @@ def _samples(
         return value if name in contributors else np.zeros_like(value)
 
     for number in range(count):
-        random = np.random.default_rng([seed, number])
-        time, body = random.uniform(0.0, filmed.duration), int(random.integers(len(filmed.bodies)))
+        random, time, body = _begun(filmed, seed, number)
         late = float(of(LATENCY, np.array(filmed.latency + filmed.clock * random.standard_normal())))
         drawn = int(random.integers(CALIBRATIONS))
         taken = filmed.believed[drawn] if CALIBRATION in contributors else filmed.calibration
@@ -168,20 +168,44 @@ def _samples(
         shift = of(REGISTRATION, _shift(filmed, random.standard_normal(6)))
         wide = of(SEGMENTATION, OF_SEGMENTATION.range[1] * random.standard_normal(1))
         mesh = of(MESH, np.array(filmed.draws[body].mesh))
-        true = filmed.viewpoint.camera(filmed.site, time)
-        then = filmed.viewpoint.camera(filmed.site, time - late) if late else true
+        readout = filmed.calibration.readout if SHUTTER in contributors else 0.0
+        motion = filmed.field + (filmed.off[body] if PARAMETERS in contributors else 0.0)
+        surface = filmed.rest + (1.0 + mesh) * motion
+        true, then = _cameras(filmed, time, late, readout, surface.mean(axis=0))
         believed = taken.camera(then.T_camera_world)
-        if taken is not filmed.calibration or off.any():
+        if taken is not filmed.calibration or off.any() or readout:
             found = corners_in(then, target, filmed.T_scan_patient, off)
+            if readout:
+                at = partial(_camera_after, filmed, time - late)
+                found = seen_by_rows(found, at, readout, filmed.T_scan_patient)
             known = then.T_camera_world @ filmed.T_scan_patient
             _, pose = pose_of(believed, target, found, known)
             if pose is None:
                 raise InputError("the camera does not see the patient's reference: take a path that keeps it in sight.")
             believed = taken.camera(pose.T_camera_target @ np.linalg.inv(filmed.T_scan_patient))
-        motion = filmed.field + (filmed.off[body] if PARAMETERS in contributors else 0.0)
-        surface = filmed.rest + (1.0 + mesh) * motion
         shown = filmed.rest + filmed.field - late * filmed.velocity + aside + wide * filmed.normals
         yield true, believed, surface, shown + _registered(filmed, shift, shown)
+
+
+def _begun(filmed: Filmed, seed: int, number: int) -> tuple[np.random.Generator, float, int]:
+    """The numbers of a sample, of which the first say its time [s] and its body."""
+    random = np.random.default_rng([seed, number])
+    return random, random.uniform(0.0, filmed.duration), int(random.integers(len(filmed.bodies)))
+
+
+def _cameras(filmed: Filmed, time: float, late: float, readout: float, middle: np.ndarray) -> tuple[Camera, Camera]:
+    """The camera that sees the tumour's `middle` (3,) [m] in the picture of a time [s], and the one that is tracked."""
+    true = _camera_after(filmed, time, 0.0)
+    then = _camera_after(filmed, time, -late) if late else true
+    if readout:
+        row = float(true.project(middle[None])[0][0, 1])
+        true = _camera_after(filmed, time, readout * after_middle(true, row))
+    return true, then
+
+
+def _camera_after(filmed: Filmed, time: float, seconds: float) -> Camera:
+    """The true camera, so long after a time [s]."""
+    return filmed.viewpoint.camera(filmed.site, time + seconds)
 
 
 def _shift(filmed: Filmed, numbers: np.ndarray) -> np.ndarray:
@@ -222,13 +246,14 @@ def _compared(
 class Budget:
     """The errors of an overlay: of each contributor alone, and of `TECHNICAL` and `CLINICAL` ones together.
 
-    `held` is the share of twins' samples within the band, where there are twins.
+    `held` is the share of twins' samples within the band, where there are twins, and its standard deviation. Samples of
+    one body are held or not together, and one twin has no deviation.
     """
 
     alone: dict[str, Errors]
     technical: Errors
     clinical: Errors
-    held: float | None = None
+    held: tuple[float, float | None] | None = None
 
     @property
     def band(self) -> float:
@@ -253,8 +278,21 @@ def budgeted(
     budget = Budget(alone, technical, clinical)
     if twins is None:
         return budget
-    fresh = errors_of(twins, CLINICAL, count, seed + 1).worst
-    return replace(budget, held=float((fresh <= budget.band).mean()))
+    within = errors_of(twins, CLINICAL, count, seed + 1).worst <= budget.band
+    return replace(budget, held=_share(within, [_begun(twins, seed + 1, number)[2] for number in range(count)]))
+
+
+def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | None]:
+    """The share of samples (S,) bool, and how far that is off, as bodies (S,) differ: clusters, of which it is a ratio.
+
+    Cochran (1977), "Sampling techniques", equation 2.46.
+    """
+    share, numbers = float(within.mean()), np.unique(bodies, return_inverse=True)[1]
+    excess = np.bincount(numbers, weights=within - share)
+    clusters = len(excess)
+    if clusters < 2:
+        return share, None
+    return share, float(np.sqrt(np.square(excess).sum() * clusters / (clusters - 1))) / len(within)
 
 
 def moment_of(still: Motions, answers: Sequence[tuple[np.ndarray, ...]], draws: Sequence[Draw]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -63,3 +64,25 @@ def corners_in(camera: Camera, target: Target, T_world_target: np.ndarray, off: 
     pixels, _ = camera.project(at @ T_world_target[:3, :3].T + T_world_target[:3, 3])
     inside = (np.isfinite(pixels) & (pixels >= 0.0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=1)
     return Corners(at[inside], (pixels + off[: len(at)])[inside], np.array(faces, int)[inside])
+
+
+def seen_by_rows(
+    seen: Corners, camera_at: Callable[[float], Camera], readout: float, T_world_target: np.ndarray
+) -> Corners:
+    """Corners as a rolling shutter sees them, which reads a picture's rows one after the other in `readout` [s].
+
+    `camera_at` says where the camera is so long [s] after the middle row is read. The noise of `seen` corners stays.
+    """
+    at = seen.points @ T_world_target[:3, :3].T + T_world_target[:3, 3]
+    middle = camera_at(0.0)
+    still, _ = middle.project(at)
+    moved = [
+        camera_at(readout * after_middle(middle, row)).project(place[None])[0][0]
+        for place, row in zip(at, still[:, 1].tolist(), strict=True)
+    ]
+    return replace(seen, pixels=seen.pixels + np.reshape(moved, still.shape) - still)
+
+
+def after_middle(camera: Camera, row: float) -> float:
+    """When a row [pixel] is read, after the middle one, as a share of the readout."""
+    return (row + 0.5) / camera.height - 0.5
