@@ -366,6 +366,7 @@ def along_x(points):
     ("spoilt", "match"),
     [
         (lambda o: replace(o, now=1e3 * o.now, rest=1e3 * o.rest), "a thousandth of that: files are in mm"),
+        (lambda o: replace(o, now=0.1 * o.rest, rest=None), "they look like centimetres"),
         (lambda o: replace(o, now=1e-3 * o.now, rest=1e-3 * o.rest), "a thousand times of that"),
         (lambda o: replace(o, rest=o.rest + [0.0, 0.0, 0.05]), "another brain or frame"),
         (lambda o: replace(o, now=o.now + 0.2), "which no brain does"),

@@ -219,6 +219,8 @@ def _elsewhere(anatomy: Anatomy, points: np.ndarray, off: float, near: float) ->
     for scale, unit_meant in ((1e-3, "a thousandth"), (1e3, "a thousand times")):
         if not _mostly_off(_off_surface(anatomy, scale * points), near):
             return f"{start}, and would lie on it if they were {unit_meant} of that: files are in mm, arrays in metres."
+    if not _mostly_off(_off_surface(anatomy, 10.0 * points), near):
+        return f"{start}, and would lie on it if they were ten times of that: they look like centimetres. Give mm."
     if not _mostly_off(_off_surface(anatomy, points * [-1.0, -1.0, 1.0]), near):
         return f"{start}, and would lie on it if x and y were turned: they are LPS. Give RAS."
     return f"{start}: they are of another brain or frame. Give the scan's own RAS, in millimetres."
