@@ -144,7 +144,8 @@ def test_what_cannot_be_meshed_fails_with_its_reason(tmp_path):
     body = make_body(tmp_path, plan, 1, 0, "cpu")
     assert "none of 6 anatomies that were drawn can be meshed; the last: a " in body.failed
     assert not list(body_path(tmp_path, 0).parent.iterdir())
-    assert "is no body of a data set" in make_episode(tmp_path, plan, 1, 0, "cpu").failed
+    with pytest.raises(InputError, match="is no body of a data set"):
+        make_episode(tmp_path, plan, 1, 0, "cpu")
 
 
 def test_a_model_knows_what_the_tumour_is_made_of():

@@ -24,8 +24,10 @@ from ar.overlay.outlines import silhouette
 from sim.deformation import Deformation
 from sim.effects import Elasticity
 from sim.errors import InputError
+from sim.fem import Fem
 from sim.loads import Loads, Posture, Pushed, Resected, Retracted, Touching
 from sim.material import tissue_to_json
+from sim.resected_fem import Operated
 from sim.runtime.atomic_files import demand_space, written_stream
 from surrogate.model.guarded import model_of
 from surrogate.model.learned import Learned
@@ -120,6 +122,8 @@ class Recording:
         What sensors read of the other columns, by name.
     stated
         Further attributes.
+    fem
+        The finite elements that solve, where they are at hand.
     """
 
     solved_every: int | None = 1
@@ -128,6 +132,7 @@ class Recording:
     grain: Callable[[int, np.ndarray], np.ndarray] = lambda number, colour: colour
     sensed: Callable[[Mapping[str, Any]], Mapping[str, np.ndarray]] = lambda columns: {}
     stated: Mapping[str, str | int] = field(default_factory=dict)
+    fem: Fem | Operated | None = None
 
 
 WHOLE = Recording()
@@ -170,7 +175,8 @@ def collect(
             loads.append(frame.loads)
         every = recording.solved_every
         numbers = np.arange(0, total, every or 1)
-        truth = None if every is None else truth_of(theatre, player.scene, [loads[k] for k in numbers], solved)
+        asked = [loads[k] for k in numbers]
+        truth = None if every is None else truth_of(theatre, player.scene, asked, solved, recording.fem)
         outcomes = write_motion(file, player, rows, numbers, truth, recording)
         describe(file, theatre, player, deformer, recording)
         seal(file)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import time as clock
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
@@ -13,15 +14,23 @@ from typing import Any
 import numpy as np
 
 from sim.errors import InputError
+from sim.fem import Fem
+from sim.resected_fem import Operated
 from sim.runtime.atomic_files import partial_path
 
-from .bodies import ABOUT, NO_LEARNER, read_body, write_body
+from ..play.deformers import Theatre
+from ..play.reference import following
+from ..script.scene import Scene
+from .bodies import ABOUT, NO_LEARNER, Body, read_body, write_body
 from .draws import random_of
 from .episode import Recording, collect
 from .plan import Plan
 from .run_folder import BODIES, episode_name
 from .scripted import drawn_episode, scene_of
 from .sensing import noisy, sensed
+
+KEPT = 2
+"""Bodies that a process keeps open, and finite elements that each of them keeps."""
 
 
 @dataclass(frozen=True)
@@ -109,11 +118,36 @@ def make_episode(folder: Path, plan: Plan, seed: int, number: int, device: str =
     return Made(path, int(str(report["frames"])), path.stat().st_size, clock.perf_counter() - began)
 
 
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A body whose files were read, and the finite elements that were made for it, by the effects that they solve."""
+
+    body: Body
+    theatre: Theatre
+    made: dict[str, Fem | Operated] = field(default_factory=dict)
+
+    def fem(self, scene: Scene) -> Fem | Operated:
+        """Those of a scene; the last few are kept, for to make them takes as long as some frames."""
+        asked = repr(scene.effects_on(self.theatre.anatomy))
+        if asked not in self.made:
+            if len(self.made) >= KEPT:
+                self.made.clear()
+            self.made[asked] = following(self.theatre, scene)
+        return self.made[asked]
+
+
+@lru_cache(maxsize=KEPT)
+def _opened(place: Path, device: str) -> Opened:
+    """A body that was made, read once for many episodes."""
+    body = read_body(place)
+    return Opened(body, body.theatre(device))
+
+
 def _collected(path: Path, plan: Plan, seed: int, number: int, place: Path, device: str) -> Mapping[str, Any]:
     """Play an episode and write its file."""
     contents = plan.contents
-    body, asked = read_body(place), drawn_episode(contents, seed, number)
-    theatre = body.theatre(device)
+    opened, asked = _opened(place, device), drawn_episode(contents, seed, number)
+    body, theatre = opened.body, opened.theatre
     scene = scene_of(plan, body, theatre.site, asked, seed, number)
     name = "fem" if contents.bodies.learner.name == NO_LEARNER else theatre.best(scene)
     player = replace(theatre.player(name, scene), style="window" if contents.overlay else "none")
@@ -130,5 +164,6 @@ def _collected(path: Path, plan: Plan, seed: int, number: int, place: Path, devi
             "family": asked.family, "body": asked.body,
             "parameters": json.dumps({**asked.values, **body.drawn}, sort_keys=True),
         },
+        None if name == "fem" else opened.fem(scene),
     )  # fmt: skip
     return collect(path, theatre, player, name, lambda frames: frames, recording=recording)
