@@ -16,7 +16,7 @@ from tiny_work import held, played
 from scenes.episodes.run_folder import failures
 from scenes.episodes.workers import own_workers
 
-COUNT, KILLS = 120, 100
+COUNT, KILLS = 150, 100
 CLIENT = """
 import sys
 from pathlib import Path
@@ -25,7 +25,7 @@ from tiny_work import Trouble, played
 
 if __name__ == "__main__":
     with own_workers(["cpu", "cpu"], {"distributed.scheduler.allowed-failures": 1000}, 1000) as workers:
-        played(Path(sys.argv[1]), workers, int(sys.argv[2]), Trouble(seconds=0.05))
+        played(Path(sys.argv[1]), workers, int(sys.argv[2]), Trouble(seconds=0.2))
 """
 
 
