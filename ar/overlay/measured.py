@@ -31,8 +31,8 @@ WIDTHS, ASPECT, CUT_STROKES = (0.34, 0.27, 0.21), 0.75, (3, 5)
 ACROSS = 4.0
 # Letters of the cut stay so far from a sheet's edge [pixel].
 EDGE = 12
-# They stand so far beside the line [pixel].
-ASIDE = 10
+# They stand so far beside the line, and reach so far from their middle [pixel].
+ASIDE, HALF = 10, 6
 NO_ROOM = "no room for the cut"
 
 
@@ -98,6 +98,7 @@ class Measure:
             pixels, _ = part.project(plane.points(np.stack([steps, 0.0 * steps], axis=1)))
             line = pixels[np.isfinite(pixels).all(axis=1)].round().astype(np.int32)
             line = line[np.diff(line, axis=0, append=-1).any(axis=1)]
+            lines = np.ascontiguousarray(sheet[..., 3] > 0).astype(np.uint8)
             dash(sheet, [line[:, None]], RING, CUT_STROKES, 1)
             line = line[((line >= EDGE) & (line < (part.width - EDGE, part.height - EDGE))).all(axis=1)]
             # Letters stand where the line comes out behind a tool.
@@ -107,8 +108,11 @@ class Measure:
                 # Beside the line: there may be another on it, from the tip.
                 along = (line[-1] - line[0]) / max(float(np.linalg.norm(line[-1] - line[0])), 1.0)
                 beside = np.rint(ASIDE * np.array([along[1], -along[0]])).astype(int)
-                for letter, at in zip(ENDS, (line[0], line[-1]), strict=True):
-                    column, row = np.clip(at + beside, EDGE, (part.width - EDGE, part.height - EDGE)).tolist()
+                places = np.clip(line + beside, EDGE, (part.width - EDGE, part.height - EDGE))
+                # And hide no other line, if they can.
+                clear = cv2.dilate(lines, np.ones((2 * HALF + 1,) * 2, np.uint8))[places[:, 1], places[:, 0]] == 0
+                places = places[clear] if clear.any() else places
+                for letter, (column, row) in zip(ENDS, places[[0, -1]].tolist(), strict=True):
                     haloed(above, letter, (column - 4, row + 4), FINE, RING)
 
     def lay(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
