@@ -5,28 +5,17 @@ import os
 import time
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
 import h5py
 import numpy as np
 
 from scenes.episodes.engine import make_all, still_missing
 from scenes.episodes.run_folder import BODIES, Run, begin, episode_name, versions_here
-from scenes.episodes.tasks import Work
+from scenes.episodes.tasks import Made, Work
 from sim.runtime.atomic_files import written_stream
 
 PER_BODY = 5
 CARD = "CUDA_VISIBLE_DEVICES"
-
-
-@dataclass(frozen=True)
-class Made:
-    path: Path
-    frames: int = 0
-    bytes: int = 0
-    seconds: float = 0.0
-    failed: str = ""
-    skipped: bool = False
 
 
 @dataclass(frozen=True)

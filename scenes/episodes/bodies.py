@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sim.accuracy import TRAIN, Accuracy
+from sim.accuracy import TRAIN
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.bodies.intensity import Intensity, read_intensity, sidecar, write_intensity
 from sim.bodies.meshfile import read_anatomy, write_anatomy
@@ -69,11 +69,8 @@ class Body:
         InputError
             As `open_theatre`.
         """
-        theatre = open_theatre(self.anatomy, device=device)
-        own = model_path(self.anatomy)
-        if own.is_file() or self.drawn["bodies.anatomies"] != "template":
-            return theatre
-        return open_theatre(self.anatomy, model_path(template_path()), device)
+        shipped = self.drawn["bodies.anatomies"] == "template" and not model_path(self.anatomy).is_file()
+        return open_theatre(self.anatomy, model_path(template_path()) if shipped else None, device)
 
 
 def tissue_of(values: Mapping[str, Any]) -> Elasticity:
@@ -171,11 +168,10 @@ def _train(body: Body, anatomy: Anatomy, plan: Plan, seed: int, number: int, dev
     """Simulate loads on a body, and train its model on them; the data are not kept."""
     learner = plan.contents.bodies.learner
     effects = (*pushed_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"]), NodalForce())
-    accuracy = Accuracy(tolerance=TRAIN.tolerance, precision=TRAIN.precision)
-    fem = Fem(anatomy, effects, accuracy, device, 64)
+    fem = Fem(anatomy, effects, TRAIN, device, 64)
     first = int(random_of(seed, number, "bodies.learner").integers(2**31))
     stated = {
-        "effects": repr(effects), **stating(body.tissue), "element": fem.space.element, "accuracy": repr(accuracy),
+        "effects": repr(effects), **stating(body.tissue), "element": fem.space.element, "accuracy": repr(TRAIN),
         "preset": PRESET, "seed": str(first),
     }  # fmt: skip
     data = body.folder / "training.h5"

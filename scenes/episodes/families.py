@@ -9,14 +9,14 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from sim.effects import Effect, Gravity, Retraction, SkullContact, ToolContact, ToolForce
+from sim.effects import Effect, Gravity, Retraction, ToolContact, ToolForce
 
 from ..builtin.retract import RELAXING
 from ..script.camera_paths import wandering
 from ..script.debulking import Debulking
 from ..script.head_posture import Lie, drained_then_turned, supine
 from ..script.tool import Blade, Instrument, Probe
-from ..script.tool_paths import Path, Touch, draw, idle, lay, palpate, slide, smooth
+from ..script.tool_paths import Path, Touch, draw, idle, lay, palpate, press, slide, smooth
 from .draws import Limits, Number
 
 PRONY = RELAXING.prony
@@ -169,16 +169,16 @@ class Chance:
         return Probe(radius=1e-3 * self.values["radius_mm"])
 
 
-def press(chance: Chance) -> Act:
+def pressed(chance: Chance) -> Act:
     """The act of `Press`."""
-    probe, force = chance.probe, chance.values["force_n"]
-    x, y = chance.place(probe.radius)
+    probe = chance.probe
+    at = chance.place(probe.radius)
     tilt, angle = np.radians(chance.values["tilt_deg"]), chance.random.uniform(0.0, 2.0 * np.pi)
-    rise, hold = 0.35 * chance.seconds, 0.2 * chance.seconds
     aslant = float(tilt * np.cos(angle)), float(tilt * np.sin(angle))
+    way = press(chance.values["force_n"], 0.35 * chance.seconds, 0.2 * chance.seconds, at)
 
     def path(time: float) -> Touch:
-        return Touch(x, y, force * (smooth(time / rise) - smooth((time - rise - hold) / rise)), aslant)
+        return replace(way(time), tilt=aslant)
 
     return Act(path, probe)
 
@@ -269,12 +269,10 @@ def debulked(chance: Chance) -> Act:
 
 
 FAMILIES: dict[str, Callable[[Chance], Act]] = {
-    "press": press, "slide": slid, "draw": drawn_aside, "reach": reach, "walk": walk, "palpate": palpated,
+    "press": pressed, "slide": slid, "draw": drawn_aside, "reach": reach, "walk": walk, "palpate": palpated,
     "retract": retracted, "drain": drained, "debulk": debulked,
 }  # fmt: skip
 """What each family of `Motions` does."""
-SKULL_LETS_GO = SkullContact()
-"""The skull of acts that it lets go in."""
 
 
 def trembling(path: Path, seed: int, place: float, force: float) -> Path:

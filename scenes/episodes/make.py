@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -26,35 +25,12 @@ from .draws import random_of
 from .episode import Recording, collect
 from .plan import Plan
 from .run_folder import BODIES, episode_name
-from .scripted import drawn_episode, scene_of
+from .scripted import drawn_body_of, drawn_episode, scene_of
 from .sensing import noisy, sensed
+from .tasks import Made
 
 KEPT = 2
 """Bodies that a process keeps open, and finite elements that each of them keeps."""
-
-
-@dataclass(frozen=True)
-class Made:
-    """What became of an episode, or of a body.
-
-    Parameters
-    ----------
-    path
-        Its file, or its folder.
-    frames, bytes, seconds
-        How many it has, how large it is, and how long it took.
-    failed
-        Why there is none; empty where there is.
-    skipped
-        Whether it was there before.
-    """
-
-    path: Path
-    frames: int = 0
-    bytes: int = 0
-    seconds: float = 0.0
-    failed: str = ""
-    skipped: bool = False
 
 
 def episode_path(folder: Path, number: int) -> Path:
@@ -69,7 +45,7 @@ def body_path(folder: Path, number: int) -> Path:
 
 def body_of(plan: Plan, seed: int, number: int) -> int:
     """Which body an episode is played on."""
-    return drawn_episode(plan.contents, seed, number).body
+    return drawn_body_of(plan.contents, seed, number)
 
 
 def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "auto") -> Made:
@@ -78,7 +54,7 @@ def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "a
     It is made under another name, so that a folder of its name is whole. Who comes second
     throws his own away: both are alike.
     """
-    path, began = body_path(folder, number), clock.perf_counter()
+    path = body_path(folder, number)
     if (path / ABOUT).is_file():
         return Made(path, skipped=True)
     partial = partial_path(path)
@@ -91,14 +67,14 @@ def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "a
     except InputError as error:
         if isinstance(error.__cause__, OSError):  # the disk's fault, and not the body's
             raise
-        return Made(path, seconds=clock.perf_counter() - began, failed=str(error))
+        return Made(path, failed=str(error))
     except OSError:
         if not (path / ABOUT).is_file():  # somebody else was faster
             raise
     finally:
         rmtree(partial, ignore_errors=True)
     size = sum(file.stat().st_size for file in path.iterdir())
-    return Made(path, bytes=size, seconds=clock.perf_counter() - began)
+    return Made(path, bytes=size)
 
 
 def make_episode(folder: Path, plan: Plan, seed: int, number: int, device: str = "auto") -> Made:
@@ -106,7 +82,7 @@ def make_episode(folder: Path, plan: Plan, seed: int, number: int, device: str =
 
     Loads without equilibrium fail no episode: their frames say so in `outcome_predicted` and `outcome_fem`.
     """
-    path, began = episode_path(folder, number), clock.perf_counter()
+    path = episode_path(folder, number)
     if path.is_file():
         return Made(path, skipped=True)
     try:
@@ -114,8 +90,8 @@ def make_episode(folder: Path, plan: Plan, seed: int, number: int, device: str =
     except InputError as error:
         if isinstance(error.__cause__, OSError):  # the disk's fault, and not the episode's
             raise
-        return Made(path, seconds=clock.perf_counter() - began, failed=str(error))
-    return Made(path, int(str(report["frames"])), path.stat().st_size, clock.perf_counter() - began)
+        return Made(path, failed=str(error))
+    return Made(path, int(str(report["frames"])), path.stat().st_size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +113,8 @@ class Opened:
 
 
 @lru_cache(maxsize=KEPT)
-def _opened(place: Path, device: str) -> Opened:
-    """A body that was made, read once for many episodes."""
+def opened_body(place: Path, device: str) -> Opened:
+    """A body that was made, read once for many episodes; InputError as `read_body`."""
     body = read_body(place)
     return Opened(body, body.theatre(device))
 
@@ -146,7 +122,7 @@ def _opened(place: Path, device: str) -> Opened:
 def _collected(path: Path, plan: Plan, seed: int, number: int, place: Path, device: str) -> Mapping[str, Any]:
     """Play an episode and write its file."""
     contents = plan.contents
-    opened, asked = _opened(place, device), drawn_episode(contents, seed, number)
+    opened, asked = opened_body(place, device), drawn_episode(contents, seed, number)
     body, theatre = opened.body, opened.theatre
     scene = scene_of(plan, body, theatre.site, asked, seed, number)
     name = "fem" if contents.bodies.learner.name == NO_LEARNER else theatre.best(scene)

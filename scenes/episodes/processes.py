@@ -20,7 +20,7 @@ from dask import config
 from distributed import Worker
 
 from sim.errors import InputError
-from sim.runtime.processes import VISIBLE, end_with_parent, uninterrupted
+from sim.runtime.processes import VISIBLE, card_of, end_with_parent, uninterrupted
 
 HERE = "127.0.0.1"
 """Where a scheduler and workers of our own listen: nobody outside this machine reaches them."""
@@ -77,10 +77,7 @@ def started_processes(address: str, devices: Sequence[str], starts: int) -> Iter
 def _card(device: str) -> str | None:
     """The card of a device, as a process is shown it; None on the CPU."""
     kind, _, number = device.partition(":")
-    if kind != "cuda":
-        return None
-    seen = os.environ.get(VISIBLE, "")
-    return seen.split(",")[int(number or 0)] if seen else number or "0"
+    return card_of(number or "0") if kind == "cuda" else None
 
 
 def _start(address: str, card: str | None, times: int) -> _Started:

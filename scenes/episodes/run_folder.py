@@ -151,7 +151,7 @@ def unmark(folder: Path, number: int) -> None:
 
 
 def _failed_path(folder: Path, number: int) -> Path:
-    return folder / FAILED / f"episode_{number:06d}.json"
+    return (folder / FAILED / episode_name(number)).with_suffix(".json")
 
 
 def _numbered(folder: Path) -> Iterator[tuple[int, str]]:

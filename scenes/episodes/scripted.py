@@ -53,9 +53,13 @@ class Drawn:
         return {name.removeprefix(head): value for name, value in self.values.items() if name.startswith(head)}
 
 
+def drawn_body_of(contents: Contents, seed: int, number: int) -> int:
+    """The number of the body that an episode is played on."""
+    return int(random_of(seed, number, "body").integers(contents.bodies.count))
+
+
 def drawn_episode(contents: Contents, seed: int, number: int) -> Drawn:
     """What is drawn for an episode: from the seed and its number alone, each value by its own name."""
-    body = int(random_of(seed, number, "body").integers(contents.bodies.count))
     named = contents.motion.named
     weights = np.array([motion.weight for motion in named.values()])
     family = list(named)[int(random_of(seed, number, "family").choice(len(named), p=weights / weights.sum()))]
@@ -66,7 +70,7 @@ def drawn_episode(contents: Contents, seed: int, number: int) -> Drawn:
         for name, value, *_ in fields_of(struct):
             full = f"{table}.{name}".lstrip(".")
             values[full] = drawn(value, random_of(seed, number, full))
-    return Drawn(body, family, values)
+    return Drawn(drawn_body_of(contents, seed, number), family, values)
 
 
 def scene_of(plan: Plan, body: Body, site: Site, asked: Drawn, seed: int, number: int) -> Scene:

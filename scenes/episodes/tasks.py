@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from sim.errors import InputError
 from sim.runtime.threads import one_thread
@@ -20,28 +19,27 @@ FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 """What no other episode gets round."""
 
 
-class Made(Protocol):
-    """What a maker gives: frames, bytes, and why it failed, if it did; `skipped` if it was there."""
+@dataclass(frozen=True)
+class Made:
+    """What became of an episode, or of a body.
 
-    @property
-    def frames(self) -> int:
-        """Frames in the file."""
-        ...
+    Parameters
+    ----------
+    path
+        Its file, or its folder.
+    frames, bytes
+        How many it has, and how large it is.
+    failed
+        Why there is none; empty where there is.
+    skipped
+        Whether it was there before.
+    """
 
-    @property
-    def bytes(self) -> int:
-        """Bytes of the file."""
-        ...
-
-    @property
-    def failed(self) -> str:
-        """Why there is none; empty if there is one."""
-        ...
-
-    @property
-    def skipped(self) -> bool:
-        """Whether it was there before."""
-        ...
+    path: Path
+    frames: int = 0
+    bytes: int = 0
+    failed: str = ""
+    skipped: bool = False
 
 
 @dataclass(frozen=True)

@@ -151,9 +151,14 @@ def seen_as(device: str) -> str:
     kind, _, number = device.partition(":")
     if kind != "cuda" or number in ("", "0"):
         return device
-    cards = os.environ.get(VISIBLE, "")
-    os.environ[VISIBLE] = cards.split(",")[int(number)] if cards else number
+    os.environ[VISIBLE] = card_of(number)
     return "cuda:0"
+
+
+def card_of(number: str) -> str:
+    """What a card that this process sees under a number is called in `VISIBLE`."""
+    cards = os.environ.get(VISIBLE, "")
+    return cards.split(",")[int(number)] if cards else number
 
 
 def _started(device: str, make: Callable[..., Any], given: tuple[Any, ...], closing: ExitStack) -> Child:

@@ -15,10 +15,10 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 
 from ..reading.contents import Contents, read_contents
+from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from ..reading.validation import solved_figures
 from ..reading.windows import episode_paths
-from .columns import opened
 from .croissant import COLUMNS, croissant
 from .datasheet import MARK, NAME, datasheet
 from .tasks import task_of
@@ -94,7 +94,7 @@ def is_card(path: Path) -> bool:
 
 def row_of(contents: Contents, folder: Path) -> dict[str, object]:
     """An episode as a row of the table."""
-    with opened(contents) as file:
+    with opened(contents.path) as file:
         times = numbers_in(file, contents, "time")
         solved, _, error = solved_figures(file, contents)
     width, height = contents.size

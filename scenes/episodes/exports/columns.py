@@ -9,10 +9,8 @@ import h5py
 import numpy as np
 
 from sim.errors import InputError
-from sim.runtime.outside_files import read_as
 
 from ..reading.contents import Contents
-from ..reading.open_files import REMEDY
 from ..reading.rows import numbers_in
 from ..reading.schema import PICTURES
 from .motion import ACTION, STATE, states, twists
@@ -23,12 +21,6 @@ UNEVEN = 1e-4
 BLOCK = 64
 NUMBERS = ("force", "force_read", "tip", "contact", "distance", "T_camera_world", "tumour_predicted")
 """Arrays with a row for each frame that go into other formats as they are, beside the tool's pose."""
-
-
-def opened(contents: Contents) -> h5py.File:
-    """An episode's file; InputError where it is none any more."""
-    with read_as(contents.path, "an episode", REMEDY):
-        return h5py.File(contents.path, "r")
 
 
 def shared_pictures(episodes: Sequence[Contents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:

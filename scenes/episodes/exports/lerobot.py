@@ -19,9 +19,10 @@ import pyarrow.parquet as pq
 from sim.errors import InputError
 
 from ..reading.contents import Contents
+from ..reading.open_files import opened
 from ..reading.rows import code_of, picture_of
-from ..reading.schema import COLOUR, DEPTH, PICTURES
-from .columns import blocks, named_axes, numbers_of, opened, rate_of, shared_numbers, shared_pictures, stored_size
+from ..reading.schema import COLOUR, DEPTH, PICTURES, suffix_of
+from .columns import blocks, named_axes, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size
 from .statistics import Spread
 from .tasks import task_of
 from .whole_folder import written_folder
@@ -60,7 +61,7 @@ def write_lerobot(
         first = 0
         try:
             for number, contents in enumerate(progress(episodes)):
-                with opened(contents) as file:
+                with opened(contents.path) as file:
                     numbers = numbers_of(file, contents, names)
                     rates.add(rate_of(contents, numbers.pop("time")))
                     if len(rates) > 1:
@@ -156,7 +157,7 @@ class Tables:
 
 def coded(file: h5py.File, contents: Contents, name: str, frames: range) -> Iterator[dict[str, Any]]:
     """Pictures as LeRobot stores them."""
-    suffix = "jpg" if PICTURES[name] == COLOUR else "png"
+    suffix = suffix_of(name)
     return ({"bytes": code_of(file, contents, name, frame), "path": f"{name}_{frame:06d}.{suffix}"} for frame in frames)
 
 

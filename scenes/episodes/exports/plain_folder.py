@@ -12,9 +12,10 @@ import h5py
 import numpy as np
 
 from ..reading.contents import Contents
+from ..reading.open_files import opened
 from ..reading.rows import code_of, numbers_in, rows_of
-from ..reading.schema import ARRAYS, COLOUR, PICTURES, SOLVED
-from .columns import file_names, opened, stored_size
+from ..reading.schema import ARRAYS, PICTURES, SOLVED, suffix_of
+from .columns import file_names, stored_size
 from .whole_folder import written_folder
 
 WIDE = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")
@@ -36,7 +37,7 @@ def write_folder(
         for contents in progress(episodes):
             place = partial / names[contents]
             place.mkdir()
-            with opened(contents) as file:
+            with opened(contents.path) as file:
                 write_pictures(place, file, contents)
                 write_tables(place, file, contents)
                 write_description(place / "episode.json", file, contents)
@@ -45,10 +46,10 @@ def write_folder(
 
 def write_pictures(place: Path, file: h5py.File, contents: Contents) -> None:
     """Write the pictures' own bytes, one file each: `colour/000000.jpg`."""
-    for name, kind in PICTURES.items():
+    for name in PICTURES:
         if name in contents.shapes:
             (place / name).mkdir()
-            suffix = "jpg" if kind == COLOUR else "png"
+            suffix = suffix_of(name)
             for frame in range(contents.frames):
                 (place / name / f"{frame:06d}.{suffix}").write_bytes(code_of(file, contents, name, frame))
 

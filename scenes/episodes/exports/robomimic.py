@@ -11,13 +11,13 @@ from typing import Any
 import h5py
 import numpy as np
 
-from sim.errors import InputError
 from sim.runtime.atomic_files import Stream, demand_space, written_stream
 
 from ..reading.contents import Contents
+from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from ..reading.schema import COLOUR, PICTURES
-from .columns import blocks, numbers_of, opened, rate_of, shared_numbers, shared_pictures, stored_size
+from .columns import blocks, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size
 from .tasks import held_out, task_of
 
 EXPORTED = ("colour", "colour_right", "depth", "segmentation")
@@ -44,7 +44,7 @@ def write_robomimic(
         data = out.create_group("data")
         for number, contents in enumerate(progress(episodes)):
             demo = data.create_group(f"demo_{number}")
-            with opened(contents) as file:
+            with opened(contents.path) as file:
                 numbers = numbers_of(file, contents, names)
                 rates.append(rate_of(contents, numbers.pop("time")))
                 obs = demo.create_group("obs")
@@ -103,9 +103,3 @@ def environment(episodes: Sequence[Contents], rates: Sequence[float]) -> dict[st
         "env_version": version("sulcus"),
         "env_kwargs": {"families": families, "frames_per_second": sorted(set(rates))},
     }
-
-
-def demand_hdf5(path: Path) -> None:
-    """Refuse a name that robomimic's files do not have."""
-    if path.suffix != ".hdf5":
-        raise InputError(f"{path}: robomimic's files end in .hdf5.")

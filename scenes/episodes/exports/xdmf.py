@@ -15,8 +15,9 @@ from sim.runtime.atomic_files import written_stream
 
 from ..reading.bodies import anatomy_of, surface_rows
 from ..reading.contents import Contents, array_in
+from ..reading.open_files import opened
 from ..reading.rows import numbers_in
-from .columns import file_names, opened, stored_size
+from .columns import file_names, stored_size
 from .whole_folder import written_folder
 
 SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
@@ -44,7 +45,7 @@ def write_xdmf(
             bare += anatomy is None
             root = Element("Xdmf", Version="3.0")
             domain = SubElement(root, "Domain")
-            with opened(contents) as file, hdf5(partial / f"{names[contents]}.h5") as out:
+            with opened(contents.path) as file, hdf5(partial / f"{names[contents]}.h5") as out:
                 times = numbers_in(file, contents, "time")
                 for name, surface in SURFACES.items():
                     if f"{name}_predicted" in contents.shapes and f"{name}_rest" in contents.shapes:

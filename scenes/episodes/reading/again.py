@@ -16,8 +16,7 @@ from sim.fem import Fem
 from sim.runtime.outside_files import read_as
 
 from ...play.reference import TOGETHER, truth_of
-from ..bodies import Body, read_body
-from ..make import body_path
+from ..make import Opened, body_path, opened_body
 from ..plan import plan_from
 from ..scripted import drawn_episode, scene_of
 from .contents import contents_of
@@ -43,8 +42,7 @@ def solved_again(report: Report, count: int, device: str = "auto") -> Report:
             place = body_path(report.path.parent, int(contents.said["body"]))
             if not place.is_dir():
                 return _skipped(report, "frames solved again: its body is not beside it")
-            body = read_body(place)
-            frames, found = _answers(contents.said, body, contents.fem_frames, count, device)
+            frames, found = _answers(contents.said, opened_body(place, device), contents.fem_frames, count)
             stored = numbers_in(file, contents, "tumour_fem")[frames]
             rest = numbers_in(file, contents, "tumour_rest")
     except InputError as error:
@@ -61,18 +59,16 @@ def _skipped(report: Report, words: str) -> Report:
     return replace(report, skipped=[*report.skipped, words])
 
 
-def _answers(
-    said: Mapping[str, Any], body: Body, solved: np.ndarray, count: int, device: str
-) -> tuple[np.ndarray, np.ndarray]:
+def _answers(said: Mapping[str, Any], opened: Opened, solved: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the frames (k,), and the tumour's displacement (k, n, 3) [m] in each."""
     plan = plan_from(str(said["plan"]), str(said.get("plan_name", "plan")), Path())
     seed, number = int(said["seed"]), int(said["episode"])
-    theatre = body.theatre(device)
+    body, theatre = opened.body, opened.theatre
     scene = scene_of(plan, body, theatre.site, drawn_episode(plan.contents, seed, number), seed, number)
     fem = theatre.fem(scene, TRAIN, TOGETHER)
     apart = isinstance(fem, Fem) and fem.problem.plain
     spread = np.unique(np.linspace(0, len(solved) - 1, min(count, len(solved))).astype(int))
     frames = solved[spread] if apart else solved[: len(spread)]
     loads = [scene.loads(theatre.site, scene.path(time), time) for time in map(float, scene.times[frames])]
-    answer = truth_of(theatre, scene, loads)
+    answer = truth_of(theatre, scene, loads, fem=fem)
     return frames, answer.at(theatre.anatomy.tumour_nodes).displacement

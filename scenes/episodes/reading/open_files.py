@@ -14,6 +14,12 @@ from sim.runtime.outside_files import read_as
 REMEDY = "`sulcus validate` says more; make it anew, or leave it out."
 
 
+def opened(path: Path) -> h5py.File:
+    """An episode's file; InputError where it is not there, or no HDF5."""
+    with read_as(path, "an episode", REMEDY):
+        return h5py.File(path, "r")
+
+
 class OpenFiles:
     """Files that are opened when they are first read, in the process that reads them; those read least go first.
 
@@ -47,8 +53,7 @@ class OpenFiles:
         if path not in self._open:
             while len(self._open) >= self.most:
                 self._open.popitem(last=False)[1].close()
-            with read_as(path, "an episode", REMEDY):
-                self._open[path] = h5py.File(path, "r")
+            self._open[path] = opened(path)
         self._open.move_to_end(path)
         return self._open[path]
 

@@ -50,6 +50,12 @@ PICTURES: Mapping[str, str] = {
 }
 """Pictures, one a frame in the group `pictures`, and how each is decoded."""
 
+
+def suffix_of(name: str) -> str:
+    """How files of a picture's bytes end: colour is JPEG, all else PNG."""
+    return "jpg" if PICTURES[name] == COLOUR else "png"
+
+
 _POSE = Array((FRAMES, 4, 4))
 _PLACE = Array((FRAMES, 3), known=False)
 _ERROR = Array((FRAMES,), known=False, limited=False)

@@ -38,9 +38,9 @@ def from_head(tip: np.ndarray, stage: Stage) -> float:
 def buried(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stage) -> str:
     """Say that a tool at a pose (4, 4) [m] is where none can be, with its tip or its markers deep inside; empty: no."""
     mesh = stage.anatomy.mesh
+    corners = mesh.nodes[mesh.surface]
     for what, place in (("tip", np.zeros(3)), ("markers", np.linalg.inv(tool.T_cube_tool)[:3, 3])):
         point = T_scan_tool[:3, :3] @ place + T_scan_tool[:3, 3]
-        corners = mesh.nodes[mesh.surface]
         depth = float(np.linalg.norm(corners.reshape(-1, 3) - point, axis=1).min())
         if depth > DEEP and encloses(corners, point):
             return f"the tool's {what} would be {1e3 * depth:.0f} mm deep in the brain"
