@@ -12,6 +12,7 @@ from scenes.episodes.families import FAMILIES, Motions
 from scenes.episodes.make import body_of, body_path, episode_path, make_body, make_episode
 from scenes.episodes.plan import load_plan, plan_from, shipped
 from scenes.episodes.scripted import drawn_episode
+from scenes.episodes.sensing import noisy
 from scenes.play.deformers import open_theatre
 from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity, pushed_effects
@@ -158,3 +159,14 @@ def test_a_model_knows_what_the_tumour_is_made_of():
     assert refusal(other, here) is None
     assert "region 2" in (refusal(model, here) or "") and refusal(other, pushed_effects(theatre.anatomy, BRAIN))
     assert "region 2" in other.source
+
+
+def test_noise_has_its_deviation_and_no_mean():
+    """Away from black and white, up to the greatest that a plan may ask for."""
+    grey = np.full((200, 200, 3), 128, np.uint8)
+    for deviation in (1.0, 6.0, 40.0):
+        added = noisy(grey, deviation, np.random.default_rng(3)).astype(float) - 128.0
+        assert added.std() == pytest.approx(deviation, rel=0.06)
+        assert abs(added.mean()) < 0.02 * deviation
+    dark = noisy(np.zeros_like(grey), 40.0, np.random.default_rng(3))
+    assert np.mean(dark == 0) == pytest.approx(0.5, abs=0.02)

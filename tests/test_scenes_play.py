@@ -122,6 +122,17 @@ def test_drawing_is_a_function_of_its_moment(play):
     assert first.distance == again.distance and first.touch == again.touch
 
 
+def test_frames_that_are_asked_for_together_are_the_same(theatre):
+    play = player(theatre, short(), "linear")
+    alone, together = list(play.frames()), list(play.frames(together=4))
+    assert [frame.number for frame in together] == [frame.number for frame in alone]
+    for one, other in zip(alone, together, strict=True):
+        assert one.touch == other.touch and one.time == other.time
+        np.testing.assert_allclose(other.deformation.displacement, one.deformation.displacement, atol=5e-9)  # single
+        np.testing.assert_allclose(other.distance, one.distance, atol=5e-9)
+        assert np.mean(other.picture.segmentation == one.picture.segmentation) > 0.999
+
+
 def test_frames_are_stamped_with_their_moment(theatre):
     for name in ("linear", "fem"):
         play = player(theatre, short(), name)

@@ -87,7 +87,7 @@ class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What sensors add; standard deviations of an episode."""
 
-    grey_levels: Annotated[Number, Limits(0, 60)] = 0.0
+    grey_levels: Annotated[Number, Limits(0, 40)] = 0.0
     force_n: Annotated[Number, Limits(0, 1)] = 0.0
     tool_mm: Annotated[Number, Limits(0, 20)] = 0.0
     tool_deg: Annotated[Number, Limits(0, 20)] = 0.0

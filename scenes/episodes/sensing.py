@@ -17,13 +17,15 @@ QUANTILES = ndtri((np.arange(256) + 0.5) / 256)
 def noisy(colour: np.ndarray, deviation: float, random: np.random.Generator) -> np.ndarray:
     """A picture (H, W, 3) uint8 with normal noise of so many grey levels, alike in every pixel and colour.
 
-    The noise has 256 values, each as probable: quantiles of the normal law. They take a quarter of the time.
+    The noise has 256 values, each as probable: quantiles of the normal law. They are quicker to draw by far, and fit
+    into a byte up to a deviation of 40.
     """
     if deviation == 0.0:
         return colour
-    steps = np.rint(deviation * QUANTILES).astype(np.int16)
-    added = steps[np.frombuffer(random.bytes(colour.size), np.uint8)].reshape(colour.shape)
-    return np.clip(added + colour, 0, 255).astype(np.uint8)
+    steps = np.rint(deviation * QUANTILES).astype(np.int8).tobytes()
+    added = np.frombuffer(random.bytes(colour.size).translate(steps), np.int8).reshape(colour.shape)
+    total = np.add(colour, added, dtype=np.int16)
+    return np.clip(total, 0, 255, out=total).astype(np.uint8)
 
 
 def jittered(poses: np.ndarray, metres: float, radians: float, random: np.random.Generator) -> np.ndarray:
