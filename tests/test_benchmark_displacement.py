@@ -7,11 +7,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
 from conftest import make_box
-from tiny_episodes import write_episode
+from tiny_episodes import Wanted, write_episode
 
 FOLDER = Path(__file__).parents[1] / "benchmarks" / "displacement_from_pictures"
 MODULES = ("frames", "inputs", "networks", "neighbours", "errors", "extraction", "experiment", "tables")
@@ -47,7 +48,7 @@ def made(parts, episodes=40, each=12, seed=0):
 def test_a_network_finds_a_function_that_nearest_frames_do_not(parts):
     training, aside = parts["experiment"].split(made(parts), 40, seed=0)
     other, inputs = made(parts, seed=1), parts["inputs"].INPUTS[-1]
-    how = parts["networks"].Training(updates=150, batch=64)
+    how = parts["networks"].Training(updates=120, batch=48)
     network = parts["networks"].fitted(inputs, training, aside, 0, CPU, how)
     assert sum(weights.numel() for weights in network.network.parameters()) < 1_000_000
     nearest = parts["neighbours"].neighbours(inputs, training, aside, CPU)
@@ -105,16 +106,67 @@ def test_intervals_are_of_episodes_and_not_of_frames(parts):
 
 
 @pytest.fixture
-def folder(tmp_path):
+def episode(tmp_path):
+    """As plans make them: with tracked poses, a force that is read, and the cortex; solved in frames 0, 3 and 6."""
     box = make_box(cells=(5, 5, 4), spacing=1e-2, opening=0.03)
-    return write_episode(tmp_path / "episode_000000.h5", box).parent
+    path = write_episode(tmp_path / "episode_000007.h5", box, Wanted(7, every=3))
+    with h5py.File(path, "a") as file:
+        file.attrs.update(
+            {"plan": 'title = "T"\nsolved_every = 3\n[motion.press]', "episode": 7, "body": 2, "footprint_m": 6e-3}
+        )
+        for name in ("T_world_tool", "T_camera_world"):
+            file[f"{name}_tracked"] = file[name][:]
+        file["force_read"] = file["force"][:] * 1.5
+        file["tumour_left"] = np.ones(file["tumour_predicted"].shape[:2], bool)
+        file["outcome_predicted"] = np.array(["PREDICTED"] * 6 + ["EXTRAPOLATED"], h5py.string_dtype())
+        file["cortex_rest"] = box.mesh.nodes[np.unique(box.open_surface)]
+    return path
 
 
-def test_episodes_of_no_plan_are_named(folder, capsys, monkeypatch):
-    monkeypatch.syspath_prepend(str(FOLDER))
+def test_what_is_measured_is_in_the_cameras_axes(parts, episode):
+    frames = parts["extraction"].frames_of(episode, 1, 20)
+    assert frames.picture.shape == (7, 15, 20, 4) and frames.episode[0] == 7 and frames.body[0] == 2
+    assert frames.tested.tolist() == [False, False, False, True, False, False, True]
+    assert frames.usable.tolist() == [True] * 6 + [False]
+    with h5py.File(episode) as file:
+        camera, rest = file["T_camera_world"][0], file["tumour_rest"][:]
+        shift = 1e3 * (file["tumour_fem"][1] - rest).mean(axis=0) @ camera[:3, :3].T
+        assert np.allclose(frames.truth[3], shift, atol=1e-6)
+        tool = 1e3 * camera[:3, :3] @ (file["T_world_tool"][4, :3, 3] - rest.mean(axis=0))
+        named = dict(zip(parts["frames"].POSE, frames.pose[4], strict=True))
+        assert np.allclose([named[f"tool_{axis}"] for axis in "xyz"], tool, atol=1e-4)
+        assert named["tumour_z"] == pytest.approx(300.0) and named["opening_normal_z"] == pytest.approx(-1.0)
+        assert np.allclose(frames.force[4, :3], 1.5 * camera[:3, :3] @ file["force"][4], atol=1e-6)
+
+
+def test_no_truth_is_among_what_is_measured(parts, episode):
+    before = parts["extraction"].frames_of(episode, 1, 20)
+    truths = ("T_world_tool", "T_camera_world", "tip", "force", "distance", "tumour_predicted", "tumour_fem")
+    with h5py.File(episode, "a") as file:
+        for name in truths:
+            file[name][:] = np.random.default_rng(0).normal(size=file[name].shape)
+    after = parts["extraction"].frames_of(episode, 1, 20)
+    assert not np.allclose(before.label, after.label)
+    for name in ("picture", "pose", "force"):
+        assert np.array_equal(getattr(before, name), getattr(after, name)), name
+
+
+def test_episodes_of_no_plan_are_named(parts, episode, capsys):
     main = runpy.run_path(str(FOLDER / "__main__.py"), run_name="benchmark")["main"]
-    assert main(["extract", str(folder), "--out", str(folder / "a.npz"), "--workers", "1"]) == 2
-    assert "states no episode" in capsys.readouterr().err
+    given = [
+        "extract",
+        str(episode.parent),
+        "--workers",
+        "1",
+        "--width",
+        "20",
+        "--out",
+        str(episode.with_suffix(".npz")),
+    ]
+    assert main([*given, "--first", "8"]) == 2 and "no episode of these numbers" in capsys.readouterr().err
+    with h5py.File(episode, "a") as file:
+        del file.attrs["plan"]
+    assert main(given) == 2 and "states no plan" in capsys.readouterr().err
 
 
 def test_frames_come_back_and_tables_are_printed(parts, tmp_path, capsys):
