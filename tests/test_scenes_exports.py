@@ -222,10 +222,7 @@ def test_folders_are_not_mixed_with_others(name, folder, tmp_path, capsys):
     words = ["convert", str(folder), "--to", name, "--out", str(out)]
     assert main(words) == 2 and "not empty" in capsys.readouterr().err
     (out / "mine").unlink()
-    (tmp_path / "out.partial").mkdir()
-    assert main(words) == 2 and "another run" in capsys.readouterr().err
-    (tmp_path / "out.partial").rmdir()
-    assert main(words) == 0 and not (tmp_path / "out.partial").exists()
+    assert main(words) == 0 and [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 def test_what_does_not_go_together_is_a_sentence_and_leaves_nothing(folder, box, tmp_path, capsys):
@@ -248,6 +245,21 @@ def test_what_is_interrupted_leaves_nothing(tmp_path):
         (partial / "a").write_text("a")
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())
+
+
+def test_what_a_killed_run_left_is_removed_and_what_runs_is_not(tmp_path):
+    out, code = tmp_path / "out", (
+        "import os, sys; from pathlib import Path; from scenes.episodes.exports.whole_folder import written_folder\n"
+        "with written_folder(Path(sys.argv[1]), 10) as partial: (partial / 'a').mkdir(); os.kill(os.getpid(), 9)"
+    )  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", code, str(out)], cwd=Path(__file__).parents[1], check=False)
+    (left,) = tmp_path.iterdir()
+    assert done.returncode == -9 and (left / "a").exists()
+    with written_folder(out, 10) as partial:
+        assert not left.exists()
+        with written_folder(tmp_path / "other", 10):
+            assert partial.exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"out", "other"}
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")

@@ -8,26 +8,26 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import REMEDY, demand_space, why
+from sim.runtime.atomic_files import REMEDY, demand_space, partial_path, remove_left_overs, why
 
 
 @contextmanager
 def written_folder(path: Path, size: int) -> Iterator[Path]:
     """A folder beside `path` to write in, which takes its name when the block ends well, and is removed if not.
 
-    `size` is how many bytes it will hold, about.
+    `size` is how many bytes it will hold, about. What a killed run left of the same folder is removed.
 
     Raises
     ------
     InputError
-        A folder that is there and not empty, what a killed run left, a full disk, a place that cannot be written.
+        A folder that is there and not empty, a full disk, a place that cannot be written.
     """
-    partial = path.with_name(f"{path.name}.partial")
+    partial = partial_path(path)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(f"{path}: is there and not empty. Choose another name, or remove it.")
-    if partial.exists():
-        raise InputError(f"{partial}: another run writes it, or was killed. Where none does, remove it.")
+    remove_left_overs(path.parent, path.name)
     demand_space(path, size)
+    shutil.rmtree(partial, ignore_errors=True)  # of a dead process that had the same number
     try:
         partial.mkdir(parents=True)
         yield partial
