@@ -80,9 +80,12 @@ def _inside(straight: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np
     return np.flatnonzero(np.any(inside, axis=1)), np.flatnonzero(np.any(inside, axis=0))
 
 
-def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(H, W) bool: the pixels whose centres a surface covers, seen alone. vertices (V, 3) [m], triangles (F, 3)."""
-    return seen(camera, vertices, triangles).mask
+def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> np.ndarray:
+    """(H, W) bool: the pixels whose centres a surface covers, seen alone. vertices (V, 3) [m], triangles (F, 3).
+
+    `device` is the Warp device that draws it.
+    """
+    return seen(camera, vertices, triangles, device=device).mask
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:

@@ -52,15 +52,18 @@ def in_bands(draw: Callable[[int, int], None], count: int, device: str, bands: i
 
     The ranges must not write to the same places; the modules of their kernels must be loaded.
     """
-    if device != "cpu":
-        return draw(0, count)
     pool, cores = workers()
+    if device != "cpu" or cores == 1:
+        return draw(0, count)
     edges = np.linspace(0, count, bands * cores + 1).astype(int).tolist()
     list(pool.map(draw, edges[:-1], edges[1:]))
 
 
 @cache
 def workers() -> tuple[ThreadPoolExecutor, int]:
-    """The threads that draw, and how many: Warp runs a CPU kernel on the calling thread and frees the interpreter."""
-    cores = min(os.cpu_count() or 1, 8)
+    """The threads that draw, and how many: Warp runs a CPU kernel on the calling thread and frees the interpreter.
+
+    One, in a process that is asked for one by `OMP_NUM_THREADS`, as beside others on the same cores.
+    """
+    cores = 1 if os.environ.get("OMP_NUM_THREADS") == "1" else min(os.cpu_count() or 1, 8)
     return ThreadPoolExecutor(cores, thread_name_prefix="raster"), cores

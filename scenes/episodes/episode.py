@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import lru_cache
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -189,7 +190,7 @@ def encoded(frame: Frame, player: Player, recording: Recording, right: Stage | N
     """The frame's pictures as compressed bytes, by name; `right` draws for the right eye, if there is one."""
     picture = frame.picture
     tumour = player.stage.at(frame.loads).tumour(player.believed(frame))
-    mask = silhouette(frame.camera, tumour.vertices, tumour.triangles)
+    mask = silhouette(frame.camera, tumour.vertices, tumour.triangles, player.stage.device)
     depth = np.minimum(np.rint(picture.depth / DEPTH_SCALE), np.iinfo(np.uint16).max).astype(np.uint16)
     found = {"colour": _jpeg(recording.grain(2 * frame.number, picture.colour))}
     if recording.overlay:
@@ -358,6 +359,7 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, r
     )
 
 
+@lru_cache(maxsize=4)
 def digest_of_model(model: Learned) -> str:
     """Sixteen hexadecimal digits of what a model's parts hold and of what it says of its training."""
     found = sha256(repr(sorted(model.training.items())).encode())
