@@ -9,13 +9,14 @@ import time
 
 import numpy as np
 import pytest
+from tiny_episodes import write_episode
 from tiny_work import tiny_run
 
 from scenes.cli import main
 from scenes.episodes.estimate import estimated, lines
 from scenes.episodes.plan import load_plan
 from scenes.episodes.rates import Rate, read_rates, written_rates
-from scenes.episodes.run_folder import begin
+from scenes.episodes.run_folder import Failure, begin, mark_failed, unmark
 from scenes.episodes.slurm import sbatch_script
 from scenes.episodes.tasks import Outcome
 from sim.errors import InputError
@@ -50,6 +51,26 @@ def test_a_folder_of_another_seed_is_refused_by_the_command(tmp_path, capsys):
     begin(tmp_path, tiny_run(digest=digest), "")
     assert main(["episodes", "small", "--count", "1", "--seed", "7", "--out", str(tmp_path), "--workers", "1"]) == 2
     assert "Give --seed 1" in capsys.readouterr().err
+
+
+def test_a_run_that_ends_has_a_data_sheet_of_what_is_there(box, tmp_path, capsys):
+    folder, begun = tmp_path / "data", tiny_run(digest=load_plan("small").digest)
+    begin(folder, begun, "")
+    words = ["episodes", "small", "--count", "2", "--seed", "1", "--out", str(folder), "--workers", "1", "--json"]
+    for number in range(2):
+        mark_failed(folder, Failure(number, "no", lost=False))
+    assert main(words) == 1 and not json.loads(capsys.readouterr().out)["card"]
+    assert not (folder / "DATASHEET.md").exists()
+    write_episode(folder / "episode_000000.h5", box)
+    unmark(folder, 0)
+    held = (folder / "episode_000000.h5").read_bytes()
+    assert main(words) == 1 and json.loads(capsys.readouterr().out)["card"]
+    assert "| all | 1 |" in (sheet := (folder / "DATASHEET.md").read_text()) and "1 could not be made" in sheet
+    (folder / "croissant.json").write_text("mine")
+    write_episode(folder / "episode_000001.h5", box)
+    unmark(folder, 1)
+    assert main(words) == 0 and "is not of a card" in capsys.readouterr().err
+    assert (folder / "croissant.json").read_text() == "mine" and (folder / "episode_000000.h5").read_bytes() == held
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -16,6 +16,7 @@ from tiny_episodes import HEIGHT, WIDTH, Wanted, write_episode
 
 from scenes import read_episodes, write_card
 from scenes.cli import main
+from scenes.episodes.exports.card import keep_card
 from scenes.episodes.exports.motion import poses_after, states, twists
 from scenes.episodes.exports.statistics import Spread
 from scenes.episodes.exports.tasks import TASKS, held_out
@@ -198,6 +199,27 @@ def test_a_card_says_what_there_is(folder, tmp_path, capsys):
     assert main(["convert", str(folder), "--to", "card"]) == 2 and "--force" in capsys.readouterr().err
     assert (folder / "LICENSE.md").read_text() == "mine"
     assert main(["convert", str(folder), "--to", "card", "--force"]) == 0
+
+
+def test_a_card_is_kept_as_episodes_come(box, tmp_path):
+    assert keep_card(tmp_path, True) is None and not list(tmp_path.iterdir())  # no episode is whole
+    write_episode(tmp_path / "episode_000000.h5", box)
+
+    def rows():
+        return (tmp_path / "episodes.csv").read_text().count("\n") - 1
+
+    assert keep_card(tmp_path, False) is None and rows() == 1
+    made = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir() if path.is_file()}
+    assert keep_card(tmp_path, False) is None and len(made) == 5
+    assert made == {name: (tmp_path / name).stat().st_mtime_ns for name in made}
+    assert keep_card(tmp_path, True) is None and made["DATASHEET.md"] < (tmp_path / "DATASHEET.md").stat().st_mtime_ns
+    write_episode(tmp_path / "episode_000001.h5", box)
+    (tmp_path / ".sulcus-00000000-1-episode_000002.h5").write_text("half")
+    assert keep_card(tmp_path, False) is None and rows() == 2
+    (tmp_path / "croissant.json").unlink()
+    assert keep_card(tmp_path, False) is None and (tmp_path / "croissant.json").exists()
+    (tmp_path / "LICENSE.md").write_text("mine")
+    assert "is not of a card" in (keep_card(tmp_path, True) or "") and (tmp_path / "LICENSE.md").read_text() == "mine"
 
 
 @pytest.mark.skipif(FOREIGN is None, reason="needs SULCUS_FORMATS_PYTHON, a Python with mlcroissant")

@@ -117,8 +117,22 @@ def _made(args: argparse.Namespace, plan: Plan, out: Path) -> int:
         begun = time.perf_counter()
         with _progress(out, there, args.count) as heard:
             tally = make_all(work, out, run, missing, workers, heard, there)
-        _report(args, out, tally, time.perf_counter() - begun, workers.where)
+        seconds = time.perf_counter() - begun
+        lacking = _card(out, tally != there)
+        _report(args, out, tally, seconds, workers.where, lacking is None and tally.made + tally.skipped > 0)
+    if lacking is not None:
+        print(lacking, file=sys.stderr)
     return int(tally.failed + tally.lost > 0)
+
+
+def _card(out: Path, changed: bool) -> str | None:
+    """Keep the data sheet up to date; why it is not, in words."""
+    from tqdm import tqdm
+
+    from ..episodes.exports.card import keep_card
+
+    bar = partial(tqdm, unit="episode", desc="data sheet", file=sys.stderr, leave=False, mininterval=1.0, disable=None)
+    return keep_card(out, changed, bar)
 
 
 def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Workers]:
@@ -172,7 +186,7 @@ def _progress(out: Path, there: Tally, total: int) -> Iterator[Heard]:
         yield heard
 
 
-def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, where: str) -> None:
+def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, where: str, card: bool) -> None:
     failed = tally.failed + tally.lost
     if args.json:
         said = {
@@ -186,6 +200,7 @@ def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, w
             "bytes": tally.bytes,
             "seconds": seconds,
             "where": where,
+            "card": card,
         }
         print(json_line(said))
         return

@@ -19,11 +19,16 @@ from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from ..reading.validation import solved_figures
 from ..reading.windows import episode_paths
+from ..run_folder import EPISODE
 from .croissant import COLUMNS, croissant
 from .datasheet import MARK, NAME, datasheet
 from .tasks import task_of
 
 TABLE = "episodes.csv"
+NAMES = (TABLE, "croissant.json", "DATASHEET.md", "LICENSE.md")
+"""Files of a card."""
+MOST_EPISODES = 5000
+"""Of larger data sets a run does not write the card by itself: 20 to 50 ms are needed for each episode."""
 LICENCE = f"""# Licence of this data set
 
 {MARK}
@@ -58,12 +63,13 @@ def write_card(
     InputError
         A folder without episodes, an episode that is damaged, or a file of such a name that no card is, unless `force`.
     """
-    names = (TABLE, "croissant.json", "DATASHEET.md", "LICENSE.md")
-    for name in names:
+    for name in NAMES:
         if not force and (folder / name).exists() and not is_card(folder / name):
             raise InputError(f"{folder / name}: is not of a card. Move it away, or give --force to replace it.")
-    episodes = contents or [read_contents(path) for path in episode_paths(folder)]
-    rows = [row_of(one, folder) for one in progress(episodes)]
+    episodes, rows = [], []
+    for one in progress(contents or episode_paths(folder)):
+        episodes.append(read_contents(one) if isinstance(one, Path) else one)
+        rows.append(row_of(episodes[-1], folder))
     inside = "episodes/*.h5" if (folder / "episodes").is_dir() else "*.h5"
     table = table_of(rows)
     failed = len(list((folder / "failed").glob("*.json")))
@@ -75,15 +81,48 @@ def write_card(
     date = max(str(one.said.get("date", ""))[:10] for one in episodes) or datetime.now(UTC).date().isoformat()
     described = croissant(folder.resolve().name, description, date, TABLE, sha256(table.encode()).hexdigest(), inside)
     texts = (table, json.dumps(described, indent=1) + "\n", sheet, LICENCE)
-    for name, text in zip(names, texts, strict=True):
+    for name, text in zip(NAMES, texts, strict=True):
         with written_whole(folder / name, Path(name).suffix) as partial:
             partial.write_text(text, encoding="utf-8")
     return {
         "out": str(folder),
         "episodes": len(rows),
         "frames": sum(one.frames for one in episodes),
-        "files": names,
+        "files": NAMES,
     }
+
+
+def keep_card(folder: Path, changed: bool, progress: Callable[[Iterable], Iterable] = iter) -> str | None:
+    """Write the card of a run's folder anew, where it is not that of the episodes there; why not, in words.
+
+    Nothing is written where no episode is whole. Files that are of no card stay.
+
+    Parameters
+    ----------
+    changed
+        Whether episodes were made, or failed, since the card was written.
+    """
+    there = {path.name: path.stat().st_size for path in folder.glob("*.h5") if EPISODE.fullmatch(path.name)}
+    if not there or not (changed or there != _listed(folder)):
+        return None
+    if len(there) > MOST_EPISODES:
+        return f"No data sheet of more than {MOST_EPISODES} episodes: `sulcus convert {folder} --to card` writes it."
+    try:
+        write_card(folder, progress=progress)
+    except (InputError, OSError) as error:  # what a run has made is none the worse for it
+        return f"No data sheet was written: {error}"
+    return None
+
+
+def _listed(folder: Path) -> dict[str, int]:
+    """Names and sizes of the episodes that a folder's card lists; none where a file of the card is missing."""
+    try:
+        if not all((folder / name).is_file() for name in NAMES):
+            return {}
+        with (folder / TABLE).open(newline="", encoding="utf-8") as file:
+            return {row["file"]: int(row["bytes"]) for row in csv.DictReader(file)}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
 
 
 def is_card(path: Path) -> bool:

@@ -96,8 +96,8 @@ def collection(episodes: Sequence[Contents]) -> str:
         lines += [f"- {title}: {text} (in {count})" for text, count in Counter(map(str, said(episodes, key))).items()]
     versions = sorted(set(map(str, said(episodes, "sulcus_version"))))
     dates = sorted(str(date)[:10] for date in said(episodes, "date"))
-    if versions and dates:
-        lines.append(f"- sulcus {', '.join(versions)}, {dates[0]} to {dates[-1]}")
+    if versions:
+        lines.append(f"- sulcus {', '.join(versions)}" + (f", {dates[0]} to {dates[-1]}" if dates else ""))
     table = list(drawn(episodes))
     if table:
         lines += [
