@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import make_box
+from scipy.spatial.transform import Rotation
 from tiny_episodes import Wanted, write_episode
 
 FOLDER = Path(__file__).parents[1] / "benchmarks" / "displacement_from_pictures"
@@ -39,8 +40,9 @@ def made(parts, episodes=40, each=12, seed=0):
     picture = np.broadcast_to(bright, (n, 12, 16, 4)).copy()
     label = (0.5 * force[:, :3] * (1.0 + bright[:, 0, 0] / 200.0)).astype(np.float32)
     episode = np.repeat(np.arange(episodes), each)
+    turn = Rotation.random(n, rng=draws).as_matrix().astype(np.float32)
     return parts["frames"].Frames(
-        picture, pose, force, label, label.copy(), np.ones(n, bool), episode, episode // 3, np.arange(n) % each,
+        picture, pose, force, turn, label, label.copy(), np.ones(n, bool), episode, episode // 3, np.arange(n) % each,
         np.full(n, "press", "U16"),
     )  # fmt: skip
 
@@ -60,7 +62,29 @@ def test_a_network_finds_a_function_that_nearest_frames_do_not(parts):
     }  # fmt: skip
     assert off["network"] < 0.5 * off["nearest"] < 0.5 * off["zero"]
     itself = replace(nearest, count=1)
-    assert np.allclose(itself.answers(training), training.label)
+    assert np.allclose(itself.answers(training), training.label, atol=1e-5)
+
+
+def test_nearest_frames_do_not_care_how_the_camera_is_held(parts):
+    frames, inputs = made(parts, 12), parts["inputs"].INPUTS[4]
+    turned = Rotation.random(len(frames), rng=3).as_matrix().astype(np.float32)
+
+    def turn(values, count):
+        vectors = values[:, : 3 * count].reshape(len(values), count, 3)
+        return np.concatenate(
+            [np.einsum("nij,nkj->nki", turned, vectors).reshape(len(values), -1), values[:, 3 * count :]], 1
+        )
+
+    other = replace(
+        frames,
+        pose=turn(frames.pose, 5),
+        force=turn(frames.force, 1),
+        turn=turned @ frames.turn,
+        label=turn(frames.label, 1),
+    )
+    found = replace(parts["neighbours"].neighbours(inputs, frames, frames, CPU), count=3)
+    assert inputs.name == "pose, force"
+    assert np.allclose(found.answers(other), turn(found.answers(frames), 1), atol=1e-4)
 
 
 def test_a_mirrored_frame_is_a_frame_of_the_mirrored_world(parts):

@@ -10,7 +10,7 @@ import torch
 from errors import Errors, distances, errors_of
 from frames import Frames
 from inputs import INPUTS, PICTURE_AND_POSE, Inputs
-from neighbours import neighbours
+from neighbours import in_scan, neighbours
 from networks import Training, fitted
 
 from sim.errors import InputError
@@ -110,11 +110,11 @@ def rows(
     `said` hears what is trained next.
     """
     whole = len(sets.training.episodes)
-    middle = sets.training.label.mean(axis=0)
+    middle = in_scan(sets.training, sets.training.label).mean(axis=0)
     for test, frames in sets.tests.items():
         for way, answers in (
             ("no displacement", np.zeros_like(frames.truth)),
-            ("mean of training", np.broadcast_to(middle, frames.truth.shape)),
+            ("mean of training", frames.turn @ middle),
             ("labels", frames.label),
         ):
             yield _row(test, way, "", whole, frames, distances(answers, frames.truth)[None])

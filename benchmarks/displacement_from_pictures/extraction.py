@@ -95,6 +95,7 @@ def _frames(file: h5py.File, contents: Contents, taken: range, width: int) -> Fr
         picture=_pictures(file, contents, taken, width, 1e3 * (camera @ [*middle, 1.0])[:, 2]),
         pose=np.stack([np.broadcast_to(measured[name], count) for name in POSE], axis=1).astype(np.float32),
         force=np.stack([np.broadcast_to(measured[name], count) for name in FORCE], axis=1).astype(np.float32),
+        turn=turn.astype(np.float32),
         label=moved("tumour_predicted").astype(np.float32),
         truth=np.where(tested[:, None], moved("tumour_fem"), np.nan).astype(np.float32),
         usable=outcomes["outcome_predicted"] & some,

@@ -32,6 +32,8 @@ class Frames:
         (n, H, W, 4) uint8: red, green, blue, and depth.
     pose, force
         (n, len(POSE)) and (n, len(FORCE)) float32; zero where there is no tool, or no force is read.
+    turn
+        (n, 3, 3) float32 takes directions of the scan to the axes of the tracked camera.
     label
         (n, 3) float32 displacement of the tumour's middle [mm] that networks are trained on, in the camera's axes.
     truth
@@ -47,6 +49,7 @@ class Frames:
     picture: np.ndarray
     pose: np.ndarray
     force: np.ndarray
+    turn: np.ndarray
     label: np.ndarray
     truth: np.ndarray
     usable: np.ndarray
