@@ -204,8 +204,10 @@ def test_frames_come_back_and_tables_are_printed(parts, tmp_path, capsys):
     given = ["train", "--train", str(tmp_path / "a.npz"), "--training", "7", "--sizes", "5", "--seeds", "1"]
     assert main([*given, "--updates", "1", "--batch", "4", "--device", "cpu", "--json", str(tmp_path / "b.json")]) == 0
     shown = capsys.readouterr().out
-    assert "| same bodies | network | picture, pose |" in shown and "| tested on | answered by | 5 | 7 |" in shown
+    assert (
+        "| same bodies | network | picture, pose |" in shown and "| tested on | answered by | given | 5 | 7 |" in shown
+    )
     rows = json.loads((tmp_path / "b.json").read_text())["rows"]
-    assert len(rows) == 3 + 2 * 6 + 2 and {row["episodes"] for row in rows} == {5, 7}
+    assert len(rows) == 3 + 2 * 6 + 3 and {row["episodes"] for row in rows} == {5, 7}
     assert main(["train", "--train", str(tmp_path / "b.json"), "--training", "7"]) == 2
     assert "Extract it anew" in capsys.readouterr().err

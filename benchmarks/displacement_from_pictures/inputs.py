@@ -31,9 +31,10 @@ class Inputs:
         return np.concatenate(given, axis=1) if given else np.zeros((len(frames), 0), np.float32)
 
 
+POSE_ALONE = Inputs("pose", pose=True)
 PICTURE_AND_POSE = Inputs("picture, pose", ALL_CHANNELS, pose=True)
 INPUTS = (
-    Inputs("pose", pose=True),
+    POSE_ALONE,
     Inputs("picture", ALL_CHANNELS),
     PICTURE_AND_POSE,
     Inputs("colour, pose", COLOURS, pose=True),

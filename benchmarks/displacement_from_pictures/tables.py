@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from experiment import Row, Sets
+from experiment import LEARNING, Row, Sets
 from frames import Frames
-from inputs import PICTURE_AND_POSE
 
 
 def counts(sets: Sets) -> dict[str, dict[str, object]]:
@@ -56,14 +55,15 @@ def table(sets: Sets, rows: Sequence[Row]) -> str:
 
 def curve(sets: Sets, rows: Sequence[Row]) -> str:
     """Median errors by the number of training episodes."""
-    picked = [row for row in rows if row.given == PICTURE_AND_POSE.name]
-    sizes = sorted({row.episodes for row in picked})
+    sizes = sorted({row.episodes for row in rows})
     lines = [
-        f"Median [95 % interval] mm, given {PICTURE_AND_POSE.name}, by training episodes", "",
-        "| tested on | answered by | " + " | ".join(map(str, sizes)) + " |", "|---|---|" + "---|" * len(sizes),
+        "Median [95 % interval] mm by training episodes", "",
+        "| tested on | answered by | given | " + " | ".join(map(str, sizes)) + " |",
+        "|---|---|---|" + "---|" * len(sizes),
     ]  # fmt: skip
     for test in sets.tests:
-        for way in dict.fromkeys(row.way for row in picked):
-            by_size = {row.episodes: row.errors.median for row in picked if (row.test, row.way) == (test, way)}
-            lines.append(f"| {test} | {way} | " + " | ".join(str(by_size[size]) for size in sizes) + " |")
+        for way, inputs in LEARNING:
+            key = test, way, inputs.name
+            by_size = {row.episodes: row.errors.median for row in rows if (row.test, row.way, row.given) == key}
+            lines.append(f"| {' | '.join(key)} | " + " | ".join(str(by_size[size]) for size in sizes) + " |")
     return "\n".join(lines)
