@@ -207,6 +207,7 @@ def test_frames_come_back_and_tables_are_printed(parts, tmp_path, capsys):
     assert (
         "| same bodies | network | picture, pose |" in shown and "| tested on | answered by | given | 5 | 7 |" in shown
     )
+    assert main(["show", str(tmp_path / "b.json")]) == 0 and capsys.readouterr().out == shown
     rows = json.loads((tmp_path / "b.json").read_text())["rows"]
     assert len(rows) == 3 + 2 * 6 + 3 and {row["episodes"] for row in rows} == {5, 7}
     assert main(["train", "--train", str(tmp_path / "b.json"), "--training", "7"]) == 2

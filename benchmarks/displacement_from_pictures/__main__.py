@@ -16,13 +16,13 @@ import json
 import os
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from sim.errors import InputError
+from sim.runtime.atomic_files import written_whole
 
 
 def main(words: list[str] | None = None) -> int:
@@ -49,9 +49,11 @@ def main(words: list[str] | None = None) -> int:
     train.add_argument("--batch", type=int, default=256, help="frames of an update (default 256)")
     train.add_argument("--device", default="auto", help="auto, cpu or cuda")
     train.add_argument("--json", type=Path, help="all figures, to this file")
+    show = commands.add_parser("show", help="print the tables of such a file again")
+    show.add_argument("json", type=Path)
     args = parser.parse_args(words)
     try:
-        return _extract(args) if args.command == "extract" else _train(args)
+        return {"extract": _extract, "train": _train, "show": _show}[args.command](args)
     except InputError as error:
         print(f"displacement_from_pictures: {error}", file=sys.stderr)
         return 2
@@ -77,7 +79,7 @@ def _train(args: argparse.Namespace) -> int:
     from experiment import rows, sets_of
     from frames import read_frames
     from networks import Training
-    from tables import curve, described, table
+    from tables import said, tables
 
     begun = time.perf_counter()
     others = {}
@@ -90,25 +92,23 @@ def _train(args: argparse.Namespace) -> int:
     name = ("cuda" if torch.cuda.is_available() else "cpu") if args.device == "auto" else args.device
     how = Training(args.updates, args.batch)
 
-    def said(words: str) -> None:
+    def heard(words: str) -> None:
         print(f"{time.perf_counter() - begun:6.1f} s  {words}", file=sys.stderr, flush=True)
 
-    found = list(rows(sets, args.sizes, range(args.seeds), torch.device(name), how, said))
-    texts = [described(sets), table(sets, found), curve(sets, found)]
-    print("\n\n".join(texts))
+    found = list(rows(sets, args.sizes, range(args.seeds), torch.device(name), how, heard))
+    record = said(sets, found, training=asdict(how), seeds=args.seeds, seconds=time.perf_counter() - begun)
+    print(tables(record))
     if args.json:
-        _write(args, sets, found, asdict(how), time.perf_counter() - begun)
+        with written_whole(args.json, ".json") as partial:
+            partial.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return 0
 
 
-def _write(args: argparse.Namespace, sets: object, found: Sequence, how: dict, seconds: float) -> None:
-    from tables import counts
+def _show(args: argparse.Namespace) -> int:
+    from tables import tables
 
-    said = {
-        "training": how, "seeds": args.seeds, "sets": counts(sets), "seconds": seconds,
-        "rows": [asdict(row) for row in found],
-    }  # fmt: skip
-    args.json.write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
+    print(tables(json.loads(args.json.read_text(encoding="utf-8"))))
+    return 0
 
 
 if __name__ == "__main__":

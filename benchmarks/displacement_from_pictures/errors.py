@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,10 +29,6 @@ class Errors:
     median: Figure
     p95: Figure
     bodies: tuple[float, float]
-
-    def said(self) -> dict[str, object]:
-        """As JSON has it."""
-        return asdict(self)
 
 
 def distances(answers: np.ndarray, truth: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from sim.errors import InputError
 
 ASIDE = 0.15
 """Share of the training episodes that says when to stop, and how many neighbours answer."""
-NETWORK, NEIGHBOURS = "network", "nearest frames"
+NETWORK, NEIGHBOURS, TRAINING = "network", "nearest frames", "training"
 FEWEST = 4
 Answers = Callable[[Frames], np.ndarray]
 

@@ -1,20 +1,24 @@
-"""What was found, as tables in Markdown and as numbers."""
+"""What was found, as tables in Markdown, and as JSON."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
-from experiment import LEARNING, Row, Sets
+from errors import Errors, Figure
+from experiment import LEARNING, TRAINING, Row, Sets
 from frames import Frames
 
 
-def counts(sets: Sets) -> dict[str, dict[str, object]]:
-    """How many of what is in each set, and how far tumours went [mm]."""
-    return {name: _counts(frames) for name, frames in {"training": sets.training, **sets.tests}.items()}
+def said(sets: Sets, rows: Sequence[Row], **more: object) -> dict[str, Any]:
+    """All of it as JSON has it: how many of what is in each set, how far tumours went [mm], and errors [mm]."""
+    counted = {name: _counts(frames) for name, frames in {TRAINING: sets.training, **sets.tests}.items()}
+    return {**more, "sets": counted, "rows": [asdict(row) for row in rows]}
 
 
-def _counts(frames: Frames) -> dict[str, object]:
+def _counts(frames: Frames) -> dict[str, Any]:
     moved = np.linalg.norm(frames.label, axis=1)
     return {
         "episodes": len(frames.episodes), "frames": len(frames), "bodies": len(np.unique(frames.body)),
@@ -23,47 +27,50 @@ def _counts(frames: Frames) -> dict[str, object]:
     }  # fmt: skip
 
 
-def described(sets: Sets) -> str:
-    """The sets as a table."""
-    lines = [
-        "| frames | episodes | frames | bodies | moved: median, p95, most [mm] | families |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name, said in counts(sets).items():
-        moved = ", ".join(f"{each:.2f}" for each in said["moved_mm"])
-        numbers = " | ".join(str(said[each]) for each in ("episodes", "frames", "bodies"))
-        lines.append(f"| {name} | {numbers} | {moved} | {', '.join(said['families'])} |")
-    return "\n".join(lines)
-
-
-def table(sets: Sets, rows: Sequence[Row]) -> str:
-    """Errors with all training episodes; a block for each set."""
-    whole = len(sets.training.episodes)
-    lines = [
-        "| tested on | answered by | given | median [95 % interval] mm | p95 [95 % interval] mm | medians of bodies |",
-        "|---|---|---|---|---|---|",
-    ]
-    for test in sets.tests:
-        lines += [
-            f"| {row.test} | {row.way} | {row.given} | {row.errors.median} | {row.errors.p95} "
-            f"| {row.errors.bodies[0]:.3f} - {row.errors.bodies[1]:.3f} |"
-            for row in rows
-            if row.test == test and row.episodes == whole
+def tables(found: Mapping[str, Any]) -> str:
+    """Tables of what `said` says."""
+    rows = [Row(**{**row, "errors": _errors(row["errors"])}) for row in found["rows"]]
+    tests = [name for name in found["sets"] if name != TRAINING]
+    whole = [row for row in rows if row.episodes == found["sets"][TRAINING]["episodes"]]
+    return "\n\n".join(
+        [
+            _sets(found["sets"]),
+            "Median error [95 % interval] mm:\n\n" + _by_test(tests, whole, lambda errors: str(errors.median)),
+            "95th percentile [95 % interval] mm:\n\n" + _by_test(tests, whole, lambda errors: str(errors.p95)),
+            "Medians of single bodies, least to greatest, mm:\n\n"
+            + _by_test(tests, whole, lambda errors: f"{errors.bodies[0]:.3f} - {errors.bodies[1]:.3f}"),
+            "Median error [95 % interval] mm, by training episodes:\n\n" + _curve(tests, rows),
         ]
-    return "\n".join(lines)
+    )
 
 
-def curve(sets: Sets, rows: Sequence[Row]) -> str:
-    """Median errors by the number of training episodes."""
-    sizes = sorted({row.episodes for row in rows})
+def _errors(errors: Mapping[str, Any]) -> Errors:
+    return Errors(Figure(**errors["median"]), Figure(**errors["p95"]), tuple(errors["bodies"]))
+
+
+def _grid(head: Sequence[object], lines: Sequence[Sequence[object]]) -> str:
+    rule = ["---"] * len(head)
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (head, rule, *lines))
+
+
+def _sets(sets: Mapping[str, Mapping[str, Any]]) -> str:
     lines = [
-        "Median [95 % interval] mm by training episodes", "",
-        "| tested on | answered by | given | " + " | ".join(map(str, sizes)) + " |",
-        "|---|---|---|" + "---|" * len(sizes),
+        [name, *(one[key] for key in ("episodes", "frames", "bodies")),
+         ", ".join(f"{each:.2f}" for each in one["moved_mm"]), ", ".join(one["families"])]
+        for name, one in sets.items()
     ]  # fmt: skip
-    for test in sets.tests:
-        for way, inputs in LEARNING:
-            key = test, way, inputs.name
-            by_size = {row.episodes: row.errors.median for row in rows if (row.test, row.way, row.given) == key}
-            lines.append(f"| {' | '.join(key)} | " + " | ".join(str(by_size[size]) for size in sizes) + " |")
-    return "\n".join(lines)
+    return _grid(["", "episodes", "frames", "bodies", "moved: median, p95, most [mm]", "families"], lines)
+
+
+def _by_test(tests: Sequence[str], rows: Sequence[Row], cell: Callable[[Errors], str]) -> str:
+    found = {(row.way, row.given, row.test): cell(row.errors) for row in rows}
+    ways = dict.fromkeys((row.way, row.given) for row in rows)
+    return _grid(["answered by", "given", *tests], [[*way, *(found[*way, test] for test in tests)] for way in ways])
+
+
+def _curve(tests: Sequence[str], rows: Sequence[Row]) -> str:
+    sizes = sorted({row.episodes for row in rows})
+    found = {(row.test, row.way, row.given, row.episodes): row.errors.median for row in rows}
+    keys = [(test, way, inputs.name) for test in tests for way, inputs in LEARNING]
+    lines = [[*key, *(found.get((*key, size), "") for size in sizes)] for key in keys]
+    return _grid(["tested on", "answered by", "given", *sizes], lines)
