@@ -17,6 +17,7 @@ from tiny_episodes import HEIGHT, WIDTH, Wanted, write_episode
 from scenes import read_episodes, write_card
 from scenes.cli import main
 from scenes.episodes.exports.card import keep_card
+from scenes.episodes.exports.datasheet import listed
 from scenes.episodes.exports.motion import poses_after, states, twists
 from scenes.episodes.exports.statistics import Spread
 from scenes.episodes.exports.tasks import TASKS, held_out
@@ -199,6 +200,12 @@ def test_a_card_says_what_there_is(folder, tmp_path, capsys):
     assert main(["convert", str(folder), "--to", "card"]) == 2 and "--force" in capsys.readouterr().err
     assert (folder / "LICENSE.md").read_text() == "mine"
     assert main(["convert", str(folder), "--to", "card", "--force"]) == 0
+
+
+def test_a_sheet_names_what_is_there_most_often():
+    lines = list(listed("tool", ["a", "b", "b", *map(str, range(20))]))
+    assert lines[:2] == ["- tool: b (in 2)", "- tool: a (in 1)"] and lines[-1] == "- tool: 10 others (in 10)"
+    assert list(listed("tool", ["a"])) == ["- tool: a (in 1)"]
 
 
 def test_a_card_is_kept_as_episodes_come(box, tmp_path):

@@ -13,7 +13,9 @@ from ..reading.schema import ARRAYS, PICTURES
 MARK = "<!-- sulcus card 1 -->"
 NAME = "with sulcus"
 # Longest list of what was drawn.
-MOST_DRAWN = 60
+MOST_DRAWN = 100
+# Most of what moved, solved or touched tissue that is named.
+MOST_LISTED = 12
 
 
 def datasheet(name: str, episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]], failed: int) -> str:
@@ -88,12 +90,9 @@ def bodies_said(episodes: Sequence[Contents]) -> str:
 def collection(episodes: Sequence[Contents]) -> str:
     """How it came about, and what was drawn at random."""
     lines = ["## Collection\n", "A scripted tool moved on a simulated brain, and a camera drew what it would see.\n"]
-    for key, title in (
-        ("answered_by", "what moved the tissue"),
-        ("finite_elements", "what solved it"),
-        ("tool", "tool"),
-    ):
-        lines += [f"- {title}: {text} (in {count})" for text, count in Counter(map(str, said(episodes, key))).items()]
+    tools = [str(tool).partition("(")[0] for tool in said(episodes, "tool")]  # sizes are among what was drawn
+    lines += [*listed("what moved the tissue", said(episodes, "answered_by"))]
+    lines += [*listed("what solved it", said(episodes, "finite_elements")), *listed("tool", tools)]
     versions = sorted(set(map(str, said(episodes, "sulcus_version"))))
     dates = sorted(str(date)[:10] for date in said(episodes, "date"))
     if versions:
@@ -109,6 +108,15 @@ def collection(episodes: Sequence[Contents]) -> str:
     else:
         lines.append("\nNothing was drawn at random, or the files do not say what.")
     return "\n".join(lines) + "\n"
+
+
+def listed(title: str, texts: Sequence[Any]) -> Iterator[str]:
+    """Lines of how often there is what; of many different ones, those that are there most often."""
+    often = Counter(map(str, texts)).most_common()
+    yield from (f"- {title}: {text} (in {count})" for text, count in often[:MOST_LISTED])
+    if often[MOST_LISTED:]:
+        others = sum(count for _, count in often[MOST_LISTED:])
+        yield f"- {title}: {len(often) - MOST_LISTED} others (in {others})"
 
 
 def said(episodes: Sequence[Contents], key: str) -> list[Any]:
