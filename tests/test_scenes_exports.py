@@ -223,6 +223,8 @@ def test_a_card_is_kept_as_episodes_come(box, tmp_path):
     write_episode(tmp_path / "episode_000001.h5", box)
     (tmp_path / ".sulcus-00000000-1-episode_000002.h5").write_text("half")
     assert keep_card(tmp_path, False) is None and rows() == 2
+    written = (tmp_path / "DATASHEET.md").stat().st_mtime_ns
+    assert keep_card(tmp_path, False) is None and (tmp_path / "DATASHEET.md").stat().st_mtime_ns == written
     (tmp_path / "croissant.json").unlink()
     assert keep_card(tmp_path, False) is None and (tmp_path / "croissant.json").exists()
     (tmp_path / "LICENSE.md").write_text("mine")

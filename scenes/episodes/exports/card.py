@@ -19,7 +19,6 @@ from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from ..reading.validation import solved_figures
 from ..reading.windows import episode_paths
-from ..run_folder import EPISODE
 from .croissant import COLUMNS, croissant
 from .datasheet import MARK, NAME, datasheet
 from .tasks import task_of
@@ -102,7 +101,7 @@ def keep_card(folder: Path, changed: bool, progress: Callable[[Iterable], Iterab
     changed
         Whether episodes were made, or failed, since the card was written.
     """
-    there = {path.name: path.stat().st_size for path in folder.glob("*.h5") if EPISODE.fullmatch(path.name)}
+    there = {path.name: path.stat().st_size for path in folder.glob("*.h5") if not path.name.startswith(".")}
     if not there or not (changed or there != _listed(folder)):
         return None
     if len(there) > MOST_EPISODES:
