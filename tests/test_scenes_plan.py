@@ -18,6 +18,8 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity, pushed_effects
 from sim.errors import InputError
 from sim.material import BRAIN, Material
+from sim.runtime.device import find_device
+from sim.runtime.memory import check_fits
 from surrogate.data.stated_tissue import stated_tissue, stating
 from surrogate.model.applicability import refusal
 
@@ -147,6 +149,18 @@ def test_what_cannot_be_meshed_fails_with_its_reason(tmp_path):
     assert not list(body_path(tmp_path, 0).parent.iterdir())
     with pytest.raises(InputError, match="is no body of a data set"):
         make_episode(tmp_path, plan, 1, 0, "cpu")
+
+
+def test_want_of_memory_fails_no_body_for_good(tmp_path, monkeypatch):
+    """Others on the same card may leave: the error is passed on, and the engine tries again."""
+
+    def full(*args):
+        check_fits(10**9, 10**6, 1, find_device("cpu", "float64"))
+
+    monkeypatch.setattr("scenes.episodes.make.write_body", full)
+    with pytest.raises(InputError, match="are free"):
+        make_body(tmp_path, plan_from(TINY, "tiny"), 1, 0, "cpu")
+    assert not list(tmp_path.glob("bodies/*"))
 
 
 def test_a_model_knows_what_the_tumour_is_made_of():

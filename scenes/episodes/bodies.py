@@ -37,6 +37,8 @@ from .plan import Bodies, Plan, fields_of
 TRIES = 6
 PRESET = "palpation"
 NO_LEARNER = "none"
+TOGETHER = 512
+"""Load cases that a card solves together as a model is trained: other processes want its memory, too."""
 ANATOMY, ABOUT = "anatomy.vtu", "body.json"
 
 
@@ -177,6 +179,7 @@ def _train(body: Body, anatomy: Anatomy, plan: Plan, seed: int, number: int, dev
     data = body.folder / "training.h5"
     simulate(data, fem, draw_loads(PRESET, anatomy, learner.loads, first), stated)
     known = read_dataset(data)
-    trained = train(known, [learner.name], expansion=Expansion(known, device))
+    batch = TOGETHER if fem.problem.device.on_cuda else None
+    trained = train(known, [learner.name], expansion=Expansion(known, device, batch=batch))
     save(model_path(body.anatomy), trained.models)
     data.unlink()

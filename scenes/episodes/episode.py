@@ -206,7 +206,8 @@ def encoded(frame: Frame, player: Player, recording: Recording, right: Stage | N
 
 
 def _jpeg(colour: np.ndarray) -> np.ndarray:
-    return cv2.imencode(".jpg", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].ravel()
+    read = cv2.cvtColor(colour, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", read, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].ravel()
 
 
 def _right(player: Player, frame: Frame) -> Camera:

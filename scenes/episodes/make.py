@@ -31,6 +31,8 @@ from .tasks import Made
 
 KEPT = 2
 """Bodies that a process keeps open, and finite elements that each of them keeps."""
+PASSING = OSError, MemoryError
+"""The fault of the disk, or of others on the same card: another try may have more luck."""
 
 
 def episode_path(folder: Path, number: int) -> Path:
@@ -65,7 +67,7 @@ def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "a
         if not path.exists():
             partial.rename(path)
     except InputError as error:
-        if isinstance(error.__cause__, OSError):  # the disk's fault, and not the body's
+        if isinstance(error.__cause__, PASSING):
             raise
         return Made(path, failed=str(error))
     except OSError:
@@ -88,7 +90,7 @@ def make_episode(folder: Path, plan: Plan, seed: int, number: int, device: str =
     try:
         report = _collected(path, plan, seed, number, body_path(folder, body_of(plan, seed, number)), device)
     except InputError as error:
-        if isinstance(error.__cause__, OSError):  # the disk's fault, and not the episode's
+        if isinstance(error.__cause__, PASSING):
             raise
         return Made(path, failed=str(error))
     return Made(path, int(str(report["frames"])), path.stat().st_size)

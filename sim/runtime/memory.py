@@ -79,7 +79,7 @@ def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0,
     Raises
     ------
     InputError
-        Naming what it takes, what is free, and what would fit.
+        Naming what it takes, what is free, and what would fit. Its cause is a MemoryError: others may leave, and it fits.
     """
     column = column_bytes(rows, device)
     free = host_bytes(budget)  # read once: Linux counts for a good part of a millisecond
@@ -90,7 +90,7 @@ def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0,
         raise InputError(
             f"the answers to {count} loads take about {gigabytes(answers)}, and {gigabytes(host)} are free: "
             + (f"solve at most {fitting} at a time." if fitting > 0 else COARSER)
-        )
+        ) from MemoryError()
     available = free_bytes(device) if device.on_cuda else free
     room = budget.share * available + held - (0 if device.on_cuda else answers)
     columns = min(batch, count)
@@ -101,7 +101,7 @@ def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0,
         raise InputError(
             f"a batch of {columns} loads takes about {gigabytes(taken)}, and {gigabytes(max(room, 0.0))} "
             f"are free: {remedy}"
-        )
+        ) from MemoryError()
 
 
 def column_bytes(rows: int, device: Device) -> int:

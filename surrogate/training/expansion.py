@@ -71,6 +71,8 @@ class Expansion:
         Where the series' table is read from, and written to where there is none: of these data, as the caller knows.
     most_pairs
         Of force components, for which the second order is had: so many take minutes, and 60 MB of a model.
+    batch
+        Most load cases that are solved together; None: as many as fit now, on a card that is nobody else's.
     """
 
     data: Dataset
@@ -78,6 +80,7 @@ class Expansion:
     progress: Callable[[int, int], object] = lambda done, total: None
     kept: Path | None = None
     most_pairs: int = 150_000
+    batch: int | None = None
 
     @cached_property
     def patch(self) -> Patch:
@@ -292,7 +295,7 @@ class Expansion:
                 "choose other learners, or simulate anew."
             )
         effects = pushed_effects(self.data.anatomy, stated_tissue(stated), trained_skull(stated))
-        return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=stated.get("element"))
+        return Fem(self.data.anatomy, effects, REFERENCE, self.device, self.batch, stated.get("element"))
 
 
 @dataclass(frozen=True, eq=False)
