@@ -79,7 +79,7 @@ def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0,
     Raises
     ------
     InputError
-        Naming what it takes, what is free, and what would fit. Its cause is a MemoryError: others may leave, and it fits.
+        Naming what it takes, what is free, and what would fit. Its cause is a MemoryError: others may leave.
     """
     column = column_bytes(rows, device)
     free = host_bytes(budget)  # read once: Linux counts for a good part of a millisecond
