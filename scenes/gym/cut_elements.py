@@ -1,0 +1,117 @@
+"""A brain that sinks as its fluid drains and its tumour is cut, as finite elements answer it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from sim.anatomy import TUMOUR_LABEL
+from sim.deformation import Deformation
+from sim.geometry.closest_point import closest
+from sim.geometry.surface import vertex_normals
+from sim.geometry.tetmesh import TetMesh
+from sim.loads import Loads, Resected
+from sim.resected_fem import Operated
+
+from ..script.head_posture import Lying
+from ..script.site import Site
+from .hertz import Hertz
+from .touched import Asked, Touched
+
+# Levels of the fluid that are solved, as a share of its height; between them answers are interpolated.
+APART = 0.1
+# Healthy tissue is looked for so far [m] from the way to the tumour, and from the tumour.
+AROUND = 0.03
+
+
+class Healthy(NamedTuple):
+    """The surface (S, 3) of the healthy tissue that is left near the tumour; outward normals (V, 3) at rest."""
+
+    triangles: np.ndarray
+    normals: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CutElements:
+    """Finite elements under weight, at levels of the fluid and after steps of the resection; each is solved once.
+
+    The tool is a ball that meets healthy tissue as `Hertz` has it. The tumour lets it in, and the tool does not move the
+    tissue.
+
+    Parameters
+    ----------
+    site
+        The open cortex.
+    fem
+        Of the resection.
+    ball
+        The tool's, on the brain's tissue.
+    """
+
+    site: Site
+    fem: Operated
+    ball: Hertz
+    _solved: dict[tuple[int, int], Deformation] = field(default_factory=dict)
+    _surfaces: dict[int, Healthy] = field(default_factory=dict)
+
+    def answer(self, asked: Sequence[Asked]) -> list[Touched]:
+        """As `Answers.answer`: what others asked before changes nothing, for levels are solved in one order."""
+        return [self._touched(each) for each in asked]
+
+    def _touched(self, asked: Asked) -> Touched:
+        level = (1.0 - asked.fluid) / APART
+        low = int(level)
+        share = level - low
+        motion = self._at(low, asked.done).displacement[0]
+        if share > 0.0:
+            motion = (1.0 - share) * motion + share * self._at(low + 1, asked.done).displacement[0]
+        force = self._force(asked.pose, asked.done, motion)
+        size = float(np.linalg.norm(force))
+        good = all(self._at(low + more, asked.done).outcome[0].good for more in range(2 if share > 0.0 else 1))
+        return Touched(motion, np.arange(len(motion)), force, self.ball.pressure(size), good)
+
+    def _at(self, level: int, done: int) -> Deformation:
+        """The answer so many levels below the scan's, from the one above; after more steps, from that after fewer."""
+        key = level, done
+        if key not in self._solved:
+            start = None
+            if done > 1:
+                start = self._at(level, done - 1)
+            elif level > 0:
+                start = self._at(level - 1, done)
+            posture = Lying(fluid=1.0 - APART * level).posture(self.site.anatomy.mesh.nodes)
+            self._solved[key] = self.fem.deform(Loads((posture, Resected(np.array([float(done)])))), start)
+        return self._solved[key]
+
+    def _force(self, pose: np.ndarray, done: int, motion: np.ndarray) -> np.ndarray:
+        """That the ball exerts on healthy tissue (3,) [N]."""
+        healthy, nodes = self._healthy(done), self.site.anatomy.mesh.nodes
+        radius = self.ball.radius
+        middle = pose[:3, 3] + radius * pose[:3, 2]
+        near = closest(middle[None], (nodes + motion)[healthy.triangles])
+        corners = healthy.triangles[near.triangle[0]]
+        outward = near.weights[0] @ healthy.normals[corners]
+        outward /= np.linalg.norm(outward)
+        away = middle - near.point[0]
+        distance = float(np.copysign(np.linalg.norm(away), away @ outward))
+        return -float(self.ball.force(np.array(radius - distance))) * outward
+
+    def _healthy(self, done: int) -> Healthy:
+        """After so many steps."""
+        if done not in self._surfaces:
+            self._surfaces[done] = self._near(done)
+        return self._surfaces[done]
+
+    def _near(self, done: int) -> Healthy:
+        left = self.fem.remains(done).anatomy.mesh
+        brain = left.region != TUMOUR_LABEL
+        surface = TetMesh(left.nodes, left.tets[brain], left.region[brain]).surface
+        tumour = self.site.anatomy.tumour_nodes
+        way = np.linspace(self.site.origin, left.nodes[tumour].mean(axis=0), 8)
+        middle = left.nodes[surface].mean(axis=1)
+        around = np.concatenate([way, left.nodes[tumour]])
+        near = np.linalg.norm(middle[:, None] - around, axis=2).min(axis=1) < AROUND
+        return Healthy(surface[near], vertex_normals(left.nodes, surface))

@@ -1,0 +1,203 @@
+"""One episode of one environment: its goal, the hand, what was reached, and what that is worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sim.errors import InputError
+
+from ..script.camera_paths import wandering
+from ..script.tool_paths import smooth
+from .observation import FELT, SEEN, TRACKED, states
+from .reward import Judged, earned
+from .pictures import Seen
+from .setting import Setting
+from .tasks import OVER, SECONDS, Goal
+from .tool_motion import Hand, frame_of, laid, lever_of, moved, trembling
+from .touched import Asked, Touched
+
+# A hand trembles by up to so much [m, standard deviation]; tools begin so far above the cortex, and so far aside [m].
+TREMOR, ABOVE, ASIDE = 1e-4, (5e-3, 8e-3), (3e-3, 8e-3)
+# The fluid falls within so many steps.
+DRAINS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What a step brought: the state (24,), its reward, whether the episode is over, and the truth."""
+
+    states: np.ndarray
+    reward: float
+    terminated: bool
+    info: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What is left to chance in an episode: goal, first posture, the tremor's seed and its size [m]."""
+
+    goal: Goal
+    hand: Hand
+    seed: int
+    tremor: float
+
+
+def draw(setting: Setting, random: np.random.Generator) -> Drawn:
+    """Draw an episode."""
+    goal, site, tool = setting.goal(random), setting.site, setting.task.tool
+    high, far, angle, size = random.random(4)
+    aside = ASIDE[0] + far * (ASIDE[1] - ASIDE[0])
+    x, y = ((goal.place - site.origin) @ axis for axis in (site.right, site.up))
+    x, y = x + aside * np.cos(2.0 * np.pi * angle), y + aside * np.sin(2.0 * np.pi * angle)
+    under = site.contact(float(x), float(y), tool.radius).point
+    tip = under - (ABOVE[0] + high * (ABOVE[1] - ABOVE[0])) * site.axis
+    return Drawn(goal, laid(site, tool, tip), int(random.integers(2**31)), TREMOR * float(size))
+
+
+class Episode:
+    """The episodes of an environment, one after the other: `begin` comes first, then `ask`; `take` after each.
+
+    Parameters
+    ----------
+    setting
+        Task and body.
+    steps
+        That an episode has; observations hold the share that is over.
+    """
+
+    def __init__(self, setting: Setting, steps: int):
+        self.setting, self.steps = setting, steps
+        self.frame = frame_of(setting.site)
+        self.drawn: Drawn | None = None
+        self.over = True
+
+    def begin(self, random: np.random.Generator) -> Asked:
+        """Draw an episode; what is asked of the tissue as it begins."""
+        self.random, self.drawn = random, draw(self.setting, random)
+        self.hand, self.touched, self.judged = self.drawn.hand, None, None
+        self.step, self.held, self.violations, self.cut, self.over = 0, 0, 0, 0, False
+        self.patch = self.setting.near(self.drawn.goal.place)
+        return self._asked(self.drawn)
+
+    def ask(self, action: np.ndarray) -> Asked:
+        """Move the tool; what is asked of the tissue then.
+
+        Raises
+        ------
+        InputError
+            An action that is not six finite numbers; an episode that is over, or did not begin.
+        """
+        if self.over or self.drawn is None:
+            raise InputError("this episode is over, or did not begin: call reset().")
+        twist = np.array(action, np.float64)
+        if twist.shape != (6,) or not np.isfinite(twist).all():
+            raise InputError(f"the action {np.array2string(twist, threshold=12)} is none: give six finite numbers.")
+        task = self.setting.task
+        twist = np.clip(twist, -1.0, 1.0) * np.repeat([task.step, task.turn], 3)
+        self.hand = moved(self.hand, self.setting.site, task.tool, twist, task.tilt, task.deepest)
+        self.step += 1
+        return self._asked(self.drawn)
+
+    def _asked(self, drawn: Drawn) -> Asked:
+        task = self.setting.task
+        offset = drawn.tremor * self.frame @ wandering(drawn.seed, SECONDS * self.step)[:3]
+        self.actual = trembling(self.hand, offset)
+        fluid = 1.0 - (1.0 - drawn.goal.fluid) * smooth(self.step / DRAINS)
+        return Asked(self.actual.pose(task.tool), self.touched, fluid, self.done)
+
+    @property
+    def done(self) -> int:
+        """Steps of the resection that are done: the corridor is cut before an episode begins."""
+        return self.cut + 1 if self.setting.task.cuts else 0
+
+    @property
+    def seen(self) -> Seen:
+        """What a picture shows.
+
+        Raises
+        ------
+        InputError
+            No episode has begun.
+        """
+        if self.touched is None:
+            raise InputError("no episode has begun: call reset() before render().")
+        return self.touched, self.actual.pose(self.setting.task.tool), self.shown
+
+    def take(self, touched: Touched) -> Step:
+        """What a step brought, by the tissue's answer."""
+        assert self.drawn is not None
+        task, goal, self.shown = self.setting.task, self.drawn.goal, self.done
+        target = self._target(touched)
+        judged = self._judge(touched, target)
+        kept = judged.away <= task.aside and judged.off <= task.tolerance and judged.load <= 1.0
+        self.held = self.held + 1 if kept else 0
+        success = self.held >= task.held
+        if success and task.cuts:
+            self.cut, self.held = self.cut + 1, 0
+            success = self.cut >= goal.amount
+            judged = self._judge(touched, target)
+        ended = judged.load > OVER or not touched.good
+        reward = 0.0 if self.judged is None else earned(self.judged, judged, success, ended)
+        self.violations += int(judged.load > 1.0)
+        self.touched, self.judged, self.over = touched, judged, success or ended
+        return Step(self._states(touched), reward, success or ended, self._truth(touched, target, success))
+
+    def _target(self, touched: Touched) -> np.ndarray:
+        """Where the tool should be (3,) [m]: over the goal's place, or at the next share where it is now."""
+        assert self.drawn is not None
+        if not self.setting.task.cuts:
+            return self.drawn.goal.place
+        shares = self.setting.shares
+        vertices = shares[min(self.cut, len(shares) - 1)]
+        return (self.setting.site.anatomy.mesh.nodes[vertices] + touched.motion[vertices]).mean(axis=0)
+
+    def _judge(self, touched: Touched, target: np.ndarray) -> Judged:
+        assert self.drawn is not None
+        task, goal, axis = self.setting.task, self.drawn.goal, self.setting.site.axis
+        size = float(np.linalg.norm(touched.force))
+        load = max(size / task.force, touched.pressure / task.pressure)
+        if task.cuts:
+            return Judged(float(np.linalg.norm(self.actual.place - target)), 0.0, self.cut, load)
+        tip = self.actual.place + lever_of(task.tool) * axis
+        along = float((target - tip) @ axis)
+        aside = float(np.linalg.norm(target - tip - along * axis))
+        away = float(np.hypot(aside, max(along, 0.0) if size == 0.0 else 0.0))
+        return Judged(away, abs(self._reached(touched) - goal.amount) / goal.amount, 0, load)
+
+    def _reached(self, touched: Touched) -> float:
+        """The force [N], the shift [m], or the shares so far, that a goal's amount is held against."""
+        assert self.drawn is not None
+        if self.setting.task.cuts:
+            return float(self.cut)
+        if self.setting.task.forward == 0.0:
+            return float(np.linalg.norm(touched.force))
+        row = np.searchsorted(touched.nodes, self.patch)
+        return float(touched.motion[row].mean(axis=0) @ self.drawn.goal.direction)
+
+    def _states(self, touched: Touched) -> np.ndarray:
+        assert self.drawn is not None
+        task, goal = self.setting.task, self.drawn.goal
+        cortex = touched.motion[np.searchsorted(touched.nodes, self.setting.cortex)].mean(axis=0)
+        noise = self.random.standard_normal((3, 3))
+        tracked = trembling(self.actual, TRACKED * noise[0])
+        sensed = np.stack([touched.force, cortex]) + np.array([[FELT], [SEEN]]) * noise[1:]
+        done = self.cut / goal.amount if task.cuts else self.held / task.held
+        share = self.step / self.steps
+        return states(task, goal, tracked, sensed, share, done, self.frame, self.setting.site.origin)
+
+    def _truth(self, touched: Touched, target: np.ndarray, success: bool) -> dict[str, Any]:
+        """What no robot has: see the docs. Arrays are new in each step."""
+        assert self.judged is not None and self.drawn is not None
+        setting = self.setting
+        tumour = setting.site.anatomy.tumour_nodes
+        now = setting.site.anatomy.mesh.nodes[tumour] + touched.motion[np.searchsorted(touched.nodes, tumour)]
+        return {
+            "pose": self.actual.pose(setting.task.tool), "force": touched.force.copy(), "pressure": touched.pressure,
+            "tumour_nodes": now, "tumour_middle": now.mean(axis=0), "model_error": touched.error,
+            "target": target.copy(), "away": self.judged.away, "asked": float(self.drawn.goal.amount),
+            "reached": self._reached(touched), "load": self.judged.load, "violations": self.violations,
+            "success": success, "reliable": touched.good, "steps_done": self.shown,
+        }  # fmt: skip

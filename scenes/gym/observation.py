@@ -1,0 +1,68 @@
+"""What a robot has of an episode: poses as tracked, forces as read, the plan's goal, and pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium import spaces
+
+from .tasks import Goal, Task
+from .tool_motion import Hand
+
+KINDS = ("states", "rgbd")
+"""What observations may be."""
+LENGTH = 0.01
+"""What is 1 in an observation [m]."""
+TRACKED, FELT, SEEN = 1e-4, 2e-3, 2e-4
+"""Standard deviations of a tracked place [m], a force's component [N], and a seen motion of the cortex [m]."""
+BOUND = 10.0
+"""No number of an observation is larger; what would be is cut off there."""
+COUNT = 24
+"""Numbers of a state."""
+FARTHEST = 2.0
+"""Depths of pictures are less [m]."""
+
+
+def space_of(kind: str, size: tuple[int, int]) -> spaces.Space:
+    """The space of observations of one of `KINDS`, with pictures of a width and height [pixel]."""
+    states = spaces.Box(-BOUND, BOUND, (COUNT,), np.float32)
+    if kind == "states":
+        return states
+    width, height = size
+    return spaces.Dict(
+        {
+            "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
+            "depth": spaces.Box(0.0, FARTHEST, (height, width), np.float32),
+            "states": states,
+        }
+    )
+
+
+def states(
+    task: Task, goal: Goal, hand: Hand, sensed: np.ndarray, share: float, done: float, frame: np.ndarray,
+    origin: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Numbers (24,) float32 of a state, in the frame (3, 3) of twists, from the open cortex's middle (3,) [m].
+
+    Parameters
+    ----------
+    hand
+        As it is tracked.
+    sensed
+        Force on the tissue [N] and motion of the open cortex [m] as they are read (2, 3).
+    share
+        Of the episode's steps that are over.
+    done
+        Share of what is to be done that is kept up, or cut.
+    """
+    parts = (
+        (hand.place - origin) @ frame / LENGTH,
+        (frame.T @ hand.turned)[:, :2].T.ravel(),
+        sensed[0] @ frame / task.force,
+        [share],
+        (goal.place - origin) @ frame / LENGTH,
+        goal.direction @ frame,
+        [goal.amount / task.unit],
+        [done],
+        sensed[1] @ frame / LENGTH,
+    )
+    return np.clip(np.concatenate(parts), -BOUND, BOUND).astype(np.float32)

@@ -1,0 +1,111 @@
+"""A ball that is moved, as a model that was trained on forces answers it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sim.geometry.closest_point import closest
+from sim.loads import Loads, Pushed, Touching
+from sim.tools import Ball
+from surrogate.data.cortex_patch import Patch, open_patch
+from surrogate.data.indentation import indented
+from surrogate.model.learned import Learned
+
+from ..script.site import Site
+from .hertz import Hertz
+from .touched import Asked, Touched
+
+# How near to its depth a ball must come [m], and within how many tries.
+NEAR, TRIES = 1e-5, 12
+# Times the strongest force of the training, beyond which none is looked for.
+STRONGEST = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class PressedModel:
+    """Finds the force under which the model has the cortex just where the ball is.
+
+    The force acts at the place of the cortex at rest that is nearest to the ball's middle, straight away from that. The
+    footprint is as wide as the contact of `Hertz`. Where the model knows only wider ones, the ball's middle is deeper by
+    what Hertz's formula has between both.
+
+    Parameters
+    ----------
+    site
+        The open cortex.
+    model
+        Trained on pushes.
+    ball
+        The tool's, on the model's tissue.
+    together
+        Whether all are answered at once.
+    """
+
+    site: Site
+    model: Learned
+    ball: Hertz
+    together: bool = False
+
+    @cached_property
+    def _patch(self) -> Patch:
+        return open_patch(self.site.anatomy)
+
+    def answer(self, asked: Sequence[Asked]) -> list[Touched]:
+        """As `Answers.answer`."""
+        poses = np.stack([each.pose for each in asked])
+        parts = [poses] if self.together else np.split(poses, len(poses))
+        return [touched for part in parts for touched in self._answered(part)]
+
+    def _answered(self, poses: np.ndarray) -> list[Touched]:
+        """Of tools at poses (B, 4, 4), all at once."""
+        near = indented(Loads((Touching(poses[:, None]),)), Ball(self.ball.radius), self._patch)
+        depth = np.linalg.norm(near.force, axis=1)
+        inward = np.divide(near.force, depth[:, None], out=np.zeros_like(near.force), where=depth[:, None] > 0.0)
+        size, found = np.zeros(len(poses)), np.ones(len(poses), bool)
+        rows = np.flatnonzero(depth > 0.0)
+        if len(rows):
+            size[rows], found[rows] = self._forces(near.point[rows], inward[rows], depth[rows])
+        answer = self.model.deform(self._loads(near.point, inward, size))
+        stated = np.where(np.isfinite(answer.bound[0]), answer.bound[0], self.model.bound)
+        return [
+            Touched(
+                answer.displacement[row], answer.nodes, size[row] * inward[row], self.ball.pressure(float(size[row])),
+                bool(found[row]), float(stated[row]) if size[row] > 0.0 else 0.0,
+            )
+            for row in range(len(poses))
+        ]  # fmt: skip
+
+    def _loads(self, point: np.ndarray, inward: np.ndarray, size: np.ndarray) -> Loads:
+        """Pushes of sizes (k,) [N], each on a footprint as wide as its contact, as far as the model knows such."""
+        return Loads((Pushed(point, size[:, None] * inward, self._footprint(size)),))
+
+    def _footprint(self, size: np.ndarray) -> np.ndarray:
+        return np.clip(self.ball.contact(size), *self.model.envelope.footprint)
+
+    def _forces(self, point: np.ndarray, inward: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sizes (k,) [N] of forces at points (k, 3), and whether each brings a ball to its depth (k,) [m]: by secants."""
+        patch, rows = self._patch, np.arange(len(depth))
+        place = closest(point, patch.points[patch.triangles])
+        corners, most = patch.triangles[place.triangle], STRONGEST * self.model.envelope.force[1]
+
+        def off(size: np.ndarray) -> np.ndarray:
+            """How much deeper than it is a ball would be under forces (k,) [m]."""
+            moved = self.model.deform(self._loads(point, inward, size), at=patch.nodes).displacement
+            there = np.einsum("kc,kci,ki->k", place.weights, moved[rows[:, None], corners], inward)
+            return there + self.ball.deeper(size, self._footprint(size)) - depth
+
+        before, short = np.zeros(len(depth)), -depth
+        size = np.minimum(self.ball.force(depth), most)
+        for _ in range(TRIES):
+            now = off(size)
+            near = np.abs(now) < NEAR
+            if near.all():
+                break
+            slope = np.where(near, np.inf, now - short) / np.where(near | (size == before), 1.0, size - before)
+            # What is found stays: what is answered beside it changes nothing.
+            before, short, size = size, now, np.where(near, size, np.clip(size - now / slope, 0.0, most))
+        return size, np.abs(off(size)) < NEAR

@@ -1,0 +1,34 @@
+"""The names by which `gymnasium.make` finds the environments."""
+
+from __future__ import annotations
+
+from sim.errors import InputError
+
+NAMESPACE = "sulcus"
+NAMES = ("Palpate", "Retract", "Debulk")
+STEPS = 200
+"""Steps after which an episode is cut short."""
+
+
+def register_environments() -> None:
+    """Register the environments, unless they are; Gymnasium does so by itself where sulcus is installed.
+
+    Raises
+    ------
+    InputError
+        Gymnasium is not installed.
+    """
+    try:
+        from gymnasium.envs.registration import register, registry
+    except ImportError as error:
+        raise InputError('these environments need Gymnasium. Install it: pip install "sulcus[gym]".') from error
+    for name in NAMES:
+        known = f"{NAMESPACE}/{name}-v0"
+        if known not in registry:
+            register(
+                known,
+                "scenes.gym.environment:Operation",
+                max_episode_steps=STEPS,
+                kwargs={"task": name.lower()},
+                vector_entry_point="scenes.gym.vector:Operations",
+            )

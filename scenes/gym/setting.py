@@ -1,0 +1,177 @@
+"""What the environments of one task on one body share: the body, its tissue, and what a goal may be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from sim.accuracy import LIVE
+from sim.anatomy import TUMOUR_LABEL
+from sim.effects import Bonded, Elasticity, Held, ToolForce
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.runtime.device import find_device
+
+from ..play.deformers import Theatre, open_theatre
+from ..play.stage import Stage
+from ..script.scene import Scene
+from ..script.site import Site
+from ..script.tool import Probe
+from .cut_elements import CutElements
+from .hertz import Hertz
+from .posed_elements import PosedElements
+from .pressed_model import PressedModel
+from .tasks import Goal, Task
+from .touched import Answers
+
+PHYSICS = ("auto", "model", "fem")
+TEMPLATE = "template"
+# A goal lies within so far of the place over the tumour's middle [m].
+SPREAD = 6e-3
+# A drained fluid stands so high at least, and at most, as a share of its height.
+LOWEST, HIGHEST = 0.6, 0.9
+# The patch of cortex whose shift counts has this radius [m].
+PATCH = 8e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """A task on a body.
+
+    Parameters
+    ----------
+    task, scene, theatre
+        What is done, in which scene, and on which body.
+    answers
+        Who answers the tool.
+    """
+
+    task: Task
+    scene: Scene
+    theatre: Theatre
+    answers: Answers
+
+    @property
+    def site(self) -> Site:
+        """The open cortex."""
+        return self.theatre.site
+
+    @cached_property
+    def stage(self) -> Stage:
+        """What is drawn."""
+        return self.theatre.stage(self.scene)
+
+    @cached_property
+    def cortex(self) -> np.ndarray:
+        """Mesh vertices (n,) of the open cortex."""
+        return np.unique(self.site.anatomy.open_surface)
+
+    @cached_property
+    def middle(self) -> np.ndarray:
+        """The tumour's in the scan (3,) [m]."""
+        return self.site.anatomy.mesh.nodes[self.site.anatomy.tumour_nodes].mean(axis=0)
+
+    @cached_property
+    def shares(self) -> tuple[np.ndarray, ...]:
+        """Mesh vertices of the tetrahedra of each share that is cut, in turn."""
+        surgery = self.task.surgery
+        if surgery is None:
+            return ()
+        mesh = self.site.anatomy.mesh
+        return tuple(mesh.tets[list(step)].ravel() for step in surgery.resection(self.site.anatomy).steps[1:])
+
+    def near(self, place: np.ndarray) -> np.ndarray:
+        """Vertices (n,) of the open cortex within `PATCH` of a place (3,) [m], or the nearest one."""
+        away = np.linalg.norm(self.site.anatomy.mesh.nodes[self.cortex] - place, axis=1)
+        return self.cortex[away <= max(PATCH, away.min())]
+
+    def goal(self, random: np.random.Generator) -> Goal:
+        """Draw a goal; every task takes as many numbers."""
+        far, angle, turn, amount, more = random.random(5)
+        task, site = self.task, self.site
+        arm = self.middle - site.origin
+        offset = SPREAD * np.sqrt(far) * np.array([np.cos(2.0 * np.pi * angle), np.sin(2.0 * np.pi * angle)])
+        place = site.contact(float(arm @ site.right + offset[0]), float(arm @ site.up + offset[1]), task.tool.radius)
+        size = task.amount[0] + amount * (task.amount[1] - task.amount[0])
+        if task.cuts:
+            return Goal(self.middle, site.axis, size, LOWEST + more * (HIGHEST - LOWEST))
+        lean, turn = task.forward * more, 2.0 * np.pi * turn
+        sideways = np.cos(turn) * site.right + np.sin(turn) * site.up
+        return Goal(place.point, np.cos(lean) * site.axis + np.sin(lean) * sideways, size)
+
+
+@lru_cache(maxsize=8)
+def open_setting(task: Task, anatomy: str, physics: str, device: str, size: tuple[int, int]) -> Setting:
+    """A task on a body, read once for all environments of a process.
+
+    Parameters
+    ----------
+    anatomy
+        "template", or the path of a .vtu file; models beside it are used.
+    physics
+        "model": the best trained model of pushes, where the task is a push with a ball. "fem": finite elements. "auto":
+        the model where there is one.
+    device
+        As of `Fem`.
+    size
+        Width and height of pictures [pixel].
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read; a body without tumour or open cortex; a model that is not there; a device that is
+        not there.
+    """
+    theatre = _theatre(anatomy, device)
+    if not (theatre.anatomy.mesh.region == TUMOUR_LABEL).any():
+        raise InputError(f"{anatomy}: has no tumour, at which these tasks aim. Mesh one that has region {TUMOUR_LABEL}.")
+    scene, tool = task.scene(size), task.tool
+    card = find_device(device, LIVE.precision).name != "cpu"
+    tissue = next(effect.default for effect in scene.effects if isinstance(effect, Elasticity))
+    assert tissue is not None
+    ball = Hertz(tool.radius, tissue) if isinstance(tool, Probe) else None
+    pushes = Scene(task.name, task.title, effects=(Elasticity(tissue), Held(), Bonded(), ToolForce()), tool=tool)
+    models = {} if ball is None or task.cuts else theatre.knowing(pushes)
+    if physics == "model" and not models:
+        raise InputError(
+            f"physics='model': no trained model beside {anatomy} answers the task {task.name}. Give physics='fem', or "
+            "for palpate train one with `sulcus train`."
+        )
+    if models and ball is not None and physics != "fem":
+        model = min(models.values(), key=lambda each: each.bound)
+        return Setting(task, scene, theatre, PressedModel(theatre.site, model, ball, card))
+    fem = theatre.fem(scene, LIVE, batch=64 if card else 1, live=not card)
+    if isinstance(fem, Fem):
+        return Setting(task, scene, theatre, PosedElements(fem, ball, card))
+    assert ball is not None
+    return Setting(task, scene, theatre, CutElements(theatre.site, fem, ball))
+
+
+@lru_cache(maxsize=4)
+def _theatre(anatomy: str, device: str) -> Theatre:
+    return open_theatre(None if anatomy == TEMPLATE else Path(anatomy), None, device)
+
+
+def checked(given: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int]]:
+    """Arguments `anatomy`, `physics`, `device` and `size` as `open_setting` takes them.
+
+    Raises
+    ------
+    InputError
+        What is none of those.
+    """
+    anatomy, physics, device, size = (given[name] for name in ("anatomy", "physics", "device", "size"))
+    if not isinstance(anatomy, str | Path):
+        raise InputError(f"anatomy is {anatomy!r:.80}: give 'template', or the path of a .vtu file.")
+    if physics not in PHYSICS:
+        raise InputError(f"physics is {physics!r:.80}: choose one of {', '.join(PHYSICS)}.")
+    if not isinstance(device, str):
+        raise InputError(f"device is {device!r:.80}: give auto, cpu, cuda or cuda:1.")
+    sides = tuple(size) if isinstance(size, tuple | list) else ()
+    if len(sides) != 2 or not all(type(side) is int and 16 <= side <= 4096 for side in sides):
+        raise InputError(f"size is {size!r:.80}: give width and height in pixels, each from 16 to 4096.")
+    return str(anatomy), str(physics), device, (sides[0], sides[1])

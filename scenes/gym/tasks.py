@@ -1,0 +1,151 @@
+"""The tasks: which tool, how far it goes in a step, what it must not exceed, and the tissue that it meets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.effects import Bonded, Elasticity, Gravity, Held, SkullContact, ToolContact
+from sim.errors import InputError
+from sim.material import MATERIALS
+
+from ..script.debulking import Debulking
+from ..script.scene import Scene
+from ..script.tool import Blade, Instrument, Probe
+from ..script.viewpoint import Viewpoint
+
+SECONDS = 0.05
+"""How long a step lasts [s]."""
+OVER = 1.25
+"""An episode ends at so many times a limit."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What is asked for in an episode, as the plan of the operation has it.
+
+    Parameters
+    ----------
+    place
+        (3,) [m] in the scan.
+    direction
+        (3,) unit vector: which way tissue is pressed or drawn.
+    amount
+        The force [N], the distance [m], or the shares, that are asked for.
+    fluid
+        Share of its height to which the fluid falls.
+    """
+
+    place: np.ndarray
+    direction: np.ndarray
+    amount: float
+    fluid: float = 1.0
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task of an environment; lengths in metres.
+
+    Parameters
+    ----------
+    name, title
+        In lower case; what is to be done.
+    tool
+        What the robot holds.
+    force, pressure
+        Limits of the force on the tissue [N], and of the pressure under the tool [Pa].
+    amount
+        Least and greatest that a goal asks for, in its own unit; `unit` is what an observation has as 1.
+    tolerance
+        How far off it may be, as a share of what is asked for.
+    aside
+        How far the tool may be from its place [m].
+    held
+        Steps that it must be kept up.
+    forward
+        Of a push: its greatest angle against the inward axis [rad].
+    step, turn
+        What an action of 1 moves [m] and turns [rad].
+    tilt
+        How far the tool may lean from its first posture [rad].
+    deepest
+        How far below the middle of the open cortex it may go [m].
+    cuts
+        Whether tissue is taken away.
+    """
+
+    name: str
+    title: str
+    tool: Instrument
+    force: float
+    pressure: float
+    amount: tuple[float, float]
+    unit: float
+    tolerance: float
+    aside: float
+    held: int
+    forward: float = 0.0
+    step: float = 1e-3
+    turn: float = float(np.radians(2.0))
+    tilt: float = float(np.radians(40.0))
+    deepest: float = 0.02
+    cuts: bool = False
+
+    @property
+    def surgery(self) -> Debulking | None:
+        """What is cut: after the corridor, share after share; the last is left."""
+        return Debulking(tuple(float(each) for each in range(int(self.amount[1]) + 1))) if self.cuts else None
+
+    def scene(self, size: tuple[int, int]) -> Scene:
+        """The scene that it is played in, with pictures of a width and height [pixel]."""
+        view = Viewpoint(width=size[0], height=size[1])
+        if self.cuts:
+            effects = Elasticity(MATERIALS["drained"].tissue), Held(), SkullContact(), Gravity()
+            return Scene(
+                self.name, self.title, effects=effects, tool=self.tool, surgery=self.surgery, viewpoint=view,
+                element="p1",
+            )  # fmt: skip
+        effects = Elasticity(), Held(), Bonded(), ToolContact((self.tool.shape,))
+        return Scene(self.name, self.title, effects=effects, tool=self.tool, viewpoint=view)
+
+
+@dataclass(frozen=True)
+class Aspirator(Probe):
+    """The tip of an ultrasonic aspirator: a small ball on a straight, thin shaft."""
+
+    radius: float = 2e-3
+    shaft: float = 1e-3
+    length: float = 0.14
+    lean: float = 0.1
+
+
+PALPATE = Task(
+    "palpate", "Press on the cortex over the tumour with the force that is asked for, and hold it.",
+    Probe(radius=6e-3), force=0.25, pressure=2.7e3, amount=(0.06, 0.15), unit=0.25, tolerance=0.15, aside=3e-3, held=5,
+)  # fmt: skip
+RETRACT = Task(
+    "retract", "Lay a spatula on the cortex, draw it aside as far as is asked for, and hold it.",
+    Blade(), force=0.5, pressure=4e3, amount=(1.5e-3, 3.5e-3), unit=5e-3, tolerance=0.15, aside=6e-3, held=5,
+    forward=float(np.radians(30.0)),
+)  # fmt: skip
+DEBULK = Task(
+    "debulk", "Follow the tumour as it sinks, and suck it out share by share, without pressing on healthy tissue.",
+    Aspirator(), force=0.02, pressure=2e3, amount=(3.0, 3.0), unit=3.0, tolerance=0.0, aside=4e-3, held=5,
+    deepest=0.06, cuts=True,
+)  # fmt: skip
+TASKS = {task.name: task for task in (PALPATE, RETRACT, DEBULK)}
+"""By name."""
+
+
+def find_task(name: object) -> Task:
+    """A task by name.
+
+    Raises
+    ------
+    InputError
+        There is none of that name.
+    """
+    if isinstance(name, str) and name in TASKS:
+        return TASKS[name]
+    raise InputError(f"no task is called {name!r:.80}: choose one of {', '.join(TASKS)}.")

@@ -1,0 +1,77 @@
+"""A tool that twists move: where it is, and what stops it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..script.site import Site
+from ..script.tool import Instrument, Probe
+
+# How far above the middle of the open cortex a tool may be [m].
+HIGHEST = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Hand:
+    """A tool in a robot's hand.
+
+    Parameters
+    ----------
+    place
+        Of the point about which it turns (3,) [m]: a ball's middle, or the middle of a blade's face.
+    turned
+        T_world_tool's rotation (3, 3).
+    """
+
+    place: np.ndarray
+    turned: np.ndarray
+
+    def pose(self, tool: Instrument) -> np.ndarray:
+        """T_world_tool (4, 4)."""
+        T = np.eye(4)
+        T[:3, :3] = self.turned
+        T[:3, 3] = self.place - lever_of(tool) * self.turned[:, 2]
+        return T
+
+
+def lever_of(tool: Instrument) -> float:
+    """How far the point about which a tool turns lies up its shaft [m]."""
+    return tool.radius if isinstance(tool, Probe) else 0.0
+
+
+def frame_of(site: Site) -> np.ndarray:
+    """The frame of twists and observations, as columns (3, 3): the open cortex's right, up, and outwards."""
+    return np.column_stack([site.right, site.up, -site.axis])
+
+
+def laid(site: Site, tool: Instrument, tip: np.ndarray) -> Hand:
+    """A tool in its first posture, its lowest point at `tip` (3,) [m]."""
+    turned = tool.pose(tip, site.axis, site.right)[:3, :3]
+    return Hand(tip - lever_of(tool) * site.axis, turned)
+
+
+def moved(
+    hand: Hand, site: Site, tool: Instrument, twist: np.ndarray, tilt: float, deepest: float
+) -> Hand:
+    """A tool after a twist (6,) [m, rad], in the frame of `frame_of`, about its own point.
+
+    The bone stops it at the opening's edge. It goes no deeper than `deepest` [m] below the open cortex's middle, and
+    leans by no more than `tilt` [rad] from its first posture: a turn beyond that is left out.
+    """
+    frame = frame_of(site)
+    place = site.within(hand.place + frame @ twist[:3], tool.radius)
+    along = float((place - site.origin) @ site.axis) + lever_of(tool)
+    place = place + (np.clip(along, -HIGHEST, deepest) - along) * site.axis
+    turned = Rotation.from_rotvec(frame @ twist[3:]).as_matrix() @ hand.turned
+    first = tool.pose(site.origin, site.axis, site.right)[:3, 2]
+    if turned[:, 2] @ first < np.cos(tilt):
+        turned = hand.turned
+    return Hand(place, np.asarray(turned))
+
+
+def trembling(hand: Hand, offset: np.ndarray) -> Hand:
+    """The same, off by (3,) [m]."""
+    return replace(hand, place=hand.place + offset)
