@@ -39,6 +39,7 @@ ORDER = (
     {"ar.page"},
     {"scenes.script"},
     {"scenes.builtin", "scenes.play"},
+    {"scenes.gym"},
     {"scenes.bench", "scenes.episodes"},
     {"scenes.report"},
     {"scenes.commands"},
@@ -54,6 +55,7 @@ OWNERS = {
     "sklearn": {"surrogate/regressors/svr.py"},
     "trimesh": {"scenes/script/tool.py"},
     "meshio": {"sim/bodies/meshfile.py"},
+    "gymnasium": {f"scenes/gym/{of}.py" for of in ["environment", "observation", "registration", "vector"]},
     "viser": {f"ar/page/{of}.py" for of in ["browser", "crowd", "guard", "inputs", "messages", "recorder", "scene"]},
     "nilearn": {"sim/bodies/template.py"},
     "pyarrow": {"scenes/episodes/exports/lerobot.py"},
@@ -64,12 +66,8 @@ OWNERS = {
 }
 """Libraries that nobody else imports."""
 JOBS = {
-    "warp": {
-        "sim/terms/elasticity.py",
-        "sim/linalg/pcg.py",
-        "ar/rendering/rasteriser.py",
-        "ar/rendering/shade.py",
-    },  # finite elements, rasteriser
+    # finite elements, rasteriser
+    "warp": {"sim/terms/elasticity.py", "sim/linalg/pcg.py", "ar/rendering/rasteriser.py", "ar/rendering/shade.py"},
     "cv2": {"ar/optics/camera.py", "ar/overlay/composite.py", "ar/screen.py"},  # camera model, compositing, video
     "numpy": {"sim/loads.py", "sim/deformation.py", "ar/optics/camera.py", "surrogate/data/dataset.py"},  # the borders
 }
@@ -210,7 +208,7 @@ def test_rooms_without_pictures_or_networks_import_none():
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported():
     project = tomllib.loads((HOUSE / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    declared = [*project["dependencies"], *extras["exports"], *extras["onnx"]]
+    declared = [*project["dependencies"], *extras["exports"], *extras["gym"], *extras["onnx"]]
     names = {re.split(r"[<>=!~\[ ]", line)[0] for line in declared}
     allowed = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
     used = set().union(*map(libraries, FILES)) - set(sys.stdlib_module_names) - set(ROOMS)

@@ -17,6 +17,7 @@ BENCHES = {
     "published": "how far the published learners are off, one force position left out at a time",
     "locate": "how much of a tumour's motion is found from points on the open cortex, by us and by rivals",
     "microscope": "how far off the tumour is that is located from pictures of two eyes, and how long that takes",
+    "gym": "how many steps a second the Gymnasium environments make, of states and of pictures",
     "fit": "how rightly tissue and skull of known patients are found from several frames",
     "track": "how far off a tool's tip is that a camera sees by its printed cube",
     "shortcuts": "how much time each shortcut of the solver saves on typical loads",

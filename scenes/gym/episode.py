@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -148,11 +148,19 @@ class Episode:
     def _target(self, touched: Touched) -> np.ndarray:
         """Where the tool should be (3,) [m]: over the goal's place, or at the next share where it is now."""
         assert self.drawn is not None
-        if not self.setting.task.cuts:
-            return self.drawn.goal.place
+        return self.drawn.goal.place if self.share is None else self._planned() + touched.motion[self.share].mean(axis=0)
+
+    @property
+    def share(self) -> np.ndarray | None:
+        """Vertices of the share of the tumour that is cut next, or was the last; None where none is cut."""
         shares = self.setting.shares
-        vertices = shares[min(self.cut, len(shares) - 1)]
-        return (self.setting.site.anatomy.mesh.nodes[vertices] + touched.motion[vertices]).mean(axis=0)
+        return shares[min(self.cut, len(shares) - 1)] if shares else None
+
+    def _planned(self) -> np.ndarray:
+        """Where the tool should be by the scan (3,) [m]."""
+        assert self.drawn is not None
+        nodes = self.setting.site.anatomy.mesh.nodes
+        return self.drawn.goal.place if self.share is None else nodes[self.share].mean(axis=0)
 
     def _judge(self, touched: Touched, target: np.ndarray) -> Judged:
         assert self.drawn is not None
@@ -186,7 +194,8 @@ class Episode:
         sensed = np.stack([touched.force, cortex]) + np.array([[FELT], [SEEN]]) * noise[1:]
         done = self.cut / goal.amount if task.cuts else self.held / task.held
         share = self.step / self.steps
-        return states(task, goal, tracked, sensed, share, done, self.frame, self.setting.site.origin)
+        planned = replace(goal, place=self._planned())
+        return states(task, planned, tracked, sensed, share, done, self.frame, self.setting.site.origin)
 
     def _truth(self, touched: Touched, target: np.ndarray, success: bool) -> dict[str, Any]:
         """What no robot has: see the docs. Arrays are new in each step."""
