@@ -155,8 +155,8 @@ def test_the_model_has_the_force_of_the_finite_elements():
 def test_many_answered_together_are_as_each_alone():
     setting = open_setting(PALPATE, "template", "model", "cpu", SIZE)
     site = setting.site
-    poses = [PALPATE.tool.pose(site.origin + 1e-3 * d * site.axis, site.axis, site.right) for d in (-3.0, 0.5, 2.0, 4.0)]
-    asked = [Asked(pose) for pose in poses]
+    tips = [site.origin + 1e-3 * depth * site.axis for depth in (-3.0, 0.5, 2.0, 4.0)]
+    asked = [Asked(PALPATE.tool.pose(tip, site.axis, site.right)) for tip in tips]
     together = replace(setting.answers, together=True).answer(asked)
     for one, each in zip(setting.answers.answer(asked), together, strict=True):
         assert np.allclose(one.force, each.force, atol=1e-4) and np.allclose(one.motion, each.motion, atol=1e-5)
@@ -226,5 +226,5 @@ def test_hostile_input_is_refused():
         vector.reset(seed=[1])
     with pytest.raises(InputError, match=r"\(2, 6\)"):
         vector.step(np.zeros((3, 6)))
-    with pytest.raises(InputError, match="has no task|no task"):
+    with pytest.raises(InputError, match="no task"):
         scripted("juggle", np.zeros(24))

@@ -38,8 +38,7 @@ class Healthy(NamedTuple):
 class CutElements:
     """Finite elements under weight, at levels of the fluid and after steps of the resection; each is solved once.
 
-    The tool is a ball that meets healthy tissue as `Hertz` has it. The tumour lets it in, and the tool does not move the
-    tissue.
+    The tool is a ball that meets healthy tissue as `Hertz` has it. The tumour lets it in, and the tool moves no tissue.
 
     Parameters
     ----------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -18,13 +18,15 @@ from .setting import Setting, checked, open_setting
 from .tasks import SECONDS, find_task
 
 RENDERED = ("rgb_array",)
+METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(1.0 / SECONDS)}
+"""What Gymnasium asks of every environment."""
 
 
 def opened(
     task: str, anatomy: str | Path, observation: str, physics: str, device: str, size: tuple[int, int],
-    render_mode: str | None,
+    render_mode: str | None, together: bool | None = None,
 ) -> Setting:  # fmt: skip
-    """What an environment stands on, of the arguments that it was made with.
+    """What environments stand on, of the arguments that they were made with.
 
     Raises
     ------
@@ -36,7 +38,7 @@ def opened(
     if render_mode is not None and render_mode not in RENDERED:
         raise InputError(f"render_mode is {render_mode!r:.80}: choose {', '.join(RENDERED)}, or None.")
     given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size}
-    return open_setting(find_task(task), *checked(given))
+    return open_setting(find_task(task), *checked(given), together)
 
 
 class Operation(gymnasium.Env):
@@ -61,7 +63,7 @@ class Operation(gymnasium.Env):
         As `opened`.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDERED), "render_fps": round(1.0 / SECONDS)}
+    metadata = METADATA
 
     def __init__(
         self,

@@ -12,8 +12,8 @@ from sim.errors import InputError
 from ..script.camera_paths import wandering
 from ..script.tool_paths import smooth
 from .observation import FELT, SEEN, TRACKED, states
-from .reward import Judged, earned
 from .pictures import Seen
+from .reward import Judged, earned
 from .setting import Setting
 from .tasks import OVER, SECONDS, Goal
 from .tool_motion import Hand, frame_of, laid, lever_of, moved, trembling
@@ -147,8 +147,8 @@ class Episode:
 
     def _target(self, touched: Touched) -> np.ndarray:
         """Where the tool should be (3,) [m]: over the goal's place, or at the next share where it is now."""
-        assert self.drawn is not None
-        return self.drawn.goal.place if self.share is None else self._planned() + touched.motion[self.share].mean(axis=0)
+        planned = self._planned()
+        return planned if self.share is None else planned + touched.motion[self.share].mean(axis=0)
 
     @property
     def share(self) -> np.ndarray | None:
@@ -203,9 +203,10 @@ class Episode:
         setting = self.setting
         tumour = setting.site.anatomy.tumour_nodes
         now = setting.site.anatomy.mesh.nodes[tumour] + touched.motion[np.searchsorted(touched.nodes, tumour)]
+        left = np.isin(tumour, setting.after(self.shown).anatomy.tumour_nodes)
         return {
             "pose": self.actual.pose(setting.task.tool), "force": touched.force.copy(), "pressure": touched.pressure,
-            "tumour_nodes": now, "tumour_middle": now.mean(axis=0), "model_error": touched.error,
+            "tumour_nodes": now, "tumour_middle": now[left].mean(axis=0), "model_error": touched.error,
             "target": target.copy(), "away": self.judged.away, "asked": float(self.drawn.goal.amount),
             "reached": self._reached(touched), "load": self.judged.load, "violations": self.violations,
             "success": success, "reliable": touched.good, "steps_done": self.shown,

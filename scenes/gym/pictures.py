@@ -9,9 +9,7 @@ import numpy as np
 
 from ar.optics.camera import Camera
 from ar.rendering.renderer import Renderer
-from sim.loads import Loads, Resected
 
-from ..play.stage import Stage
 from .setting import Setting
 from .touched import Touched
 
@@ -33,22 +31,18 @@ class Pictures:
 
     def drawn(self, seen: Sequence[Seen]) -> tuple[np.ndarray, np.ndarray]:
         """Colours (B, H, W, 3) uint8 and depths (B, H, W) float32 [m], 0 where nothing is."""
-        height, width = self.camera.height, self.camera.width
-        colour, depth = np.empty((len(seen), height, width, 3), np.uint8), np.empty((len(seen), height, width), np.float32)
+        shape = len(seen), self.camera.height, self.camera.width
+        colour, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
         for done in sorted({each[2] for each in seen}):
             rows = [row for row, each in enumerate(seen) if each[2] == done]
-            stage = self._stage(done)
+            stage = self.setting.after(done)
             scenes = [stage.layers(self._positions(touched), pose) for touched, pose, _ in (seen[row] for row in rows)]
             if done not in self._renderers:
                 self._renderers[done] = Renderer(scenes[0], stage.lamp, stage.device)
-            moved = np.stack([np.concatenate([each.vertices for each in layers if not each.still]) for layers in scenes])
-            pictures = self._renderers[done].pictures(moved, [self.camera])
+            moved = [np.concatenate([each.vertices for each in layers if not each.still]) for layers in scenes]
+            pictures = self._renderers[done].pictures(np.stack(moved), [self.camera])
             colour[rows], depth[rows] = pictures.colour.numpy(), pictures.depth.numpy()
         return colour, depth
-
-    def _stage(self, done: int) -> Stage:
-        stage = self.setting.stage
-        return stage.at(Loads((Resected(np.array([float(done)])),))) if self.setting.task.cuts else stage
 
     def _positions(self, touched: Touched) -> np.ndarray:
         positions = self.setting.site.anatomy.mesh.nodes.copy()

@@ -56,7 +56,9 @@ class PosedElements:
             highest = [self.ball.pressure(float(each)) for each in size]
         else:
             highest = pressure(self.fem, loads, answer).max(axis=1).tolist()
-        rows = [answer] if len(asked) == 1 else [replace(answer.rows(np.array([row])), warm={}) for row in range(len(asked))]
+        rows = [answer]
+        if len(asked) > 1:
+            rows = [replace(answer.rows(np.array([row])), warm={}) for row in range(len(asked))]
         return [
             Touched(row.displacement[0], row.nodes, force[number], highest[number], row.outcome[0].good, memory=row)
             for number, row in enumerate(rows)

@@ -30,8 +30,8 @@ class PressedModel:
     """Finds the force under which the model has the cortex just where the ball is.
 
     The force acts at the place of the cortex at rest that is nearest to the ball's middle, straight away from that. The
-    footprint is as wide as the contact of `Hertz`. Where the model knows only wider ones, the ball's middle is deeper by
-    what Hertz's formula has between both.
+    footprint is as wide as the contact of `Hertz`. Where the model knows only wider ones, the ball is deeper by what
+    Hertz's formula has between both.
 
     Parameters
     ----------
@@ -65,19 +65,20 @@ class PressedModel:
         near = indented(Loads((Touching(poses[:, None]),)), Ball(self.ball.radius), self._patch)
         depth = np.linalg.norm(near.force, axis=1)
         inward = np.divide(near.force, depth[:, None], out=np.zeros_like(near.force), where=depth[:, None] > 0.0)
-        size, found = np.zeros(len(poses)), np.ones(len(poses), bool)
+        answers = [Touched(np.zeros((len(self.model.nodes), 3)), self.model.nodes, np.zeros(3), 0.0) for _ in poses]
         rows = np.flatnonzero(depth > 0.0)
-        if len(rows):
-            size[rows], found[rows] = self._forces(near.point[rows], inward[rows], depth[rows])
-        answer = self.model.deform(self._loads(near.point, inward, size))
+        if not len(rows):
+            return answers
+        point, inward = near.point[rows], inward[rows]
+        size, found = self._forces(point, inward, depth[rows])
+        answer = self.model.deform(self._loads(point, inward, size))
         stated = np.where(np.isfinite(answer.bound[0]), answer.bound[0], self.model.bound)
-        return [
-            Touched(
-                answer.displacement[row], answer.nodes, size[row] * inward[row], self.ball.pressure(float(size[row])),
-                bool(found[row]), float(stated[row]) if size[row] > 0.0 else 0.0,
-            )
-            for row in range(len(poses))
-        ]  # fmt: skip
+        for number, row in enumerate(rows.tolist()):
+            answers[row] = Touched(
+                answer.displacement[number], answer.nodes, size[number] * inward[number],
+                self.ball.pressure(float(size[number])), bool(found[number]), float(stated[number]),
+            )  # fmt: skip
+        return answers
 
     def _loads(self, point: np.ndarray, inward: np.ndarray, size: np.ndarray) -> Loads:
         """Pushes of sizes (k,) [N], each on a footprint as wide as its contact, as far as the model knows such."""
@@ -87,7 +88,7 @@ class PressedModel:
         return np.clip(self.ball.contact(size), *self.model.envelope.footprint)
 
     def _forces(self, point: np.ndarray, inward: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sizes (k,) [N] of forces at points (k, 3), and whether each brings a ball to its depth (k,) [m]: by secants."""
+        """By secants: forces (k,) [N] at points (k, 3), and whether each brings a ball to its depth (k,) [m]."""
         patch, rows = self._patch, np.arange(len(depth))
         place = closest(point, patch.points[patch.triangles])
         corners, most = patch.triangles[place.triangle], STRONGEST * self.model.envelope.force[1]

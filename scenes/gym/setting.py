@@ -14,6 +14,7 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Bonded, Elasticity, Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
+from sim.loads import Loads, Resected
 from sim.runtime.device import find_device
 
 from ..play.deformers import Theatre, open_theatre
@@ -65,6 +66,10 @@ class Setting:
         """What is drawn."""
         return self.theatre.stage(self.scene)
 
+    def after(self, done: int) -> Stage:
+        """What is drawn after so many steps of a resection."""
+        return self.stage.at(Loads((Resected(np.array([float(done)])),))) if self.task.cuts else self.stage
+
     @cached_property
     def cortex(self) -> np.ndarray:
         """Mesh vertices (n,) of the open cortex."""
@@ -105,7 +110,9 @@ class Setting:
 
 
 @lru_cache(maxsize=8)
-def open_setting(task: Task, anatomy: str, physics: str, device: str, size: tuple[int, int]) -> Setting:
+def open_setting(
+    task: Task, anatomy: str, physics: str, device: str, size: tuple[int, int], together: bool | None = None
+) -> Setting:
     """A task on a body, read once for all environments of a process.
 
     Parameters
@@ -119,6 +126,9 @@ def open_setting(task: Task, anatomy: str, physics: str, device: str, size: tupl
         As of `Fem`.
     size
         Width and height of pictures [pixel].
+    together
+        Whether all environments are answered at once; None: on a card. On the CPU that is several times as fast, but
+        the last digits depend on the neighbours.
 
     Raises
     ------
@@ -128,9 +138,10 @@ def open_setting(task: Task, anatomy: str, physics: str, device: str, size: tupl
     """
     theatre = _theatre(anatomy, device)
     if not (theatre.anatomy.mesh.region == TUMOUR_LABEL).any():
-        raise InputError(f"{anatomy}: has no tumour, at which these tasks aim. Mesh one that has region {TUMOUR_LABEL}.")
+        raise InputError(f"{anatomy}: has no tumour, which these tasks aim at: mesh one with region {TUMOUR_LABEL}.")
     scene, tool = task.scene(size), task.tool
     card = find_device(device, LIVE.precision).name != "cpu"
+    at_once = card if together is None else together
     tissue = next(effect.default for effect in scene.effects if isinstance(effect, Elasticity))
     assert tissue is not None
     ball = Hertz(tool.radius, tissue) if isinstance(tool, Probe) else None
@@ -143,10 +154,10 @@ def open_setting(task: Task, anatomy: str, physics: str, device: str, size: tupl
         )
     if models and ball is not None and physics != "fem":
         model = min(models.values(), key=lambda each: each.bound)
-        return Setting(task, scene, theatre, PressedModel(theatre.site, model, ball, card))
-    fem = theatre.fem(scene, LIVE, batch=64 if card else 1, live=not card)
+        return Setting(task, scene, theatre, PressedModel(theatre.site, model, ball, at_once))
+    fem = theatre.fem(scene, LIVE, batch=64 if at_once else 1, live=not at_once)
     if isinstance(fem, Fem):
-        return Setting(task, scene, theatre, PosedElements(fem, ball, card))
+        return Setting(task, scene, theatre, PosedElements(fem, ball, at_once))
     assert ball is not None
     return Setting(task, scene, theatre, CutElements(theatre.site, fem, ball))
 

@@ -53,12 +53,10 @@ def laid(site: Site, tool: Instrument, tip: np.ndarray) -> Hand:
     return Hand(tip - lever_of(tool) * site.axis, turned)
 
 
-def moved(
-    hand: Hand, site: Site, tool: Instrument, twist: np.ndarray, tilt: float, deepest: float
-) -> Hand:
+def moved(hand: Hand, site: Site, tool: Instrument, twist: np.ndarray, tilt: float, deepest: float) -> Hand:
     """A tool after a twist (6,) [m, rad], in the frame of `frame_of`, about its own point.
 
-    The bone stops it at the opening's edge. It goes no deeper than `deepest` [m] below the open cortex's middle, and
+    The bone stops it at the opening's edge. It goes no deeper than `deepest` [m] below the open cortex's middle. It
     leans by no more than `tilt` [rad] from its first posture: a turn beyond that is left out.
     """
     frame = frame_of(site)

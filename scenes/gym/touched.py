@@ -73,4 +73,3 @@ class Answers(Protocol):
     def answer(self, asked: Sequence[Asked]) -> list[Touched]:
         """Answer what is asked, in its order."""
         ...
-

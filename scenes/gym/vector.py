@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -15,12 +15,11 @@ from gymnasium.vector.utils import batch_space
 from sim.arguments import at_least
 from sim.errors import InputError
 
-from .environment import RENDERED, opened
+from .environment import METADATA, opened
 from .episode import Episode, Step
 from .observation import space_of
 from .pictures import Pictures
 from .registration import STEPS
-from .tasks import SECONDS
 from .touched import Asked
 
 
@@ -37,6 +36,8 @@ class Operations(VectorEnv):
         After so many steps an episode is cut short.
     task, anatomy, observation, physics, device, size, render_mode
         As of `Operation`.
+    together
+        As `open_setting`.
 
     Raises
     ------
@@ -44,11 +45,7 @@ class Operations(VectorEnv):
         As `Operation`; a number of environments or steps below 1.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
-        "render_modes": list(RENDERED),
-        "render_fps": round(1.0 / SECONDS),
-        "autoreset_mode": AutoresetMode.NEXT_STEP,
-    }
+    metadata = METADATA | {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(
         self,
@@ -61,10 +58,11 @@ class Operations(VectorEnv):
         device: str = "auto",
         size: tuple[int, int] = (160, 120),
         render_mode: str | None = None,
+        together: bool | None = None,
     ):
         self.num_envs = at_least("num_envs", num_envs, 1)
         self.steps = at_least("max_episode_steps", max_episode_steps, 1)
-        self.setting = opened(task, anatomy, observation, physics, device, size, render_mode)
+        self.setting = opened(task, anatomy, observation, physics, device, size, render_mode, together)
         self.observation, self.render_mode = observation, render_mode
         self.single_observation_space = space_of(observation, size)
         self.single_action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
