@@ -1,5 +1,6 @@
 """Surgical tasks as Gymnasium environments: what they promise, on the template's model and on a box."""
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,6 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import scenes.gym
+from scenes.cli import main
 from scenes.gym.hertz import Hertz
 from scenes.gym.registration import NAMES, register_environments
 from scenes.gym.reward import ENDED, OVER_LIMIT, STEP, Judged, earned
@@ -228,3 +230,13 @@ def test_hostile_input_is_refused():
         vector.step(np.zeros((3, 6)))
     with pytest.raises(InputError, match="no task"):
         scripted("juggle", np.zeros(24))
+
+
+def test_the_bench_counts_steps(boxed, capsys):
+    words = ["bench", "gym", "debulk", "--anatomy", boxed, "--device", "cpu", "--envs", "2", "--steps", "2"]
+    assert main([*words, "--repeats", "2", "--size", "32x24", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [(row["task"], row["observation"]) for row in rows] == [("debulk", "states"), ("debulk", "rgbd")]
+    assert all(0.0 < row["least"] <= row["median"] <= row["most"] and row["environments"] == 2 for row in rows)
+    assert main([*words, "--repeats", "0"]) == 2 and main(["bench", "gym", "juggle", "--device", "cpu"]) == 2
+    assert "choose one of palpate, retract, debulk" in capsys.readouterr().err
