@@ -111,6 +111,40 @@ def test_a_vector_begins_anew_what_is_over():
     assert np.array_equal(one.reset()[0], seen[0])
 
 
+def test_a_vector_is_what_gymnasium_makes_of_single_ones():
+    """Byte for byte, over the end of episodes; the truth too."""
+    vectors = [many(2, max_episode_steps=4), many(2, max_episode_steps=4, vectorization_mode="sync")]
+    assert vectors[0].metadata["autoreset_mode"] == vectors[1].metadata["autoreset_mode"]
+    random = np.random.default_rng(0)
+    ours, theirs = (vector.reset(seed=11) for vector in vectors)
+    for _ in range(12):
+        for one, other in zip(ours[:-1], theirs[:-1], strict=True):
+            assert np.array_equal(one, other)
+        assert set(theirs[-1]) <= set(ours[-1])
+        assert all(np.array_equal(ours[-1][name], value) for name, value in theirs[-1].items())
+        actions = random.uniform(-1.0, 1.0, (2, 6)).astype(np.float32)
+        ours, theirs = (vector.step(actions) for vector in vectors)
+
+
+def test_finite_elements_answer_together_what_they_answer_apart(boxed):
+    """A spatula on a box: each tool goes its own way, and the second begins anew in between."""
+    vectors = [many(3, "Retract", anatomy=boxed, max_episode_steps=30, together=each) for each in (False, True)]
+    seen = [vector.reset(seed=[0, 1, 2]) for vector in vectors]
+    touched = np.zeros(3, bool)
+    for number in range(14):
+        if number == 9:
+            for vector in vectors:
+                vector.episodes[1].over = True
+        actions = scripted("retract", seen[0][0])
+        seen = [vector.step(actions) for vector in vectors]
+        apart, together = (each[-1] for each in seen)
+        assert np.allclose(apart["force"], together["force"], atol=2e-3)
+        assert np.allclose(apart["tumour_nodes"], together["tumour_nodes"], atol=5e-5)
+        assert np.allclose(apart["pressure"], together["pressure"], rtol=0.05, atol=50.0)
+        touched |= apart["pressure"] > 0.0
+    assert touched[[0, 2]].all()
+
+
 def test_the_scripted_policy_palpates_and_pushing_on_ends_at_the_limit():
     rows = played(made(), 3, 60)
     truth = rows[-1][2]

@@ -13,7 +13,6 @@ from sim.errors import InputError
 from .episode import Episode, Step
 from .observation import KINDS, space_of
 from .pictures import Pictures
-from .registration import STEPS
 from .setting import Setting, checked, open_setting
 from .tasks import SECONDS, find_task
 
@@ -54,8 +53,6 @@ class Operation(gymnasium.Env):
         "states", or "rgbd": pictures too.
     render_mode
         "rgb_array", or None.
-    steps
-        That an episode has, as observations know it.
 
     Raises
     ------
@@ -74,13 +71,12 @@ class Operation(gymnasium.Env):
         device: str = "auto",
         size: tuple[int, int] = (160, 120),
         render_mode: str | None = None,
-        steps: int = STEPS,
     ):
         self.setting = opened(task, anatomy, observation, physics, device, size, render_mode)
         self.observation, self.render_mode = observation, render_mode
         self.observation_space = space_of(observation, size)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
-        self.episode, self.pictures = Episode(self.setting, steps), Pictures(self.setting)
+        self.episode, self.pictures = Episode(self.setting), Pictures(self.setting)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode: what is seen, and the truth; `options` are none.

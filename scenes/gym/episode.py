@@ -64,12 +64,10 @@ class Episode:
     ----------
     setting
         Task and body.
-    steps
-        That an episode has; observations hold the share that is over.
     """
 
-    def __init__(self, setting: Setting, steps: int):
-        self.setting, self.steps = setting, steps
+    def __init__(self, setting: Setting):
+        self.setting = setting
         self.frame = frame_of(setting.site)
         self.drawn: Drawn | None = None
         self.over = True
@@ -193,9 +191,9 @@ class Episode:
         tracked = trembling(self.actual, TRACKED * noise[0])
         sensed = np.stack([touched.force, cortex]) + np.array([[FELT], [SEEN]]) * noise[1:]
         done = self.cut / goal.amount if task.cuts else self.held / task.held
-        share = self.step / self.steps
+        time = SECONDS * self.step
         planned = replace(goal, place=self._planned())
-        return states(task, planned, tracked, sensed, share, done, self.frame, self.setting.site.origin)
+        return states(task, planned, tracked, sensed, time, done, self.frame, self.setting.site.origin)
 
     def _truth(self, touched: Touched, target: np.ndarray, success: bool) -> dict[str, Any]:
         """What no robot has: see the docs. Arrays are new in each step."""

@@ -12,6 +12,8 @@ KINDS = ("states", "rgbd")
 """What observations may be."""
 LENGTH = 0.01
 """What is 1 in an observation [m]."""
+LONG = 10.0
+"""What is 1 in an observation [s]: as long as an episode may last."""
 TRACKED, FELT, SEEN = 1e-4, 2e-3, 2e-4
 """Standard deviations of a tracked place [m], a force's component [N], and a seen motion of the cortex [m]."""
 BOUND = 10.0
@@ -38,7 +40,7 @@ def space_of(kind: str, size: tuple[int, int]) -> spaces.Space:
 
 
 def states(
-    task: Task, goal: Goal, hand: Hand, sensed: np.ndarray, share: float, done: float, frame: np.ndarray,
+    task: Task, goal: Goal, hand: Hand, sensed: np.ndarray, time: float, done: float, frame: np.ndarray,
     origin: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Numbers (24,) float32 of a state, in the frame (3, 3) of twists, from the open cortex's middle (3,) [m].
@@ -49,8 +51,8 @@ def states(
         As it is tracked.
     sensed
         Force on the tissue [N] and motion of the open cortex [m] as they are read (2, 3).
-    share
-        Of the episode's steps that are over.
+    time
+        Since the episode began [s].
     done
         Share of what is to be done that is kept up, or cut.
     """
@@ -58,7 +60,7 @@ def states(
         (hand.place - origin) @ frame / LENGTH,
         (frame.T @ hand.turned)[:, :2].T.ravel(),
         sensed[0] @ frame / task.force,
-        [share],
+        [time / LONG],
         (goal.place - origin) @ frame / LENGTH,
         goal.direction @ frame,
         [goal.amount / task.unit],

@@ -68,12 +68,12 @@ class Operations(VectorEnv):
         self.single_action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.episodes = [Episode(self.setting, self.steps) for _ in range(num_envs)]
+        self.episodes = [Episode(self.setting) for _ in range(num_envs)]
         self.pictures = Pictures(self.setting)
         self.randoms = [np.random.default_rng() for _ in range(num_envs)]
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | np.integer | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin all episodes; a seed s is s, s + 1, ... of the environments. `options` are none.
 
@@ -84,7 +84,7 @@ class Operations(VectorEnv):
         """
         if options:
             raise InputError(f"options are {options!r:.80}: there are none; give them to gymnasium.make_vec.")
-        seeds = [seed + row for row in range(self.num_envs)] if isinstance(seed, int) else seed
+        seeds = [int(seed) + row for row in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
         seeds = [None] * self.num_envs if seeds is None else list(seeds)
         if len(seeds) != self.num_envs:
             raise InputError(f"{len(seeds)} seeds for {self.num_envs} environments: give one for each, or one for all.")
