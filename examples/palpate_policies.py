@@ -7,7 +7,7 @@ are drawn, the best are kept, and the next are drawn about those. It needs `pip 
 import gymnasium
 import numpy as np
 
-import scenes.gym  # registers the environments; with sulcus installed, Gymnasium does that by itself
+import scenes.gym  # registers the environments
 from scenes.gym.scripted import scripted
 
 ROUNDS, DRAWN, KEPT, STEPS = 7, 32, 5, 40

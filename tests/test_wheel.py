@@ -75,5 +75,7 @@ def test_the_commands_run_where_there_is_no_checkout(programs, sulcus, tmp_path)
     sulcus("render", "press", "--every", 60, "--out", "frames")
     assert "pass" in sulcus("check", "press", "--every", 60, "--device", "cpu")
     assert "http://" in sulcus("demo", "--device", "cpu", "--seconds", 1, "--port", free_port())
-    made = "import gymnasium; print(gymnasium.make('sulcus/Palpate-v0', device='cpu').reset(seed=0)[0].shape)"
-    assert "(24,)" in ran(programs / "python", "-W", "error", "-c", made, cwd=tmp_path)
+    made = "import gymnasium; made = gymnasium.make('scenes.gym:sulcus/Palpate-v0', device='cpu')"
+    assert "(24,)" in ran(
+        programs / "python", "-W", "error", "-c", f"{made}; print(made.reset(seed=0)[0].shape)", cwd=tmp_path
+    )

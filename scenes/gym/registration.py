@@ -11,7 +11,7 @@ STEPS = 200
 
 
 def register_environments() -> None:
-    """Register the environments, unless they are; Gymnasium does so by itself where sulcus is installed.
+    """Register the environments, unless they are: importing `scenes.gym` does it.
 
     Raises
     ------
