@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from sim.accuracy import TRAIN
-from sim.deformation import Deformation, joined
+from sim.deformation import Deformation, Deformer, joined
 from sim.fem import Fem
 from sim.loads import Loads, stacked
 from sim.resected_fem import Operated
@@ -29,6 +29,14 @@ def following(theatre: Theatre, scene: Scene) -> Fem | Operated:
     return theatre.fem(scene, TRAIN, 1, live=True)
 
 
+def past_matters(fem: Deformer) -> bool:
+    """Whether finite elements have to solve a frame after those before it.
+
+    They need not where forces alone act on a whole body that only resists. What is no finite elements needs no past.
+    """
+    return isinstance(fem, Operated) or (isinstance(fem, Fem) and not fem.problem.plain)
+
+
 def truth_of(
     theatre: Theatre,
     scene: Scene,
@@ -42,7 +50,7 @@ def truth_of(
     `following` makes them.
     """
     fem = fem or theatre.fem(scene, TRAIN, TOGETHER)
-    apart = not isinstance(fem, Fem) or (fem.problem.plain and fem.batch > 1)
+    apart = not past_matters(fem) and not (isinstance(fem, Fem) and fem.batch == 1)
     size = TOGETHER if apart else 1
     answers: list[Deformation] = []
     for first in range(0, len(loads), size):

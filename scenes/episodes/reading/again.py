@@ -10,12 +10,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from sim.accuracy import TRAIN
 from sim.errors import InputError
-from sim.fem import Fem
 from sim.runtime.outside_files import read_as
 
-from ...play.reference import TOGETHER, truth_of
+from ...play.reference import following, past_matters, truth_of
 from ..make import Opened, body_path, opened_body
 from ..plan import plan_from
 from ..scripted import drawn_episode, scene_of
@@ -31,7 +29,7 @@ SAME_MM, LIVE_MM = 0.02, 0.2
 def solved_again(report: Report, count: int, device: str = "auto") -> Report:
     """A report with what solving `count` of its frames again found: where the tumour comes to lie elsewhere.
 
-    Frames are spread evenly. Where the past matters they are the first that were solved, one after the other.
+    Frames are spread evenly. Where the past matters, all that were solved before them are solved too, in their order.
     """
     try:
         with read_as(report.path, "an episode", REMEDY), h5py.File(report.path, "r") as file:
@@ -65,10 +63,9 @@ def _answers(said: Mapping[str, Any], opened: Opened, solved: np.ndarray, count:
     seed, number = int(said["seed"]), int(said["episode"])
     body, theatre = opened.body, opened.theatre
     scene = scene_of(plan, body, theatre.site, drawn_episode(plan.contents, seed, number), seed, number)
-    fem = theatre.fem(scene, TRAIN, TOGETHER)
-    apart = isinstance(fem, Fem) and fem.problem.plain
-    spread = np.unique(np.linspace(0, len(solved) - 1, min(count, len(solved))).astype(int))
-    frames = solved[spread] if apart else solved[: len(spread)]
-    loads = [scene.loads(theatre.site, scene.path(time), time) for time in map(float, scene.times[frames])]
-    answer = truth_of(theatre, scene, loads, fem=fem)
-    return frames, answer.at(theatre.anatomy.tumour_nodes).displacement
+    fem = following(theatre, scene)
+    rows = np.unique(np.linspace(0, len(solved) - 1, min(count, len(solved))).astype(int))
+    asked = np.arange(rows[-1] + 1) if past_matters(fem) else rows
+    loads = [scene.loads(theatre.site, scene.path(time), time) for time in map(float, scene.times[solved[asked]])]
+    answer = truth_of(theatre, scene, loads, fem=fem).at(theatre.anatomy.tumour_nodes)
+    return solved[rows], answer.displacement[np.searchsorted(asked, rows)]

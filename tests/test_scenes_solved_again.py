@@ -1,0 +1,50 @@
+"""Frames of an episode solved again: those whose past matters after their past, and any that is wrong is named."""
+
+import h5py
+import pytest
+
+from scenes.episodes.make import make_body, make_episode
+from scenes.episodes.plan import load_plan
+from scenes.episodes.reading.again import solved_again
+from scenes.episodes.reading.validation import Report
+from sim.bodies.meshfile import write_anatomy
+
+PLAN = """
+title = "A box"
+seconds = 1
+frames_per_second = 5
+size = [64, 48]
+[motion.{family}]
+{numbers}
+[bodies]
+anatomies = "box.vtu"
+[bodies.learner]
+name = "none"
+"""
+FAMILIES = {
+    "palpate": "depth_mm = 5",
+    "retract": "depth_mm = 5",
+    "debulk": "fluid = 0.2\nsteps = 2",
+}
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def episode(request, box, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(request.param)
+    write_anatomy(folder / "box.vtu", box)
+    (folder / "plan.toml").write_text(PLAN.format(family=request.param, numbers=FAMILIES[request.param]))
+    plan = load_plan(str(folder / "plan.toml"))
+    assert not make_body(folder, plan, 1, 0, "cpu").failed
+    made = make_episode(folder, plan, 1, 0, "cpu")
+    assert not made.failed
+    return made.path
+
+
+def test_a_frame_is_solved_again_after_its_past(episode):
+    """Of the frames 0, 2 and 5 the last is not as it was: the others are right, and it alone is named."""
+    report = solved_again(Report(episode), 3, "cpu")
+    assert report.problems == [] and report.again == 3 and report.again_mm < 0.1
+    with h5py.File(episode, "a") as file:
+        file["tumour_fem"][2, 0, 2] += 4e-4
+    (said,) = solved_again(Report(episode), 3, "cpu").problems
+    assert said.startswith("frame 2, solved again, is 0.")
