@@ -125,7 +125,7 @@ def test_a_folder_is_one_runs_own(tmp_path):
     folder = tmp_path / "new"
     assert begin(folder, tiny_run(), PLAN) and not begin(folder, tiny_run(), PLAN)
     for changed, words in (
-        ({"digest": "other"}, "of another text of the plan tiny"),
+        ({"digest": "other"}, "of another text or other anatomies of the plan tiny"),
         ({"seed": 2}, "Give --seed 1"),
         ({"device": "cuda"}, "Give --device cpu"),
         ({"versions": {**tiny_run().versions, "numpy": "3.0"}}, r"numpy .* and not 3\.0.*--force"),

@@ -6,6 +6,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from conftest import make_box
 
 from scenes.episodes.checksums import broken
 from scenes.episodes.families import FAMILIES, Motions
@@ -15,6 +16,7 @@ from scenes.episodes.scripted import drawn_episode
 from scenes.episodes.sensing import noisy
 from scenes.play.deformers import open_theatre
 from sim.anatomy import TUMOUR_LABEL
+from sim.bodies.meshfile import write_anatomy
 from sim.effects import Elasticity, pushed_effects
 from sim.errors import InputError
 from sim.material import BRAIN, Material
@@ -79,6 +81,13 @@ def test_an_episode_is_drawn_by_itself_and_each_value_by_its_name():
         ("[motion.press]\nweight = 0", "with a weight above 0"),
         ("[motion.press]\n[bodies]\ncount = 0", "bodies.count: 0 is outside"),
         ("[motion.press]\n[bodies]\nanatomies = 'mine'", "bodies.anatomies: 'mine' is none"),
+        ("[motion.press]\n[bodies]\nanatomies = '../../etc/x.vtu'", "leaves the plan's folder"),
+        ("[motion.press]\n[bodies]\nanatomies = '/etc/x.vtu'", "leaves the plan's folder"),
+        ("[motion.press]\n[bodies.learner]\nname = 'gpt'", "no learner is called gpt"),
+        ("[motion.press]\nforce_n = {choice = [1, 2], weights = [1e308, 1e308]}", "weights .* are none"),
+        ("[motion.press]\nweight = inf", "with a weight above 0"),
+        ("[motion.press]\n[hand]\ntremor_mm = nan", "hand.tremor_mm: nan may be drawn"),
+        (f"seconds = {'[' * 5000}", "recursion"),
         ("[motion.press", "docs/episodes.md says"),
         ("", "motion"),
     ],
@@ -93,6 +102,27 @@ def test_a_plan_that_is_not_there_is_named(tmp_path):
         load_plan("big")
     (tmp_path / "own.toml").write_text(TINY)
     assert load_plan(str(tmp_path / "own.toml")).digest == plan_from(TINY, "own").digest
+
+
+def test_a_long_name_and_a_long_plan_are_named(tmp_path):
+    with pytest.raises(InputError, match="no plan is called"):
+        load_plan(f"{'long' * 500}.toml")
+    (tmp_path / "long.toml").write_text(f"{TINY}#{'x' * 10_000_000}")
+    with pytest.raises(InputError, match="is longer than a plan may be"):
+        load_plan(str(tmp_path / "long.toml"))
+
+
+def test_an_anatomy_beside_a_plan_is_part_of_its_digest(box, tmp_path):
+    path, text = tmp_path / "own.toml", f"{TINY}[bodies]\nanatomies = 'box.vtu'\n[bodies.learner]\nname = 'none'\n"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"box.vtu: cannot be read as an anatomy: no such file.*beside the plan"):
+        load_plan(str(path))
+    write_anatomy(tmp_path / "box.vtu", box)
+    plan = load_plan(str(path))
+    assert load_plan(str(path)).digest == plan.digest != plan_from(text, "own").digest
+    write_anatomy(tmp_path / "box.vtu", make_box(cells=(6, 6, 4), spacing=12e-3))
+    assert load_plan(str(path)).digest != plan.digest
+    assert "box.vtu: has changed since the plan was read" in make_body(tmp_path / "set", plan, 1, 0, "cpu").failed
 
 
 @pytest.fixture(scope="module")

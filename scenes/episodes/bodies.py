@@ -31,12 +31,11 @@ from surrogate.training.train import train
 from ..play.deformers import Theatre, model_path, open_theatre
 from ..script.shipped_files import template_path
 from .draws import drawn, random_of
-from .plan import Bodies, Plan, fields_of
+from .plan import NO_LEARNER, Bodies, Plan, digest_beside, fields_of
 
 # Drawn tumours may reach out of the brain, or an opening have too few nodes: so many are tried.
 TRIES = 6
 PRESET = "palpation"
-NO_LEARNER = "none"
 TOGETHER = 512
 """Load cases that a card solves together as a model is trained: other processes want its memory, too."""
 ANATOMY, ABOUT = "anatomy.vtu", "body.json"
@@ -140,6 +139,8 @@ def _anatomy(plan: Plan, seed: int, number: int) -> tuple[Anatomy, Intensity | N
     if kind != "drawn":
         path = template_path() if kind == "template" else plan.folder / kind
         scan = sidecar(path)
+        if kind in plan.own and digest_beside(plan, kind) != plan.own[kind]:
+            raise InputError(f"{path}: has changed since the plan was read. Begin another folder with it.")
         return read_anatomy(path), read_intensity(scan) if scan.is_file() else None, values
     refused: list[str] = []
     for attempt in range(TRIES):

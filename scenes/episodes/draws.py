@@ -121,7 +121,7 @@ def _check_choice(spread: Spread, name: str) -> None:
         return
     if len(weights) != count:
         raise InputError(f"{name}: {len(weights)} weights for {count} values: give one for each.")
-    if not (all(0.0 <= each < np.inf for each in weights) and sum(weights) > 0.0):
+    if not (all(each >= 0.0 for each in weights) and 0.0 < sum(weights) < np.inf):
         raise InputError(f"{name}: weights {weights} are none: give numbers that are not below 0, and one above.")
 
 

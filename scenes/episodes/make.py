@@ -20,10 +20,10 @@ from sim.runtime.atomic_files import partial_path
 from ..play.deformers import Theatre
 from ..play.reference import following
 from ..script.scene import Scene
-from .bodies import ABOUT, NO_LEARNER, Body, read_body, write_body
+from .bodies import ABOUT, Body, read_body, write_body
 from .draws import random_of
 from .episode import Recording, collect
-from .plan import Plan
+from .plan import NO_LEARNER, Plan
 from .run_folder import BODIES, episode_name
 from .scripted import drawn_body_of, drawn_episode, scene_of
 from .sensing import noisy, sensed

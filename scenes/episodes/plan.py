@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated, get_args, get_type_hints
 
 import msgspec
 
+from sim.bodies.intensity import sidecar
 from sim.bodies.template import SITES
 from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.material import LAWS
+from sim.runtime.outside_files import read_as
+from surrogate.training.train import check_learners
 
 from ..script.camera_paths import PATHS
 from .draws import Limits, Number, Spread, Word, check_spread
@@ -20,6 +25,10 @@ from .families import Motions
 
 SHIPPED = Path(__file__).parent.parent / "data" / "plans"
 """Plans that ship, by the names of their files."""
+NO_LEARNER = "none"
+"""The learner of bodies on which finite elements play."""
+MOST_BYTES = 200_000
+"""Of a plan's text: every episode holds it."""
 FIXED = "fixed"
 """The path of a camera that stays."""
 
@@ -132,17 +141,20 @@ class Plan:
         What it says.
     folder
         Where own anatomies are looked for.
+    own
+        Digests of the own anatomies' files and their scans, by the names of the anatomies.
     """
 
     name: str
     text: str
     contents: Contents
     folder: Path
+    own: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def digest(self) -> str:
-        """Sixteen hexadecimal digits of the text."""
-        return sha256(self.text.encode()).hexdigest()[:16]
+        """Sixteen hexadecimal digits of the text, and of the own anatomies if there are any."""
+        return sha256("".join((self.text, *self.own.values())).encode()).hexdigest()[:16]
 
 
 def shipped() -> list[str]:
@@ -156,18 +168,35 @@ def load_plan(name: str) -> Plan:
     Raises
     ------
     InputError
-        No such plan; a file that is no TOML, or says what no plan says; a range that is impossible.
+        No such plan; a file that is no TOML, or says what no plan says; a range that is impossible; an own anatomy
+        that is not there.
     """
     path = Path(name) if name.endswith(".toml") else SHIPPED / f"{name}.toml"
-    if not path.is_file():
+    if not os.path.isfile(path):  # which answers for any name
         raise InputError(
             f"no plan is called {name!r}: choose {', '.join(shipped())}, or name a file of your own, .toml."
         )
-    try:
+    with read_as(path, "a plan", "A plan is text in UTF-8."):
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"is longer than a plan may be, {MOST_BYTES:,} bytes. Leave out what is no plan.")
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error}).") from error
-    return plan_from(text, path.stem, path.parent)
+    plan = plan_from(text, path.stem, path.parent)
+    return replace(plan, own={each: digest_beside(plan, each) for each in _own_anatomies(plan.contents)})
+
+
+def digest_beside(plan: Plan, anatomy: str) -> str:
+    """Sixteen hexadecimal digits of an own anatomy's file and of its scan, as they are now.
+
+    Raises
+    ------
+    InputError
+        A file that is not there, or cannot be read.
+    """
+    found, path = sha256(), plan.folder / anatomy
+    with read_as(path, "an anatomy", "Put it beside the plan."):
+        for file in (path, *filter(Path.is_file, [sidecar(path)])):
+            found.update(sha256(file.read_bytes()).digest())
+    return found.hexdigest()[:16]
 
 
 def plan_from(text: str, name: str, folder: Path = Path()) -> Plan:
@@ -180,7 +209,7 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> Plan:
     """
     try:
         contents = msgspec.toml.decode(text, type=Contents)
-    except (msgspec.MsgspecError, ValueError) as error:
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise InputError(f"the plan {name}: {error}. docs/episodes.md says what a plan holds.") from error
     plan = Plan(name, text, contents, folder)
     try:
@@ -224,11 +253,21 @@ def _check(contents: Contents) -> None:
     ):
         if not low <= value <= high:
             raise InputError(f"{name}: {value} is outside {low:g} to {high:g}.")
+    if contents.bodies.learner.name != NO_LEARNER:
+        check_learners([contents.bodies.learner.name], False, "bodies.learner.name")
     weights = [each.weight for each in contents.motion.named.values()]
-    if not (weights and all(0.0 <= weight < float("inf") for weight in weights) and sum(weights) > 0.0):
+    if not (weights and all(weight >= 0.0 for weight in weights) and 0.0 < sum(weights) < float("inf")):
         raise InputError("motion: give one family or more, with a weight above 0.")
+    for each in _own_anatomies(contents):
+        path = PurePath(each)
+        if path.suffix != ".vtu":
+            raise InputError(f"bodies.anatomies: {each!r} is none: give drawn, template, or a .vtu beside the plan.")
+        if path.is_absolute() or ".." in path.parts:
+            raise InputError(f"bodies.anatomies: {each!r} leaves the plan's folder: put the file beside the plan.")
+
+
+def _own_anatomies(contents: Contents) -> list[str]:
+    """What is named as the anatomies of bodies, but for those of ours."""
     choices = contents.bodies.anatomies
     named = choices.choice if isinstance(choices, Spread) else [choices] if isinstance(choices, str) else choices
-    for each in named or ():
-        if each not in ("drawn", "template") and not str(each).endswith(".vtu"):
-            raise InputError(f"bodies.anatomies: {each!r} is none: give drawn, template, or a .vtu beside the plan.")
+    return sorted({str(each) for each in named or ()} - {"drawn", "template"})

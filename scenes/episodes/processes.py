@@ -74,6 +74,12 @@ def started_processes(address: str, devices: Sequence[str], starts: int) -> Iter
             _close(one)
 
 
+def quiet_dask() -> None:
+    """Let Dask print no notes of its own: what matters of them is said in our sentences."""
+    for name in ("distributed", "tornado"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
 def _card(device: str) -> str | None:
     """The card of a device, as a process is shown it; None on the CPU."""
     kind, _, number = device.partition(":")
@@ -105,8 +111,7 @@ def _close(one: _Started) -> None:
 
 def _serve(address: str, card: str | None, connected: Any) -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
-    for name in ("distributed", "tornado"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+    quiet_dask()
     with config.set({"distributed.worker.profile.enabled": False}):  # it holds on to what a task has closed
         asyncio.run(_work(address, card, connected))
 

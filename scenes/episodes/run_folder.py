@@ -179,7 +179,8 @@ def _demand_empty(folder: Path, force: bool) -> None:
 
 def _demand_same(folder: Path, found: Run, run: Run, force: bool) -> None:
     if found.digest != run.digest:
-        other = f"of the plan {found.plan}" if found.plan != run.plan else f"of another text of the plan {run.plan}"
+        changed = f"of another text or other anatomies of the plan {run.plan}"
+        other = changed if found.plan == run.plan else f"of the plan {found.plan}"
         raise InputError(
             f"{folder}: holds episodes {other}; its {PLAN} has what they were made by. Choose another folder."
         )

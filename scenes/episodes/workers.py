@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -13,7 +12,7 @@ from distributed import Client, Scheduler, SpecCluster
 
 from sim.errors import InputError
 
-from .processes import CARD, HERE, started_processes
+from .processes import CARD, HERE, quiet_dask, started_processes
 
 MOST_DEATHS = 20
 """How often a task may see its worker end before it is given up: machines are taken back at any time."""
@@ -88,8 +87,7 @@ def own_workers(
     """
     device = devices[0].split(":")[0]
     with _environment(), config.set({**SETTINGS, **(settings or {})}):
-        for name in ("distributed", "tornado"):
-            logging.getLogger(name).setLevel(logging.CRITICAL)
+        quiet_dask()
         scheduler = {"cls": Scheduler, "options": {"host": HERE, "port": 0, "dashboard_address": f"{HERE}:0"}}
         with (
             closing(SpecCluster({}, scheduler, name=f"sulcus-{os.getpid()}")) as cluster,
@@ -115,6 +113,7 @@ def scheduled_workers(address: str, device: str, patience: float = PATIENCE) -> 
     InputError
         A scheduler that does not answer.
     """
+    quiet_dask()
     try:
         client = Client(address, set_as_default=False, timeout=patience)
     except (OSError, ValueError, TimeoutError) as error:
