@@ -15,7 +15,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.resected_fem import Operated
-from sim.runtime.atomic_files import partial_path
+from sim.runtime.atomic_files import partial_path, why
 
 from ..play.deformers import Theatre
 from ..play.reference import following
@@ -59,6 +59,8 @@ def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "a
     path = body_path(folder, number)
     if (path / ABOUT).is_file():
         return Made(path, skipped=True)
+    if path.exists() and not (path / ABOUT).is_file():  # asked again, as another may have made it meanwhile
+        return Made(path, failed=f"{path}: is no whole body. Remove it, and give the same command with --again.")
     partial = partial_path(path)
     try:
         rmtree(partial, ignore_errors=True)
@@ -70,9 +72,9 @@ def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "a
         if isinstance(error.__cause__, PASSING):
             raise
         return Made(path, failed=str(error))
-    except OSError:
-        if not (path / ABOUT).is_file():  # somebody else was faster
-            raise
+    except OSError as error:
+        if not (path / ABOUT).is_file():  # nobody else was faster
+            raise InputError(f"{path}: cannot be made ({why(error)}). Choose another folder.") from error
     finally:
         rmtree(partial, ignore_errors=True)
     size = sum(file.stat().st_size for file in path.iterdir())

@@ -10,6 +10,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from sim.errors import InputError
+from sim.runtime.atomic_files import why
+
 from .run_folder import RATES
 from .tasks import Outcome
 
@@ -29,10 +32,20 @@ class Rate:
 
 @contextmanager
 def written_rates(folder: Path) -> Iterator[Callable[[str, Outcome], None]]:
-    """What writes down each task that was done, into a file of this process alone."""
+    """What writes down each task that was done, into a file of this process alone.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be made.
+    """
     now = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
     path = folder / RATES / f"{now}-{platform.node()}-{os.getpid()}.csv"
-    with path.open("a", buffering=1) as file:
+    try:
+        file = path.open("a", buffering=1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({why(error)}). Choose another folder for --out.") from error
+    with file:
         file.write(COLUMNS + "\n")
 
         def note(kind: str, one: Outcome) -> None:

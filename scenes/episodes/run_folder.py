@@ -101,6 +101,8 @@ def begin(folder: Path, run: Run, text: str, force: bool = False) -> bool:
         (folder / RATES).mkdir()
     except FileExistsError:
         return False
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written to ({why(error)}). Choose another folder.") from error
     return True
 
 

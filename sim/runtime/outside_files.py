@@ -11,6 +11,9 @@ import numpy as np
 
 from ..errors import InputError
 
+LOCKED = "Close it there, then give the same command again."
+"""What to do about a file that another program holds."""
+
 
 def path_of(path: object) -> Path:
     """What names a file.
@@ -48,6 +51,8 @@ def read_as(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
         if str(error).startswith(str(path)):
             raise
         raise InputError(f"{path}: {error}") from error
+    except BlockingIOError as error:
+        raise InputError(f"{path}: is locked: another program has it open for writing. {LOCKED}") from error
     except (Exception, SystemExit) as error:  # a damaged byte leads a library to raise anything, or to exit
         raise InputError(f"{path}: cannot be read as {kind}: {_reason(error)}. {remedy}") from error
 
