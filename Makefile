@@ -18,7 +18,8 @@ quick: $(STAMP)
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile $(QUICK:%=tests/test_%.py)
 
 test: $(STAMP)
-	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile --durations 15 $(PAGES:%=--ignore=%)
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile \
+		--no-loadscope-reorder --durations 15 $(PAGES:%=--ignore=%)
 	$(VENV)/bin/python -m pytest $(PAGES)
 
 lint: $(STAMP)

@@ -13,6 +13,21 @@ from sim.geometry.tetmesh import TetMesh, oriented
 from sim.loads import Nodal, Pushed
 from surrogate.regressors.ann import Ann
 
+# Files that take longest on two cores, with a few long tests each: begun last, they would leave a core idle at the end.
+LONGEST = (
+    "engine_kills", "commands", "check", "locating", "effects", "play", "docs", "wheel", "examples", "series", "sight",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    """Files of long tests come first, all others as they were."""
+
+    def place(item):
+        name = item.path.stem.removeprefix("test_").removeprefix("scenes_").removeprefix("surrogate_")
+        return LONGEST.index(name) if name in LONGEST else len(LONGEST)
+
+    items.sort(key=place)
+
 
 def make_box(cells=(12, 12, 7), spacing=6e-3, tumour=10e-3, depth=22e-3, opening=25e-3):
     """A box with its top at z = 0: a disc of the top is open, the rest of the surface held, a tumour under the disc."""
