@@ -11,7 +11,8 @@ import numpy as np
 
 from scenes import Viewpoint, collect, find_scene, open_theatre, read_episodes, template_path
 
-scene = replace(find_scene("press"), viewpoint=Viewpoint(width=160, height=120), duration=1.0)
+small = Viewpoint(width=160, height=120)
+scene = replace(find_scene("press"), viewpoint=small, duration=1.0, frames_per_second=10.0)
 theatre = open_theatre(template_path(), device="cpu")
 collect(Path("press.h5"), theatre, theatre.player("series-gp", scene), "series-gp", iter)
 

@@ -284,7 +284,8 @@ class TestBrainShift:
     def test_its_border_stays_hidden(self):
         """The cortex that moves out from under the bone is drawn too: nothing is seen through the hole beside it."""
         theatre, scene = template_theatre(), small("brain_shift")
-        still, sunk = (theatre.player("fem", scene).draw(0, time, Touch()) for time in (0.0, 3.0))
+        playing = theatre.player("fem", scene)
+        still, sunk = (playing.draw(0, time, Touch()) for time in (0.0, 3.0))
         seen = still.picture.segmentation == CORTEX
         inside = seen & ~(sunk.picture.segmentation == CORTEX)
         assert seen.sum() > 5000 and inside.sum() < 0.015 * seen.sum()
