@@ -1,5 +1,6 @@
 """A body that many tests share, and a deformer that answers in microseconds."""
 
+import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -91,6 +92,13 @@ class Pretender:
             np.zeros((len(loads), 0, 6)),
         )
         return answer if at is None else answer.at(at)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared(tmp_path_factory):
+    """Where processes of one run keep what each of them would make anew; nowhere if there is but one."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        os.environ["SULCUS_TESTS_SHARED"] = str(tmp_path_factory.getbasetemp().parent)
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -25,7 +26,8 @@ from sim.fem import Fem
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.model.store import save
+from surrogate.model.learned import Learned
+from surrogate.model.store import load, save
 from surrogate.training.train import train
 
 SIGHTED = tuple(name for name in SCENES if find_scene(name).sight is not None)
@@ -34,15 +36,27 @@ PUSHING = tuple(name for name in SCENES if ToolForce() in find_scene(name).effec
 """The others in which a tool pushes."""
 
 
-@cache
-def theatre_of(anatomy: Anatomy) -> Theatre:
-    """Models `linear` and `svr`, and a scan of slanted stripes."""
+def trained_on(anatomy: Anatomy) -> dict[str, Learned]:
+    """Both models, trained on a hundred loads."""
     fem = Fem(anatomy, (Elasticity(), Held(), Slide(), ToolForce(), NodalForce()), TRAIN, "cpu")
     with TemporaryDirectory() as folder:
         path = Path(folder) / "data.h5"
         simulate(path, fem, draw("palpation", anatomy, 100, 0), {"preset": "palpation"})
         learnt = train(read_dataset(path), ["linear", "svr"]).models
-    models = {name: replace(model, anatomy=anatomy) for name, model in learnt.items()}
+    return {name: replace(model, anatomy=anatomy) for name, model in learnt.items()}
+
+
+@cache
+def theatre_of(anatomy: Anatomy) -> Theatre:
+    """Models `linear` and `svr`, and a scan of slanted stripes."""
+    shared = os.environ.get("SULCUS_TESTS_SHARED")
+    kept = Path(shared or "", f"{anatomy.digest}.npz")
+    if shared and kept.is_file():  # another process of this run has trained them
+        models = dict(load(kept, anatomy))
+    else:
+        models = trained_on(anatomy)
+        if shared:
+            save(kept, models)
     stripes = 127.5 + 127.5 * np.sin(np.indices((40, 40, 24)).sum(axis=0) / 3.0)
     affine = np.diag([2e-3, 2e-3, 2e-3, 1.0])
     affine[:3, 3] = anatomy.mesh.nodes.mean(axis=0) - [0.04, 0.04, 0.02]
