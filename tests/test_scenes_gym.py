@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 import scenes.gym
 from scenes.cli import main
 from scenes.gym.hertz import Hertz
+from scenes.gym.observation import FELT, TRACKED
 from scenes.gym.registration import NAMES, register_environments
 from scenes.gym.reward import ENDED, OVER_LIMIT, STEP, Judged, earned
 from scenes.gym.scripted import scripted
@@ -205,6 +206,36 @@ def test_the_tumour_sinks_and_is_cut_share_by_share(boxed):
     assert sorted({truth["steps_done"] for truth in truths}) == [1, 2, 3]
     sunk = np.linalg.norm(truths[-1]["tumour_nodes"] - truths[0]["tumour_nodes"], axis=1)
     assert sunk.mean() > 1e-5
+
+
+def test_the_goal_follows_the_tumour_and_its_middle_is_of_what_is_left(boxed):
+    environment = made("Debulk", anatomy=boxed)
+    rows = played(environment, 0, 120, "debulk")
+    setting = environment.unwrapped.episode.setting
+    tumour, first = setting.site.anatomy.tumour_nodes, [truth for _, _, truth in rows if truth["steps_done"] == 1]
+    share = np.searchsorted(tumour, setting.shares[0])
+    assert np.allclose(first[-2]["target"], first[-2]["tumour_nodes"][share].mean(axis=0), atol=1e-12)
+    assert np.linalg.norm(first[-2]["target"] - first[0]["target"]) > 1e-6
+    last = rows[-1][2]
+    assert np.allclose(first[0]["tumour_middle"], first[0]["tumour_nodes"].mean(axis=0), atol=1e-3)
+    assert np.linalg.norm(last["tumour_middle"] - last["tumour_nodes"].mean(axis=0)) > 1e-3
+
+
+def test_what_is_observed_is_the_truth_with_its_noise():
+    """In the axes of the twists."""
+    environment = made()
+    environment.reset(seed=3)
+    episode, off = environment.unwrapped.episode, []
+    for step in range(60):
+        states, _, _, _, truth = environment.step(DOWN if step < 12 else 0.0 * DOWN)
+        place = episode.frame.T @ (episode.actual.place - episode.setting.site.origin)
+        force = episode.frame.T @ truth["force"]
+        off.append((*(1e-2 * states[:3] - place), *(PALPATE.force * states[9:12] - force)))
+    assert np.linalg.norm(force) > 0.05
+    deviation = np.std(off, axis=0)
+    assert deviation[:3] == pytest.approx(np.full(3, TRACKED), rel=0.35)
+    assert deviation[3:] == pytest.approx(np.full(3, FELT), rel=0.35)
+    assert np.abs(np.mean(off, axis=0)[3:]).max() < FELT
 
 
 def test_an_aspirator_presses_on_healthy_tissue_by_hertz(boxed):
