@@ -144,7 +144,7 @@ def test_the_code_on_the_page_of_formats_reads_the_files(tmp_path, monkeypatch, 
         file.visititems(lambda name, item: held.add(name) if isinstance(item, h5py.Dataset) else None)
     assert "loads/Pushed/force" in held and held <= set(DATASET)
     read = re.findall(r'file\["([\w/]+)"\]', episode)
-    assert len(read) == 3 and set(read) <= set(EPISODE)
+    assert len(read) == 4 and set(read) <= set(EPISODE)
 
 
 def test_the_page_of_formats_lists_what_a_model_holds():

@@ -141,7 +141,8 @@ def _anatomy(plan: Plan, seed: int, number: int) -> tuple[Anatomy, Intensity | N
         scan = sidecar(path)
         if kind in plan.own and digest_beside(plan, kind) != plan.own[kind]:
             raise InputError(f"{path}: has changed since the plan was read. Begin another folder with it.")
-        return read_anatomy(path), read_intensity(scan) if scan.is_file() else None, values
+        known = {name: value for name, value in values.items() if not name.startswith("bodies.tumour.")}
+        return read_anatomy(path), read_intensity(scan) if scan.is_file() else None, known
     refused: list[str] = []
     for attempt in range(TRIES):
         values = drawn_body(bodies, seed, number, attempt)

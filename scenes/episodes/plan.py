@@ -20,6 +20,7 @@ from sim.runtime.outside_files import read_as
 from surrogate.training.train import check_learners
 
 from ..script.camera_paths import PATHS
+from .decoding import said_plainly
 from .draws import Limits, Number, Spread, Word, check_spread
 from .families import Motions
 
@@ -210,7 +211,8 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> Plan:
     try:
         contents = msgspec.toml.decode(text, type=Contents)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise InputError(f"the plan {name}: {error}. docs/episodes.md says what a plan holds.") from error
+        said = said_plainly(str(error))
+        raise InputError(f"the plan {name}: {said} docs/episodes.md says what a plan holds.") from error
     plan = Plan(name, text, contents, folder)
     try:
         _check(contents)
@@ -258,6 +260,10 @@ def _check(contents: Contents) -> None:
     weights = [each.weight for each in contents.motion.named.values()]
     if not (weights and all(weight >= 0.0 for weight in weights) and 0.0 < sum(weights) < float("inf")):
         raise InputError("motion: give one family or more, with a weight above 0.")
+    if contents.bodies.tumour != Tumour() and "drawn" not in _anatomies(contents):
+        raise InputError(
+            'bodies.tumour: only drawn anatomies have such a tumour. Say anatomies = "drawn", or leave it out.'
+        )
     for each in _own_anatomies(contents):
         path = PurePath(each)
         if path.suffix != ".vtu":
@@ -268,6 +274,11 @@ def _check(contents: Contents) -> None:
 
 def _own_anatomies(contents: Contents) -> list[str]:
     """What is named as the anatomies of bodies, but for those of ours."""
+    return sorted(_anatomies(contents) - {"drawn", "template"})
+
+
+def _anatomies(contents: Contents) -> set[str]:
+    """What is named as the anatomies of bodies."""
     choices = contents.bodies.anatomies
     named = choices.choice if isinstance(choices, Spread) else [choices] if isinstance(choices, str) else choices
-    return sorted({str(each) for each in named or ()} - {"drawn", "template"})
+    return {str(each) for each in named or ()}
