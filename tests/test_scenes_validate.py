@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from tiny_episodes import Wanted, packed, write_episode
 
+from scenes import write_card
 from scenes.cli import main
 from scenes.episodes.checksums import seal
 from scenes.episodes.reading.again import solved_again
@@ -107,6 +108,28 @@ def test_content_that_is_not_what_was_written_is_named(whole, tmp_path):
     assert validate_episode(path).problems == ["/force: is not as it was written."]
 
 
+def test_arrays_that_are_gone_or_came_later_are_named(whole, tmp_path):
+    path = tmp_path / whole.name
+    path.write_bytes(whole.read_bytes())
+    with h5py.File(path, "a") as file:
+        seal(file)
+        del file["force"], file["pictures/depth"]
+        file["tip"][2, 1] += 1e-9
+        file["late"] = [1.0]
+    gone = "is gone; it was there when the file was written."
+    assert validate_episode(path).problems == [
+        f"/force: {gone}",
+        f"/pictures/depth: {gone}",
+        "/late: was not there when the file was written.",
+        "/tip: is not as it was written.",
+    ]
+    path.write_bytes(whole.read_bytes())
+    with h5py.File(path, "a") as file:
+        seal(file)
+        file["force"].attrs["note"] = "mine"
+    assert validate_episode(path).problems == ["attributes are not as they were written."]
+
+
 def test_frames_are_not_solved_again_without_a_plan(whole):
     report = solved_again(validate_episode(whole), 2, "cpu")
     assert not report.problems and any("solved again: it states no" in words for words in report.skipped)
@@ -129,9 +152,30 @@ def test_the_command_names_broken_files_and_ends_with_one(whole, tmp_path, capsy
     assert main(["validate", str(whole), str(broken), "--workers", "1", "--json"]) == 1
     said = json.loads(capsys.readouterr().out)
     assert said["broken"] == 1 and said["files"][1]["path"] == str(broken)
-    assert "cannot be read as an episode" in said["files"][1]["problems"][0]
+    size, (problem,) = whole.stat().st_size, said["files"][1]["problems"]
+    assert f"cannot be read as an episode: it is cut off: 3000 of {size} bytes. Make it anew" in problem
+    assert "sulcus validate" not in problem
+    with h5py.File(broken, "w") as file:
+        file.attrs.update({"format": "sulcus episode 2", "width": 40, "height": 30})
+    assert validate_episode(broken).problems == ["it has no 'time'. Make it anew, or leave it out."]
     assert main(["validate", str(tmp_path / "none.h5")]) == 2 and "no such file" in capsys.readouterr().err
     assert main(["validate", str(whole), "--workers", "0"]) == 2
+
+
+def test_figures_are_of_whole_episodes_and_what_the_card_names_is_missed(box, tmp_path, capsys):
+    for number in range(3):
+        write_episode(tmp_path / f"episode_00000{number}.h5", box, Wanted(4 + number, every=1))
+    with h5py.File(tmp_path / "episode_000000.h5", "a") as file:
+        file["tumour_fem"][...] = file["tumour_predicted"][:] + [0.0, 0.0, 2e-7]
+    with h5py.File(tmp_path / "episode_000001.h5", "a") as file:
+        file["force"].attrs["unit"] = "mN"
+    write_card(tmp_path)
+    (tmp_path / "episode_000002.h5").unlink()
+    assert main(["validate", str(tmp_path), "--workers", "1"]) == 1
+    unit, gone, *_, frames, error = capsys.readouterr().out.splitlines()
+    assert "'mN'" in unit and "episode_000002.h5: is gone; episodes.csv names it" in gone
+    assert "1 of 3 episodes are whole: 4 frames, 4 of them solved" in frames
+    assert "0.000200 mm on average, 0.000200 mm at most" in error
 
 
 def slow(path):

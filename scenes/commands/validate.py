@@ -53,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
             found[report.path] = report
             bar.update()
     reports = [found[path] for path in dict.fromkeys(paths)]
+    reports += [one for place in args.episodes if place.is_dir() for one in lost_from(place)]
     if args.solve:
         from ..episodes.reading.again import solved_again
 
@@ -64,6 +65,15 @@ def run(args: argparse.Namespace) -> int:
     else:
         print("\n".join(lines(reports, broken)))
     return 1 if broken else 0
+
+
+def lost_from(folder: Path) -> list[Report]:
+    """Episodes that a folder's card names and that are not there."""
+    from ..episodes.exports.card import TABLE, listed_files
+    from ..episodes.reading.validation import Report
+
+    words = f"is gone; {TABLE} names it. Make it anew, or write the card anew: `sulcus convert FOLDER --to card`."
+    return [Report(folder / name, [words]) for name in listed_files(folder) if not (folder / name).is_file()]
 
 
 def as_json(report: Report) -> dict[str, object]:
@@ -83,16 +93,17 @@ def lines(reports: list[Report], broken: list[Report]) -> list[str]:
         for one in report.skipped:
             skipped[one] = skipped.get(one, 0) + 1
     said += [f"not looked at in {count} of {len(reports)} episodes: {one}" for one, count in skipped.items()]
+    whole = [report for report in reports if not report.problems]
     counts = ("frames", "solved", "unsolved")
-    frames, solved, unsolved = (sum(getattr(report, name) for report in reports) for name in counts)
+    frames, solved, unsolved = (sum(getattr(report, name) for report in whole) for name in counts)
     said.append(
-        f"{len(reports) - len(broken)} of {len(reports)} episodes are whole: {frames} frames, {solved} of them solved "
+        f"{len(whole)} of {len(reports)} episodes are whole: {frames} frames, {solved} of them solved "
         f"by finite elements, {unsolved} without convergence"
     )
-    errors = [one.error_mm for one in reports if one.error_mm is not None]
+    errors = [one.error_mm for one in whole if one.error_mm is not None]
     if errors:
         mean, worst = sum(one[0] for one in errors) / len(errors), max(one[1] for one in errors)
-        said.append(f"tumour as predicted, against finite elements: {mean:.3f} mm on average, {worst:.3f} mm at most")
+        said.append(f"tumour as predicted, against finite elements: {mean:#.3g} mm on average, {worst:#.3g} mm at most")
     again = [one for one in reports if one.again_mm is not None]
     if again:
         said.append(

@@ -9,6 +9,8 @@ import numpy as np
 
 SUM = "sha256"
 """The attribute that a data set's checksum, and the file's own, is under."""
+LISTED = "arrays"
+"""The file's attribute that names the data sets it was written with."""
 
 
 def digest_of(data: h5py.Dataset) -> str:
@@ -45,9 +47,10 @@ def digest_of_file(file: h5py.File) -> str:
 
 
 def seal(file: h5py.File) -> None:
-    """State the checksum of every data set, and that of the file."""
+    """State the names of all data sets, the checksum of each, and that of the file."""
     for data in datasets_of(file):
         data.attrs[SUM] = digest_of(data)
+    file.attrs[LISTED] = " ".join(_names_of(file))
     file.attrs[SUM] = digest_of_file(file)
 
 
@@ -58,6 +61,17 @@ def broken(file: h5py.File) -> list[str]:
     found = [
         f"{data.name}: is not as it was written" for data in datasets_of(file) if data.attrs.get(SUM) != digest_of(data)
     ]
+    if LISTED in file.attrs:
+        there, written = _names_of(file), str(file.attrs[LISTED]).split()
+        gone = [f"{name}: is gone; it was there when the file was written" for name in written if name not in there]
+        gone += [f"{name}: was not there when the file was written" for name in there if name not in written]
+        if gone:
+            return [*gone, *(words for words in found if words.partition(": ")[0] in written)]
     if file.attrs[SUM] != digest_of_file(file):
-        found.append("attributes are not as they were written")
+        arrays = "" if LISTED in file.attrs else ", or an array is gone: the file does not name those it had"
+        found.append(f"attributes are not as they were written{arrays}")
     return found
+
+
+def _names_of(file: h5py.File) -> list[str]:
+    return [str(data.name) for data in datasets_of(file)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,9 @@ from ..errors import InputError
 
 LOCKED = "Close it there, then give the same command again."
 """What to do about a file that another program holds."""
+
+CUT_OFF = re.compile(r"truncated file: eof = (\d+),.* stored_eof = (\d+)")
+"""What HDF5 says of a file that ends too early: how many bytes it has, and should have."""
 
 
 def path_of(path: object) -> Path:
@@ -68,4 +72,6 @@ def _reason(error: BaseException) -> str:
             return os.strerror(number)[0].lower() + os.strerror(number)[1:]
         case EOFError():
             return "it ends too early"
+        case OSError() if found := CUT_OFF.search(str(error)):
+            return f"it is cut off: {found[1]} of {found[2]} bytes"
     return "it is damaged, or of another kind"

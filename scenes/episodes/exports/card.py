@@ -102,7 +102,7 @@ def keep_card(folder: Path, changed: bool, progress: Callable[[Iterable], Iterab
         Whether episodes were made, or failed, since the card was written.
     """
     there = {path.name: path.stat().st_size for path in folder.glob("*.h5") if not path.name.startswith(".")}
-    if not there or not (changed or there != _listed(folder)):
+    if not there or not (changed or there != (listed_files(folder) if has_card(folder) else {})):
         return None
     if len(there) > MOST_EPISODES:
         return f"No data sheet of more than {MOST_EPISODES} episodes: `sulcus convert {folder} --to card` writes it."
@@ -113,14 +113,17 @@ def keep_card(folder: Path, changed: bool, progress: Callable[[Iterable], Iterab
     return None
 
 
-def _listed(folder: Path) -> dict[str, int]:
-    """Names and sizes of the episodes that a folder's card lists; none where a file of the card is missing."""
+def has_card(folder: Path) -> bool:
+    """Whether all files of a card are there."""
+    return all((folder / name).is_file() for name in NAMES)
+
+
+def listed_files(folder: Path) -> dict[str, int]:
+    """Names and sizes of the episodes that a folder's card lists; none where there is no such table."""
     try:
-        if not all((folder / name).is_file() for name in NAMES):
-            return {}
         with (folder / TABLE).open(newline="", encoding="utf-8") as file:
             return {row["file"]: int(row["bytes"]) for row in csv.DictReader(file)}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, csv.Error):
         return {}
 
 

@@ -18,7 +18,7 @@ from ..make import Opened, body_path, opened_body
 from ..plan import plan_from
 from ..scripted import drawn_episode, scene_of
 from .contents import contents_of
-from .open_files import REMEDY
+from .open_files import REMEDY, said_by_validate
 from .rows import numbers_in
 from .validation import Report
 
@@ -44,8 +44,8 @@ def solved_again(report: Report, count: int, device: str = "auto") -> Report:
             stored = numbers_in(file, contents, "tumour_fem")[frames]
             rest = numbers_in(file, contents, "tumour_rest")
     except InputError as error:
-        said = str(error).removeprefix(f"{report.path}: ")
-        return replace(report, problems=[*report.problems, f"frames cannot be solved again: {said}"])
+        words = f"frames cannot be solved again: {said_by_validate(error, report.path)}"
+        return replace(report, problems=[*report.problems, words])
     off = 1e3 * np.linalg.norm(rest + found - stored, axis=2).max(axis=1)
     allowed = LIVE_MM if contents.said.get("deformer") == "fem" else SAME_MM
     wrong = [f"frame {frame}, solved again, is {far:.3f} mm off." for frame, far in zip(frames, off, strict=True)]

@@ -11,13 +11,19 @@ import h5py
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
-REMEDY = "`sulcus validate` says more; make it anew, or leave it out."
+HINT = "`sulcus validate` says more; "
+REMEDY = f"{HINT}make it anew, or leave it out."
 
 
 def opened(path: Path) -> h5py.File:
     """An episode's file; InputError where it is not there, or no HDF5."""
     with read_as(path, "an episode", REMEDY):
         return h5py.File(path, "r")
+
+
+def said_by_validate(error: InputError, path: Path) -> str:
+    """What is wrong with an episode, without its path, and without the hint to the command that says it."""
+    return str(error).removeprefix(f"{path}: ").replace(f"{HINT}make", "Make")
 
 
 class OpenFiles:

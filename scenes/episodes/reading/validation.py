@@ -15,7 +15,7 @@ from sim.runtime.outside_files import read_as
 from ..checksums import SUM, broken
 from .bodies import anatomy_of
 from .contents import Contents, array_in, attributes_of, contents_of
-from .open_files import REMEDY
+from .open_files import REMEDY, said_by_validate
 from .rows import numbers_in, picture_of
 from .schema import ARRAYS, LABELS, PICTURES
 from .silhouettes import mask_findings
@@ -45,7 +45,7 @@ class Report:
         Of those, how many did not converge.
     error_mm
         Of predicted tumour vertices against the finite elements' where they solved: mean and largest [mm]; None where
-        nothing was solved.
+        nothing was solved, or finite elements played.
     again, again_mm
         How many frames were solved again here, and how far the tumour then lay from where the file has it [mm].
     """
@@ -82,7 +82,7 @@ def validate_episode(path: Path) -> Report:
             solved, unsolved, error = solved_figures(file, contents)
             return Report(path, problems, skipped, contents.frames, solved, unsolved, error)
     except InputError as error:
-        return Report(path, [*problems, str(error).removeprefix(f"{path}: ")], skipped)
+        return Report(path, [*problems, said_by_validate(error, path)], skipped)
 
 
 def unit_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
@@ -146,7 +146,7 @@ def picture_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
             try:
                 picture = picture_of(file, contents, name, frame)
             except InputError as error:
-                yield str(error).removeprefix(f"{contents.path}: ").removesuffix(" Make the episode anew.")
+                yield said_by_validate(error, contents.path).removesuffix(" Make the episode anew.")
                 break
             if kind == LABELS and not (found := set(np.unique(picture).tolist())) <= allowed:
                 yield f"the picture {name!r} of frame {frame} has labels {sorted(found - allowed)} that nothing names."
@@ -154,12 +154,16 @@ def picture_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
 
 
 def solved_figures(file: h5py.File, contents: Contents) -> tuple[int, int, tuple[float, float] | None]:
-    """How many frames were solved, how many of them did not converge, and how far the prediction was off [mm]."""
+    """How many frames were solved, how many of them did not converge, and how far the prediction was off [mm].
+
+    Where finite elements played, nothing was predicted, and None says so.
+    """
     solved = len(contents.fem_frames)
     unsolved = 0
     if "outcome_fem" in contents.shapes:
         unsolved = sum(not text.startswith(b"CONVERGED") for text in array_in(file, "outcome_fem")[:])
-    if not solved or not {"tumour_fem", "tumour_predicted"} <= set(contents.shapes):
+    played = contents.said.get("deformer") == "fem"
+    if played or not solved or not {"tumour_fem", "tumour_predicted"} <= set(contents.shapes):
         return solved, unsolved, None
     truth, total, worst = array_in(file, "tumour_fem"), 0.0, 0.0
     for start in range(0, solved, BLOCK):
