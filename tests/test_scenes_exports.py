@@ -78,6 +78,7 @@ def test_lerobot_has_its_layout_and_the_pictures_own_bytes(lerobot, folder):
     with h5py.File(folder / "episode_000001.h5") as file:
         for name in ("colour", "depth"):
             assert table[f"observation.images.{name}"][9]["bytes"].as_py() == bytes(file[f"pictures/{name}"][2])
+        assert np.allclose(np.array(table["observation.K"].to_pylist())[8], file["K"])
         tumour = np.array(table["observation.tumour_predicted"].to_pylist())
         assert np.allclose(tumour[7:], file["tumour_predicted"], atol=1e-7)
         actions = np.array(table["action"].to_pylist())[7:]
@@ -179,7 +180,17 @@ def test_xdmf_refers_to_numbers_that_are_there(folder, tmp_path):
 def test_a_card_says_what_there_is(folder, tmp_path, capsys):
     (folder / "failed").mkdir(exist_ok=True)
     (folder / "failed/episode_000002.json").write_text("{}")
+    run = {
+        "format": "sulcus run 1",
+        "plan": "tiny",
+        "digest": "0",
+        "seed": 1,
+        "device": "cpu",
+        "versions": {"h5py": "3"},
+    }
+    (folder / "run.json").write_text(json.dumps(run))
     assert main(["convert", str(folder), "--to", "card"]) == 0
+    assert "card of 2 episodes written to" in capsys.readouterr().out
     rows = list(csv.DictReader((folder / "episodes.csv").read_text().splitlines()))
     assert [row["frames"] for row in rows] == ["7", "9"] and rows[1]["solved"] == "3"
     assert float(rows[0]["largest_error_mm"]) == pytest.approx(0.1)
@@ -187,12 +198,17 @@ def test_a_card_says_what_there_is(folder, tmp_path, capsys):
     for words in (
         "| slide | 1 | 9 | 3 |",
         "| `force_n` | 0.1 | 1.1 | 2 |",
+        "| `site.path` | straight | 2 |",
+        "- seed: 0 (in 1)\n- seed: 1 (in 1)",
+        "device: cpu; packages: h5py 3",
+        "In 2 episodes the files do not say whose brain it is",
         "[press]",
         "0.100 mm",
         "1 could not be made",
     ):
         assert words in sheet
-    assert "CC BY 4.0" in (folder / "LICENSE.md").read_text()
+    licence = (folder / "LICENSE.md").read_text()
+    assert "CC BY 4.0" in licence and "Louis Collins" not in licence
     described = json.loads((folder / "croissant.json").read_text())
     assert described["conformsTo"][0].endswith("croissant/1.1")
     assert len(write_card(folder)["files"]) == 4  # its own it replaces
@@ -200,6 +216,24 @@ def test_a_card_says_what_there_is(folder, tmp_path, capsys):
     assert main(["convert", str(folder), "--to", "card"]) == 2 and "--force" in capsys.readouterr().err
     assert (folder / "LICENSE.md").read_text() == "mine"
     assert main(["convert", str(folder), "--to", "card", "--force"]) == 0
+
+
+def test_a_card_says_whose_brain_it_is_and_what_played(box, tmp_path):
+    path = write_episode(tmp_path / "in/episode_000000.h5", box)
+    drawn = {"bodies.anatomies": "template", "bodies.tumour.radius_mm": 12.0, "force_n": 0.2}
+    with h5py.File(path, "a") as file:
+        file.attrs.update({"parameters": json.dumps(drawn), "deformer": "fem"})
+    write_card(path.parent)
+    sheet = (path.parent / "DATASHEET.md").read_text()
+    assert "the brain is the ICBM 152 template's" in sheet and "Finite elements played 1 of the episodes" in sheet
+    assert "error of the model" not in sheet and "radius_mm" not in sheet and "from least to greatest" not in sheet
+    assert "McGill" in (path.parent / "LICENSE.md").read_text()
+    other = write_episode(tmp_path / "other/episode_000000.h5", box)
+    (other.parent / "LICENSE.md").write_text("mine")
+    for name, given in (("one", [path]), ("two", [path, other])):
+        assert main(["convert", *map(str, given), "--to", "folder", "--out", str(tmp_path / name)]) == 0
+    assert (tmp_path / "one/DATASHEET.md").read_text() == sheet and (tmp_path / "two/DATASHEET_0.md").is_file()
+    assert (tmp_path / "two/LICENSE_1.md").read_text() == "mine"
 
 
 def test_a_sheet_names_what_is_there_most_often():

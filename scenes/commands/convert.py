@@ -48,6 +48,8 @@ def run(args: argparse.Namespace) -> int:
     contents = [read_contents(path) for path in episode_paths(args.episodes)]
     report = write(contents, progress=partial(tqdm, unit="episode", file=sys.stderr))
     said = f"{len(contents)} episodes written to {report['out']}"
+    if args.to == "card":
+        said = f"card of {len(contents)} episodes written to {report['out']}: {', '.join(report['files'])}"
     if report.get("points_only"):
         said += f"; the surfaces of {report['points_only']} are not known, so that they hold points alone"
     print(json_line(report) if args.json else said)

@@ -19,12 +19,16 @@ from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from ..reading.validation import solved_figures
 from ..reading.windows import episode_paths
+from ..run_folder import Run, read_run
+from .along import LICENCE as LICENCE_NAME
+from .along import SHEET
 from .croissant import COLUMNS, croissant
 from .datasheet import MARK, NAME, datasheet
+from .origin import notice_of_template, of_template
 from .tasks import task_of
 
 TABLE = "episodes.csv"
-NAMES = (TABLE, "croissant.json", "DATASHEET.md", "LICENSE.md")
+NAMES = (TABLE, "croissant.json", SHEET, LICENCE_NAME)
 """Files of a card."""
 MOST_EPISODES = 5000
 """Of larger data sets a run does not write the card by itself: 20 to 50 ms are needed for each episode."""
@@ -72,14 +76,15 @@ def write_card(
     inside = "episodes/*.h5" if (folder / "episodes").is_dir() else "*.h5"
     table = table_of(rows)
     failed = len(list((folder / "failed").glob("*.json")))
-    sheet = datasheet(folder.resolve().name, episodes, rows, failed)
+    sheet = datasheet(folder.resolve().name, episodes, rows, failed, run_of(folder))
     description = (
         f"{len(rows)} episodes of scripted surgery on simulated brains with a tumour: pictures, depth, poses of camera "
         "and tool, forces, and where the tumour is by finite elements."
     )
     date = max(str(one.said.get("date", ""))[:10] for one in episodes) or datetime.now(UTC).date().isoformat()
     described = croissant(folder.resolve().name, description, date, TABLE, sha256(table.encode()).hexdigest(), inside)
-    texts = (table, json.dumps(described, indent=1) + "\n", sheet, LICENCE)
+    licence = LICENCE + (notice_of_template() if of_template(episodes) else "")
+    texts = (table, json.dumps(described, indent=1) + "\n", sheet, licence)
     for name, text in zip(NAMES, texts, strict=True):
         with written_whole(folder / name, Path(name).suffix) as partial:
             partial.write_text(text, encoding="utf-8")
@@ -125,6 +130,14 @@ def listed_files(folder: Path) -> dict[str, int]:
             return {row["file"]: int(row["bytes"]) for row in csv.DictReader(file)}
     except (OSError, ValueError, KeyError, TypeError, csv.Error):
         return {}
+
+
+def run_of(folder: Path) -> Run | None:
+    """The run whose folder it is; None of a folder that is no run's, or whose note of it cannot be read."""
+    try:
+        return read_run(folder)
+    except InputError:
+        return None
 
 
 def is_card(path: Path) -> bool:

@@ -19,8 +19,11 @@ from .motion import ACTION, STATE, states, twists
 UNEVEN = 1e-4
 # Frames that are held in memory at once.
 BLOCK = 64
-NUMBERS = ("force", "force_read", "tip", "contact", "distance", "T_camera_world", "tumour_predicted")
-"""Arrays with a row for each frame that go into other formats as they are, beside the tool's pose."""
+NUMBERS = (
+    "force", "force_read", "tip", "contact", "distance", "K", "T_camera_world", "T_camera_world_tracked",
+    "T_world_tool_tracked", "tumour_predicted",
+)  # fmt: skip
+"""Arrays that go into other formats as they are, a row for each frame, beside the tool's pose."""
 
 
 def shared_pictures(episodes: Sequence[Contents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:
@@ -75,8 +78,17 @@ def numbers_of(file: h5py.File, contents: Contents, names: Sequence[str]) -> dic
         raise InputError(f"{contents.path}: has no tool, and so no actions: leave it out.")
     poses = numbers_in(file, contents, "T_world_tool")
     found = {"state": states(poses), "action": twists(poses)}
-    found |= {name: numbers_in(file, contents, name).astype(np.float32) for name in names}
+    found |= {name: framed(file, contents, name).astype(np.float32) for name in names}
     return {**found, "time": numbers_in(file, contents, "time")}
+
+
+def framed(file: h5py.File, contents: Contents, name: str) -> np.ndarray:
+    """Rows (T, ...) of a named array; of `K` (T, 3, 3) that of each frame, which changes where the camera zooms."""
+    if name != "K":
+        return numbers_in(file, contents, name)
+    if "K_of_frame" in contents.shapes:
+        return numbers_in(file, contents, "K_of_frame")
+    return np.tile(numbers_in(file, contents, "K"), (contents.frames, 1, 1))
 
 
 def blocks(frames: int) -> Iterator[range]:

@@ -44,7 +44,10 @@ COLUMNS: Mapping[str, tuple[str, str]] = {
     "seed": ("sc:Text", "What its draws began from; empty where nothing was drawn."),
     "anatomy": ("sc:Text", "Digest of the anatomy."),
     "deformer": ("sc:Text", "What moved the tissue in the pictures."),
-    "largest_error_mm": ("sc:Float", "Of the predicted tumour against finite elements, where they solved [mm]."),
+    "largest_error_mm": (
+        "sc:Float",
+        "Of the predicted tumour against finite elements, where they solved [mm]; empty where no model played.",
+    ),
     "bytes": ("sc:Integer", "Size of the file."),
     "sha256": ("sc:Text", "Checksum that the file states of its arrays; empty where it states none."),
 }

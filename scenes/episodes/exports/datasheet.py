@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ..reading.contents import Contents
 from ..reading.schema import ARRAYS, PICTURES
+from ..run_folder import RUN, Run
+from .drawn import drawn_tables
+from .origin import origins
 
 MARK = "<!-- sulcus card 1 -->"
 NAME = "with sulcus"
-# Longest list of what was drawn.
-MOST_DRAWN = 100
 # Most of what moved, solved or touched tissue that is named.
 MOST_LISTED = 12
 
 
-def datasheet(name: str, episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]], failed: int) -> str:
+def datasheet(
+    name: str, episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]], failed: int, run: Run | None = None
+) -> str:
     """The sheet as Markdown, of what the files say: `rows` are those of the table of episodes.
 
-    `failed` is how many episodes were asked for and could not be made.
+    `failed` is how many episodes were asked for and could not be made; `run` is the run whose folder it is.
     """
     parts = (
         f"# Data sheet: {name}\n\n{MARK}\n",
@@ -29,7 +31,7 @@ def datasheet(name: str, episodes: Sequence[Contents], rows: Sequence[Mapping[st
         "Datasets*.\n",
         motivation(),
         composition(episodes, rows, failed),
-        collection(episodes),
+        collection(episodes, run),
         UNKNOWN,
         "## Preprocessing\n\nColour is JPEG, depth PNG of 16 bits and labels PNG of 8 bits. Nothing else was changed. "
         "`sulcus validate` compares pictures, arrays and checksums.\n",
@@ -37,7 +39,7 @@ def datasheet(name: str, episodes: Sequence[Contents], rows: Sequence[Mapping[st
         "are used. Not for decisions about patients: nothing here was measured on one.\n",
         "## Distribution\n\nUnder CC BY 4.0, as `LICENSE.md` says in plain words.\n",
         "## Maintenance\n\nWhoever gives these data out answers for them: write here who, and where errors are "
-        "reported. The plan and the seeds below make them anew.\n",
+        "reported. The plan below and the seeds above make them anew.\n",
         *plans(episodes),
     )
     return "\n".join(parts)
@@ -72,9 +74,12 @@ def composition(episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]],
     worst = [row["largest_error_mm"] for row in rows if row["largest_error_mm"] != ""]
     if worst:
         lines.append(
-            f"\nThe largest distance of a predicted tumour vertex from the finite elements' is {max(worst):.3f} mm, in "
-            "the frames that they solved. That is an error of the model, not of the tumour in a patient."
+            f"\nThe largest distance of a predicted tumour vertex from the finite elements' is {max(worst):#.3g} mm, "
+            "in the frames that they solved. That is an error of the model, not of the tumour in a patient."
         )
+    played = sum(row["deformer"] == "fem" for row in rows)
+    if played:
+        lines.append(f"\nFinite elements played {played} of the episodes: no model predicted anything there.")
     lines.append("Attributes of each array say what it means, and the file formats of sulcus describe them.\n")
     return "\n".join(lines)
 
@@ -84,10 +89,10 @@ def bodies_said(episodes: Sequence[Contents]) -> str:
     bodies = len({one.said.get("anatomy") for one in episodes})
     sizes = sorted({one.size for one in episodes})
     said_sizes = ", ".join(f"{width} x {height}" for width, height in sizes)
-    return f"Anatomies: {bodies}. Pictures: {said_sizes} pixels."
+    return "\n".join([f"Anatomies: {bodies}. Pictures: {said_sizes} pixels.\n", *origins(episodes)])
 
 
-def collection(episodes: Sequence[Contents]) -> str:
+def collection(episodes: Sequence[Contents], run: Run | None) -> str:
     """How it came about, and what was drawn at random."""
     lines = ["## Collection\n", "A scripted tool moved on a simulated brain, and a camera drew what it would see.\n"]
     tools = [str(tool).partition("(")[0] for tool in said(episodes, "tool")]  # sizes are among what was drawn
@@ -97,16 +102,11 @@ def collection(episodes: Sequence[Contents]) -> str:
     dates = sorted(str(date)[:10] for date in said(episodes, "date"))
     if versions:
         lines.append(f"- sulcus {', '.join(versions)}" + (f", {dates[0]} to {dates[-1]}" if dates else ""))
-    table = list(drawn(episodes))
-    if table:
-        lines += [
-            "\nWhat was drawn at random, from least to greatest:\n",
-            "| what | from | to | episodes |",
-            "|---|---|---|---|",
-        ]
-        lines += table[:MOST_DRAWN]
-    else:
-        lines.append("\nNothing was drawn at random, or the files do not say what.")
+    lines += [*listed("plan", said(episodes, "plan_name")), *listed("seed", said(episodes, "seed"))]
+    if run is not None:
+        parts = ", ".join(f"{part} {version}" for part, version in run.versions.items())
+        lines.append(f"- device: {run.device}; packages: {parts} (as `{RUN}` says)")
+    lines += drawn_tables(episodes)
     return "\n".join(lines) + "\n"
 
 
@@ -122,38 +122,6 @@ def listed(title: str, texts: Sequence[Any]) -> Iterator[str]:
 def said(episodes: Sequence[Contents], key: str) -> list[Any]:
     """An attribute of all episodes that have it."""
     return [one.said[key] for one in episodes if key in one.said]
-
-
-def drawn(episodes: Sequence[Contents]) -> Iterator[str]:
-    """Rows of the table of what was drawn: ranges of numbers, and how often each text came."""
-    values: dict[str, list[Any]] = {}
-    for text in said(episodes, "parameters"):
-        try:
-            found = json.loads(text)
-        except (TypeError, ValueError, RecursionError):
-            continue
-        for key, value in leaves(found):
-            values.setdefault(key, []).append(value)
-    for key, found in values.items():
-        numbers = [one for one in found if isinstance(one, int | float) and not isinstance(one, bool)]
-        if len(numbers) == len(found):
-            yield f"| `{key}` | {min(numbers):.4g} | {max(numbers):.4g} | {len(found)} |"
-        else:
-            often = ", ".join(f"{text} ({count})" for text, count in Counter(map(str, found)).most_common(8))
-            yield f"| `{key}` | {often} | | {len(found)} |"
-
-
-def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Numbers and texts of nested JSON by their dotted names; lists are numbered."""
-    match value:
-        case dict():
-            for key, inner in value.items():
-                yield from leaves(inner, f"{name}.{key}".strip("."))
-        case list():
-            for place, inner in enumerate(value):
-                yield from leaves(inner, f"{name}.{place}".strip("."))
-        case _:
-            yield name, value
 
 
 def plans(episodes: Sequence[Contents]) -> Iterator[str]:

@@ -15,6 +15,7 @@ from ..reading.contents import Contents
 from ..reading.open_files import opened
 from ..reading.rows import code_of, numbers_in, rows_of
 from ..reading.schema import ARRAYS, PICTURES, SOLVED, suffix_of
+from .along import write_along
 from .columns import file_names, stored_size
 from .whole_folder import written_folder
 
@@ -41,6 +42,7 @@ def write_folder(
                 write_pictures(place, file, contents)
                 write_tables(place, file, contents)
                 write_description(place / "episode.json", file, contents)
+        write_along(episodes, partial)
     return {"out": str(folder), "episodes": len(episodes), "frames": sum(one.frames for one in episodes)}
 
 

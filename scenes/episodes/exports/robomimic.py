@@ -17,6 +17,7 @@ from ..reading.contents import Contents
 from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from ..reading.schema import COLOUR, PICTURES
+from .along import texts_along
 from .columns import blocks, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size
 from .tasks import held_out, task_of
 
@@ -56,6 +57,8 @@ def write_robomimic(
         out_of = np.array(held_out(episodes))
         out.create_dataset("mask/train", data=names_of[~out_of])
         out.create_dataset("mask/valid", data=names_of[out_of])
+        for name, text in texts_along(episodes).items():
+            out[name] = text
     return {"out": str(path), "episodes": len(episodes), "frames": total, "held_out": int(out_of.sum())}
 
 

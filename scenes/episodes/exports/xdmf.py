@@ -17,6 +17,7 @@ from ..reading.bodies import anatomy_of, surface_rows
 from ..reading.contents import Contents, array_in
 from ..reading.open_files import opened
 from ..reading.rows import numbers_in
+from .along import write_along
 from .columns import file_names, stored_size
 from .whole_folder import written_folder
 
@@ -56,6 +57,7 @@ def write_xdmf(
                         add_series(domain, group, f"{names[contents]}.h5", times)
             indent(root)
             ElementTree(root).write(partial / f"{names[contents]}.xdmf", "utf-8", xml_declaration=True)
+        write_along(episodes, partial)
     return {"out": str(folder), "episodes": len(episodes), "points_only": bare}
 
 

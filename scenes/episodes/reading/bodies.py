@@ -23,6 +23,12 @@ def anatomy_of(contents: Contents) -> Anatomy | None:
     return _known(str(contents.said.get("anatomy")), contents.path.resolve().parent)
 
 
+def is_template(digest: str) -> bool:
+    """Whether an anatomy's digest is that of the template."""
+    template = _read(template_path())
+    return template is not None and template.digest == digest
+
+
 def surface_rows(surface: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Those triangles (S, 3) of mesh vertices whose corners are all among sorted `nodes` (n,), as numbers of these."""
     places = np.searchsorted(nodes, surface).clip(max=len(nodes) - 1)
