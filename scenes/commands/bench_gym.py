@@ -20,7 +20,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)} (default: all)")
     parser.add_argument("--envs", type=int, default=64, help="environments, stepped together (default %(default)s)")
     parser.add_argument(
-        "--observation", nargs="+", choices=OBSERVATIONS, default=list(OBSERVATIONS), help="(default: both)"
+        "--observation",
+        nargs="+",
+        choices=OBSERVATIONS,
+        default=list(OBSERVATIONS),
+        help="states, or pictures too (default: both)",
     )
     parser.add_argument("--size", default="160x120", metavar="WxH", help="of pictures (default %(default)s)")
     parser.add_argument("--steps", type=int, default=40, help="of every environment in a repeat (default %(default)s)")
