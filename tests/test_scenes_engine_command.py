@@ -59,6 +59,7 @@ def test_a_run_that_ends_has_a_data_sheet_of_what_is_there(box, tmp_path, capsys
     words = ["episodes", "small", "--count", "2", "--seed", "1", "--out", str(folder), "--workers", "1", "--json"]
     for number in range(2):
         mark_failed(folder, Failure(number, "no", lost=False))
+    assert main(words[:-1]) == 1 and capsys.readouterr().out.endswith("Episode 0: no\n")
     assert main(words) == 1 and not json.loads(capsys.readouterr().out)["card"]
     assert not (folder / "DATASHEET.md").exists()
     write_episode(folder / "episode_000000.h5", box)

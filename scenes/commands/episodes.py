@@ -187,6 +187,8 @@ def _progress(out: Path, there: Tally, total: int) -> Iterator[Heard]:
 
 
 def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, where: str, card: bool) -> None:
+    from ..episodes.run_folder import failures
+
     failed = tally.failed + tally.lost
     if args.json:
         said = {
@@ -215,6 +217,9 @@ def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, w
             f"{failed} failed: {out / 'failed'} says why of each. {tally.lost} of them are tried again by the same "
             "command; with --again all are."
         )
+        known = failures(out)
+        for number in sorted(set(known).intersection(range(args.first, args.first + args.count)))[:1]:
+            print(f"Episode {number}: {known[number].reason}")
 
 
 def _print_estimate(args: argparse.Namespace, plan: Plan, out: Path) -> int:

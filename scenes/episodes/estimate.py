@@ -58,7 +58,9 @@ def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
     """
     own = {kind: [rate for rate in rates if rate.kind == kind] for kind in (EPISODE, BODY)}
     if not own[EPISODE]:
-        raise InputError("no episode was measured there: make some first, by the same command with --count 8.")
+        raise InputError(
+            "no episode was measured there: make some first, by the same command with --count 8 and without --estimate."
+        )
 
     def amount(what: str, kinds: Sequence[str]) -> Amount:
         counts = {EPISODE: episodes, BODY: bodies}
