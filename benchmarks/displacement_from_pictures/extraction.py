@@ -10,7 +10,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from frames import FORCE, POSE, Frames, joined
+from frames import AXES, FORCE, POSE, Frames, joined
 
 from scenes.episodes.plan import plan_from
 from scenes.episodes.reading.contents import Contents, read_contents
@@ -112,7 +112,7 @@ def _good(names: Sequence[str] | np.ndarray) -> list[bool]:
 
 def _named(name: str, vectors: np.ndarray) -> dict[str, np.ndarray]:
     """Components (n,) of vectors (n, 3) by name."""
-    return {f"{name}_{axis}": vectors[:, place] for place, axis in enumerate("xyz")}
+    return {f"{name}_{axis}": vectors[:, place] for place, axis in enumerate(AXES)}
 
 
 def _scanned(rest: np.ndarray, cortex: np.ndarray, camera: np.ndarray, turn: np.ndarray) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from frames import FORCE, POSE, Frames
+from frames import AXES, FORCE, POSE, Frames
 
 COLOURS, ALL_CHANNELS = 3, 4
 
@@ -55,14 +55,18 @@ class Scale:
     @classmethod
     def of(cls, inputs: Inputs, training: Frames) -> Scale:
         """Of training frames alone."""
-        numbers = inputs.numbers(training)
-        deviation = numbers.std(axis=0)
         size = float(np.sqrt(np.square(training.label).sum(axis=1).mean()))
-        return cls(numbers.mean(axis=0), np.where(deviation > 1e-6, deviation, 1.0), size or 1.0)
+        return cls(*spread_of(inputs.numbers(training)), size or 1.0)
 
     def scaled(self, inputs: Inputs, frames: Frames) -> np.ndarray:
         """Numbers (n, k) with mean 0 and deviation 1 in training."""
         return ((inputs.numbers(frames) - self.mean) / self.deviation).astype(np.float32)
+
+
+def spread_of(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means and deviations (k,) of numbers (n, k); of those that do not differ the deviation is taken as 1."""
+    deviation = numbers.std(axis=0)
+    return numbers.mean(axis=0), np.where(deviation > 1e-6, deviation, 1.0)
 
 
 def mirrored(
@@ -82,7 +86,7 @@ def mirrored(
         turned = (signs[:, axis] < 0.0)[:, None, None, None]
         picture = torch.where(turned, picture.flip(dimension), picture) if inputs.channels else picture
     signs = torch.cat([signs, torch.ones_like(signs[:, :1])], dim=1)
-    place = torch.tensor(["xyz".find(name[-1]) if name[-2] == "_" else 2 for name in inputs.names], dtype=torch.long)
+    place = torch.tensor([AXES.find(name[-1]) if name[-2] == "_" else 2 for name in inputs.names], dtype=torch.long)
     if len(place):
         mean = torch.as_tensor(scale.mean / scale.deviation, device=numbers.device, dtype=numbers.dtype)
         numbers = (numbers + mean) * signs[:, place.to(signs.device)] - mean

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from frames import FORCE, POSE, Frames
-from inputs import Inputs
+from inputs import Inputs, spread_of
 from torch.nn.functional import adaptive_avg_pool2d
 
 COUNTS = (1, 3, 10, 30)
@@ -64,7 +64,6 @@ class Neighbours:
 def neighbours(inputs: Inputs, training: Frames, aside: Frames, device: torch.device) -> Neighbours:
     """Nearest neighbours in training frames; as many as answer the frames set `aside` best."""
     numbers = _numbers(inputs, training)
-    deviation = numbers.std(axis=0)
     label = in_scan(training, training.label) if inputs.pose else training.label
     mean = components = torch.zeros(0, device=device)
     if inputs.channels:
@@ -74,9 +73,7 @@ def neighbours(inputs: Inputs, training: Frames, aside: Frames, device: torch.de
         whole = float(sizes[:COMPONENTS].square().sum()) / len(small)
         components = axes[:COMPONENTS].T * np.sqrt(max(numbers.shape[1], 1) / max(whole, 1e-12))
     known = torch.from_numpy(np.ascontiguousarray(label)).to(device)
-    found = Neighbours(
-        inputs, numbers.mean(axis=0), np.where(deviation > 1e-6, deviation, 1.0), mean, components, known[:0], known
-    )  # fmt: skip
+    found = Neighbours(inputs, *spread_of(numbers), mean, components, known[:0], known)
     found = replace(found, points=found.placed(training))
     errors = [np.linalg.norm(one - aside.label, axis=1).mean() for one in found.by_count(aside, COUNTS)]
     return replace(found, count=COUNTS[int(np.argmin(errors))])

@@ -11,7 +11,7 @@ import numpy as np
 from sim.errors import InputError
 
 from .episode import Episode, Step
-from .observation import KINDS, space_of
+from .observation import KINDS, space_of, twists
 from .pictures import Pictures
 from .setting import Setting, checked, open_setting
 from .tasks import SECONDS, find_task
@@ -75,7 +75,7 @@ class Operation(gymnasium.Env):
         self.setting = opened(task, anatomy, observation, physics, device, size, render_mode)
         self.observation, self.render_mode = observation, render_mode
         self.observation_space = space_of(observation, size)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
+        self.action_space = twists()
         self.episode, self.pictures = Episode(self.setting), Pictures(self.setting)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

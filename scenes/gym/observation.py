@@ -24,6 +24,11 @@ FARTHEST = 2.0
 """Depths of pictures are less [m]."""
 
 
+def twists() -> spaces.Box:
+    """The space of actions: twists (6,) of a tool."""
+    return spaces.Box(-1.0, 1.0, (6,), np.float32)
+
+
 def space_of(kind: str, size: tuple[int, int]) -> spaces.Space:
     """The space of observations of one of `KINDS`, with pictures of a width and height [pixel]."""
     states = spaces.Box(-BOUND, BOUND, (COUNT,), np.float32)

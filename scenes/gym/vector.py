@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -17,7 +16,7 @@ from sim.errors import InputError
 
 from .environment import METADATA, opened
 from .episode import Episode, Step
-from .observation import space_of
+from .observation import space_of, twists
 from .pictures import Pictures
 from .registration import STEPS
 from .touched import Asked
@@ -65,7 +64,7 @@ class Operations(VectorEnv):
         self.setting = opened(task, anatomy, observation, physics, device, size, render_mode, together)
         self.observation, self.render_mode = observation, render_mode
         self.single_observation_space = space_of(observation, size)
-        self.single_action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
+        self.single_action_space = twists()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.episodes = [Episode(self.setting) for _ in range(num_envs)]

@@ -16,8 +16,10 @@ TEMPLATE, DRAWN, UNKNOWN = "template", "drawn", ""
 
 def origin_of(contents: Contents) -> str:
     """Whose an episode's anatomy is: `TEMPLATE`, `DRAWN`, the name of an own one, or `UNKNOWN`."""
-    shipped = is_template(str(contents.said.get("anatomy")))
-    return str(parameters_of(contents).get("bodies.anatomies", TEMPLATE if shipped else UNKNOWN))
+    stated = parameters_of(contents).get("bodies.anatomies")
+    if stated is not None:
+        return str(stated)
+    return TEMPLATE if is_template(str(contents.said.get("anatomy"))) else UNKNOWN
 
 
 def notice_of_template() -> str:
@@ -35,15 +37,14 @@ def of_template(episodes: Sequence[Contents]) -> bool:
 def origins(episodes: Sequence[Contents]) -> Iterator[str]:
     """Lines of the data sheet."""
     for origin, count in Counter(origin_of(one) for one in episodes).most_common():
-        match origin:
-            case "template" | "drawn":
-                tumour = "one and the same" if origin == TEMPLATE else "drawn"
-                yield (
-                    f"- In {count} episodes the brain is the ICBM 152 template's of 2009 (MNI152), as nilearn "
-                    "ships it, scaled to a person's. It is an average of 152 healthy adults, and nobody's own. "
-                    f"Tumour and opening were put into it; they are {tumour}."
-                )
-            case "":
-                yield f"- In {count} episodes the files do not say whose brain it is: write it here."
-            case _:
-                yield f"- In {count} episodes the anatomy is the maker's own, `{origin}`. Write here whose it is."
+        if origin in (TEMPLATE, DRAWN):
+            tumour = "one and the same" if origin == TEMPLATE else "drawn"
+            yield (
+                f"- In {count} episodes the brain is the ICBM 152 template's of 2009 (MNI152), as nilearn "
+                "ships it, scaled to a person's. It is an average of 152 healthy adults, and nobody's own. "
+                f"Tumour and opening were put into it; they are {tumour}."
+            )
+        elif origin == UNKNOWN:
+            yield f"- In {count} episodes the files do not say whose brain it is: write it here."
+        else:
+            yield f"- In {count} episodes the anatomy is the maker's own, `{origin}`. Write here whose it is."
