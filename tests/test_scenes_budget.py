@@ -6,10 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenes.bench.error_budget import CLINICAL, LATENCY, MARKERS, MESH, SHUTTER, TECHNICAL, Filmed, budgeted, errors_of
+from scenes.bench.error_budget import (
+    CLINICAL,
+    LATENCY,
+    MARKERS,
+    MESH,
+    PARAMETERS,
+    SHUTTER,
+    TECHNICAL,
+    Filmed,
+    budgeted,
+    errors_of,
+)
 from scenes.bench.tracking_errors import changed, usual_covariance
 from scenes.cli import main
-from scenes.script.priors import OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION, drawn
+from scenes.script.priors import OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION
 from scenes.script.reference_place import USUAL, VIEW, reference_beside
 from scenes.script.site import site_of
 from scenes.script.uncertainty import SURROGATE
@@ -18,6 +29,7 @@ from sim.errors import InputError
 
 COUNT = 200
 SPEED = 0.05
+DEVIATES = np.random.default_rng(5).normal(size=100)
 
 
 def sideways(camera, target, time):
@@ -34,7 +46,8 @@ def filmed(box):
     bodies = 1e-3 * rng.normal(size=(100, 1, 3)) + np.zeros_like(rest)
     return Filmed(
         site, VIEW, 2.0, reference_beside(site, VIEW.camera(site)), usual_covariance(USUAL), 1.0, rest,
-        0.002 * site.axis + np.zeros_like(rest), ball, np.zeros_like(rest), bodies, drawn(100), 0.3e-3,
+        0.002 * site.axis + np.zeros_like(rest), ball, np.zeros_like(rest), bodies,
+        0.2 * DEVIATES, 0.05 * DEVIATES, surrogate=0.3e-3,
     )  # fmt: skip
 
 
@@ -51,8 +64,10 @@ def test_registration_segmentation_model_and_mesh_are_as_large_as_they_are_said_
     wide = errors_of(filmed, [SEGMENTATION], COUNT)
     assert np.quantile(wide.worst, 0.68) == pytest.approx(OF_SEGMENTATION.range[1], rel=0.15)
     assert np.quantile(errors_of(filmed, [SURROGATE], COUNT).worst, 0.95) == pytest.approx(0.3e-3, rel=0.15)
-    off = np.abs([draw.mesh for draw in filmed.draws]).max()
-    assert errors_of(filmed, [MESH], COUNT).worst.max() == pytest.approx(0.002 * off, rel=0.02)
+    off = 0.002 * np.abs(DEVIATES).max()
+    assert errors_of(filmed, [MESH], COUNT).worst.max() == pytest.approx(0.05 * off, rel=0.02)
+    alike = replace(filmed, bodies=np.broadcast_to(filmed.field, filmed.bodies.shape))
+    assert errors_of(alike, [MESH, PARAMETERS], COUNT).worst.max() == pytest.approx(0.2 * off, rel=0.02)
 
 
 def test_latency_costs_what_the_camera_moves_meanwhile(filmed):
@@ -103,7 +118,8 @@ def test_the_band_holds_for_twins_and_not_for_bodies_that_differ_more(filmed):
     here, other = (
         1e-3 * np.random.default_rng(seed).normal(size=(600, 1, 3)) + np.zeros_like(filmed.rest) for seed in (2, 3)
     )
-    first, twins = (replace(filmed, bodies=bodies, draws=drawn(600)) for bodies in (here, other))
+    meshes = 0.05 * np.random.default_rng(4).normal(size=600)
+    first, twins = (replace(filmed, bodies=bodies, meshes=meshes) for bodies in (here, other))
     band = np.quantile(errors_of(first, CLINICAL, 600).worst, 0.95)
     assert 0.92 < (errors_of(twins, CLINICAL, 600, 1).worst <= band).mean() < 0.98
     assert (errors_of(replace(twins, bodies=6.0 * other), CLINICAL, 200, 1).worst <= band).mean() < 0.8

@@ -15,8 +15,12 @@ from scenes.bench.uncertainty import (
     changed,
     coverage,
     distances,
+    mesh_errors,
+    mesh_prior,
     nominal,
+    off_by,
     parts,
+    skull_of,
     skulls_of,
     solved,
     uncertainty,
@@ -101,6 +105,19 @@ class TestPriors:
     def test_from_a_skull_that_lets_go_nothing_is_bonded(self):
         assert skulls_of(find_scene("brain_shift")) == ("slide", "contact")
 
+    def test_meshes_are_farther_off_where_the_brain_slides_and_the_farthest_under_weight(self):
+        press, sinking = find_scene("press"), find_scene("brain_shift")
+        assert skull_of(press) == "bonded" and skull_of(sinking) == "contact"
+        draws = [replace(SAME, skull=share, mesh=1.0) for share in (0.1, 0.5, 0.9)]
+        np.testing.assert_allclose(mesh_errors(press, draws), [0.05, 0.12, 0.12])
+        np.testing.assert_allclose(mesh_errors(sinking, draws), 0.25)
+        loose = replace(press, effects=tuple(one for one in press.effects if one not in SKULLS.values()))
+        assert skull_of(loose) is None
+        np.testing.assert_allclose(mesh_errors(loose, draws), 0.05)
+        assert mesh_prior(sinking, "bonded").range[1] == 0.05
+        motion = np.ones((3, 2, 3))
+        np.testing.assert_allclose(off_by(motion, motion[0], mesh_errors(press, draws))[:, 0, 0], [0.05, 0.12, 0.12])
+
 
 class TestEnsemble:
     def test_a_drawn_scene_has_what_was_drawn(self):
@@ -158,10 +175,10 @@ class TestEnsemble:
 
         draws, twins = drawn(300, 0), drawn(300, 1)
         found = uncertainty(theatre, scene, still, draws, answers(draws))
-        assert 0.93 < coverage(still, found, twins, answers(twins), 1) < 0.97
+        assert 0.93 < coverage(scene, still, found, twins, answers(twins), 1) < 0.97
         assert 0.93 < found.held < 0.97
         tight = replace(found, worst=tuple(0.7 * one for one in found.worst))
-        assert coverage(still, tight, twins, answers(twins), 1) < 0.85
+        assert coverage(scene, still, tight, twins, answers(twins), 1) < 0.85
 
     def test_draws_without_equilibrium_are_counted_and_too_many_refused(self, theatre):
         field = np.ones((9, 3))

@@ -18,7 +18,7 @@ from ar.tracking.targets import patient_reference
 from sim.errors import InputError
 from surrogate.locating.calibration import RADIUS_SQUARED
 
-from ..script.priors import MESH, OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION, Draw
+from ..script.priors import MESH, OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION
 from ..script.site import Site
 from ..script.uncertainty import LEVEL, SURROGATE
 from ..script.viewpoint import Viewpoint
@@ -55,8 +55,10 @@ class Filmed:
         (n, 3) [m]: the tumour's surface in the scan, how it moves, and its outward normals after that.
     velocity
         (n, 3) [m/s] of the surface.
-    bodies, draws
-        How it moves in other bodies (b, n, 3) [m], and what they are.
+    bodies
+        How it moves in other bodies (b, n, 3) [m].
+    meshes, own_mesh
+        By which share of its motion each body's mesh is off (b,), and by which so many meshes of the scene's own are.
     surrogate
         The bound [m] that a trained model states, 0 for finite elements.
     registration
@@ -77,7 +79,8 @@ class Filmed:
     normals: np.ndarray
     velocity: np.ndarray
     bodies: np.ndarray
-    draws: Sequence[Draw]
+    meshes: np.ndarray
+    own_mesh: np.ndarray
     surrogate: float = 0.0
     registration: Registration | None = None
     corner: float = CORNER
@@ -167,7 +170,7 @@ def _samples(
         aside = of(SURROGATE, filmed.surrogate / np.sqrt(RADIUS_SQUARED) * random.standard_normal(3))
         shift = of(REGISTRATION, _shift(filmed, random.standard_normal(6)))
         wide = of(SEGMENTATION, OF_SEGMENTATION.range[1] * random.standard_normal(1))
-        mesh = of(MESH, np.array(filmed.draws[body].mesh))
+        mesh = of(MESH, (filmed.meshes if PARAMETERS in contributors else filmed.own_mesh)[body])
         readout = filmed.calibration.readout if SHUTTER in contributors else 0.0
         motion = filmed.field + (filmed.off[body] if PARAMETERS in contributors else 0.0)
         surface = filmed.rest + (1.0 + mesh) * motion
@@ -295,11 +298,11 @@ def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | No
     return share, float(np.sqrt(np.square(excess).sum() * clusters / (clusters - 1))) / len(within)
 
 
-def moment_of(still: Motions, answers: Sequence[tuple[np.ndarray, ...]], draws: Sequence[Draw]) -> int:
-    """The moment of a scene at which its bodies differ the most."""
+def moment_of(still: Motions, answers: Sequence[tuple[np.ndarray, ...]], meshes: np.ndarray) -> int:
+    """The moment of a scene at which its bodies differ the most; `meshes` (b,) as of `off_by`."""
     sizes = []
     for number, here in enumerate(still.fields):
-        off = off_by(np.stack([answer[number] for answer in answers]), here, draws)
+        off = off_by(np.stack([answer[number] for answer in answers]), here, meshes)
         sizes.append(float(np.linalg.norm(off, axis=2).max(axis=1).mean()))
     return int(np.argmax(sizes))
 

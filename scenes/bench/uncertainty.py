@@ -11,7 +11,7 @@ from ar.rendering.layer import vertex_normals
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import Deformation
-from sim.effects import SKULLS, Effect, Elasticity
+from sim.effects import SKULLS, Effect, Elasticity, Gravity
 from sim.errors import InputError
 from sim.material import Material
 from sim.skulls import Bonded, SkullContact, Slide
@@ -21,6 +21,8 @@ from ..play.stage import Stage
 from ..script.priors import (
     MESH,
     OF_MESH,
+    OF_MESH_SINKING,
+    OF_MESH_SLIDING,
     OF_REGISTRATION,
     OF_SEGMENTATION,
     POISSON,
@@ -32,6 +34,7 @@ from ..script.priors import (
     TOGETHER,
     TOOL,
     Draw,
+    Prior,
     chosen,
     rigid,
 )  # fmt: skip
@@ -94,6 +97,32 @@ def skulls_of(scene: Scene) -> tuple[str, ...]:
     """What the skull may do in a scene: where it lets go, fluid came between, and nothing is bonded any more."""
     lets_go = any(isinstance(effect, SkullContact) for effect in scene.effects)
     return tuple(name for name in SKULLS if not (lets_go and name == "bonded"))
+
+
+def skull_of(scene: Scene) -> str | None:
+    """What the skull does in a scene; None: it is not simulated."""
+    own = next((type(effect) for effect in scene.effects if isinstance(effect, SKULL_EFFECTS)), None)
+    return next((name for name, skull in SKULLS.items() if type(skull) is own), None)
+
+
+def mesh_prior(scene: Scene, skull: str | None) -> Prior:
+    """What a scene's mesh may be off by where the skull does this."""
+    if skull in (None, "bonded"):
+        return OF_MESH
+    return OF_MESH_SINKING if any(isinstance(effect, Gravity) for effect in scene.effects) else OF_MESH_SLIDING
+
+
+def mesh_errors(scene: Scene, draws: Sequence[Draw]) -> np.ndarray:
+    """By which share of its motion each draw's mesh is off (draws,)."""
+    return mesh_deviations(scene, draws) * np.array([draw.mesh for draw in draws])
+
+
+def mesh_deviations(scene: Scene, draws: Sequence[Draw]) -> np.ndarray:
+    """By which share of its motion each draw's mesh may be off (draws,), as a standard deviation."""
+    if skull_of(scene) is None:
+        return np.full(len(draws), mesh_prior(scene, None).range[1])
+    skulls = skulls_of(scene)
+    return np.array([mesh_prior(scene, chosen(draw.skull, skulls)).range[1] for draw in draws])
 
 
 def tissue_of(scene: Scene) -> Material:
@@ -215,10 +244,11 @@ def uncertainty(
     """
     sound = enough_of(scene, draws, answers)
     kept, shifts = [draw for draw, _ in sound], rigid(SHIFTS, seed)
+    meshes = mesh_errors(scene, kept)
     rows, held = [], []
     for moment, (field, normals) in enumerate(zip(still.fields, still.normals, strict=True)):
         motion = np.stack([answer[moment] for _, answer in sound])
-        worst, middle = distances(off_by(motion, field, kept), normals, *shifts)
+        worst, middle = distances(off_by(motion, field, meshes), normals, *shifts)
         held.append(left_out(worst))
         bounds = [float(np.quantile(one, LEVEL)) for one in (worst, middle)]
         moved = float(np.linalg.norm(field, axis=1).mean())
@@ -230,9 +260,9 @@ def uncertainty(
     return Uncertainty(scene.name, mark, len(draws), failed, share, still.times, worst, middle, moved, named)
 
 
-def off_by(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw]) -> np.ndarray:
-    """What a scene's field (n, 3) [m] is off by from motions (draws, n, 3) with what their meshes are off by."""
-    return (1.0 + np.array([draw.mesh for draw in draws]))[:, None, None] * motion - field
+def off_by(motion: np.ndarray, field: np.ndarray, meshes: np.ndarray) -> np.ndarray:
+    """What a scene's field (n, 3) [m] is off by from motions (draws, n, 3) whose meshes are off by so much (draws,)."""
+    return (1.0 + meshes)[:, None, None] * motion - field
 
 
 def distances(
@@ -269,7 +299,7 @@ def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw], scene: S
         found[name] = size((column @ slope[first:last]).reshape(off.shape))
         first = last
     found[TOGETHER] = size(off - (design @ slope).reshape(off.shape))
-    found[MESH] = OF_MESH.range[1] * size(motion)
+    found[MESH] = size(mesh_deviations(scene, draws)[:, None, None] * motion)
     found[REGISTRATION] = float(np.sqrt(3.0)) * OF_REGISTRATION.range[1]
     return found | {SEGMENTATION: OF_SEGMENTATION.range[1]}
 
@@ -277,10 +307,10 @@ def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw], scene: S
 def causes(draws: Sequence[Draw], scene: Scene) -> dict[str, np.ndarray]:
     """By contributor, how a draw differs from the scene (draws, columns): zero where it does not."""
     poisson = tissue_of(scene).poisson
-    skull = next((effect for effect in scene.effects if isinstance(effect, SKULL_EFFECTS)), None)
     table = np.array([[np.log(one.stiffness), one.poisson - poisson, np.log(one.ratio), *one.tip] for one in draws])
     found = {STIFFNESS.name: table[:, :1], POISSON.name: table[:, 1:2], RATIO.name: table[:, 2:3]}
-    others = [name for name in skulls_of(scene) if type(SKULLS[name]) is not type(skull)]
+    skull = skull_of(scene)
+    others = [name for name in skulls_of(scene) if name != skull]
     names = [chosen(draw.skull, skulls_of(scene)) for draw in draws]
     if skull is not None:
         found[SKULL] = np.array([[name == other for other in others] for name in names], float)
@@ -292,7 +322,9 @@ def size(field: np.ndarray) -> float:
     return float(np.sqrt((field**2).sum(axis=2).max(axis=1).mean()))
 
 
-def coverage(still: Motions, stated: Uncertainty, draws: Sequence[Draw], answers: Iterable[Answer], seed: int) -> float:
+def coverage(
+    scene: Scene, still: Motions, stated: Uncertainty, draws: Sequence[Draw], answers: Iterable[Answer], seed: int
+) -> float:
     """The share of twins whose worst point lies within the stated bound, over all moments but the first.
 
     Twins are other draws, with other errors of registration and segmentation.
@@ -301,7 +333,7 @@ def coverage(still: Motions, stated: Uncertainty, draws: Sequence[Draw], answers
     kept, held = [draw for draw, _ in sound], []
     for moment in range(1, len(still.times)):
         motion = np.stack([answer[moment] for _, answer in sound])
-        off = off_by(motion, still.fields[moment], kept)
+        off = off_by(motion, still.fields[moment], mesh_errors(scene, kept))
         worst, _ = distances(off, still.normals[moment], *rigid(SHIFTS, seed))
         held.append(worst <= stated.worst[moment])
     return float(np.mean(held))

@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
         What cannot be read, numbers out of range, or a scene that cannot be solved.
     """
     from ..bench.error_budget import Filmed, budgeted, moment_of, velocity_at
-    from ..bench.uncertainty import nominal, parts
+    from ..bench.uncertainty import mesh_errors, nominal, parts
     from ..play.deformers import open_theatre
     from ..play.stage import Stage
     from ..script.reference_place import reference_beside
@@ -119,21 +119,22 @@ def run(args: argparse.Namespace) -> int:
         other_mesh(registration, theatre.anatomy, args.registration)
     still = nominal(theatre, scene)
     bodies = _bodies(args, theatre, scene, args.draws, args.seed)
-    number = moment_of(still, [answer for _, answer in bodies], [draw for draw, _ in bodies])
+    draws = [draw for draw, _ in bodies]
+    number = moment_of(still, [answer for _, answer in bodies], mesh_errors(scene, draws))
     time = still.times[number]
     filmed = Filmed(
         site, scene.viewpoint, scene.duration, reference_beside(site, scene.viewpoint.camera(site)), known, time,
         Stage(scene, site).at(scene.loads(site, scene.path(time), time)).tumour_at_rest.vertices,
-        still.fields[number], still.normals[number], velocity_at(still, number), *_at(bodies, number),
+        still.fields[number], still.normals[number], velocity_at(still, number), *_at(scene, bodies, number),
         _promised(theatre, scene, time), registration, args.corner_px, 1e-3 * args.latency_ms, 1e-3 * args.clock_ms,
     )  # fmt: skip
     twins = None
     if args.twins:
-        others, draws = _at(_bodies(args, theatre, scene, args.twins, args.seed + 1), number)
-        twins = replace(filmed, bodies=others, draws=draws)
+        others, meshes, own_mesh = _at(scene, _bodies(args, theatre, scene, args.twins, args.seed + 1), number)
+        twins = replace(filmed, bodies=others, meshes=meshes, own_mesh=own_mesh)
     bar = partial(tqdm, unit="part", desc="errors", leave=False, file=sys.stderr)
     found = budgeted(filmed, args.samples, args.seed, twins, bar)
-    report = _flat(args, filmed, found, parts(filmed.bodies, filmed.field, filmed.draws, scene))
+    report = _flat(args, filmed, found, parts(filmed.bodies, filmed.field, draws, scene))
     print(json_line(report) if args.json else "\n".join(_lines(report)))
     return 0
 
@@ -204,9 +205,13 @@ def _bodies(args: argparse.Namespace, theatre: Theatre, scene: Scene, count: int
     return enough_of(scene, draws, bar)
 
 
-def _at(bodies: Bodies, number: int) -> tuple[np.ndarray, list[Draw]]:
-    """How the tumour's surface moves in each body at a moment (b, n, 3) [m], and the bodies."""
-    return np.stack([answer[number] for _, answer in bodies]), [draw for draw, _ in bodies]
+def _at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How the tumour's surface moves in each body at a moment, and what their meshes and own ones are off by."""
+    from ..bench.uncertainty import mesh_errors, mesh_prior, skull_of
+
+    draws = [draw for draw, _ in bodies]
+    own = mesh_prior(scene, skull_of(scene)).range[1] * np.array([draw.mesh for draw in draws])
+    return np.stack([answer[number] for _, answer in bodies]), mesh_errors(scene, draws), own
 
 
 def _promised(theatre: Theatre, scene: Scene, time: float) -> float:
@@ -231,7 +236,7 @@ def _flat(args: argparse.Namespace, filmed: Filmed, found: Budget, split: dict[s
         },
         "latency_ms": args.latency_ms, "clock_ms": args.clock_ms, "corner_px": args.corner_px,
         "readout_ms": 1e3 * calibration.readout,
-        "samples": args.samples, "bodies": len(filmed.draws), "seed": args.seed,
+        "samples": args.samples, "bodies": len(filmed.bodies), "seed": args.seed,
         "parts": {name: _figures(errors) for name, errors in rows.items()},
         "inside": {PARAMETERS: inside}, "largest": {"middle": found.largest("middle"), "worst": found.largest("worst")},
         "band_mm": 1e3 * found.band, "held_twins": None if found.held is None else found.held[0],

@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         found = replace(found, frames=0 if fitted is None else fitted.frames)
         write_uncertainties(out, [found])
         tried = bar(ensemble(theatre, scene, twins), total=len(twins))
-        held = coverage(still, found, twins, tried, args.seed + 1) if twins else None
+        held = coverage(scene, still, found, twins, tried, args.seed + 1) if twins else None
         rows.append(_flat(theatre, scene, found, held))
         print("\n".join(_lines(rows[-1])), file=lines, flush=True)
     if args.json:

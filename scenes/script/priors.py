@@ -84,8 +84,16 @@ SKULL_HOLDS = Prior(
     "arXiv 2512.08425",
 )  # fmt: skip
 OF_MESH = Prior(
-    MESH, "normal", (0.05, 0.05), "share of the tumour's motion",
+    MESH, "normal", (0.05, 0.05), "share of the tumour's motion, where the skull holds the brain",
     "smoothed elements are 5.2 % off quadratic ones: docs/surrogate.md",
+)  # fmt: skip
+OF_MESH_SLIDING = Prior(
+    "mesh of a sliding brain", "normal", (0.12, 0.12), "share of the tumour's motion, where the brain slides",
+    "smoothed elements are 8 to 17 % off quadratic ones under tools: docs/uncertainty.md",
+)  # fmt: skip
+OF_MESH_SINKING = Prior(
+    "mesh of a sinking brain", "normal", (0.25, 0.25), "share of the tumour's motion, where it slides under weight",
+    "smoothed elements are 16 to 22 % off quadratic ones, and these go down on finer meshes: docs/uncertainty.md",
 )  # fmt: skip
 OF_REGISTRATION = Prior(
     REGISTRATION, "normal", (1.56e-3, 1.56e-3), "shift of the whole scan, along each axis [m]",
@@ -96,7 +104,8 @@ OF_SEGMENTATION = Prior(
     "raters agree with a Dice score of 74 - 85 %, which is 1.3 - 2.3 mm between two of them on 7 ml: Menze et al. "
     "2015, IEEE Trans. Med. Imaging 34:1993-2024",
 )  # fmt: skip
-PRIORS = (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, OF_MESH, OF_REGISTRATION, OF_SEGMENTATION)
+PRIORS = (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, OF_MESH, OF_MESH_SLIDING, OF_MESH_SINKING)
+PRIORS += (OF_REGISTRATION, OF_SEGMENTATION)
 """All of them; what a trained model is off by is added where one answers."""
 
 
@@ -113,7 +122,7 @@ class Draw:
     tip
         How far off the tool is (3,) [m]: to the right, up, and inwards.
     mesh
-        The motion is longer by this share of it.
+        What the mesh is off by, in standard deviations of its prior. Positive: the motion is longer.
     """
 
     stiffness: float
@@ -128,10 +137,11 @@ def drawn(count: int, seed: int = 0) -> list[Draw]:
     """So many draws that cover each prior evenly (a Latin hypercube: McKay, Beckman, Conover 1979)."""
     random = np.random.default_rng(seed)
 
-    def values(prior: Prior) -> list[float]:
-        return prior.at((random.permutation(count) + random.uniform(size=count)) / count).tolist()
+    def shares() -> np.ndarray:
+        return (random.permutation(count) + random.uniform(size=count)) / count
 
-    columns = [values(prior) for prior in (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, TIP, TIP, OF_MESH)]
+    columns = [prior.at(shares()).tolist() for prior in (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, TIP, TIP)]
+    columns.append(ndtri(shares()).tolist())
     rows = zip(*columns, strict=True)
     return [Draw(young, nu, ratio, skull, tuple(tip), mesh) for young, nu, ratio, skull, *tip, mesh in rows]
 
