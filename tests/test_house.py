@@ -54,6 +54,7 @@ OWNERS = {
     },
     "sklearn": {"surrogate/regressors/svr.py"},
     "trimesh": {"scenes/script/tool.py"},
+    "isal": {"scenes/episodes/png.py"},
     "meshio": {"sim/bodies/meshfile.py"},
     "gymnasium": {f"scenes/gym/{of}.py" for of in ["environment", "observation", "registration", "vector"]},
     "viser": {f"ar/page/{of}.py" for of in ["browser", "crowd", "guard", "inputs", "messages", "recorder", "scene"]},

@@ -130,7 +130,7 @@ def _collected(path: Path, plan: Plan, seed: int, number: int, place: Path, devi
     body, theatre = opened.body, opened.theatre
     scene = scene_of(plan, body, theatre.site, asked, seed, number)
     name = "fem" if contents.bodies.learner.name == NO_LEARNER else theatre.best(scene)
-    player = replace(theatre.player(name, scene), style="window" if contents.overlay else "none")
+    player = replace(theatre.player(name, scene), composed=contents.overlay)
     noise = asked.group("noise")
 
     def grain(picture: int, colour: np.ndarray) -> np.ndarray:

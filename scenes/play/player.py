@@ -139,12 +139,16 @@ class HeldTool:
 
 @dataclass(frozen=True, eq=False)
 class Player:
-    """A scene on a stage with one deformer. `draw` is a pure function of time, touch and the previous answer."""
+    """A scene on a stage with one deformer. `draw` is a pure function of time, touch and the previous answer.
+
+    Not `composed`: no overlay and no words are drawn, and `Frame.shown` is the picture itself.
+    """
 
     stage: Stage
     deformer: Deformer
     style: Style = "window"
     uncertainty: Uncertainty | None = None
+    composed: bool = True
 
     @property
     def scene(self) -> Scene:
@@ -227,15 +231,18 @@ class Player:
         trained = answering(self.deformer, deformation) is not None
         lines = error_lines(promised, error, trained, doubt, camera.width < FEW)
         head = [part for line in lines for part in folded(line, WIDE * camera.width)]
-        over = composite(
-            picture, camera, tumour, COVERS, self.style, band, shown, rest, doubt, traces, moved, head,
-            opening=OPENING, error=error.bound, names=names_of(estimate),
-        )  # fmt: skip
-        if estimate is not None and self.style != "none":
-            draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
         remarks = self.scene.stopped(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
-        annotate(over, number, remark)
+        if self.composed:
+            over = composite(
+                picture, camera, tumour, COVERS, self.style, band, shown, rest, doubt, traces, moved, head,
+                opening=OPENING, error=error.bound, names=names_of(estimate),
+            )  # fmt: skip
+            if estimate is not None and self.style != "none":
+                draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
+            annotate(over, number, remark)
+        else:
+            over = Overlaid(picture.colour, np.zeros((camera.height, camera.width), np.uint8))
         spent = seconds, seen - begun - located, clock.perf_counter() - seen
         took = dict(zip(STAGES, spent, strict=True)) | ({} if estimate is None else {"locate": located})
         return Frame(
