@@ -22,7 +22,7 @@ from ...script.tracked_tool import TrackedTool
 from ...script.uncertainty import DEVIATIONS, LEVEL
 from .agreement import Agreement
 from .elsewhere import Elsewhere
-from .plausible import NEAR, buried, from_head, implausible
+from .plausible import implausible, misplaced_tool
 from .tool_motion import Motion, ToolMotion
 
 # So long a picture's overlay stays where it was when the reference is lost: in a hand's picture it is off by less than
@@ -214,16 +214,9 @@ class Follower:
     def _implausible(self, camera: Camera, tool: np.ndarray | None, before: Known | None) -> tuple[str, bool]:
         """Why this can be no registration of this patient, in words; and whether the tool has been near the head."""
         stage, near = self.motion.stage, before is not None and before.near
-        away = 0.0 if tool is None else from_head(tool[:3, 3], stage)
-        near = near or (tool is not None and away <= NEAR)
-        doubt = implausible(self.registration, stage, camera)
         theirs = "is this its registration?" if self.elsewhere is None else "are these its poses and registration?"
-        if not doubt and away > NEAR and not near:
-            doubt = (
-                f"the tool is {1e3 * away:.0f} mm from the head, and was never nearer than {1e3 * NEAR:.0f}: {theirs}"
-            )
-        if not doubt and tool is not None and self.tool is not None and (deep := buried(self.tool, tool, stage)):
-            doubt = f"{deep}: {theirs}"
+        misplaced, near = ("", near) if tool is None else misplaced_tool(self.tool, tool, stage, near, theirs)
+        doubt = implausible(self.registration, stage, camera) or misplaced
         return doubt, near
 
     def _without_reference(self, tracked: Tracked, time: float, before: Known | None) -> Known:
@@ -266,7 +259,7 @@ class Follower:
             return Known(time, State.NO_TOOL, words, tracked, last, felt=felt)
         into = np.linalg.inv(self.registration.T_patient_scan)
         pose = into @ beside.T_camera_target @ self.tool.T_cube_tool
-        spread = self._tip_covariance(beside) + (LEVER * shutter / DEVIATIONS) ** 2 * np.eye(3)
+        spread = tip_covariance(self.registration, self.tool, beside) + (LEVER * shutter / DEVIATIONS) ** 2 * np.eye(3)
         motion = self.motion.under(pose, spread, last)
         moved = State.GOOD if motion.moved > 0.0 else State.REST
         state = State.UNSURE if motion.doubt else moved if motion.known else State.UNKNOWN
@@ -289,16 +282,6 @@ class Follower:
             return f"not known, {outside} (see --clock)"
         return f"stale, no pose for {age:.1f} s" if np.isfinite(age) else "not seen yet by the other tracker"
 
-    def _tip_covariance(self, beside: Pose) -> np.ndarray:
-        """Of the tool's tip in the scan (3, 3) [m^2]: by both poses, the tool's calibration and the registration."""
-        assert self.tool is not None
-        T = self.registration.T_patient_scan
-        arm, tracked = beside.point(self.tool.T_cube_tool[:3, 3])
-        turned = beside.T_camera_target[:3, :3]
-        _, registered = self.registration.point((arm - T[:3, 3]) @ T[:3, :3])
-        whole = tracked + turned @ self.tool.tip_covariance @ turned.T + registered
-        return T[:3, :3].T @ whole @ T[:3, :3]
-
     def _band(
         self, reference: Pose, middle: np.ndarray, motion: Motion, shutter: float
     ) -> tuple[float, dict[str, float]]:
@@ -320,6 +303,16 @@ class Follower:
             **({"shutter": shutter} if self.calibration.readout > 0.0 else {}),
         }
         return float(np.linalg.norm([across(tracked + camera + registered, at), motion.error, shutter])), parts
+
+
+def tip_covariance(registration: Registration, tool: TrackedTool, beside: Pose) -> np.ndarray:
+    """Of a tool's tip in the scan (3, 3) [m^2]: by its pose beside the reference, its calibration and registration."""
+    T = registration.T_patient_scan
+    arm, tracked = beside.point(tool.T_cube_tool[:3, 3])
+    turned = beside.T_camera_target[:3, :3]
+    _, registered = registration.point((arm - T[:3, 3]) @ T[:3, :3])
+    whole = tracked + turned @ tool.tip_covariance @ turned.T + registered
+    return T[:3, :3].T @ whole @ T[:3, :3]
 
 
 def across(covariance: np.ndarray, sight: np.ndarray) -> float:

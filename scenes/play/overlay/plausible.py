@@ -45,3 +45,19 @@ def buried(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stage) -> str:
         if depth > DEEP and encloses(corners, point):
             return f"the tool's {what} would be {1e3 * depth:.0f} mm deep in the brain"
     return ""
+
+
+def misplaced_tool(
+    tool: TrackedTool | None, T_scan_tool: np.ndarray, stage: Stage, near: bool, theirs: str
+) -> tuple[str, bool]:
+    """Say why a tool's pose (4, 4) [m] can be none on this patient, if so; and whether the tool has been near the head.
+
+    `near` says whether it was before, and `theirs` asks what may be wrong.
+    """
+    away = from_head(T_scan_tool[:3, 3], stage)
+    near = near or away <= NEAR
+    if not near:
+        never = f"the tool is {1e3 * away:.0f} mm from the head, and was never nearer than {1e3 * NEAR:.0f}"
+        return f"{never}: {theirs}", near
+    deep = "" if tool is None else buried(tool, T_scan_tool, stage)
+    return f"{deep}: {theirs}" if deep else "", near

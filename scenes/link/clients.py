@@ -1,0 +1,250 @@
+"""Many OpenIGTLink clients at once: what they send is checked, and each is sent the newest; nobody waits for another."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import count
+
+from .frame import HEADER, WRONG_CHECKSUM, BadMessageError, Header, content_of, framed, read_header
+from .messages import Code, status
+
+STATUS_NAME = "Sulcus"
+"""The device name of each STATUS that is sent."""
+# Bytes of a message that is passed over if it is not wanted; a longer one ends the connection.
+LONGEST = 1 << 26
+# So long a body that was announced may take to come, and a client may leave unread what it is sent [s].
+PATIENCE = 10.0
+# So long a new client may take to ask before it is sent everything, and one that is sent away to hear why [s].
+GREETING, FAREWELL = 0.2, 1.0
+# What the system holds for a client that is slow, in bytes: what is there is not replaced by what is newer.
+HELD = 1 << 18
+# What is read ahead of a client, and is passed over at a time, in bytes.
+AHEAD = 1 << 16
+REQUESTS, ASKING = ("GET_", "STT_", "STP_"), ("GET_", "STP_")
+
+Receive = Callable[[int, Header, bytes], None]
+"""Takes a client's number, a message's header and its content; raises `BadMessageError`."""
+Longest = Callable[[str], int]
+"""The size in bytes up to which messages of a type are wanted; 0: none."""
+
+
+@dataclass(eq=False)
+class Client:
+    """One connection: what it waits for, by what it is, and whether it asks for each message."""
+
+    number: int
+    writer: asyncio.StreamWriter
+    waiting: dict[str, tuple[bytes, ...]] = field(default_factory=dict)
+    news: asyncio.Event = field(default_factory=asyncio.Event)
+    spoke: asyncio.Event = field(default_factory=asyncio.Event)
+    asks: bool = False
+    leaving: bool = False
+
+    def offer(self, key: str, messages: tuple[bytes, ...]) -> None:
+        """Have messages sent when the connection is free; older ones of the same key are dropped."""
+        self.waiting[key] = messages
+        self.news.set()
+
+    def leave(self) -> None:
+        """End, once what waits is sent."""
+        self.leaving = True
+        self.news.set()
+
+
+class Clients:
+    """The clients of a server, or the one connection of a client.
+
+    All methods belong to the event loop's thread.
+
+    Parameters
+    ----------
+    receive
+        Hears each message that is wanted and whose checksum is right.
+    longest
+        Which messages those are.
+    left
+        Hears the number of a client that is gone.
+    most
+        How many clients there may be; another one is sent away.
+    """
+
+    def __init__(
+        self, receive: Receive, longest: Longest, left: Callable[[int], None] = lambda number: None, most: int = 16
+    ) -> None:
+        self.refused: Counter[str] = Counter()
+        """How often messages were refused, by why."""
+        self._receive, self._longest, self._left, self._most = receive, longest, left, most
+        self._numbers = count()
+        self._clients: dict[int, Client] = {}
+        self._newest: dict[str, tuple[bytes, ...]] = {}
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._clients)
+
+    def publish(self, key: str, messages: Iterable[bytes]) -> None:
+        """Send messages to all clients, together; they take the place of those of the same key that still wait."""
+        self._newest[key] = tuple(messages)
+        for client in self._clients.values():
+            if not client.asks:
+                client.offer(key, self._newest[key])
+
+    def say(self, number: int, code: Code, text: str) -> None:
+        """Send a STATUS to one client; of many at once it gets the newest."""
+        client = self._clients.get(number)
+        if client is not None and not client.asks:
+            client.offer("status", (framed("STATUS", STATUS_NAME, status(code, text), 0),))
+
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Serve one connection until it ends."""
+        client = Client(next(self._numbers), writer)
+        _hold_little(writer)
+        if len(self._clients) >= self._most:
+            self.refused["too many clients"] += 1
+            text = f"{self._most} clients are connected, and no more are taken: end one of them"
+            writer.write(framed("STATUS", STATUS_NAME, status(Code.BUSY, text), 0))
+            await _close(writer)
+            return
+        self._clients[client.number] = client
+        sending = asyncio.create_task(self._send(client))
+        reading = asyncio.create_task(self._read(client, reader))
+        try:
+            await asyncio.wait((sending, reading), return_when=asyncio.FIRST_COMPLETED)
+            if reading.done() and not sending.done():
+                client.leave()
+                await asyncio.wait((sending,), timeout=FAREWELL)
+        finally:
+            del self._clients[client.number]
+            for task in (sending, reading):
+                task.cancel()
+            await asyncio.gather(sending, reading, return_exceptions=True)
+            self._left(client.number)
+            await _close(writer)
+
+    async def _send(self, client: Client) -> None:
+        """Send what waits, as fast as the client reads it."""
+        try:
+            async with asyncio.timeout(GREETING):
+                await client.spoke.wait()
+        except TimeoutError:
+            pass
+        if not client.asks:
+            client.waiting = self._newest | client.waiting
+            client.news.set()
+        try:
+            while not client.leaving or client.waiting:
+                await client.news.wait()
+                client.news.clear()
+                while client.waiting:
+                    messages = client.waiting.pop(next(iter(client.waiting)))
+                    client.writer.writelines(messages)
+                    async with asyncio.timeout(PATIENCE):
+                        await client.writer.drain()
+        except TimeoutError:
+            self.refused["client that does not read"] += 1
+            client.writer.transport.abort()
+        except OSError:
+            self.refused["client that vanished"] += 1
+
+    async def _read(self, client: Client, reader: asyncio.StreamReader) -> None:
+        """Hear what a client sends, until it ends or sends what cannot be followed."""
+        try:
+            while True:
+                raw = await reader.readexactly(HEADER.size)
+                header = read_header(raw)
+                if header.size > LONGEST:
+                    raise BadMessageError(f"{_named(header)} announces {header.size} bytes; {LONGEST} are the most")
+                async with asyncio.timeout(PATIENCE):
+                    await self._hear(client, reader, header)
+                await asyncio.sleep(0)  # One that sends without pause keeps nobody else waiting.
+        except TimeoutError:
+            self._refuse(client, Code.TIMEOUT, "message that does not end", "a message did not end: connect anew")
+        except BadMessageError as error:
+            self._refuse(client, Code.OVERFLOW, "no message", f"{error}: connect anew")
+        except asyncio.IncompleteReadError as error:
+            self.refused["message that breaks off"] += bool(error.partial)
+        except OSError:
+            self.refused["client that vanished"] += 1
+
+    async def _hear(self, client: Client, reader: asyncio.StreamReader, header: Header) -> None:
+        """Hear one message's body, and answer."""
+        if header.kind[:4] in REQUESTS:
+            await _pass_over(reader, header.size)
+            self._ask(client, header)
+            return
+        client.spoke.set()
+        longest = self._longest(header.kind)
+        if header.size > longest:
+            await _pass_over(reader, header.size)
+            why, code = ("too long", Code.OVERFLOW) if longest else ("type not used", Code.UNKNOWN_INSTRUCTION)
+            self._refuse(client, code, why, f"{_named(header)} is passed over: {why}")
+            return
+        body = await reader.readexactly(header.size)
+        try:
+            self._receive(client.number, header, content_of(header, body))
+        except BadMessageError as error:
+            code = Code.CHECKSUM if str(error) == WRONG_CHECKSUM else Code.CONFIGURATION
+            # What stands after a colon differs from message to message.
+            self._refuse(client, code, str(error).partition(":")[0], f"{_named(header)} is refused: {error}")
+
+    def _ask(self, client: Client, header: Header) -> None:
+        """A client that asks, or wants no stream, is sent what it asks for and nothing else."""
+        client.asks = header.kind.startswith(ASKING)
+        client.spoke.set()
+        if header.kind.startswith("STP_"):
+            client.waiting.clear()
+        elif client.asks:
+            found = _found(self._newest, header.kind.removeprefix("GET_"), header.name)
+            text = f"there is no {header.kind.removeprefix('GET_')} yet"
+            none = framed("STATUS", STATUS_NAME, status(Code.NOT_FOUND, text), 0)
+            client.waiting.clear()
+            client.offer("asked", (found or none,))
+        else:
+            client.waiting = dict(self._newest)
+            client.news.set()
+
+    def _refuse(self, client: Client, code: Code, why: str, text: str) -> None:
+        self.refused[why] += 1
+        self.say(client.number, code, text)
+
+
+def _found(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> bytes | None:
+    """The newest message of a type: that of a name if there is one, else the first."""
+    alike = [
+        (header.name, message)
+        for messages in newest.values()
+        for message in messages
+        if (header := read_header(message[: HEADER.size])).kind == kind
+    ]
+    return next((message for own, message in alike if own == name), alike[0][1] if alike else None)
+
+
+def _named(header: Header) -> str:
+    return f"{header.kind} {header.name}".strip()
+
+
+async def _pass_over(reader: asyncio.StreamReader, size: int) -> None:
+    """Read so many bytes, and keep none."""
+    while size:
+        size -= len(await reader.readexactly(min(size, AHEAD)))
+
+
+def _hold_little(writer: asyncio.StreamWriter) -> None:
+    """Have the system hold few bytes that a client has not read, and notice one that vanished."""
+    writer.transport.set_write_buffer_limits(high=0)
+    own = writer.get_extra_info("socket")
+    own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, HELD)
+    own.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+
+
+async def _close(writer: asyncio.StreamWriter) -> None:
+    try:
+        writer.close()
+        async with asyncio.timeout(FAREWELL):
+            await writer.wait_closed()
+    except (OSError, TimeoutError):
+        writer.transport.abort()

@@ -1,0 +1,105 @@
+"""The frame round every OpenIGTLink message: its header of 58 bytes, its checksum and its time stamp."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from sim.errors import InputError
+
+try:
+    from fastcrc import crc64
+except ImportError as error:
+    raise InputError("OpenIGTLink's checksums need fastcrc. Install it: pip install 'sulcus[link]'.") from error
+
+HEADER = struct.Struct(">H12s20sQQQ")
+"""Version, type, device name, time stamp, size of the body, checksum: 58 bytes, all numbers big-endian."""
+# Sizes of the extended header, of the index of metadata and of metadata, and the message's number: of version 2 on.
+EXTENDED = struct.Struct(">HHII")
+VERSIONS = (1, 2)
+# A time stamp counts 2^-32 s since 1970.
+TICKS = 1 << 32
+NAME_BYTES = 20
+WRONG_CHECKSUM = "wrong checksum"
+
+
+class BadMessageError(ValueError):
+    """Bytes that are no message, or one whose content is wrong; in words that a sender can act on."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """A message's header.
+
+    Parameters
+    ----------
+    version
+        1, or 2 where an extended header and metadata surround the content.
+    kind, name
+        Type and device name.
+    stamp
+        When it was true, in 2^-32 s since 1970; 0: not said.
+    size
+        Of its body, in bytes.
+    checksum
+        CRC-64 of the body (ECMA-182, from 0).
+    """
+
+    version: int
+    kind: str
+    name: str
+    stamp: int
+    size: int
+    checksum: int
+
+
+def read_header(raw: bytes) -> Header:
+    """The header in 58 bytes.
+
+    Raises
+    ------
+    BadMessageError
+        Another version, or a type or name that is not of printable ASCII characters: this is no OpenIGTLink.
+    """
+    version, kind, name, stamp, size, checksum = HEADER.unpack(raw)
+    words = [text.split(b"\0", 1)[0] for text in (kind, name)]
+    if version not in VERSIONS or not words[0] or not all(32 <= byte < 127 for text in words for byte in text):
+        raise BadMessageError("these bytes are no OpenIGTLink message of version 1 or 2")
+    return Header(version, words[0].decode().strip(), words[1].decode().strip(), stamp, size, checksum)
+
+
+def content_of(header: Header, body: bytes) -> bytes:
+    """What lies between an extended header and metadata, once the checksum is right; of version 1 the whole body.
+
+    Raises
+    ------
+    BadMessageError
+        A wrong checksum, or sizes that the body does not have.
+    """
+    if crc64.ecma_182(body) != header.checksum:
+        raise BadMessageError(WRONG_CHECKSUM)
+    if header.version == 1:
+        return body
+    if len(body) < EXTENDED.size:
+        raise BadMessageError("too short for an extended header")
+    start, index, metadata, _ = EXTENDED.unpack_from(body)
+    end = len(body) - index - metadata
+    if not EXTENDED.size <= start <= end:
+        raise BadMessageError("its extended header names other sizes than the message has")
+    return body[start:end]
+
+
+def framed(kind: str, name: str, body: bytes, stamp: int) -> bytes:
+    """A whole message of version 1, which every client reads; a name longer than 20 bytes is cut."""
+    text = name.encode("ascii", "replace")[:NAME_BYTES]
+    return HEADER.pack(1, kind.encode(), text, stamp, len(body), crc64.ecma_182(body)) + body
+
+
+def stamp_of(time: float) -> int:
+    """The time stamp of a moment [s since 1970]."""
+    return int(time * TICKS)
+
+
+def time_of(stamp: int) -> float:
+    """The moment of a time stamp [s since 1970]."""
+    return stamp / TICKS

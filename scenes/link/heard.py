@@ -1,0 +1,129 @@
+"""What was heard of tool, reference, camera and scan, by OpenIGTLink's names; what is old is not known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .frame import TICKS, BadMessageError
+
+# By how much axes may differ from length 1 and right angles: matrices come in single precision.
+SQUARE = 2e-3
+# A tracked body is nearer to its tracker [m].
+FARTHEST = 10.0
+# A time stamp that is older than the last one is out of order, but for a clock that was set back by more [s].
+SET_BACK = 5.0
+
+
+@dataclass(frozen=True)
+class Names:
+    """Device names of the transforms that are listened to, each AToB: it takes places in A's frame to B's.
+
+    Where tool or camera end in another frame than the patient's reference, they end in that of the tracker, as
+    `reference` does. A name of another form is taken for one that ends in the reference's frame.
+    """
+
+    tool: str = "StylusTipToReference"
+    reference: str = "ReferenceToTracker"
+    camera: str = "CameraToReference"
+    registration: str = "ReferenceToRas"
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """Every one."""
+        return self.tool, self.reference, self.camera, self.registration
+
+    def by_tracker(self, name: str) -> bool:
+        """Whether a body's transform ends in the tracker's frame."""
+        tracker = self.reference.rpartition("To")[2]
+        return "To" in self.reference and name.rpartition("To")[2] == tracker
+
+
+@dataclass(frozen=True, eq=False)
+class Sent:
+    """A transform as it came: T (4, 4) [m], its time stamp, when it came [s], and from which client."""
+
+    T: np.ndarray
+    stamp: int
+    arrived: float
+    sender: int
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """The newest transforms by name.
+
+    Parameters
+    ----------
+    names
+        Which are listened to.
+    stale
+        How old one of a moving body may be [s].
+    """
+
+    names: Names
+    stale: float
+    sent: Mapping[str, Sent] = field(default_factory=dict)
+
+    def hearing(self, name: str, matrix: np.ndarray, stamp: int, now: float, sender: int) -> Heard:
+        """With a transform (4, 4) [mm] of one client.
+
+        Raises
+        ------
+        BadMessageError
+            A matrix that is no rigid motion, or one that says that nothing is seen; a time that does not go on;
+            another client that sends the same transform.
+        """
+        T = rigid(matrix)
+        if name != self.names.registration and np.array_equal(matrix, np.eye(4)):
+            raise BadMessageError("the identity, which trackers send of what they do not see")
+        last = self.sent.get(name)
+        if last is not None and last.sender != sender and now - last.arrived < self.stale:
+            raise BadMessageError("another client sends it, too")
+        if last is not None and last.sender == sender and stamp and name != self.names.registration:
+            if stamp == last.stamp:
+                raise BadMessageError("the same time stamp again")
+            if 0 < last.stamp - stamp < SET_BACK * TICKS:
+                raise BadMessageError("a time stamp before the last one")
+        return replace(self, sent={**self.sent, name: Sent(T, stamp, now, sender)})
+
+    def beside(self, name: str, now: float) -> Sent | str:
+        """A body beside the patient's reference, with its own time stamp; or why that is not known."""
+        needed = (name, self.names.reference) if self.names.by_tracker(name) else (name,)
+        for each in needed:
+            sent = self.sent.get(each)
+            if sent is None:
+                return f"no {each} yet"
+            if (age := now - sent.arrived) > self.stale:
+                return f"no new {each} for {age:.1f} s"
+        body = self.sent[name]
+        if len(needed) == 1:
+            return body
+        reference = self.sent[self.names.reference]
+        arrived = min(body.arrived, reference.arrived)
+        return replace(body, T=np.linalg.inv(reference.T) @ body.T, arrived=arrived)
+
+
+def rigid(matrix: np.ndarray) -> np.ndarray:
+    """The rigid motion (4, 4) [m] of a matrix (4, 4) [mm], rid of single precision's rounding.
+
+    Raises
+    ------
+    BadMessageError
+        A matrix that is not finite, mirrors, scales or shears, or shifts by more than 10 m.
+    """
+    if not np.isfinite(matrix).all():
+        raise BadMessageError("a matrix that is not finite")
+    axes, shift = matrix[:3, :3], 1e-3 * matrix[:3, 3]
+    if np.linalg.det(axes) < 0.0:
+        raise BadMessageError("a matrix that mirrors: one frame is left-handed")
+    if np.abs(axes.T @ axes - np.eye(3)).max() > SQUARE:
+        raise BadMessageError("a matrix that scales or shears: give a rotation and a shift in mm")
+    if np.abs(shift).max() > FARTHEST:
+        raise BadMessageError("a shift of more than 10 m: give mm")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_matrix(axes).as_matrix(), shift
+    return T

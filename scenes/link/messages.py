@@ -1,0 +1,178 @@
+"""The contents of OpenIGTLink messages: TRANSFORM, POSITION, POINT and IMAGE to read, and what is sent.
+
+Lengths are millimetres here, as in the protocol. Layouts: openigtlink.org/protocols, version 2.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .frame import BadMessageError
+
+FLOATS = np.dtype(">f4")
+WHOLES = np.dtype(">u4")
+# Version, components, scalar type, endianness, space, sizes, axes and centre, start and sizes of the part that is sent.
+IMAGE = struct.Struct(">HBBBB3H12f6H")
+POINT = struct.Struct(">64s32s4B3ff20s")
+STATUS = struct.Struct(">Hq20s")
+BYTES, BIG, RAS = 3, 1, 1
+ASCII = 3
+LONGEST_TEXT = (1 << 16) - 1
+
+
+class Code(IntEnum):
+    """Codes of a STATUS."""
+
+    OK = 1
+    NOT_FOUND = 4
+    BUSY = 6
+    TIMEOUT = 7
+    OVERFLOW = 8
+    CHECKSUM = 9
+    CONFIGURATION = 10
+    UNKNOWN_INSTRUCTION = 12
+    NOT_READY = 13
+    SHUTDOWN = 19
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles (m, 3) of a surface whose points move, as they are sent.
+
+    The bytes of the triangles are made once.
+    """
+
+    count: int
+    cells: bytes
+
+    @staticmethod
+    def of(triangles: np.ndarray) -> Mesh:
+        """From vertex numbers (m, 3)."""
+        rows = np.full((len(triangles), 4), 3, WHOLES)
+        rows[:, 1:] = triangles
+        return Mesh(len(triangles), rows.tobytes())
+
+
+NOTHING = Mesh(0, b"")
+"""A surface that is not known."""
+
+
+def polydata(points: np.ndarray, mesh: Mesh) -> bytes:
+    """POLYDATA: points (n, 3) [mm] and the triangles between them."""
+    head = struct.pack(">10I", len(points), 0, 0, 0, 0, mesh.count, len(mesh.cells), 0, 0, 0)
+    return head + np.ascontiguousarray(points, FLOATS).tobytes() + mesh.cells
+
+
+def transform(T: np.ndarray) -> bytes:
+    """TRANSFORM: a rigid motion (4, 4) [mm], column by column."""
+    return np.ascontiguousarray(T[:3].T, FLOATS).tobytes()
+
+
+def read_transform(content: bytes) -> np.ndarray:
+    """The matrix (4, 4) [mm] of a TRANSFORM, whatever it holds.
+
+    Raises
+    ------
+    BadMessageError
+        Another size.
+    """
+    T = np.eye(4)
+    T[:3] = _floats(content, 12).reshape(4, 3).T
+    return T
+
+
+def read_position(content: bytes) -> np.ndarray:
+    """The matrix (4, 4) [mm] of a POSITION: a place, and a unit quaternion, or none.
+
+    Raises
+    ------
+    BadMessageError
+        Another size; a quaternion that is none.
+    """
+    numbers = _floats(content, 7 if len(content) == 28 else 3)
+    T = np.eye(4)
+    T[:3, 3] = numbers[:3]
+    if len(numbers) == 7:
+        length = float(np.linalg.norm(numbers[3:]))
+        if not abs(length - 1.0) < 1e-2:
+            raise BadMessageError("its quaternion is not of length 1")
+        T[:3, :3] = Rotation.from_quat(numbers[3:]).as_matrix()
+    return T
+
+
+def _floats(content: bytes, count: int) -> np.ndarray:
+    if len(content) != FLOATS.itemsize * count:
+        raise BadMessageError(f"wrong size: {len(content)} bytes in place of {FLOATS.itemsize * count}")
+    return np.frombuffer(content, FLOATS).astype(float)
+
+
+def points(names: list[str], places: np.ndarray) -> bytes:
+    """POINT: places (n, 3) [mm], with a name each."""
+    rows = zip(names, places.tolist(), strict=True)
+    return b"".join(
+        POINT.pack(name.encode("ascii", "replace")[:64], b"", 255, 255, 0, 255, *place, 0.0, b"")
+        for name, place in rows
+    )
+
+
+def read_points(content: bytes) -> tuple[list[str], np.ndarray]:
+    """Names and places (n, 3) [mm] of a POINT.
+
+    Raises
+    ------
+    BadMessageError
+        Another size; places that are not finite.
+    """
+    if len(content) % POINT.size:
+        raise BadMessageError(f"wrong size: {len(content)} bytes, no multiple of {POINT.size}")
+    rows = list(POINT.iter_unpack(content))
+    places = np.array([row[6:9] for row in rows], float).reshape(-1, 3)
+    if not np.isfinite(places).all():
+        raise BadMessageError("holds a place that is not finite")
+    return [row[0].split(b"\0", 1)[0].decode("ascii", "replace") for row in rows], places
+
+
+def image(colour: np.ndarray) -> bytes:
+    """IMAGE: a picture (H, W, 3) uint8, pixels of 1 mm round the origin."""
+    height, width, channels = colour.shape
+    size = width, height, 1
+    axes = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
+    return IMAGE.pack(1, channels, BYTES, BIG, RAS, *size, *axes, 0, 0, 0, *size) + colour.tobytes()
+
+
+def read_image(content: bytes) -> np.ndarray:
+    """The picture (H, W, 3) uint8 of an IMAGE; grey ones have three equal channels.
+
+    Raises
+    ------
+    BadMessageError
+        What is no single picture of bytes, sent whole, in grey, RGB or RGBA.
+    """
+    if len(content) < IMAGE.size:
+        raise BadMessageError("is too short for a picture")
+    _, channels, kind, _, _, *numbers = IMAGE.unpack_from(content)
+    size, part = numbers[:3], numbers[15:]
+    width, height, depth = size
+    if kind != BYTES or depth != 1 or channels not in (1, 3, 4) or part != [0, 0, 0, *size]:
+        raise BadMessageError("is no single picture of 8 bits, in grey or RGB, that is sent whole")
+    if len(content) != IMAGE.size + width * height * channels:
+        raise BadMessageError("holds another number of pixels than it names")
+    pixels = np.frombuffer(content, np.uint8, offset=IMAGE.size).reshape(height, width, channels)
+    return np.ascontiguousarray(np.broadcast_to(pixels, (height, width, 3)) if channels == 1 else pixels[..., :3])
+
+
+def string(text: str) -> bytes:
+    """STRING: a text of ASCII characters."""
+    raw = text.encode("ascii", "replace")[:LONGEST_TEXT]
+    return struct.pack(">HH", ASCII, len(raw)) + raw
+
+
+def status(code: Code, text: str) -> bytes:
+    """STATUS: a code, its name, and a sentence."""
+    name = "" if code is Code.OK else code.name
+    return STATUS.pack(code, 0, name.encode()) + text.encode("ascii", "replace") + b"\0"
