@@ -42,6 +42,7 @@ COMMANDS = {
     "track": "follow the tool and the patient's reference through a film: poses, covariances, and where they are lost",
     "film": "film a scene as a real camera would, with printed targets in view, and write down what is true of it",
     "overlay": "draw where the tumour is into a film or what a camera sees, by the tracked reference and tool",
+    "link": "send where the tumour is to 3D Slicer, PLUS and others by OpenIGTLink, live, by the poses that they send",
     "calibrate": "find a camera's intrinsics, a tool's tip, or how two tracked bodies lie together, and how surely",
     "register": "find how a scan lies beside the patient's reference, from points that were touched, and how surely",
     "sensitivity": "measure how the tumour's motion changes with tissue, skull, tool and element, one at a time",
@@ -55,7 +56,7 @@ COMMANDS = {
 # Commands that make or read models, whose learners may be a user's own.
 MAKING = ("train", "patient")
 READING = (
-    "judge", "export", "scenes", "effects", "demo", "render", "film", "overlay", "collect", "sensitivity",
+    "judge", "export", "scenes", "effects", "demo", "render", "film", "overlay", "link", "collect", "sensitivity",
     "uncertainty", "budget", "check",
 )  # fmt: skip
 

@@ -39,7 +39,7 @@ ORDER = (
     {"ar.page"},
     {"scenes.script"},
     {"scenes.builtin", "scenes.play"},
-    {"scenes.gym"},
+    {"scenes.gym", "scenes.link"},
     {"scenes.bench", "scenes.episodes"},
     {"scenes.report"},
     {"scenes.commands"},
@@ -61,6 +61,7 @@ OWNERS = {
     "nilearn": {"sim/bodies/template.py"},
     "pyarrow": {"scenes/episodes/exports/lerobot.py"},
     "onnx": {"surrogate/onnx_export/export.py", "surrogate/onnx_export/graph.py"},
+    "fastcrc": {"scenes/link/frame.py"},
     "pyamg": {"sim/linalg/amg.py"},
     "PIL": {"ar/tracking/pages.py", "ar/tracking/pictures.py"},
     "nibabel": {"sim/bodies/intensity.py", "sim/bodies/nifti.py"},
@@ -209,7 +210,7 @@ def test_rooms_without_pictures_or_networks_import_none():
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported():
     project = tomllib.loads((HOUSE / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    declared = [*project["dependencies"], *extras["exports"], *extras["gym"], *extras["onnx"]]
+    declared = [*project["dependencies"], *extras["exports"], *extras["gym"], *extras["link"], *extras["onnx"]]
     names = {re.split(r"[<>=!~\[ ]", line)[0] for line in declared}
     allowed = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
     used = set().union(*map(libraries, FILES)) - set(sys.stdlib_module_names) - set(ROOMS)

@@ -88,6 +88,10 @@ next: sulcus overlay film/film.mp4 --camera film/camera.yaml --registration ...,
   sulcus overlay film.mp4 --camera K.yaml --registration R.json --tool T.json --out shown.mp4
   sulcus overlay 0 --camera K.yaml --registration R.json --tool T.json
 next: look at the film that it wrote""",
+    "link": """examples:
+  sulcus link patient.vtu --model poses.model.npz --registration registration.json
+  sulcus link patient.vtu --model poses.model.npz --client localhost:18944
+next: in 3D Slicer, OpenIGTLinkIF, add a client of this machine; docs/openigtlink.md names what comes""",
     "calibrate": """examples:
   sulcus calibrate board.mp4 --out camera.yaml
   sulcus calibrate pictures --size 1280x960 --out camera.yaml --json

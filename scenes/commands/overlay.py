@@ -23,26 +23,21 @@ from .json_line import json_line
 from .outputs import add_force, claimed
 from .poses_options import add_poses, demand_poses, elsewhere_of
 from .style_option import add_style
-from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
+from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments
+from .tracked_scene import REST, mover, tracked_scene
 
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
-    from sim.deformation import Deformer
-    from sim.tools import BuiltIn
 
-    from ..play.deformers import Theatre
     from ..play.overlay.follower import Follower
     from ..play.overlay.page import OverlayPage
     from ..play.overlay.picture import Painter
     from ..play.overlay.run import Shown
-    from ..script.scene import Scene
 
 FILMS = (".mp4", ".gif", ".webp")
 TABLE = "a table of `sulcus overlay`"
 # Only this machine reaches the page.
 HOST = "127.0.0.1"
-REST = "rest"
-"""The deformer that lets the brain stay as in the scan."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -245,47 +240,14 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     said = other_mesh(registration, theatre.anatomy, args.registration)
     if said:
         print(f"sulcus overlay: {said}", file=sys.stderr)
-    scene = _scene(args, None if tool is None else tool.shape)
+    scene = tracked_scene(args, None if tool is None else tool.shape)
     stage = theatre.stage(scene)
-    deformer, who = _deformer(args, theatre, scene, tool is not None)
+    deformer, who = mover(args, theatre, scene, tool is not None)
     motion = ToolMotion(stage, deformer)
     device = find_device(args.device, LIVE.precision).name
     load_kernels(device)
     follower = Follower(calibration, registration, tool, motion, elsewhere, intrinsic)
     return Parts(calibration, follower, Painter(stage, tool, args.style, device), who)
-
-
-def _scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
-    """What acts on the brain: the tool, moved by pose, and the skull."""
-    from sim.effects import SKULLS, Elasticity, Held, ToolContact
-
-    from ..script.scene import Scene
-
-    touched = () if shape is None else (ToolContact((shape,)),)
-    effects = (Elasticity(tissue_of(args)), Held(), SKULLS[args.skull], *touched)
-    return Scene("overlay", "A real picture.", effects=effects, element=args.element)
-
-
-def _deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool) -> tuple[Deformer | None, str]:
-    """Who says how the brain lies, and that in words."""
-    from ..play.deformers import GUARDED
-
-    still = "nobody: the brain stays as in the scan"
-    if not tooled:
-        return None, still
-    name = args.deformer
-    if name is None and not theatre.knowing(scene):
-        refused = next(iter(theatre.refusals(scene).values()), "there is none")
-        said = f"no model says how the brain moves: {refused}. Give --deformer fem, or a model of the tool's poses"
-        print(f"sulcus overlay: {said}", file=sys.stderr)
-        name = REST
-    if name == REST:
-        return None, still
-    name = name or theatre.usual(scene)
-    names = (*theatre.names(scene), REST)
-    if name not in (*names, *theatre.models, GUARDED):
-        raise InputError(f"no deformer is called {name!r} here: choose one of {', '.join(names)}.")
-    return theatre.deformer(name, scene), theatre.described(name, scene)
 
 
 def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:

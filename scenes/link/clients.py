@@ -1,4 +1,4 @@
-"""Many OpenIGTLink clients at once: what they send is checked, and each is sent the newest; nobody waits for another."""
+"""Many OpenIGTLink clients: what they send is checked, each is sent the newest, and nobody waits for another."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from itertools import count
 from .frame import HEADER, WRONG_CHECKSUM, BadMessageError, Header, content_of, framed, read_header
 from .messages import Code, status
 
-STATUS_NAME = "Sulcus"
-"""The device name of each STATUS that is sent."""
+REFUSED = "SulcusRefused"
+"""The device name of each STATUS that is sent to one client."""
 # Bytes of a message that is passed over if it is not wanted; a longer one ends the connection.
-LONGEST = 1 << 26
+LONGEST = 1 << 28
 # So long a body that was announced may take to come, and a client may leave unread what it is sent [s].
 PATIENCE = 10.0
 # So long a new client may take to ask before it is sent everything, and one that is sent away to hear why [s].
@@ -66,18 +66,14 @@ class Clients:
         Hears each message that is wanted and whose checksum is right.
     longest
         Which messages those are.
-    left
-        Hears the number of a client that is gone.
     most
         How many clients there may be; another one is sent away.
     """
 
-    def __init__(
-        self, receive: Receive, longest: Longest, left: Callable[[int], None] = lambda number: None, most: int = 16
-    ) -> None:
+    def __init__(self, receive: Receive, longest: Longest, most: int = 16) -> None:
         self.refused: Counter[str] = Counter()
         """How often messages were refused, by why."""
-        self._receive, self._longest, self._left, self._most = receive, longest, left, most
+        self._receive, self._longest, self._most = receive, longest, most
         self._numbers = count()
         self._clients: dict[int, Client] = {}
         self._newest: dict[str, tuple[bytes, ...]] = {}
@@ -97,7 +93,7 @@ class Clients:
         """Send a STATUS to one client; of many at once it gets the newest."""
         client = self._clients.get(number)
         if client is not None and not client.asks:
-            client.offer("status", (framed("STATUS", STATUS_NAME, status(code, text), 0),))
+            client.offer(REFUSED, (framed("STATUS", REFUSED, status(code, text), 0),))
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve one connection until it ends."""
@@ -106,7 +102,7 @@ class Clients:
         if len(self._clients) >= self._most:
             self.refused["too many clients"] += 1
             text = f"{self._most} clients are connected, and no more are taken: end one of them"
-            writer.write(framed("STATUS", STATUS_NAME, status(Code.BUSY, text), 0))
+            writer.write(framed("STATUS", REFUSED, status(Code.BUSY, text), 0))
             await _close(writer)
             return
         self._clients[client.number] = client
@@ -122,7 +118,6 @@ class Clients:
             for task in (sending, reading):
                 task.cancel()
             await asyncio.gather(sending, reading, return_exceptions=True)
-            self._left(client.number)
             await _close(writer)
 
     async def _send(self, client: Client) -> None:
@@ -200,7 +195,7 @@ class Clients:
         elif client.asks:
             found = _found(self._newest, header.kind.removeprefix("GET_"), header.name)
             text = f"there is no {header.kind.removeprefix('GET_')} yet"
-            none = framed("STATUS", STATUS_NAME, status(Code.NOT_FOUND, text), 0)
+            none = framed("STATUS", REFUSED, status(Code.NOT_FOUND, text), 0)
             client.waiting.clear()
             client.offer("asked", (found or none,))
         else:

@@ -87,21 +87,18 @@ def read_transform(content: bytes) -> np.ndarray:
 
 
 def read_position(content: bytes) -> np.ndarray:
-    """The matrix (4, 4) [mm] of a POSITION: a place, and a unit quaternion, or none.
+    """The matrix (4, 4) [mm] of a POSITION: a place, and a unit quaternion, the real part last.
 
     Raises
     ------
     BadMessageError
-        Another size; a quaternion that is none.
+        Another size, as of a place without its orientation; a quaternion that is none.
     """
-    numbers = _floats(content, 7 if len(content) == 28 else 3)
+    numbers = _floats(content, 7)
+    if not abs(np.linalg.norm(numbers[3:]) - 1.0) < 1e-2:
+        raise BadMessageError("its quaternion is not of length 1")
     T = np.eye(4)
-    T[:3, 3] = numbers[:3]
-    if len(numbers) == 7:
-        length = float(np.linalg.norm(numbers[3:]))
-        if not abs(length - 1.0) < 1e-2:
-            raise BadMessageError("its quaternion is not of length 1")
-        T[:3, :3] = Rotation.from_quat(numbers[3:]).as_matrix()
+    T[:3, :3], T[:3, 3] = Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]
     return T
 
 

@@ -1,0 +1,183 @@
+"""`sulcus link`: poses in and the tumour out by OpenIGTLink, live."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.errors import InputError
+
+from .interrupt import until_ended
+from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments
+from .tracked_scene import mover, tracked_scene
+
+if TYPE_CHECKING:
+    from ..link.session import Session
+    from ..play.deformers import Theatre
+    from ..script.tracked_tool import TrackedTool
+
+PORT = 18944
+"""That of OpenIGTLink."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("anatomy", type=Path, metavar="PATIENT.vtu", help="from `sulcus patient` or `sulcus anatomy`")
+    parser.add_argument("--model", type=Path, help="MODEL.npz of a tool's poses (default: PATIENT.model.npz beside it)")
+    parser.add_argument(
+        "--deformer", metavar="NAME",
+        help="who says how the brain lies under the tool: a model of its poses, guarded, fem or rest. rest: as in the "
+        "scan. Default: the best model that knows the tool, else rest",
+    )  # fmt: skip
+    parser.add_argument("--host", default="127.0.0.1", help="address to serve on (default %(default)s: this machine)")
+    parser.add_argument("--port", type=int, default=PORT, help="0: any free one (default %(default)s)")
+    parser.add_argument(
+        "--client", metavar="HOST[:PORT]", help="be the client of this server, as of PLUS, in place of serving"
+    )
+    parser.add_argument("--clients", type=int, default=16, help="how many there may be (default %(default)s)")
+    names = parser.add_argument_group("names of the transforms that are heard; AToB takes places in A's frame to B's")
+    names.add_argument("--tool-name", default="StylusTipToReference", help="default %(default)s")
+    names.add_argument("--reference-name", default="ReferenceToTracker", help="for AToTracker (default %(default)s)")
+    names.add_argument("--camera-name", default="CameraToReference", help="default %(default)s")
+    names.add_argument("--registration-name", default="ReferenceToRas", help="the scan's, RAS (default %(default)s)")
+    parser.add_argument(
+        "--registration", metavar="R.json", help="from `sulcus register`, in place of a transform that is sent"
+    )
+    parser.add_argument(
+        "--tool", metavar="TOOL.json",
+        help="the tool, and where it is in the frame that is sent. Default: that of the model, at PLUS's StylusTip: "
+        "origin at the tip, z away from the shaft",
+    )  # fmt: skip
+    parser.add_argument(
+        "--tracking-mm", type=float, default=0.5, metavar="MM",
+        help="standard deviation of the tip's place along each axis, which no message says (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--stale", type=float, default=0.3, metavar="S", help="a pose that is older is not known (default %(default)s)"
+    )
+    parser.add_argument("--camera", metavar="K.yaml", help="from `sulcus calibrate`: IMAGE is drawn into and sent back")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after so long (default: never)")
+    add_tissue_arguments(parser)
+    add_skull_argument(parser)
+    add_element_argument(parser)
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for finite elements and pictures")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until the time is over, Ctrl-C (exit code 0) or SIGTERM (143).
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read or do not belong together, impossible options, an address that cannot be used.
+    """
+    for name, value in {"--seconds": args.seconds, "--stale": args.stale, "--clients": args.clients}.items():
+        if not value > 0:
+            raise InputError(f"{name} {value:g}: give a positive number, or leave it out.")
+    if not 0.0 <= args.tracking_mm < 100.0:
+        raise InputError(f"--tracking-mm {args.tracking_mm:g}: give millimetres, 0 to 100.")
+    if not 0 <= args.port < 1 << 16:
+        raise InputError(f"--port {args.port}: give a port from 0 to 65535.")
+    at = None if args.client is None else address_of(args.client)
+    return until_ended(partial(_linked, args, at))
+
+
+def address_of(text: str) -> tuple[str, int]:
+    """Host and port of `HOST[:PORT]`.
+
+    Raises
+    ------
+    InputError
+        A text that is none.
+    """
+    host, _, port = text.partition(":")
+    if not host or not (port or str(PORT)).isdecimal() or int(port or PORT) >= 1 << 16:
+        raise InputError(f"--client {text}: give a host, and a port from 0 to 65535 after a colon.")
+    return host, int(port or PORT)
+
+
+def _linked(args: argparse.Namespace, at: tuple[str, int] | None, closing: ExitStack) -> int:
+    async def work() -> None:
+        session = opened(args)
+        closing.callback(session.end)
+        if at is not None:
+            print(f"sulcus: listens to {at[0]}:{at[1]} (Ctrl-C ends)", flush=True)
+            await session.follow(*at, args.seconds)
+            return
+        ready = asyncio.get_running_loop().create_future()
+        ready.add_done_callback(
+            lambda port: print(f"sulcus: serves on {args.host}:{port.result()} (Ctrl-C ends)", flush=True)
+        )
+        await session.serve(args.host, args.port, args.seconds, ready)
+
+    try:
+        asyncio.run(work())
+    except OSError as error:
+        raise InputError(f"no server on {args.host}, port {args.port} ({error}): choose others.") from error
+    return 0
+
+
+def opened(args: argparse.Namespace) -> Session:
+    """The link that the arguments ask for; in an event loop.
+
+    Raises
+    ------
+    InputError
+        As `run`.
+    """
+    from ar.overlay.composite import load_kernels
+    from sim.accuracy import LIVE
+    from sim.runtime.device import find_device
+
+    from ..link.answer import Answering
+    from ..link.heard import Heard, Names
+    from ..link.outgoing import Outgoing
+    from ..link.session import Eye, Session
+    from ..play.deformers import open_theatre
+    from ..play.overlay.picture import Painter
+    from ..play.overlay.tool_motion import ToolMotion
+    from ..script.calibration_file import read_calibration
+    from ..script.registration_file import other_mesh, read_registration
+    from ..script.tracked_tool import read_tool
+
+    calibration = None if args.camera is None else read_calibration(args.camera)
+    registration = None if args.registration is None else read_registration(args.registration)
+    tool = None if args.tool is None else read_tool(args.tool)
+    theatre = open_theatre(args.anatomy, args.model, args.device)
+    said = "" if registration is None else other_mesh(registration, theatre.anatomy, str(args.registration))
+    if said:
+        print(f"sulcus link: {said}", file=sys.stderr)
+    tool = tool or _tool_of(theatre, args.anatomy)
+    scene = tracked_scene(args, tool.shape)
+    deformer, who = mover(args, theatre, scene, True)
+    stage, tracking = theatre.stage(scene), 1e-3 * args.tracking_mm
+    eye = None
+    if calibration is not None:
+        device = find_device(args.device, LIVE.precision).name
+        load_kernels(device)
+        eye = Eye(calibration, Painter(stage, tool, device=device), tracking)
+    names = Names(args.tool_name, args.reference_name, args.camera_name, args.registration_name)
+    print(f"{args.anatomy.name}; {tool.shape}; motion by {who}", flush=True)
+    answering = Answering(ToolMotion(stage, deformer), tool, tracking, registration)
+    heard = Heard(names, args.stale)
+    return Session(answering, Outgoing(stage, registration is not None), heard, eye, args.clients)
+
+
+def _tool_of(theatre: Theatre, path: Path) -> TrackedTool:
+    """The tool that the best model of poses knows, at its tip as PLUS has it: z points away from the shaft."""
+    from ..script.tracked_tool import TrackedTool
+
+    posed = [(model.bound, model.tool) for model in theatre.models.values() if model.tool is not None]
+    if not posed:
+        raise InputError(
+            f"no model beside {path} knows a tool's poses. Give --tool TOOL.json with --deformer fem, or make a model: "
+            "`sulcus simulate --poses`, `sulcus train`."
+        )
+    return TrackedTool(min(posed, key=lambda each: each[0])[1], np.diag([1.0, -1.0, -1.0, 1.0]))

@@ -1,0 +1,152 @@
+"""From a tool's pose to what is known: where tumour and open cortex are, and how far off that may be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from ar.overlay.gauge import Gauge
+from ar.tracking.pose import Pose
+from ar.tracking.registration import Registration
+from ar.tracking.track import Tracked
+
+from ..play.overlay.follower import LIMIT, UNCHECKED, UNKNOWN, Known, State, tip_covariance
+from ..play.overlay.picture import Painter
+from ..play.overlay.plausible import misplaced_tool
+from ..play.overlay.tool_motion import ToolMotion
+from ..script.tracked_tool import TrackedTool
+from ..script.uncertainty import LEVEL
+from .frame import stamp_of, time_of
+from .heard import Heard
+
+THEIRS = "are these its poses and registration?"
+NOT_SEEN = Tracked(0, {}, {}, {})
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What is known of a pose.
+
+    Parameters
+    ----------
+    stamp
+        The pose's own time stamp; where it had none, or where nothing is known, that of the answer.
+    known
+        Where tumour and cortex are, by the state and words of an overlay.
+    gauge
+        From tip to tumour; None where that is not known.
+    """
+
+    stamp: int
+    known: Known
+    gauge: Gauge | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Answering:
+    """Who answers poses: a pure function of what was heard, but for where a finite element's answer starts.
+
+    Parameters
+    ----------
+    motion
+        Says how the brain lies under a tool.
+    tool
+        Its shape, and where it is in the frame that is tracked.
+    tracking
+        Standard deviation of the tip's place along each axis [m]: no message says it.
+    registration
+        From a file; None: it is sent, and its error is not known.
+    """
+
+    motion: ToolMotion
+    tool: TrackedTool
+    tracking: float
+    registration: Registration | None = None
+
+    def answer(self, heard: Heard, now: float, moment: float, before: Known | None = None) -> Answer:
+        """What is known at a time `now` [s], from what was known `before`; `moment` is now, in seconds since 1970."""
+        registration = self._registration(heard)
+        if isinstance(registration, str):
+            return self._nothing(registration, moment, before)
+        body = heard.beside(heard.names.tool, now)
+        if isinstance(body, str):
+            return self._nothing(body, moment, before)
+        stamp = body.stamp or stamp_of(moment)
+        beside = Pose(body.T, np.diag(np.repeat([self.tracking**2, 0.0], 3)), 0.0, 0)
+        pose = np.linalg.inv(registration.T_patient_scan) @ body.T @ self.tool.T_cube_tool
+        spread = tip_covariance(registration, self.tool, beside)
+        motion = self.motion.under(pose, spread, None if before is None else before.motion)
+        known = Known(
+            time_of(stamp), State.GOOD if motion.moved > 0.0 else State.REST, "", NOT_SEEN, motion, None, pose, spread
+        )  # fmt: skip
+        known = replace(known, seen=known.time, felt=moment, **self._doubts(known, before))
+        if known.state is State.UNKNOWN:
+            return Answer(stamp, known)
+        known = self._with_band(known, registration)
+        stage = self.motion.stage
+        gauge = Painter(stage, self.tool).gauge(known, stage.tumour(motion.positions))
+        return Answer(stamp, known, gauge)
+
+    def camera(self, heard: Heard, now: float) -> np.ndarray | str:
+        """T_camera_scan (4, 4) [m] at a time [s], or why nobody knows it."""
+        registration, body = self._registration(heard), heard.beside(heard.names.camera, now)
+        if isinstance(registration, str):
+            return registration
+        return body if isinstance(body, str) else np.linalg.inv(body.T) @ registration.T_patient_scan
+
+    def _registration(self, heard: Heard) -> Registration | str:
+        """From the file, or as it was sent; or why there is none."""
+        if self.registration is not None:
+            return self.registration
+        sent = heard.sent.get(heard.names.registration)
+        if sent is None:
+            return f"no {heard.names.registration} yet"
+        return Registration(np.linalg.inv(sent.T), np.zeros((6, 6)), np.zeros(3), 0.0, 0)
+
+    def _doubts(self, known: Known, before: Known | None) -> dict[str, object]:
+        """The state, the words and whether the tool has been near, of an answer that may not be relied on."""
+        near = before is not None and before.near
+        assert known.T_scan_tool is not None
+        doubt, near = misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, THEIRS)
+        unchecked = self.registration is not None and self.registration.scanned is None
+        doubt = doubt or known.motion.doubt or (UNCHECKED if unchecked else "")
+        if doubt:
+            return {"state": State.UNSURE, "words": doubt, "near": near}
+        if not known.motion.known:
+            return {"state": State.UNKNOWN, "words": UNKNOWN, "near": near}
+        return {"near": near}
+
+    def _with_band(self, known: Known, registration: Registration) -> Known:
+        """With how far off the tumour may be [m], and by what, where it may be relied on."""
+        if not known.relied:
+            return known
+        middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
+        _, covariance = registration.point(middle)
+        registered = float(np.sqrt(chi2.ppf(LEVEL, 3) * max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
+        parts = {"registration": registered, "tool": known.motion.tool, "model": known.motion.model}
+        band = float(np.hypot(registered, known.motion.error))
+        if band > LIMIT:
+            words = f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
+            return replace(known, state=State.UNSURE, words=words)
+        return replace(known, band=band, parts=parts)
+
+    def _nothing(self, why: str, moment: float, before: Known | None) -> Answer:
+        """Nothing is known now; how long that has been so is said."""
+        felt = None if before is None else before.felt
+        since = "" if felt is None else f", not known since {max(moment - felt, 0.0):.1f} s"
+        near = before is not None and before.near
+        state = State.NO_TOOL if felt is None else State.STALE
+        motion = self.motion.rest if before is None else before.motion
+        return Answer(
+            stamp_of(moment), Known(moment, state, f"{why}{since}", NOT_SEEN, motion, felt=felt, near=near)
+        )  # fmt: skip
+
+
+def late(answer: Answer, age: float, stale: float) -> Answer:
+    """What is known of an answer to a pose that is so old by now [s]: beyond `stale` it is not relied on."""
+    if age <= stale or not answer.known.relied:
+        return answer
+    words = f"stale, the answer is {age:.1f} s old: do not rely on it"
+    return replace(answer, known=replace(answer.known, state=State.STALE, words=words, band=None), gauge=None)

@@ -1,0 +1,261 @@
+"""The loop of a live link: the newest pose is answered in a thread of its own, and what is old is said to be so."""
+
+from __future__ import annotations
+
+import asyncio
+import time as clock
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from ar.optics.calibration import Calibration
+
+from ..play.overlay.follower import Known, State, across
+from ..play.overlay.picture import Painter
+from .answer import Answer, late
+from .clients import Clients
+from .frame import BadMessageError, Header, framed, stamp_of
+from .heard import Heard
+from .messages import IMAGE, POINT, Code, image, read_image, read_points, read_position, read_transform, status
+from .outgoing import MOST_PLACES, Places
+
+# How often what is not known is said anew, and a connection that is lost is tried again [s].
+TICK, AGAIN = 0.1, 1.0
+# Other transforms that are heard of, to be named where the wanted one does not come.
+MOST_OTHERS = 6
+# Types that are heard and not answered: a STATUS that answers a STATUS would have no end.
+UNANSWERED = ("STATUS", "STRING", "CAPABILITY")
+SHORT = 1 << 16
+
+Picture = tuple[np.ndarray, int]
+"""Colours (H, W, 3) uint8, and a time stamp."""
+
+
+class Answers(Protocol):
+    """Who answers poses."""
+
+    def answer(self, heard: Heard, now: float, moment: float, before: Known | None = None) -> Answer:
+        """As `Answering.answer`."""
+        ...
+
+    def camera(self, heard: Heard, now: float) -> np.ndarray | str:
+        """As `Answering.camera`."""
+        ...
+
+
+class Speaks(Protocol):
+    """Who makes messages of answers."""
+
+    def scan(self, stamp: int) -> bytes:
+        """As `Outgoing.scan`."""
+        ...
+
+    def messages(self, answer: Answer, places: Places | None = None) -> tuple[bytes, ...]:
+        """As `Outgoing.messages`."""
+        ...
+
+    def status(self, answer: Answer, refused: str) -> bytes:
+        """As `Outgoing.status`."""
+        ...
+
+    def placed(self, names: list[str], at: np.ndarray) -> Places:
+        """As `Outgoing.placed`."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Eye:
+    """Draws into a camera's pictures; `tracking` is the standard deviation of its place along each axis [m]."""
+
+    calibration: Calibration
+    painter: Painter
+    tracking: float
+
+    def painted(self, colour: np.ndarray, known: Known, T_camera_scan: np.ndarray | str) -> np.ndarray:
+        """A picture (H, W, 3) uint8 with what is known.
+
+        Where it is not known how the scan lies before the camera, a sentence says why, and nothing else is drawn.
+        """
+        if isinstance(T_camera_scan, str):
+            words = f"{T_camera_scan}: nothing is drawn"
+            return self.painter.paint(colour, replace(known, state=State.NO_REFERENCE, words=words)).colour
+        if known.band is not None:
+            middle = known.motion.positions[self.painter.stage.tumour_vertices].mean(axis=0)
+            at = T_camera_scan[:3, :3] @ middle + T_camera_scan[:3, 3]
+            placed = across(self.tracking**2 * np.eye(3), at)
+            parts = {**known.parts, "camera": placed}
+            known = replace(known, band=float(np.hypot(known.band, placed)), parts=parts)
+        seen = self.calibration.camera(T_camera_scan)
+        return self.painter.paint(colour, replace(known, camera=seen)).colour
+
+
+class Session:
+    """A live link: hears poses, has them answered, and publishes the answers.
+
+    All but `_answered` and what is drawn belongs to the event loop's thread.
+
+    Parameters
+    ----------
+    answers, speaks
+        Who answers, and who makes messages of that.
+    heard
+        Which transforms are listened to.
+    eye
+        Draws into pictures that are sent; None: they are not wanted.
+    most
+        How many clients there may be.
+    """
+
+    def __init__(self, answers: Answers, speaks: Speaks, heard: Heard, eye: Eye | None = None, most: int = 16) -> None:
+        self.clients = Clients(self._receive, self._longest, most)
+        self._answers, self._speaks, self._heard, self._eye = answers, speaks, heard, eye
+        self._others: dict[str, None] = {}
+        self._places: Places | None = None
+        self._known: Known | None = None
+        self._posed, self._pictured = asyncio.Event(), asyncio.Event()
+        self._picture: Picture | None = None
+        self._ended = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+
+    def end(self) -> None:
+        """Say to all clients that it is over, and end `serve` or `follow`; from any thread."""
+        with suppress(RuntimeError):  # the loop is closed: it has ended
+            self._loop.call_soon_threadsafe(self._ended.set)
+
+    async def serve(self, host: str, port: int, seconds: float, ready: asyncio.Future[int]) -> None:
+        """Answer clients for so long; `ready` is given the port.
+
+        Raises
+        ------
+        OSError
+            An address that cannot be served on.
+        """
+        server = await asyncio.start_server(self.clients.converse, host, port, limit=1 << 18)
+        ready.set_result(server.sockets[0].getsockname()[1])
+        try:
+            await self._work(seconds)
+        finally:
+            server.close()
+
+    async def follow(self, host: str, port: int, seconds: float) -> None:
+        """Be the client of a server, for so long; where it is not there, it is tried again."""
+        connecting = asyncio.create_task(self._connected(host, port))
+        try:
+            await self._work(seconds)
+        finally:
+            connecting.cancel()
+
+    async def _connected(self, host: str, port: int) -> None:
+        while True:
+            with suppress(OSError):
+                await self.clients.converse(*await asyncio.open_connection(host, port, limit=1 << 18))
+            await asyncio.sleep(AGAIN)
+
+    async def _work(self, seconds: float) -> None:
+        self.clients.publish("scan", (self._speaks.scan(stamp_of(clock.time())),))
+        with ThreadPoolExecutor(1, "answer") as answering, ThreadPoolExecutor(1, "draw") as drawing:
+            work = [self._answering(answering), *([] if self._eye is None else [self._drawing(self._eye, drawing)])]
+            tasks = [asyncio.create_task(each) for each in work]
+            ended = asyncio.create_task(self._ended.wait())
+            limit = seconds if np.isfinite(seconds) else None
+            done, _ = await asyncio.wait((*tasks, ended), timeout=limit, return_when=asyncio.FIRST_COMPLETED)
+            over = framed("STATUS", "Sulcus", status(Code.SHUTDOWN, "the server ends"), stamp_of(clock.time()))
+            self.clients.publish("status", (over,))
+            await asyncio.sleep(0.05)
+            for task in (*tasks, ended):
+                task.cancel()
+            for task in done:
+                task.result()  # what went wrong is raised
+
+    async def _answering(self, thread: ThreadPoolExecutor) -> None:
+        """Answer the newest pose, again and again; say what is not known."""
+        said, refused = "", -1
+        while True:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(TICK):
+                    await self._posed.wait()
+            fresh = self._posed.is_set()
+            self._posed.clear()
+            if not fresh and self._known is not None and not self._gone():
+                continue
+            answer, messages = await self._loop.run_in_executor(thread, self._answered, self._heard, self._places)
+            self._known = answer.known
+            self.clients.publish("answer", messages)
+            words, count = answer.known.words, self.clients.refused.total()
+            if (words, count) != (said, refused) or not answer.known.relied:
+                said, refused = words, count
+                self.clients.publish("status", (self._speaks.status(answer, self._refused_words(answer.known)),))
+
+    def _gone(self) -> bool:
+        """Whether the tool's pose is not known now."""
+        return isinstance(self._heard.beside(self._heard.names.tool, self._loop.time()), str)
+
+    def _answered(self, heard: Heard, places: Places | None) -> tuple[Answer, tuple[bytes, ...]]:
+        """An answer and its messages, in the thread that answers."""
+        now = self._loop.time()
+        answer = self._answers.answer(heard, now, clock.time(), self._known)
+        body = heard.beside(heard.names.tool, now)
+        if not isinstance(body, str):
+            answer = late(answer, self._loop.time() - body.arrived, heard.stale)
+        return answer, self._speaks.messages(answer, places)
+
+    def _refused_words(self, known: Known) -> str:
+        """What was refused so far, and which other transforms there are where the wanted one does not come."""
+        parts = [f"{number} {why}" for why, number in self.clients.refused.most_common(MOST_OTHERS)]
+        words = f"; refused: {', '.join(parts)}" if parts else ""
+        if self._others and known.state in (State.NO_TOOL, State.STALE):
+            words += f"; other transforms heard: {', '.join(self._others)}"
+        return words
+
+    async def _drawing(self, eye: Eye, thread: ThreadPoolExecutor) -> None:
+        """Draw into the newest picture, again and again."""
+        while True:
+            await self._pictured.wait()
+            self._pictured.clear()
+            if self._picture is None or self._known is None:
+                continue
+            (colour, stamp), heard = self._picture, self._heard
+            camera = self._answers.camera(heard, self._loop.time())
+            drawn = await self._loop.run_in_executor(thread, eye.painted, colour, self._known, camera)
+            self.clients.publish("picture", (framed("IMAGE", "Overlay", image(drawn), stamp),))
+
+    def _longest(self, kind: str) -> int:
+        """How many bytes a message of a type may have that is wanted; 0: none is."""
+        if kind == "IMAGE" and self._eye is not None:
+            return IMAGE.size + 4 * self._eye.calibration.width * self._eye.calibration.height + SHORT
+        if kind == "POINT":
+            return MOST_PLACES * POINT.size + SHORT
+        return SHORT if kind in ("TRANSFORM", "POSITION", *UNANSWERED) else 0
+
+    def _receive(self, number: int, header: Header, content: bytes) -> None:
+        """Hear a message; raises `BadMessageError`."""
+        match header.kind:
+            case "TRANSFORM" | "POSITION":
+                self._hear_transform(number, header, content)
+            case "IMAGE" if self._eye is not None:
+                colour, wanted = read_image(content), self._eye.calibration
+                if colour.shape[:2] != (wanted.height, wanted.width):
+                    size = f"{colour.shape[1]} x {colour.shape[0]}"
+                    raise BadMessageError(
+                        f"another size than the camera's: {size}, not {wanted.width} x {wanted.height}"
+                    )
+                self._picture = colour, header.stamp
+                self._pictured.set()
+            case "POINT":
+                names, places = read_points(content)
+                self._places = self._speaks.placed(names, 1e-3 * places)
+                self._posed.set()
+
+    def _hear_transform(self, number: int, header: Header, content: bytes) -> None:
+        names = self._heard.names
+        if header.name not in names.all:
+            if len(self._others) < MOST_OTHERS:
+                self._others[header.name] = None
+            return
+        matrix = (read_transform if header.kind == "TRANSFORM" else read_position)(content)
+        self._heard = self._heard.hearing(header.name, matrix, header.stamp, self._loop.time(), number)
+        if header.name in (names.tool, names.registration):
+            self._posed.set()

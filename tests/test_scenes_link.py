@@ -1,0 +1,338 @@
+"""A live link: many clients, bad ones among them, and poses whose answers are known, over 127.0.0.1 and a free port."""
+
+import asyncio
+import socket
+import struct
+import time
+from contextlib import asynccontextmanager, suppress
+
+import numpy as np
+import pytest
+from films import FILM, follower_of, truth_of
+from theatres import template_theatre
+
+from scenes.link import clients as limits
+from scenes.link.answer import Answering
+from scenes.link.clients import Clients
+from scenes.link.frame import HEADER, BadMessageError, framed, read_header, stamp_of
+from scenes.link.heard import Heard, Names
+from scenes.link.messages import points, string, transform
+from scenes.link.outgoing import Outgoing
+from scenes.link.session import Session
+from scenes.script.registration_file import read_registration
+from scenes.script.scene import find_scene
+
+HOST = "127.0.0.1"
+NAMES = Names()
+NOW = stamp_of(time.time())
+
+
+class Peer:
+    """A client of bytes."""
+
+    def __init__(self, reader, writer):
+        self.reader, self.writer = reader, writer
+
+    async def next(self, kind="", name=""):
+        """The next message (header, body) of a type and name."""
+        while True:
+            async with asyncio.timeout(5.0):
+                header = read_header(await self.reader.readexactly(HEADER.size))
+                body = await self.reader.readexactly(header.size)
+            if kind in ("", header.kind) and name in ("", header.name):
+                return header, body
+
+    async def said(self, name="SulcusRefused"):
+        return (await self.next("STATUS", name))[1][30:-1].decode()
+
+    def send(self, kind, name, body, stamp=0):
+        self.writer.write(framed(kind, name, body, stamp))
+
+
+@asynccontextmanager
+async def peers(port, count=1):
+    found = [Peer(*await asyncio.open_connection(HOST, port)) for _ in range(count)]
+    try:
+        yield found
+    finally:
+        for each in found:
+            each.writer.transport.abort()
+
+
+@asynccontextmanager
+async def served(receive=lambda number, header, content: None, most=16, longest=1 << 16):
+    clients = Clients(receive, lambda kind: longest if kind == "TRANSFORM" else 0, most)
+    server = await asyncio.start_server(clients.converse, HOST, 0)
+    try:
+        yield clients, server.sockets[0].getsockname()[1]
+    finally:
+        server.close()
+
+
+async def until(what):
+    async with asyncio.timeout(5.0):
+        while not what():
+            await asyncio.sleep(0.005)
+
+
+def test_every_client_hears_the_newest_and_a_new_one_what_it_missed():
+    async def scene():
+        async with served() as (clients, port):
+            clients.publish("a", [framed("STRING", "A", string("one"), NOW)])
+            async with peers(port, 3) as three:
+                for each in three:
+                    header, body = await each.next()
+                    assert (header.name, body[4:], header.stamp) == ("A", b"one", NOW)
+                three[0].writer.transport.abort()
+                await until(lambda: len(clients) == 2)
+                clients.publish("a", [framed("STRING", "A", string("two"), NOW + 1)])
+                assert [(await each.next())[1][4:] for each in three[1:]] == [b"two", b"two"]
+
+    asyncio.run(scene())
+
+
+def test_a_client_that_does_not_read_gets_the_newest_later_and_keeps_nobody_waiting():
+    count, large = 200, bytes(200_000)
+
+    async def scene():
+        async with served() as (clients, port):
+            slow = socket.socket()
+            slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)
+            slow.connect((HOST, port))
+            async with peers(port, 1) as (quick,):
+                await until(lambda: len(clients) == 2)
+                await asyncio.sleep(1.2 * limits.GREETING)
+                for number in range(count):
+                    clients.publish("a", [framed("STRING", f"{number}", large, NOW)])
+                    assert (await quick.next())[0].name == f"{number}"
+            slow.setblocking(False)
+            late = Peer(*await asyncio.open_connection(sock=slow))
+            names = [(await late.next())[0].name]
+            while names[-1] != f"{count - 1}":
+                names.append((await late.next())[0].name)
+            late.writer.transport.abort()
+        assert len(names) < 20  # what it did not read in time was never queued
+
+    asyncio.run(scene())
+
+
+@pytest.mark.parametrize(
+    ("sent", "why", "goes_on"),
+    [
+        (b"\x16\x03\x01" + bytes(80), "no OpenIGTLink message", False),
+        (framed("TRANSFORM", "A", bytes(48), 0)[:-1] + b"\1", "TRANSFORM A is refused: wrong checksum", True),
+        (framed("TRANSFORM", "bad", bytes(48), 0), "TRANSFORM bad is refused: what", True),
+        (framed("NDARRAY", "A", bytes(90), 0), "NDARRAY A is passed over: type not used", True),
+        (framed("TRANSFORM", "A", bytes(1 << 17), 0), "too long", True),
+        (HEADER.pack(1, b"POINT", b"A", 0, 1 << 60, 0), "announces 1152921504606846976 bytes", False),
+    ],
+)
+def test_what_is_no_good_message_is_said_to_its_sender_alone(sent, why, goes_on):
+    heard = []
+
+    def receive(number, header, content):
+        if header.name == "bad":
+            raise BadMessageError("what: 7")
+        heard.append(header.name)
+
+    async def scene():
+        async with served(receive) as (clients, port), peers(port, 2) as (bad, good):
+            bad.writer.write(sent)
+            assert why in await bad.said()
+            assert clients.refused.total() == 1
+            bad.send("TRANSFORM", "next", bytes(48))
+            good.send("TRANSFORM", "fine", bytes(48))
+            if not goes_on:
+                with pytest.raises((asyncio.IncompleteReadError, ConnectionError)):
+                    await bad.next()
+            await until(lambda: len(heard) == 1 + goes_on)
+            assert sorted(heard) == sorted(["fine", *["next"] * goes_on])
+            await asyncio.sleep(1.2 * limits.GREETING)
+            clients.publish("a", [framed("STRING", "A", b"", 0)])
+            assert (await good.next())[0].kind == "STRING"  # and no STATUS before it
+
+    asyncio.run(scene())
+
+
+def test_a_storm_of_clients_is_bounded_and_passes():
+    async def scene():
+        async with served(most=4) as (clients, port), peers(port, 1) as (first,):
+            await until(lambda: len(clients) == 1)
+            for _ in range(100):
+                reader, writer = await asyncio.open_connection(HOST, port)
+                writer.write(b"\0\1TRANS")  # and vanish in the middle of a message
+                assert len(clients) <= 4
+                writer.close()
+            async with peers(port, 8) as many:
+                await until(lambda: len(clients) == 4)
+                refused = [each for each in many if await busy(each)]
+                assert len(refused) >= 5
+            await until(lambda: len(clients) == 1)
+            clients.publish("a", [framed("STRING", "A", b"", 0)])
+            assert (await first.next())[0].name == "A"
+
+    async def busy(peer):
+        with suppress(TimeoutError):
+            async with asyncio.timeout(0.4):
+                return "4 clients are connected" in await peer.said()
+        return False
+
+    asyncio.run(scene())
+
+
+def test_a_client_that_asks_is_sent_that_and_nothing_else():
+    async def scene():
+        async with served() as (clients, port), peers(port, 1) as (one,):
+            clients.publish("a", [framed("STRING", "A", string("s"), 0), framed("POLYDATA", "P", bytes(40), 0)])
+            for _ in range(2):
+                one.send("GET_POLYDATA", "", b"")
+                assert (await one.next())[0].name == "P"
+            one.send("GET_IMAGE", "", b"")
+            assert "no IMAGE yet" in await one.said()
+            one.send("STT_STRING", "", b"")
+            assert [(await one.next())[0].name for _ in range(2)] == ["A", "P"]
+
+    asyncio.run(scene())
+
+
+@pytest.fixture(scope="module")
+def stage():
+    return template_theatre().stage(find_scene("palpate"))
+
+
+@pytest.fixture(scope="module")
+def truth(stage):
+    return truth_of(stage)
+
+
+@pytest.fixture(scope="module")
+def registration():
+    return read_registration(FILM / "registration.json")
+
+
+@pytest.fixture(scope="module")
+def follower(stage):
+    return follower_of(stage)
+
+
+@pytest.fixture(scope="module")
+def beside(follower, truth):
+    """T_reference_cube (4, 4) [mm] of the film's poses, as a tracker would send it."""
+    found = follower.registration.T_patient_scan @ truth.T_scan_tool @ np.linalg.inv(follower.tool.T_cube_tool)
+    found[:, :3, 3] *= 1e3
+    return found
+
+
+@asynccontextmanager
+async def linked(follower, registration=None, eye=None, tracking=1e-4):
+    answering = Answering(follower.motion, follower.tool, tracking, registration)
+    session = Session(answering, Outgoing(follower.motion.stage, registration is not None), Heard(NAMES, 0.3), eye)
+    ready = asyncio.get_running_loop().create_future()
+    serving = asyncio.create_task(session.serve(HOST, 0, np.inf, ready))
+    try:
+        yield await ready
+    finally:
+        session.end()
+        await serving
+
+
+def corners_of(body):
+    return np.frombuffer(body, ">f4", 3 * struct.unpack(">I", body[:4])[0], 40).reshape(-1, 3)
+
+
+def test_the_tumour_comes_where_it_is_with_the_time_of_its_pose(follower, truth, beside):
+    row, stamp = 10, NOW + 12345
+    expected = 1e3 * (follower.motion.stage.tumour_at_rest.vertices + truth.displacement[row])
+    into = np.linalg.inv(follower.registration.T_patient_scan)
+    into[:3, 3] *= 1e3
+
+    async def scene():
+        async with linked(follower) as port, peers(port, 3) as (tracker, slicer, other):
+            header, body = await slicer.next("POLYDATA", "TumourInScan")
+            rest = corners_of(body)
+            assert rest == pytest.approx(1e3 * follower.motion.stage.tumour_at_rest.vertices, abs=1e-3)
+            assert "no ReferenceToRas yet" in await slicer.said("Sulcus")
+            tracker.send("TRANSFORM", NAMES.registration, transform(into), NOW)
+            tracker.send("TRANSFORM", "ProbeToTracker", transform(into), NOW)
+            while "no StylusTipToReference yet; other transforms heard: ProbeToTracker" not in await slicer.said(
+                "Sulcus"
+            ):
+                pass
+            tracker.send("TRANSFORM", NAMES.tool, transform(beside[row]), stamp)
+            for each in (slicer, other):
+                while (found := await each.next("POLYDATA", "TumourNow"))[0].stamp != stamp:
+                    pass
+                assert corners_of(found[1]) == pytest.approx(expected, abs=2e-2)
+                assert not len(corners_of((await each.next("POLYDATA", "TumourDoubtful"))[1]))
+                # The film's truth says nothing of the cortex: it is not sent as if it were known.
+                assert not len(corners_of((await each.next("POLYDATA", "CortexNow"))[1]))
+                header, body = await each.next("TRANSFORM", "TumourToRas")
+                T = np.eye(4)
+                T[:3] = np.frombuffer(body, ">f4").reshape(4, 3).T
+                assert header.stamp == stamp
+                assert rest @ T[:3, :3].T + T[:3, 3] == pytest.approx(expected, abs=1.0)
+                words = (await each.next("STRING", "TipToTumour"))[1][4:].decode()
+                assert "+-" in words and "not known of registration, tissue and segmentation" in words
+            # Its pose is old soon: then nothing is drawn as if it were known.
+            while len(corners_of((await slicer.next("POLYDATA", "TumourNow"))[1])):
+                pass
+            while "no new StylusTipToReference for" not in (words := await slicer.said("Sulcus")):
+                pass
+            assert "not known since" in words
+
+    asyncio.run(scene())
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda T: np.diag([1.0, 1.0, -1.0, 1.0]) @ T, "mirrors"),
+        (lambda T: np.diag([1e-3, 1e-3, 1e-3, 1.0]) @ T, "scales"),
+        (lambda T: np.full((4, 4), np.nan), "not finite"),
+        (lambda T: np.eye(4), "identity"),
+    ],
+)
+def test_a_pose_that_is_none_is_refused_and_counted(follower, registration, beside, change, why):
+    async def scene():
+        async with linked(follower, registration) as port, peers(port, 1) as (tracker,):
+            tracker.send("TRANSFORM", NAMES.tool, transform(change(beside[10])), NOW)
+            assert why in await tracker.said()
+            while why not in (words := await tracker.said("Sulcus")):
+                pass
+            assert "no StylusTipToReference yet; refused: 1 a matrix" in words or "the identity" in words
+            assert not len(corners_of((await tracker.next("POLYDATA", "TumourNow"))[1]))
+
+    asyncio.run(scene())
+
+
+def test_a_tool_where_none_can_be_is_doubtful(follower, registration, beside):
+    far = beside[10].copy()
+    far[:3, 3] += 1000.0
+
+    async def scene():
+        async with linked(follower, registration) as port, peers(port, 1) as (tracker,):
+            tracker.send("TRANSFORM", NAMES.tool, transform(far), NOW)
+            while not len(corners_of((await tracker.next("POLYDATA", "TumourDoubtful"))[1])):
+                pass
+            assert "mm from the head" in (await tracker.next("STRING", "TipToTumour"))[1].decode()
+
+    asyncio.run(scene())
+
+
+def test_places_on_the_tumour_move_with_it_and_a_million_points_are_passed_over(follower, registration, truth, beside):
+    rest = 1e3 * follower.motion.stage.tumour_at_rest.vertices
+
+    async def scene():
+        async with linked(follower, registration) as port, peers(port, 1) as (tracker,):
+            tracker.send("POINT", "P", bytes(136 * 10**6))
+            assert "too long" in await tracker.said()
+            tracker.send("POINT", "P", points(["a"], rest[:1] + 100.0))
+            assert "not on tumour or open cortex" in await tracker.said()
+            tracker.send("POINT", "P", points(["a", "b"], rest[:2]))
+            tracker.send("TRANSFORM", NAMES.tool, transform(beside[10]), NOW)
+            while not len(body := (await tracker.next("POINT", "PointsNow"))[1]):
+                pass
+            found = np.array([struct.unpack(">3f", body[at + 100 : at + 112]) for at in (0, 136)])
+            assert found == pytest.approx(rest[:2] + 1e3 * truth.displacement[10, :2], abs=1e-2)
+
+    asyncio.run(scene())

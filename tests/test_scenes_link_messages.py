@@ -1,0 +1,198 @@
+"""OpenIGTLink's messages as pyigtl and the C++ library have them, both ways; and what is no message."""
+
+import struct
+import warnings
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scenes.link.frame import HEADER, BadMessageError, content_of, framed, read_header, stamp_of, time_of
+from scenes.link.heard import Heard, Names, rigid
+from scenes.link.messages import (
+    Code,
+    Mesh,
+    image,
+    points,
+    polydata,
+    read_image,
+    read_points,
+    read_position,
+    read_transform,
+    status,
+    string,
+    transform,
+)  # fmt: skip
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    import pyigtl
+
+STAMP = stamp_of(1_700_000_000.25)
+RANDOM = np.random.default_rng(0)
+
+
+def matrix(shift=(10.0, -20.0, 30.0)):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec([0.3, -0.5, 1.1]).as_matrix(), shift
+    return T
+
+
+def theirs(kind, name, body):
+    """Our message as pyigtl reads it."""
+    raw = framed(kind, name, body, STAMP)
+    fields = pyigtl.messages.MessageBase.parse_header(raw[: HEADER.size])
+    message = pyigtl.messages.MessageBase.create_message(kind)
+    message.unpack(fields, raw[HEADER.size :])
+    assert message.device_name == name and message.timestamp == pytest.approx(time_of(STAMP))
+    assert pyigtl.messages.CRC64(raw[HEADER.size :]) == struct.unpack(">Q", raw[50:58])[0]
+    return message
+
+
+def ours(message, version=1, **metadata):
+    """A message of pyigtl as we read it: header and content."""
+    message.header_version, message.metadata = version, metadata
+    raw = message.pack()
+    header = read_header(raw[: HEADER.size])
+    return header, content_of(header, raw[HEADER.size :])
+
+
+def test_what_we_send_is_what_pyigtl_reads():
+    assert theirs("TRANSFORM", "TumourToRas", transform(matrix())).matrix == pytest.approx(matrix(), abs=1e-5)
+    assert theirs("STRING", "TipToTumour", string("12.3 +- 0.4 mm")).string == "12.3 +- 0.4 mm"
+    places = RANDOM.normal(size=(3, 3))
+    read = theirs("POINT", "PointsNow", points(["a", "b", "c"], places))
+    assert np.array(read.positions) == pytest.approx(places, abs=1e-6) and list(read.names) == ["a", "b", "c"]
+    colour = RANDOM.integers(0, 255, (5, 7, 3), np.uint8)
+    read = theirs("IMAGE", "Overlay", image(colour))
+    assert np.array_equal(read.image, colour[None]) and read.world_coordinate_system == "ras"
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_what_pyigtl_sends_is_what_we_read(version):
+    more = {} if version == 1 else {"ToolTransformStatus": "OK", "a": "b"}
+    sent = pyigtl.TransformMessage(matrix(), timestamp=1_700_000_000.25, device_name="StylusTipToReference")
+    header, content = ours(sent, version, **more)
+    assert (header.kind, header.name, header.version) == ("TRANSFORM", "StylusTipToReference", version)
+    assert time_of(header.stamp) == pytest.approx(1_700_000_000.25, abs=1e-6)
+    assert read_transform(content) == pytest.approx(matrix(), abs=1e-5)
+    _, content = ours(pyigtl.PointMessage(np.arange(6.0).reshape(2, 3), ["a", "b"], device_name="P"), version, **more)
+    names, places = read_points(content)
+    assert names == ["a", "b"] and np.array_equal(places, np.arange(6.0).reshape(2, 3))
+    colour = RANDOM.integers(0, 255, (1, 5, 7, 3), np.uint8)
+    _, content = ours(pyigtl.ImageMessage(colour, device_name="I"), version, **more)
+    assert np.array_equal(read_image(content), colour[0])
+    _, content = ours(pyigtl.ImageMessage(colour[..., :1], device_name="I"), version, **more)
+    assert np.array_equal(read_image(content)[..., 2], colour[0, ..., 0])
+
+
+def test_polydata_and_status_have_the_layout_of_the_protocol():
+    corners = RANDOM.normal(size=(4, 3)).astype(np.float32)
+    body = polydata(corners, Mesh.of(np.array([[0, 1, 2], [0, 2, 3]])))
+    assert struct.unpack(">10I", body[:40]) == (4, 0, 0, 0, 0, 2, 32, 0, 0, 0)
+    assert np.array_equal(np.frombuffer(body, ">f4", 12, 40).reshape(4, 3), corners)
+    assert struct.unpack(">8I", body[88:]) == (3, 0, 1, 2, 3, 0, 2, 3)
+    body = status(Code.NOT_READY, "no pose yet")
+    assert struct.unpack(">Hq20s", body[:30])[0] == 13 and body[30:] == b"no pose yet\0"
+
+
+def test_a_position_is_a_place_and_a_quaternion():
+    """As `igtl_position.h` has it; pyigtl writes that of points."""
+    numbers = [*matrix()[:3, 3], *Rotation.from_matrix(matrix()[:3, :3]).as_quat()]
+    assert read_position(struct.pack(">7f", *numbers)) == pytest.approx(matrix(), abs=1e-5)
+    with pytest.raises(BadMessageError, match="wrong size: 12 bytes"):
+        read_position(bytes(12))
+
+
+def test_a_time_stamp_goes_through_to_its_last_bit():
+    raw = framed("TRANSFORM", "A", transform(np.eye(4)), STAMP + 1)
+    assert read_header(raw[:58]).stamp == STAMP + 1
+
+
+def test_the_checksum_is_that_of_the_catalogue():
+    assert read_header(framed("STRING", "A", b"123456789", 0)[:58]).checksum == 0x6C40DF5F0B497347
+
+
+def body_of(raw):
+    return content_of(read_header(raw[:58]), raw[58:])
+
+
+@pytest.mark.parametrize(
+    ("read", "why"),
+    [
+        (lambda: read_header(b"GET / HTTP/1.1\r\n".ljust(58)), "no OpenIGTLink"),
+        (lambda: read_header(bytes(58)), "no OpenIGTLink"),
+        (lambda: body_of(framed("STRING", "A", b"abc", 0)[:-1] + b"d"), "wrong checksum"),
+        (lambda: body_of(b"\0\2" + framed("STRING", "A", b"abc", 0)[2:]), "too short for an extended"),
+        (lambda: body_of(b"\0\2" + framed("STRING", "A", b"\0\xff" + bytes(14), 0)[2:]), "extended header names"),
+        (lambda: read_transform(bytes(44)), "wrong size: 44 bytes in place of 48"),
+        (lambda: read_position(bytes(28)), "quaternion"),
+        (lambda: read_points(bytes(135)), "wrong size"),
+        (lambda: read_points(points(["a"], np.array([[0.0, np.nan, 0.0]]))), "not finite"),
+        (lambda: read_image(bytes(20)), "too short"),
+        (lambda: read_image(image(np.zeros((4, 4, 3), np.uint8))[:-1]), "another number of pixels"),
+        (lambda: read_image(image(np.zeros((4, 4, 2), np.uint8))), "no single picture"),
+    ],
+)  # fmt: skip
+def test_what_is_no_message_is_refused(read, why):
+    with pytest.raises(BadMessageError, match=why):
+        read()
+
+
+def changed(row, column, value):
+    T = matrix()
+    T[row, column] = value
+    return T
+
+
+@pytest.mark.parametrize(
+    ("T", "why"),
+    [
+        (changed(0, 0, np.nan), "not finite"),
+        (changed(1, 3, np.inf), "not finite"),
+        (matrix() @ np.diag([-1.0, 1.0, 1.0, 1.0]), "mirrors"),
+        (matrix() @ np.diag([1.01, 1.01, 1.01, 1.0]), "scales"),
+        (np.zeros((4, 4)), "scales"),
+        (matrix((0.0, 2e4, 0.0)), "more than 10 m"),
+    ],
+)
+def test_a_matrix_that_moves_no_body_is_refused(T, why):
+    with pytest.raises(BadMessageError, match=why):
+        rigid(T)
+
+
+def test_a_rigid_matrix_of_single_precision_is_taken_in_metres():
+    T = rigid(matrix().astype(np.float32).astype(float))
+    assert T[:3, 3] == pytest.approx([0.01, -0.02, 0.03]) and T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3))
+
+
+def test_a_body_is_known_while_its_transforms_are_new():
+    names = Names()
+    heard = Heard(names, 0.3)
+    assert heard.beside(names.tool, 0.0) == "no StylusTipToReference yet"
+    heard = heard.hearing(names.tool, matrix(), STAMP, 1.0, 0)
+    found = heard.beside(names.tool, 1.2)
+    assert found.stamp == STAMP and found.T[:3, 3] == pytest.approx([0.01, -0.02, 0.03])
+    assert heard.beside(names.tool, 1.4) == "no new StylusTipToReference for 0.4 s"
+    for T, stamp, sender, why in (
+        (np.eye(4), STAMP + 9, 0, "identity"),
+        (matrix(), STAMP, 0, "the same time stamp"),
+        (matrix(), STAMP - 9, 0, "before the last"),
+        (matrix(), STAMP + 9, 1, "another client"),
+    ):
+        with pytest.raises(BadMessageError, match=why):
+            heard.hearing(names.tool, T, stamp, 1.1, sender)
+    assert heard.hearing(names.tool, matrix(), STAMP, 2.0, 1).sent[names.tool].sender == 1  # the first one is silent
+    clock_set = heard.hearing(names.tool, matrix(), stamp_of(time_of(STAMP) - 60.0), 1.1, 0)
+    assert clock_set.sent[names.tool].arrived == 1.1
+
+
+def test_bodies_in_the_trackers_frame_are_brought_to_the_reference():
+    names = Names(tool="StylusTipToTracker")
+    heard = Heard(names, 0.3).hearing(names.tool, matrix(), STAMP, 1.0, 0)
+    assert heard.beside(names.tool, 1.0) == "no ReferenceToTracker yet"
+    heard = heard.hearing(names.reference, matrix((0.0, 0.0, 100.0)), STAMP, 0.9, 0)
+    found = heard.beside(names.tool, 1.0)
+    expected = np.linalg.inv(rigid(matrix((0.0, 0.0, 100.0)))) @ rigid(matrix())
+    assert pytest.approx(expected) == found.T and found.arrived == 0.9
+    assert heard.beside(names.tool, 1.25) == "no new ReferenceToTracker for 0.3 s"
