@@ -9,54 +9,17 @@ from contextlib import asynccontextmanager, suppress
 import numpy as np
 import pytest
 from films import FILM, follower_of, truth_of
+from links import HOST, NAMES, Peer, corners_of, in_mm, linked, peers, played
 from theatres import template_theatre
 
 from scenes.link import clients as limits
-from scenes.link.answer import Answering
 from scenes.link.clients import Clients
-from scenes.link.frame import HEADER, BadMessageError, framed, read_header, stamp_of
-from scenes.link.heard import Heard, Names
+from scenes.link.frame import HEADER, BadMessageError, framed, stamp_of
 from scenes.link.messages import points, string, transform
-from scenes.link.outgoing import Outgoing
-from scenes.link.session import Session
 from scenes.script.registration_file import read_registration
 from scenes.script.scene import find_scene
 
-HOST = "127.0.0.1"
-NAMES = Names()
 NOW = stamp_of(time.time())
-
-
-class Peer:
-    """A client of bytes."""
-
-    def __init__(self, reader, writer):
-        self.reader, self.writer = reader, writer
-
-    async def next(self, kind="", name=""):
-        """The next message (header, body) of a type and name."""
-        while True:
-            async with asyncio.timeout(5.0):
-                header = read_header(await self.reader.readexactly(HEADER.size))
-                body = await self.reader.readexactly(header.size)
-            if kind in ("", header.kind) and name in ("", header.name):
-                return header, body
-
-    async def said(self, name="SulcusRefused"):
-        return (await self.next("STATUS", name))[1][30:-1].decode()
-
-    def send(self, kind, name, body, stamp=0):
-        self.writer.write(framed(kind, name, body, stamp))
-
-
-@asynccontextmanager
-async def peers(port, count=1):
-    found = [Peer(*await asyncio.open_connection(HOST, port)) for _ in range(count)]
-    try:
-        yield found
-    finally:
-        for each in found:
-            each.writer.transport.abort()
 
 
 @asynccontextmanager
@@ -88,7 +51,7 @@ def test_every_client_hears_the_newest_and_a_new_one_what_it_missed():
                 clients.publish("a", [framed("STRING", "A", string("two"), NOW + 1)])
                 assert [(await each.next())[1][4:] for each in three[1:]] == [b"two", b"two"]
 
-    asyncio.run(scene())
+    played(scene())
 
 
 def test_a_client_that_does_not_read_gets_the_newest_later_and_keeps_nobody_waiting():
@@ -113,7 +76,7 @@ def test_a_client_that_does_not_read_gets_the_newest_later_and_keeps_nobody_wait
             late.writer.transport.abort()
         assert len(names) < 20  # what it did not read in time was never queued
 
-    asyncio.run(scene())
+    played(scene())
 
 
 @pytest.mark.parametrize(
@@ -151,7 +114,7 @@ def test_what_is_no_good_message_is_said_to_its_sender_alone(sent, why, goes_on)
             clients.publish("a", [framed("STRING", "A", b"", 0)])
             assert (await good.next())[0].kind == "STRING"  # and no STATUS before it
 
-    asyncio.run(scene())
+    played(scene())
 
 
 def test_a_storm_of_clients_is_bounded_and_passes():
@@ -159,7 +122,7 @@ def test_a_storm_of_clients_is_bounded_and_passes():
         async with served(most=4) as (clients, port), peers(port, 1) as (first,):
             await until(lambda: len(clients) == 1)
             for _ in range(100):
-                reader, writer = await asyncio.open_connection(HOST, port)
+                _, writer = await asyncio.open_connection(HOST, port)
                 writer.write(b"\0\1TRANS")  # and vanish in the middle of a message
                 assert len(clients) <= 4
                 writer.close()
@@ -177,7 +140,7 @@ def test_a_storm_of_clients_is_bounded_and_passes():
                 return "4 clients are connected" in await peer.said()
         return False
 
-    asyncio.run(scene())
+    played(scene())
 
 
 def test_a_client_that_asks_is_sent_that_and_nothing_else():
@@ -192,7 +155,7 @@ def test_a_client_that_asks_is_sent_that_and_nothing_else():
             one.send("STT_STRING", "", b"")
             assert [(await one.next())[0].name for _ in range(2)] == ["A", "P"]
 
-    asyncio.run(scene())
+    played(scene())
 
 
 @pytest.fixture(scope="module")
@@ -218,33 +181,13 @@ def follower(stage):
 @pytest.fixture(scope="module")
 def beside(follower, truth):
     """T_reference_cube (4, 4) [mm] of the film's poses, as a tracker would send it."""
-    found = follower.registration.T_patient_scan @ truth.T_scan_tool @ np.linalg.inv(follower.tool.T_cube_tool)
-    found[:, :3, 3] *= 1e3
-    return found
-
-
-@asynccontextmanager
-async def linked(follower, registration=None, eye=None, tracking=1e-4):
-    answering = Answering(follower.motion, follower.tool, tracking, registration)
-    session = Session(answering, Outgoing(follower.motion.stage, registration is not None), Heard(NAMES, 0.3), eye)
-    ready = asyncio.get_running_loop().create_future()
-    serving = asyncio.create_task(session.serve(HOST, 0, np.inf, ready))
-    try:
-        yield await ready
-    finally:
-        session.end()
-        await serving
-
-
-def corners_of(body):
-    return np.frombuffer(body, ">f4", 3 * struct.unpack(">I", body[:4])[0], 40).reshape(-1, 3)
+    return in_mm(follower.registration.T_patient_scan @ truth.T_scan_tool @ np.linalg.inv(follower.tool.T_cube_tool))
 
 
 def test_the_tumour_comes_where_it_is_with_the_time_of_its_pose(follower, truth, beside):
     row, stamp = 10, NOW + 12345
     expected = 1e3 * (follower.motion.stage.tumour_at_rest.vertices + truth.displacement[row])
-    into = np.linalg.inv(follower.registration.T_patient_scan)
-    into[:3, 3] *= 1e3
+    into = in_mm(np.linalg.inv(follower.registration.T_patient_scan))
 
     async def scene():
         async with linked(follower) as port, peers(port, 3) as (tracker, slicer, other):
@@ -280,7 +223,7 @@ def test_the_tumour_comes_where_it_is_with_the_time_of_its_pose(follower, truth,
                 pass
             assert "not known since" in words
 
-    asyncio.run(scene())
+    played(scene())
 
 
 @pytest.mark.parametrize(
@@ -302,7 +245,7 @@ def test_a_pose_that_is_none_is_refused_and_counted(follower, registration, besi
             assert "no StylusTipToReference yet; refused: 1 a matrix" in words or "the identity" in words
             assert not len(corners_of((await tracker.next("POLYDATA", "TumourNow"))[1]))
 
-    asyncio.run(scene())
+    played(scene())
 
 
 def test_a_tool_where_none_can_be_is_doubtful(follower, registration, beside):
@@ -316,7 +259,7 @@ def test_a_tool_where_none_can_be_is_doubtful(follower, registration, beside):
                 pass
             assert "mm from the head" in (await tracker.next("STRING", "TipToTumour"))[1].decode()
 
-    asyncio.run(scene())
+    played(scene())
 
 
 def test_places_on_the_tumour_move_with_it_and_a_million_points_are_passed_over(follower, registration, truth, beside):
@@ -335,4 +278,4 @@ def test_places_on_the_tumour_move_with_it_and_a_million_points_are_passed_over(
             found = np.array([struct.unpack(">3f", body[at + 100 : at + 112]) for at in (0, 136)])
             assert found == pytest.approx(rest[:2] + 1e3 * truth.displacement[10, :2], abs=1e-2)
 
-    asyncio.run(scene())
+    played(scene())

@@ -90,8 +90,9 @@ next: sulcus overlay film/film.mp4 --camera film/camera.yaml --registration ...,
 next: look at the film that it wrote""",
     "link": """examples:
   sulcus link patient.vtu --model poses.model.npz --registration registration.json
-  sulcus link patient.vtu --model poses.model.npz --client localhost:18944
-next: in 3D Slicer, OpenIGTLinkIF, add a client of this machine; docs/openigtlink.md names what comes""",
+  sulcus link patient.vtu --model poses.model.npz --client localhost --port 18945
+
+next: add a client of localhost in 3D Slicer's OpenIGTLinkIF; docs/openigtlink.md names what comes""",
     "calibrate": """examples:
   sulcus calibrate board.mp4 --out camera.yaml
   sulcus calibrate pictures --size 1280x960 --out camera.yaml --json

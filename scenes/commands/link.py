@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import sys
+import threading
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 PORT = 18944
 """That of OpenIGTLink."""
+# So long a signal waits for clients to hear that the server ends [s].
+FAREWELL = 0.25
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", default="127.0.0.1", help="address to serve on (default %(default)s: this machine)")
     parser.add_argument("--port", type=int, default=PORT, help="0: any free one (default %(default)s)")
     parser.add_argument(
-        "--client", metavar="HOST[:PORT]", help="be the client of this server, as of PLUS, in place of serving"
+        "--client",
+        metavar="HOST[:PORT]",
+        help="hear this server, too, as that of PLUS, and send it nothing; --port is then another one than its own",
     )
     parser.add_argument("--clients", type=int, default=16, help="how many there may be (default %(default)s)")
     names = parser.add_argument_group("names of the transforms that are heard; AToB takes places in A's frame to B's")
@@ -85,8 +90,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--tracking-mm {args.tracking_mm:g}: give millimetres, 0 to 100.")
     if not 0 <= args.port < 1 << 16:
         raise InputError(f"--port {args.port}: give a port from 0 to 65535.")
-    at = None if args.client is None else address_of(args.client)
-    return until_ended(partial(_linked, args, at))
+    source = None if args.client is None else address_of(args.client)
+    return until_ended(partial(_linked, args, source))
 
 
 def address_of(text: str) -> tuple[str, int]:
@@ -103,24 +108,25 @@ def address_of(text: str) -> tuple[str, int]:
     return host, int(port or PORT)
 
 
-def _linked(args: argparse.Namespace, at: tuple[str, int] | None, closing: ExitStack) -> int:
+def _linked(args: argparse.Namespace, source: tuple[str, int] | None, closing: ExitStack) -> int:
+    over = threading.Event()
+
     async def work() -> None:
         session = opened(args)
+        closing.callback(over.wait, FAREWELL)
         closing.callback(session.end)
-        if at is not None:
-            print(f"sulcus: listens to {at[0]}:{at[1]} (Ctrl-C ends)", flush=True)
-            await session.follow(*at, args.seconds)
-            return
         ready = asyncio.get_running_loop().create_future()
         ready.add_done_callback(
-            lambda port: print(f"sulcus: serves on {args.host}:{port.result()} (Ctrl-C ends)", flush=True)
+            lambda port: print(f"sulcus: serves {args.host}:{port.result()} (Ctrl-C ends)", flush=True)
         )
-        await session.serve(args.host, args.port, args.seconds, ready)
+        await session.serve(args.host, args.port, args.seconds, ready, source)
 
     try:
         asyncio.run(work())
     except OSError as error:
         raise InputError(f"no server on {args.host}, port {args.port} ({error}): choose others.") from error
+    finally:
+        over.set()
     return 0
 
 

@@ -20,6 +20,8 @@ LONGEST = 1 << 28
 PATIENCE = 10.0
 # So long a new client may take to ask before it is sent everything, and one that is sent away to hear why [s].
 GREETING, FAREWELL = 0.2, 1.0
+# So long all may take to read the last message when a server ends [s].
+PARTING = 0.1
 # What the system holds for a client that is slow, in bytes: what is there is not replaced by what is newer.
 HELD = 1 << 18
 # What is read ahead of a client, and is passed over at a time, in bytes.
@@ -77,6 +79,7 @@ class Clients:
         self._numbers = count()
         self._clients: dict[int, Client] = {}
         self._newest: dict[str, tuple[bytes, ...]] = {}
+        self._attending: set[asyncio.Task] = set()
 
     def __len__(self) -> int:
         """How many there are."""
@@ -97,14 +100,34 @@ class Clients:
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve one connection until it ends."""
-        client = Client(next(self._numbers), writer)
+        task = asyncio.current_task()
+        assert task is not None
+        self._attending.add(task)
+        task.add_done_callback(self._attending.discard)
         _hold_little(writer)
-        if len(self._clients) >= self._most:
-            self.refused["too many clients"] += 1
-            text = f"{self._most} clients are connected, and no more are taken: end one of them"
-            writer.write(framed("STATUS", REFUSED, status(Code.BUSY, text), 0))
-            await _close(writer)
+        if len(self._clients) < self._most:
+            await self._attend(Client(next(self._numbers), writer), reader)
             return
+        self.refused["too many clients"] += 1
+        text = f"{self._most} clients are connected, and no more are taken: end one of them"
+        writer.write(framed("STATUS", REFUSED, status(Code.BUSY, text), 0))
+        await _close(writer)
+
+    async def close(self) -> None:
+        """Send what waits, for a moment, and end all connections."""
+        for client in self._clients.values():
+            client.leave()
+        for patience in (PARTING, FAREWELL):
+            if self._attending:
+                await asyncio.wait(self._attending, timeout=patience)
+            for client in self._clients.values():
+                client.writer.transport.abort()
+
+    async def listen(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Hear a server that was connected to, until it ends, and send nothing."""
+        await self._attend(Client(next(self._numbers), writer, asks=True), reader)
+
+    async def _attend(self, client: Client, reader: asyncio.StreamReader) -> None:
         self._clients[client.number] = client
         sending = asyncio.create_task(self._send(client))
         reading = asyncio.create_task(self._read(client, reader))
@@ -118,7 +141,7 @@ class Clients:
             for task in (sending, reading):
                 task.cancel()
             await asyncio.gather(sending, reading, return_exceptions=True)
-            await _close(writer)
+            await _close(client.writer)
 
     async def _send(self, client: Client) -> None:
         """Send what waits, as fast as the client reads it."""
@@ -208,14 +231,11 @@ class Clients:
 
 
 def _found(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> bytes | None:
-    """The newest message of a type: that of a name if there is one, else the first."""
-    alike = [
-        (header.name, message)
-        for messages in newest.values()
-        for message in messages
-        if (header := read_header(message[: HEADER.size])).kind == kind
-    ]
-    return next((message for own, message in alike if own == name), alike[0][1] if alike else None)
+    """A message of a type: that of a name if there is one, else the first of those with the last time stamp."""
+    every = [(read_header(each[: HEADER.size]), each) for messages in newest.values() for each in messages]
+    alike = [(header, each) for header, each in every if header.kind == kind]
+    named = (each for header, each in alike if header.name == name)
+    return next(named, max(alike, key=lambda pair: pair[0].stamp)[1] if alike else None)
 
 
 def _named(header: Header) -> str:

@@ -29,6 +29,8 @@ MOST_OTHERS = 6
 # Types that are heard and not answered: a STATUS that answers a STATUS would have no end.
 UNANSWERED = ("STATUS", "STRING", "CAPABILITY")
 SHORT = 1 << 16
+# What is read ahead of a client, in bytes.
+AHEAD = 1 << 18
 
 Picture = tuple[np.ndarray, int]
 """Colours (H, W, 3) uint8, and a time stamp."""
@@ -121,41 +123,40 @@ class Session:
         self._loop = asyncio.get_running_loop()
 
     def end(self) -> None:
-        """Say to all clients that it is over, and end `serve` or `follow`; from any thread."""
+        """Say to all clients that it is over, and end `serve`; from any thread."""
         with suppress(RuntimeError):  # the loop is closed: it has ended
             self._loop.call_soon_threadsafe(self._ended.set)
 
-    async def serve(self, host: str, port: int, seconds: float, ready: asyncio.Future[int]) -> None:
+    async def serve(
+        self, host: str, port: int, seconds: float, ready: asyncio.Future[int], source: tuple[str, int] | None = None
+    ) -> None:
         """Answer clients for so long; `ready` is given the port.
+
+        Poses may come from a server, too, the `source`: it is sent nothing, and tried again where it is not there.
 
         Raises
         ------
         OSError
             An address that cannot be served on.
         """
-        server = await asyncio.start_server(self.clients.converse, host, port, limit=1 << 18)
+        server = await asyncio.start_server(self.clients.converse, host, port, limit=AHEAD)
         ready.set_result(server.sockets[0].getsockname()[1])
+        work = [] if source is None else [asyncio.create_task(self._connected(*source))]
         try:
             await self._work(seconds)
         finally:
             server.close()
-
-    async def follow(self, host: str, port: int, seconds: float) -> None:
-        """Be the client of a server, for so long; where it is not there, it is tried again."""
-        connecting = asyncio.create_task(self._connected(host, port))
-        try:
-            await self._work(seconds)
-        finally:
-            connecting.cancel()
+            for each in work:
+                each.cancel()
 
     async def _connected(self, host: str, port: int) -> None:
         while True:
             with suppress(OSError):
-                await self.clients.converse(*await asyncio.open_connection(host, port, limit=1 << 18))
+                await self.clients.listen(*await asyncio.open_connection(host, port, limit=AHEAD))
             await asyncio.sleep(AGAIN)
 
     async def _work(self, seconds: float) -> None:
-        self.clients.publish("scan", (self._speaks.scan(stamp_of(clock.time())),))
+        self.clients.publish("scan", (self._speaks.scan(0),))
         with ThreadPoolExecutor(1, "answer") as answering, ThreadPoolExecutor(1, "draw") as drawing:
             work = [self._answering(answering), *([] if self._eye is None else [self._drawing(self._eye, drawing)])]
             tasks = [asyncio.create_task(each) for each in work]
@@ -164,7 +165,7 @@ class Session:
             done, _ = await asyncio.wait((*tasks, ended), timeout=limit, return_when=asyncio.FIRST_COMPLETED)
             over = framed("STATUS", "Sulcus", status(Code.SHUTDOWN, "the server ends"), stamp_of(clock.time()))
             self.clients.publish("status", (over,))
-            await asyncio.sleep(0.05)
+            await self.clients.close()
             for task in (*tasks, ended):
                 task.cancel()
             for task in done:

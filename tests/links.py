@@ -1,0 +1,77 @@
+"""Clients of bytes for a live link, over 127.0.0.1."""
+
+import asyncio
+import struct
+from contextlib import asynccontextmanager
+
+import numpy as np
+
+from scenes.link.answer import Answering
+from scenes.link.frame import HEADER, framed, read_header
+from scenes.link.heard import Heard, Names
+from scenes.link.outgoing import Outgoing
+from scenes.link.session import Session
+
+HOST = "127.0.0.1"
+NAMES = Names()
+
+
+def played(scene):
+    """Run a scene; one that waits for what does not come fails."""
+    asyncio.run(asyncio.wait_for(scene, 20.0))
+
+
+class Peer:
+    """A client of bytes."""
+
+    def __init__(self, reader, writer):
+        self.reader, self.writer = reader, writer
+
+    async def next(self, kind="", name=""):
+        """The next message (header, body) of a type and name."""
+        while True:
+            async with asyncio.timeout(5.0):
+                header = read_header(await self.reader.readexactly(HEADER.size))
+                body = await self.reader.readexactly(header.size)
+            if kind in ("", header.kind) and name in ("", header.name):
+                return header, body
+
+    async def said(self, name="SulcusRefused"):
+        return (await self.next("STATUS", name))[1][30:-1].decode()
+
+    def send(self, kind, name, body, stamp=0):
+        self.writer.write(framed(kind, name, body, stamp))
+
+
+@asynccontextmanager
+async def peers(port, count=1):
+    found = [Peer(*await asyncio.open_connection(HOST, port)) for _ in range(count)]
+    try:
+        yield found
+    finally:
+        for each in found:
+            each.writer.transport.abort()
+
+
+@asynccontextmanager
+async def linked(follower, registration=None, eye=None, tracking=1e-4, names=NAMES, source=None):
+    answering = Answering(follower.motion, follower.tool, tracking, registration)
+    session = Session(answering, Outgoing(follower.motion.stage, registration is not None), Heard(names, 0.3), eye)
+    ready = asyncio.get_running_loop().create_future()
+    serving = asyncio.create_task(session.serve(HOST, 0, np.inf, ready, source))
+    try:
+        yield await ready
+    finally:
+        session.end()
+        await serving
+
+
+def corners_of(body):
+    return np.frombuffer(body, ">f4", 3 * struct.unpack(">I", body[:4])[0], 40).reshape(-1, 3)
+
+
+def in_mm(T):
+    """A pose (..., 4, 4) [m] as it is sent."""
+    out = T.copy()
+    out[..., :3, 3] *= 1e3
+    return out

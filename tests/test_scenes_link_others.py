@@ -1,0 +1,235 @@
+"""The link beside others' programs: the C++ library's examples, pyigtl, a camera's pictures, and Ctrl-C."""
+
+import asyncio
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from films import FILM, follower_of, truth_of
+from links import HOST, NAMES, in_mm, linked, peers, played
+from theatres import template_theatre
+
+from ar.overlay.outlines import ink_of, silhouette
+from ar.overlay.refind import of_ink, outline_gap
+from ar.tracking.pictures import film_of
+from scenes.cli import main
+from scenes.link.frame import HEADER, read_header, stamp_of
+from scenes.link.heard import Names
+from scenes.link.messages import image, read_image, transform
+from scenes.link.session import Eye
+from scenes.play.overlay.picture import Painter
+from scenes.play.stage import TUMOUR_COLOUR
+from scenes.script.registration_file import read_registration
+from scenes.script.scene import find_scene
+from scenes.script.shipped_files import template_path
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    import pyigtl
+
+EXAMPLES = Path("/usr/share/doc/openigtlink-examples/examples")
+ROW = 10
+
+
+@pytest.fixture(scope="module")
+def stage():
+    return template_theatre().stage(find_scene("palpate"))
+
+
+@pytest.fixture(scope="module")
+def truth(stage):
+    return truth_of(stage)
+
+
+@pytest.fixture(scope="module")
+def follower(stage):
+    return follower_of(stage)
+
+
+@pytest.fixture(scope="module")
+def registration():
+    return read_registration(FILM / "registration.json")
+
+
+@pytest.fixture(scope="module")
+def beside(follower, truth):
+    """T_reference_cube (4, 4) [mm] of one of the film's poses."""
+    T = follower.registration.T_patient_scan @ truth.T_scan_tool[ROW] @ np.linalg.inv(follower.tool.T_cube_tool)
+    return in_mm(T)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """A function that compiles an example of the C++ library."""
+    if not (EXAMPLES.is_dir() and Path("/usr/include/openigtlink").is_dir() and shutil.which("g++")):
+        pytest.skip("Debian's libopenigtlink-dev, openigtlink-examples and g++ are not installed")
+    folder = tmp_path_factory.mktemp("igtl")
+
+    def compiled(name):
+        out = folder / Path(name).stem
+        flags = ["-fpermissive", "-w", "-DOpenIGTLink_PROTOCOL_VERSION=2", "-I/usr/include/openigtlink"]
+        subprocess.run(["g++", *flags, EXAMPLES / name, "-lOpenIGTLink", "-lpthread", "-o", out], check=True)
+        return str(out)
+
+    return compiled
+
+
+@asynccontextmanager
+async def program(*words):
+    process = await asyncio.create_subprocess_exec(*map(str, words), stderr=asyncio.subprocess.PIPE)
+    try:
+        yield process.stderr
+    finally:
+        process.kill()
+        await process.wait()
+
+
+async def lines_until(stream, *wanted):
+    """What a program says until it has said all of this."""
+    said = ""
+    async with asyncio.timeout(10.0):
+        while not all(each in said for each in wanted):
+            line = await stream.readline()
+            assert line, said
+            said += line.decode()
+    return said
+
+
+async def sending(peer, beside, beat=0.03):
+    """Send a pose again and again, each at its time."""
+    while True:
+        peer.send("TRANSFORM", NAMES.tool, transform(beside), stamp_of(time.time()))
+        await asyncio.sleep(beat)
+
+
+def test_the_c_library_reads_what_is_sent(built, follower, registration, beside):
+    receiver, asker = built("Receiver/ReceiveClient.cxx"), built("PolyData/PolyDataClient.cxx")
+
+    async def scene():
+        async with linked(follower, registration) as port, peers(port) as (tracker,):
+            task = asyncio.create_task(sending(tracker, beside))
+            async with program(receiver, HOST, port) as said:
+                words = await lines_until(
+                    said, "Receiving TRANSFORM", "String: moved", "the tumour is known", "POLYDATA"
+                )
+                assert "CRC" not in words
+            first = 1e3 * follower.motion.stage.tumour_at_rest.vertices[0]
+            async with program(asker, HOST, port) as said:
+                words = await lines_until(said, "point[0] = (", "cell[0] = (")
+            read = words.split("point[0] = (")[1].split(")")[0].split(",")
+            assert [float(each) for each in read] == pytest.approx(first, abs=1.0)
+            task.cancel()
+
+    played(scene())
+
+
+def test_the_c_library_sends_what_is_read(built, follower, registration):
+    sender, server = built("Tracker/TrackerClient.cxx"), built("Tracker/TrackerServer.cxx")
+    names = Names(tool="Tracker")
+    with socket.socket() as free:
+        free.bind((HOST, 0))
+        other = free.getsockname()[1]
+
+    async def scene(source, words):
+        link = linked(follower, registration, names=names, source=source)
+        async with link as port, peers(port) as (viewer,), program(*words(port)):
+            while b"no Tracker yet" in (await viewer.next("STRING", "TipToTumour"))[1]:
+                pass
+
+    played(scene(None, lambda port: (sender, HOST, port, 30)))
+    played(scene((HOST, other), lambda port: (server, other, 30)))
+
+
+def test_pyigtl_sends_and_hears(follower, registration, beside):
+    async def scene():
+        async with linked(follower, registration) as port:
+            client = await asyncio.to_thread(connected, port)
+            stamp = time.time()
+            for number in range(3):
+                client.send_message(pyigtl.TransformMessage(beside, timestamp=stamp + number, device_name=NAMES.tool))
+            found = await asyncio.to_thread(client.wait_for_message, "TumourToRas", timeout=5)
+            assert found.timestamp == pytest.approx(stamp, abs=2.1) and found.matrix.shape == (4, 4)
+            words = await asyncio.to_thread(client.wait_for_message, "TipToTumour", timeout=5)
+            assert "+-" in words.string
+            await asyncio.to_thread(client.stop)
+
+    def connected(port):
+        return pyigtl.OpenIGTLinkClient(HOST, port, start_now=True)
+
+    played(scene())
+
+
+def test_a_cameras_picture_comes_back_with_the_tumour_in_it(follower, registration, truth, beside, stage):
+    picture = next(iter(film_of(FILM / "film.mp4", 30.0, colour=True))).colour
+    camera = follower.calibration.camera(truth.T_camera_scan[0])
+    placed = in_mm(registration.T_patient_scan @ np.linalg.inv(truth.T_camera_scan[0]))
+    mask = silhouette(camera, stage.tumour_at_rest.vertices, stage.tumour_at_rest.triangles)
+    tool = follower.tool.at(truth.T_scan_tool[0])
+    rest = in_mm(registration.T_patient_scan @ truth.T_scan_tool[0] @ np.linalg.inv(follower.tool.T_cube_tool))
+
+    async def scene():
+        eye = Eye(follower.calibration, Painter(stage, follower.tool, "contour"), 1e-4)
+        async with linked(follower, registration, eye) as port, peers(port) as (tracker,):
+            tracker.send("IMAGE", "Camera", image(picture[:100]))
+            assert "another size than the camera's: 960 x 100" in await tracker.said()
+            moving = asyncio.create_task(sending(tracker, rest))
+            await tracker.next("TRANSFORM", "TumourToRas")
+            tracker.send("IMAGE", "Camera", image(picture), stamp_of(5.0))
+            header, body = await tracker.next("IMAGE", "Overlay")
+            assert header.stamp == stamp_of(5.0) and not found(read_image(body))  # nobody says where the camera is
+            tracker.send("TRANSFORM", NAMES.camera, transform(placed), stamp_of(time.time()))
+            tracker.send("IMAGE", "Camera", image(picture), stamp_of(6.0))
+            drawn = read_image((await tracker.next("IMAGE", "Overlay"))[1])
+            moving.cancel()
+            covered = silhouette(camera, *tool)
+            assert outline_gap(drawn, ink_of(TUMOUR_COLOUR), mask, covered) < 2.5
+
+    def found(drawn):
+        return np.count_nonzero(of_ink(drawn, ink_of(TUMOUR_COLOUR))) > 5
+
+    played(scene())
+
+
+def test_the_command_serves_this_machine_alone_and_ends_at_a_signal():
+    words = ["link", template_path(), "--tool", FILM / "tool.json", "--deformer", "rest", "--port", "0"]
+    command = [sys.executable, "-m", "scenes.cli", *map(str, words), "--device", "cpu"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        address = next(line for line in process.stdout if "serves" in line).split()[2]
+        assert address.startswith("127.0.0.1:")
+        with socket.create_connection(address.split(":"), timeout=10) as one:
+            assert read_header(one.recv(HEADER.size, socket.MSG_WAITALL)).name == "TumourInScan"
+            process.send_signal(signal.SIGINT)
+            _, error = process.communicate(timeout=20)
+            said = b""
+            while some := one.recv(1 << 16):
+                said += some
+        assert b"the server ends" in said
+    finally:
+        process.kill()
+    assert process.returncode == 0 and "Traceback" not in error, error
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--port", "70000"], "--port 70000"),
+        (["--stale", "0"], "--stale 0"),
+        (["--tracking-mm", "-1"], "--tracking-mm -1"),
+        (["--client", ":18944"], "--client :18944"),
+        (["--registration", "none.json"], "none.json: no such file"),
+        ([], "no model beside"),
+    ],
+)
+def test_what_cannot_be_served_is_refused(words, why, capsys):
+    assert main(["link", str(template_path()), "--device", "cpu", *words]) == 2
+    assert why in capsys.readouterr().err
