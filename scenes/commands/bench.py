@@ -20,6 +20,7 @@ BENCHES = {
     "gym": "how many steps a second the Gymnasium environments make, of states and of pictures",
     "fit": "how rightly tissue and skull of known patients are found from several frames",
     "track": "how far off a tool's tip is that a camera sees by its printed cube",
+    "link": "how long an OpenIGTLink client waits for the answer to a pose",
     "shortcuts": "how much time each shortcut of the solver saves on typical loads",
     "solver": "time of the first load on a mesh and of a further one, compared with other packages",
     "all": "every figure of the performance pages in one go: a record, its tables, and what got slower",
