@@ -182,20 +182,35 @@ def test_a_cameras_picture_comes_back_with_the_tumour_in_it(follower, registrati
             assert "another size than the camera's: 960 x 100" in await tracker.said()
             moving = asyncio.create_task(sending(tracker, rest))
             await tracker.next("TRANSFORM", "TumourToRas")
-            tracker.send("IMAGE", "Camera", image(picture), stamp_of(5.0))
-            header, body = await tracker.next("IMAGE", "Overlay")
-            assert header.stamp == stamp_of(5.0) and not found(read_image(body))  # nobody says where the camera is
-            tracker.send("TRANSFORM", NAMES.camera, transform(placed), stamp_of(time.time()))
-            tracker.send("IMAGE", "Camera", image(picture), stamp_of(6.0))
-            drawn = read_image((await tracker.next("IMAGE", "Overlay"))[1])
+            for apart, shift, where in (
+                (0.0, 0.0, "one"),
+                (0.01, 0.0, "drawn"),
+                (0.02, 30.0, "fast"),
+                (9.0, 0.0, "late"),
+            ):
+                stamp = stamp_of(begun + apart)
+                if where != "late":
+                    moved = placed.copy()
+                    moved[0, 3] += shift
+                    tracker.send("TRANSFORM", NAMES.camera, transform(moved), stamp)
+                tracker.send("IMAGE", "Camera", image(picture), stamp + (where == "fast") * stamp_of(0.005))
+                header, body = await tracker.next("IMAGE", "Overlay")
+                shown[where] = read_image(body)
+            assert header.stamp == stamp
             moving.cancel()
-            covered = silhouette(camera, *tool)
-            assert outline_gap(drawn, ink_of(TUMOUR_COLOUR), mask, covered) < 2.5
 
-    def found(drawn):
-        return np.count_nonzero(of_ink(drawn, ink_of(TUMOUR_COLOUR))) > 5
-
+    begun, shown = 1e9, {}
     played(scene())
+    # Of a single pose, or of another time than the picture's, nothing is drawn; of a camera that is too fast, no green.
+    assert {where: found(drawn) for where, drawn in shown.items()} == {
+        "one": False, "drawn": True, "fast": False, "late": False
+    }  # fmt: skip
+    assert outline_gap(shown["drawn"], ink_of(TUMOUR_COLOUR), mask, silhouette(camera, *tool)) < 2.5
+
+
+def found(drawn):
+    """Whether a tumour is drawn as known."""
+    return np.count_nonzero(of_ink(drawn, ink_of(TUMOUR_COLOUR))) > 5
 
 
 def test_the_command_serves_this_machine_alone_and_ends_at_a_signal():
@@ -228,8 +243,17 @@ def test_the_command_serves_this_machine_alone_and_ends_at_a_signal():
         (["--client", ":18944"], "--client :18944"),
         (["--registration", "none.json"], "none.json: no such file"),
         ([], "no model beside"),
+        (
+            ["--host", "198.51.100.1", "--tool", str(FILM / "tool.json"), "--deformer", "rest"],
+            "no server on 198.51.100.1",
+        ),
     ],
 )
 def test_what_cannot_be_served_is_refused(words, why, capsys):
     assert main(["link", str(template_path()), "--device", "cpu", *words]) == 2
     assert why in capsys.readouterr().err
+
+
+def test_a_bench_of_no_poses_is_refused(capsys):
+    assert main(["bench", "link", "--rate", "0"]) == 2
+    assert "--rate and --seconds" in capsys.readouterr().err

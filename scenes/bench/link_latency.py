@@ -12,7 +12,7 @@ import numpy as np
 
 from sim.runtime.processes import at_once, working
 
-from ..link.answer import NOT_SEEN, Answer
+from ..link.answer import NOT_SEEN, Answer, Seen
 from ..link.frame import HEADER, BadMessageError, framed, read_header, stamp_of, time_of
 from ..link.heard import Heard, Names
 from ..link.messages import Code, Mesh, polydata, status, transform
@@ -57,7 +57,7 @@ class Moved:
         motion = Motion(self._points + body.T[:3, 3], True)
         return Answer(body.stamp, Known(moment, State.GOOD, "", NOT_SEEN, motion))
 
-    def camera(self, heard: Heard, now: float) -> np.ndarray | str:
+    def camera(self, heard: Heard, now: float, stamp: int) -> Seen | str:
         """No camera is listened to."""
         return "no camera"
 

@@ -90,6 +90,9 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--tracking-mm {args.tracking_mm:g}: give millimetres, 0 to 100.")
     if not 0 <= args.port < 1 << 16:
         raise InputError(f"--port {args.port}: give a port from 0 to 65535.")
+    if args.host not in ("127.0.0.1", "localhost", "::1"):
+        said = "OpenIGTLink asks for no password: whoever reaches this address may move the tumour that all see"
+        print(f"sulcus link: {said}", file=sys.stderr)
     source = None if args.client is None else address_of(args.client)
     return until_ended(partial(_linked, args, source))
 

@@ -45,6 +45,17 @@ class Answer:
 
 
 @dataclass(frozen=True, eq=False)
+class Seen:
+    """How the scan lies before a camera: T_camera_scan (4, 4) [m].
+
+    `moved` is how far the tumour may have gone between the picture and the camera's pose [m].
+    """
+
+    T_camera_scan: np.ndarray
+    moved: float
+
+
+@dataclass(frozen=True, eq=False)
 class Answering:
     """Who answers poses: a pure function of what was heard, but for where a finite element's answer starts.
 
@@ -89,12 +100,24 @@ class Answering:
         gauge = Painter(stage, self.tool).gauge(known, stage.tumour(motion.positions))
         return Answer(stamp, known, gauge)
 
-    def camera(self, heard: Heard, now: float) -> np.ndarray | str:
-        """T_camera_scan (4, 4) [m] at a time [s], or why nobody knows it."""
-        registration, body = self._registration(heard), heard.beside(heard.names.camera, now)
-        if isinstance(registration, str):
-            return registration
-        return body if isinstance(body, str) else np.linalg.inv(body.T) @ registration.T_patient_scan
+    def camera(self, heard: Heard, now: float, stamp: int) -> Seen | str:
+        """How the scan lies before the camera in the picture of a time stamp, or why nobody knows that at `now` [s]."""
+        name = heard.names.camera
+        registration, body = self._registration(heard), heard.beside(name, now)
+        if isinstance(registration, str) or isinstance(body, str):
+            return registration if isinstance(registration, str) else str(body)
+        stamped = stamp and body.stamp
+        apart = abs(time_of(stamp) - time_of(body.stamp)) if stamped else now - body.arrived
+        if apart > heard.stale:
+            return f"no {name} within {heard.stale:g} s of the picture's time"
+        before = heard.earlier(name)
+        if before is None:
+            return f"one {name} alone, which does not say how fast the camera moves"
+        between = time_of(body.stamp) - time_of(before.stamp) if stamped else body.arrived - before.arrived
+        middle = self.motion.stage.tumour_at_rest.vertices.mean(axis=0)
+        T, U = (np.linalg.inv(each.T) @ registration.T_patient_scan for each in (body, before))
+        way = float(np.linalg.norm((T - U)[:3] @ np.append(middle, 1.0)))
+        return Seen(T, way * apart / between if between > 0.0 else np.inf)
 
     def _registration(self, heard: Heard) -> Registration | str:
         """From the file, or as it was sent; or why there is none."""
@@ -127,21 +150,25 @@ class Answering:
         registered = float(np.sqrt(chi2.ppf(LEVEL, 3) * max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
         parts = {"registration": registered, "tool": known.motion.tool, "model": known.motion.model}
         band = float(np.hypot(registered, known.motion.error))
-        if band > LIMIT:
-            words = f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
-            return replace(known, state=State.UNSURE, words=words)
-        return replace(known, band=band, parts=parts)
+        return bounded(known, band, parts)
 
     def _nothing(self, why: str, moment: float, before: Known | None) -> Answer:
-        """Nothing is known now; how long that has been so is said."""
+        """Nothing is known now, and why."""
         felt = None if before is None else before.felt
-        since = "" if felt is None else f", not known since {max(moment - felt, 0.0):.1f} s"
         near = before is not None and before.near
         state = State.NO_TOOL if felt is None else State.STALE
         motion = self.motion.rest if before is None else before.motion
         return Answer(
-            stamp_of(moment), Known(moment, state, f"{why}{since}", NOT_SEEN, motion, felt=felt, near=near)
+            stamp_of(moment), Known(moment, state, why, NOT_SEEN, motion, felt=felt, near=near)
         )  # fmt: skip
+
+
+def bounded(known: Known, band: float, parts: dict[str, float]) -> Known:
+    """What is known with a bound [m] on its place, and what that is of; beyond 5 mm it may not be relied on."""
+    if band <= LIMIT:
+        return replace(known, band=band, parts=parts)
+    words = f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
+    return replace(known, state=State.UNSURE, words=words, band=None, parts={})
 
 
 def late(answer: Answer, age: float, stale: float) -> Answer:

@@ -62,11 +62,14 @@ class Heard:
         Which are listened to.
     stale
         How old one of a moving body may be [s].
+    sent, last
+        The newest, and those before them.
     """
 
     names: Names
     stale: float
     sent: Mapping[str, Sent] = field(default_factory=dict)
+    last: Mapping[str, Sent] = field(default_factory=dict)
 
     def hearing(self, name: str, matrix: np.ndarray, stamp: int, now: float, sender: int) -> Heard:
         """With a transform (4, 4) [mm] of one client.
@@ -88,7 +91,8 @@ class Heard:
                 raise BadMessageError("the same time stamp again")
             if 0 < last.stamp - stamp < SET_BACK * TICKS:
                 raise BadMessageError("a time stamp before the last one")
-        return replace(self, sent={**self.sent, name: Sent(T, stamp, now, sender)})
+        before = {} if last is None else {name: last}
+        return replace(self, sent={**self.sent, name: Sent(T, stamp, now, sender)}, last={**self.last, **before})
 
     def beside(self, name: str, now: float) -> Sent | str:
         """A body beside the patient's reference, with its own time stamp; or why that is not known."""
@@ -99,8 +103,15 @@ class Heard:
                 return f"no {each} yet"
             if (age := now - sent.arrived) > self.stale:
                 return f"no new {each} for {age:.1f} s"
-        body = self.sent[name]
-        if len(needed) == 1:
+        return self._in_reference(name, self.sent[name])
+
+    def earlier(self, name: str) -> Sent | None:
+        """The same by the transform before the newest, beside the reference as it is now; None where there is none."""
+        sent = self.last.get(name)
+        return None if sent is None else self._in_reference(name, sent)
+
+    def _in_reference(self, name: str, body: Sent) -> Sent:
+        if not self.names.by_tracker(name):
             return body
         reference = self.sent[self.names.reference]
         arrived = min(body.arrived, reference.arrived)

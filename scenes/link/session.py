@@ -15,7 +15,7 @@ from ar.optics.calibration import Calibration
 
 from ..play.overlay.follower import Known, State, across
 from ..play.overlay.picture import Painter
-from .answer import Answer, late
+from .answer import Answer, Seen, bounded, late
 from .clients import Clients
 from .frame import BadMessageError, Header, framed, stamp_of
 from .heard import Heard
@@ -43,7 +43,7 @@ class Answers(Protocol):
         """As `Answering.answer`."""
         ...
 
-    def camera(self, heard: Heard, now: float) -> np.ndarray | str:
+    def camera(self, heard: Heard, now: float, stamp: int) -> Seen | str:
         """As `Answering.camera`."""
         ...
 
@@ -76,22 +76,21 @@ class Eye:
     painter: Painter
     tracking: float
 
-    def painted(self, colour: np.ndarray, known: Known, T_camera_scan: np.ndarray | str) -> np.ndarray:
+    def painted(self, colour: np.ndarray, known: Known, seen: Seen | str) -> np.ndarray:
         """A picture (H, W, 3) uint8 with what is known.
 
         Where it is not known how the scan lies before the camera, a sentence says why, and nothing else is drawn.
         """
-        if isinstance(T_camera_scan, str):
-            words = f"{T_camera_scan}: nothing is drawn"
-            return self.painter.paint(colour, replace(known, state=State.NO_REFERENCE, words=words)).colour
+        if isinstance(seen, str):
+            known = replace(known, state=State.NO_REFERENCE, words=f"{seen}: nothing is drawn")
+            return self.painter.paint(colour, known).colour
+        T = seen.T_camera_scan
         if known.band is not None:
             middle = known.motion.positions[self.painter.stage.tumour_vertices].mean(axis=0)
-            at = T_camera_scan[:3, :3] @ middle + T_camera_scan[:3, 3]
-            placed = across(self.tracking**2 * np.eye(3), at)
-            parts = {**known.parts, "camera": placed}
-            known = replace(known, band=float(np.hypot(known.band, placed)), parts=parts)
-        seen = self.calibration.camera(T_camera_scan)
-        return self.painter.paint(colour, replace(known, camera=seen)).colour
+            placed = across(self.tracking**2 * np.eye(3), T[:3, :3] @ middle + T[:3, 3])
+            parts = {**known.parts, "camera": placed, "time": seen.moved}
+            known = bounded(known, float(np.linalg.norm([known.band, placed, seen.moved])), parts)
+        return self.painter.paint(colour, replace(known, camera=self.calibration.camera(T))).colour
 
 
 class Session:
@@ -219,7 +218,7 @@ class Session:
             if self._picture is None or self._known is None:
                 continue
             (colour, stamp), heard = self._picture, self._heard
-            camera = self._answers.camera(heard, self._loop.time())
+            camera = self._answers.camera(heard, self._loop.time(), stamp)
             drawn = await self._loop.run_in_executor(thread, eye.painted, colour, self._known, camera)
             self.clients.publish("picture", (framed("IMAGE", "Overlay", image(drawn), stamp),))
 
