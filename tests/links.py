@@ -54,9 +54,9 @@ async def peers(port, count=1):
 
 
 @asynccontextmanager
-async def linked(follower, registration=None, eye=None, tracking=1e-4, names=NAMES, source=None):
+async def linked(follower, registration=None, eye=None, tracking=1e-4, names=NAMES, source=None, stale=2.0):
     answering = Answering(follower.motion, follower.tool, tracking, registration)
-    session = Session(answering, Outgoing(follower.motion.stage, registration is not None), Heard(names, 0.3), eye)
+    session = Session(answering, Outgoing(follower.motion.stage, registration is not None), Heard(names, stale), eye)
     ready = asyncio.get_running_loop().create_future()
     serving = asyncio.create_task(session.serve(HOST, 0, np.inf, ready, source))
     try:

@@ -47,7 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="hear this server, too, as that of PLUS, and send it nothing; --port is then another one than its own",
     )
     parser.add_argument("--clients", type=int, default=16, help="how many there may be (default %(default)s)")
-    names = parser.add_argument_group("names of the transforms that are heard; AToB takes places in A's frame to B's")
+    what = "transforms that are heard, in mm; AToB takes places in A's frame to B's; the scan's space is RAS"
+    names = parser.add_argument_group(what)
     names.add_argument("--tool-name", default="StylusTipToReference", help="default %(default)s")
     names.add_argument("--reference-name", default="ReferenceToTracker", help="for AToTracker (default %(default)s)")
     names.add_argument("--camera-name", default="CameraToReference", help="default %(default)s")

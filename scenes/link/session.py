@@ -252,7 +252,7 @@ class Session:
     def _hear_transform(self, number: int, header: Header, content: bytes) -> None:
         names = self._heard.names
         if header.name not in names.all:
-            if len(self._others) < MOST_OTHERS:
+            if header.name and len(self._others) < MOST_OTHERS:
                 self._others[header.name] = None
             return
         matrix = (read_transform if header.kind == "TRANSFORM" else read_position)(content)
