@@ -207,6 +207,7 @@ def test_files_that_are_no_volumes(tmp_path):
     (tmp_path / "text.nii").write_text("not a volume" * 99)
     (tmp_path / "text.nii.gz").write_text("not compressed")
     (tmp_path / "text.mgz").write_text("")
+    (tmp_path / "text.img").write_text("")
     affine, places = grid(AFFINES["thick slices"])
     whole = save(tmp_path / "whole.nii.gz", ellipsoid(places), affine).read_bytes()
     (tmp_path / "half.nii.gz").write_bytes(whole[: len(whole) // 2])
@@ -216,7 +217,8 @@ def test_files_that_are_no_volumes(tmp_path):
         ("text.nii", "cannot be read as NIfTI"),
         ("text.nii.gz", "cannot be read as NIfTI"),
         ("half.nii.gz", "cannot be read as NIfTI"),
-        ("text.mgz", "is not called .nii"),
+        ("text.mgz", "cannot be read as a FreeSurfer volume"),
+        ("text.img", "is not called .nii"),
     ):
         with pytest.raises(InputError, match=reason) as caught:
             volume_subject(tmp_path / name, (1,), (3,))

@@ -15,7 +15,7 @@ import pytest
 from boxes import base_held, box
 
 from sim.bodies.meshfile import read_anatomy, write_mesh
-from sim.bodies.nifti import read_volume
+from sim.bodies.volume import read_volume
 from sim.bodies.vtu_size import demand_small
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh

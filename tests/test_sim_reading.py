@@ -26,7 +26,7 @@ from boxes import base_held, box
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import read_intensity
 from sim.bodies.meshfile import read_anatomy, read_mesh, write_anatomy, write_mesh
-from sim.bodies.nifti import read_volume
+from sim.bodies.volume import read_volume
 from sim.bodies.vtu_size import demand_small
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.bodies.head_masks import head_masks
 from sim.bodies.intensity import sidecar, write_intensity
-from sim.bodies.label_volume import volume_subject
+from sim.bodies.label_volume import masked_subject
 from sim.bodies.mesher import lost_pieces, lost_words, surface_errors
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.placement import side_of
@@ -24,6 +25,7 @@ from sim.geometry.tetmesh import dihedral_angles
 from sim.runtime.timing import stage
 
 from .companion_files import demand_no_strangers
+from .label_options import add_label_arguments, sources_of
 from .outputs import add_force, claimed
 from .placement_options import add_opening_arguments, opened, opened_over, point
 
@@ -67,8 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_opening_arguments(parser)
     own = parser.add_argument_group("your own brain")
     own.add_argument("--labels", type=Path, metavar="FILE.nii.gz", help="label volume; without it, the template")
-    own.add_argument("--brain", type=_labels, metavar="1,2", help="labels that are brain")
-    own.add_argument("--tumour", type=_labels, metavar="3,4", help="labels that are tumour")
+    add_label_arguments(own, "--convention")
     own.add_argument(
         "--t1", type=Path, metavar="FILE.nii.gz", help="intensities in the same space, for the camera view"
     )
@@ -90,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Make the anatomy, write it, and print what it is."""
     began = time.perf_counter()
-    read = (args.labels, args.t1)
+    read = (args.labels, args.mask, args.tumour_in, args.t1)
     claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, read)
     beside = sidecar(args.out)
     claimed(beside, ".gz", "a scan that sulcus put beside an anatomy", args.force, read)
@@ -131,35 +132,27 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _labels(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of whole numbers such as 1,2") from None
-
-
 def _given(args: argparse.Namespace) -> dict[str, float | str]:
     return {name: getattr(args, name) for name in DEFAULTS if getattr(args, name) is not None}
 
 
 def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
     if args.labels is None:
-        for name in ("brain", "tumour", "t1"):
+        for name in ("brain", "tumour", "convention", "mask", "tumour_in", "t1"):
             if getattr(args, name) is not None:
-                raise InputError(f"--{name} belongs to a label volume: give --labels FILE.nii.gz too, or leave it out.")
+                option = name.replace("_", "-")
+                raise InputError(
+                    f"--{option} belongs to a label volume: give --labels FILE.nii.gz too, or leave it out."
+                )
         if args.tumour_at is not None and (args.site is not None or args.cover is not None):
             raise InputError("--tumour-at says where the tumour lies: leave out --site and --cover, or --tumour-at.")
         middle = None if args.tumour_at is None else tuple(1e-3 * value for value in args.tumour_at)
         lengths = 1e-3 * chosen["radius"], 1e-3 * chosen["cover"]
         return template_subject(Tumour(*lengths, chosen["tumour_shape"], chosen["site"], args.seed, middle))
-    if not args.brain or not args.tumour:
-        raise InputError(
-            "--labels needs --brain and --tumour, the labels of each: for instance --brain 1,2 --tumour 3."
-        )
     for name in PLACED:
         if getattr(args, name) is not None:
             raise InputError(f"--{name.replace('_', '-')} places the template's tumour: leave it out with --labels.")
-    return volume_subject(args.labels, args.brain, args.tumour, args.t1)
+    return masked_subject(head_masks(sources_of(args)), args.t1)
 
 
 def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost: list[bool]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from surrogate.data.disc_split import APART, FEWEST
 from surrogate.data.tool_loads import PRESETS
 
 from .devices_option import add_devices
+from .label_options import add_label_arguments, label_words
 from .outputs import add_force, claimed
 from .placement_options import add_opening_arguments, opening_words
 from .tissue_options import add_element_argument
@@ -24,8 +25,7 @@ from .tissue_options import add_element_argument
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("labels", type=Path, metavar="LABELS.nii.gz", help="label volume")
-    parser.add_argument("--brain", required=True, help="labels that are brain, separated by commas")
-    parser.add_argument("--tumour", required=True, help="labels that are tumour, separated by commas")
+    add_label_arguments(parser, "--labels", "--convention")
     parser.add_argument("--t1", type=Path, help="intensities in the same space, for the camera view")
     parser.add_argument(
         "--out",
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
 
     # Said now, not after minutes of meshing.
     data, model = args.out.with_suffix(".h5"), model_path(args.out)
-    claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, [args.labels, args.t1])
+    claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, [args.labels, args.mask, args.tumour_in, args.t1])
     claimed(data, ".h5", "a data set of `sulcus simulate`", args.force)
     claimed(model, ".npz", "a model of `sulcus train`", args.force)
     device_names(args.device)
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     force = ["--force"] if args.force else []
     t1 = [] if args.t1 is None else ["--t1", str(args.t1)]
     steps = [
-        ["anatomy", "--labels", str(args.labels), "--brain", args.brain, "--tumour", args.tumour, *t1,
+        ["anatomy", *label_words(args), *t1,
          "--nodes", str(args.nodes), "--craniotomy", str(args.craniotomy), *opening_words(args),
          "--out", str(args.out), *force],
         ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--preset", args.preset,

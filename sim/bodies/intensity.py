@@ -12,7 +12,7 @@ from scipy import ndimage
 from ..errors import InputError
 from ..geometry.tetmesh import TetMesh
 from ..runtime.atomic_files import written_whole
-from .nifti import read_volume
+from .volume import read_volume
 
 HEADER = 348  # bytes of NIfTI
 # Grey values that differ by less than this share of them are one.

@@ -11,8 +11,10 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import InputError
+from ..runtime.outside_files import path_of
+from .head_masks import HeadMasks, Sources, head_masks
 from .intensity import read_intensity
-from .nifti import read_volume
+from .label_map import Label, on_border
 from .placement import Piece, site_over
 from .signed_distance import Blur, mask_field
 from .subject import Subject, rim
@@ -46,12 +48,23 @@ class Labelling:
 
 def volume_subject(
     path: str | Path,
-    brain: Sequence[int],
-    tumour: Sequence[int],
+    brain: Sequence[Label],
+    tumour: Sequence[Label],
     t1: str | Path | None = None,
     settings: Labelling = Labelling(),
 ) -> Subject:
-    """The subject in a NIfTI file of whole-number labels, of which some are `brain` and some `tumour`.
+    """The subject in a file of whole-number labels, of which some are `brain` and some `tumour`.
+
+    Raises
+    ------
+    InputError
+        What `head_masks` and `masked_subject` refuse.
+    """
+    return masked_subject(head_masks(Sources(path_of(path), tuple(brain), tuple(tumour))), t1, settings)
+
+
+def masked_subject(masks: HeadMasks, t1: str | Path | None = None, settings: Labelling = Labelling()) -> Subject:
+    """The subject whose brain and tumour are masks of voxels.
 
     The solid is brain or tumour, its largest component, with holes filled; tumour components outside it are left out,
     and each such change is noted. The skull is opened over the largest of them. `t1` is a volume of intensities in the
@@ -60,34 +73,30 @@ def volume_subject(
     Raises
     ------
     InputError
-        What `read_volume` refuses; labels that are not whole, not there, or named twice; a tumour outside the brain.
-        What `settings` refuse: by default a brain of less than 20 ml or more than 5,000 ml, and a tumour of fewer than
-        27 voxels.
+        A T1 that `read_intensity` refuses; a tumour outside the brain. What `settings` refuse: by default a brain of
+        less than 20 ml or more than 5,000 ml, and a tumour of fewer than 27 voxels.
     """
-    volume = read_volume(path)
-    _check_labels(path, volume.values, brain, tumour)
-    voxel = abs(float(np.linalg.det(volume.affine[:3, :3])))
-    notes = list(volume.notes)
-    marked = np.isin(volume.values, tumour)
-    solid = _whole(np.isin(volume.values, brain), marked, voxel, notes)
+    affine, voxel = masks.affine, abs(float(np.linalg.det(masks.affine[:3, :3])))
+    notes = list(masks.notes)
+    solid = _whole(masks.brain, masks.tumour, voxel, notes)
     smallest, largest = settings.smallest_brain, settings.largest_brain
     if not smallest <= solid.sum() * voxel <= largest:
         raise InputError(
-            f"{path}: the labels {_listed(brain)} make a brain of {solid.sum() * voxel * 1e6:.3g} ml; expected "
+            f"{masks.name}: {masks.meant} make a brain of {solid.sum() * voxel * 1e6:.3g} ml; expected "
             f"{smallest * 1e6:g} to {largest * 1e6:g} ml. Check the labels and the voxel size."
         )
-    edge = int(solid.sum() - solid[1:-1, 1:-1, 1:-1].sum())
+    edge = max(on_border(solid), masks.cut)
     if edge:
         notes.append(
             f"{edge} voxels of the brain lie on the volume's border: where it is cut there is no cortex, so see that "
             "the craniotomy lies elsewhere"
         )
-    inside = _inside(path, solid, marked, voxel, notes, settings)
-    cortex, interface = rim(solid, volume.affine), rim(inside, volume.affine)
-    pieces = _pieces(inside, volume.affine)
+    inside = _inside(masks.name, solid, masks.tumour, voxel, notes, settings)
+    cortex, interface = rim(solid, affine), rim(inside, affine)
+    pieces = _pieces(inside, affine)
     return Subject(
-        brain=mask_field(solid, volume.affine, settings.blur),
-        tumour=mask_field(_extended(inside, solid, settings.extension), volume.affine, settings.blur),
+        brain=mask_field(solid, affine, settings.blur),
+        tumour=mask_field(_extended(inside, solid, settings.extension), affine, settings.blur),
         cortex=cortex,
         interface=interface,
         tumour_volume=float(inside.sum() * voxel),
@@ -96,28 +105,6 @@ def volume_subject(
         notes=tuple(notes),
         pieces=pieces,
     )
-
-
-def _check_labels(path: str | Path, values: np.ndarray, brain: Sequence[int], tumour: Sequence[int]) -> None:
-    if not brain or not tumour:
-        raise InputError("name at least one label of the brain and one of the tumour.")
-    both = sorted(set(brain) & set(tumour))
-    if both:
-        raise InputError(f"labels {_listed(both)} are named as brain and as tumour: give each to one of them.")
-    if values.dtype.kind == "f" and not np.array_equal(values, np.rint(values)):
-        raise InputError(f"{path}: holds fractions, so it is no label volume. Give whole-number labels.")
-    present = np.unique(values).astype(int).tolist()
-    if present == [0]:
-        raise InputError(f"{path}: is empty, every voxel is 0. Export the labels again.")
-    missing = sorted((set(brain) | set(tumour)) - set(present))
-    if missing or 0 in (*brain, *tumour):
-        wrong = f"has no label {_listed(missing)}" if missing else "has label 0 as background"
-        raise InputError(f"{path}: {wrong}. Choose from {_listed([label for label in present if label])}.")
-
-
-def _listed(labels: Sequence[int]) -> str:
-    shown = ", ".join(map(str, labels[:20]))
-    return f"{shown}, ... ({len(labels)} in all)" if len(labels) > 20 else shown
 
 
 def _whole(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:
@@ -135,7 +122,7 @@ def _whole(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]
 
 
 def _inside(
-    path: str | Path,
+    name: str,
     solid: np.ndarray,
     tumour: np.ndarray,
     voxel: float,
@@ -145,7 +132,7 @@ def _inside(
     """The tumour's components that lie in the solid, but for specks."""
     inside = tumour & solid
     if not inside.any():
-        raise InputError(f"{path}: the tumour lies outside the brain. Check the labels given as brain and as tumour.")
+        raise InputError(f"{name}: the tumour lies outside the brain. Check the labels given as brain and as tumour.")
     component, count = cast(tuple[np.ndarray, int], ndimage.label(inside, np.ones((3, 3, 3))))
     size = np.bincount(component.ravel(), minlength=count + 1)
     fewest = settings.fewest_voxels
@@ -153,7 +140,7 @@ def _inside(
     kept[0] = False
     if not kept.any():
         raise InputError(
-            f"{path}: the tumour's largest component has {size[1:].max()} voxels, and {fewest} are needed to "
+            f"{name}: the tumour's largest component has {size[1:].max()} voxels, and {fewest} are needed to "
             "show its shape. Resample the volume more finely, or check the labels."
         )
     result = kept[component]

@@ -1,0 +1,60 @@
+"""What is brain and what tumour, on the command line: the same options for `anatomy` and `patient`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sim.bodies.conventions import CONVENTIONS
+from sim.bodies.head_masks import Sources
+from sim.bodies.label_map import Label
+
+
+def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None:
+    """Declare --brain, --tumour, --mask, --tumour-in, and by these `names` the convention that labels follow."""
+    parser.add_argument(
+        "--brain", type=labels, metavar="1,2", help="labels that are brain, by number or by a segment's name"
+    )
+    parser.add_argument(
+        "--tumour", type=labels, metavar="3,4", help="labels that are tumour, by number or by a segment's name"
+    )
+    said = ". ".join(f"{name}: {one.source}" for name, one in CONVENTIONS.items())
+    parser.add_argument(
+        *names,
+        dest="convention",
+        choices=tuple(CONVENTIONS),
+        help=f"whose labels they are, in place of numbers. {said}",
+    )
+    parser.add_argument(
+        "--mask", type=Path, metavar="BRAIN.nii.gz",
+        help="what is not 0 there is brain, in place of --brain, on a grid of its own",
+    )  # fmt: skip
+    parser.add_argument(
+        "--tumour-in", type=Path, metavar="FILE", help="the file in which the tumour is marked, on a grid of its own"
+    )
+
+
+def labels(text: str) -> tuple[Label, ...]:
+    """Numbers and names with commas between them, for argparse."""
+    found = tuple(int(part) if part.strip().isdecimal() else part.strip() for part in text.split(","))
+    if "" in found:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of labels such as 1,2 or Brain,Tumour")
+    return found
+
+
+def sources_of(args: argparse.Namespace) -> Sources:
+    """The files and labels that the options name."""
+    return Sources(args.labels, args.brain or (), args.tumour or (), args.convention, args.mask, args.tumour_in)
+
+
+def label_words(args: argparse.Namespace) -> list[str]:
+    """The options as words for `sulcus anatomy`."""
+    given = {
+        "--labels": args.labels,
+        "--brain": args.brain and ",".join(map(str, args.brain)),
+        "--tumour": args.tumour and ",".join(map(str, args.tumour)),
+        "--convention": args.convention,
+        "--mask": args.mask,
+        "--tumour-in": args.tumour_in,
+    }
+    return [f"{name}={value}" for name, value in given.items() if value is not None]

@@ -1,0 +1,247 @@
+"""Which voxels are brain and which tumour, from one label map or from several files on grids of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from ..errors import InputError
+from .conventions import CONVENTIONS, Convention, demand_fits
+from .label_map import Label, LabelMap, Mask, listed, on_border, read_labels, widened
+from .volume import read_volume
+
+TO_LPS = np.array([-1.0, -1.0, 1.0])
+# Share of a tumour inside the brain's convex hull: less is amiss, and so much after x and y are negated says why.
+AMISS, EXPLAINED = 0.5, 0.9
+SAMPLED = 20_000
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Files and labels that say what is brain and what tumour.
+
+    Parameters
+    ----------
+    labels
+        The label map, whose grid is kept.
+    brain, tumour
+        Labels by number or name; () for those of the convention, or for what other files mark.
+    convention
+        A name of `CONVENTIONS`, or None.
+    mask
+        A volume whose voxels other than 0 are brain, in place of `brain`.
+    tumour_in
+        A label map that the labels `tumour` are of, all of them if there are none.
+    """
+
+    labels: Path
+    brain: tuple[Label, ...] = ()
+    tumour: tuple[Label, ...] = ()
+    convention: str | None = None
+    mask: Path | None = None
+    tumour_in: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class HeadMasks:
+    """Marked voxels (I, J, K) bool on one grid.
+
+    Parameters
+    ----------
+    name
+        Of the file, or of the files, as errors say it.
+    meant
+        What is taken for brain, in words.
+    brain, tumour
+        What is labelled so; the brain need not hold the tumour.
+    cut
+        Voxels of the brain on the border of a file that has a grid of its own.
+    parts
+        Other tissues that a convention tells, by name: necrosis, oedema, ventricles.
+    affine
+        (4, 4) from indices to metres (RAS).
+    notes
+        Sentences about what had to be assumed.
+    """
+
+    name: str
+    meant: str
+    brain: np.ndarray
+    tumour: np.ndarray
+    affine: np.ndarray
+    notes: tuple[str, ...] = ()
+    cut: int = 0
+    parts: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def head_masks(sources: Sources) -> HeadMasks:
+    """Read what is brain and what tumour, on the label map's grid, widened so far that it holds the other files.
+
+    Raises
+    ------
+    InputError
+        What `read_labels` and `read_volume` refuse; a convention that is not known, or that the labels are not of.
+        Labels that are not there, or named twice; no labels, and nothing that stands for them. Left that lies on the
+        right. A tumour in another file that does not lie at the brain.
+    """
+    convention = _convention(sources)
+    _demand_named(sources, convention)
+    whole = read_labels(sources.labels)
+    brain, tumour = _meant(whole, sources, convention)
+    marked = {} if sources.mask else {"brain": whole.mask(brain)}
+    marked |= {} if sources.tumour_in else {"tumour": whole.mask(tumour)}
+    marked |= {} if convention is None else _parts(whole, convention)
+    others = _others(sources, tumour)
+    if others:
+        ours = {name: Mask(Path(sources.labels), mask, whole.affine) for name, mask in marked.items()}
+        _demand_together((ours | others)["brain"], (ours | others)["tumour"])
+    shape, affine = whole.layers.shape[:3], whole.affine
+    for other in others.values():
+        lacking, affine = widened(shape, affine, other)
+        marked = {name: np.pad(mask, lacking) for name, mask in marked.items()}
+        shape = tuple((np.array(shape) + lacking.sum(axis=1)).tolist())
+    marked |= {name: other.onto(shape, affine) for name, other in others.items()}
+    return HeadMasks(
+        " and ".join(str(path) for path in (sources.labels, sources.mask, sources.tumour_in) if path),
+        f"the mask {sources.mask}" if sources.mask else f"the labels {listed(brain)}",
+        marked.pop("brain"),
+        marked.pop("tumour"),
+        affine,
+        whole.notes + tuple(f"{one.path}: {note}" for one in others.values() for note in one.notes),
+        on_border(others["brain"].marked if sources.mask else whole.mask(brain)),
+        marked,
+    )
+
+
+def _meant(
+    whole: LabelMap, sources: Sources, convention: Convention | None
+) -> tuple[tuple[Label, ...], tuple[Label, ...]]:
+    """The labels of brain and tumour: those given, or the convention's that are there."""
+    brain, tumour = sources.brain, sources.tumour
+    if convention is not None:
+        own = brain + (() if sources.tumour_in else tumour)
+        demand_fits(sources.labels, convention, whole.labels, {value for _, value in whole.places(own)})
+        _demand_sides(whole, convention)
+        if not brain and not sources.mask:
+            brain = _there(convention.brain, whole)
+        if not tumour and not sources.tumour_in:
+            tumour = _there(convention.tumour, whole)
+    if not sources.tumour_in:
+        _demand_apart(whole, brain, tumour)
+    return brain, tumour
+
+
+def _there(labels: Sequence[int], whole: LabelMap) -> tuple[int, ...]:
+    return tuple(label for label in labels if label in whole.labels)
+
+
+def _parts(whole: LabelMap, convention: Convention) -> dict[str, np.ndarray]:
+    """Masks of the other tissues that the file marks."""
+    groups = {"necrosis": convention.necrosis, "oedema": convention.oedema, "ventricles": convention.ventricles}
+    return {name: whole.mask(found) for name, of in groups.items() if (found := _there(of, whole))}
+
+
+def _others(sources: Sources, tumour: Sequence[Label]) -> dict[str, Mask]:
+    """What other files mark."""
+    others = {}
+    if sources.mask:
+        volume = read_volume(sources.mask)
+        others["brain"] = Mask(Path(sources.mask), volume.values != 0, volume.affine, volume.notes)
+    if sources.tumour_in:
+        second = read_labels(sources.tumour_in)
+        others["tumour"] = Mask(Path(sources.tumour_in), second.mask(tumour), second.affine, second.notes)
+    return others
+
+
+def _convention(sources: Sources) -> Convention | None:
+    if sources.convention is None:
+        return None
+    if sources.convention not in CONVENTIONS:
+        raise InputError(f"no labels are called {sources.convention!r}: choose one of {', '.join(CONVENTIONS)}.")
+    return CONVENTIONS[sources.convention]
+
+
+def _demand_named(sources: Sources, convention: Convention | None) -> None:
+    """Refuse where nothing says what the brain is, or the tumour, or where two things do."""
+    if sources.mask and sources.brain:
+        raise InputError("--mask says what is brain, and --brain does: leave one of them out.")
+    if sources.mask and sources.tumour_in:
+        raise InputError(
+            "--mask says what is brain and --tumour-in what is tumour: of the labels nothing is left. Give the "
+            "tumour's file as labels, and --mask."
+        )
+    if convention is not None and convention.mask and not (sources.mask or sources.brain):
+        raise InputError(
+            f"{sources.labels}: labels of {convention.name} do not mark the brain. Give --mask BRAIN.nii.gz; "
+            "an image without its skull will do."
+        )
+    if not (sources.brain or sources.mask or (convention and convention.brain)):
+        raise InputError("name at least one label of the brain: --brain 1,2, or give --mask BRAIN.nii.gz.")
+    if not (sources.tumour or sources.tumour_in or (convention and convention.tumour)):
+        raise InputError(
+            "name at least one label of the tumour: --tumour 3, or give --tumour-in FILE, in which it is marked."
+        )
+
+
+def _demand_apart(whole: LabelMap, brain: Sequence[Label], tumour: Sequence[Label]) -> None:
+    places = {place: label for place, label in zip(whole.places(brain), brain, strict=True)}
+    both = [places[place] for place in whole.places(tumour) if place in places]
+    if both:
+        raise InputError(f"labels {listed(both)} are named as brain and as tumour: give each to one of them.")
+
+
+def _demand_sides(whole: LabelMap, convention: Convention) -> None:
+    """Refuse labels whose left half lies on the right: the file's axes are not what it says."""
+    right = []
+    for side in (convention.left, convention.right):
+        index = np.argwhere(np.isin(whole.layers[..., 0], side))
+        right.append(float((index @ whole.affine[0, :3]).mean()) if len(index) else 0.0)
+    if right[0] > right[1]:
+        raise InputError(
+            f"{whole.path}: its labels of the left half lie {1e3 * (right[0] - right[1]):.0f} mm to the right of those "
+            "of the right half. Its affine is mirrored, or it is LPS that is stated as RAS: export it anew."
+        )
+
+
+def _demand_together(brain: Mask, tumour: Mask) -> None:
+    """Refuse a tumour beside the brain; if it would lie there with x and y negated, say so."""
+    boxes = [mask.box for mask in (brain, tumour)]
+    apart = (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any()
+    index = np.argwhere(tumour.marked)
+    index = index[:: max(1, len(index) // SAMPLED)]
+    points = index @ tumour.affine[:3, :3].T + tumour.affine[:3, 3]
+    planes = ConvexHull(_corners(brain)).equations
+    within, turned = (_share_within(planes, points * signs) for signs in (np.ones(3), TO_LPS))
+    if within < AMISS and turned > EXPLAINED:
+        raise InputError(
+            f"{tumour.path}: its tumour lies at {_box(boxes[1])}, and the brain of {brain.path} at {_box(boxes[0])}. "
+            "With x and y negated it would lie in the brain: one of the two states LPS as RAS. Export that one anew."
+        )
+    if apart:
+        raise InputError(
+            f"{tumour.path}: its tumour lies at {_box(boxes[1])} and does not overlap the brain of {brain.path}, at "
+            f"{_box(boxes[0])}. Give volumes of one space, or resample one into the other's."
+        )
+
+
+def _corners(mask: Mask) -> np.ndarray:
+    """Points (n, 3) [m] on both sides of the outline: a mask of one slice has a hull, too."""
+    half = 0.5 * mask.affine[:3, :3].sum(axis=1)
+    return np.concatenate([mask.outline - half, mask.outline + half])
+
+
+def _share_within(planes: np.ndarray, points: np.ndarray) -> float:
+    """The share of points (n, 3) that no plane of a convex hull cuts off."""
+    outermost = np.full(len(points), -np.inf)
+    for part in np.array_split(planes, max(1, len(planes) // 64)):
+        np.maximum(outermost, (points @ part[:, :3].T + part[:, 3]).max(axis=1), out=outermost)
+    return float((outermost <= 0.0).mean())
+
+
+def _box(box: np.ndarray) -> str:
+    low, high = (", ".join(f"{1e3 * value:.0f}" for value in end) for end in box)
+    return f"{low} to {high} mm (RAS)"

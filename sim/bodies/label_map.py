@@ -1,0 +1,207 @@
+"""Labels of voxels by number or by name, and masks of voxels that are brought from one grid onto another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from ..errors import InputError
+from ..runtime.file_limits import MOST_VOXELS
+from .volume import read_volume
+from .voxels import Segment
+
+Label = int | str
+"""A number, or what the file calls it."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelMap:
+    """Whole numbers of voxels.
+
+    Parameters
+    ----------
+    path
+        The file, as errors name it.
+    layers
+        (I, J, K, L) of whole numbers; most files have one layer.
+    affine
+        (4, 4) from indices to metres (RAS).
+    notes
+        Sentences about what had to be assumed.
+    segments
+        What the file calls its labels, if it does.
+    """
+
+    path: Path
+    layers: np.ndarray
+    affine: np.ndarray
+    notes: tuple[str, ...]
+    segments: tuple[Segment, ...]
+
+    @cached_property
+    def present(self) -> tuple[frozenset[int], ...]:
+        """Of each layer, the labels that some voxel has, without 0."""
+        layers = np.moveaxis(self.layers, -1, 0)
+        return tuple(frozenset(np.unique(layer).astype(int).tolist()) - {0} for layer in layers)
+
+    @property
+    def labels(self) -> frozenset[int]:
+        """The labels of all layers, without 0."""
+        return frozenset().union(*self.present)
+
+    def mask(self, labels: Sequence[Label]) -> np.ndarray:
+        """Which voxels (I, J, K) have one of these labels; any label, if there are none.
+
+        Raises
+        ------
+        InputError
+            As `places`.
+        """
+        found = np.asarray(self.layers.any(axis=-1)) if not labels else np.zeros(self.layers.shape[:3], bool)
+        places = self.places(labels)
+        for layer in {layer for layer, _ in places}:
+            found |= np.isin(self.layers[..., layer], [value for on, value in places if on == layer])
+        return found
+
+    def places(self, labels: Sequence[Label]) -> list[tuple[int, int]]:
+        """The layer and the number there of each label.
+
+        Raises
+        ------
+        InputError
+            Labels that no voxel has, 0, or a number that several layers have.
+        """
+        found = [self._place(label) for label in labels]
+        missing = [label for label, at in zip(labels, found, strict=True) if not at]
+        if missing or 0 in labels:
+            wrong = f"has no label {listed(missing)}" if missing and missing != [0] else "has label 0 as background"
+            raise InputError(f"{self.path}: {wrong}. Choose from {self._choice()}.")
+        for label, at in zip(labels, found, strict=True):
+            if len(at) > 1:
+                names = ", ".join(sorted(one.name for one in self.segments if (one.layer, one.value) in at))
+                raise InputError(f"{self.path}: several segments have the label {label}: name one of {names}.")
+        return [at[0] for at in found]
+
+    def _place(self, label: Label) -> list[tuple[int, int]]:
+        if isinstance(label, int):
+            return [(layer, label) for layer, present in enumerate(self.present) if label in present]
+        alike = [one for one in self.segments if one.name == label]
+        alike = alike or [one for one in self.segments if one.name.casefold() == label.casefold()]
+        return [(one.layer, one.value) for one in alike if one.value in self.present[one.layer]]
+
+    def _choice(self) -> str:
+        if self.segments:
+            return listed(
+                [f"{one.name} ({one.value})" for one in self.segments if one.value in self.present[one.layer]]
+            )
+        return listed(sorted(self.labels))
+
+
+def read_labels(path: str | Path) -> LabelMap:
+    """The label map in a file.
+
+    Raises
+    ------
+    InputError
+        What `read_volume` refuses; values that are not whole, or all 0.
+    """
+    volume = read_volume(path, layered=True)
+    values = volume.values
+    if values.dtype.kind == "f":
+        whole = np.rint(values)
+        if not np.array_equal(values, whole) or np.abs(whole).max() > 2**31 - 1:
+            raise InputError(f"{path}: holds fractions, so it is no label volume. Give whole-number labels.")
+        values = whole.astype(np.int32)
+    if not values.any():
+        raise InputError(f"{path}: is empty, every voxel is 0. Export the labels again.")
+    layers = values if values.ndim == 4 else values[..., None]
+    return LabelMap(Path(path), layers, volume.affine, volume.notes, volume.segments)
+
+
+def listed(labels: Sequence[Label]) -> str:
+    """The first twenty, and how many there are."""
+    shown = ", ".join(map(str, labels[:20]))
+    return f"{shown}, ... ({len(labels)} in all)" if len(labels) > 20 else shown
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """Marked voxels (I, J, K) bool of a file, the affine (4, 4) from their indices to metres (RAS), and notes."""
+
+    path: Path
+    marked: np.ndarray
+    affine: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def outline(self) -> np.ndarray:
+        """Points (n, 3) [m] with the convex hull of the marked voxels' centres: the ends of each row of voxels.
+
+        Raises
+        ------
+        InputError
+            Nothing is marked.
+        """
+        rows = np.argwhere(self.marked.any(axis=2))
+        if not len(rows):
+            raise InputError(f"{self.path}: is empty, every voxel is 0. Export it again.")
+        first = self.marked.argmax(axis=2)
+        last = self.marked.shape[2] - 1 - self.marked[..., ::-1].argmax(axis=2)
+        ends = np.concatenate([np.column_stack([rows, end[tuple(rows.T)]]) for end in (first, last)])
+        return ends @ self.affine[:3, :3].T + self.affine[:3, 3]
+
+    @property
+    def box(self) -> np.ndarray:
+        """(2, 3) [m]: the lowest and the highest corner of a box (RAS) round the marked voxels' centres."""
+        return np.stack([self.outline.min(axis=0), self.outline.max(axis=0)])
+
+    def onto(self, shape: tuple[int, ...], affine: np.ndarray) -> np.ndarray:
+        """Marks (I, J, K) on the grid of another volume: those of the nearest voxels."""
+        if _alike(shape, affine, self):
+            return self.marked
+        matrix = np.linalg.inv(self.affine) @ affine
+        found = ndimage.affine_transform(
+            self.marked.view(np.uint8), matrix, output_shape=shape, order=0, mode="constant"
+        )
+        return found.view(bool)
+
+
+def widened(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple[np.ndarray, np.ndarray]:
+    """How many voxels (3, 2) a grid lacks at both ends of its axes to hold `other`, and its affine (4, 4) with them.
+
+    A grid of its own is held with a voxel round it.
+
+    Raises
+    ------
+    InputError
+        A grid that would become too large.
+    """
+    inverse = np.linalg.inv(affine)
+    index = other.outline @ inverse[:3, :3].T + inverse[:3, 3]
+    margin = 0 if _alike(shape, affine, other) else 1
+    low = np.maximum(0, margin - np.floor(index.min(axis=0)).astype(int))
+    high = np.maximum(0, margin + np.ceil(index.max(axis=0)).astype(int) - np.array(shape) + 1)
+    voxels = float(np.prod(np.array(shape, float) + low + high))
+    if voxels > MOST_VOXELS:
+        raise InputError(
+            f"{other.path}: on the labels' grid it takes {voxels:.3g} voxels, and {MOST_VOXELS:.3g} are the most. "
+            "Resample the labels more coarsely."
+        )
+    moved = affine.copy()
+    moved[:3, 3] -= affine[:3, :3] @ low
+    return np.stack([low, high], axis=1), moved
+
+
+def _alike(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> bool:
+    """Whether a grid is that of a mask."""
+    return shape == other.marked.shape and np.allclose(affine, other.affine, rtol=0.0, atol=1e-9)
+
+
+def on_border(mask: np.ndarray) -> int:
+    """How many marked voxels (I, J, K) lie on the volume's border."""
+    return int(mask.sum() - mask[1:-1, 1:-1, 1:-1].sum())

@@ -1,0 +1,178 @@
+"""NRRD volumes, and the segmentations that 3D Slicer writes as `.seg.nrrd`."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from ..errors import InputError
+from ..runtime.file_limits import INFLATION, MOST_VOXELS
+from .voxels import PIECE, REMEDY, SURPLUS, Segment, Volume, Voxels
+
+SIGNS = {
+    "right-anterior-superior": (1.0, 1.0, 1.0),
+    "left-anterior-superior": (-1.0, 1.0, 1.0),
+    "left-posterior-superior": (-1.0, -1.0, 1.0),
+}
+"""Of each space that says where a patient's sides are, what its axes become in RAS."""
+SHORT = {"".join(word[0] for word in space.split("-")): space for space in SIGNS}
+METRES = {"mm": 1e-3, "": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6}
+TYPES = {
+    **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
+    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
+    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
+    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
+    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
+    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
+    **dict.fromkeys(("longlong", "long long", "long long int", "signed long long", "int64", "int64_t"), "i8"),
+    **dict.fromkeys(("ulonglong", "unsigned long long", "unsigned long long int", "uint64", "uint64_t"), "u8"),
+    "float": "f4",
+    "double": "f8",
+}
+ENDIAN = {"little": "<", "big": ">"}
+# Characters of a line of a header, and lines: a segmentation of a hundred segments has a thousand.
+LONGEST, MOST_LINES = 2**16, 2**14
+BESIDE = "Save it as one file (.nrrd), with its header and voxels together."
+
+
+def read_nrrd(path: Path, voxels: Voxels) -> Volume:
+    """The voxels of an NRRD file of one part; of a segmentation with layers, (I, J, K, L).
+
+    NRRD states its unit, millimetres if none, and one affine: `voxels` say nothing about it.
+
+    Raises
+    ------
+    InputError
+        A file that is none, or whose header is not whole; one that does not state a space of a patient's sides.
+        Voxels in another file, or in another coding than raw, gzip or bzip2. Fewer of them than declared, or too many.
+    """
+    with path.open("rb") as file:
+        fields, keys = _header(path, file)
+        sizes = [int(size) for size in _field(path, fields, "sizes").split()]
+        if len(sizes) != int(_field(path, fields, "dimension")) or min(sizes, default=0) < 1:
+            raise InputError(f"{path}: its sizes do not match its dimension. Save it again.")
+        if math.prod(sizes) > MOST_VOXELS:
+            raise InputError(
+                f"{path}: has {math.prod(sizes):.3g} voxels, and {MOST_VOXELS:.3g} are the most. Resample it."
+            )
+        dtype = _dtype(path, fields)
+        needed = math.prod(sizes) * dtype.itemsize
+        values = np.frombuffer(_voxels(path, file, fields, needed), dtype, math.prod(sizes)).reshape(sizes, order="F")
+    values = values.astype(dtype.newbyteorder("="), copy=False)
+    affine, across = _affine(path, fields, len(sizes))
+    if across:
+        values = np.moveaxis(values, across[0], -1)
+    return Volume(values, affine, segments=_segments(path, keys, values.shape[3] if across else 1))
+
+
+def _header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]:
+    """Fields by their names in lower case, and keys of the writer's own; the file is then at its voxels."""
+    if not re.fullmatch(rb"NRRD000[1-5]\s*", file.readline(LONGEST)):
+        raise InputError(f"{path}: does not begin as an NRRD file does. {REMEDY}")
+    fields, keys = {}, {}
+    for _ in range(MOST_LINES):
+        line = file.readline(LONGEST)
+        if not line.endswith(b"\n"):
+            break
+        text = line.decode("utf-8", "replace").rstrip("\r\n")
+        if not text:
+            return fields, keys
+        if text.startswith("#"):
+            continue
+        if ":=" in text and not re.match(r"[a-z ]+: ", text):
+            key, value = text.split(":=", 1)
+            keys[key] = value
+        elif ":" in text:
+            name, value = text.split(":", 1)
+            fields[name.strip().lower()] = value.strip()
+    raise InputError(f"{path}: its header has no end. Copy or save it again.")
+
+
+def _field(path: Path, fields: Mapping[str, str], name: str) -> str:
+    if name not in fields:
+        raise InputError(f"{path}: its header does not state its {name}. Save it again with another program.")
+    return fields[name]
+
+
+def _dtype(path: Path, fields: Mapping[str, str]) -> np.dtype:
+    kind = _field(path, fields, "type").lower()
+    if kind not in TYPES:
+        raise InputError(f"{path}: holds values of type {kind!r}, not plain numbers. {REMEDY}")
+    if TYPES[kind].endswith("1"):
+        return np.dtype(TYPES[kind])
+    endian = _field(path, fields, "endian").lower()
+    if endian not in ENDIAN:
+        raise InputError(f"{path}: states its endian as {endian!r}: little or big are known. Save it again.")
+    return np.dtype(ENDIAN[endian] + TYPES[kind])
+
+
+def _voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) -> bytes:
+    """All bytes of the voxels: no memory is taken for what the file cannot hold."""
+    if "data file" in fields or "datafile" in fields:
+        raise InputError(f"{path}: has its voxels in another file. {BESIDE}")
+    if any(float(fields.get(skip, 0)) for skip in ("byte skip", "byteskip", "line skip", "lineskip")):
+        raise InputError(f"{path}: skips a part of itself before its voxels. {BESIDE}")
+    coding = _field(path, fields, "encoding").lower()
+    if coding in ("gzip", "gz"):
+        stream, most = gzip.GzipFile(fileobj=file), INFLATION
+    elif coding in ("bzip2", "bz2"):
+        stream, most = bz2.BZ2File(file), 2**20
+    elif coding == "raw":
+        stream, most = file, 1
+    else:
+        raise InputError(f"{path}: its voxels are coded as {coding!r}: raw, gzip and bzip2 are read. Save it so.")
+    if needed > most * path.stat().st_size:
+        raise InputError(f"{path}: is too short for its {needed:,} bytes of voxels. Copy or save it again.")
+    held = bytearray()
+    while len(held) < needed + SURPLUS and (piece := stream.read(PIECE)):  # to the end, where gzip has its checksum
+        held += piece
+    if len(held) < needed:
+        raise InputError(f"{path}: ends after {len(held):,} of {needed:,} bytes of voxels. Copy or save it again.")
+    return bytes(held[:needed])
+
+
+def _affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[np.ndarray, list[int]]:
+    """From indices to metres (RAS), and the axes that do not lie in space: at most one."""
+    stated = fields.get("space", "").lower()
+    space = SHORT.get(stated, stated)
+    if space not in SIGNS:
+        said = f"its space is stated as {stated!r}" if stated else "it does not state its space"
+        raise InputError(
+            f"{path}: {said}, so nobody knows where left is. Save it from 3D Slicer, or state "
+            f"`space: {next(reversed(SIGNS))}` if that is so; known are {', '.join(SIGNS)}."
+        )
+    vectors = re.findall(r"none|\([^)]*\)", _field(path, fields, "space directions").lower())
+    across = [axis for axis, vector in enumerate(vectors) if vector == "none"]
+    if len(vectors) != axes or len(across) > 1 or axes - len(across) != 3:
+        raise InputError(f"{path}: has {axes} axes, of which {axes - len(across)} lie in space. {REMEDY}")
+    metres = {METRES.get(unit.strip()) for unit in re.findall(r'"([^"]*)"', fields.get("space units", '""'))}
+    if len(metres) != 1 or None in metres:
+        raise InputError(f"{path}: its space units are {fields['space units']}. Save it in mm.")
+    affine = np.eye(4)
+    places = [*(vector for vector in vectors if vector != "none"), _field(path, fields, "space origin")]
+    columns = [[float(number) for number in place.strip("() ").split(",")] for place in places]
+    affine[:3] = next(iter(metres)) * (np.array(SIGNS[space])[:, None] * np.array(columns).T)
+    return affine, across
+
+
+def _segments(path: Path, keys: Mapping[str, str], layers: int) -> tuple[Segment, ...]:
+    """What 3D Slicer calls the labels. Its old files have a layer of ones for each segment, and do not say so."""
+    numbers = sorted({int(found[1]) for key in keys if (found := re.match(r"Segment(\d+)_", key))})
+    segments = tuple(
+        Segment(
+            keys.get(f"Segment{number}_Name", f"Segment_{number + 1}"),
+            int(keys.get(f"Segment{number}_Layer", number if layers > 1 else 0)),
+            int(keys.get(f"Segment{number}_LabelValue", 1)),
+        )
+        for number in numbers
+    )
+    if any(not 0 <= segment.layer < layers for segment in segments):
+        raise InputError(f"{path}: has a segment in a layer that is not there. Save it again.")
+    return segments

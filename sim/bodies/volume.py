@@ -1,0 +1,43 @@
+"""Volumes of voxels from files of several formats: any affine, in metres, RAS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..errors import InputError
+from ..runtime.outside_files import path_of, read_as
+from .nifti import read_mgh, read_nifti
+from .nrrd import read_nrrd
+from .voxels import OF_BRAINS, REMEDY, Volume, Voxels, checked
+
+READERS = {
+    ".nii": ("NIfTI", read_nifti),
+    ".nii.gz": ("NIfTI", read_nifti),
+    ".mgz": ("a FreeSurfer volume", read_mgh),
+    ".mgh": ("a FreeSurfer volume", read_mgh),
+    ".nrrd": ("NRRD", read_nrrd),
+}
+"""Endings of names, what they say of a file, and what reads it."""
+
+
+def read_volume(path: str | Path, voxels: Voxels = OF_BRAINS, finite: bool = True, layered: bool = False) -> Volume:
+    """Read one volume of numbers from a file; unless `finite` is off, all of them must be finite.
+
+    Where `layered`, the values of a segmentation may be (I, J, K, L), in layers that overlap.
+
+    Raises
+    ------
+    InputError
+        A path that is no readable file of these formats, or a file that ends before its voxels do. Several volumes, a
+        slice, colours or complex numbers. Values or a slope that are not finite. A space that is not stated, an affine
+        that is singular. Voxels that are too coarse or too fine, or too many of them.
+    """
+    path = path_of(path)
+    if not path.is_file():
+        raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {REMEDY}")
+    ending = next((one for one in READERS if path.name.lower().endswith(one)), None)
+    if ending is None:
+        raise InputError(f"{path}: is not called {', '.join(READERS)}. {REMEDY}")
+    kind, read = READERS[ending]
+    with read_as(path, kind, REMEDY):
+        return checked(path, read(path, voxels), voxels, finite, layered)

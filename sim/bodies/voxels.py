@@ -1,0 +1,106 @@
+"""A volume of voxels as it is read from a file of any format, and what voxels a volume of a brain may have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+
+REMEDY = "Give one three-dimensional volume (.nii, .nii.gz, .mgz, .mgh, .nrrd or .seg.nrrd)."
+# What lies behind the voxels and is read for the checksum after them [bytes], and what is read at once.
+SURPLUS, PIECE = 2**24, 2**20
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """Which voxels a volume of a brain may have.
+
+    Parameters
+    ----------
+    finest, coarsest
+        [m] Edges: no scanner of a brain resolves less, and larger voxels do not show its surface.
+    same_place
+        [m] An sform and a qform that place a voxel less far apart differ by round-off.
+    """
+
+    finest: float = 1e-5
+    coarsest: float = 6e-3
+    same_place: float = 1e-3
+
+
+OF_BRAINS = Voxels()
+"""What a scanner of brains makes."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """What a segmentation calls a label: its name, the layer that it lies in, and its number there."""
+
+    name: str
+    layer: int
+    value: int
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Voxels, and where they lie.
+
+    Parameters
+    ----------
+    values
+        (I, J, K), or (I, J, K, L) where a segmentation has several layers.
+    affine
+        (4, 4) from their indices to metres (RAS).
+    notes
+        Sentences about what had to be assumed.
+    segments
+        What the file calls its labels, if it does.
+    """
+
+    values: np.ndarray
+    affine: np.ndarray
+    notes: tuple[str, ...] = ()
+    segments: tuple[Segment, ...] = ()
+
+
+def checked(path: Path, volume: Volume, voxels: Voxels, finite: bool, layered: bool) -> Volume:
+    """The volume without axes of one voxel beyond the third, if it is one of numbers with a place.
+
+    `layered` lets several layers of a segmentation pass, as (I, J, K, L).
+
+    Raises
+    ------
+    InputError
+        Colours or complex numbers; a slice or several volumes; unless not `finite`, values that are no numbers. An
+        affine that is singular, and voxels too fine or too coarse.
+    """
+    values, affine = volume.values, volume.affine
+    shape = " x ".join(map(str, values.shape))
+    if values.dtype.kind not in "biuf":
+        raise InputError(f"{path}: holds colours or complex numbers ({values.dtype}), not plain ones. {REMEDY}")
+    most = values.shape[3] if layered and volume.segments and values.ndim == 4 else 1
+    if values.ndim < 3 or min(values.shape[:3]) < 2 or max(values.shape[3:], default=1) > most:
+        raise InputError(f"{path}: measures {shape} voxels, which is not one volume. {REMEDY}")
+    if finite and not np.isfinite(values).all():
+        raise InputError(f"{path}: {int((~np.isfinite(values)).sum())} voxels are not finite. Replace them by 0.")
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) <= 1e-6 * spacing.prod():
+        raise InputError(
+            f"{path}: its affine is singular, so its voxels have no place. Export it with its orientation."
+        )
+    if spacing.min() < voxels.finest:
+        raise InputError(
+            f"{path}: its voxels measure {spacing.min() * 1e3:.3g} mm along an axis; {voxels.finest * 1e3:g} mm is the "
+            "least. Set the voxel size, or resample it."
+        )
+    if spacing.max() > voxels.coarsest:
+        voxel = " x ".join(f"{edge * 1e3:.3g}" for edge in spacing)
+        raise InputError(
+            f"{path}: its voxels measure {voxel} mm; {voxels.coarsest * 1e3:g} mm is the most that shows a brain."
+        )
+    while values.ndim > 3 and values.shape[-1] == 1:
+        values = values[..., 0]
+    return Volume(values, affine, volume.notes, volume.segments)

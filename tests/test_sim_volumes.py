@@ -1,0 +1,344 @@
+"""One head in files of every format, by every convention, on one grid or several: the same brain, or a sentence."""
+
+import gzip
+import re
+import struct
+
+import nibabel
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sim.bodies.head_masks import Sources, head_masks
+from sim.bodies.label_map import read_labels
+from sim.bodies.label_volume import masked_subject, volume_subject
+from sim.bodies.volume import read_volume
+from sim.bodies.voxels import Voxels
+from sim.errors import InputError
+
+LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+EDGE = 3.0  # [mm]
+MIDDLE, TUMOUR = np.array([20.0, 40.0, 10.0]), np.array([38.0, 48.0, 25.0])  # [mm, RAS]
+TURNED = Rotation.from_euler("xyz", [12, -9, 17], degrees=True).as_matrix()
+AXES = {"straight": np.eye(3), "mirrored": np.diag([-1.0, 1.0, 1.0]), "oblique": TURNED @ np.diag([1.0, -1.0, 1.0])}
+
+
+def grid(axes=AXES["straight"], edge=EDGE, count=40, middle=MIDDLE):
+    """Affine [mm] of a cube of voxels round a place, and where each voxel lies (I, J, K, 3) [mm]."""
+    affine = np.eye(4)
+    affine[:3, :3] = edge * axes
+    affine[:3, 3] = middle - edge * axes @ np.full(3, 0.5 * (count - 1))
+    index = np.moveaxis(np.indices((count,) * 3), 0, -1)
+    return affine, index @ affine[:3, :3].T + affine[:3, 3]
+
+
+def head(places, brain=1, tumour=3):
+    """An ellipsoid with a ball in it."""
+    labels = np.where(np.linalg.norm((places - MIDDLE) / [46.0, 55.0, 42.0], axis=-1) < 1.0, brain, 0)
+    labels[np.linalg.norm(places - TUMOUR, axis=-1) < 12.0] = tumour
+    return labels.astype(np.int16)
+
+
+def nifti(path, values, affine):
+    nibabel.save(nibabel.Nifti1Image(values, affine), path)
+    return path
+
+
+def mgz(path, values, affine):
+    nibabel.save(nibabel.MGHImage(values, affine), path)
+    return path
+
+
+def nrrd(path, values, affine, space="left-posterior-superior", more="", coding="gzip", signs=LPS, leave_out=()):
+    """Voxels (I, J, K) or (L, I, J, K) as an NRRD file whose axes are those of `space`, by `signs` from RAS."""
+    placed = signs @ affine
+    vectors = [f"({','.join(map(repr, column))})" for column in placed[:3, :3].T.tolist()]
+    fields = {
+        "type": {"int16": "short", "uint8": "uint8", "float32": "float"}[values.dtype.name],
+        "dimension": values.ndim,
+        "space": space,
+        "sizes": " ".join(map(str, values.shape)),
+        "space directions": " ".join(["none"] * (values.ndim - 3) + vectors),
+        "endian": "little",
+        "encoding": coding,
+        "space origin": f"({','.join(map(repr, placed[:3, 3].tolist()))})",
+    }
+    text = "NRRD0004\n# a comment\n" + "".join(f"{k}: {v}\n" for k, v in fields.items() if k not in leave_out)
+    raw = values.tobytes(order="F")
+    path.write_bytes((text + more + "\n").encode() + (gzip.compress(raw) if coding == "gzip" else raw))
+    return path
+
+
+def segments(*named):
+    """Keys of 3D Slicer: names with their layers and label values."""
+    return "".join(
+        f"Segment{n}_ID:=Segment_{n}\nSegment{n}_Name:={name}\nSegment{n}_Layer:={layer}\nSegment{n}_LabelValue:={value}\n"
+        for n, (name, layer, value) in enumerate(named)
+    )
+
+
+def seg_nrrd(path, values, affine):
+    """Brain and tumour in layers that overlap."""
+    layers = np.stack([values > 0, values == 3]).astype(np.uint8)
+    return nrrd(path, layers, affine, more=segments(("Whole brain", 0, 1), ("Tumour", 1, 1)))
+
+
+WRITERS = {
+    "labels.nii.gz": nifti,
+    "labels.mgz": mgz,
+    "labels.nrrd": nrrd,
+    "raw.nrrd": lambda *given: nrrd(*given, coding="raw"),
+    "ras.nrrd": lambda *given: nrrd(*given, space="RAS", signs=np.eye(4)),
+    "las.nrrd": lambda *given: nrrd(*given, space="left-anterior-superior", signs=np.diag([-1.0, 1.0, 1.0, 1.0])),
+    "labels.seg.nrrd": seg_nrrd,
+}
+
+
+@pytest.mark.parametrize("axes", AXES)
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_head_is_the_same_in_every_format(tmp_path, name, axes):
+    affine, places = grid(AXES[axes])
+    path = WRITERS[name](tmp_path / name, head(places), affine)
+    named = ("Whole brain",), ("tumour",)
+    subject = volume_subject(path, *(named if name.endswith(".seg.nrrd") else ((1,), (3,))))
+    assert subject.notes == ()
+    within = head(places) > 0
+    np.testing.assert_allclose(subject.cortex.min(axis=0), 1e-3 * places[within].min(axis=0), atol=1e-6)
+    np.testing.assert_allclose(subject.cortex.max(axis=0), 1e-3 * places[within].max(axis=0), atol=1e-6)
+    assert np.linalg.norm(subject.pieces[0].centre - 1e-3 * TUMOUR) < 1e-3 * EDGE / 4
+    assert subject.tumour_volume == pytest.approx((head(places) == 3).sum() * (1e-3 * EDGE) ** 3, rel=1e-5)
+    points = 1e-3 * (MIDDLE + np.random.default_rng(0).uniform(-70.0, 70.0, (200, 3)))
+    assert (
+        (subject.brain(points) < 0.0) == (np.linalg.norm((1e3 * points - MIDDLE) / [46, 55, 42], axis=1) < 1)
+    ).mean() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"leave_out": ("space",)}, "does not state its space, so nobody knows where left is"),
+        ({"space": "scanner-xyz"}, "its space is stated as 'scanner-xyz'"),
+        ({"leave_out": ("space origin",)}, "does not state its space origin"),
+        ({"leave_out": ("space directions",)}, "does not state its space directions"),
+        ({"leave_out": ("endian",)}, "does not state its endian"),
+        ({"more": 'space units: "inch" "inch" "inch"\n'}, "its space units are"),
+        ({"coding": "hex"}, "coded as 'hex': raw, gzip and bzip2 are read"),
+        ({"more": "data file: voxels.raw\n"}, "has its voxels in another file"),
+        ({"more": "byte skip: 16\n"}, "skips a part of itself"),
+    ],
+)
+def test_an_nrrd_file_that_does_not_say_all_is_refused(tmp_path, change, reason):
+    affine, places = grid()
+    with pytest.raises(InputError, match=reason):
+        read_volume(nrrd(tmp_path / "a.nrrd", head(places), affine, **change))
+
+
+@pytest.mark.parametrize("coding", ["gzip", "raw"])
+def test_a_damaged_nrrd_file_is_a_sentence(tmp_path, coding):
+    affine, places = grid(count=12, edge=6.0)
+    whole = nrrd(tmp_path / "a.nrrd", head(places), affine, coding=coding, more=segments(("A", 0, 1))).read_bytes()
+    path = tmp_path / "b.nrrd"
+    for place in range(0, len(whole), 11):
+        for spoilt in (whole[:place], whole[:place] + bytes([whole[place] ^ 255]) + whole[place + 1 :]):
+            path.write_bytes(spoilt)
+            try:
+                read_volume(path)
+            except InputError as error:
+                assert str(error).startswith(str(path)) and "Error -" not in str(error)
+    path.write_bytes(whole.replace(b"sizes: 12 12 12", b"sizes: 800 800 800"))
+    with pytest.raises(
+        InputError, match=r"ends after .* of 1,024,000,000 bytes|is too short for its 1,024,000,000 bytes"
+    ):
+        read_volume(path)
+    path.write_bytes(whole.replace(b"sizes: 12 12 12", b"sizes: 9999 999 999"))
+    with pytest.raises(InputError, match=r"9\.98e\+09 voxels, and 5\.37e\+08 are the most"):
+        read_volume(path)
+
+
+def test_a_freesurfer_volume_without_orientation_is_refused(tmp_path):
+    affine, places = grid()
+    path = mgz(tmp_path / "a.mgz", head(places), affine)
+    raw = bytearray(gzip.decompress(path.read_bytes()))
+    struct.pack_into(">h", raw, 28, 0)
+    path.write_bytes(gzip.compress(bytes(raw)))
+    with pytest.raises(InputError, match="does not state how its axes lie in the head"):
+        read_volume(path)
+    path.write_bytes(gzip.compress(bytes(raw[:5000])))
+    with pytest.raises(InputError, match=r"ends after 5,000 of \d+,\d+ bytes"):
+        read_volume(path)
+
+
+@pytest.mark.parametrize(("name", "layers"), [("Segmentation", 1), ("SegmentationOverlapping", 2)])
+def test_what_slicer_wrote_is_read_as_others_read_it(name, layers):
+    slicerio = pytest.importorskip("slicerio")
+    import nrrd as reference
+
+    path = slicerio.get_testdata_file(f"{name}.seg.nrrd")
+    values, header = reference.read(path)
+    found = read_volume(path, Voxels(coarsest=0.011), layered=True)
+    expected = np.moveaxis(values, 0, -1) if layers > 1 else values
+    np.testing.assert_array_equal(found.values, expected)
+    np.testing.assert_allclose(1e3 * found.affine[:3, 3], header["space origin"] * [-1, -1, 1])
+    np.testing.assert_allclose(1e3 * found.affine[:3, :3], LPS[:3, :3] @ header["space directions"][-3:].T)
+    assert [one.name for one in found.segments[4:6]] == ["right lung", "left lung"]
+    right, left = (
+        np.argwhere(expected.reshape(*expected.shape[:3], -1)[..., 0] == label).mean(axis=0) for label in (5, 6)
+    )
+    assert found.affine[0, :3] @ right > found.affine[0, :3] @ left
+    if layers > 1:
+        assert (found.segments[7].name, found.segments[7].layer) == ("overlapping sphere", 1)
+        with pytest.raises(InputError, match="not one volume"):
+            read_volume(path, Voxels(coarsest=0.011))
+
+
+def test_segments_are_called_by_their_names(tmp_path):
+    affine, places = grid()
+    path = seg_nrrd(tmp_path / "a.seg.nrrd", head(places), affine)
+    with pytest.raises(InputError, match=r"has no label Tumor. Choose from Whole brain \(1\), Tumour \(1\)"):
+        volume_subject(path, ("Whole brain",), ("Tumor",))
+    with pytest.raises(InputError, match="several segments have the label 1: name one of Tumour, Whole brain"):
+        volume_subject(path, (1,), ("Tumour",))
+    with pytest.raises(InputError, match="labels tumour are named as brain and as tumour"):
+        volume_subject(path, ("Whole brain", "tumour"), ("Tumour",))
+
+
+class TestSeveralFiles:
+    @pytest.fixture
+    def files(self, tmp_path):
+        """A mask that is oblique and coarse, and a tumour on a small and fine grid of its own."""
+        affine, places = grid(AXES["oblique"], edge=3.5, count=40)
+        nifti(tmp_path / "brain.nii.gz", (100.0 * (head(places) > 0)).astype(np.float32), affine)
+        affine, places = grid(AXES["mirrored"], edge=2.0, count=16, middle=TUMOUR + 1.0)
+        nifti(tmp_path / "tumour.nii.gz", (head(places) == 3).astype(np.int16), affine)
+        return tmp_path
+
+    def test_a_mask_on_another_grid_widens_the_labels(self, files):
+        sources = Sources(files / "tumour.nii.gz", tumour=(1,), mask=files / "brain.nii.gz")
+        subject = masked_subject(head_masks(sources))
+        assert subject.notes == ()
+        assert np.linalg.norm(subject.pieces[0].centre - 1e-3 * TUMOUR) < 5e-4
+        low, high = 1e3 * subject.cortex.min(axis=0), 1e3 * subject.cortex.max(axis=0)
+        np.testing.assert_allclose([low, high], MIDDLE + np.outer([-1, 1], [46.0, 55.0, 42.0]), atol=3.5)
+
+    def test_a_tumour_in_another_file(self, files):
+        affine, places = grid(AXES["oblique"])
+        nrrd(files / "brain.nrrd", head(places, tumour=1), affine)
+        sources = Sources(files / "brain.nrrd", brain=(1,), tumour_in=files / "tumour.nii.gz")
+        subject = masked_subject(head_masks(sources))
+        assert np.linalg.norm(subject.pieces[0].centre - 1e-3 * TUMOUR) < 5e-4
+        assert subject.tumour_volume == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.05)
+
+    @pytest.mark.parametrize(
+        ("moved", "reason"),
+        [
+            (np.array([200.0, 0.0, 0.0]), r"does not overlap the brain of .*brain\.nii\.gz, at -2\d, -1\d, -3\d to"),
+            (None, "With x and y negated it would lie in the brain: one of the two states LPS as RAS"),
+        ],
+    )
+    def test_volumes_apart_are_refused_with_both_boxes(self, files, moved, reason):
+        image = nibabel.load(files / "tumour.nii.gz")
+        affine = LPS @ image.affine if moved is None else image.affine.copy()
+        affine[:3, 3] += 0.0 if moved is None else moved
+        nifti(files / "elsewhere.nii", np.asarray(image.dataobj), affine)
+        with pytest.raises(InputError, match=reason) as caught:
+            head_masks(Sources(files / "elsewhere.nii", tumour=(1,), mask=files / "brain.nii.gz"))
+        assert str(caught.value).count("(RAS)") == 2
+
+    def test_what_says_nothing_or_too_much_is_refused(self, files):
+        tumour, brain = files / "tumour.nii.gz", files / "brain.nii.gz"
+        nifti(files / "none.nii", np.zeros((5, 5, 5), np.uint8), np.eye(4))
+        for sources, reason in (
+            (Sources(tumour, brain=(1,), mask=brain), "leave one of them out"),
+            (Sources(tumour, mask=brain, tumour_in=tumour), "nothing is left"),
+            (Sources(tumour, tumour=(1,), mask=files / "none.nii"), "none.nii: is empty"),
+            (Sources(tumour, tumour=(1,)), "at least one label of the brain"),
+            (Sources(tumour, brain=(1,)), "at least one label of the tumour"),
+        ):
+            with pytest.raises(InputError, match=reason):
+                head_masks(sources)
+
+
+class TestConventions:
+    def brats(self, folder, enhancing):
+        affine, places = grid()
+        labels = np.where(np.linalg.norm(places - TUMOUR, axis=-1) < 18.0, 2, 0)
+        core = np.linalg.norm(places - TUMOUR, axis=-1)
+        labels[core < 12.0], labels[core < 6.0] = enhancing, 1
+        nifti(folder / "t1.nii", (head(places) > 0).astype(np.float32), affine)
+        return nifti(folder / "seg.nii", labels.astype(np.uint8), affine)
+
+    @pytest.mark.parametrize("enhancing", [3, 4])
+    def test_brats(self, tmp_path, enhancing):
+        path = self.brats(tmp_path, enhancing)
+        masks = head_masks(Sources(path, convention="brats", mask=tmp_path / "t1.nii"))
+        assert masked_subject(masks).tumour_volume == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.05)
+        assert {name: int(mask.sum()) for name, mask in masks.parts.items()} == {
+            "necrosis": (read_labels(path).layers == 1).sum(), "oedema": (read_labels(path).layers == 2).sum()
+        }  # fmt: skip
+        with pytest.raises(InputError, match="labels of brats do not mark the brain"):
+            head_masks(Sources(path, convention="brats"))
+
+    def test_a_cavity_is_no_tumour(self, tmp_path):
+        affine, places = grid()
+        labels = head(places, brain=0)
+        labels[10:14, 10:14, 10:14] = 4
+        nifti(tmp_path / "seg.nii", labels, affine)
+        nifti(tmp_path / "t1.nii", head(places), affine)
+        with pytest.raises(InputError, match="label 4 is the cavity of a resection"):
+            head_masks(Sources(tmp_path / "seg.nii", convention="brats", mask=tmp_path / "t1.nii"))
+        masks = head_masks(Sources(tmp_path / "seg.nii", tumour=(3,), convention="brats", mask=tmp_path / "t1.nii"))
+        assert masks.tumour.sum() == (labels == 3).sum()
+
+    def aseg(self, folder, name="aseg.mgz", mirrored=False):
+        """White matter and cortex by halves, a ventricle on the left, and fluid around."""
+        affine, places = grid(AXES["oblique"])
+        whole = head(places, tumour=1)
+        size = np.linalg.norm((places - MIDDLE) / [46.0, 55.0, 42.0], axis=-1)
+        right = (places[..., 0] > MIDDLE[0]) ^ mirrored
+        labels = np.where(whole == 0, np.where(size < 1.1, 24, 0), np.where(size > 0.8, 3, 2))
+        labels[right & (whole > 0)] += 39
+        labels[np.linalg.norm(places - MIDDLE + [15.0, 0.0, 0.0], axis=-1) < 8.0] = 4
+        small, near = grid(edge=2.0, count=16, middle=TUMOUR)
+        nifti(folder / "tumour.nii", (head(near) == 3).astype(np.int16), small)
+        return mgz(folder / name, labels.astype(np.int32), affine)
+
+    @pytest.mark.parametrize("name", ["freesurfer", "synthseg"])
+    def test_freesurfer(self, tmp_path, name):
+        path = self.aseg(tmp_path)
+        masks = head_masks(Sources(path, convention=name, tumour_in=tmp_path / "tumour.nii"))
+        subject = masked_subject(masks)
+        assert masks.parts["ventricles"].any() and subject.notes == ()
+        low, high = 1e3 * subject.cortex.min(axis=0), 1e3 * subject.cortex.max(axis=0)
+        np.testing.assert_allclose([low, high], MIDDLE + np.outer([-1, 1], [46.0, 55.0, 42.0]), atol=EDGE)
+
+    def test_left_on_the_right_is_refused(self, tmp_path):
+        path = self.aseg(tmp_path, mirrored=True)
+        with pytest.raises(InputError, match=r"left half lie \d+ mm to the right of .* Its affine is mirrored, or"):
+            head_masks(Sources(path, convention="freesurfer", tumour_in=tmp_path / "tumour.nii"))
+
+    def test_labels_of_another_program_are_refused(self, tmp_path):
+        aseg, brats, tumour = self.aseg(tmp_path), self.brats(tmp_path, 4), tmp_path / "tumour.nii"
+        for sources, reason in (
+            (
+                Sources(aseg, convention="brats", mask=tmp_path / "t1.nii"),
+                "it has 24, 41, 42 beside. It looks like free",
+            ),
+            (
+                Sources(aseg, convention="fsl", tumour_in=tumour),
+                "it has 4, 24, 41, 42 beside. It looks like freesurfer or",
+            ),
+            (Sources(brats, convention="freesurfer", tumour_in=tumour), "it lacks 41. It looks like brats"),
+            (Sources(brats, convention="fsl", tumour_in=tumour), "it lacks 3. It looks like brats"),
+        ):
+            with pytest.raises(InputError, match=re.escape(reason)):
+                head_masks(sources)
+
+    def test_fsl_with_a_tumour_of_a_number_of_ones_own(self, tmp_path):
+        affine, places = grid()
+        labels = head(places, brain=2, tumour=9)
+        labels[(labels == 2) & (places[..., 2] > MIDDLE[2])] = 3
+        path = nifti(tmp_path / "a.nii", labels, affine)
+        masks = head_masks(Sources(path, tumour=(9,), convention="fsl"))
+        assert masks.brain.sum() == np.isin(labels, (2, 3)).sum() and masks.tumour.sum() == (labels == 9).sum()
+        with pytest.raises(InputError, match="no labels are called 'spm': choose one of brats, freesurfer"):
+            head_masks(Sources(path, convention="spm"))
