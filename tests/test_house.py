@@ -63,7 +63,7 @@ OWNERS = {
     "onnx": {"surrogate/onnx_export/export.py", "surrogate/onnx_export/graph.py"},
     "fastcrc": {"scenes/link/frame.py"},
     "pyamg": {"sim/linalg/amg.py"},
-    "PIL": {"ar/tracking/pages.py", "ar/tracking/pictures.py"},
+    "PIL": {"ar/tracking/pages.py", "ar/tracking/pictures.py", "scenes/commands/inspection_sheet.py"},
     "nibabel": {"sim/bodies/intensity.py", "sim/bodies/nifti.py"},
 }
 """Libraries that nobody else imports."""

@@ -244,6 +244,20 @@ class TestSeveralFiles:
             head_masks(Sources(files / "elsewhere.nii", tumour=(1,), mask=files / "brain.nii.gz"))
         assert str(caught.value).count("(RAS)") == 2
 
+    def test_one_grid_with_x_and_y_negated_is_refused(self, tmp_path):
+        affine, places = grid(middle=np.zeros(3))
+        brain = nifti(tmp_path / "brain.nii", (head(places + MIDDLE) > 0).astype(np.uint8), affine)
+        tumour = nifti(tmp_path / "tumour.nii", (head(places + MIDDLE) == 3).astype(np.uint8), LPS @ affine)
+        with pytest.raises(InputError, match=r"has the grid of .*, but with x and y negated"):
+            head_masks(Sources(tumour, tumour=(1,), mask=brain))
+
+    def test_a_tumour_that_a_mask_lacks_is_noted(self, tmp_path):
+        affine, places = grid()
+        brain = nifti(tmp_path / "brain.nii", (head(places, tumour=0) > 0).astype(np.uint8), affine)
+        tumour = nifti(tmp_path / "tumour.nii", (head(places) == 3).astype(np.uint8), affine)
+        (note,) = head_masks(Sources(tumour, tumour=(1,), mask=brain)).notes
+        assert re.fullmatch(r"7(\.\d)? ml of what is labelled lie outside of the mask: see that .*", note)
+
     def test_what_says_nothing_or_too_much_is_refused(self, files):
         tumour, brain = files / "tumour.nii.gz", files / "brain.nii.gz"
         nifti(files / "none.nii", np.zeros((5, 5, 5), np.uint8), np.eye(4))

@@ -29,7 +29,8 @@ next: sulcus export brain.model.npz --out brain.onnx""",
     "export": """example:
   sulcus export brain.model.npz --out brain.onnx
 next: run it by ONNX Runtime; the file itself says what goes in and what comes out""",
-    "patient": """example:
+    "patient": """examples:
+  sulcus patient labels.nii.gz --brain 1,2 --tumour 3 --out patient.vtu --inspect
   sulcus patient labels.nii.gz --brain 1,2 --tumour 3 --t1 t1.nii.gz --out patient.vtu
 next: sulcus demo --anatomy patient.vtu""",
     "locate": """examples:

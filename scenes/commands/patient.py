@@ -6,8 +6,12 @@ import argparse
 import json
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 
+from sim.bodies.head_masks import head_masks
+from sim.bodies.label_volume import masked_subject
+from sim.bodies.subject import MeshPlan, opened_cortex
 from sim.elements import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS
@@ -16,9 +20,9 @@ from surrogate.data.disc_split import APART, FEWEST
 from surrogate.data.tool_loads import PRESETS
 
 from .devices_option import add_devices
-from .label_options import add_label_arguments, label_words
+from .label_options import add_label_arguments, label_words, sources_of
 from .outputs import add_force, claimed
-from .placement_options import add_opening_arguments, opening_words
+from .placement_options import add_opening_arguments, opened, opening_words
 from .tissue_options import add_element_argument
 
 
@@ -41,6 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="diameter of the opening along the cortex [mm] (default %(default)s)",
     )
     add_opening_arguments(parser)
+    parser.add_argument(
+        "--inspect",
+        action="store_true",
+        help="only show, in seconds, what would be made: numbers, warnings, and the picture PATIENT.inspect.png",
+    )
     parser.add_argument("--count", type=int, default=1000, help="loads to simulate (default %(default)s)")
     parser.add_argument(
         "--preset", choices=PRESETS, default="palpation",
@@ -61,6 +70,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; an interrupted run goes on when the same command is given again."""
+    if args.inspect:
+        return _inspect(args)
     from sim.runtime.device import device_names
     from surrogate.training.train import check_learners
 
@@ -105,6 +116,31 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(f"{_shares(seconds, whole)}\nready: sulcus demo --anatomy {args.out}{_physics(args)}")
         print(f"for the error of the tumour: sulcus uncertainty press --anatomy {args.out}{_physics(args)}")
+    return 0
+
+
+def _inspect(args: argparse.Namespace) -> int:
+    """Print what would be made, and draw it."""
+    from ar.screen import write_png
+
+    from .inspection import inspected
+    from .inspection_sheet import sheet
+
+    began = time.perf_counter()
+    picture = args.out.with_suffix(".inspect.png")
+    claimed(picture, ".png", "a picture of sulcus", args.force, [args.labels, args.mask, args.tumour_in, args.t1])
+    plan = MeshPlan(args.nodes, 1e-3 * args.craniotomy)
+    masks = head_masks(sources_of(args))
+    subject = opened(masked_subject(masks, args.t1), args)
+    found = inspected(masks, subject)
+    write_png(picture, sheet(found, masks, subject, opened_cortex(subject, plan.craniotomy)))
+    took = round(time.perf_counter() - began, 2)
+    if args.json:
+        print(json.dumps({**asdict(found), "picture": str(picture), "seconds": took}))
+    else:
+        warnings = [f"  - {warning}" for warning in found.warnings]
+        print("\n".join([*found.lines(), *(["warnings:", *warnings] if warnings else ["no warnings"])]))
+        print(f"drawn to {picture} in {took} s; without --inspect the models are made")
     return 0
 
 

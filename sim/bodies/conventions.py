@@ -27,7 +27,7 @@ class Convention:
     necrosis, oedema, ventricles
         Parts of the core, of the brain, and of the brain.
     left, right
-        Of the two hemispheres, where they are told apart.
+        Of each hemisphere, where its labels are its own.
     only
         Whether a file has no other labels than these.
     mask

@@ -17,7 +17,11 @@ from .volume import read_volume
 TO_LPS = np.array([-1.0, -1.0, 1.0])
 # Share of a tumour inside the brain's convex hull: less is amiss, and so much after x and y are negated says why.
 AMISS, EXPLAINED = 0.5, 0.9
-SAMPLED = 20_000
+SAMPLED = 500
+# Share of what is labelled that may lie outside of a mask without a word.
+OUTSIDE = 0.01
+# Voxels that are kept round a brain: more than a tumour at the cortex goes on beyond it.
+SURROUNDINGS = 10
 
 
 @dataclass(frozen=True)
@@ -105,16 +109,41 @@ def head_masks(sources: Sources) -> HeadMasks:
         marked = {name: np.pad(mask, lacking) for name, mask in marked.items()}
         shape = tuple((np.array(shape) + lacking.sum(axis=1)).tolist())
     marked |= {name: other.onto(shape, affine) for name, other in others.items()}
+    notes = whole.notes + tuple(f"{one.path}: {note}" for one in others.values() for note in one.notes)
+    if sources.mask:
+        notes += _outside(marked, affine)
+    marked, affine = _cropped(marked, affine)
     return HeadMasks(
         " and ".join(str(path) for path in (sources.labels, sources.mask, sources.tumour_in) if path),
         f"the mask {sources.mask}" if sources.mask else f"the labels {listed(brain)}",
         marked.pop("brain"),
         marked.pop("tumour"),
         affine,
-        whole.notes + tuple(f"{one.path}: {note}" for one in others.values() for note in one.notes),
+        notes,
         on_border(others["brain"].marked if sources.mask else whole.mask(brain)),
         marked,
     )
+
+
+def _outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[str, ...]:
+    """A note, if much of what is labelled lies outside of the brain's mask."""
+    labelled = np.logical_or.reduce([mask for name, mask in marked.items() if name != "brain"])
+    out = int((labelled & ~marked["brain"]).sum())
+    if out <= OUTSIDE * labelled.sum():
+        return ()
+    lost = 1e6 * out * abs(float(np.linalg.det(affine[:3, :3])))
+    return (f"{lost:.2g} ml of what is labelled lie outside of the mask: see that both files are of one space",)
+
+
+def _cropped(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The masks where brain or tumour are, and `SURROUNDINGS` voxels round them; and the affine (4, 4) there."""
+    anything = marked["brain"] | marked["tumour"]
+    ends = [np.flatnonzero(anything.any(axis=tuple({0, 1, 2} - {axis})))[[0, -1]] for axis in range(3)]
+    low = np.maximum(0, np.array(ends)[:, 0] - SURROUNDINGS)
+    part = tuple(slice(first, end[1] + 1 + SURROUNDINGS) for first, end in zip(low, ends, strict=True))
+    moved = affine.copy()
+    moved[:3, 3] += affine[:3, :3] @ low
+    return {name: np.ascontiguousarray(mask[part]) for name, mask in marked.items()}, moved
 
 
 def _meant(
@@ -208,8 +237,14 @@ def _demand_sides(whole: LabelMap, convention: Convention) -> None:
 
 
 def _demand_together(brain: Mask, tumour: Mask) -> None:
-    """Refuse a tumour beside the brain; if it would lie there with x and y negated, say so."""
+    """Refuse a tumour beside the brain, and LPS that is stated as RAS as far as it shows."""
     boxes = [mask.box for mask in (brain, tumour)]
+    negated = np.array([*TO_LPS, 1.0])[:, None] * tumour.affine
+    if brain.marked.shape == tumour.marked.shape and np.allclose(brain.affine, negated, rtol=0.0, atol=1e-6):
+        raise InputError(
+            f"{tumour.path}: has the grid of {brain.path}, but with x and y negated: one of the two states LPS as RAS. "
+            "Export that one anew."
+        )
     apart = (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any()
     index = np.argwhere(tumour.marked)
     index = index[:: max(1, len(index) // SAMPLED)]

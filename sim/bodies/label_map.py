@@ -47,7 +47,7 @@ class LabelMap:
     def present(self) -> tuple[frozenset[int], ...]:
         """Of each layer, the labels that some voxel has, without 0."""
         layers = np.moveaxis(self.layers, -1, 0)
-        return tuple(frozenset(np.unique(layer).astype(int).tolist()) - {0} for layer in layers)
+        return tuple(frozenset(np.unique(layer.T).astype(int).tolist()) - {0} for layer in layers)
 
     @property
     def labels(self) -> frozenset[int]:
@@ -62,10 +62,11 @@ class LabelMap:
         InputError
             As `places`.
         """
-        found = np.asarray(self.layers.any(axis=-1)) if not labels else np.zeros(self.layers.shape[:3], bool)
+        found = np.asarray(self.layers.any(axis=-1)) if not labels else np.zeros(self.layers.shape[:3], bool, order="F")
         places = self.places(labels)
         for layer in {layer for layer, _ in places}:
-            found |= np.isin(self.layers[..., layer], [value for on, value in places if on == layer])
+            # Transposed: files have the first axis fastest, and NumPy copies what does not lie as it likes.
+            found |= np.isin(self.layers[..., layer].T, [value for on, value in places if on == layer]).T
         return found
 
     def places(self, labels: Sequence[Label]) -> list[tuple[int, int]]:

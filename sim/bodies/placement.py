@@ -13,6 +13,9 @@ AXES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
 """Of RAS: what small and large coordinates are called."""
 
 
+AT_ONCE = 256  # points that are held against all planes of a hull
+
+
 @dataclass(frozen=True)
 class Placement:
     """Where a brain is held, where its skull can be opened, and what counts as its midline.
@@ -73,8 +76,7 @@ def side_of(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings: Plac
 def site_over(cortex: np.ndarray, centre: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
     """The point (3,) [m] of `cortex` (n, 3) nearest to `centre` (3,) that can be reached through the skull."""
     floor = min(cortex[:, 2].min() + settings.base * np.ptp(cortex[:, 2]), centre[2])
-    outer = _outermost(cortex, settings)
-    return _nearest(outer[outer[:, 2] >= floor], centre)
+    return _nearest_outer(cortex[cortex[:, 2] >= floor], centre, cortex, settings)
 
 
 def opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
@@ -86,7 +88,7 @@ def opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement = Plac
         A point that is not finite, or more than `near` from there; one over the brainstem.
     """
     _demand_finite(point, "--opening-at")
-    site = _nearest(_outermost(cortex, settings), point)
+    site = _nearest_outer(cortex, point, cortex, settings)
     apart = float(np.linalg.norm(site - point))
     if apart > settings.near:
         raise InputError(
@@ -113,15 +115,13 @@ def opening_over(cortex: np.ndarray, point: np.ndarray, depth: float, settings: 
     return _not_over_stem(cortex, site_over(cortex, point, settings), settings)
 
 
-def _outermost(cortex: np.ndarray, settings: Placement) -> np.ndarray:
-    """The cortex (k, 3) near its convex hull."""
+def _nearest_outer(points: np.ndarray, place: np.ndarray, cortex: np.ndarray, settings: Placement) -> np.ndarray:
+    """Of `points` (k, 3) of the `cortex` (n, 3) near its convex hull, the nearest to a place (3,)."""
     hull = ConvexHull(cortex).equations
-    depth = np.concatenate([-(part @ hull[:, :3].T + hull[:, 3]).max(axis=1) for part in np.array_split(cortex, 50)])
-    return cortex[depth <= settings.hull_depth]
-
-
-def _nearest(points: np.ndarray, place: np.ndarray) -> np.ndarray:
-    return points[np.linalg.norm(points - place, axis=1).argmin()]
+    order = np.argsort(np.linalg.norm(points - place, axis=1), kind="stable")
+    parts = (points[order[first : first + AT_ONCE]] for first in range(0, len(order), AT_ONCE))
+    outer = (part[-(part @ hull[:, :3].T + hull[:, 3]).max(axis=1) <= settings.hull_depth] for part in parts)
+    return next(part[0] for part in outer if len(part))
 
 
 def _demand_finite(point: np.ndarray, option: str) -> None:

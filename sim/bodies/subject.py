@@ -97,13 +97,21 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
     InputError
         What `mesh_solids` and `bounded` refuse.
     """
-    opening = subject.cortex[np.linalg.norm(subject.cortex - subject.site, axis=1) <= 0.5 * plan.craniotomy]
+    opening = subject.cortex[opened_cortex(subject, plan.craniotomy)]
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     solids = Solids(
         subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening, subject.pieces
     )
     mesh = mesh_solids(solids, plan.nodes, plan.meshing)
     return bounded(mesh, subject.site, plan.craniotomy, plan.placement)
+
+
+def opened_cortex(subject: Subject, craniotomy: float) -> np.ndarray:
+    """(n,) bool: which points of a subject's cortex lie under an opening of such a diameter [m].
+
+    Distances are straight here. The mesh is opened by those along its surface, which are a little longer.
+    """
+    return np.linalg.norm(subject.cortex - subject.site, axis=1) <= 0.5 * craniotomy
 
 
 def rim(mask: np.ndarray, affine: np.ndarray) -> np.ndarray:

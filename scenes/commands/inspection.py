@@ -1,0 +1,147 @@
+"""What would be made of a patient's labels, found in seconds: volumes, depth, opening, and what looks wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from sim.bodies.head_masks import HeadMasks
+from sim.bodies.placement import side_of
+from sim.bodies.subject import Subject
+
+# [ml] Brains of adults, with their ventricles: beyond, a mask lacks a part or holds more than brain.
+SMALL, LARGE = 850.0, 2000.0
+# Share of the brain that a tumour has; labels of another convention are often more.
+MUCH = 0.25
+# [m] From the opening to the tumour: farther than a press of the cortex moves anything.
+FAR = 0.040
+# Of the longest edge of a voxel to the shortest: beyond, surfaces are stairs along one axis.
+OBLONG = 2.5
+# Share of the brain that a T1 in the same space covers, at least.
+COVERED = 0.98
+AXES = ("LR", "PA", "IS")
+# Pieces that are listed.
+MOST = 4
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What is found; lengths in mm, volumes in ml.
+
+    Parameters
+    ----------
+    brain, tumour
+        Volumes.
+    pieces
+        Of the tumour: volume and place in words, the largest first.
+    parts
+        Volumes of the other tissues that the labels tell.
+    depth
+        From the tumour to the nearest cortex.
+    opening
+        Where its middle lies (RAS).
+    place
+        The same in words.
+    distance
+        From the middle of the opening to the tumour.
+    voxel
+        Edges; lengths here are off by up to the longest.
+    axes, mirrored
+        Where the file's axes point, as three letters of R or L, A or P, S or I; whether they are left-handed.
+    warnings
+        Sentences.
+    """
+
+    brain: float
+    tumour: float
+    pieces: tuple[tuple[float, str], ...]
+    parts: dict[str, float]
+    depth: float
+    opening: tuple[float, float, float]
+    place: str
+    distance: float
+    voxel: tuple[float, float, float]
+    axes: str
+    mirrored: bool
+    warnings: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """The same in a few lines of text."""
+        error = max(self.voxel)
+        pieces = [
+            f"  piece {number}: {volume:.2f} ml, {place}" for number, (volume, place) in enumerate(self.pieces, 1)
+        ]
+        shown, hidden = pieces[:MOST], len(pieces) - MOST
+        at = ", ".join(f"{value:.0f}" for value in self.opening)
+        return [
+            f"brain {self.brain:.0f} ml; tumour {self.tumour:.2f} ml in {_counted(len(pieces), 'piece')}",
+            *shown,
+            *([f"  and {hidden} smaller"] if hidden > 0 else []),
+            *(f"{name} {volume:.2f} ml" for name, volume in self.parts.items()),
+            f"tumour {self.depth:.0f} mm under the nearest cortex, give or take a voxel of {error:.1f} mm",
+            f"opening: {self.place}, at {at} mm (RAS), {self.distance:.0f} mm from the tumour",
+            f"voxels {' x '.join(f'{edge:.3g}' for edge in self.voxel)} mm, stored {self.axes} "
+            f"({'mirrored, as many scanners do' if self.mirrored else 'not mirrored'}; left is where its affine says)",
+        ]
+
+
+def inspected(masks: HeadMasks, subject: Subject) -> Inspection:
+    """What would be made of `masks` and of the `subject` in them."""
+    affine = masks.affine
+    edges, voxel = 1e3 * np.linalg.norm(affine[:3, :3], axis=0), 1e6 * abs(float(np.linalg.det(affine[:3, :3])))
+    low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
+    marked = masks.brain | masks.tumour
+    found = Inspection(
+        brain=voxel * float(marked.sum()),
+        tumour=1e6 * subject.tumour_volume,
+        pieces=tuple((1e6 * one.volume, side_of(one.centre, low, high)) for one in subject.pieces),
+        parts={name: voxel * float(mask.sum()) for name, mask in masks.parts.items()},
+        depth=1e3 * float(KDTree(subject.cortex).query(subject.interface)[0].min()),
+        opening=tuple((1e3 * subject.site).tolist()),
+        place=side_of(subject.site, low, high),
+        distance=1e3 * float(np.linalg.norm(subject.interface - subject.site, axis=1).min()),
+        voxel=tuple(edges.tolist()),
+        axes=axes_of(affine),
+        mirrored=bool(np.linalg.det(affine[:3, :3]) < 0.0),
+        warnings=(),
+    )
+    return replace(found, warnings=(*subject.notes, *_warnings(found, subject)))
+
+
+def axes_of(affine: np.ndarray) -> str:
+    """Three letters for where a volume's axes point, by its affine (4, 4) to RAS."""
+    letters, taken = [], set()
+    for column in affine[:3, :3].T / np.linalg.norm(affine[:3, :3], axis=0)[:, None]:
+        axis = next(axis for axis in np.argsort(-np.abs(column)) if axis not in taken)
+        taken.add(axis)
+        letters.append(AXES[axis][int(column[axis] > 0.0)])
+    return "".join(letters)
+
+
+def _warnings(found: Inspection, subject: Subject) -> Iterator[str]:
+    if not SMALL <= found.brain <= LARGE:
+        word, ask = ("small", "is the mask whole") if found.brain < SMALL else ("large", "does the mask hold the skull")
+        yield f"a brain of {found.brain:.0f} ml is {word} for an adult: {ask}?"
+    if found.tumour > MUCH * found.brain:
+        yield f"the tumour has {100.0 * found.tumour / found.brain:.0f} % of the brain: are these its labels?"
+    if found.depth <= max(found.voxel):
+        yield "the tumour touches the cortex"
+    if len(found.pieces) > 1:
+        yield f"the tumour lies in {len(found.pieces)} pieces, and the skull is opened over one of them"
+    if 1e-3 * found.distance > FAR:
+        yield f"the opening lies {found.distance:.0f} mm from the tumour: pressing there will hardly move it"
+    if max(found.voxel) > OBLONG * min(found.voxel):
+        yield f"voxels are up to {max(found.voxel):.1f} mm long: surfaces have steps of that size"
+    if subject.intensity is not None:
+        index = np.linalg.inv(subject.intensity.affine) @ np.c_[subject.cortex, np.ones(len(subject.cortex))].T
+        inside = (index[:3].T > -0.5) & (np.array(subject.intensity.values.shape) - 0.5 > index[:3].T)
+        covered = float(inside.all(axis=1).mean())
+        if covered < COVERED:
+            yield f"the T1 holds {100.0 * covered:.0f} % of the brain's surface: is it of the same space?"
+
+
+def _counted(count: int, word: str) -> str:
+    return f"{count} {word}{'' if count == 1 else 's'}"

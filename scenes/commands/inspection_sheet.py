@@ -1,0 +1,233 @@
+"""The picture sheet of an inspection: three slices, the opening as a surgeon sees it, and the numbers."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from scipy.spatial import KDTree
+
+from ar.page.slices import PLANES
+from sim.bodies.head_masks import HeadMasks
+from sim.bodies.signed_distance import gradient
+from sim.bodies.subject import Subject
+
+from .inspection import Inspection
+
+Colour = tuple[int, int, int]
+
+# Pixels: a panel's side, the column of text, from one of its lines to the next, its letters, and where things begin.
+SIDE, COLUMN, LINE, SIZE, PAD = 480, 500, 22, 16, 14
+# Letters of a line of text, at most.
+WIDTH = 58
+GROUND, TEXT, FAINT, WARNING = (12, 12, 14), (238, 238, 232), (160, 160, 156), (255, 196, 92)
+BRAIN: Colour = (104, 116, 138)
+COLOURS: dict[str, Colour] = {
+    "brain": BRAIN,
+    "ventricles": (66, 132, 214),
+    "oedema": (222, 178, 72),
+    "tumour": (214, 62, 62),
+    "necrosis": (122, 28, 58),
+    "left out": (206, 92, 206),
+    "opening": (70, 205, 110),
+}
+"""What is drawn in what colour; the later over the earlier."""
+# [m] Round the brain; thickness of the opening's line in a slice; share of colour over a scan.
+ROOM, RIND, TINT = 6e-3, 2.2e-3, 0.6
+# Directions of RAS, against and along.
+SIDES = ("LR", "PA", "IS")
+# Of the light on the cortex: from the viewer's upper left.
+LIGHT = np.array([-0.4, 0.5, 0.77])
+
+
+@dataclass(frozen=True)
+class View:
+    """A square picture of a plane of space.
+
+    Parameters
+    ----------
+    name
+        In words.
+    right, down
+        Unit vectors (3,) of the picture.
+    middle
+        (3,) [m]: what its middle shows.
+    reach
+        [m] Half of its side.
+    """
+
+    name: str
+    right: np.ndarray
+    down: np.ndarray
+    middle: np.ndarray
+    reach: float
+
+    def points(self) -> np.ndarray:
+        """Places (SIDE, SIDE, 3) [m] of the pixels."""
+        steps = self.reach * ((2.0 * np.arange(SIDE) + 1.0) / SIDE - 1.0)
+        return self.middle + steps[:, None, None] * self.down + steps[None, :, None] * self.right
+
+    def letters(self) -> dict[str, str]:
+        """The patient's sides at the left, right, upper and lower edge, by the axis that lies most along it."""
+        found = {}
+        for edge, direction in (
+            ("left", -self.right),
+            ("right", self.right),
+            ("top", -self.down),
+            ("bottom", self.down),
+        ):
+            axis = int(np.abs(direction).argmax())
+            found[edge] = SIDES[axis][int(direction[axis] > 0.0)]
+        return found
+
+
+def sheet(found: Inspection, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
+    """The sheet (H, W, 3) uint8; `opened` (n,) bool says which points of the subject's cortex are in the opening."""
+    low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
+    centre = subject.pieces[0].centre
+    panels = []
+    for plane in PLANES:
+        right, down = np.array(plane.right), np.array(plane.down)
+        across = np.abs(right) + np.abs(down)
+        reach = 0.5 * float(((high - low) * across).max()) + ROOM
+        middle = 0.5 * (low + high) * across + centre * (1.0 - across)
+        view = View(f"{plane.name}, through the tumour", right, down, middle, reach)
+        panels.append(_framed(_slice(view, masks, subject, opened), view))
+    panels.append(_outside(masks, subject, opened))
+    picture = Image.new("RGB", (2 * SIDE + COLUMN, 2 * SIDE), GROUND)
+    for number, panel in enumerate(panels):
+        picture.paste(Image.fromarray(panel), (SIDE * (number % 2), SIDE * (number // 2)))
+    drawn = {"tumour", "left out", "opening", *masks.parts, *([] if subject.intensity else ["brain"])}
+    _write(ImageDraw.Draw(picture), found, [name for name in COLOURS if name in drawn])
+    return np.asarray(picture)
+
+
+def _slice(view: View, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
+    """Labels in colours, over the scan where there is one, and the opened cortex."""
+    points = view.points().reshape(-1, 3)
+    inverse = np.linalg.inv(masks.affine)
+    index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3]).astype(int)
+    there = ((index >= 0) & (index < masks.brain.shape)).all(axis=1)
+
+    def marked(mask: np.ndarray) -> np.ndarray:
+        found = np.zeros(len(points), bool)
+        found[there] = mask[tuple(index[there].T)]
+        return found
+
+    solid, kept = subject.brain(points), subject.tumour(points)
+    tumour = marked(masks.tumour)
+    voxel = float(np.linalg.norm(masks.affine[:3, :3], axis=0).max())
+    layers = {
+        "brain": solid < 0.0,
+        **{name: marked(mask) for name, mask in masks.parts.items() if name != "necrosis"},
+        "tumour": tumour,
+        **{name: marked(mask) & tumour for name, mask in masks.parts.items() if name == "necrosis"},
+        "left out": tumour & ((kept > voxel) | (solid > voxel)),
+    }
+    colour = np.tile(np.array(GROUND, float), (len(points), 1))
+    tint = 1.0
+    if subject.intensity is not None:
+        grey = subject.intensity.at(points)
+        white = np.quantile(grey[layers["brain"]], 0.98) if layers["brain"].any() else grey.max()
+        colour = np.repeat(np.clip(grey / (white or 1.0), 0.0, 1.0)[:, None] * 235.0, 3, axis=1)
+        tint = TINT
+    for name, mask in layers.items():
+        if name != "brain" or subject.intensity is None:
+            colour[mask] = (1.0 - tint) * colour[mask] + tint * np.array(COLOURS[name])
+    rind = np.flatnonzero(np.abs(solid) < RIND)
+    if len(rind) and opened.any():
+        apart = np.linalg.norm(points[rind, None] - subject.site, axis=2)[:, 0]
+        near = rind[apart < np.linalg.norm(subject.cortex[opened] - subject.site, axis=1).max() + RIND]
+        colour[near[_nearest_is(subject.cortex, opened, points[near])]] = COLOURS["opening"]
+    return np.rint(colour).astype(np.uint8).reshape(SIDE, SIDE, 3)
+
+
+def _nearest_is(cortex: np.ndarray, chosen: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n,) bool: whether of the cortex the point nearest to each of `points` (n, 3) is a chosen one."""
+    return chosen[KDTree(cortex).query(points)[1]]
+
+
+def _outside(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
+    """The cortex as seen along the opening's middle, with the tumour's shadow under it."""
+    low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
+    inward = 0.5 * (low + high) - subject.site
+    if opened.sum() > 3:  # across the plane of the opening
+        normal = np.linalg.svd(subject.cortex[opened] - subject.cortex[opened].mean(axis=0), full_matrices=False)[2][2]
+        inward = normal if normal @ inward > 0.0 else -normal
+    inward = inward / np.linalg.norm(inward)
+    up = np.array([0.0, 0.0, 1.0]) if abs(inward[2]) < 0.8 else np.array([0.0, 1.0, 0.0])
+    down = -(up - (up @ inward) * inward)
+    down /= np.linalg.norm(down)
+    right = np.cross(down, inward)
+    across = subject.cortex - subject.site
+    reach = float(np.abs(np.stack([across @ right, across @ down])).max(axis=1).mean()) * 0.8
+    view = View("from outside, along the opening", right, down, subject.site, reach)
+    cell = max(2.0 * reach / SIDE, 1.2 * float(np.linalg.norm(masks.affine[:3, :3], axis=0).max()))
+    seen = _seen(view, subject.cortex, inward, cell)
+    colour = np.tile(np.array(GROUND, float), (SIDE, SIDE, 1))
+    there = seen >= 0
+    places = subject.cortex[seen[there]]
+    normals = gradient(subject.brain, places, probe=cell)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    light = np.clip(normals @ np.stack([right, -down, -inward], axis=1) @ LIGHT, 0.0, 1.0)
+    base = np.where(opened[seen[there]][:, None], COLOURS["opening"], (176, 168, 164))
+    colour[there] = base * (0.3 + 0.7 * light)[:, None]
+    shadow = _seen(view, subject.interface, inward, cell) >= 0
+    colour[shadow] = 0.55 * colour[shadow] + 0.45 * np.array(COLOURS["tumour"])
+    return _framed(np.rint(colour).astype(np.uint8), view)
+
+
+def _seen(view: View, points: np.ndarray, inward: np.ndarray, cell: float) -> np.ndarray:
+    """(SIDE, SIDE): the number of the point (n, 3) that each pixel shows, or -1; points are squares of `cell` [m]."""
+    off, scale = points - view.middle, 0.5 * SIDE / view.reach
+    half = int(np.ceil(0.5 * cell * scale))
+    order = np.argsort(-(off @ inward), kind="stable")  # the nearest is painted last
+    at = np.rint(np.stack([off @ view.down, off @ view.right], axis=1)[order] * scale + 0.5 * SIDE).astype(int)
+    square = np.stack(np.meshgrid(*[np.arange(-half, half + 1)] * 2), axis=-1).reshape(1, -1, 2)
+    index = (at[:, None] + square).reshape(-1, 2)
+    number = np.repeat(order, square.shape[1])
+    inside = ((index >= 0) & (index < SIDE)).all(axis=1)
+    seen = np.full((SIDE, SIDE), -1)
+    seen[tuple(index[inside].T)] = number[inside]
+    return seen
+
+
+def _framed(colour: np.ndarray, view: View) -> np.ndarray:
+    """The panel with its name, the patient's sides and a scale."""
+    picture = Image.fromarray(colour)
+    ink = ImageDraw.Draw(picture)
+    ink.rectangle([0, 0, SIDE - 1, SIDE - 1], outline=(60, 60, 64))
+    font = ImageFont.load_default(SIZE)
+    letters = view.letters()
+    half = SIDE // 2
+    for edge, at, anchor in (
+        ("left", (8, half), "lm"), ("right", (SIDE - 8, half), "rm"),
+        ("top", (half, 6), "ma"), ("bottom", (half, SIDE - 6), "md"),
+    ):  # fmt: skip
+        ink.text(at, letters[edge], TEXT, ImageFont.load_default(SIZE + 4), anchor, stroke_width=2, stroke_fill=GROUND)
+    ink.text((8, 6), view.name, TEXT, font, stroke_width=2, stroke_fill=GROUND)
+    bar = 0.5 * SIDE * 0.02 / view.reach
+    ink.line([PAD, SIDE - PAD, PAD + bar, SIDE - PAD], TEXT, 3)
+    ink.text((PAD, SIDE - PAD - 6), "20 mm", TEXT, font, "ld", stroke_width=2, stroke_fill=GROUND)
+    return np.asarray(picture)
+
+
+def _write(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> None:
+    """The numbers, the warnings and the colours, in the column on the right."""
+    left, top = 2 * SIDE + PAD, PAD
+    rows: list[tuple[str, Colour]] = [("What would be made", TEXT)]
+    for text in found.lines():
+        rows += [(part, TEXT) for part in textwrap.wrap(text, WIDTH, subsequent_indent="    ")]
+    rows += [("", TEXT), ("Warnings" if found.warnings else "No warnings", WARNING if found.warnings else TEXT)]
+    for text in found.warnings:
+        rows += [(part, WARNING) for part in textwrap.wrap(f"- {text}", WIDTH, subsequent_indent="  ")]
+    rows += [("", TEXT), ("Research only; not a medical device.", FAINT)]
+    for number, (text, colour) in enumerate(rows):
+        ink.text((left, top + LINE * number), text, colour, ImageFont.load_default(SIZE))
+    for number, name in enumerate(reversed(shown)):
+        row = 2 * SIDE - PAD - LINE * (number + 1)
+        ink.rectangle([left, row + 3, left + 15, row + 18], fill=COLOURS[name])
+        said = "tumour that is left out" if name == "left out" else name
+        ink.text((left + 24, row), said, TEXT, ImageFont.load_default(SIZE))

@@ -1,0 +1,90 @@
+"""`sulcus patient --inspect`: what would be made is shown as it is, in figures and a picture, and nothing is made."""
+
+import json
+
+import nibabel
+import numpy as np
+import pytest
+from balls import ball
+from PIL import Image
+from scipy import ndimage
+
+from scenes.cli import main
+from scenes.commands.inspection import axes_of
+from scenes.commands.inspection_sheet import COLOURS, SIDE
+
+RED, GREEN = COLOURS["tumour"], COLOURS["opening"]
+
+
+def inspected(capsys, folder, *words):
+    code = main(["patient", *map(str, words), "--out", str(folder / "p.vtu"), "--inspect", "--json"])
+    said = capsys.readouterr()
+    assert code == 0, said.err
+    return json.loads(said.out), np.asarray(Image.open(folder / "p.inspect.png"))
+
+
+def middle_of(panel, colour):
+    """Column and row of the middle of the pixels of a colour, in shares of the panel."""
+    rows, columns = np.nonzero((panel == colour).all(axis=2))
+    return columns.mean() / SIDE, rows.mean() / SIDE
+
+
+def test_the_sheet_shows_where_things_are(tmp_path, capsys):
+    """A ball of 55 mm round the origin, and one of 10 mm in it, 20 mm to the right and up."""
+    ball(tmp_path)
+    found, picture = inspected(capsys, tmp_path, tmp_path / "labels.nii.gz", "--brain", 1, "--tumour", 2)
+    assert found["brain"] == pytest.approx(4 / 3 * np.pi * 55**3 / 1e3, rel=0.01)
+    assert found["tumour"] == pytest.approx(552 * 0.008)
+    assert found["depth"] == pytest.approx(55 - 10 - np.hypot(20, 20), abs=2.0)
+    assert found["distance"] == pytest.approx(found["depth"], abs=2.0)
+    np.testing.assert_allclose(found["opening"], 55 / np.sqrt(2) * np.array([1, 0, 1]), atol=3.0)
+    assert found["axes"] == "RAS" and not found["mirrored"] and found["voxel"] == pytest.approx([2.0] * 3)
+    assert found["warnings"] == ["a brain of 695 ml is small for an adult: is the mask whole?"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["labels.nii.gz", "p.inspect.png", "t1.nii.gz"]
+    axial, coronal = picture[:SIDE, :SIDE], picture[:SIDE, SIDE : 2 * SIDE]
+    sagittal, outside = picture[SIDE:, :SIDE], picture[SIDE:, SIDE : 2 * SIDE]
+    # As radiologists have it, the right is on the left; half of the side is 61 mm.
+    off = 20.0 / 122.0
+    np.testing.assert_allclose(middle_of(axial, RED), [0.5 - off, 0.5], atol=0.02)
+    np.testing.assert_allclose(middle_of(coronal, RED), [0.5 - off, 0.5 - off], atol=0.02)
+    np.testing.assert_allclose(middle_of(sagittal, RED), [0.5, 0.5 - off], atol=0.02)
+    column, row = middle_of(coronal, GREEN)
+    assert column < 0.25 and row < 0.25
+    # From outside, the opening has its diameter, and the tumour's shadow lies in its middle.
+    green = (outside[..., 1] > outside[..., 0] * 1.3) & (outside[..., 1] > outside[..., 2] * 1.3)
+    whole = ndimage.binary_fill_holes(green)
+    np.testing.assert_allclose(ndimage.center_of_mass(whole), [SIDE / 2, SIDE / 2], atol=0.03 * SIDE)
+    shadow = whole & ~green
+    assert np.sqrt(whole.sum() / shadow.sum()) == pytest.approx(50.0 / 22.0, rel=0.15)
+
+
+def test_what_looks_wrong_is_said(tmp_path, capsys):
+    ball(tmp_path)
+    image = nibabel.load(tmp_path / "labels.nii.gz")
+    labels, affine = np.asarray(image.dataobj).copy(), np.diag([-1.0, 1.0, 1.0, 1.0]) @ image.affine
+    index = np.moveaxis(np.indices(labels.shape), 0, -1)
+    labels[np.linalg.norm(2.0 * (index - 31.5) - [0.0, 50.0, 0.0], axis=-1) < 8.0] = 2
+    nibabel.save(nibabel.Nifti1Image(labels, affine), tmp_path / "mirrored.nii")
+    nibabel.save(nibabel.Nifti1Image(np.ones((20, 64, 64), np.uint8), image.affine), tmp_path / "part.nii")
+    words = (tmp_path / "mirrored.nii", "--brain", 1, "--tumour", 2, "--t1", tmp_path / "part.nii")
+    found, picture = inspected(capsys, tmp_path, *words, "--opening-at", "0,-55,0")
+    said = " ".join(found["warnings"])
+    for part in ("touches the cortex", "lies in 2 pieces", "the T1 holds", "mm from the tumour: pressing"):
+        assert part in said
+    assert found["axes"] == "LAS" and found["mirrored"]
+    assert [place for _, place in found["pieces"]] == ["left superior", "midline anterior"]
+    assert middle_of(picture[:SIDE, :SIDE], GREEN)[1] > 0.8
+    # From behind, the left is on the left: there is the larger piece, higher up.
+    outside = picture[SIDE:, SIDE : 2 * SIDE].astype(float)
+    shadow = (outside[..., 0] > 1.3 * outside[..., 1]) & (outside[..., 0] > 1.3 * outside[..., 2])
+    rows, columns = np.nonzero(shadow)
+    assert columns.min() < 0.35 * SIDE and rows.min() < 0.35 * SIDE and columns.max() < 0.6 * SIDE
+    assert main(["patient", *map(str, words[:-2]), "--out", str(tmp_path / "p.vtu"), "--inspect"]) == 0
+    text = capsys.readouterr().out
+    assert "stored LAS (mirrored, as many scanners do; left is where its affine says)" in text and "warnings:" in text
+
+
+def test_axes_are_named_as_they_point():
+    turned = np.eye(4)
+    turned[:3, :3] = np.array([[0.0, 0.2, 1.0], [-1.0, 0.1, 0.0], [0.1, -1.0, 0.2]])
+    assert axes_of(turned) == "PIR"
