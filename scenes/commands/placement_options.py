@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from sim.bodies.placement import opening_at, opening_over
+from sim.bodies.markups import Markup, read_markup
+from sim.bodies.placement import opening_at, opening_over, opening_within
 from sim.bodies.subject import Subject
 from sim.errors import InputError
 
 Point = tuple[float, float, float]
+# Places at which a trajectory is held against the brain.
+ON_LINE = 2000
 
 
 def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --opening-at and --opening-over, of which one may be given."""
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
-        "--opening-at", type=point, metavar="X,Y,Z",
+        "--opening-at", type=point_or_file, metavar="X,Y,Z|FILE.mrk.json",
         help="centre the craniotomy on the nearest reachable point of the brain's surface [mm, RAS] (default: over the "
-        "tumour)",
+        "tumour). A file of 3D Slicer may hold a point, a trajectory as a line, or an outline as a closed curve",
     )  # fmt: skip
     place.add_argument(
-        "--opening-over", type=piece_or_point, metavar="PIECE|X,Y,Z",
-        help="open the skull over a piece of the tumour, by its number (1 is the largest), or over a point inside the "
-        "brain [mm, RAS] (default 1)",
+        "--opening-over", type=piece_point_or_file, metavar="PIECE|X,Y,Z|FILE.mrk.json",
+        help="open the skull over a piece of the tumour, by its number (1, the default, is the largest), or over a point "
+        "inside the brain [mm, RAS]. A file of 3D Slicer may hold the point, or a trajectory that ends there",
     )  # fmt: skip
 
 
@@ -38,16 +42,21 @@ def point(text: str) -> Point:
     return x, y, z
 
 
-def piece_or_point(text: str) -> int | Point:
-    """A piece's number or X,Y,Z, for argparse."""
-    return int(text) if text.isdecimal() else point(text)
+def point_or_file(text: str) -> Point | Path:
+    """X,Y,Z or a file of markups, for argparse."""
+    return Path(text) if text.lower().endswith(".json") else point(text)
+
+
+def piece_point_or_file(text: str) -> int | Point | Path:
+    """A piece's number, X,Y,Z or a file of markups, for argparse."""
+    return int(text) if text.isdecimal() else point_or_file(text)
 
 
 def opening_words(args: argparse.Namespace) -> list[str]:
     """The options as words for another command."""
     given = {"--opening-at": args.opening_at, "--opening-over": args.opening_over}
     texts = {
-        name: str(value) if isinstance(value, int) else ",".join(map(repr, value))
+        name: ",".join(map(repr, value)) if isinstance(value, tuple) else str(value)
         for name, value in given.items()
         if value is not None
     }
@@ -56,9 +65,10 @@ def opening_words(args: argparse.Namespace) -> list[str]:
 
 def opened_over(args: argparse.Namespace) -> str:
     """What the skull is opened over, in words."""
-    if args.opening_at is not None:
-        return "the point given"
-    return f"piece {args.opening_over or 1}" if not isinstance(args.opening_over, tuple) else "the point given"
+    given = args.opening_over if args.opening_at is None else args.opening_at
+    if isinstance(given, Path):
+        return f"what {given} marks"
+    return "the point given" if isinstance(given, tuple) else f"piece {given or 1}"
 
 
 def opened(subject: Subject, args: argparse.Namespace) -> Subject:
@@ -67,8 +77,11 @@ def opened(subject: Subject, args: argparse.Namespace) -> Subject:
     Raises
     ------
     InputError
-        A piece that the tumour does not have; a point where nothing can be opened.
+        A piece that the tumour does not have; a point where nothing can be opened; a file that `read_markup` refuses,
+        or whose markup is of another kind.
     """
+    if isinstance(args.opening_at, Path):
+        return _marked(subject, read_markup(args.opening_at))
     if args.opening_at is not None:
         return replace(subject, site=opening_at(subject.cortex, 1e-3 * np.array(args.opening_at)))
     over, pieces = args.opening_over, subject.pieces
@@ -78,9 +91,41 @@ def opened(subject: Subject, args: argparse.Namespace) -> Subject:
         if not 1 <= over <= len(pieces):
             raise InputError(f"--opening-over {over}: the tumour has {len(pieces)} pieces: choose 1 to {len(pieces)}.")
         place = pieces[over - 1].centre
+    elif isinstance(over, Path):
+        markup = read_markup(over)
+        _demand_kind(markup, "--opening-over", Fiducial=1, Line=2)
+        place = max(markup.points, key=lambda end: _depth(subject, end))
     else:
         place = 1e-3 * np.array(over)
-    # Some voxels off the surface the field of a volume tells the side alone.
+    return replace(subject, site=opening_over(subject.cortex, place, _depth(subject, place)))
+
+
+def _depth(subject: Subject, place: np.ndarray) -> float:
+    """How deep [m] a place (3,) lies in the brain; negative outside."""
+    # Some voxels off the surface the field of a volume says no more than the side.
     apart = float(np.linalg.norm(subject.cortex - place, axis=1).min())
-    depth = -apart if subject.brain(place[None])[0] > 0.0 else apart
-    return replace(subject, site=opening_over(subject.cortex, place, depth))
+    return -apart if subject.brain(place[None])[0] > 0.0 else apart
+
+
+def _marked(subject: Subject, markup: Markup) -> Subject:
+    """The subject opened at a point, where a trajectory enters the brain, or within an outline."""
+    _demand_kind(markup, "--opening-at", Fiducial=1, Line=2, ClosedCurve=None)
+    if markup.kind == "ClosedCurve":
+        outline = markup.curve()
+        return replace(subject, outline=outline, site=opening_within(subject.cortex, outline))
+    ends = sorted(markup.points, key=lambda end: _depth(subject, end))
+    along = ends[0] + np.linspace(0.0, 1.0, ON_LINE)[:, None] * (ends[-1] - ends[0])
+    inside = np.flatnonzero(subject.brain(along) < 0.0)
+    entry = along[inside[0]] if len(inside) else ends[-1]
+    return replace(subject, site=opening_at(subject.cortex, entry))
+
+
+def _demand_kind(markup: Markup, option: str, **kinds: int | None) -> None:
+    """Refuse markups of other kinds, or with another number of points than is stated."""
+    if markup.kind in kinds and kinds[markup.kind] in (None, len(markup.points)):
+        return
+    words = {"Fiducial": "one point", "Line": "a line of two points", "ClosedCurve": "a closed curve"}
+    raise InputError(
+        f"{markup.path}: holds a {markup.kind} of {len(markup.points)} points; {option} takes "
+        f"{' or '.join(words[kind] for kind in kinds)}. Save that from 3D Slicer."
+    )

@@ -9,15 +9,19 @@ from ..errors import InputError
 from ..geometry.geodesic import distances
 from ..geometry.surface import vertex_normals
 from ..geometry.tetmesh import TetMesh
-from .placement import Placement
+from .placement import Placement, within_outline
 
 
-def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, settings: Placement) -> Anatomy:
+def bounded(
+    mesh: TetMesh, site: np.ndarray, craniotomy: float, settings: Placement, outline: np.ndarray | None = None
+) -> Anatomy:
     """The anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
 
     The stem is held: surface nodes within a share of the brain's height from the lowest one (least superior). The
     craniotomy is free: surface nodes within half of the diameter `craniotomy` [m] along the surface from the point
-    nearest to `site`. The skull covers the rest of the surface, and effects say what it does. Each of its nodes has its
+    nearest to `site`. An `outline` (n, 3) [m] frees those within it instead.
+
+    The skull covers the rest of the surface, and effects say what it does. Each of its nodes has its
     unit normal n_i, along the integral of grad N_i. A body of linear tetrahedra whose nodes do not move along theirs
     passes no volume through the skull (Engelman, Sani, Gresho 1982, Int. J. Numer. Methods Fluids 2:225-238).
 
@@ -32,16 +36,21 @@ def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, settings: Placem
     height = np.ptp(mesh.nodes[outer, 2])
     stem = np.zeros(len(mesh.nodes), bool)
     stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= settings.stem * height
-    opened = (distances(mesh.nodes, surface, site, 0.5 * craniotomy) <= 0.5 * craniotomy) & ~stem
+    said = f"a craniotomy of {craniotomy * 1e3:g} mm" if outline is None else "the outlined opening"
+    if outline is None:
+        opened = distances(mesh.nodes, surface, site, 0.5 * craniotomy) <= 0.5 * craniotomy
+    else:
+        opened = np.isin(np.arange(len(mesh.nodes)), outer) & within_outline(mesh.nodes, outline)
+    opened &= ~stem
     if opened.sum() < settings.fewest_open:
         raise InputError(
-            f"a craniotomy of {craniotomy * 1e3:g} mm holds {opened.sum()} mesh nodes, and {settings.fewest_open} are "
+            f"{said} holds {opened.sum()} mesh nodes, and {settings.fewest_open} are "
             "needed: ask for a larger one, or for more nodes."
         )
     rest = np.zeros(len(mesh.nodes), bool)
     rest[outer] = True
     rest &= ~stem & ~opened
     if not rest.any():
-        raise InputError(f"a craniotomy of {craniotomy * 1e3:g} mm leaves no skull: ask for a smaller one.")
+        raise InputError(f"{said} leaves no skull: ask for a smaller one.")
     normals = np.where(rest[:, None], vertex_normals(mesh.nodes, surface), 0.0)
     return Anatomy(mesh, np.repeat(stem[:, None], 3, axis=1), normals, opened)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, KDTree
 
 from ..errors import InputError
 
@@ -113,6 +113,43 @@ def opening_over(cortex: np.ndarray, point: np.ndarray, depth: float, settings: 
             f"{_box(cortex)}"
         )
     return _not_over_stem(cortex, site_over(cortex, point, settings), settings)
+
+
+def opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
+    """The reachable point (3,) [m] of `cortex` (n, 3) that is nearest to the middle of an opening's outline (m, 3).
+
+    Raises
+    ------
+    InputError
+        As `opening_at`; an outline that does not lie at the surface.
+    """
+    apart = float(KDTree(cortex).query(outline)[0].max())
+    if apart > settings.near:
+        raise InputError(
+            f"the opening's outline lies up to {apart * 1e3:.0f} mm from the cortex; {settings.near * 1e3:g} mm is "
+            f"the most. {_box(cortex)} See that its coordinates are those of the labels."
+        )
+    inside = cortex[within_outline(cortex, outline)]
+    return opening_at(cortex, inside.mean(axis=0) if len(inside) else outline.mean(axis=0), settings)
+
+
+def within_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
+    """(n,) bool: which points (n, 3) lie within a closed curve (m, 3), seen across the plane that fits it best.
+
+    Points farther from that plane than the curve is wide are not meant: they lie on the head's other side.
+    """
+    middle = outline.mean(axis=0)
+    axes = np.linalg.svd(outline - middle, full_matrices=False)[2]
+    corners, places = (outline - middle) @ axes[:2].T, (points - middle) @ axes.T
+    near = np.flatnonzero((np.abs(places) <= np.linalg.norm(corners, axis=1).max()).all(axis=1))
+    x, y = places[near, :1], places[near, 1:2]
+    (x0, y0), (x1, y1) = corners.T, np.roll(corners, -1, axis=0).T
+    crossed = (y0 > y) != (y1 > y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        beyond = x < x0 + (y - y0) * (x1 - x0) / (y1 - y0)
+    found = np.zeros(len(points), bool)
+    found[near] = (crossed & beyond).sum(axis=1) % 2 == 1
+    return found
 
 
 def _nearest_outer(points: np.ndarray, place: np.ndarray, cortex: np.ndarray, settings: Placement) -> np.ndarray:

@@ -13,7 +13,7 @@ from ..errors import InputError
 from .boundary_conditions import bounded
 from .intensity import Intensity
 from .mesher import Meshing, Solids, mesh_solids
-from .placement import Piece, Placement
+from .placement import Piece, Placement, within_outline
 from .signed_distance import Field
 
 FEWEST_NODES, MOST_NODES = 2_000, 250_000
@@ -76,6 +76,8 @@ class Subject:
         Sentences about what was changed in reading.
     pieces
         Of the tumour, the largest first.
+    outline
+        (n, 3) [m]: a closed curve round the opening, in place of a disc.
     """
 
     brain: Field
@@ -87,6 +89,7 @@ class Subject:
     intensity: Intensity | None = None
     notes: tuple[str, ...] = ()
     pieces: tuple[Piece, ...] = ()
+    outline: np.ndarray | None = None
 
 
 def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
@@ -103,14 +106,16 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
         subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening, subject.pieces
     )
     mesh = mesh_solids(solids, plan.nodes, plan.meshing)
-    return bounded(mesh, subject.site, plan.craniotomy, plan.placement)
+    return bounded(mesh, subject.site, plan.craniotomy, plan.placement, subject.outline)
 
 
 def opened_cortex(subject: Subject, craniotomy: float) -> np.ndarray:
-    """(n,) bool: which points of a subject's cortex lie under an opening of such a diameter [m].
+    """(n,) bool: which points of a subject's cortex lie under its outlined opening, or one of such a diameter [m].
 
     Distances are straight here. The mesh is opened by those along its surface, which are a little longer.
     """
+    if subject.outline is not None:
+        return within_outline(subject.cortex, subject.outline)
     return np.linalg.norm(subject.cortex - subject.site, axis=1) <= 0.5 * craniotomy
 
 

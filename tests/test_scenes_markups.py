@@ -1,0 +1,139 @@
+"""Where the skull is opened, as drawn in 3D Slicer: points, trajectories and outlines of `.mrk.json`."""
+
+import json
+
+import numpy as np
+import pytest
+from balls import ball
+
+from scenes.cli import main
+from sim.bodies.markups import read_markup
+from sim.bodies.meshfile import read_anatomy
+from sim.bodies.placement import within_outline
+from sim.errors import InputError
+
+RADIUS = 55.0  # [mm] of the brain of `ball`, round the origin
+
+
+def markup(path, points, kind="Fiducial", system="LPS", **more):
+    """A file as Slicer writes it, of points [mm, RAS]."""
+    signs = {"LPS": [-1.0, -1.0, 1.0], "RAS": [1.0, 1.0, 1.0], None: [-1.0, -1.0, 1.0]}.get(system, [1.0, 1.0, 1.0])
+    controls = [
+        {"id": str(n), "label": f"F-{n}", "position": (np.array(p) * signs).tolist(), "positionStatus": "defined"}
+        for n, p in enumerate(points, start=1)
+    ]
+    stated = {"type": kind, "coordinateSystem": system, "coordinateUnits": "mm", "controlPoints": controls, **more}
+    one = {key: value for key, value in stated.items() if value is not None}
+    path.write_text(json.dumps({"@schema": "https://.../markups-schema-v1.0.3.json#", "markups": [one]}))
+    return path
+
+
+def curve(count=9, wide=30.0, high=18.0, over=(0.0, 0.0, 1.0)):
+    """Points [mm] of an ellipse on the ball, `wide` and `high` its half axes, seen from `over`."""
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    across = np.stack([wide * np.cos(angle), high * np.sin(angle)], axis=1)
+    up = np.sqrt(RADIUS**2 - (across**2).sum(axis=1))
+    axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], over])
+    return np.column_stack([across, up]) @ axes
+
+
+@pytest.mark.parametrize("system", ["LPS", "RAS", None])
+def test_coordinates_are_of_the_system_that_is_stated_or_else_of_slicers(tmp_path, system):
+    found = read_markup(markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0], [1.0, 2.0, 3.0]], "Line", system))
+    np.testing.assert_allclose(found.points, [[0.01, 0.02, 0.03], [0.001, 0.002, 0.003]])
+
+
+def test_a_curve_is_smooth_through_its_points(tmp_path):
+    smooth = read_markup(markup(tmp_path / "c.mrk.json", curve(), "ClosedCurve")).curve()
+    np.testing.assert_allclose(1e3 * np.linalg.norm(smooth, axis=1), RADIUS, atol=0.15)
+    np.testing.assert_allclose((1e3 * smooth[:, 1] / 30.0) ** 2 + (1e3 * smooth[:, 0] / 18.0) ** 2, 1.0, atol=0.04)
+
+
+def test_what_lies_within_an_outline_is_on_its_side_of_the_head():
+    square = np.array([[-1.0, -1.0, 2.0], [1.0, -1.0, 2.1], [1.0, 1.0, 2.0], [-1.0, 1.0, 2.1]])
+    points = np.array([[0.0, 0.0, 2.0], [0.9, -0.9, 2.5], [1.1, 0.0, 2.0], [0.0, -1.2, 2.0], [0.0, 0.0, -2.0]])
+    assert within_outline(points, square).tolist() == [True, True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("more", "reason"),
+    [
+        ({"system": "IJK"}, "its coordinate system is 'IJK': LPS and RAS are known"),
+        ({"coordinateUnits": ["m", "m", "m"]}, "and mm are read"),
+        ({"points": [[0.0, np.nan, 0.0]]}, "coordinates are no numbers"),
+        ({"points": []}, "has 0 points that are placed"),
+        ({"controlPoints": 3}, "cannot be read as markups"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, more, reason):
+    points = more.pop("points", [[1.0, 2.0, 3.0]])
+    with pytest.raises(InputError, match=reason):
+        read_markup(markup(tmp_path / "p.mrk.json", points, **more))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("markups")
+    ball(folder)
+    return folder
+
+
+class TestOpenings:
+    def found(self, folder, capsys, option, *given):
+        file = markup(folder / "given.mrk.json", *given)
+        words = ["patient", str(folder / "labels.nii.gz"), "--brain", "1", "--tumour", "2", option, str(file)]
+        code = main([*words, "--out", str(folder / "p.vtu"), "--inspect", "--json"])
+        said = capsys.readouterr()
+        return np.array(json.loads(said.out)["opening"]) if code == 0 else said.err
+
+    def test_at_a_point_and_where_a_trajectory_enters(self, folder, capsys):
+        top = [0.0, 0.0, RADIUS]
+        np.testing.assert_allclose(self.found(folder, capsys, "--opening-at", [[0.0, 0.0, 60.0]]), top, atol=2.5)
+        # From far outside and off the middle: neither end is where it enters, whichever is drawn first.
+        entry = np.sqrt(RADIUS**2 - 24.0**2)
+        for ends in ([[24.0, 0.0, 95.0], [24.0, 0.0, 5.0]], [[24.0, 0.0, 5.0], [24.0, 0.0, 95.0]]):
+            found = self.found(folder, capsys, "--opening-at", ends, "Line")
+            np.testing.assert_allclose(found, [24.0, 0.0, entry], atol=2.5)
+        # Over its deeper end, the tumour's middle.
+        over = self.found(folder, capsys, "--opening-over", [[0.0, 30.0, 70.0], [0.0, 25.0, 25.0]], "Line")
+        np.testing.assert_allclose(over, RADIUS / np.sqrt(2.0) * np.array([0.0, 1.0, 1.0]), atol=3.5)
+
+    def test_what_lies_elsewhere_or_is_of_another_kind_is_refused(self, folder, capsys):
+        for option, points, kind, reason in (
+            ("--opening-at", [[0.0, 0.0, 90.0]], "Fiducial", "from the nearest cortex"),
+            (
+                "--opening-at",
+                [[0.0, 0.0, 55.0]] * 2,
+                "Fiducial",
+                "holds a Fiducial of 2 points; --opening-at takes one",
+            ),
+            ("--opening-at", curve(), "Curve", "holds a Curve of 9 points"),
+            ("--opening-over", curve(), "ClosedCurve", "--opening-over takes one point or a line of two points"),
+            ("--opening-at", curve()[:2], "ClosedCurve", "needs three points or more"),
+            ("--opening-at", curve() + [0.0, 0.0, 30.0], "ClosedCurve", "opening's outline lies up to 2"),
+        ):
+            assert reason in self.found(folder, capsys, option, points, kind)
+
+    def test_an_outline_is_the_opening_of_the_mesh(self, folder, capsys):
+        """An ellipse twice as wide as high: what is open lies within it, and all that lies well within is open."""
+        file = markup(folder / "outline.mrk.json", curve(), "ClosedCurve")
+        words = [
+            "anatomy",
+            "--labels",
+            str(folder / "labels.nii.gz"),
+            "--brain",
+            "1",
+            "--tumour",
+            "2",
+            "--nodes",
+            "2500",
+        ]
+        assert main([*words, "--opening-at", str(file), "--out", str(folder / "a.vtu"), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["opening"]["over"] == f"what {file} marks"
+        anatomy = read_anatomy(folder / "a.vtu")
+        outer = np.zeros(len(anatomy.mesh.nodes), bool)
+        outer[anatomy.mesh.surface] = True
+        x, y, z = 1e3 * anatomy.mesh.nodes.T
+        size = np.hypot(x / 18.0, y / 30.0)
+        assert size[anatomy.craniotomy].max() < 1.03 and z[anatomy.craniotomy].min() > 0.0
+        assert anatomy.craniotomy[outer & (size < 0.97) & (z > 0.0)].all() and anatomy.craniotomy.sum() > 20
