@@ -12,6 +12,8 @@ from .geometry.tetmesh import TetMesh, digest_of
 
 BRAIN_LABEL, TUMOUR_LABEL = 1, 2
 """Region labels that the project's own anatomies use."""
+PART_LABELS = {"oedema": 3, "ventricles": 4}
+"""Region labels of parts of the brain that have a stiffness of their own, where an anatomy tells them."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 import gzip
 import re
 import struct
+from dataclasses import replace
 
 import nibabel
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from sim.bodies.head_masks import Sources, head_masks
 from sim.bodies.label_map import read_labels
 from sim.bodies.label_volume import masked_subject, volume_subject
+from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.volume import read_volume
 from sim.bodies.voxels import Voxels
 from sim.errors import InputError
@@ -270,6 +272,31 @@ class TestSeveralFiles:
         ):
             with pytest.raises(InputError, match=reason):
                 head_masks(sources)
+
+
+def test_oedema_and_ventricles_become_regions(tmp_path):
+    """Of labels of one's own, and by their names where a convention knows them; as large as their labels."""
+    affine, places = grid()
+    labels = head(places)
+    rim = np.linalg.norm(places - TUMOUR, axis=-1)
+    labels[(rim > 12.0) & (rim < 24.0) & (labels == 1)] = 5
+    labels[np.linalg.norm(places - MIDDLE + [18.0, 0.0, 0.0], axis=-1) < 10.0] = 4
+    path = nifti(tmp_path / "a.nii", labels, affine)
+    sources = Sources(path, (1,), (3,), parts={"oedema": (5,), "ventricles": (4,)})
+    masks = head_masks(sources)
+    assert masks.brain.sum() == np.isin(labels, (1, 4, 5)).sum() and not masked_subject(masks).parts
+    subject = masked_subject(masks, regions=("oedema", "ventricles"))
+    mesh = make_anatomy(subject, MeshPlan(nodes=2500)).mesh
+    for region, label, off in ((2, 3, 0.1), (3, 5, 0.1), (4, 4, 0.25)):  # of the last, few tetrahedra
+        marked = (labels == label).sum() * (1e-3 * EDGE) ** 3
+        assert mesh.volumes[mesh.region == region].sum() == pytest.approx(marked, rel=off)
+    assert set(np.unique(mesh.region)) == {1, 2, 3, 4}
+    everywhere = make_anatomy(replace(subject, parts=((3, subject.brain),)), MeshPlan(nodes=2500)).mesh
+    assert ((everywhere.region == 2) == (mesh.region == 2)).all()  # a tumour stays one
+    with pytest.raises(InputError, match=r"marks no necrosis, so it is no region\. Choose from oedema, ventricles"):
+        masked_subject(masks, regions=("necrosis",))
+    with pytest.raises(InputError, match="labels 3 are named as brain and as tumour"):
+        head_masks(Sources(path, (1,), (3,), parts={"oedema": (3,)}))
 
 
 class TestConventions:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import PART_LABELS, TUMOUR_LABEL, Anatomy
 from sim.bodies.head_masks import head_masks
 from sim.bodies.intensity import sidecar, write_intensity
 from sim.bodies.label_volume import masked_subject
@@ -25,7 +25,7 @@ from sim.geometry.tetmesh import dihedral_angles
 from sim.runtime.timing import stage
 
 from .companion_files import demand_no_strangers
-from .label_options import add_label_arguments, sources_of
+from .label_options import add_label_arguments, regions_asked, sources_of
 from .outputs import add_force, claimed
 from .placement_options import add_opening_arguments, opened, opened_over, point
 
@@ -138,7 +138,7 @@ def _given(args: argparse.Namespace) -> dict[str, float | str]:
 
 def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
     if args.labels is None:
-        for name in ("brain", "tumour", "convention", "mask", "tumour_in", "t1"):
+        for name in ("brain", "tumour", "convention", "mask", "tumour_in", *PART_LABELS, "t1"):
             if getattr(args, name) is not None:
                 option = name.replace("_", "-")
                 raise InputError(
@@ -152,7 +152,7 @@ def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
     for name in PLACED:
         if getattr(args, name) is not None:
             raise InputError(f"--{name.replace('_', '-')} places the template's tumour: leave it out with --labels.")
-    return masked_subject(head_masks(sources_of(args)), args.t1)
+    return masked_subject(head_masks(sources_of(args)), args.t1, regions=regions_asked(args))
 
 
 def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost: list[bool]) -> dict[str, Any]:
@@ -169,6 +169,11 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost:
         "worst_dihedral_deg": round(float(dihedral_angles(mesh.nodes, mesh.tets).min()), 2),
         "brain_ml": round(float(mesh.volumes.sum()) * 1e6, 2),
         "tumour_ml": round(float(volume) * 1e6, 4),
+        "regions_ml": {
+            name: round(1e6 * float(mesh.volumes[mesh.region == label].sum()), 3)
+            for name, label in PART_LABELS.items()
+            if label in dict(subject.parts)
+        },
         "tumour_volume_error_percent": round(100.0 * float(volume / subject.tumour_volume - 1.0), 3),
         "surface_error_mean_mm": round(1e3 * float(np.average(error, weights=weight)), 3),
         "surface_error_p95_mm": round(1e3 * float(np.quantile(error, 0.95, weights=weight, method="inverted_cdf")), 3),
@@ -207,6 +212,7 @@ def _sentences(figures: dict) -> str:
         "{nodes} nodes, {tets} tetrahedra; worst dihedral angle {worst_dihedral_deg} deg",
         "brain {brain_ml} ml; surface off by {surface_error_mean_mm} mm mean, {surface_error_p95_mm} mm p95",
         "tumour {tumour_ml} ml ({tumour_volume_error_percent:+} % of the label's), {tumour_nodes} nodes",
+        *(f"{name} {volume:g} ml, region {PART_LABELS[name]}" for name, volume in figures["regions_ml"].items()),
         *_pieces(figures["tumour_pieces"], figures["opening"]["over"]),
         f"opening: {_said(figures['opening'])}",
         "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} sliding, {held_nodes} held",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sim.anatomy import PART_LABELS
 from sim.bodies.conventions import CONVENTIONS
 from sim.bodies.head_masks import Sources
 from sim.bodies.label_map import Label
@@ -32,6 +33,15 @@ def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None
     parser.add_argument(
         "--tumour-in", type=Path, metavar="FILE", help="the file in which the tumour is marked, on a grid of its own"
     )
+    for name, number in PART_LABELS.items():
+        parser.add_argument(
+            f"--{name}", type=labels, metavar="LABELS",
+            help=f"labels that are {name}: they count as brain, and become region {number} for a stiffness of its own",
+        )  # fmt: skip
+    parser.add_argument(
+        "--regions", type=lambda text: tuple(text.split(",")), default=(), metavar="NAMES",
+        help=f"parts that the convention marks and that become regions: {' or '.join(PART_LABELS)}, or both",
+    )  # fmt: skip
 
 
 def labels(text: str) -> tuple[Label, ...]:
@@ -44,7 +54,18 @@ def labels(text: str) -> tuple[Label, ...]:
 
 def sources_of(args: argparse.Namespace) -> Sources:
     """The files and labels that the options name."""
-    return Sources(args.labels, args.brain or (), args.tumour or (), args.convention, args.mask, args.tumour_in)
+    return Sources(
+        args.labels, args.brain or (), args.tumour or (), args.convention, args.mask, args.tumour_in, _parts(args)
+    )
+
+
+def regions_asked(args: argparse.Namespace) -> tuple[str, ...]:
+    """The parts of the brain that become regions of their own."""
+    return tuple(dict.fromkeys((*_parts(args), *args.regions)))
+
+
+def _parts(args: argparse.Namespace) -> dict[str, tuple[Label, ...]]:
+    return {name: getattr(args, name) for name in PART_LABELS if getattr(args, name) is not None}
 
 
 def label_words(args: argparse.Namespace) -> list[str]:
@@ -56,5 +77,7 @@ def label_words(args: argparse.Namespace) -> list[str]:
         "--convention": args.convention,
         "--mask": args.mask,
         "--tumour-in": args.tumour_in,
+        **{f"--{name}": ",".join(map(str, found)) for name, found in _parts(args).items()},
+        "--regions": ",".join(args.regions) or None,
     }
     return [f"{name}={value}" for name, value in given.items() if value is not None]

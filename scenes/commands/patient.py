@@ -20,7 +20,7 @@ from surrogate.data.disc_split import APART, FEWEST
 from surrogate.data.tool_loads import PRESETS
 
 from .devices_option import add_devices
-from .label_options import add_label_arguments, label_words, sources_of
+from .label_options import add_label_arguments, label_words, regions_asked, sources_of
 from .outputs import add_force, claimed
 from .placement_options import add_opening_arguments, opened, opening_words
 from .tissue_options import add_element_argument
@@ -131,7 +131,7 @@ def _inspect(args: argparse.Namespace) -> int:
     claimed(picture, ".png", "a picture of sulcus", args.force, [args.labels, args.mask, args.tumour_in, args.t1])
     plan = MeshPlan(args.nodes, 1e-3 * args.craniotomy)
     masks = head_masks(sources_of(args))
-    subject = opened(masked_subject(masks, args.t1), args)
+    subject = opened(masked_subject(masks, args.t1, regions=regions_asked(args)), args)
     found = inspected(masks, subject)
     write_png(picture, sheet(found, masks, subject, opened_cortex(subject, plan.craniotomy)))
     took = round(time.perf_counter() - began, 2)

@@ -28,8 +28,8 @@ def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     place.add_argument(
         "--opening-over", type=piece_point_or_file, metavar="PIECE|X,Y,Z|FILE.mrk.json",
-        help="open the skull over a piece of the tumour, by its number (1, the default, is the largest), or over a point "
-        "inside the brain [mm, RAS]. A file of 3D Slicer may hold the point, or a trajectory that ends there",
+        help="open the skull over a piece of the tumour, by its number (1, the default, is the largest), or over a "
+        "point inside the brain [mm, RAS]. A file of 3D Slicer may hold the point, or a trajectory that ends there",
     )  # fmt: skip
 
 

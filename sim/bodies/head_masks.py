@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -40,6 +40,8 @@ class Sources:
         A volume whose voxels other than 0 are brain, in place of `brain`.
     tumour_in
         A label map that the labels `tumour` are of, all of them if there are none.
+    parts
+        Labels of other tissues by name, `oedema` and `ventricles`, in place of the convention's; they count as brain.
     """
 
     labels: Path
@@ -48,6 +50,7 @@ class Sources:
     convention: str | None = None
     mask: Path | None = None
     tumour_in: Path | None = None
+    parts: Mapping[str, tuple[Label, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +101,11 @@ def head_masks(sources: Sources) -> HeadMasks:
     brain, tumour = _meant(whole, sources, convention)
     marked = {} if sources.mask else {"brain": whole.mask(brain)}
     marked |= {} if sources.tumour_in else {"tumour": whole.mask(tumour)}
-    marked |= {} if convention is None else _parts(whole, convention)
+    parts = {} if convention is None else _parts(whole, convention)
+    parts |= {name: whole.mask(labels) for name, labels in sources.parts.items()}
+    if not sources.mask:
+        marked["brain"] = np.logical_or.reduce([marked["brain"], *(parts[name] for name in sources.parts)])
+    marked |= parts
     others = _others(sources, tumour)
     if others:
         ours = {name: Mask(Path(sources.labels), mask, whole.affine) for name, mask in marked.items()}
@@ -151,8 +158,9 @@ def _meant(
 ) -> tuple[tuple[Label, ...], tuple[Label, ...]]:
     """The labels of brain and tumour: those given, or the convention's that are there."""
     brain, tumour = sources.brain, sources.tumour
+    parts = tuple(label for labels in sources.parts.values() for label in labels)
     if convention is not None:
-        own = brain + (() if sources.tumour_in else tumour)
+        own = brain + parts + (() if sources.tumour_in else tumour)
         demand_fits(sources.labels, convention, whole.labels, {value for _, value in whole.places(own)})
         _demand_sides(whole, convention)
         if not brain and not sources.mask:
@@ -160,7 +168,7 @@ def _meant(
         if not tumour and not sources.tumour_in:
             tumour = _there(convention.tumour, whole)
     if not sources.tumour_in:
-        _demand_apart(whole, brain, tumour)
+        _demand_apart(whole, brain + parts, tumour)
     return brain, tumour
 
 

@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
+from ..anatomy import PART_LABELS
 from ..errors import InputError
 from ..runtime.outside_files import path_of
 from .head_masks import HeadMasks, Sources, head_masks
@@ -63,19 +64,32 @@ def volume_subject(
     return masked_subject(head_masks(Sources(path_of(path), tuple(brain), tuple(tumour))), t1, settings)
 
 
-def masked_subject(masks: HeadMasks, t1: str | Path | None = None, settings: Labelling = Labelling()) -> Subject:
+def masked_subject(
+    masks: HeadMasks,
+    t1: str | Path | None = None,
+    settings: Labelling = Labelling(),
+    regions: Sequence[str] = (),
+) -> Subject:
     """The subject whose brain and tumour are masks of voxels.
 
     The solid is brain or tumour, its largest component, with holes filled; tumour components outside it are left out,
     and each such change is noted. The skull is opened over the largest of them. `t1` is a volume of intensities in the
-    same space.
+    same space. Parts of the brain named in `regions`, of `PART_LABELS`, become regions of their own.
 
     Raises
     ------
     InputError
-        A T1 that `read_intensity` refuses; a tumour outside the brain. What `settings` refuse: by default a brain of
-        less than 20 ml or more than 5,000 ml, and a tumour of fewer than 27 voxels.
+        A region that is not known, or not marked. A T1 that `read_intensity` refuses; a tumour outside the brain. What
+        `settings` refuse: by default a brain of less than 20 ml or more than 5,000 ml, and a tumour of fewer than 27
+        voxels.
     """
+    for name in regions:
+        if name not in PART_LABELS or name not in masks.parts:
+            known = [one for one in PART_LABELS if one in masks.parts]
+            raise InputError(
+                f"{masks.name}: marks no {name}, so it is no region. Choose from {', '.join(known) or 'none'}, or name "
+                "its labels."
+            )
     affine, voxel = masks.affine, abs(float(np.linalg.det(masks.affine[:3, :3])))
     notes = list(masks.notes)
     solid = _whole(masks.brain, masks.tumour, voxel, notes)
@@ -104,6 +118,7 @@ def masked_subject(masks: HeadMasks, t1: str | Path | None = None, settings: Lab
         intensity=None if t1 is None else read_intensity(t1),
         notes=tuple(notes),
         pieces=pieces,
+        parts=tuple((PART_LABELS[name], mask_field(masks.parts[name], affine, settings.blur)) for name in regions),
     )
 
 

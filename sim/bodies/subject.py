@@ -8,8 +8,9 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
-from ..anatomy import Anatomy
+from ..anatomy import BRAIN_LABEL, Anatomy
 from ..errors import InputError
+from ..geometry.tetmesh import TetMesh
 from .boundary_conditions import bounded
 from .intensity import Intensity
 from .mesher import Meshing, Solids, mesh_solids
@@ -76,6 +77,8 @@ class Subject:
         Sentences about what was changed in reading.
     pieces
         Of the tumour, the largest first.
+    parts
+        Region labels of parts of the brain, each with its field; of two that overlap the later counts.
     outline
         (n, 3) [m]: a closed curve round the opening, in place of a disc.
     """
@@ -89,6 +92,7 @@ class Subject:
     intensity: Intensity | None = None
     notes: tuple[str, ...] = ()
     pieces: tuple[Piece, ...] = ()
+    parts: tuple[tuple[int, Field], ...] = ()
     outline: np.ndarray | None = None
 
 
@@ -105,8 +109,16 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
     solids = Solids(
         subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening, subject.pieces
     )
-    mesh = mesh_solids(solids, plan.nodes, plan.meshing)
+    mesh = _with_parts(mesh_solids(solids, plan.nodes, plan.meshing), subject)
     return bounded(mesh, subject.site, plan.craniotomy, plan.placement, subject.outline)
+
+
+def _with_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
+    """The mesh with the regions of the subject's parts: tetrahedra of the brain whose middle lies in one."""
+    region, middles = mesh.region.copy(), mesh.nodes[mesh.tets].mean(axis=1)
+    for label, inside in subject.parts:
+        region[(mesh.region == BRAIN_LABEL) & (inside(middles) < 0.0)] = label
+    return TetMesh(mesh.nodes, mesh.tets, region) if subject.parts else mesh
 
 
 def opened_cortex(subject: Subject, craniotomy: float) -> np.ndarray:
