@@ -64,6 +64,7 @@ def test_a_users_volume_with_and_without_intensities(brain, capsys):
         (("--radius", "-3"), "radius of -3 mm"),
         (("--brain", "1"), "give --labels"),
         (("--t1", "x.nii"), "give --labels"),
+        (("--regions", "oedema"), "--regions belongs to a label volume"),
         (("--labels", "labels.nii.gz", "--brain", "1"), "at least one label of the tumour"),
         (("--labels", "labels.nii.gz", "--brain", "1", "--tumour", "5"), "has no label 5"),
         (("--labels", "labels.nii.gz", "--brain", "1", "--tumour", "2", "--radius", "5"), "leave it out"),

@@ -81,6 +81,8 @@ def test_what_looks_wrong_is_said(tmp_path, capsys):
     assert columns.min() < 0.35 * SIDE and rows.min() < 0.35 * SIDE and columns.max() < 0.6 * SIDE
     assert main(["patient", *map(str, words[:-2]), "--out", str(tmp_path / "p.vtu"), "--inspect"]) == 0
     text = capsys.readouterr().out
+    assert main(["patient", *map(str, words[:-2]), "--out", str(tmp_path / "p.txt"), "--inspect"]) == 2
+    assert ".vtu" in capsys.readouterr().err
     assert "stored LAS (mirrored, as many scanners do; left is where its affine says)" in text and "warnings:" in text
 
 

@@ -138,8 +138,8 @@ def _given(args: argparse.Namespace) -> dict[str, float | str]:
 
 def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
     if args.labels is None:
-        for name in ("brain", "tumour", "convention", "mask", "tumour_in", *PART_LABELS, "t1"):
-            if getattr(args, name) is not None:
+        for name in ("brain", "tumour", "convention", "mask", "tumour_in", *PART_LABELS, "regions", "t1"):
+            if getattr(args, name):
                 option = name.replace("_", "-")
                 raise InputError(
                     f"--{option} belongs to a label volume: give --labels FILE.nii.gz too, or leave it out."

@@ -70,6 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; an interrupted run goes on when the same command is given again."""
+    claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, [args.labels, args.mask, args.tumour_in, args.t1])
     if args.inspect:
         return _inspect(args)
     from sim.runtime.device import device_names
@@ -81,7 +82,6 @@ def run(args: argparse.Namespace) -> int:
 
     # Said now, not after minutes of meshing.
     data, model = args.out.with_suffix(".h5"), model_path(args.out)
-    claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, [args.labels, args.mask, args.tumour_in, args.t1])
     claimed(data, ".h5", "a data set of `sulcus simulate`", args.force)
     claimed(model, ".npz", "a model of `sulcus train`", args.force)
     device_names(args.device)
