@@ -1,0 +1,1 @@
+"""A body's displacement on a grid: within it, smoothly round it, and the other way."""

@@ -1,0 +1,46 @@
+"""What a body's field goes on to just outside its surface."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ..geometry.closest_point import closest
+from ..geometry.tetmesh import faces_once
+
+# Triangles, of which one is the closest, and points that are looked at together.
+NEAR, TOGETHER = 16, 4096
+
+
+def beyond_surface(nodes: np.ndarray, tets: np.ndarray, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Values (n, 3) at points (n, 3) [m] near the surface of tetrahedra (T, 4), from those at vertices (V, 3) of each.
+
+    A point has the value of the closest place of the surface, and goes on from there as the field does inside: by the
+    mean gradient of the tetrahedra round each vertex.
+    """
+    surface = faces_once(tets)
+    corners, slopes = nodes[surface], vertex_gradients(nodes, tets, values)
+    middles = KDTree(corners.mean(axis=1))
+    found = np.empty((len(points), 3))
+    for first in range(0, len(points), TOGETHER):
+        some = slice(first, first + TOGETHER)
+        near = middles.query(points[some], k=min(NEAR, len(surface)))[1].reshape(len(points[some]), -1)
+        place, which, weights = closest(points[some], corners[near])
+        vertices = surface[near[np.arange(len(near)), which]]
+        gradient = np.einsum("nc,ncij->nij", weights, slopes[vertices])
+        level = np.einsum("nc,nci->ni", weights, values[vertices])
+        found[some] = level + np.einsum("nij,nj->ni", gradient, points[some] - place)
+    return found
+
+
+def vertex_gradients(nodes: np.ndarray, tets: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Gradients (V, 3, 3) of values (V, 3): the mean of the tetrahedra round each vertex, by volume."""
+    corners, at = nodes[tets], values[tets]
+    edges = corners[:, 1:] - corners[:, :1]
+    gradients = np.linalg.solve(edges, at[:, 1:] - at[:, :1]).transpose(0, 2, 1)
+    volume = np.abs(np.linalg.det(edges))
+    total, size = np.zeros((len(nodes), 3, 3)), np.zeros(len(nodes))
+    for corner in tets.T:
+        np.add.at(total, corner, volume[:, None, None] * gradients)
+        np.add.at(size, corner, volume)
+    return total / np.where(size > 0.0, size, 1.0)[:, None, None]

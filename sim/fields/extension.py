@@ -1,0 +1,46 @@
+"""A field beyond where it is known: it goes on as at the nearest place where it is, and fades."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+# Times that what was filled in is smoothed: where two places are equally near, it would jump.
+SWEEPS = 6
+
+
+def extended(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:
+    """The field (3, I, J, K) with nodes that are not known (I, J, K) filled in; zero from `reach` [nodes] on.
+
+    They have the nearest known value, the less of it the farther away it is, and are smoothed. No value exceeds those
+    that are known.
+    """
+    away, nearest = ndimage.distance_transform_edt(~known, return_indices=True)
+    free = (away > 0.0) & (away < reach)
+    source = np.ravel_multi_index([part[free] for part in nearest], known.shape)
+    left = 1.0 - away[free] / reach
+    fade = (left * left * (3.0 - 2.0 * left)).astype(np.float32)
+    filled = np.where(known, field, np.float32(0.0))
+    for part in filled:
+        part[free] = fade * part.reshape(-1)[source]
+    smooth(filled, free, SWEEPS)
+    return filled
+
+
+def smooth(field: np.ndarray, free: np.ndarray, sweeps: int) -> None:
+    """Replace free nodes (I, J, K), but those at the edge, of a field (3, I, J, K) by the mean of their six neighbours.
+
+    It is done in place, so many times.
+    """
+    middle = slice(1, -1)
+    inner = free[1:-1, 1:-1, 1:-1]
+    total = np.empty(inner.shape, field.dtype)
+    for part in field:
+        for _ in range(sweeps):
+            np.add(part[:-2, middle, middle], part[2:, middle, middle], out=total)
+            total += part[middle, :-2, middle]
+            total += part[middle, 2:, middle]
+            total += part[middle, middle, :-2]
+            total += part[middle, middle, 2:]
+            total *= field.dtype.type(1.0 / 6.0)
+            np.copyto(part[middle, middle, middle], total, where=inner)

@@ -1,0 +1,45 @@
+"""Regular grids along the axes of the patient's space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Nodes at `origin` (3,) + `spacing` (i, j, k) [m], RAS, for i, j, k below `shape`."""
+
+    origin: np.ndarray
+    spacing: float
+    shape: tuple[int, int, int]
+
+    @property
+    def affine(self) -> np.ndarray:
+        """From indices to metres (4, 4)."""
+        affine = np.diag([self.spacing] * 3 + [1.0])
+        affine[:3, 3] = self.origin
+        return affine
+
+    def index(self, points: np.ndarray) -> np.ndarray:
+        """Indices (..., 3), not whole, of points (..., 3) [m]."""
+        return (points - self.origin) / self.spacing
+
+    def points(self, numbers: np.ndarray) -> np.ndarray:
+        """Places (n, 3) [m] of nodes by their numbers (n,) in the flat grid."""
+        return self.origin + self.spacing * np.stack(np.unravel_index(numbers, self.shape), axis=-1)
+
+    def read(self, field: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """A field (3, I, J, K) at points (n, 3) [m]: linear between nodes, and zero (n, 3) outside."""
+        index = self.index(points).T
+        return np.stack([ndimage.map_coordinates(part, index, order=1) for part in field], axis=-1)
+
+
+def grid_around(points: np.ndarray, spacing: float, margin: float) -> Grid:
+    """The grid of a spacing [m] that holds points (n, 3) [m], with a margin [m]; nodes lie at multiples of the spacing."""
+    low = np.floor((points.min(axis=0) - margin) / spacing)
+    high = np.ceil((points.max(axis=0) + margin) / spacing)
+    i, j, k = (high - low).astype(int) + 1
+    return Grid(spacing * low, spacing, (int(i), int(j), int(k)))

@@ -1,0 +1,50 @@
+"""The inverse of a field on a grid, where no tetrahedra say what it is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .grid import Grid
+
+# The inverse is found so exactly [m], in so many steps, none of them longer than so many nodes.
+EXACT, STEPS, LONGEST = 1e-6, 25, 2.0
+
+
+def inverted(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """Find d (n, 3) [m] with d = -forward(y + d) at points y (n, 3) [m], by Newton's method from a guess (n, 3).
+
+    The fixed point of that equation alone is no way to it: where tissue is sheared by more than 45 degrees, each step
+    leads farther away. Of a point that is not found, the best try comes back.
+    """
+    best, least = guess.copy(), np.full(len(points), np.inf)
+    trial, going, share = guess.copy(), np.arange(len(points)), np.ones(len(points))
+    step = np.zeros_like(guess)
+    for _ in range(STEPS):
+        at = points[going] + trial[going]
+        rest = trial[going] + grid.read(forward, at)
+        size = np.linalg.norm(rest, axis=1)
+        good = size < least[going]
+        best[going[good]], least[going[good]] = trial[going[good]], size[good]
+        share[going] = np.where(good, 1.0, 0.5 * share[going])  # half of a step that led away
+        fresh = going[good]
+        step[fresh] = _newton(grid, forward, points[fresh] + best[fresh], rest[good])
+        going = going[least[going] > EXACT]
+        if not len(going):
+            break
+        trial[going] = best[going] + share[going, None] * step[going]
+    return best
+
+
+def _newton(grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Newton's step (n, 3) [m] at places (n, 3) [m] that are off by `rest` (n, 3)."""
+    half = 0.25 * grid.spacing
+    columns = []
+    for axis in np.eye(3):
+        ahead, behind = (grid.read(forward, at + sign * half * axis) for sign in (1.0, -1.0))
+        columns.append((ahead - behind) / (2.0 * half) + axis)
+    matrix = np.stack(columns, axis=-1)
+    flat = np.abs(np.linalg.det(matrix)) < 1e-3
+    matrix[flat] = np.eye(3)
+    step = -np.linalg.solve(matrix, rest[..., None])[..., 0]
+    length = np.linalg.norm(step, axis=1, keepdims=True)
+    return step * np.minimum(1.0, LONGEST * grid.spacing / np.maximum(length, 1e-30))
