@@ -40,6 +40,7 @@ COMMANDS = {
     "validate": "look whether episodes are whole: their arrays, pictures, checksums and silhouettes",
     "markers": "write the pages to print: markers of tool and patient, and the board that calibrates cameras",
     "track": "follow the tool and the patient's reference through a film: poses, covariances, and where they are lost",
+    "warp": "write a deformed brain for 3D Slicer and ITK: fields, the patient's own images, meshes, points",
     "film": "film a scene as a real camera would, with printed targets in view, and write down what is true of it",
     "overlay": "draw where the tumour is into a film or what a camera sees, by the tracked reference and tool",
     "link": "send where the tumour is to 3D Slicer, PLUS and others by OpenIGTLink, live, by the poses that they send",
@@ -67,8 +68,8 @@ INNER = {"bench": tuple(BENCHES)}
 # More threads of a library's wait for one another: products here are small.
 MOST_THREADS = 4
 
-POINT = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+")
-"""A point whose first coordinate is negative, which argparse would take for an option."""
+POINT = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+(?:,[^,]+)?")
+"""A point, or a load there, whose first coordinate is negative: argparse would take it for an option."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -19,6 +19,7 @@ ORDER = (
     {"sim.errors", "sim.elements"},
     {"sim.arguments", "sim.skulls", "sim.tools", "sim.material", "sim.geometry"},
     {"sim.accuracy", "sim.loads", "sim.anatomy"},
+    {"sim.fields"},
     {"sim.runtime", "sim.effects", "sim.deformation"},
     {"sim.discretisation", "sim.terms.laws"},
     {"sim.terms", "sim.linalg", "sim.bodies", "sim.diagnostics"},
@@ -41,7 +42,7 @@ ORDER = (
     {"scenes.builtin", "scenes.play"},
     {"scenes.gym", "scenes.link"},
     {"scenes.bench", "scenes.episodes"},
-    {"scenes.report"},
+    {"scenes.report", "scenes.warp"},
     {"scenes.commands"},
 )
 """Folders from below, and the modules that lie beside them: each imports itself and what lies under it."""
@@ -64,7 +65,7 @@ OWNERS = {
     "fastcrc": {"scenes/link/frame.py"},
     "pyamg": {"sim/linalg/amg.py"},
     "PIL": {"ar/tracking/pages.py", "ar/tracking/pictures.py", "scenes/commands/inspection_sheet.py"},
-    "nibabel": {"sim/bodies/intensity.py", "sim/bodies/nifti.py"},
+    "nibabel": {"sim/bodies/intensity.py", "sim/bodies/nifti.py", "scenes/warp/images.py"},
 }
 """Libraries that nobody else imports."""
 JOBS = {

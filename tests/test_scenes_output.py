@@ -48,6 +48,7 @@ FOLDERS = {
     "report": (["report", "--data", "none.h5"], "index.html"),
     "render": (["render", "press", "--anatomy", "none.vtu"], None),
     "episodes": (["episodes", "none", "--count", "1"], None),
+    "warp": (["warp", "none.vtu", "--located", "none.vtu"], None),
 }
 ALL = {**WRITING, **{name: (words, "x") for name, (words, _) in FOLDERS.items()}}
 
@@ -134,6 +135,7 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
     write_table(tmp_path / "truth.csv", truth, place)
     write_rows(tmp_path / "rows.csv", [], [])
     write_registration(tmp_path / "registered.json", Registration(np.eye(4), np.eye(6), np.zeros(3), 1e-3, 6))
+    (tmp_path / "warp.json").write_text('{\n "format": "sulcus warp 1"\n}')
     (tmp_path / "text.txt").write_text("my own")
     expected = {
         "an anatomy of sulcus": "anatomy.vtu",
@@ -164,6 +166,7 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
         "what is true of a film of `sulcus film`": "truth.npz",
         "a table of `sulcus film`": "truth.csv",
         "a table of `sulcus overlay`": "rows.csv",
+        "figures of `sulcus warp`": "warp.json",
     }
     assert set(expected) == set(KINDS)
     for kind, name in expected.items():

@@ -220,6 +220,7 @@ KINDS: dict[str, Callable[[Path], bool]] = {
     "what is true of a film of `sulcus film`": lambda path: str(model_header(path)["format"]).startswith("sulcus film"),
     "a table of `sulcus film`": _begins(b"time_s,tumour_x_mm,"),
     "a table of `sulcus overlay`": _begins(b"time_s,state,tumour_x_mm,"),
+    "figures of `sulcus warp`": _begins(b'"format": "sulcus warp'),
     "a page of `sulcus markers`": _is_printed,
     "a list of `sulcus markers`": _begins(b'"format": "sulcus targets'),
 }

@@ -10,13 +10,15 @@ from ..geometry.tetmesh import faces_once
 
 # Triangles, of which one is the closest, and points that are looked at together.
 NEAR, TOGETHER = 16, 4096
+# Of the surface's value, by which a point outside may differ: what is at rest is left at rest.
+SHARE, TINY = 0.5, 1e-30
 
 
 def beyond_surface(nodes: np.ndarray, tets: np.ndarray, values: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Values (n, 3) at points (n, 3) [m] near the surface of tetrahedra (T, 4), from those at vertices (V, 3) of each.
 
     A point has the value of the closest place of the surface, and goes on from there as the field does inside: by the
-    mean gradient of the tetrahedra round each vertex.
+    mean gradient of the tetrahedra round each vertex, but at most by half of that value.
     """
     surface = faces_once(tets)
     corners, slopes = nodes[surface], vertex_gradients(nodes, tets, values)
@@ -29,7 +31,9 @@ def beyond_surface(nodes: np.ndarray, tets: np.ndarray, values: np.ndarray, poin
         vertices = surface[near[np.arange(len(near)), which]]
         gradient = np.einsum("nc,ncij->nij", weights, slopes[vertices])
         level = np.einsum("nc,nci->ni", weights, values[vertices])
-        found[some] = level + np.einsum("nij,nj->ni", gradient, points[some] - place)
+        change = np.einsum("nij,nj->ni", gradient, points[some] - place)
+        size, most = (np.linalg.norm(values, axis=1, keepdims=True) for values in (change, SHARE * level))
+        found[some] = level + change * np.minimum(1.0, most / np.maximum(size, TINY))
     return found
 
 

@@ -27,9 +27,7 @@ def jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
         cx, cy, cz = part[:, :-1, :-1, 1:] - here
         for diagonal in (ax, by, cz):
             diagonal += 1.0
-        found[first : first + TOGETHER] = (
-            ax * (by * cz - bz * cy) - ay * (bx * cz - bz * cx) + az * (bx * cy - by * cx)
-        )
+        found[first : first + TOGETHER] = ax * (by * cz - bz * cy) - ay * (bx * cz - bz * cx) + az * (bx * cy - by * cx)
     return found
 
 

@@ -38,7 +38,7 @@ class Grid:
 
 
 def grid_around(points: np.ndarray, spacing: float, margin: float) -> Grid:
-    """The grid of a spacing [m] that holds points (n, 3) [m], with a margin [m]; nodes lie at multiples of the spacing."""
+    """The grid of a spacing [m] round points (n, 3) [m], with a margin [m]; nodes lie at multiples of the spacing."""
     low = np.floor((points.min(axis=0) - margin) / spacing)
     high = np.ceil((points.max(axis=0) + margin) / spacing)
     i, j, k = (high - low).astype(int) + 1

@@ -91,7 +91,8 @@ def backward_on(grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np
     now, tets = body.mesh.nodes + displacement, body.mesh.tets
     field, inside = in_tetrahedra(grid, now, tets, -displacement)
     filled = extended(field, inside, reach_of(displacement) / grid.spacing)
-    numbers = np.flatnonzero(~inside & (np.abs(filled).max(axis=0) > STILL))
+    moving = np.maximum(np.abs(filled).max(axis=0), np.abs(forward).max(axis=0)) > STILL
+    numbers = np.flatnonzero(~inside & moving)
     flat = filled.reshape(3, -1)
     flat[:, numbers] = inverted(grid, forward, grid.points(numbers), flat[:, numbers].T.astype(np.float64)).T
     return filled, unfold(filled, inside, grid.spacing)

@@ -1,0 +1,218 @@
+"""`sulcus warp`: a deformed brain as fields, images, meshes and markups that other programs open."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.errors import InputError
+
+from .json_line import json_line
+from .outputs import add_force
+from .tissue_options import add_element_argument, add_tissue_arguments, tissue_asked
+
+if TYPE_CHECKING:
+    from ..play.deformers import Theatre
+    from ..script.scene import Scene
+    from ..warp.moment import Moment
+
+FINEST, COARSEST = 0.3, 5.0
+"""Spacings of a field [mm]."""
+ORDERS = ("linear", "cubic")
+# A push harder than this [N], or so far off the open cortex [mm], is a slip of the keyboard.
+HARDEST, FARTHEST = 20.0, 20.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        "anatomy", nargs="?", type=Path, metavar="PATIENT.vtu",
+        help="made by `sulcus anatomy` or `sulcus patient` (default: the template that ships)",
+    )  # fmt: skip
+    cause = parser.add_mutually_exclusive_group(required=True)
+    cause.add_argument("--scene", metavar="NAME", help="a moment of a scene, or of MY_SCENE.py, by finite elements")
+    cause.add_argument(
+        "--load", type=load, metavar="X,Y,Z,N",
+        help="a round tool that pushes inwards with N newton on the open cortex nearest to a place [mm, RAS]",
+    )  # fmt: skip
+    cause.add_argument(
+        "--located", type=Path, metavar="RESULT.vtu",
+        help="a result of `sulcus locate`, whose covariance gives the tumour's bound, or of `sulcus solve`",
+    )  # fmt: skip
+    parser.add_argument("--frame", type=int, metavar="K", help="which moment of --scene")
+    parser.add_argument(
+        "--sequence", type=int, metavar="EVERY",
+        help="also write the forward field of one frame in so many of the whole scene, for Slicer to play",
+    )  # fmt: skip
+    parser.add_argument(
+        "--image", type=Path, nargs="+", action="extend", default=[], metavar="T1.nii.gz",
+        help="images of the patient, in the space of the labels that the anatomy was made from",
+    )  # fmt: skip
+    parser.add_argument(
+        "--labels", type=Path, nargs="+", action="extend", default=[], metavar="LABELS.nii.gz",
+        help="label maps, likewise: no label is mixed with another",
+    )  # fmt: skip
+    parser.add_argument(
+        "--interpolation", choices=ORDERS, default=ORDERS[0], help="between voxels of images (default %(default)s)"
+    )
+    parser.add_argument(
+        "--spacing", type=float, default=1.0, metavar="MM", help="of the fields' nodes [mm] (default %(default)s)"
+    )
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for all that is written")
+    add_tissue_arguments(parser)
+    add_element_argument(parser)
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
+    add_force(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON line")
+
+
+def load(text: str) -> tuple[float, float, float, float]:
+    """X,Y,Z,N as four numbers, for argparse."""
+    try:
+        x, y, z, newton = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a place and a force such as -30,12.5,60,0.3") from None
+    return x, y, z, newton
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve, write, say. 1: the answer did not converge, or space folds; all is written nevertheless."""
+    from ..play.deformers import open_theatre
+    from ..warp.export import Asked, write_warp
+    from ..warp.images import read_picture
+    from ..warp.output_folder import claimed_warp
+
+    demand_options(args)
+    out = claimed_warp(args.out, args.force)
+    theatre = open_theatre(args.anatomy, None, args.device)
+    scene = None if args.located else scene_of(args, theatre)
+    pictures = [read_picture(path, theatre.anatomy, path in args.labels) for path in (*args.image, *args.labels)]
+    for picture in pictures:
+        for warning in picture.warnings:
+            print(f"{picture.path}: {warning}", file=sys.stderr)
+    moment, sequence = moments(args, theatre, scene)
+    report = write_warp(out, moment, pictures, Asked(1e-3 * args.spacing, args.interpolation), sequence)
+    print(json_line({**report, "out": str(out)}) if args.json else sentences(report, out))
+    wrong = "" if report["converged"] else "the answer did not converge"
+    if not min(report["least_jacobian"].values()) > 0.0:
+        wrong = "space folds, see README.txt"
+    if wrong:
+        print(f"sulcus warp: {wrong}: do not rely on what was written", file=sys.stderr)
+    return 1 if wrong else 0
+
+
+def demand_options(args: argparse.Namespace) -> None:
+    """Refuse options that do not go together, or are out of range.
+
+    Raises
+    ------
+    InputError
+        One that is missing, is no use, or has such a value; two images whose names would be one.
+    """
+    from ..warp.images import warped_name
+
+    if not FINEST <= args.spacing <= COARSEST:
+        raise InputError(f"--spacing {args.spacing:g}: give {FINEST:g} to {COARSEST:g} mm.")
+    if args.scene is None and (args.frame is not None or args.sequence is not None):
+        raise InputError("--frame and --sequence are of a --scene: give one, or leave them out.")
+    if args.scene is not None and args.frame is None:
+        raise InputError("--frame: say which moment of the scene, by its number; `sulcus demo` shows them.")
+    names = [warped_name(path) for path in (*args.image, *args.labels)]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two images would both become {name}. Rename one, or warp them one after the other.")
+
+
+def scene_of(args: argparse.Namespace, theatre: Theatre) -> Scene:
+    """The scene that is asked for; a load is one whose tool pushes all the time.
+
+    Raises
+    ------
+    InputError
+        A scene or a frame that there is not; a force that is no push, or too hard; a place that is not on the cortex.
+    """
+    from ..script.scene import find_scene
+
+    tissue = tissue_asked(args)
+    if args.load is not None:
+        return replace(pushing(theatre, args.load), name="load").made_of(tissue, args.element)
+    scene = find_scene(args.scene).made_of(tissue, args.element)
+    last = len(scene.times) - 1
+    if not 0 <= args.frame <= last:
+        raise InputError(f"--frame {args.frame}: {scene.name} has the frames 0 to {last}.")
+    if args.sequence is not None and not 1 <= args.sequence <= last:
+        raise InputError(f"--sequence {args.sequence}: give 1 to {last}, one frame in so many.")
+    return scene
+
+
+def pushing(theatre: Theatre, asked: tuple[float, float, float, float]) -> Scene:
+    """The scene of a round tool that pushes on the open cortex at X, Y, Z [mm, RAS] with so many newton.
+
+    Raises
+    ------
+    InputError
+        As `scene_of`.
+    """
+    from ..script.scene import find_scene
+    from ..script.tool_paths import Touch
+
+    *place, newton = asked
+    if not 0.0 < newton <= HARDEST:
+        raise InputError(f"--load: a force of {newton:g} N is no push on a brain; give 0 to {HARDEST:g} N.")
+    point, site = 1e-3 * np.array(place), theatre.site
+    nearest = site.nearest(point).point if np.isfinite(point).all() else np.full(3, np.inf)
+    apart = 1e3 * float(np.linalg.norm(nearest - point))
+    if not apart <= FARTHEST:
+        middle = ", ".join(f"{1e3 * value:.0f}" for value in site.origin)
+        raise InputError(
+            f"--load: the place is {apart:.0f} mm from the open cortex; {FARTHEST:g} mm is the most. The middle of the "
+            f"open cortex is at {middle} mm (RAS)."
+        )
+    arm = nearest - site.origin
+    touch = Touch(float(arm @ site.right), float(arm @ site.up), newton)
+    return replace(find_scene("press"), path=lambda time: touch, duration=1.0, frames_per_second=1.0)
+
+
+def moments(
+    args: argparse.Namespace, theatre: Theatre, scene: Scene | None
+) -> tuple[Moment, list[tuple[float, Moment]]]:
+    """The moment that is asked for, and those of a sequence with their times [s]; None as scene: of a file.
+
+    Raises
+    ------
+    InputError
+        As `read_moment`.
+    """
+    from tqdm import tqdm
+
+    from ..warp.moment import Played, read_moment
+
+    if scene is None:
+        return read_moment(args.located, theatre.anatomy), []
+    wanted = args.frame or 0
+    many = [] if args.sequence is None else list(range(0, len(scene.times), args.sequence))
+    frames = sorted({wanted, *many})
+    with tqdm(total=frames[-1] + 1, unit="frame", desc="finite elements", file=sys.stderr) as bar:
+        found = dict(zip(frames, Played(theatre, scene).moments(frames, bar.update), strict=True))
+    return found[wanted], [(float(scene.times[number]), found[number]) for number in many]
+
+
+def sentences(report: dict, out: Path) -> str:
+    """What is said of a warp, from its figures."""
+    error, bound = report["grid_error_mm"], report["bound_mm"]
+    lines = [
+        f"Moved by: {report['moved_by']}. The largest displacement is {report['largest_displacement_mm']:.2f} mm.",
+        f"On the grid the tumour is off the finite elements by at most {error['tumour_worst']:.3f} mm.",
+        f"How far the tumour may be off in the patient is not known: {report['bound_of']}."
+        if bound is None
+        else f"In the patient, with 95 %, no point of the tumour is off by more than {bound:.1f} mm.",
+    ]
+    for image in report["images"]:
+        lost = image["outside"] + image["gone"]
+        lines.append(f"{image['name']}: {image['moved']:,} voxels moved, {lost:,} are 0 as nothing is known of them.")
+    return "\n".join([*lines, f"Written to {out}; README.txt there says how to open it."])

@@ -1,0 +1,1 @@
+"""Deformed brains in the files of other programs: fields, images, meshes, markups, segmentations."""

@@ -1,0 +1,140 @@
+"""All files of a warp."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.anatomy import TUMOUR_LABEL
+from sim.errors import InputError
+from sim.fields.warp_fields import WarpFields, forward_on, landmark_errors, warp_fields, warp_grid
+
+from .images import Picture, Warped, write_field_nifti, write_warped
+from .markups import write_markups
+from .meshes import mesh_of, write_glb, write_stl, write_vtp
+from .moment import Moment
+from .nrrd_files import write_field_nrrd, write_field_sequence
+from .output_folder import FORMAT, LISTED, written_warp
+from .readme import page
+from .segmentation import write_segmentation
+
+LOOKS = {
+    "brain": (0.86, 0.72, 0.66, 0.35),
+    "cortex": (0.86, 0.60, 0.54, 1.0),
+    "tumour": (0.20, 0.94, 0.42, 1.0),
+}
+"""Surfaces, and their colours."""
+# A vertex that goes farther moves [m].
+MOVED = 1e-4
+# A sequence has nodes so far apart [m], and no more numbers than so many.
+SEQUENCE_SPACING, MOST_NUMBERS = 3e-3, 400_000_000
+
+
+@dataclass(frozen=True)
+class Asked:
+    """How fields and images are made: spacing of the fields [m], and the interpolation of images."""
+
+    spacing: float
+    order: str
+
+
+def write_warp(
+    folder: Path, moment: Moment, pictures: Sequence[Picture], asked: Asked, sequence: Sequence[tuple[float, Moment]]
+) -> dict[str, Any]:
+    """Write a moment as files of other programs, and moments of a `sequence` with their times [s]; return the figures.
+
+    Raises
+    ------
+    InputError
+        As `written_warp`; a sequence that is too long.
+    """
+    fields = warp_fields(moment.anatomy, moment.displacement, asked.spacing, moment.left)
+    with written_warp(folder) as place:
+        write_field_nifti(place / "field_resampling.nii.gz", fields.grid, fields.backward)
+        write_field_nrrd(place / "field_modeling.nrrd", fields.grid, fields.forward, "modeling")
+        if sequence:
+            _write_sequence(place / "field_sequence.seq.nrrd", sequence)
+        warped = [write_warped(place, picture, fields, asked.order) for picture in pictures]
+        _write_surfaces(place, moment)
+        _write_points(place, moment)
+        report = figures(moment, fields, warped, len(sequence))
+        trust = () if moment.converged else ("THE ANSWER DID NOT CONVERGE: do not rely on it.",)
+        (place / "README.txt").write_text(page(report, moment.words, trust, warped, True))
+        files = sorted(path.name for path in place.iterdir())
+        report = {"format": FORMAT, "files": files, **report}
+        (place / LISTED).write_text(json.dumps(report, indent=1) + "\n")
+    return report
+
+
+def _write_surfaces(place: Path, moment: Moment) -> None:
+    triangles = {
+        "brain": moment.left.mesh.surface,
+        "cortex": moment.left.open_surface,
+        "tumour": moment.left.tumour_surface,
+    }
+    nodes = moment.anatomy.mesh.nodes
+    meshes = [
+        mesh_of(name, which, nodes, moment.displacement, LOOKS[name]) for name, which in triangles.items() if len(which)
+    ]
+    for mesh in meshes:
+        write_vtp(place / f"{mesh.name}.vtp", mesh)
+        write_stl(place / f"{mesh.name}.stl", mesh)
+    write_glb(place / "deformed.glb", meshes)
+
+
+def _write_points(place: Path, moment: Moment) -> None:
+    landmarks = moment.landmarks()
+    if landmarks:
+        write_markups(place / "landmarks.mrk.json", "Fiducial", landmarks)
+    gap = moment.gap()
+    if gap is not None and moment.tip is not None:
+        write_markups(place / "tip_to_tumour.mrk.json", "Line", {"tip": moment.tip, "tumour": gap[0]})
+    tumour = moment.left.mesh.tets[moment.left.mesh.region == TUMOUR_LABEL]
+    if len(tumour):
+        write_segmentation(place / "tumour.seg.nrrd", moment.now, tumour, moment.bound)
+
+
+def _write_sequence(path: Path, sequence: Sequence[tuple[float, Moment]]) -> None:
+    anatomy = sequence[0][1].anatomy
+    moved = np.stack([moment.displacement for _, moment in sequence])
+    grid = warp_grid(anatomy, moved, SEQUENCE_SPACING)
+    if 3 * np.prod(grid.shape) * len(sequence) > MOST_NUMBERS:
+        raise InputError(f"--sequence: {len(sequence)} moments are too many. Give a larger step.")
+    fields = [forward_on(grid, moment.left, moment.displacement)[0] for _, moment in sequence]
+    write_field_sequence(path, grid, fields, [time for time, _ in sequence])
+
+
+def figures(moment: Moment, fields: WarpFields, warped: Sequence[Warped], frames: int) -> dict[str, Any]:
+    """What a warp says of itself: millimetres, shares, and counts of voxels."""
+    nodes, moved = moment.left.mesh.nodes, moment.displacement
+    used = np.unique(moment.left.mesh.tets)
+    error = 1e3 * landmark_errors(fields, nodes[used], moved[used])
+    moving = np.linalg.norm(moved[used], axis=1) > MOVED
+    tumour = np.isin(used, moment.left.tumour_nodes)
+    gap = moment.gap()
+    return {
+        "moved_by": moment.words,
+        "space": "RAS",
+        "converged": moment.converged,
+        "largest_displacement_mm": 1e3 * float(np.linalg.norm(moved, axis=1).max()),
+        "tip_to_tumour_mm": None if gap is None else 1e3 * gap[1],
+        "bound_mm": None if moment.bound is None else 1e3 * moment.bound,
+        "bound_of": moment.bound_words,
+        "spacing_mm": round(1e3 * fields.grid.spacing, 6),
+        "nodes": list(fields.grid.shape),
+        "reach_mm": 1e3 * fields.reach,
+        "least_jacobian": dict(zip(("modeling", "resampling", "tetrahedra"), fields.least, strict=True)),
+        "grid_error_mm": {
+            "median": float(np.median(error)),
+            "moved_p95": float(np.quantile(error[moving], 0.95)) if moving.any() else 0.0,
+            "worst": float(error.max()),
+            "tumour_worst": float(error[tumour].max(initial=0.0)),
+        },
+        "images": [vars(one) for one in warped],
+        "sequence_frames": frames,
+    }

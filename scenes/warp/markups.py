@@ -1,0 +1,46 @@
+"""Points and lines as 3D Slicer's markups: JSON in millimetres, LPS."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from .nrrd_files import LPS
+
+SCHEMA = (
+    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
+    "markups-schema-v1.0.3.json#"
+)
+
+
+def write_markups(path: Path, kind: str, points: Mapping[str, np.ndarray]) -> None:
+    """Write points (3,) [m, RAS] by their labels: as a `Fiducial` list, or two of them as a `Line`."""
+    controls = [
+        {
+            "id": str(number),
+            "label": label,
+            "position": [round(float(value), 6) + 0.0 for value in 1e3 * point * LPS],
+            "selected": True,
+            "locked": True,
+            "visibility": True,
+            "positionStatus": "defined",
+        }
+        for number, (label, point) in enumerate(points.items(), 1)
+    ]
+    markup: dict[str, object] = {
+        "type": kind,
+        "coordinateSystem": "LPS",
+        "coordinateUnits": "mm",
+        "locked": True,
+        "controlPoints": controls,
+    }
+    if kind == "Line":
+        first, second = points.values()
+        length = 1e3 * float(np.linalg.norm(second - first))
+        markup["measurements"] = [
+            {"name": "length", "enabled": True, "value": length, "units": "mm", "printFormat": "%-#4.4g%s"}
+        ]
+    path.write_text(json.dumps({"@schema": SCHEMA, "markups": [markup]}, indent=1) + "\n")

@@ -1,0 +1,155 @@
+"""The moment that is exported: how a body is displaced, by what, and how surely."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from sim.accuracy import TRAIN
+from sim.anatomy import Anatomy
+from sim.bodies.meshfile import read_mesh
+from sim.deformation import Deformation
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.geometry.closest_point import closest
+from sim.geometry.surface import encloses
+from sim.resected_fem import Operated
+
+from ..play.deformers import AtRest, Theatre
+from ..play.player import Player
+from ..play.reference import past_matters, truth_of
+from ..play.stage import Stage
+from ..script.scene import Scene
+
+# Of three normal components within a ball: 95 %.
+CHI = 7.815
+ENSEMBLE = "registration, segmentation, tissue and skull, as `sulcus uncertainty` has it"
+"""What the bound of a scene is of."""
+# Two meshes of one body have nodes so near [m].
+SAME = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A body that has been displaced.
+
+    Parameters
+    ----------
+    words
+        What moved it.
+    anatomy, left
+        The body, and what is left of it where some was cut.
+    displacement
+        (V, 3) [m].
+    converged
+        Whether the answer may be relied on.
+    bound, bound_words
+        With a probability of 95 % no point of the tumour's surface is farther off [m]; None: not known. What it is of.
+    tip
+        Of the tool (3,) [m]; None without one.
+    """
+
+    words: str
+    anatomy: Anatomy
+    left: Anatomy
+    displacement: np.ndarray
+    converged: bool = True
+    bound: float | None = None
+    bound_words: str = "nobody has said how far the tumour may be off"
+    tip: np.ndarray | None = None
+
+    @property
+    def now(self) -> np.ndarray:
+        """Where the vertices are (V, 3) [m]."""
+        return self.anatomy.mesh.nodes + self.displacement
+
+    def landmarks(self) -> Mapping[str, np.ndarray]:
+        """Points (3,) [m] by name: the middles of tumour and open cortex, in the scan and now, and the tool's tip."""
+        found = {}
+        surfaces = {"tumour": self.anatomy.tumour_nodes, "open cortex": np.unique(self.left.open_surface)}
+        for name, vertices in surfaces.items():
+            if len(vertices):
+                found[f"{name}, in the scan"] = self.anatomy.mesh.nodes[vertices].mean(axis=0)
+                found[f"{name}, now"] = self.now[vertices].mean(axis=0)
+        return found if self.tip is None else {**found, "tip": self.tip}
+
+    def gap(self) -> tuple[np.ndarray, float] | None:
+        """The tumour's point (3,) [m] nearest to the tip, and how far it is [m], 0 inside; None where there is none."""
+        triangles = self.left.tumour_surface
+        if self.tip is None or not len(triangles):
+            return None
+        corners = self.now[triangles]
+        point = closest(self.tip[None], corners).point[0]
+        return point, 0.0 if encloses(corners, self.tip) else float(np.linalg.norm(point - self.tip))
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """A scene on a theatre, and the finite elements that answer it."""
+
+    theatre: Theatre
+    scene: Scene
+    solved: dict[int, Deformation] = field(default_factory=dict)
+
+    def moments(self, frames: Sequence[int], progress: Callable[[int], object] = lambda more: None) -> list[Moment]:
+        """The moments of some frames, in rising order."""
+        fem = self.theatre.fem(self.scene, TRAIN, 1, live=True)
+        needed = range(frames[-1] + 1) if past_matters(fem) else frames
+        answers = truth_of(self.theatre, self.scene, [self._loads(number) for number in needed], progress, fem)
+        rows = {number: row for row, number in enumerate(needed)}
+        return [self._moment(number, answers.rows(np.array([rows[number]])), fem) for number in frames]
+
+    def steps(self, frames: Sequence[int]) -> int:
+        """How many frames at most are solved for those."""
+        return frames[-1] + 1
+
+    def _loads(self, number: int):
+        scene, time = self.scene, float(self.scene.times[number])
+        return scene.loads(self.theatre.site, scene.path(time), time)
+
+    def _moment(self, number: int, answer: Deformation, fem: Fem | Operated) -> Moment:
+        scene, site, time = self.scene, self.theatre.site, float(self.scene.times[number])
+        moved = answer.displacement[0]
+        # Nothing is located here, and no locator is asked for.
+        stage = Stage(replace(scene, sight=None), site)
+        player = Player(stage, AtRest(site.anatomy))
+        now = site.anatomy.mesh.nodes + moved
+        tip = None if scene.tool is None else player.tool(scene.tool, scene.path(time), now).tip
+        known = self.theatre.uncertainty(scene)
+        bound = None if known is None else known.at(time).prior
+        words = f"scene {scene.name}, frame {number}, {time:.2f} s, by finite elements: {answer.source}"
+        said = {} if bound is None else {"bound_words": ENSEMBLE}
+        left = stage.at(self._loads(number)).anatomy
+        return Moment(words, site.anatomy, left, moved, answer.outcome[0].good, bound, tip=tip, **said)
+
+
+def read_moment(path: Path, anatomy: Anatomy) -> Moment:
+    """The moment in a result of `sulcus locate` or `sulcus solve` for an anatomy.
+
+    Raises
+    ------
+    InputError
+        As `read_mesh`; a mesh without `displacement` (V, 3), or of another body.
+    """
+    file = read_mesh(path)
+    moved = file.point_data.get("displacement")
+    if moved is None or moved.shape != file.mesh.nodes.shape or not np.isfinite(moved).all():
+        raise InputError(
+            f"{path}: has no point data `displacement` (V, 3) of finite numbers. Give a result of `sulcus locate` or "
+            "`sulcus solve`."
+        )
+    mesh = anatomy.mesh
+    same = file.mesh.nodes.shape == mesh.nodes.shape and np.array_equal(file.mesh.tets, mesh.tets)
+    if not same or np.abs(file.mesh.nodes - mesh.nodes).max() > SAME:
+        raise InputError(f"{path}: is of another mesh than the anatomy. Give the anatomy that it was made with.")
+    words = f"displacement of {path.name}"
+    if "covariance" not in file.point_data:
+        return Moment(words, anatomy, anatomy, np.asarray(moved, np.float64))
+    xx, yy, zz, xy, yz, xz = np.asarray(file.point_data["covariance"])[np.unique(anatomy.tumour_surface)].T
+    matrices = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
+    bound = float(np.sqrt(CHI * np.linalg.eigvalsh(matrices)[:, -1].max()))
+    said = "what was seen of the cortex, as the covariance in the file says, at the tumour's worst vertex"
+    return Moment(words, anatomy, anatomy, np.asarray(moved, np.float64), True, bound, said)

@@ -1,0 +1,89 @@
+"""The page that lies beside a warp's files: what each is, how it is opened, and what it does not know."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from .images import Warped
+
+INTRODUCTION = """sulcus warp: a deformed brain, for other programs
+Research only. Not a medical device.
+
+What moved it: {words}
+The patient's space is RAS (right, anterior, superior), in which the anatomy was made.
+{trust}
+"""
+
+FILES = """
+FILES
+field_resampling.nii.gz  for images. At each place now, where that tissue was: NIfTI, 5-D, intent 1006, mm, RAS.
+field_modeling.nrrd      for points and meshes. At each place in the scan, where it is now: NRRD, mm, LPS.
+{sequence}{images}{surfaces}README.txt, warp.json      this page, and its figures for programs.
+
+HOW TO OPEN THEM
+3D Slicer  Drag the whole folder into the window. Add the two fields as transforms.
+           Images: put your MRI under field_resampling in the Data module; it bends as you look.
+           Points: put markups under field_modeling. Then harden the transform to keep what you see.
+           Slicer knows the space of each mesh and each point by what is written in it.
+ITK        field = sitk.ReadImage("field_resampling.nii.gz", sitk.sitkVectorFloat64)
+           now = sitk.Resample(mri, mri, sitk.DisplacementFieldTransform(field), sitk.sitkLinear, 0.0)
+ANTs       antsApplyTransforms -d 3 -i mri.nii.gz -r mri.nii.gz -t field_resampling.nii.gz -o now.nii.gz
+Others     VTP and STL are in millimetres, LPS: x to the patient's left, y to the back, z to the head.
+           deformed.glb is in metres: x to the patient's left, y to the head, z to the front.
+"""
+
+LIMITS = """
+WHAT IS NOT KNOWN
+Only the brain was computed. Skull, air and skin were not: there the fields are no prediction.
+Outside the brain they go on from its surface, and fade to zero within {reach:.0f} mm. So an image shows no tear
+there. Bone above an opening may seem to move: it does not.
+A voxel whose source lies outside the image, or in tissue that was cut away, is 0.
+{fold}
+Read between their nodes ({spacing:g} mm apart), the fields miss the finite elements' vertices by {median:.4f} mm in the
+median. They miss those that move by {moved:.3f} mm in 95 of 100, and the worst by {worst:.3f} mm. Of the tumour it
+is {tumour:.3f} mm.
+These are errors of the grid. How far the tumour may be off: {bound}
+"""
+
+
+def page(report: dict, words: str, trust: Sequence[str], images: Sequence[Warped], meshes: bool) -> str:
+    """The text of README.txt from the figures of a warp."""
+    sequence = (
+        "field_sequence.seq.nrrd  the same of many moments, which Slicer plays.\n" if report["sequence_frames"] else ""
+    )
+    lines = ""
+    for one in images:
+        lines += f"{one.name}\n    your image now, on its own grid: {one.moved:,} voxels moved.\n"
+        lines += f"    0 as their source lies outside: {one.outside:,}; as it was cut away: {one.gone:,}.\n"
+    surfaces = (
+        "brain, cortex, tumour    .vtp, .stl, and all together deformed.glb: the deformed surfaces.\n"
+        "*.mrk.json               points, and the line from the tip to the tumour where there is a tool.\n"
+        "tumour.seg.nrrd          the tumour, and if it is known the shell in which its surface may lie.\n"
+    )
+    error = report["grid_error_mm"]
+    limits = LIMITS.format(
+        reach=report["reach_mm"],
+        spacing=report["spacing_mm"],
+        fold=_folds(report),
+        median=error["median"],
+        moved=error["moved_p95"],
+        worst=error["worst"],
+        tumour=error["tumour_worst"],
+        bound=_bound(report),
+    )
+    start = INTRODUCTION.format(words=words, trust="\n".join(trust))
+    return start + FILES.format(sequence=sequence, images=lines, surfaces=surfaces if meshes else "") + limits
+
+
+def _folds(report: dict) -> str:
+    least = ", ".join(f"{value:.3f}" for value in report["least_jacobian"].values())
+    said = f"Least volume that is left, as a share (modeling, resampling, tetrahedra): {least}."
+    if min(report["least_jacobian"].values()) > 0.0:
+        return f"{said} All are above 0: nothing folds."
+    return f"{said} NOT ALL ARE ABOVE 0: SPACE FOLDS, and what lies there is not to be relied on."
+
+
+def _bound(report: dict) -> str:
+    if report["bound_mm"] is None:
+        return f"not known ({report['bound_of']})."
+    return f"with 95 %, no point of it by more than {report['bound_mm']:.1f} mm. Of: {report['bound_of']}."

@@ -1,0 +1,138 @@
+"""A displacement on a grid, both ways: exact in the body, whole at its surface, fading round it, nowhere folded."""
+
+import numpy as np
+import pytest
+
+from sim.fields.extension import extended
+from sim.fields.folds import jacobians, unfold
+from sim.fields.grid import Grid, grid_around
+from sim.fields.in_tetrahedra import in_tetrahedra
+from sim.fields.inversion import inverted
+from sim.fields.warp_fields import landmark_errors, warp_fields
+from sim.geometry.locate import locate
+
+
+def bump(nodes, depth=5e-3, width=14e-3):
+    """A push on the top, which dies away to the held sides: (V, 3) [m]."""
+    across = np.exp(-(np.linalg.norm(nodes[:, :2], axis=1) ** 2) / (2 * width**2))
+    fades = np.clip(1.0 - np.linalg.norm(nodes[:, :2], axis=1) / 25e-3, 0.0, 1.0) * np.clip(
+        1 + nodes[:, 2] / 42e-3, 0, 1
+    )
+    push = -depth * across * fades
+    return np.stack([-0.4 * push * nodes[:, 0] / width, 0.2 * push, push], axis=1)
+
+
+@pytest.fixture(scope="module")
+def moved(box):
+    return bump(box.mesh.nodes)
+
+
+@pytest.fixture(scope="module")
+def fields(box, moved):
+    return warp_fields(box, moved, 1e-3)
+
+
+def test_nodes_in_tetrahedra_have_what_the_vertices_say(box, moved):
+    grid = grid_around(box.mesh.nodes, 1.7e-3, 4e-3)
+    field, inside = in_tetrahedra(grid, box.mesh.nodes, box.mesh.tets, moved)
+    points = grid.points(np.arange(inside.size))
+    low, high = box.mesh.nodes.min(axis=0), box.mesh.nodes.max(axis=0)
+    assert np.array_equal(inside.ravel(), ((points > low - 1e-9) & (points < high + 1e-9)).all(axis=1))
+    some = np.flatnonzero(inside)[::37]
+    expected = locate(box.mesh, points[some]).read(moved[None])[0]
+    assert np.abs(field.reshape(3, -1)[:, some].T - expected).max() < 1e-8
+    assert not field[:, ~inside].any()
+
+
+def test_every_grid_node_on_a_shared_face_is_inside():
+    """A lattice whose nodes are the grid's: none falls between two tetrahedra."""
+    nodes = 1e-3 * np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4], [4, 4, 4]], float)
+    tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
+    grid = grid_around(nodes, 1e-3, 0.0)
+    inside = in_tetrahedra(grid, nodes, tets, nodes)[1]
+    points = 1e3 * grid.points(np.arange(inside.size))
+    x, y, z = points.T
+    first = x + y + z <= 4 + 1e-9
+    second = (x + y + z >= 4 - 1e-9) & (x - y + z <= 4 + 1e-9) & (x + y - z <= 4 + 1e-9) & (-x + y + z <= 4 + 1e-9)
+    assert np.array_equal(inside.ravel(), first | second)
+
+
+def test_the_backward_field_leads_each_vertex_back(box, moved, fields):
+    error = landmark_errors(fields, box.mesh.nodes, moved)
+    assert np.median(error) < 1e-6 and error.max() < 0.15e-3
+    inner = box.mesh.nodes[:, 2] < -12e-3
+    assert np.quantile(error, 0.98) < 0.05e-3 and error[inner].max() < 0.1e-3
+    forward = fields.grid.read(fields.forward, box.mesh.nodes)
+    assert np.abs(forward - moved).max() < 0.15e-3
+
+
+def test_nothing_folds_and_least_jacobians_are_those_of_the_fields(fields):
+    assert not fields.folds and min(fields.least) > 0.5
+    for field, least in ((fields.forward, fields.least[0]), (fields.backward, fields.least[1])):
+        gradient = np.stack(np.gradient(field.astype(float), fields.grid.spacing, axis=(1, 2, 3)), axis=-1)
+        between = np.linalg.det(np.moveaxis(gradient, 0, -2) + np.eye(3))
+        assert between.min() > least > 0.0
+
+
+def test_no_tear_at_skull_or_opening_and_zero_at_the_edge(box, fields):
+    """From node to node the field changes by no more than the tissue itself is strained."""
+    for field in (fields.forward, fields.backward):
+        steps = max(np.abs(np.diff(field, axis=axis)).max() for axis in (1, 2, 3))
+        assert steps < 0.9 * fields.grid.spacing
+        for axis in (1, 2, 3):
+            assert not np.take(field, [0, -1], axis=axis).any()
+    below = np.array([[x, y, -43.5e-3] for x in (-20e-3, 0.0, 20e-3) for y in (-20e-3, 0.0)])
+    assert np.abs(fields.grid.read(fields.forward, below)).max() < 1e-9  # a skull that holds is left where it is
+
+
+def test_just_outside_the_field_goes_on_as_inside(box, moved, fields):
+    top = np.array([[2e-3, 1e-3, 0.0], [-5e-3, 4e-3, 0.0], [8e-3, -3e-3, 0.0]])
+    inside, above = (fields.grid.read(fields.forward, top + [0, 0, z]) for z in (-1e-4, 1e-4))
+    assert np.abs(above - inside).max() < 1e-4
+
+
+def test_outside_the_two_fields_are_each_others_inverse(box, fields):
+    around = np.array([[x, y, z] for x in (-8e-3, 0.0, 7e-3) for y in (-4e-3, 5e-3) for z in (3e-3, 6e-3)])
+    back = around + fields.grid.read(fields.backward, around)
+    assert np.abs(back + fields.grid.read(fields.forward, back) - around).max() < 0.05e-3
+
+
+def test_a_shear_that_no_fixed_point_inverts_is_inverted():
+    """d = -u(y + d) alone moves away where tissue is sheared by more than 45 degrees."""
+    grid = Grid(np.zeros(3), 1e-3, (40, 40, 40))
+    z = np.indices(grid.shape)[2] * 1e-3
+    field = np.zeros((3, *grid.shape), np.float32)
+    field[0] = 4e-3 * np.sin(z / 2.5e-3)
+    points = 1e-3 * np.random.default_rng(0).uniform(8.0, 30.0, (200, 3))
+    found = inverted(grid, field, points, np.zeros_like(points))
+    assert np.abs(found + grid.read(field, points + found)).max() < 2e-6
+
+
+def test_folds_outside_are_smoothed_and_those_inside_are_reported():
+    rng = np.random.default_rng(1)
+    field = np.zeros((3, 20, 20, 20), np.float32)
+    field[:, 8:12, 8:12, 8:12] = rng.uniform(-1.5e-3, 1.5e-3, (3, 4, 4, 4))
+    assert jacobians(field, 1e-3).min() < 0.0
+    nothing = np.zeros(field.shape[1:], bool)
+    free, kept = field.copy(), field.copy()
+    assert unfold(free, nothing, 1e-3) > 0.0
+    assert unfold(kept, ~nothing, 1e-3) < 0.0 and np.array_equal(kept, field)
+
+
+def test_what_is_filled_in_is_no_larger_than_what_is_known():
+    known = np.zeros((24, 24, 24), bool)
+    known[10:14, 10:14, 10:14] = True
+    field = np.where(known, np.float32(2e-3), np.float32(0.0)) * np.ones((3, 1, 1, 1), np.float32)
+    filled = extended(field, known, 8.0)
+    assert np.array_equal(filled[:, known], field[:, known]) and filled.max() <= 2e-3 * (1 + 1e-6)
+    line = filled[0, 12, 12, 13:]
+    assert (np.diff(line) <= 0).all() and line[-1] == 0.0 and line[2] > 1e-3
+
+
+def test_tissue_that_was_cut_away_is_known_to_be_gone(box, moved):
+    cut = np.flatnonzero(box.mesh.region == 2)
+    found = warp_fields(box, moved, 2e-3, box.without(cut))
+    middle = box.mesh.nodes[box.mesh.tets[cut]].mean(axis=(0, 1))
+    place = tuple(np.rint(found.grid.index(middle)).astype(int))
+    assert found.gone[place] and not found.folds
+    assert not found.gone[tuple(np.rint(found.grid.index(middle + [0, 0, 14e-3])).astype(int))]
