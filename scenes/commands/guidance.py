@@ -82,10 +82,9 @@ next: print markers/markers.pdf at 100 %, measure its rulers, glue; then film th
   sulcus track film.mp4 --camera camera.yaml --frame patient --out tool.csv
 next: sulcus calibrate --pivot tool.csv, where the film shows the tool pivoting""",
     "warp": """examples:
-  sulcus warp patient.vtu --scene press --frame 60 --image t1.nii.gz --labels labels.nii.gz --out warp
-  sulcus warp patient.vtu --load=-30,12,60,0.3 --image t1.nii.gz --out warp
-  sulcus warp patient.vtu --located located.vtu --image t1.nii.gz t2.nii.gz --out warp
-next: read warp/README.txt; drag the folder into 3D Slicer""",
+  sulcus warp patient.vtu --scene press --frame 60 --image t1.nii.gz --out warp
+  sulcus warp patient.vtu --located located.vtu --image t1.nii.gz --out warp
+next: read warp/README.txt""",
     "film": """examples:
   sulcus film palpate --out film --path hand-held
   sulcus film palpate --out film --trouble reference:1-1.5 --trouble bright:2.5-2.8

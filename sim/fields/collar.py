@@ -17,8 +17,8 @@ SHARE, TINY = 0.5, 1e-30
 def beyond_surface(nodes: np.ndarray, tets: np.ndarray, values: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Values (n, 3) at points (n, 3) [m] near the surface of tetrahedra (T, 4), from those at vertices (V, 3) of each.
 
-    A point has the value of the closest place of the surface, and goes on from there as the field does inside: by the
-    mean gradient of the tetrahedra round each vertex, but at most by half of that value.
+    A point has the value of the closest place of the surface, and goes on from there as the field does inside. That is
+    by the mean gradient of the tetrahedra round each vertex, and at most by half of the value.
     """
     surface = faces_once(tets)
     corners, slopes = nodes[surface], vertex_gradients(nodes, tets, values)

@@ -16,9 +16,9 @@ def extended(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:
     that are known.
     """
     nearest = np.empty((3, *known.shape), np.int32)
-    away = np.asarray(ndimage.distance_transform_edt(~known, return_indices=True, indices=nearest))
+    away = np.asarray(ndimage.distance_transform_edt(~known, return_indices=True, indices=nearest), np.float64)
     free = (away > 0.0) & (away < reach)
-    source = np.ravel_multi_index(tuple(part[free] for part in nearest), known.shape)
+    source = np.ravel_multi_index(tuple(nearest[:, free]), known.shape)
     left = 1.0 - away[free] / reach
     fade = (left * left * (3.0 - 2.0 * left)).astype(np.float32)
     filled = np.where(known, field, np.float32(0.0))

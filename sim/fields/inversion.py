@@ -8,14 +8,34 @@ from .grid import Grid
 
 # The inverse is found so exactly [m], in so many steps, none of them longer than so many nodes.
 EXACT, STEPS, LONGEST = 1e-6, 25, 2.0
+# A fixed point whose steps do not get shorter by this factor is looked for by Newton's method.
+SHORTER = 0.6
 
 
 def inverted(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Find d (n, 3) [m] with d = -forward(y + d) at points y (n, 3) [m], by Newton's method from a guess (n, 3).
+    """Find d (n, 3) [m] with d = -forward(y + d) at points y (n, 3) [m], from a guess (n, 3).
 
-    The fixed point of that equation alone is no way to it: where tissue is sheared by more than 45 degrees, each step
-    leads farther away. Of a point that is not found, the best try comes back.
+    Most are found as the fixed point of that equation. It is no way to all: where tissue is sheared by more than 45
+    degrees, each step leads farther away. There Newton's method goes on.
     """
+    found, going, left = guess.copy(), np.arange(len(points)), []
+    last = np.full(len(points), np.inf)
+    for _ in range(STEPS):
+        new = -grid.read(forward, points[going] + found[going])
+        change = np.linalg.norm(new - found[going], axis=1)
+        nearer = change < SHORTER * last[going]
+        left.append(going[~nearer])
+        found[going[nearer]], last[going[nearer]] = new[nearer], change[nearer]
+        going = going[nearer & (change > EXACT)]
+        if not len(going):
+            break
+    hard = np.concatenate([*left, going])
+    found[hard] = by_newton(grid, forward, points[hard], guess[hard])
+    return found
+
+
+def by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """As `inverted`, by Newton's method; of a point that is not found, the best try comes back."""
     best, least = guess.copy(), np.full(len(points), np.inf)
     trial, going, share = guess.copy(), np.arange(len(points)), np.ones(len(points))
     step = np.zeros_like(guess)

@@ -19,7 +19,7 @@ from .inversion import inverted
 # Beyond the body the field fades to zero within so much [m], and so many times what the body moves by.
 LEAST_REACH, REACHES = 5e-3, 2.0
 # Nodes from there to the edge of the grid; what moves less [m] has no inverse to look for.
-EDGE, STILL = 2, 1e-6
+EDGE, STILL = 2, 1e-5
 
 
 @dataclass(frozen=True, eq=False)
