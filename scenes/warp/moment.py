@@ -58,7 +58,7 @@ class Moment:
     displacement: np.ndarray
     converged: bool = True
     bound: float | None = None
-    bound_words: str = "nobody has said how far the tumour may be off"
+    bound_words: str = "no uncertainty was solved for this"
     tip: np.ndarray | None = None
 
     @property

@@ -18,14 +18,15 @@ FILES = """
 FILES
 field_resampling.nii.gz  for images. At each place now, where that tissue was: NIfTI, 5-D, intent 1006, mm, RAS.
 field_modeling.nrrd      for points and meshes. At each place in the scan, where it is now: NRRD, mm, LPS.
-{sequence}{images}{surfaces}README.txt, warp.json      this page, and its figures for programs.
+{sequence}{images}{surfaces}README.txt, warp.json    this page, and its figures for programs.
 
 HOW TO OPEN THEM
 3D Slicer  Drag the whole folder into the window. Add the two fields as transforms.
            Images: put your MRI under field_resampling in the Data module; it bends as you look.
            Points: put markups under field_modeling. Then harden the transform to keep what you see.
            Slicer knows the space of each mesh and each point by what is written in it.
-ITK        field = sitk.ReadImage("field_resampling.nii.gz", sitk.sitkVectorFloat64)
+ITK        import SimpleITK as sitk
+           field = sitk.ReadImage("field_resampling.nii.gz", sitk.sitkVectorFloat64)
            now = sitk.Resample(mri, mri, sitk.DisplacementFieldTransform(field), sitk.sitkLinear, 0.0)
 ANTs       antsApplyTransforms -d 3 -i mri.nii.gz -r mri.nii.gz -t field_resampling.nii.gz -o now.nii.gz
 Others     VTP and STL are in millimetres, LPS: x to the patient's left, y to the back, z to the head.
