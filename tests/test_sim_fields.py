@@ -97,13 +97,15 @@ def test_outside_the_two_fields_are_each_others_inverse(box, fields):
     assert np.abs(back + fields.grid.read(fields.forward, back) - around).max() < 0.05e-3
 
 
-def test_a_shear_that_no_fixed_point_inverts_is_inverted():
-    """d = -u(y + d) alone moves away where tissue is sheared by more than 45 degrees."""
-    grid = Grid(np.zeros(3), 1e-3, (40, 40, 40))
-    x, _, z = np.indices(grid.shape) * 1e-3
+def test_a_twist_that_no_fixed_point_inverts_is_inverted():
+    """d = -u(y + d) alone moves away where tissue is turned, or sheared, by that much."""
+    grid = Grid(np.full(3, -20e-3), 1e-3, (41, 41, 41))
+    x, y, _ = np.indices(grid.shape) * 1e-3 - 20e-3
+    turn = 1.3 * np.exp(-(np.hypot(x, y) ** 2) / 7e-3**2)
     field = np.zeros((3, *grid.shape), np.float32)
-    field[0], field[2] = 4e-3 * np.sin(z / 3e-3), -4e-3 * np.sin(x / 3e-3)
-    points = 1e-3 * np.random.default_rng(0).uniform(8.0, 30.0, (200, 3))
+    field[0] = x * np.cos(turn) - y * np.sin(turn) - x
+    field[1] = x * np.sin(turn) + y * np.cos(turn) - y
+    points = 1e-3 * np.random.default_rng(0).uniform(-9.0, 9.0, (300, 3))
     found = inverted(grid, field, points, np.zeros_like(points))
     assert np.abs(found + grid.read(field, points + found)).max() < 2e-6
 
