@@ -69,7 +69,7 @@ class Moment:
     def landmarks(self) -> Mapping[str, np.ndarray]:
         """Points (3,) [m] by name: the middles of tumour and open cortex, in the scan and now, and the tool's tip."""
         found = {}
-        surfaces = {"tumour": self.anatomy.tumour_nodes, "open cortex": np.unique(self.left.open_surface)}
+        surfaces = {"tumour": self.left.tumour_nodes, "open cortex": np.unique(self.left.open_surface)}
         for name, vertices in surfaces.items():
             if len(vertices):
                 found[f"{name}, in the scan"] = self.anatomy.mesh.nodes[vertices].mean(axis=0)
