@@ -94,21 +94,25 @@ def tree_of(path):
     return ast.parse(path.read_text())
 
 
+@cache
+def nodes_of(path):
+    return tuple(ast.walk(tree_of(path)))
+
+
+@cache
 def imports(path, everywhere=True, types=True):
     """Absolute dotted names that a file imports.
 
     Only those that run with the module if not `everywhere`; none that only a type checker reads if not `types`.
     """
     package = name_of(path).removesuffix(".py").split("/")[:-1]
-    tree = tree_of(path)
-    left_out = (
-        set() if everywhere else {id(n) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)}
-    )
+    nodes = nodes_of(path)
+    left_out = set() if everywhere else {id(n) for f in nodes if isinstance(f, ast.FunctionDef) for n in ast.walk(f)}
     if not types:
-        typed = (f for f in ast.walk(tree) if isinstance(f, ast.If) and getattr(f.test, "id", "") == "TYPE_CHECKING")
+        typed = (f for f in nodes if isinstance(f, ast.If) and getattr(f.test, "id", "") == "TYPE_CHECKING")
         left_out |= {id(n) for f in typed for n in ast.walk(f)}
     found = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if id(node) in left_out:
             continue
         if isinstance(node, ast.Import):
@@ -117,7 +121,7 @@ def imports(path, everywhere=True, types=True):
             start = package[: len(package) - node.level + 1] if node.level else []
             base = ".".join([*start, *([node.module] if node.module else [])])
             found |= {f"{base}.{alias.name}" for alias in node.names}
-    return found
+    return frozenset(found)
 
 
 def libraries(path, everywhere=True):
@@ -292,11 +296,12 @@ def test_a_sentence_ends_where_it_ends():
 def test_names_have_the_words_of_the_field():
     """Of packages, tests and examples: what a model was trained on is not what it was taught."""
     ours = re.compile(r"(?:^|_)(?:(?:un)?taught|told|teach(?:er|es|ing)?)(?:_|$)", re.IGNORECASE)
+    search = cache(ours.search)
     assert ours.search("taught") and ours.search("FEWEST_TAUGHT") and ours.search("Told") and not ours.search("untold")
     for path in [*FILES, *(HOUSE / "tests").glob("*.py"), *(HOUSE / "examples").glob("*.py")]:
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             names = [getattr(node, kind, None) for kind in ("id", "name", "arg", "attr")]
-            found = [name for name in names if isinstance(name, str) and ours.search(name)]
+            found = [name for name in names if isinstance(name, str) and search(name)]
             assert not found, f"{name_of(path)}:{node.lineno}: {found[0]}"
 
 
@@ -305,7 +310,7 @@ def test_names_say_what_things_are():
     for path in FILES:
         imposed = {"options"} if name_of(path).startswith("scenes/gym/") else set()  # Gymnasium calls it so
         assert not vague.search(path.stem), name_of(path)
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.ClassDef):
                 assert not vague.search(node.name), f"{name_of(path)}: {node.name}"
             if isinstance(node, ast.arg) and node.arg in {"options", "opts", "config"} - imposed:
