@@ -39,7 +39,7 @@ def parts(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def locator(body, parts):
-    return make_locator(body, causes=FEW, device="cpu", folder=parts)
+    return make_locator(body, causes=FEW, device="cpu", folder=parts, count=240)
 
 
 @pytest.fixture(scope="module")

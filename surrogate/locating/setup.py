@@ -8,7 +8,7 @@ from pathlib import Path
 from sim.anatomy import Anatomy
 from sim.runtime.threads import one_thread
 
-from .calibration import trials
+from .calibration import TRIALS, trials
 from .causes import USUAL, Causes
 from .ensemble import solved
 from .locator import Locator
@@ -23,10 +23,11 @@ def make_locator(
     causes: Causes = USUAL,
     folder: Path | None = None,
     progress: Callable[[str, int, int], object] = lambda stage, done, total: None,
+    count: int = TRIALS,
 ) -> Locator:
     """A locator of one anatomy. Groups that a `folder` keeps from a run that was stopped are read.
 
-    `progress` hears a stage, how many of its parts are done, and of how many.
+    `progress` hears a stage, how many of its parts are done, and of how many. `count` trials calibrate it.
 
     Raises
     ------
@@ -37,5 +38,5 @@ def make_locator(
     progress("forces on the cortex", 0, 1)
     presses = pressed(anatomy, tuple(dict.fromkeys(PRESSED.values())), device)
     with one_thread():  # products are small
-        tried = trials(ensemble, presses, lambda done, total: progress("trials", done, total))
+        tried = trials(ensemble, presses, lambda done, total: progress("trials", done, total), count)
     return Locator(prior_of(ensemble, presses), tried)
