@@ -60,9 +60,10 @@ def outline_gap(
     return float(max(np.percentile(each, SHARE) for each in apart if len(each)))
 
 
-def of_ink(colour: np.ndarray, ink: Sequence[float]) -> np.ndarray:
-    """(H, W) bool: the pixels of a picture (H, W, 3) uint8 that have an ink's colour (3,) in 0 .. 255."""
-    return np.abs(colour.astype(int) - np.rint(ink).astype(int)).max(axis=2) <= SAME
+def of_ink(colour: np.ndarray, ink: Sequence[float], off: int = SAME) -> np.ndarray:
+    """(H, W) bool: the pixels of a picture (H, W, 3) uint8 with an ink's colour (3,) in 0 .. 255, `off` in each."""
+    low, high = (tuple(np.clip(np.rint(ink) + by, 0, 255).tolist()) for by in (-off, off))
+    return cv2.inRange(np.ascontiguousarray(colour), low, high) > 0
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:
@@ -83,7 +84,7 @@ def found_at(
     blank = np.zeros((above + below + 2, width + 2 * APART, 3), np.uint8)
     cv2.putText(blank, text, (APART, above + 1), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
     shape = (blank == ink).all(axis=2).astype(np.float32)
-    here = np.pad((colour == np.asarray(ink, np.uint8)).all(axis=2), APART).astype(np.float32)
+    here = np.pad(of_ink(colour, ink, 0), APART).astype(np.float32)
     if shape.shape[0] > here.shape[0] or shape.shape[1] > here.shape[1]:
         return None
     right = cv2.matchTemplate(here, shape, cv2.TM_CCORR)
@@ -114,7 +115,7 @@ def changed_share(before: np.ndarray, after: np.ndarray, where: np.ndarray) -> f
     NaN of fewer than `FEW` pixels.
     """
     inner = cv2.erode(where.astype(np.uint8), np.ones((2 * BESIDE + 1,) * 2, np.uint8), borderValue=0) > 0
-    return _share(np.abs(after.astype(int) - before).max(axis=2) > SAME, inner)
+    return _share(~of_ink(cv2.absdiff(before, after), (0, 0, 0)), inner)
 
 
 def _share(found: np.ndarray, where: np.ndarray) -> float:

@@ -54,16 +54,16 @@ def drawn(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, n
     by_row, by_column = (np.gradient(straight, axis=axis) for axis in (0, 1))
     ink, cover = np.zeros(straight.shape[:2]), np.zeros(straight.shape[:2])
     for shift in _shifts():
-        pixels = straight + shift[0] * by_column + shift[1] * by_row
-        nearest, grey = np.full(ink.shape, np.inf), np.full(ink.shape, np.nan)
+        nearest, grey = np.full(ink.shape, np.inf), np.zeros(ink.shape)
         for face, T, where in seen:
             part = tuple(slice(a.start - b.start, a.stop - b.start) for a, b in zip(where, box, strict=True))
-            rays = np.concatenate([pixels[part], np.ones((*pixels[part].shape[:2], 1))], axis=-1) @ inverse.T
+            pixels = straight[part] + shift[0] * by_column[part] + shift[1] * by_row[part]
+            rays = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=-1) @ inverse.T
             depth = (T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2])
             here = _grey(face, _printed(face), (rays * depth[..., None] - T[:3, 3]) @ T[:3, :2])
             front = ~np.isnan(here) & (depth > 0.0) & (depth < nearest[part])
             grey[part], nearest[part] = np.where(front, here, grey[part]), np.where(front, depth, nearest[part])
-        ink, cover = ink + np.nan_to_num(grey), cover + ~np.isnan(grey)
+        ink, cover = ink + grey, cover + (nearest < np.inf)
     behind = picture[box].astype(np.float64)
     share, ink = 1.0 - cover / SAMPLES**2, ink / SAMPLES**2
     if picture.ndim == 3:
@@ -108,5 +108,6 @@ def _grey(face: Face, printed: np.ndarray, on_face: np.ndarray) -> np.ndarray:
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=255.0,
     )
-    inside = ((on_face >= -BORDER) & (on_face <= face.size + BORDER)).all(axis=-1)
+    (x, y), (width, height) = np.moveaxis(on_face, -1, 0), face.size + BORDER
+    inside = (x >= -BORDER) & (x <= width) & (y >= -BORDER) & (y <= height)
     return np.where(inside, INK + (PAPER - INK) / 255.0 * paper, np.nan)

@@ -61,7 +61,7 @@ def truth_off(frame: Frame, mask: np.ndarray) -> float:
 
 def _above(frame: Frame) -> np.ndarray:
     """(H, W) bool: words and tools."""
-    return (frame.shown == np.asarray(WHITE, np.uint8)).all(axis=2) | (frame.picture.segmentation == TOOL)
+    return of_ink(frame.shown, WHITE, 0) | (frame.picture.segmentation == TOOL)
 
 
 def closed(frame: Frame) -> np.ndarray:

@@ -141,5 +141,5 @@ def _off(film: DrawnFilm, shot: Shot, colour: np.ndarray) -> float:
     camera, rest = film.calibration.camera(shot.T_camera_scan), film.stage.tumour_at_rest
     mask = silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
     tool = silhouette(camera, *film.mounts.tool.at(shot.T_scan_tool))
-    words = (colour == np.asarray(WHITE, np.uint8)).all(axis=2)
+    words = of_ink(colour, WHITE, 0)
     return outline_gap(colour, ink_of(TUMOUR_COLOUR), mask, tool | words, gap=HIDDEN[1] + SOFT)
