@@ -17,7 +17,7 @@ from ..model.learned import Learned
 from ..model.left_out import FEWEST_FOR_P999
 from .solve_counts import SolveCounts
 
-WARM_UP, TIMED = 20, 200
+WARM_UP, TIMED = 10, 100
 T = TypeVar("T")
 
 
