@@ -107,6 +107,12 @@ def box():
 
 
 @pytest.fixture(scope="session")
+def small_box():
+    """Half as large, for commands that solve for a body many times."""
+    return make_box((9, 9, 5), opening=20e-3, depth=18e-3)
+
+
+@pytest.fixture(scope="session")
 def pretender(box):
     return Pretender(box)
 

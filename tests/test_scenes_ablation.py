@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+from io import StringIO
 
 import cv2
 import numpy as np
@@ -26,8 +28,21 @@ def theatre(box):
 
 
 @pytest.fixture(scope="module")
+def small_theatre(small_box):
+    return theatre_of(small_box)
+
+
+@pytest.fixture(scope="module")
 def anatomy(theatre, tmp_path_factory):
     return str(put(theatre, tmp_path_factory.mktemp("ablation") / "box.vtu"))
+
+
+@pytest.fixture(scope="module")
+def printed(anatomy):
+    """What the command prints of one scene, and what it says beside it."""
+    with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as error:
+        assert main(["effects", "brain_shift", "--anatomy", anatomy, "--every", "60", "--device", "cpu", "--json"]) == 0
+    return out.getvalue(), error.getvalue()
 
 
 def test_a_scene_is_left_without_one_effect():
@@ -37,9 +52,9 @@ def test_a_scene_is_left_without_one_effect():
     assert without(cut, object()).surgery is None and without(cut, Held()).surgery is not None  # type: ignore
 
 
-def test_each_effect_has_its_row(theatre):
+def test_each_effect_has_its_row(small_theatre):
     both = replace(short(), effects=(*short().effects, Gravity()), lying=sinking().lying)
-    found = {row.effect: row for row in rows(theatre, both, 1)}
+    found = {row.effect: row for row in rows(small_theatre, both, 1)}
     assert list(found) == [ALL, "Elasticity", "Held", "Bonded", "ToolForce", "Gravity"]
     assert "nothing else resists" in found["Elasticity"].refused and found["Elasticity"].milliseconds is None
     assert "can move rigidly" in found["Held"].refused
@@ -52,10 +67,10 @@ def test_each_effect_has_its_row(theatre):
     assert whole.milliseconds > 0.0 and whole.held_mb > 0.1
 
 
-def test_bytes_are_the_same_in_every_run(theatre):
-    held = [run(replace(theatre, models={}), sinking(), 3).held for _ in range(3)]
+def test_bytes_are_the_same_in_every_run(small_theatre):
+    held = [run(replace(small_theatre, models={}), sinking(), 3).held for _ in range(3)]
     assert held[0] == held[1] == held[2] > 100_000
-    assert held[0] == pytest.approx(counted(theatre, sinking(), 3), rel=0.02)
+    assert held[0] == pytest.approx(counted(small_theatre, sinking(), 3), rel=0.02)
 
 
 def counted(theatre, scene, every):
@@ -69,10 +84,9 @@ def counted(theatre, scene, every):
     return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in new)
 
 
-def test_the_memory_that_is_printed_is_that_of_arrays(theatre, anatomy, capsys):
+def test_the_memory_that_is_printed_is_that_of_arrays(theatre, printed):
     """Of every row, in the table and in JSON, by bytes that are counted without `scenes.play.effect_ablation.rows`."""
-    assert main(["effects", "brain_shift", "--anatomy", anatomy, "--every", "60", "--device", "cpu", "--json"]) == 0
-    out, error = capsys.readouterr()
+    out, error = printed
     table = [[cell.strip() for cell in line.split("|")] for line in error.splitlines() if line.startswith("| ")]
     scene = find_scene("brain_shift")
     whole = counted(theatre, scene, 60)
@@ -85,12 +99,12 @@ def test_the_memory_that_is_printed_is_that_of_arrays(theatre, anatomy, capsys):
     assert {cells[name] for name, held in reported.items() if held is None} == {""}
 
 
-def test_the_change_is_that_between_the_answers(theatre):
+def test_the_change_is_that_between_the_answers(small_theatre):
     """By another way: an effect that does all that is done."""
     scene = sinking()
-    found = {row.effect: row for row in rows(theatre, scene, 2)}
-    alone = run(replace(theatre, models={}), scene, 2)
-    whole = alone.displacement[:, theatre.anatomy.tumour_nodes]
+    found = {row.effect: row for row in rows(small_theatre, scene, 2)}
+    alone = run(replace(small_theatre, models={}), scene, 2)
+    whole = alone.displacement[:, small_theatre.anatomy.tumour_nodes]
     largest = 1e3 * np.linalg.norm(whole, axis=2).mean(axis=1).max()
     assert found["Gravity"].tumour_mm == found[ALL].tumour_mm == pytest.approx(largest, rel=1e-6)
     assert found[ALL].held_mb == pytest.approx(1e-6 * alone.held, rel=0.01)
@@ -110,9 +124,8 @@ def test_bytes_are_those_of_arrays_that_live():
     assert new == [array] and array.capacity == 4_000_000 and len(view) == 500_000
 
 
-def test_the_command_tells_rows(theatre, anatomy, capsys):
-    assert main(["effects", "brain_shift", "--anatomy", anatomy, "--every", "60", "--device", "cpu", "--json"]) == 0
-    out, error = capsys.readouterr()
+def test_the_command_tells_rows(theatre, anatomy, printed, capsys):
+    out, error = printed
     reported = json.loads(out)
     asked = [type(effect).__name__ for effect in find_scene("brain_shift").effects_on(theatre.anatomy)]
     assert out.count("\n") == 1 and reported["scene"] == "brain_shift"

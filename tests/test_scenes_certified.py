@@ -18,8 +18,8 @@ from surrogate.evaluation.certificate import SCOPE
 
 
 @pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
+def theatre(small_box):
+    return theatre_of(small_box)
 
 
 @pytest.fixture(scope="module")

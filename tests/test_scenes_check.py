@@ -244,8 +244,13 @@ def test_nothing_but_idle_frames_prove_nothing(play, frames, truth):
 
 
 @pytest.fixture(scope="module")
-def anatomy(theatre, tmp_path_factory):
-    return put(theatre, tmp_path_factory.mktemp("check") / "box.vtu")
+def small_theatre(small_box):
+    return theatre_of(small_box)
+
+
+@pytest.fixture(scope="module")
+def anatomy(small_theatre, tmp_path_factory):
+    return put(small_theatre, tmp_path_factory.mktemp("check") / "box.vtu")
 
 
 class TestCommand:
@@ -271,10 +276,10 @@ class TestCommand:
         assert solver == "draw by finite elements (smoothed; neo-hookean, E 3 kPa, nu 0.49)"
         assert verdict.split()[:2] == ["draw", "passes"]
 
-    def test_a_wrong_model_fails_with_its_figures(self, theatre, anatomy, tmp_path, capsys):
-        linear = theatre.models["linear"]
+    def test_a_wrong_model_fails_with_its_figures(self, small_theatre, anatomy, tmp_path, capsys):
+        linear = small_theatre.models["linear"]
         parts = [replace(part, basis=replace(part.basis, modes=2 * part.basis.modes)) for part in linear.parts]
-        wrong = replace(theatre, models={"linear": replace(linear, parts=tuple(parts))})
+        wrong = replace(small_theatre, models={"linear": replace(linear, parts=tuple(parts))})
         off = put(wrong, tmp_path / "off.vtu")
         assert main(["check", "press", "--anatomy", str(off), "--every", "60", "--json"]) == 1
         report = json.loads(capsys.readouterr().out)

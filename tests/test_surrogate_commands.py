@@ -5,7 +5,6 @@ import json
 import h5py
 import numpy as np
 import pytest
-from conftest import make_box
 
 from scenes.cli import main
 from sim.bodies.meshfile import write_anatomy
@@ -15,22 +14,16 @@ from surrogate.training.train import LEARNERS
 
 
 @pytest.fixture(scope="module")
-def box():
-    """Half as large as the others': commands solve for it six times."""
-    return make_box((9, 9, 5), opening=20e-3, depth=18e-3)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory, box):
+def folder(tmp_path_factory, small_box):
     path = tmp_path_factory.mktemp("commands")
-    write_anatomy(path / "box.vtu", box)
+    write_anatomy(path / "box.vtu", small_box)
     assert main(["simulate", str(path / "box.vtu"), "--out", str(path / "data.h5"), "--count", "150"]) == 0
     return path
 
 
-def test_data_say_where_they_come_from(folder, box):
+def test_data_say_where_they_come_from(folder, small_box):
     data = read_dataset(folder / "data.h5")
-    assert data.good.all() and len(data.loads) == 150 and data.anatomy.digest == box.digest
+    assert data.good.all() and len(data.loads) == 150 and data.anatomy.digest == small_box.digest
     assert data.residual.max() <= 1e-4 and data.iterations.min() >= 1
     for name in (
         "anatomy",
@@ -47,22 +40,22 @@ def test_data_say_where_they_come_from(folder, box):
     assert "law='neo-hookean'" in data.provenance["effects"] and "0.0001" in data.provenance["accuracy"]
 
 
-def test_displacements_are_those_of_the_finite_elements(folder, box):
+def test_displacements_are_those_of_the_finite_elements(folder, small_box):
     from sim.effects import Elasticity, Held, ToolForce
     from sim.fem import Fem
 
     data = read_dataset(folder / "data.h5")
-    truth = Fem(box, (Elasticity(), Held(), ToolForce()), device="cpu").deform(data.loads.rows(np.arange(3)))
+    truth = Fem(small_box, (Elasticity(), Held(), ToolForce()), device="cpu").deform(data.loads.rows(np.arange(3)))
     stored = data.displacement(slice(None))[:3]
     assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
 
 
-def test_training_prints_every_figure_and_writes_every_model(folder, box, capsys, short_fits):
+def test_training_prints_every_figure_and_writes_every_model(folder, small_box, capsys, short_fits):
     out = folder / "model.npz"
     assert main(["train", str(folder / "data.h5"), "--out", str(out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     rows = {row["name"]: row for row in report["scores"]}
-    assert set(rows) == set(LEARNERS) == set(load(out, box))
+    assert set(rows) == set(LEARNERS) == set(load(out, small_box))
     figures = {f"{figure}_{unit}" for figure in ("mean", "p95", "max") for unit in ("mm", "percent")}
     for row in rows.values():
         assert figures | {"microseconds", "bound_mm"} <= set(row) and all(row[name] > 0 for name in figures)
@@ -147,7 +140,7 @@ def test_a_damaged_data_file_is_a_sentence(folder, tmp_path, capsys):
     assert "was changed" in capsys.readouterr().err
 
 
-def test_models_are_judged_by_loads_that_they_have_never_seen(folder, box, capsys):
+def test_models_are_judged_by_loads_that_they_have_never_seen(folder, small_box, capsys):
     data, model, fresh = (str(folder / name) for name in ("data.h5", "table.npz", "fresh.h5"))
     assert main(["train", data, "--out", model, "--learners", "linear", "--device", "cpu,cpu", "--json"]) == 0
     words = ["--count", "60", "--device", "cpu", "--json"]
@@ -156,8 +149,8 @@ def test_models_are_judged_by_loads_that_they_have_never_seen(folder, box, capsy
     assert main(["judge", model, fresh, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     answers = read_dataset(fresh)
-    guess = load(model, box)["linear"].deform(answers.loads, at=box.tumour_nodes)
-    miss = np.linalg.norm(guess.displacement - answers.displacement(box.tumour_nodes), axis=2)
+    guess = load(model, small_box)["linear"].deform(answers.loads, at=small_box.tumour_nodes)
+    miss = np.linalg.norm(guess.displacement - answers.displacement(small_box.tumour_nodes), axis=2)
     assert said["scores"][0]["mean_mm"] == pytest.approx(1e3 * miss.mean(), rel=1e-6)
     found = said["coverage"]["linear"]
     assert found["held"] == [np.mean(miss.max(axis=1) <= row) for row in guess.bound]
