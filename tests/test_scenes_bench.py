@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import make_box
+from theatres import coarse_brain
 
 from scenes.bench import stages, stopwatch
 from scenes.bench.elements import Press, Row, limits, rows
@@ -13,15 +14,13 @@ from scenes.bench.robustness import SETS, Record, Trial, records, shares, tallie
 from scenes.cli import main
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.refine import refined
-from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Tumour, template_subject
 from sim.deformation import Outcome
 from sim.effects import Elasticity, Held, Slide, ToolForce
 
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return make_anatomy(template_subject(Tumour()), MeshPlan(2000))
+    return coarse_brain()
 
 
 def test_medians_leave_the_warm_up_aside(monkeypatch):

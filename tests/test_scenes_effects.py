@@ -7,7 +7,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from theatres import player, short, sinking, small, template_theatre, theatre_of
+from theatres import coarse_brain, player, short, sinking, small, template_theatre, theatre_of
 from visitor import Visitor, free_port, wait_for
 
 from scenes.builtin.retract import RELAXING
@@ -25,8 +25,6 @@ from scenes.script.scene import Bounds, find_scene
 from scenes.script.site import HOLE
 from scenes.script.tool_paths import Touch
 from sim.accuracy import LIVE, TRAIN
-from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Tumour, template_subject
 from sim.deformation import guess
 from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.errors import InputError
@@ -253,13 +251,18 @@ class TestSwitches:
         assert demo.wish.off == {"ToolForce"}
 
 
+@pytest.fixture(scope="module")
+def coarse():
+    """The brain that ships, on fewer nodes."""
+    return Theatre(coarse_brain(), None, {}, "cpu")
+
+
 class TestBrainShift:
-    def test_the_brain_sinks_as_far_as_in_patients(self):
+    def test_the_brain_sinks_as_far_as_in_patients(self, coarse):
         """Cortex 6.1 +- 3.4 mm in 61 patients; 5.1, and the tumour 3.5, over 1,000 computed cases."""
-        anatomy, scene = make_anatomy(template_subject(Tumour()), MeshPlan(2000)), find_scene("brain_shift")
-        theatre = Theatre(anatomy, None, {}, "cpu")
+        theatre, anatomy, scene = coarse, coarse.anatomy, find_scene("brain_shift")
         fem, cortex = theatre.fem(scene, scene.accuracy), np.unique(anatomy.open_surface)
-        lying = {time: scene.loads(theatre.site, scene.path(time), time) for time in (0.0, 1.5, 3.0, 4.5, 6.0)}
+        lying = {time: scene.loads(theatre.site, scene.path(time), time) for time in (0.0, 1.5, 3.0, 6.0)}
         answer = fem.deform(stacked([lying[time] for time in (0.0, 1.5, 3.0)]))
         moved = 1e3 * np.linalg.norm(answer.displacement, axis=2)
         shift, tumour = moved[:, cortex].mean(axis=1), moved[:, anatomy.tumour_nodes].mean(axis=1)
@@ -267,7 +270,7 @@ class TestBrainShift:
         assert (np.diff(shift) > 0.3).all() and 5.0 < shift[2] < 8.0
         assert 1.2 < shift[2] / tumour[2] < 1.8
         # It sinks along gravity where it can, and turns with the head.
-        turned = fem.deform(lying[6.0], fem.deform(lying[4.5], answer.rows(np.array([2]))))
+        turned = fem.deform(lying[6.0], answer.rows(np.array([2])))
         way = [each.displacement[-1, cortex].mean(axis=0) for each in (answer, turned)]
         assert turned.outcome[0].good and way[0][1] < -0.8 * np.linalg.norm(way[0])
         assert way[1][0] < way[0][0] - 5e-4
@@ -281,11 +284,10 @@ class TestBrainShift:
         low = (drawn - true) @ site.axis
         assert (low[beyond < 0.0] == 0.0).all() and (low[beyond > 2e-3] > 5e-3).all() and (beyond > 2e-3).sum() > 20
 
-    def test_its_border_stays_hidden(self):
+    def test_its_border_stays_hidden(self, coarse):
         """The cortex that moves out from under the bone is drawn too: nothing is seen through the hole beside it."""
-        theatre, scene = template_theatre(), small("brain_shift")
-        playing = theatre.player("fem", scene)
+        playing = coarse.player("fem", small("brain_shift"))
         still, sunk = (playing.draw(0, time, Touch()) for time in (0.0, 3.0))
         seen = still.picture.segmentation == CORTEX
         inside = seen & ~(sunk.picture.segmentation == CORTEX)
-        assert seen.sum() > 5000 and inside.sum() < 0.015 * seen.sum()
+        assert seen.sum() > 5000 and inside.sum() < 0.005 * seen.sum()  # without what lies under the bone: 0.012

@@ -5,6 +5,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+from theatres import coarse_brain
 
 from scenes.bench.skull_models import rows
 from scenes.cli import main
@@ -26,10 +27,7 @@ from surrogate.training.expansion import Expansion
 @pytest.fixture(scope="module")
 def brain(tmp_path_factory):
     """A file and its anatomy."""
-    path, anatomy = (
-        tmp_path_factory.mktemp("skulls") / "brain.vtu",
-        make_anatomy(template_subject(Tumour()), MeshPlan(2000)),
-    )
+    path, anatomy = tmp_path_factory.mktemp("skulls") / "brain.vtu", coarse_brain()
     write_anatomy(path, anatomy)
     return str(path), anatomy
 

@@ -21,6 +21,8 @@ from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity, read_intensity, sidecar, write_intensity
 from sim.bodies.meshfile import read_anatomy, write_anatomy
+from sim.bodies.subject import MeshPlan, make_anatomy
+from sim.bodies.template import Tumour, template_subject
 from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.fem import Fem
 from surrogate.data.dataset import read_dataset
@@ -61,6 +63,19 @@ def theatre_of(anatomy: Anatomy) -> Theatre:
     affine = np.diag([2e-3, 2e-3, 2e-3, 1.0])
     affine[:3, 3] = anatomy.mesh.nodes.mean(axis=0) - [0.04, 0.04, 0.02]
     return Theatre(anatomy, Intensity(stripes.astype(np.uint8), affine), models, "cpu")
+
+
+@cache
+def coarse_brain() -> Anatomy:
+    """The brain that ships, on 2,000 nodes: meshed once a run."""
+    shared = os.environ.get("SULCUS_TESTS_SHARED")
+    kept = Path(shared or "", "coarse.vtu")
+    if shared and kept.is_file():
+        return read_anatomy(kept)
+    made = make_anatomy(template_subject(Tumour()), MeshPlan(2000))
+    if shared:
+        write_anatomy(kept, made)
+    return made
 
 
 @cache
