@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 import warp as wp
 from conftest import make_box
 
-from scenes.script.scene import SCENES, Scene, find_scene
+from scenes.script.scene import SCENES, find_scene
 from scenes.script.site import site_of
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
@@ -45,9 +46,11 @@ def sliding_box() -> Anatomy:
 BODY = sliding_box()
 
 
-def posed(scene: Scene) -> tuple[Anatomy, tuple[Effect, ...], Loads, Deformation]:
+@cache
+def posed(name: str) -> tuple[Anatomy, tuple[Effect, ...], Loads, Deformation]:
     """The body, what acts without mass, the load that stays, and what the body starts from, at rest."""
-    effects, time = scene.effects_on(BODY), TAKEN[scene.name]
+    scene, time = find_scene(name), TAKEN[name]
+    effects = scene.effects_on(BODY)
     site = site_of(BODY)
     loads = scene.loads(site, scene.path(time), time)
     body, start = BODY, guess(np.zeros((1, len(BODY.mesh.nodes), 3)))
@@ -95,8 +98,7 @@ def potential(fem: Fem, loads: Loads, answer: Deformation) -> float:
 @pytest.mark.parametrize(("step", "damping"), [(1e-3, 0.0), (1e-2, 0.0), (1e-2, 5.0)])
 @pytest.mark.parametrize("name", SCENES)
 def test_energy_does_not_grow(name: str, step: float, damping: float) -> None:
-    scene = find_scene(name)
-    body, effects, loads, answer = posed(scene)
+    body, effects, loads, answer = posed(name)
     fem = Fem(body, (*effects, Inertia(damping=damping)), TIGHT, "cpu", element="p1")
     mass, begun = lumped_mass(Inertia().density, fem.space), answer.time
     kinetic, stored = [], []
