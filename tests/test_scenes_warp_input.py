@@ -189,3 +189,24 @@ def test_a_folder_of_somebody_elses_is_left_alone(folder, capsys):
     assert not (mine.parent / "t1_deformed.nii.gz").exists()
     (folder / "file").write_text("my own")
     assert warp(folder, *located, out="file") == 2
+
+
+def test_other_formats_give_the_same_picture_as_nifti(folder, box, fields, tmp_path):
+    values = np.random.default_rng(2).integers(0, 200, (40, 40, 32)).astype(np.int16)
+    save(tmp_path / "a.nii.gz", values)
+    nibabel.save(nibabel.MGHImage(values, AFFINE), tmp_path / "b.mgz")
+    lps = np.diag([-1.0, -1.0, 1.0, 1.0]) @ AFFINE
+    header = {
+        "space": "left-posterior-superior", "space directions": lps[:3, :3].T, "space origin": lps[:3, 3],
+        "kinds": ["domain"] * 3,
+    }  # fmt: skip
+    nrrd.write(str(tmp_path / "c.nrrd"), values.astype(np.int64), header)
+    found = {}
+    for name in ("a.nii.gz", "b.mgz", "c.nrrd"):
+        warped = write_warped(tmp_path, read_picture(tmp_path / name, box, False), fields, "linear")
+        found[name] = nibabel.load(tmp_path / warped.name)
+        assert warped.name == f"{name[0]}_deformed.nii.gz" and warped.moved > 100
+    for image in found.values():
+        assert image.header["sform_code"] > 0
+        np.testing.assert_allclose(image.affine, AFFINE, atol=1e-5)
+        np.testing.assert_array_equal(image.get_fdata(), found["a.nii.gz"].get_fdata())

@@ -11,17 +11,18 @@ from nibabel.arrayproxy import ArrayProxy
 from scipy import ndimage
 
 from sim.anatomy import Anatomy
-from sim.bodies.nifti import Volume, read_volume
+from sim.bodies.volume import READERS, Volume, read_volume
 from sim.errors import InputError
 from sim.fields.grid import Grid
 from sim.fields.warp_fields import WarpFields
-from sim.runtime.outside_files import read_as
 
 from .nrrd_files import DIGITS
 
-SUFFIXES = (".nii.gz", ".nii")
+SUFFIXES = (".seg.nrrd", *READERS)
 ORDERS = {"nearest": 0, "linear": 1, "cubic": 3}
 """How values between voxels are had, and the degree of the spline."""
+WHOLE = np.uint8, np.int16, np.uint16, np.int32
+"""Types of whole numbers that every reader of NIfTI knows."""
 DISPLACEMENT = 1006
 """NIfTI's intent: vectors in millimetres, RAS."""
 # Less of the brain inside an image, or on voxels that are not empty, is worth a warning.
@@ -34,7 +35,7 @@ TOGETHER = 8
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """An image of a patient: its file, its stored values (I, J, K), and where they are; what seems wrong with it."""
+    """An image of a patient: its file, itself as NIfTI, its values (I, J, K) and their place; what seems wrong."""
 
     path: Path
     image: nibabel.Nifti1Image
@@ -62,9 +63,7 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool) -> Picture:
         As `read_volume`; an image that shows none of this brain; labels that are not whole numbers.
     """
     volume = read_volume(path, finite=False)
-    with read_as(path, "NIfTI", "Give one three-dimensional NIfTI volume (.nii or .nii.gz)."):
-        image = nibabel.load(path)
-    assert isinstance(image, nibabel.Nifti1Image)
+    image = _as_nifti(path, volume)
     values, shape = volume.values, np.array(volume.values.shape)
     if labels and not np.array_equal(values, np.rint(values)):
         raise InputError(f"{path}: holds values that are not whole, so it is no label map. Give it by --image.")
@@ -93,6 +92,20 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool) -> Picture:
     return Picture(path, image, volume, labels, tuple(warnings))
 
 
+def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
+    """The image as its NIfTI file has it; of another format, the same values in the same place, whole ones whole."""
+    image = nibabel.load(path) if path.name.lower().endswith((".nii", ".nii.gz")) else None
+    if isinstance(image, nibabel.Nifti1Image):
+        return image
+    values = np.nan_to_num(volume.values)
+    with np.errstate(invalid="ignore"):
+        whole = [kind for kind in WHOLE if np.array_equal(values, values.astype(kind))]
+    values = values.astype(whole[0] if whole else np.float32)
+    made = nibabel.Nifti1Image(values, volume.affine * [[1e3], [1e3], [1e3], [1.0]])
+    made.header.set_xyzt_units("mm")
+    return made
+
+
 def warped_name(path: Path) -> str:
     """The name of a warped image: that of its file, with `_deformed`."""
     ending = next((end for end in SUFFIXES if path.name.lower().endswith(end)), "")
@@ -107,10 +120,11 @@ def write_warped(folder: Path, picture: Picture, fields: WarpFields, order: str)
     """
     image, shape = picture.image, picture.volume.values.shape
     proxy = image.dataobj
-    assert isinstance(proxy, ArrayProxy)
-    stored = np.asanyarray(proxy.get_unscaled()).reshape(shape)
+    whole, slope, shift = np.asanyarray(proxy), 1.0, 0.0
+    if isinstance(proxy, ArrayProxy):
+        whole, slope, shift = np.asanyarray(proxy.get_unscaled()), float(proxy.slope), float(proxy.inter)
+    stored = whole.reshape(shape)
     values, counts = warped_values(stored, picture.volume.affine, fields, 0 if picture.labels else ORDERS[order])
-    slope, shift = float(proxy.slope), float(proxy.inter)
     blank = 0.0 if shift == 0.0 else -shift / slope
     if blank:
         values[counts.blank] = np.rint(blank) if values.dtype.kind in "iu" else blank
