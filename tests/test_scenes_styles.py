@@ -159,6 +159,15 @@ def test_the_same_frame_is_the_same_picture():
     assert np.abs(frame.shown.astype(int) - frame_of().shown).max() > 50
 
 
+def test_what_is_not_composed_is_the_picture_and_says_the_same():
+    frame, play = frame_of(), player((640, 360))
+    bare = replace(play, composed=False).draw(frame.number, frame.time, frame.touch)
+    np.testing.assert_array_equal(bare.shown, bare.picture.colour)
+    np.testing.assert_array_equal(bare.picture.colour, frame.picture.colour)
+    assert not np.array_equal(frame.shown, frame.picture.colour) and not bare.taken.any()
+    assert (bare.distance, bare.moved, bare.tumour_error) == (frame.distance, frame.moved, frame.tumour_error)
+
+
 def test_the_commands_name_all_styles(capsys):
     for command in ("render", "demo", "check", "collect"):
         with pytest.raises(SystemExit):
