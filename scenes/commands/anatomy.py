@@ -1,4 +1,4 @@
-"""`sulcus anatomy`: a tetrahedral brain with a tumour, from the template or from a label volume."""
+"""`sulcus anatomy`: a tetrahedral brain with a tumour, from a label volume or drawn in a healthy head."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from sim.bodies.mesher import lost_pieces, lost_words, surface_errors
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.placement import side_of
 from sim.bodies.subject import MeshPlan, Subject, make_anatomy
-from sim.bodies.template import SITES, Tumour, template_subject
 from sim.errors import InputError
 from sim.geometry.tetmesh import dihedral_angles
 from sim.runtime.timing import stage
 
 from .companion_files import demand_no_strangers
+from .drawn_options import add_drawn_arguments, demand_no_drawn, drawn, source
 from .label_options import add_label_arguments, regions_asked, sources_of
 from .outputs import add_force, claimed
-from .placement_options import add_opening_arguments, opened, opened_over, point
+from .placement_options import add_opening_arguments, opened, opened_over
 
 # Lengths in millimetres, as on the command line.
 DEFAULTS = {
@@ -47,7 +47,6 @@ PRESETS = {
 }
 NOTED = 3.0
 """Per cent of the tumour's volume: a mesh that misses more of it is noted."""
-PLACED = ("radius", "cover", "tumour_shape", "site", "tumour_at")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -68,22 +67,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_opening_arguments(parser)
     own = parser.add_argument_group("your own brain")
-    own.add_argument("--labels", type=Path, metavar="FILE.nii.gz", help="label volume; without it, the template")
+    own.add_argument("--labels", type=Path, metavar="FILE.nii.gz", help="label volume; without it, a tumour is drawn")
     add_label_arguments(own, "--convention")
     own.add_argument(
         "--t1", type=Path, metavar="FILE.nii.gz", help="intensities in the same space, for the camera view"
     )
-    placed = parser.add_argument_group("the template's tumour")
-    placed.add_argument(
-        "--radius", type=float, metavar="MM", help="radius [mm]; of a ball of equal volume if lobed (12)"
-    )
-    placed.add_argument("--cover", type=float, metavar="MM", help="depth of its cap under the cortex [mm] (10)")
-    placed.add_argument("--tumour-shape", choices=("sphere", "lobed"), help="its shape (default sphere)")
-    placed.add_argument("--site", choices=tuple(SITES), help="the cortex that it lies under (central)")
-    placed.add_argument(
-        "--tumour-at", type=point, metavar="X,Y,Z", help="its middle [mm, RAS], in place of --site and --cover"
-    )
-    placed.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random lobed shape (default 0)")
+    add_drawn_arguments(parser)
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as one line of JSON")
 
@@ -97,10 +86,10 @@ def run(args: argparse.Namespace) -> int:
     claimed(beside, ".gz", "a scan that sulcus put beside an anatomy", args.force, read)
     chosen = {**DEFAULTS, **PRESETS[args.preset], **_given(args)}
     plan = MeshPlan(args.nodes, 1e-3 * chosen["craniotomy"])
-    with stage("labels" if args.labels else "template"):
+    with stage("labels" if args.labels else "head" if args.mask or args.head else "template"):
         subject = opened(_subject(args, chosen), args)
     for note in subject.notes:
-        print(f"{args.labels}: {note}", file=sys.stderr)
+        print(f"{source(args)}: {note}", file=sys.stderr)
     print(f"sulcus anatomy: meshing with about {plan.nodes} nodes ...", file=sys.stderr)
     with stage("mesh"):
         anatomy = make_anatomy(subject, plan)
@@ -123,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
     if abs(missed) > NOTED:
         print(
             f"{args.out}: holds {abs(missed):.1f} % {'less' if missed < 0.0 else 'more'} tumour than "
-            f"{args.labels or 'the template'}: where that matters, ask for more nodes.",
+            f"{source(args)}: where that matters, ask for more nodes.",
             file=sys.stderr,
         )
     files = {"mesh": str(args.out), "t1": None if intensity is None else str(beside)}
@@ -138,20 +127,14 @@ def _given(args: argparse.Namespace) -> dict[str, float | str]:
 
 def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
     if args.labels is None:
-        for name in ("brain", "tumour", "convention", "mask", "tumour_in", *PART_LABELS, "regions", "t1"):
+        for name in ("brain", "tumour", "convention", "tumour_in", *PART_LABELS, "regions"):
             if getattr(args, name):
                 option = name.replace("_", "-")
                 raise InputError(
                     f"--{option} belongs to a label volume: give --labels FILE.nii.gz too, or leave it out."
                 )
-        if args.tumour_at is not None and (args.site is not None or args.cover is not None):
-            raise InputError("--tumour-at says where the tumour lies: leave out --site and --cover, or --tumour-at.")
-        middle = None if args.tumour_at is None else tuple(1e-3 * value for value in args.tumour_at)
-        lengths = 1e-3 * chosen["radius"], 1e-3 * chosen["cover"]
-        return template_subject(Tumour(*lengths, chosen["tumour_shape"], chosen["site"], args.seed, middle))
-    for name in PLACED:
-        if getattr(args, name) is not None:
-            raise InputError(f"--{name.replace('_', '-')} places the template's tumour: leave it out with --labels.")
+        return drawn(args, chosen)
+    demand_no_drawn(args)
     return masked_subject(head_masks(sources_of(args)), args.t1, regions=regions_asked(args))
 
 

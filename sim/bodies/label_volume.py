@@ -92,19 +92,7 @@ def masked_subject(
             )
     affine, voxel = masks.affine, abs(float(np.linalg.det(masks.affine[:3, :3])))
     notes = list(masks.notes)
-    solid = _whole(masks.brain, masks.tumour, voxel, notes)
-    smallest, largest = settings.smallest_brain, settings.largest_brain
-    if not smallest <= solid.sum() * voxel <= largest:
-        raise InputError(
-            f"{masks.name}: {masks.meant} make a brain of {solid.sum() * voxel * 1e6:.3g} ml; expected "
-            f"{smallest * 1e6:g} to {largest * 1e6:g} ml. Check the labels and the voxel size."
-        )
-    edge = max(on_border(solid), masks.cut)
-    if edge:
-        notes.append(
-            f"{edge} voxels of the brain lie on the volume's border: where it is cut there is no cortex, so see that "
-            "the craniotomy lies elsewhere"
-        )
+    solid = whole_brain(masks, notes, settings)
     inside = _inside(masks.name, solid, masks.tumour, voxel, notes, settings)
     cortex, interface = rim(solid, affine), rim(inside, affine)
     pieces = _pieces(inside, affine)
@@ -120,6 +108,31 @@ def masked_subject(
         pieces=pieces,
         parts=tuple((PART_LABELS[name], mask_field(masks.parts[name], affine, settings.blur)) for name in regions),
     )
+
+
+def whole_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelling()) -> np.ndarray:
+    """The voxels (I, J, K) bool of a head's brain and tumour in one piece without holes; what is changed is noted.
+
+    Raises
+    ------
+    InputError
+        A brain of a volume that `settings` refuse.
+    """
+    voxel = abs(float(np.linalg.det(masks.affine[:3, :3])))
+    solid = _whole(masks.brain, masks.tumour, voxel, notes)
+    smallest, largest = settings.smallest_brain, settings.largest_brain
+    if not smallest <= solid.sum() * voxel <= largest:
+        raise InputError(
+            f"{masks.name}: {masks.meant} make a brain of {solid.sum() * voxel * 1e6:.3g} ml; expected "
+            f"{smallest * 1e6:g} to {largest * 1e6:g} ml. Check the labels and the voxel size."
+        )
+    edge = max(on_border(solid), masks.cut)
+    if edge:
+        notes.append(
+            f"{edge} voxels of the brain lie on the volume's border: where it is cut there is no cortex, so see that "
+            "the craniotomy lies elsewhere"
+        )
+    return solid
 
 
 def _whole(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The built-in subject: the MNI152 brain of the nilearn wheel, scaled to a person's, with a tumour placed in it."""
+"""A tumour drawn in a healthy head, and the built-in one: the MNI152 brain of the nilearn wheel, of a person's size."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from .placement import Piece, site_over
 from .signed_distance import Field, mask_field
 from .subject import Subject, rim
 
+MIDDLE = (0.0, -17.4, 5.4)
+"""[mm] Middle of the template's box, from which the sites are seen."""
 SITES = {
     "frontal": (32.0, 42.0, 36.0),
     "central": (40.0, -14.0, 58.0),
@@ -22,7 +24,7 @@ SITES = {
     "temporal": (66.0, -22.0, 2.0),
     "occipital": (28.0, -92.0, 14.0),
 }
-"""Directions, from the brain's middle, of points on the right hemisphere's convexity: MNI152 coordinates [mm]."""
+"""Directions, from the template's middle, of points on the right hemisphere's convexity: MNI152 coordinates [mm]."""
 
 Shape = Literal["sphere", "lobed"]
 SMALLEST_RADIUS, LARGEST_RADIUS = 3e-3, 35e-3
@@ -130,6 +132,29 @@ class Tumour:
 
 
 @dataclass(frozen=True, eq=False)
+class Healthy:
+    """A head without a tumour.
+
+    Parameters
+    ----------
+    mask, affine
+        Voxels (I, J, K) bool of the brain, and (4, 4) from their indices to metres (RAS).
+    intensity
+        Grey values in the same space, if there are any.
+    middle
+        (3,) [m] from which the directions of `SITES` are taken; None for the middle of its own box.
+    notes
+        Sentences about what had to be assumed.
+    """
+
+    mask: np.ndarray
+    affine: np.ndarray
+    intensity: Intensity | None = None
+    middle: tuple[float, float, float] | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class Lobed:
     """A star-shaped solid: its radius in the unit direction n is scale * (1 + sum_k height_k exp(s (n . d_k - 1))).
 
@@ -162,10 +187,20 @@ def template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
     InputError
         A tumour that would reach out of the brain.
     """
-    grey, mask, affine = _scaled_template(head)
-    brain, cortex = mask_field(mask, affine), rim(mask, affine)
+    return drawn_subject(tumour, _scaled_template(head), head)
+
+
+def drawn_subject(tumour: Tumour, healthy: Healthy, head: Head = Head()) -> Subject:
+    """A healthy head with a tumour drawn in it. Of `head`, volume and threshold do not count here.
+
+    Raises
+    ------
+    InputError
+        A tumour that would reach out of the brain.
+    """
+    brain, cortex = mask_field(healthy.mask, healthy.affine), rim(healthy.mask, healthy.affine)
     if tumour.middle is None:
-        site, inward = _site(brain, cortex, tumour.site, head.smooth)
+        site, inward = _site(brain, cortex, healthy.middle, tumour.site, head.smooth)
         shape = _round(
             tumour, lambda unit, scale: site + (tumour.cover + scale * unit.radius(-inward[None])[0]) * inward
         )
@@ -180,11 +215,27 @@ def template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
         )
     volume = 4.0 / 3.0 * np.pi * tumour.radius**3
     pieces = (Piece(volume, shape.middle, interface),)
-    return Subject(brain, shape, cortex, interface, volume, site, Intensity(grey, affine), pieces=pieces)
+    return Subject(
+        brain, shape, cortex, interface, volume, site, healthy.intensity, notes=healthy.notes, pieces=pieces
+    )
 
 
-def _scaled_template(head: Head) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Grey values (I, J, K), the brain's mask, and their affine (4, 4) to metres."""
+def scaled(affine: np.ndarray, centre: np.ndarray, factor: float, place: np.ndarray) -> np.ndarray:
+    """An affine (4, 4) whose space is scaled by a factor about a `centre` (3,) that comes to lie at `place` (3,)."""
+    moved = affine.copy()
+    moved[:3, 3] -= centre
+    moved[:3] *= factor
+    moved[:3, 3] += place
+    return moved
+
+
+def size_of(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centroid (3,) and volume of the voxels `mask` (I, J, K), in the units of their affine (4, 4)."""
+    centre = affine[:3, :3] @ np.argwhere(mask).mean(axis=0) + affine[:3, 3]
+    return centre, float(mask.sum() * abs(np.linalg.det(affine[:3, :3])))
+
+
+def _scaled_template(head: Head) -> Healthy:
     from nilearn.datasets import load_mni152_template  # takes seconds; only where an anatomy is made
 
     image = load_mni152_template(resolution=1)
@@ -192,18 +243,17 @@ def _scaled_template(head: Head) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     component, _ = cast(tuple[np.ndarray, int], ndimage.label(grey > head.threshold * grey.max()))
     mask = cast(np.ndarray, ndimage.binary_fill_holes(component == np.bincount(component.ravel())[1:].argmax() + 1))
     affine = np.array(image.affine, np.float64)
-    centre = affine[:3, :3] @ np.argwhere(mask).mean(axis=0) + affine[:3, 3]
-    scale = (head.volume / (mask.sum() * abs(np.linalg.det(affine[:3, :3])))) ** (1.0 / 3.0)
-    affine[:3, 3] -= centre
-    affine[:3] *= scale
-    affine[:3, 3] += 1e-3 * centre
-    return grey, mask, affine
+    centre, volume = size_of(mask, affine)
+    affine = scaled(affine, centre, (head.volume / volume) ** (1.0 / 3.0), 1e-3 * centre)
+    return Healthy(mask, affine, Intensity(grey, affine))
 
 
-def _site(brain: Field, cortex: np.ndarray, name: str, smooth: float) -> tuple[np.ndarray, np.ndarray]:
+def _site(
+    brain: Field, cortex: np.ndarray, seen_from: tuple[float, float, float] | None, name: str, smooth: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Where (3,) [m] the ray from the brain's middle leaves it at a named site, and the inward normal (3,) there."""
     middle = 0.5 * (cortex.min(axis=0) + cortex.max(axis=0))
-    outward = 1e-3 * np.array(SITES[name]) - middle
+    outward = 1e-3 * np.array(SITES[name]) - (middle if seen_from is None else np.array(seen_from))
     outward /= np.linalg.norm(outward)
     along = np.arange(0.02, 0.15, 1e-5)
     site = middle + along[np.flatnonzero(brain(middle + along[:, None] * outward) < 0.0)[-1]] * outward

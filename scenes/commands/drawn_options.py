@@ -1,0 +1,78 @@
+"""A healthy head, and the tumour that is drawn in it, on the command line."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from sim.bodies.healthy_heads import fsaverage_head, masked_head
+from sim.bodies.subject import Subject
+from sim.bodies.template import SITES, Head, Tumour, drawn_subject, template_subject
+from sim.errors import InputError
+
+from .placement_options import point
+
+PLACED = ("radius", "cover", "tumour_shape", "site", "tumour_at", "head", "brain_ml")
+SMALLEST_ML, LARGEST_ML = 20.0, 5000.0
+
+
+def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare which healthy head is taken and where its tumour is drawn."""
+    drawn = parser.add_argument_group("a tumour drawn in a healthy head, without --labels")
+    drawn.add_argument(
+        "--head",
+        choices=("template", "fsaverage"),
+        help="whose: the ICBM template (default), or what fsaverage's inner skull holds, of the package mne. Or give "
+        "--mask, the brain of any healthy head, with --t1 if you like",
+    )
+    drawn.add_argument(
+        "--brain-ml", type=float, metavar="ML", help="volume that the brain is scaled to [ml] (1470; a --mask's own)"
+    )
+    drawn.add_argument(
+        "--radius", type=float, metavar="MM", help="radius [mm]; of a ball of equal volume if lobed (12)"
+    )
+    drawn.add_argument("--cover", type=float, metavar="MM", help="depth of its cap under the cortex [mm] (10)")
+    drawn.add_argument("--tumour-shape", choices=("sphere", "lobed"), help="its shape (default sphere)")
+    drawn.add_argument("--site", choices=tuple(SITES), help="the cortex that it lies under (central)")
+    drawn.add_argument(
+        "--tumour-at", type=point, metavar="X,Y,Z", help="its middle [mm, RAS], in place of --site and --cover"
+    )
+    drawn.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random lobed shape (default 0)")
+
+
+def source(args: argparse.Namespace) -> str:
+    """What the brain is made from, in words."""
+    return str(args.labels or args.mask or (args.head if args.head == "fsaverage" else "the template"))
+
+
+def demand_no_drawn(args: argparse.Namespace) -> None:
+    """Refuse options of a drawn tumour beside a label volume, with an `InputError`."""
+    for name in PLACED:
+        if getattr(args, name) is not None:
+            raise InputError(f"--{name.replace('_', '-')} draws in a healthy head: leave it out with --labels.")
+
+
+def drawn(args: argparse.Namespace, chosen: dict[str, Any]) -> Subject:
+    """The subject that the options draw; `chosen` has lengths [mm], shape and site after presets and defaults.
+
+    Raises
+    ------
+    InputError
+        Options that contradict each other, a volume out of bounds; what the head and the tumour refuse.
+    """
+    if args.t1 is not None and args.mask is None:
+        raise InputError("--t1 colours your own brain: give --labels or --mask too, or leave it out.")
+    if args.mask is not None and args.head is not None:
+        raise InputError(f"--mask says whose brain it is, and --head {args.head} does: leave one of them out.")
+    if args.brain_ml is not None and not SMALLEST_ML <= args.brain_ml <= LARGEST_ML:
+        raise InputError(f"--brain-ml {args.brain_ml:g} is outside {SMALLEST_ML:g} to {LARGEST_ML:g}: choose between.")
+    if args.tumour_at is not None and (args.site is not None or args.cover is not None):
+        raise InputError("--tumour-at says where the tumour lies: leave out --site and --cover, or --tumour-at.")
+    middle = None if args.tumour_at is None else tuple(1e-3 * value for value in args.tumour_at)
+    lengths = 1e-3 * chosen["radius"], 1e-3 * chosen["cover"]
+    tumour = Tumour(*lengths, chosen["tumour_shape"], chosen["site"], args.seed, middle)
+    volume = None if args.brain_ml is None else 1e-6 * args.brain_ml
+    if args.mask is not None:
+        return drawn_subject(tumour, masked_head(args.mask, args.t1, volume))
+    head = Head() if volume is None else Head(volume)
+    return drawn_subject(tumour, fsaverage_head(head.volume)) if args.head == "fsaverage" else template_subject(tumour, head)

@@ -1,0 +1,85 @@
+"""Healthy heads beside the template, in which a tumour may be drawn: a brain's mask, and what fsaverage's skull holds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from .enclosed_voxels import enclosed
+from .fif import read_surface
+from .head_masks import HeadMasks
+from .intensity import Intensity, read_intensity
+from .label_map import on_border
+from .label_volume import whole_brain
+from .template import MIDDLE, Healthy, scaled, size_of
+from .volume import read_volume
+
+SEEN_FROM = (1e-3 * MIDDLE[0], 1e-3 * MIDDLE[1], 1e-3 * MIDDLE[2])
+INNER_SKULL = Path("data", "fsaverage", "fsaverage-inner_skull-bem.fif")
+"""Where the wheel of mne has it."""
+VOXEL = 1e-3
+"""[m] The skull is put onto voxels of this edge."""
+REMEDY = 'Install it: pip install "sulcus[anatomies]".'
+
+
+def masked_head(mask: Path, t1: Path | None = None, volume: float | None = None) -> Healthy:
+    """The head whose brain is what is not 0 in a volume, scaled about its centroid to a `volume` [m^3] if one is given.
+
+    `t1` is a volume of intensities in the same space, and is scaled with it.
+
+    Raises
+    ------
+    InputError
+        What `read_volume`, `read_intensity` and `whole_brain` refuse, and a volume in which all is 0.
+    """
+    read = read_volume(mask)
+    brain = read.values != 0
+    if not brain.any():
+        raise InputError(f"{mask}: has no voxel other than 0: give a mask of the brain.")
+    notes = list(read.notes)
+    masks = HeadMasks(str(mask), "its voxels", brain, np.zeros_like(brain), read.affine, cut=on_border(brain))
+    solid = whole_brain(masks, notes)
+    healthy = Healthy(solid, read.affine, t1 and read_intensity(t1), SEEN_FROM, tuple(notes))
+    return healthy if volume is None else _scaled(healthy, volume)
+
+
+def fsaverage_head(volume: float) -> Healthy:
+    """The head of fsaverage, scaled to a `volume` [m^3]: all that its inner skull encloses counts as brain.
+
+    The surface of this body is the skull: no fluid lies between them, and no sulci are in it.
+
+    Raises
+    ------
+    InputError
+        A package mne that is not there, or that does not hold the skull as one closed surface.
+    """
+    path = _skull_path()
+    points, triangles = read_surface(path)
+    try:
+        mask, affine = enclosed(points, triangles, VOXEL)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return _scaled(Healthy(mask, affine, middle=SEEN_FROM), volume)
+
+
+def _skull_path() -> Path:
+    found = find_spec("mne")
+    if found is None or not found.submodule_search_locations:
+        raise InputError(f"fsaverage's skull is in the package mne, which is not there. {REMEDY}")
+    path = Path(found.submodule_search_locations[0]) / INNER_SKULL
+    if not path.is_file():
+        raise InputError(f"{path}: no such file, so this mne holds no skull of fsaverage. {REMEDY}")
+    return path
+
+
+def _scaled(healthy: Healthy, volume: float) -> Healthy:
+    centre, own = size_of(healthy.mask, healthy.affine)
+    factor = (volume / own) ** (1.0 / 3.0)
+    grey = healthy.intensity
+    if grey is not None:
+        grey = Intensity(grey.values, scaled(grey.affine, centre, factor, centre))
+    return replace(healthy, affine=scaled(healthy.affine, centre, factor, centre), intensity=grey)
