@@ -75,4 +75,6 @@ def drawn(args: argparse.Namespace, chosen: dict[str, Any]) -> Subject:
     if args.mask is not None:
         return drawn_subject(tumour, masked_head(args.mask, args.t1, volume))
     head = Head() if volume is None else Head(volume)
-    return drawn_subject(tumour, fsaverage_head(head.volume)) if args.head == "fsaverage" else template_subject(tumour, head)
+    if args.head == "fsaverage":
+        return drawn_subject(tumour, fsaverage_head(head.volume), head)
+    return template_subject(tumour, head)

@@ -19,8 +19,11 @@ def enclosed(points: np.ndarray, triangles: np.ndarray, edge: float) -> tuple[np
     Raises
     ------
     InputError
-        A surface that is not closed: some ray leaves it more or less often than it enters.
+        A surface that is not closed: some edge is not one of two triangles.
     """
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    if (np.unique(edges, axis=0, return_counts=True)[1] != 2).any():
+        raise InputError("the surface is not closed: give one without holes.")
     low = np.floor(points.min(axis=0) / edge) - 1.0
     shape = (np.ceil(points.max(axis=0) / edge) - low + 2.0).astype(int)
     corners = (points / edge - low)[triangles]
@@ -29,12 +32,9 @@ def enclosed(points: np.ndarray, triangles: np.ndarray, edge: float) -> tuple[np
     first = np.clip(np.ceil(height).astype(int), 0, shape[2] - 1)
     changes = np.zeros(shape, np.int32)
     np.add.at(changes, (column[:, 0], column[:, 1], first), 1)
-    odd = np.cumsum(changes, axis=2) % 2 == 1
-    if odd[..., -1].any():
-        raise InputError("the surface is not closed: give one without holes.")
     affine = np.diag([edge, edge, edge, 1.0])
     affine[:3, 3] = edge * low
-    return odd, affine
+    return np.cumsum(changes, axis=2) % 2 == 1, affine
 
 
 def _crossings(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

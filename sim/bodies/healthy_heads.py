@@ -1,4 +1,4 @@
-"""Healthy heads beside the template, in which a tumour may be drawn: a brain's mask, and what fsaverage's skull holds."""
+"""Healthy heads beside the template: a mask of the brain, and what the inner skull of fsaverage encloses."""
 
 from __future__ import annotations
 

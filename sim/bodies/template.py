@@ -215,9 +215,7 @@ def drawn_subject(tumour: Tumour, healthy: Healthy, head: Head = Head()) -> Subj
         )
     volume = 4.0 / 3.0 * np.pi * tumour.radius**3
     pieces = (Piece(volume, shape.middle, interface),)
-    return Subject(
-        brain, shape, cortex, interface, volume, site, healthy.intensity, notes=healthy.notes, pieces=pieces
-    )
+    return Subject(brain, shape, cortex, interface, volume, site, healthy.intensity, notes=healthy.notes, pieces=pieces)
 
 
 def scaled(affine: np.ndarray, centre: np.ndarray, factor: float, place: np.ndarray) -> np.ndarray:

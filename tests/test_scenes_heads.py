@@ -1,0 +1,193 @@
+"""Healthy heads beside the template in which `sulcus anatomy` draws a tumour: a mask's, and fsaverage's inner skull."""
+
+import importlib
+import json
+import struct
+from importlib.util import find_spec
+
+import nibabel
+import numpy as np
+import pytest
+from balls import EGG, ball
+from scipy.spatial import ConvexHull
+
+from scenes.cli import main
+from sim.bodies.enclosed_voxels import enclosed
+from sim.bodies.fif import read_surface
+from sim.bodies.healthy_heads import INNER_SKULL
+from sim.bodies.intensity import read_intensity, sidecar
+from sim.bodies.meshfile import read_anatomy
+from sim.errors import InputError
+
+RADII = 0.080 * EGG
+BALL_ML = 4e6 / 3.0 * np.pi * RADII.prod()
+
+
+def run(capsys, *words):
+    code = main(["anatomy", *map(str, words)])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def egg(count=4000):
+    """Vertices (n, 3) [m] and triangles (m, 3) of an ellipsoid, which are turned either way."""
+    directions = np.random.default_rng(3).normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return RADII * directions, ConvexHull(directions).simplices
+
+
+def tag(kind, of, data, following=0):
+    return struct.pack(">iiii", kind, of, len(data), following) + data
+
+
+def table(values, kind):
+    return values.astype(kind).tobytes() + struct.pack(">iii", values.shape[1], len(values), 2)
+
+
+def fif(points, triangles, frame=5):
+    """A surface as MNE writes it."""
+    return (
+        tag(100, 31, bytes(20))
+        + tag(3112, 3, struct.pack(">i", frame))
+        + tag(3105, 0x40000004, table(points, ">f4"))
+        + tag(3106, 0x40000003, table(triangles + 1, ">i4"))
+        + tag(108, 0, b"", -1)
+    )
+
+
+@pytest.fixture
+def skull(tmp_path, monkeypatch):
+    """Where the skull of a package mne lies that holds nothing else: an ellipsoid."""
+    path = tmp_path / "packages" / "mne" / INNER_SKULL
+    path.parent.mkdir(parents=True)
+    (tmp_path / "packages" / "mne" / "__init__.py").write_text("raise RuntimeError('is not to be imported')")
+    path.write_bytes(fif(*egg()))
+    monkeypatch.syspath_prepend(tmp_path / "packages")
+    importlib.invalidate_caches()
+    return path
+
+
+def test_what_a_surface_encloses_is_counted_to_a_voxel():
+    points, triangles = egg()
+    mask, affine = enclosed(points, triangles, 2e-3)
+    middles = np.argwhere(np.ones_like(mask)) @ affine[:3, :3].T + affine[:3, 3]
+    outside = np.linalg.norm(middles / RADII, axis=1).reshape(mask.shape) > 1.0
+    assert mask.sum() * 8e-3 == pytest.approx(BALL_ML, rel=0.01)
+    assert not (mask & outside).any()  # flat triangles between points of the ellipsoid lie inside
+    with pytest.raises(InputError, match="not closed"):
+        enclosed(points, triangles[1:], 2e-3)
+
+
+def test_fsaverage_is_what_its_inner_skull_holds_at_the_size_asked_for(skull, tmp_path, capsys):
+    words = ("--head", "fsaverage", "--brain-ml", 1300, "--nodes", 2000, "--cover", 8, "--json")
+    code, text, _ = run(capsys, *words, "--out", tmp_path / "fs.vtu")
+    summary = json.loads(text)
+    nodes = read_anatomy(tmp_path / "fs.vtu").mesh.nodes
+    assert code == 0 and summary["brain_ml"] == pytest.approx(1300, rel=0.01)
+    assert np.ptp(nodes, axis=0) == pytest.approx(2.0 * RADII * (1300 / BALL_ML) ** (1 / 3), rel=0.02)
+    assert summary["opening"]["side"] == "right superior" and summary["t1"] is None
+    assert abs(summary["tumour_volume_error_percent"]) < 2.0
+
+
+@pytest.mark.skipif(find_spec("mne") is None, reason="the package mne is not installed: pip install sulcus[anatomies]")
+def test_the_skull_that_mne_ships_is_of_a_head():
+    points, triangles = read_surface(importlib.resources.files("mne") / str(INNER_SKULL))
+    mask, _ = enclosed(points, triangles, 2e-3)
+    assert mask.sum() * 8e-3 == pytest.approx(2190, abs=10)
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        b"another's file",
+        fif(*egg())[:-200],
+        fif(*egg(), frame=4),
+        fif(egg()[0], egg()[1] + 1),
+        fif(egg()[0] * np.nan, egg()[1]),
+        tag(100, 31, bytes(4)) + tag(101, 3, bytes(4), 1),
+    ],
+)
+def test_another_file_in_the_skulls_place_is_refused(skull, tmp_path, capsys, damaged):
+    skull.write_bytes(damaged)
+    code, text, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
+    assert code == 2 and not text and not (tmp_path / "fs.vtu").exists()
+    assert error.startswith("sulcus anatomy: ") and str(skull) in error and "anew" in error and error.count("\n") == 1
+
+
+def test_a_skull_with_a_hole_or_none_is_refused(skull, tmp_path, capsys):
+    points, triangles = egg()
+    skull.write_bytes(fif(points, triangles[1:]))
+    code, _, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
+    assert code == 2 and f"{skull}: the surface is not closed" in error
+    skull.unlink()
+    code, _, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
+    assert code == 2 and 'pip install "sulcus[anatomies]"' in error
+
+
+@pytest.fixture
+def masked(tmp_path):
+    """A folder with `brain.nii.gz`, an ellipsoid far from the origin and a speck; `t1.nii.gz`, light on the right."""
+    ball(tmp_path, EGG)
+    for name in ("labels", "t1"):
+        image = nibabel.load(tmp_path / f"{name}.nii.gz")
+        values, affine = np.asarray(image.dataobj).copy(), image.affine.copy()
+        affine[:3, 3] += [10.0, 60.0, -40.0]
+        if name == "labels":
+            values[2:4, 2:4, 2:4] = 1
+        else:
+            values = np.where(values > 90.0, 100.0, 20.0)  # 20 mm to the right of the ellipsoid's middle
+        nibabel.save(nibabel.Nifti1Image(values, affine), tmp_path / f"{name}.nii.gz")
+    (tmp_path / "labels.nii.gz").rename(tmp_path / "brain.nii.gz")
+    return tmp_path
+
+
+def test_a_tumour_is_drawn_in_a_mask_where_the_site_is_and_t1_goes_with_it(masked, capsys):
+    words = ("--mask", masked / "brain.nii.gz", "--t1", masked / "t1.nii.gz", "--nodes", 2000, "--radius", 10, "--json")
+    code, text, noted = run(capsys, *words, "--out", masked / "own.vtu")
+    own = json.loads(text)
+    assert code == 0 and f"{masked / 'brain.nii.gz'}: left out 0.064 ml" in noted
+    assert own["brain_ml"] == pytest.approx(4e-3 / 3 * np.pi * 55.0**3 * EGG.prod(), rel=0.01)
+    # Of an ellipsoid round (10, 60, -40) the central site lies on the right and above.
+    at = np.array(own["opening"]["at_mm"]) - [10.0, 60.0, -40.0]
+    assert np.linalg.norm(at / (55.0 * EGG)) == pytest.approx(1.0, abs=0.05)
+    direction = np.array([40.0, 3.4, 52.6])
+    assert at @ direction > 0.99 * np.linalg.norm(at) * np.linalg.norm(direction)
+    code, text, _ = run(capsys, *words, "--brain-ml", 1400, "--out", masked / "large.vtu")
+    large, factor = json.loads(text), (1400 / own["brain_ml"]) ** (1 / 3)
+    assert code == 0 and large["brain_ml"] == pytest.approx(1400, rel=0.01)
+    assert large["tumour_ml"] == pytest.approx(own["tumour_ml"], rel=0.02)  # the tumour keeps its size
+    grown = np.array(large["opening"]["at_mm"]) - [10.0, 60.0, -40.0]
+    assert grown == pytest.approx(at * factor, abs=1.5)
+    for one, border in ((own, 20.0), (large, 20.0 * factor)):
+        across = np.arange(5.0, 40.0, 0.1)
+        line = np.array([10.0 + across, *np.outer(one["opening"]["at_mm"][1:], np.ones(len(across)))]).T
+        grey = read_intensity(sidecar(one["mesh"])).at(1e-3 * line)
+        assert np.ptp(grey) > 0.3 and across[np.searchsorted(grey, grey.mean())] == pytest.approx(border, abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--mask", "none.nii.gz"), "none.nii.gz: no such file"),
+        (("--mask", "zero.nii.gz"), "zero.nii.gz: has no voxel other than 0"),
+        (("--mask", "tiny.nii.gz"), "make a brain of 0.064 ml"),
+        (("--mask", "brain.nii.gz", "--head", "fsaverage"), "leave one of them out"),
+        (("--mask", "brain.nii.gz", "--brain-ml", "nan"), "--brain-ml nan is outside 20 to 5000"),
+        (("--mask", "brain.nii.gz", "--radius", "35", "--cover", "60"), "reaches out of the brain"),
+        (("--mask", "brain.nii.gz", "--tumour", "2"), "--tumour belongs to a label volume"),
+        (("--head", "fsaverage", "--t1", "t1.nii.gz"), "give --labels or --mask"),
+        (("--labels", "brain.nii.gz", "--brain", "1", "--tumour", "2", "--head", "template"), "leave it out with"),
+    ],
+)
+def test_bad_heads_are_a_sentence_and_nothing_is_written(masked, capsys, monkeypatch, words, reason):
+    monkeypatch.chdir(masked)
+    image = nibabel.load("brain.nii.gz")
+    for name, kept in (("zero", 0), ("tiny", 4)):
+        values = np.zeros(image.shape, np.uint8)
+        values[2 : 2 + kept // 2, 2 : 2 + kept // 2, 2 : 2 + kept // 2] = 1
+        nibabel.save(nibabel.Nifti1Image(values, image.affine), f"{name}.nii.gz")
+    before = sorted(masked.iterdir())
+    code, text, error = run(capsys, *words, "--out", "mine.vtu")
+    assert code == 2 and not text
+    assert reason in error and error.count("\n") == 1
+    assert sorted(masked.iterdir()) == before
