@@ -20,7 +20,7 @@ from .commands.interrupt import INTERRUPTED
 
 # A command's module is imported only when it is asked for: `sulcus solve` does not wait for torch.
 COMMANDS = {
-    "anatomy": "make a tetrahedral brain with a tumour, from the template or from a label volume",
+    "anatomy": "make a tetrahedral brain with a tumour, from a label volume or drawn in a healthy head",
     "solve": "find the static equilibrium of any tetrahedral mesh",
     "simulate": "draw loads of a tool and answer them by finite elements, into a data set",
     "train": "fit surrogate models to a data set, and compare their errors on cortex that was left out",

@@ -3,7 +3,9 @@
 import importlib
 import json
 import struct
+import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 import nibabel
 import numpy as np
@@ -91,7 +93,7 @@ def test_fsaverage_is_what_its_inner_skull_holds_at_the_size_asked_for(skull, tm
 
 @pytest.mark.skipif(find_spec("mne") is None, reason="the package mne is not installed: pip install sulcus[anatomies]")
 def test_the_skull_that_mne_ships_is_of_a_head():
-    points, triangles = read_surface(importlib.resources.files("mne") / str(INNER_SKULL))
+    points, triangles = read_surface(Path(find_spec("mne").origin).parent / INNER_SKULL)
     mask, _ = enclosed(points, triangles, 2e-3)
     assert mask.sum() * 8e-3 == pytest.approx(2190, abs=10)
 
@@ -104,7 +106,7 @@ def test_the_skull_that_mne_ships_is_of_a_head():
         fif(*egg(), frame=4),
         fif(egg()[0], egg()[1] + 1),
         fif(egg()[0] * np.nan, egg()[1]),
-        tag(100, 31, bytes(4)) + tag(101, 3, bytes(4), 1),
+        tag(100, 31, bytes(4)) + tag(101, 3, bytes(4), 20),
     ],
 )
 def test_another_file_in_the_skulls_place_is_refused(skull, tmp_path, capsys, damaged):
@@ -114,14 +116,17 @@ def test_another_file_in_the_skulls_place_is_refused(skull, tmp_path, capsys, da
     assert error.startswith("sulcus anatomy: ") and str(skull) in error and "anew" in error and error.count("\n") == 1
 
 
-def test_a_skull_with_a_hole_or_none_is_refused(skull, tmp_path, capsys):
+def test_a_skull_with_a_hole_or_none_is_refused(skull, tmp_path, capsys, monkeypatch):
     points, triangles = egg()
     skull.write_bytes(fif(points, triangles[1:]))
     code, _, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
     assert code == 2 and f"{skull}: the surface is not closed" in error
     skull.unlink()
     code, _, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
-    assert code == 2 and 'pip install "sulcus[anatomies]"' in error
+    assert code == 2 and f"{skull}: no such file" in error and 'pip install "sulcus[anatomies]"' in error
+    monkeypatch.setitem(sys.modules, "mne", None)  # as where it is not installed
+    code, _, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
+    assert code == 2 and "mne, which is not there" in error and 'pip install "sulcus[anatomies]"' in error
 
 
 @pytest.fixture
