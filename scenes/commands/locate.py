@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
             "deviation": np.sqrt(np.maximum(np.trace(covariance, axis1=1, axis2=2), 0.0)),
             "covariance": covariance[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]],
         }
-        write_mesh(out, anatomy.mesh, fields)
+        write_mesh(out, anatomy.mesh, fields, "RAS")
     if observation.rest is not None:
         motions = np.linalg.norm(observation.now - observation.rest, axis=1)
         if 0.0 < np.median(motions) < UNSEEN:

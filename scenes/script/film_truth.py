@@ -16,6 +16,7 @@ from sim.runtime.outside_files import path_of, read_as
 FORMAT = "sulcus film 1"
 WANTED = "Give the truth.npz that `sulcus film` wrote."
 COLUMNS = ("T_camera_scan", "T_scan_tool")
+SPACES = {"scan": "RAS [m]", "camera": "x right, y down, z forward [m]"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ def write_truth(path: Path, truth: Truth) -> None:
     with written_whole(path, ".npz") as partial, partial.open("wb") as file:
         np.savez_compressed(
             file,
-            header=np.array(json.dumps({"format": FORMAT, "anatomy": truth.anatomy})),
+            header=np.array(json.dumps({"format": FORMAT, "anatomy": truth.anatomy, "spaces": SPACES})),
             times=truth.times,
             T_camera_scan=truth.T_camera_scan,
             T_scan_tool=truth.T_scan_tool,
@@ -93,10 +94,10 @@ def write_table(path: Path, truth: Truth, rest: np.ndarray) -> None:
     names = [f"{what}_{row}{column}" for what in COLUMNS for row in range(3) for column in range(4)]
     with written_whole(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
-        table.writerow(("time_s", "tumour_x_mm", "tumour_y_mm", "tumour_z_mm", "moved_mm", *names))
+        table.writerow(("time_s", "tumour_x_mm", "tumour_y_mm", "tumour_z_mm", "moved_mm", *names, "space"))
         for number, time in enumerate(truth.times):
             moved = truth.displacement[number]
             middle = 1e3 * (rest + moved).mean(axis=0)
             poses = np.stack([truth.T_camera_scan[number], truth.T_scan_tool[number]])[:, :3] * [1.0, 1.0, 1.0, 1e3]
             mean = 1e3 * float(np.linalg.norm(moved, axis=1).mean())
-            table.writerow((f"{time:.6f}", *(f"{each:.5f}" for each in (*middle, mean, *poses.ravel()))))
+            table.writerow((f"{time:.6f}", *(f"{each:.5f}" for each in (*middle, mean, *poses.ravel())), "RAS"))

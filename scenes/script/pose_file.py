@@ -19,6 +19,8 @@ from surrogate.locating.observed_files import read_columns
 TIME, PLACE, TURN = "time_s", ("x_mm", "y_mm", "z_mm"), ("qx", "qy", "qz", "qw")
 TIP, TIP_DEVIATION = ("tip_x_mm", "tip_y_mm", "tip_z_mm"), "tip_off_mm"
 COVARIANCE = tuple(f"cov_{row}{column}" for row in range(6) for column in range(row, 6))
+LAST = ("corners", "residual_px", "ms", "frame")
+CAMERA = "camera: x right, y down, z forward"
 # By how much a quaternion's length may differ from 1, and a place be from the origin [m].
 ROUNDED, FARTHEST = 0.01, 100.0
 # Of the covariance: from metres and radians to millimetres and radians.
@@ -131,13 +133,13 @@ def write_poses(path: Path, rows: Iterable[TrackedRow], tip: np.ndarray) -> None
     """
     with written_whole(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
-        table.writerow((TIME, "state", *PLACE, *TURN, *TIP, TIP_DEVIATION, *COVARIANCE, "corners", "residual_px", "ms"))
+        table.writerow((TIME, "state", *PLACE, *TURN, *TIP, TIP_DEVIATION, *COVARIANCE, *LAST))
         for row in rows:
-            end = f"{1e3 * row.seconds:.2f}"
+            end = f"{1e3 * row.seconds:.2f}", CAMERA
             cells = [""] * (len(PLACE) + len(TURN) + len(TIP) + 1 + len(COVARIANCE) + 2)
             if row.pose is not None:
                 cells = [*_of_pose(row.pose, tip), str(row.pose.corners), f"{row.pose.residual:.3f}"]
-            table.writerow((f"{row.time:.6f}", row.verdict.name.lower(), *cells, end))
+            table.writerow((f"{row.time:.6f}", row.verdict.name.lower(), *cells, *end))
 
 
 def _of_pose(pose: Pose, tip: np.ndarray) -> list[str]:

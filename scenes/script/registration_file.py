@@ -125,6 +125,7 @@ def as_stored(registration: Registration) -> dict[str, object]:
     )
     return {
         "format": FORMAT,
+        "spaces": {"scan": "RAS [mm]", "patient": "the frame of the patient's reference [mm]"},
         "T_patient_scan_mm": T.tolist(),
         "covariance": (registration.covariance * np.outer(_UNITS, _UNITS)).tolist(),
         "centre_mm": (1e3 * registration.centre).tolist(),

@@ -121,6 +121,7 @@ def write_tool(path: Path, tool: TrackedTool) -> None:
     T[:3, 3] *= 1e3
     stored = {
         "format": FORMAT,
+        "spaces": {"tool": "origin at its lowest point, z up the shaft [mm]", "cube": "the cube's own [mm]"},
         "shape": repr(tool.shape),
         "T_cube_tool": T.tolist(),
         "tip_covariance_mm2": (1e6 * tool.tip_covariance).tolist(),

@@ -163,7 +163,8 @@ def _read(row: dict) -> Uncertainty:
 def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:
     """Add scenes to a file, in place of those of the same name."""
     scenes = read_uncertainties(path) | {one.scene: one for one in found}
-    stored = {"format": FORMAT, "level": LEVEL, "scenes": {name: asdict(scenes[name]) for name in sorted(scenes)}}
+    rows = {name: asdict(scenes[name]) for name in sorted(scenes)}
+    stored = {"format": FORMAT, "unit": "m", "level": LEVEL, "scenes": rows}
     with written_whole(path, ".json") as unfinished:
         unfinished.write_text(json.dumps(_rounded(stored), indent=1) + "\n")
 

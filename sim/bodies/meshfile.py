@@ -105,10 +105,10 @@ def _taken(path: Path, raw: meshio.Mesh, metre: float) -> MeshFile:
     return MeshFile(mesh, {name: np.asarray(field) for name, field in raw.point_data.items()}, tuple(notes))
 
 
-def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray]) -> None:
+def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray], space: str = "") -> None:
     """Write `.vtu` in metres, with cell data `region`, `tetra10` cells where the mesh has mid-edge nodes.
 
-    The file appears whole or not at all.
+    The file says its unit, and its `space` if that is known. It appears whole or not at all.
 
     Raises
     ------
@@ -124,6 +124,17 @@ def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndar
             point_data=dict(point_data),
             cell_data={"region": [mesh.region]},
         ).write(partial)
+        head, grid, rest = partial.read_bytes().partition(b"<UnstructuredGrid>")
+        partial.write_bytes(head + grid + _said(space).encode() + rest)
+
+
+def _said(space: str) -> str:
+    """Unit and space, as a comment and as field data; meshio, which wrote the file, reads no field data of text."""
+    name = f"{space}, metres per unit".removeprefix(", ")
+    return (
+        f"<!-- sulcus: {space or 'a space of its own'}; metres --><FieldData>"
+        f'<DataArray type="Float64" Name="{name}" NumberOfTuples="1" format="ascii">1</DataArray></FieldData>'
+    )
 
 
 def read_anatomy(path: str | Path) -> Anatomy:
@@ -169,4 +180,5 @@ def write_anatomy(path: str | Path, anatomy: Anatomy) -> None:
             "slide_normal": anatomy.slide_normal,
             "craniotomy": anatomy.craniotomy.astype(np.uint8),
         },
+        "RAS",
     )

@@ -41,7 +41,7 @@ def save_locator(path: str | Path, locator: Locator) -> None:
     prior = locator.prior
     header = {
         "format": FORMAT, "anatomy": prior.anatomy.digest, "version": version("sulcus"), "kinds": KINDS,
-        "whole": prior.nodes is None,
+        "whole": prior.nodes is None, "space": "RAS [m]",
     }  # fmt: skip
     arrays = {name: getattr(prior, name) for name in _names(header)}
     with written_whole(path, ".npz") as unfinished:

@@ -83,6 +83,7 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
     header = {
         "format": FORMAT,
         "anatomy": digests.pop(),
+        "space": "RAS [m]",
         "versions": {name: version(name) for name in ("sulcus", "numpy")},
         "models": {name: _described(model, put) for name, model in models.items()},
     }

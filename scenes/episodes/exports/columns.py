@@ -24,6 +24,8 @@ NUMBERS = (
     "T_world_tool_tracked", "tumour_predicted",
 )  # fmt: skip
 """Arrays that go into other formats as they are, a row for each frame, beside the tool's pose."""
+SPACE = "world: RAS [m]; camera: x right, y down, z forward [m]"
+"""Where all places are."""
 
 
 def shared_pictures(episodes: Sequence[Contents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:

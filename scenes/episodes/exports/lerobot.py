@@ -23,7 +23,7 @@ from ..reading.open_files import opened
 from ..reading.rows import code_of, picture_of
 from ..reading.schema import COLOUR, DEPTH, PICTURES, suffix_of
 from .along import write_along
-from .columns import blocks, named_axes, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size
+from .columns import SPACE, blocks, named_axes, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size
 from .statistics import Spread
 from .tasks import task_of
 from .whole_folder import written_folder
@@ -104,6 +104,7 @@ def write_lerobot(
         features = {**features_of(shapes), **picture_features(episodes[0], pictures)}
         described = info(len(episodes), first, len(tasks), rates.pop(), features)
         write_json(partial / "meta/info.json", described)
+        write_json(partial / "meta/spaces.json", {"spaces": SPACE})
         write_along(episodes, partial)
     return {"out": str(folder), "episodes": len(episodes), "frames": first, "features": sorted(features)}
 

@@ -18,7 +18,7 @@ from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from ..reading.schema import COLOUR, PICTURES
 from .along import texts_along
-from .columns import blocks, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size
+from .columns import SPACE, blocks, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size
 from .tasks import held_out, task_of
 
 EXPORTED = ("colour", "colour_right", "depth", "segmentation")
@@ -52,7 +52,7 @@ def write_robomimic(
                 write_demo(demo, obs, contents, numbers)
                 write_pictures(obs, file, contents, pictures, stream)
             total += contents.frames
-        data.attrs.update({"total": total, "env_args": json.dumps(environment(episodes, rates))})
+        data.attrs.update({"total": total, "env_args": json.dumps(environment(episodes, rates)), "space": SPACE})
         names_of = np.array([f"demo_{number}" for number in range(len(episodes))], "S")
         out_of = np.array(held_out(episodes))
         out.create_dataset("mask/train", data=names_of[~out_of])

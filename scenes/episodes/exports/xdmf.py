@@ -18,7 +18,7 @@ from ..reading.contents import Contents, array_in
 from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from .along import write_along
-from .columns import file_names, stored_size
+from .columns import SPACE, file_names, stored_size
 from .whole_folder import written_folder
 
 SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
@@ -46,6 +46,7 @@ def write_xdmf(
             bare += anatomy is None
             root = Element("Xdmf", Version="3.0")
             domain = SubElement(root, "Domain")
+            SubElement(domain, "Information", Name="space", Value=SPACE)
             with opened(contents.path) as file, hdf5(partial / f"{names[contents]}.h5") as out:
                 times = numbers_in(file, contents, "time")
                 for name, surface in SURFACES.items():

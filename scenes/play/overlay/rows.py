@@ -14,7 +14,7 @@ from .truth import Off
 COLUMNS = (
     "time_s", "state", "tumour_x_mm", "tumour_y_mm", "tumour_z_mm", "moved_mm", "motion_off_mm", "within_mm",
     "tracking_mm", "camera_mm", "registration_mm", "tool_mm", "model_mm", "shutter_mm", "ms", "latency_ms", "words",
-    "outline_px", "overlap", "middle_off_mm", "worst_off_mm",
+    "outline_px", "overlap", "middle_off_mm", "worst_off_mm", "space",
 )  # fmt: skip
 
 
@@ -22,7 +22,7 @@ def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[Off | None])
     """Write a row for each picture, which appear all or not at all; what is not known is blank.
 
     The place is that of the tumour's middle in the scan, RAS. `within_mm` holds with 95 %, across the line of sight.
-    The last four columns hold it against the truth, if that is given.
+    Four columns hold it against the truth, if that is given; the last one names the space.
     """
     with written_whole(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
@@ -44,7 +44,7 @@ def _row(shown: Shown, error: Off | None) -> list[str]:
     against = (None,) * 4 if error is None else (error.outline, error.overlap, 1e3 * error.middle, 1e3 * error.worst)
     return [
         f"{known.time:.6f}", known.state.name.lower(), *cells, f"{1e3 * shown.seconds:.1f}", _number(late, 1),
-        known.words, *(_number(value, 3) for value in against),
+        known.words, *(_number(value, 3) for value in against), "RAS",
     ]  # fmt: skip
 
 
