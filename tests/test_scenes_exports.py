@@ -69,6 +69,7 @@ def test_statistics_of_parts_are_those_of_the_whole():
 
 def test_lerobot_has_its_layout_and_the_pictures_own_bytes(lerobot, folder):
     info = json.loads((lerobot / "meta/info.json").read_text())
+    assert "RAS [m]" in json.loads((lerobot / "meta/spaces.json").read_text())["spaces"]
     assert info["codebase_version"] == "v3.0" and info["fps"] == 30 and info["total_frames"] == 16
     depth = info["features"]["observation.images.depth"]
     assert depth["shape"] == [HEIGHT, WIDTH, 1] and depth["info"]["range_m"] == [0.1, 0.6]
@@ -131,6 +132,7 @@ def test_robomimic_has_demonstrations_and_holds_one_out(folder, tmp_path, capsys
     ours = read_episodes(folder, ["depth", "colour", "T_world_tool"], window=7).at(0, 0)
     with h5py.File(out) as file:
         demo = file["data/demo_0"]
+        assert "RAS [m]" in file["data"].attrs["space"]
         assert file["data"].attrs["total"] == 16 and "env_name" in json.loads(file["data"].attrs["env_args"])
         assert list(file["mask/train"]) == [b"demo_0"] and list(file["mask/valid"]) == [b"demo_1"]
         assert demo.attrs["num_samples"] == 7 and demo["dones"][:].tolist() == [0] * 6 + [1]
@@ -166,7 +168,9 @@ def test_a_folder_has_pictures_and_tables(folder, tmp_path):
 def test_xdmf_refers_to_numbers_that_are_there(folder, tmp_path):
     out = tmp_path / "paraview"
     assert main(["convert", str(folder), "--to", "xdmf", "--out", str(out)]) == 0
-    grids = ElementTree.parse(out / "episode_000001.xdmf").findall(".//Grid[@GridType='Uniform']")
+    tree = ElementTree.parse(out / "episode_000001.xdmf")
+    assert "RAS [m]" in tree.find("Domain/Information[@Name='space']").get("Value")
+    grids = tree.findall(".//Grid[@GridType='Uniform']")
     assert len(grids) == 9 and float(grids[3].find("Time").get("Value")) == pytest.approx(0.1)
     assert len(grids[3].findall("Attribute")) == 2 and len(grids[4].findall("Attribute")) == 1  # solved, and not
     for item in (found for grid in grids for found in grid.iter("DataItem")):

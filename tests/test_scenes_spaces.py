@@ -1,5 +1,6 @@
 """A patient whose scan is oblique, mirrored and anisotropic: others find the tumour at one place in all its files."""
 
+import csv
 import io
 import json
 from dataclasses import replace
@@ -18,14 +19,20 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from theatres import short
 
+from ar.tracking.pose import Verdict
 from ar.tracking.registration import Registration
 from scenes.cli import main
 from scenes.episodes.episode import Recording, collect
 from scenes.play.deformers import Theatre
+from scenes.play.overlay.rows import write_rows
 from scenes.play.player import Player
 from scenes.play.stage import Stage
+from scenes.script.film_truth import Truth, write_table, write_truth
+from scenes.script.pose_file import TrackedRow, write_poses
 from scenes.script.registration_file import scanned_of, write_registration
+from scenes.script.tracked_tool import TrackedTool, read_tool, write_tool
 from sim.bodies.meshfile import read_anatomy, write_mesh
+from sim.tools import Ball
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 
@@ -166,3 +173,25 @@ def test_an_episode_shows_the_tumour_where_it_says_it_is(folder, pretender):
     seen = np.array([columns, rows])
     assert np.abs(pixels.min(axis=0) - seen.min(axis=1)).max() < 2.0
     assert np.abs(pixels.max(axis=0) - seen.max(axis=1)).max() < 2.0
+
+
+def test_tables_and_headers_name_their_spaces(tmp_path):
+    """Rows are of two pictures of a tumour of one vertex; what places are is held by tests of who writes them."""
+    poses, still = np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 1, 3))
+    truth = Truth("digest", np.arange(2.0), poses, poses, still)
+    write_truth(tmp_path / "truth.npz", truth)
+    assert json.loads(str(np.load(tmp_path / "truth.npz")["header"]))["spaces"]["scan"] == "RAS [m]"
+    write_table(tmp_path / "truth.csv", truth, 1e-3 * TUMOUR[None])
+    write_poses(tmp_path / "track.csv", [TrackedRow(0.0, Verdict.LOST, None, 0.01)], np.zeros(3))
+    write_rows(tmp_path / "overlay.csv", [], [])
+    (heads, *rows), (tracked, lost), (drawn,) = (
+        list(csv.reader((tmp_path / name).read_text().splitlines()))
+        for name in ("truth.csv", "track.csv", "overlay.csv")
+    )
+    assert (heads[-1], rows[0][-1]) == ("space", "RAS") and heads[1] == "tumour_x_mm"
+    near([float(value) for value in rows[0][1:4]], TUMOUR, 1e-3)
+    assert (tracked[-1], lost[-1]) == ("frame", "camera: x right, y down, z forward")
+    assert drawn[-1] == "space" and "tumour_x_mm" in drawn
+    write_tool(tmp_path / "tool.json", TrackedTool(Ball(7e-3)))
+    assert json.loads((tmp_path / "tool.json").read_text())["spaces"]["cube"] == "the cube's own [mm]"
+    assert read_tool(tmp_path / "tool.json").shape == Ball(7e-3)

@@ -140,6 +140,10 @@ def rewritten(stored, path, change):
     return path
 
 
+def test_a_file_says_its_space(stored):
+    assert json.loads(str(np.load(stored)["header"]))["space"] == "RAS [m]"
+
+
 def test_bounds_of_older_files_grow_beyond_the_reach_alone(stored, models, box, tmp_path):
     def older(text):
         header = json.loads(text)
