@@ -7,7 +7,7 @@ The link wants the extension SlicerOpenIGTLink and a running `sulcus link`; the 
 from pathlib import Path
 
 try:
-    import slicer
+    import slicer  # pyright: ignore[reportMissingImports]
 except ImportError as error:
     raise SystemExit("slicer_console.py: Slicer is not here. Run it in the Python console of 3D Slicer.") from error
 
