@@ -10,7 +10,6 @@ PLAYING = ("demo", "render", "film", "collect", "check", "effects")
 EXAMPLES = {
     "anatomy": """examples:
   sulcus anatomy --out brain.vtu --preset superficial
-  sulcus anatomy --mask brain.nii.gz --t1 t1.nii.gz --cover 15 --out drawn.vtu
   sulcus anatomy --labels labels.nii.gz --brain 1,2 --tumour 3 --opening-over 2 --out patient.vtu
 next: sulcus simulate brain.vtu --out brain.h5""",
     "solve": """example:
