@@ -86,6 +86,16 @@ def test_what_looks_wrong_is_said(tmp_path, capsys):
     assert "stored LAS (mirrored, as many scanners do; left is where its affine says)" in text and "warnings:" in text
 
 
+def test_a_folder_that_is_not_there_is_made_and_one_that_cannot_be_is_refused(tmp_path, capsys):
+    ball(tmp_path)
+    (tmp_path / "file").touch()
+    words = ["patient", str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--inspect", "--out"]
+    assert main([*words, str(tmp_path / "new" / "a" / "p.vtu")]) == 0
+    assert [path.name for path in (tmp_path / "new" / "a").iterdir()] == ["p.inspect.png"]
+    assert main([*words, str(tmp_path / "file" / "p.vtu")]) == 2
+    assert "cannot be made" in capsys.readouterr().err
+
+
 def test_axes_are_named_as_they_point():
     turned = np.eye(4)
     turned[:3, :3] = np.array([[0.0, 0.2, 1.0], [-1.0, 0.1, 0.0], [0.1, -1.0, 0.2]])

@@ -15,6 +15,7 @@ from sim.bodies.subject import MeshPlan, opened_cortex
 from sim.elements import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS
+from sim.runtime.atomic_files import written_whole
 from sim.runtime.timing import listened
 from surrogate.data.disc_split import APART, FEWEST
 from surrogate.data.tool_loads import PRESETS
@@ -133,7 +134,8 @@ def _inspect(args: argparse.Namespace) -> int:
     masks = head_masks(sources_of(args))
     subject = opened(masked_subject(masks, args.t1, regions=regions_asked(args)), args)
     found = inspected(masks, subject)
-    write_png(picture, sheet(found, masks, subject, opened_cortex(subject, plan.craniotomy)))
+    with written_whole(picture, ".png") as partial:
+        write_png(partial, sheet(found, masks, subject, opened_cortex(subject, plan.craniotomy)))
     took = round(time.perf_counter() - began, 2)
     if args.json:
         print(json.dumps({**asdict(found), "picture": str(picture), "seconds": took}))
