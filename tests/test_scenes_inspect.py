@@ -96,6 +96,44 @@ def test_a_folder_that_is_not_there_is_made_and_one_that_cannot_be_is_refused(tm
     assert "cannot be made" in capsys.readouterr().err
 
 
+LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def moved(folder, name, to, affine, crop=None):
+    """A file of the ball with another affine; with `crop`, without its last voxels."""
+    image = nibabel.load(folder / f"{name}.nii.gz")
+    nibabel.save(nibabel.Nifti1Image(np.asarray(image.dataobj)[..., :crop], affine), folder / to)
+    return folder / to
+
+
+def test_a_scan_in_lps_that_is_stated_as_ras_is_refused(tmp_path, capsys):
+    """On the grid of the labels, whichever of both is wrong; and on one of its own, which then misses the brain."""
+    ball(tmp_path)
+    labels, affine = tmp_path / "labels.nii.gz", nibabel.load(tmp_path / "labels.nii.gz").affine
+    far = affine.copy()
+    far[:2, 3] += 80.0
+    wrong, own = moved(tmp_path, "t1", "lps.nii", LPS @ affine), moved(tmp_path, "t1", "own.nii", LPS @ far, -2)
+    for given, scan, said in (
+        (labels, wrong, f"lps.nii: has the grid of {labels}, but with x and y negated"),
+        (moved(tmp_path, "labels", "wrong.nii", LPS @ affine), tmp_path / "t1.nii.gz", "t1.nii.gz: has the grid of"),
+        (moved(tmp_path, "labels", "far.nii", far), own, "own.nii: holds 0 % of the brain of"),
+    ):
+        for words in (["anatomy", "--labels", given], ["patient", given, "--inspect"]):
+            words += ["--brain", 1, "--tumour", 2, "--t1", scan, "--out", tmp_path / "p.vtu"]
+            assert main([str(word) for word in words]) == 2
+            assert said in (error := capsys.readouterr().err) and "one of the two states LPS as RAS" in error
+
+
+def test_the_side_of_a_tumour_is_stated_where_nothing_else_tells_it(tmp_path, capsys):
+    ball(tmp_path)
+    labels = tmp_path / "labels.nii.gz"
+    own = moved(tmp_path, "labels", "own.nii", nibabel.load(labels).affine, -2)
+    for marked, count in ((own, 1), (labels, 0)):
+        found, _ = inspected(capsys, tmp_path, labels, "--brain", 1, "--tumour-in", marked, "--tumour", 2)
+        notes = [one for one in found["warnings"] if one.startswith(f"{marked}: has a grid of its own")]
+        assert len(notes) == count and all(note.endswith("tumour lies right superior") for note in notes)
+
+
 def test_axes_are_named_as_they_point():
     turned = np.eye(4)
     turned[:3, :3] = np.array([[0.0, 0.2, 1.0], [-1.0, 0.1, 0.0], [0.1, -1.0, 0.2]])

@@ -7,17 +7,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from ..errors import InputError
 from .conventions import CONVENTIONS, Convention, demand_fits
 from .label_map import Label, LabelMap, Mask, listed, on_border, read_labels, widened
+from .one_space import in_one_space
+from .placement import side_of
 from .volume import read_volume
+from .voxels import Grid
 
-TO_LPS = np.array([-1.0, -1.0, 1.0])
-# Share of a tumour inside the brain's convex hull: less is amiss, and so much after x and y are negated says why.
-AMISS, EXPLAINED = 0.5, 0.9
-SAMPLED = 500
 # Share of what is labelled that may lie outside of a mask without a word.
 OUTSIDE = 0.01
 # Voxels that are kept round a brain: more than a tumour at the cortex goes on beyond it.
@@ -67,6 +65,8 @@ class HeadMasks:
         What is labelled so; the brain need not hold the tumour.
     cut
         Voxels of the brain on the border of a file that has a grid of its own.
+    grids
+        Of the files that were read.
     parts
         Other tissues that a convention tells, by name: necrosis, oedema, ventricles.
     affine
@@ -83,6 +83,7 @@ class HeadMasks:
     notes: tuple[str, ...] = ()
     cut: int = 0
     parts: dict[str, np.ndarray] = field(default_factory=dict)
+    grids: tuple[Grid, ...] = ()
 
 
 def head_masks(sources: Sources) -> HeadMasks:
@@ -107,9 +108,10 @@ def head_masks(sources: Sources) -> HeadMasks:
         marked["brain"] = np.logical_or.reduce([marked["brain"], *(parts[name] for name in sources.parts)])
     marked |= parts
     others = _others(sources, tumour)
+    either = False
     if others:
         ours = {name: Mask(Path(sources.labels), mask, whole.affine) for name, mask in marked.items()}
-        _demand_together((ours | others)["brain"], (ours | others)["tumour"])
+        either = in_one_space((ours | others)["brain"], (ours | others)["tumour"])
     shape, affine = whole.layers.shape[:3], whole.affine
     for other in others.values():
         lacking, affine = widened(shape, affine, other)
@@ -119,6 +121,8 @@ def head_masks(sources: Sources) -> HeadMasks:
     notes = whole.notes + tuple(f"{one.path}: {note}" for one in others.values() for note in one.notes)
     if sources.mask:
         notes += _outside(marked, affine)
+    if either:
+        notes += (_side(marked, affine, next(iter(others.values())).path),)
     marked, affine = _cropped(marked, affine)
     return HeadMasks(
         " and ".join(str(path) for path in (sources.labels, sources.mask, sources.tumour_in) if path),
@@ -129,6 +133,17 @@ def head_masks(sources: Sources) -> HeadMasks:
         notes,
         on_border(others["brain"].marked if sources.mask else whole.mask(brain)),
         marked,
+        (Grid(Path(sources.labels), whole.layers.shape[:3], whole.affine), *(one.grid for one in others.values())),
+    )
+
+
+def _side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
+    """A note on which side the tumour lies, as nothing else tells whether a file is of the right space."""
+    low, high = Mask(path, marked["brain"], affine).box
+    centre = affine[:3, :3] @ np.argwhere(marked["tumour"]).mean(axis=0) + affine[:3, 3]
+    return (
+        f"{path}: has a grid of its own, and would fit with x and y negated, too. See that it is right that the tumour "
+        f"lies {side_of(centre, low, high)}"
     )
 
 
@@ -242,49 +257,3 @@ def _demand_sides(whole: LabelMap, convention: Convention) -> None:
             f"{whole.path}: its labels of the left half lie {1e3 * (right[0] - right[1]):.0f} mm to the right of those "
             "of the right half. Its affine is mirrored, or it is LPS that is stated as RAS: export it anew."
         )
-
-
-def _demand_together(brain: Mask, tumour: Mask) -> None:
-    """Refuse a tumour beside the brain, and LPS that is stated as RAS as far as it shows."""
-    boxes = [mask.box for mask in (brain, tumour)]
-    negated = np.array([*TO_LPS, 1.0])[:, None] * tumour.affine
-    if brain.marked.shape == tumour.marked.shape and np.allclose(brain.affine, negated, rtol=0.0, atol=1e-6):
-        raise InputError(
-            f"{tumour.path}: has the grid of {brain.path}, but with x and y negated: one of the two states LPS as RAS. "
-            "Export that one anew."
-        )
-    apart = (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any()
-    index = np.argwhere(tumour.marked)
-    index = index[:: max(1, len(index) // SAMPLED)]
-    points = index @ tumour.affine[:3, :3].T + tumour.affine[:3, 3]
-    planes = ConvexHull(_corners(brain)).equations
-    within, turned = (_share_within(planes, points * signs) for signs in (np.ones(3), TO_LPS))
-    if within < AMISS and turned > EXPLAINED:
-        raise InputError(
-            f"{tumour.path}: its tumour lies at {_box(boxes[1])}, and the brain of {brain.path} at {_box(boxes[0])}. "
-            "With x and y negated it would lie in the brain: one of the two states LPS as RAS. Export that one anew."
-        )
-    if apart:
-        raise InputError(
-            f"{tumour.path}: its tumour lies at {_box(boxes[1])} and does not overlap the brain of {brain.path}, at "
-            f"{_box(boxes[0])}. Give volumes of one space, or resample one into the other's."
-        )
-
-
-def _corners(mask: Mask) -> np.ndarray:
-    """Points (n, 3) [m] on both sides of the outline: a mask of one slice has a hull, too."""
-    half = 0.5 * mask.affine[:3, :3].sum(axis=1)
-    return np.concatenate([mask.outline - half, mask.outline + half])
-
-
-def _share_within(planes: np.ndarray, points: np.ndarray) -> float:
-    """The share of points (n, 3) that no plane of a convex hull cuts off."""
-    outermost = np.full(len(points), -np.inf)
-    for part in np.array_split(planes, max(1, len(planes) // 64)):
-        np.maximum(outermost, (points @ part[:, :3].T + part[:, 3]).max(axis=1), out=outermost)
-    return float((outermost <= 0.0).mean())
-
-
-def _box(box: np.ndarray) -> str:
-    low, high = (", ".join(f"{1e3 * value:.0f}" for value in end) for end in box)
-    return f"{low} to {high} mm (RAS)"

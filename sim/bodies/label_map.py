@@ -13,7 +13,7 @@ from scipy import ndimage
 from ..errors import InputError
 from ..runtime.file_limits import MOST_VOXELS
 from .volume import read_volume
-from .voxels import Segment
+from .voxels import Grid, Segment
 
 Label = int | str
 """A number, or what the file calls it."""
@@ -155,6 +155,11 @@ class Mask:
         last = self.marked.shape[2] - 1 - self.marked[..., ::-1].argmax(axis=2)
         ends = np.concatenate([np.column_stack([rows, end[tuple(rows.T)]]) for end in (first, last)])
         return ends @ self.affine[:3, :3].T + self.affine[:3, 3]
+
+    @property
+    def grid(self) -> Grid:
+        """Where its voxels lie."""
+        return Grid(self.path, self.marked.shape, self.affine)
 
     @property
     def box(self) -> np.ndarray:

@@ -15,10 +15,12 @@ from ..errors import InputError
 from ..runtime.outside_files import path_of
 from .head_masks import HeadMasks, Sources, head_masks
 from .intensity import read_intensity
-from .label_map import Label, on_border
+from .label_map import Label, Mask, on_border
+from .one_space import demand_scan_of
 from .placement import Piece, site_over
 from .signed_distance import Blur, mask_field
 from .subject import Subject, rim
+from .voxels import Grid
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ def masked_subject(
     Raises
     ------
     InputError
-        A region that is not known, or not marked. A T1 that `read_intensity` refuses; a tumour outside the brain. What
+        A region that is not known, or not marked. A T1 that `read_intensity` refuses, or in LPS that is stated as RAS
+        as far as it shows; a tumour outside the brain. What
         `settings` refuse: by default a brain of less than 20 ml or more than 5,000 ml, and a tumour of fewer than 27
         voxels.
     """
@@ -90,6 +93,10 @@ def masked_subject(
                 f"{masks.name}: marks no {name}, so it is no region. Choose from {', '.join(known) or 'none'}, or name "
                 "its labels."
             )
+    intensity = None if t1 is None else read_intensity(t1)
+    if t1 is not None and intensity is not None:
+        scan = Grid(path_of(t1), intensity.values.shape, intensity.affine)
+        demand_scan_of(Mask(Path(masks.name), masks.brain, masks.affine), scan, masks.grids)
     affine, voxel = masks.affine, abs(float(np.linalg.det(masks.affine[:3, :3])))
     notes = list(masks.notes)
     solid = whole_brain(masks, notes, settings)
@@ -103,7 +110,7 @@ def masked_subject(
         interface=interface,
         tumour_volume=float(inside.sum() * voxel),
         site=site_over(cortex, pieces[0].centre),
-        intensity=None if t1 is None else read_intensity(t1),
+        intensity=intensity,
         notes=tuple(notes),
         pieces=pieces,
         parts=tuple((PART_LABELS[name], mask_field(masks.parts[name], affine, settings.blur)) for name in regions),

@@ -66,6 +66,15 @@ class Volume:
     segments: tuple[Segment, ...] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Where the voxels of a file lie: how many there are along each axis, and (4, 4) from indices to metres (RAS)."""
+
+    path: Path
+    shape: tuple[int, ...]
+    affine: np.ndarray
+
+
 def checked(path: Path, volume: Volume, voxels: Voxels, finite: bool, layered: bool) -> Volume:
     """The volume without axes of one voxel beyond the third, if it is one of numbers with a place.
 

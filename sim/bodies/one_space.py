@@ -1,0 +1,117 @@
+"""Whether several files are of one space, and not one of them in LPS that is stated as RAS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from ..errors import InputError
+from .label_map import Mask
+from .voxels import Grid
+
+TO_LPS = np.array([-1.0, -1.0, 1.0])
+# Share of what has to lie inside that does: less is amiss, and so much after x and y are negated says why.
+AMISS, EXPLAINED = 0.5, 0.9
+SAMPLED = 500
+ONE_OF_BOTH = "one of the two states LPS as RAS. Export that one anew."
+
+
+def in_one_space(brain: Mask, tumour: Mask) -> bool:
+    """Whether a brain and a tumour of grids of their own would fit as well if x and y of one were negated.
+
+    Raises
+    ------
+    InputError
+        A tumour beside the brain, and LPS that is stated as RAS as far as it shows.
+    """
+    demand_not_negated(brain.grid, tumour.grid)
+    boxes = [mask.box for mask in (brain, tumour)]
+    apart = (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any()
+    points = _places(tumour.grid, _thinned(np.argwhere(tumour.marked)))
+    planes = ConvexHull(_corners(brain)).equations
+    within, turned = (_share_within(planes, points * signs) for signs in (np.ones(3), TO_LPS))
+    if within < AMISS and turned > EXPLAINED:
+        raise InputError(
+            f"{tumour.path}: its tumour lies at {_box(boxes[1])}, and the brain of {brain.path} at {_box(boxes[0])}. "
+            f"With x and y negated it would lie in the brain: {ONE_OF_BOTH}"
+        )
+    if apart:
+        raise InputError(
+            f"{tumour.path}: its tumour lies at {_box(boxes[1])} and does not overlap the brain of {brain.path}, at "
+            f"{_box(boxes[0])}. Give volumes of one space, or resample one into the other's."
+        )
+    return turned > EXPLAINED and not _same(brain.grid, tumour.grid)
+
+
+def demand_scan_of(brain: Mask, scan: Grid, grids: Iterable[Grid]) -> None:
+    """Refuse a scan in LPS that is stated as RAS, as far as it shows; `grids` are of the files that mark the `brain`.
+
+    Raises
+    ------
+    InputError
+        A grid that is one of those with x and y negated, or a scan that would hold the brain if they were.
+    """
+    for grid in grids:
+        demand_not_negated(grid, scan)
+    points = _thinned(brain.outline)
+    within, turned = (_share_on(scan, points * signs) for signs in (np.ones(3), TO_LPS))
+    if within < AMISS and turned > EXPLAINED:
+        raise InputError(
+            f"{scan.path}: holds {100.0 * within:.0f} % of the brain of {brain.path}. With x and y negated it would "
+            f"hold {100.0 * turned:.0f} %: {ONE_OF_BOTH}"
+        )
+
+
+def demand_not_negated(one: Grid, other: Grid) -> None:
+    """Refuse two grids of which one is the other with x and y negated.
+
+    Raises
+    ------
+    InputError
+        Such grids.
+    """
+    negated = np.array([*TO_LPS, 1.0])[:, None] * other.affine
+    if _same(one, Grid(other.path, other.shape, negated)):
+        raise InputError(f"{other.path}: has the grid of {one.path}, but with x and y negated: {ONE_OF_BOTH}")
+
+
+def _same(one: Grid, other: Grid) -> bool:
+    return one.shape == other.shape and np.allclose(one.affine, other.affine, rtol=0.0, atol=1e-6)
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    """Some `SAMPLED` of them, at least."""
+    return points[:: max(1, len(points) // SAMPLED)]
+
+
+def _places(grid: Grid, index: np.ndarray) -> np.ndarray:
+    """Places (n, 3) [m] of voxels (n, 3)."""
+    return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+
+
+def _share_on(grid: Grid, points: np.ndarray) -> float:
+    """The share of points (n, 3) that lie in a voxel."""
+    inverse = np.linalg.inv(grid.affine)
+    index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3])
+    return float(((index >= 0) & (index < np.array(grid.shape))).all(axis=1).mean())
+
+
+def _corners(mask: Mask) -> np.ndarray:
+    """Points (n, 3) [m] on both sides of the outline: a mask of one slice has a hull, too."""
+    half = 0.5 * mask.affine[:3, :3].sum(axis=1)
+    return np.concatenate([mask.outline - half, mask.outline + half])
+
+
+def _share_within(planes: np.ndarray, points: np.ndarray) -> float:
+    """The share of points (n, 3) that no plane of a convex hull cuts off."""
+    outermost = np.full(len(points), -np.inf)
+    for part in np.array_split(planes, max(1, len(planes) // 64)):
+        np.maximum(outermost, (points @ part[:, :3].T + part[:, 3]).max(axis=1), out=outermost)
+    return float((outermost <= 0.0).mean())
+
+
+def _box(box: np.ndarray) -> str:
+    low, high = (", ".join(f"{1e3 * value:.0f}" for value in end) for end in box)
+    return f"{low} to {high} mm (RAS)"
