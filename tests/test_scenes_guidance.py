@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import nibabel
@@ -167,6 +168,8 @@ def test_the_skull_is_opened_over_the_piece_that_is_asked_for(tmp_path):
         opened(subject, SimpleNamespace(**asked | {"opening_over": (-90.0, 0.0, 20.0)}))
     with pytest.raises(InputError, match="has 2 pieces: choose 1 to 2"):
         opened(subject, SimpleNamespace(**asked | {"opening_over": 3}))
+    with pytest.raises(InputError, match="has one piece: give no number"):
+        opened(replace(subject, pieces=(large,)), SimpleNamespace(**asked | {"opening_over": 2}))
 
 
 def test_an_anatomy_says_where_its_pieces_lie_and_refuses_to_leave_data_behind(tmp_path, capsys):

@@ -33,12 +33,12 @@ def test_the_sheet_shows_where_things_are(tmp_path, capsys):
     """A ball of 55 mm round the origin, and one of 10 mm in it, 20 mm to the right and up."""
     ball(tmp_path)
     found, picture = inspected(capsys, tmp_path, tmp_path / "labels.nii.gz", "--brain", 1, "--tumour", 2)
-    assert found["brain"] == pytest.approx(4 / 3 * np.pi * 55**3 / 1e3, rel=0.01)
-    assert found["tumour"] == pytest.approx(552 * 0.008)
-    assert found["depth"] == pytest.approx(55 - 10 - np.hypot(20, 20), abs=2.0)
-    assert found["distance"] == pytest.approx(found["depth"], abs=2.0)
-    np.testing.assert_allclose(found["opening"], 55 / np.sqrt(2) * np.array([1, 0, 1]), atol=3.0)
-    assert found["axes"] == "RAS" and not found["mirrored"] and found["voxel"] == pytest.approx([2.0] * 3)
+    assert found["brain_ml"] == pytest.approx(4 / 3 * np.pi * 55**3 / 1e3, rel=0.01)
+    assert found["tumour_ml"] == pytest.approx(552 * 0.008)
+    assert found["depth_mm"] == pytest.approx(55 - 10 - np.hypot(20, 20), abs=2.0)
+    assert found["distance_mm"] == pytest.approx(found["depth_mm"], abs=2.0)
+    np.testing.assert_allclose(found["opening"]["at_mm"], 55 / np.sqrt(2) * np.array([1, 0, 1]), atol=3.0)
+    assert found["axes"] == "RAS" and not found["mirrored"] and found["voxel_mm"] == [2.0] * 3
     assert found["warnings"] == ["a brain of 695 ml is small for an adult: is the mask whole?"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["labels.nii.gz", "p.inspect.png", "t1.nii.gz"]
     axial, coronal = picture[:SIDE, :SIDE], picture[:SIDE, SIDE : 2 * SIDE]
@@ -72,7 +72,7 @@ def test_what_looks_wrong_is_said(tmp_path, capsys):
     for part in ("touches the cortex", "lies in 2 pieces", "the T1 holds", "mm from the tumour: pressing"):
         assert part in said
     assert found["axes"] == "LAS" and found["mirrored"]
-    assert [place for _, place in found["pieces"]] == ["left superior", "midline anterior"]
+    assert [piece["side"] for piece in found["tumour_pieces"]] == ["left superior", "midline anterior"]
     assert middle_of(picture[:SIDE, :SIDE], GREEN)[1] > 0.8
     # From behind, the left is on the left: there is the larger piece, higher up.
     outside = picture[SIDE:, SIDE : 2 * SIDE].astype(float)
@@ -83,6 +83,10 @@ def test_what_looks_wrong_is_said(tmp_path, capsys):
     text = capsys.readouterr().out
     assert main(["patient", *map(str, words[:-2]), "--out", str(tmp_path / "p.txt"), "--inspect"]) == 2
     assert ".vtu" in capsys.readouterr().err
+    # Before anything is read: these labels are not there.
+    for more in ((), ("--inspect",)):
+        refused = ["patient", "none.nii", "--out", str(tmp_path / "p.vtu"), "--nodes", "1999", *more]
+        assert main(refused) == 2 and "1999 nodes are outside 2000 to" in capsys.readouterr().err
     assert "stored LAS (mirrored, as many scanners do; left is where its affine says)" in text and "warnings:" in text
 
 

@@ -84,7 +84,7 @@ class TestOpenings:
         words = ["patient", str(folder / "labels.nii.gz"), "--brain", "1", "--tumour", "2", option, str(file)]
         code = main([*words, "--out", str(folder / "p.vtu"), "--inspect", "--json"])
         said = capsys.readouterr()
-        return np.array(json.loads(said.out)["opening"]) if code == 0 else said.err
+        return np.array(json.loads(said.out)["opening"]["at_mm"]) if code == 0 else said.err
 
     def test_at_a_point_and_where_a_trajectory_enters(self, folder, capsys):
         top = [0.0, 0.0, RADIUS]
@@ -105,9 +105,10 @@ class TestOpenings:
                 "--opening-at",
                 [[0.0, 0.0, 55.0]] * 2,
                 "Fiducial",
-                "holds a Fiducial of 2 points; --opening-at takes one",
+                "holds a list of 2 points; --opening-at takes one",
             ),
-            ("--opening-at", curve(), "Curve", "holds a Curve of 9 points"),
+            ("--opening-at", curve(), "Curve", "holds an open curve; --opening-at takes one point or"),
+            ("--opening-at", [[0.0, 0.0, 55.0]], "Plane", "holds a plane; --opening-at takes"),
             ("--opening-over", curve(), "ClosedCurve", "--opening-over takes one point or a line of two points"),
             ("--opening-at", curve()[:2], "ClosedCurve", "needs three points or more"),
             ("--opening-at", curve() + [0.0, 0.0, 30.0], "ClosedCurve", "opening's outline lies up to 2"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -86,6 +87,23 @@ class Inspection:
             f"voxels {' x '.join(f'{edge:.3g}' for edge in self.voxel)} mm, stored {self.axes} "
             f"({'mirrored, as many scanners do' if self.mirrored else 'not mirrored'}; left is where its affine says)",
         ]
+
+    def figures(self) -> dict[str, Any]:
+        """The same as JSON, with units in the names: volumes to a microlitre, lengths to 0.1 mm, voxels to 1 um."""
+        pieces = [{"ml": round(volume, 3), "side": place} for volume, place in self.pieces]
+        return {
+            "brain_ml": round(self.brain, 3),
+            "tumour_ml": round(self.tumour, 3),
+            "tumour_pieces": pieces,
+            "parts_ml": {name: round(volume, 3) for name, volume in self.parts.items()},
+            "depth_mm": round(self.depth, 1),
+            "opening": {"at_mm": [round(value, 1) + 0.0 for value in self.opening], "side": self.place},
+            "distance_mm": round(self.distance, 1),
+            "voxel_mm": [round(edge, 3) for edge in self.voxel],
+            "axes": self.axes,
+            "mirrored": self.mirrored,
+            "warnings": list(self.warnings),
+        }
 
 
 def inspected(masks: HeadMasks, subject: Subject) -> Inspection:

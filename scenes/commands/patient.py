@@ -6,7 +6,6 @@ import argparse
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 
 from sim.bodies.head_masks import head_masks
@@ -30,7 +29,7 @@ from .tissue_options import add_element_argument
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("labels", type=Path, metavar="LABELS.nii.gz", help="label volume")
-    add_label_arguments(parser, "--labels", "--convention")
+    add_label_arguments(parser, "--convention", "--labels")
     parser.add_argument("--t1", type=Path, help="intensities in the same space, for the camera view")
     parser.add_argument(
         "--out",
@@ -38,7 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="the anatomy, PATIENT.vtu; data (.h5) and models (.model.npz) are put beside it",
     )
-    parser.add_argument("--nodes", type=int, default=5300, help="number of mesh nodes (default %(default)s)")
+    parser.add_argument(
+        "--nodes", type=int, default=5300, help="number of mesh nodes, 2000 to 250000 (default %(default)s)"
+    )
     parser.add_argument(
         "--craniotomy",
         type=float,
@@ -71,9 +72,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; an interrupted run goes on when the same command is given again."""
+    # What can be said now is, not after minutes of reading and meshing.
+    plan = MeshPlan(args.nodes, 1e-3 * args.craniotomy)
     claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, [args.labels, args.mask, args.tumour_in, args.t1])
     if args.inspect:
-        return _inspect(args)
+        return _inspect(args, plan)
     from sim.runtime.device import device_names
     from surrogate.training.train import check_learners
 
@@ -81,7 +84,6 @@ def run(args: argparse.Namespace) -> int:
     from ..play.deformers import model_path
     from .train import asked_learners
 
-    # Said now, not after minutes of meshing.
     data, model = args.out.with_suffix(".h5"), model_path(args.out)
     claimed(data, ".h5", "a data set of `sulcus simulate`", args.force)
     claimed(model, ".npz", "a model of `sulcus train`", args.force)
@@ -120,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _inspect(args: argparse.Namespace) -> int:
+def _inspect(args: argparse.Namespace, plan: MeshPlan) -> int:
     """Print what would be made, and draw it."""
     from ar.screen import write_png
 
@@ -130,7 +132,6 @@ def _inspect(args: argparse.Namespace) -> int:
     began = time.perf_counter()
     picture = args.out.with_suffix(".inspect.png")
     claimed(picture, ".png", "a picture of sulcus", args.force, [args.labels, args.mask, args.tumour_in, args.t1])
-    plan = MeshPlan(args.nodes, 1e-3 * args.craniotomy)
     masks = head_masks(sources_of(args))
     subject = opened(masked_subject(masks, args.t1, regions=regions_asked(args)), args)
     found = inspected(masks, subject)
@@ -138,7 +139,7 @@ def _inspect(args: argparse.Namespace) -> int:
         write_png(partial, sheet(found, masks, subject, opened_cortex(subject, plan.craniotomy)))
     took = round(time.perf_counter() - began, 2)
     if args.json:
-        print(json.dumps({**asdict(found), "picture": str(picture), "seconds": took}))
+        print(json.dumps({**found.figures(), "picture": str(picture), "seconds": took}))
     else:
         warnings = [f"  - {warning}" for warning in found.warnings]
         print("\n".join([*found.lines(), *(["warnings:", *warnings] if warnings else ["no warnings"])]))

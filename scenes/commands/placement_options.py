@@ -89,7 +89,8 @@ def opened(subject: Subject, args: argparse.Namespace) -> Subject:
         return subject
     if isinstance(over, int):
         if not 1 <= over <= len(pieces):
-            raise InputError(f"--opening-over {over}: the tumour has {len(pieces)} pieces: choose 1 to {len(pieces)}.")
+            has = f"{len(pieces)} pieces: choose 1 to {len(pieces)}" if len(pieces) > 1 else "one piece: give no number"
+            raise InputError(f"--opening-over {over}: the tumour has {has}.")
         place = pieces[over - 1].centre
     elif isinstance(over, Path):
         markup = read_markup(over)
@@ -126,6 +127,21 @@ def _demand_kind(markup: Markup, option: str, **kinds: int | None) -> None:
         return
     words = {"Fiducial": "one point", "Line": "a line of two points", "ClosedCurve": "a closed curve"}
     raise InputError(
-        f"{markup.path}: holds a {markup.kind} of {len(markup.points)} points; {option} takes "
-        f"{' or '.join(words[kind] for kind in kinds)}. Save that from 3D Slicer."
+        f"{markup.path}: holds {_held(markup)}; {option} takes {' or '.join(words[kind] for kind in kinds)}. "
+        "Save that from 3D Slicer."
     )
+
+
+def _held(markup: Markup) -> str:
+    """What a file holds, in words."""
+    count = "1 point" if len(markup.points) == 1 else f"{len(markup.points)} points"
+    known = {
+        "Fiducial": f"a list of {count}",
+        "Line": f"a line of {count}",
+        "Curve": "an open curve",
+        "ClosedCurve": "a closed curve",
+        "Plane": "a plane",
+        "Angle": "an angle",
+        "ROI": "a box (ROI)",
+    }
+    return known.get(markup.kind, f"markups of the kind {markup.kind}")

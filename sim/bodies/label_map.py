@@ -97,9 +97,7 @@ class LabelMap:
 
     def _choice(self) -> str:
         if self.segments:
-            return listed(
-                [f"{one.name} ({one.value})" for one in self.segments if one.value in self.present[one.layer]]
-            )
+            return listed([one.name for one in self.segments if one.value in self.present[one.layer]])
         return listed(sorted(self.labels))
 
 
