@@ -41,6 +41,11 @@ def test_the_sheet_shows_where_things_are(tmp_path, capsys):
     assert found["axes"] == "RAS" and not found["mirrored"] and found["voxel_mm"] == [2.0] * 3
     assert found["warnings"] == ["a brain of 695 ml is small for an adult: is the mask whole?"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["labels.nii.gz", "p.inspect.png", "t1.nii.gz"]
+    # The legend has what is drawn, a tumour under the opening among it, and no tumour that is left out.
+    legend = picture[:, 2 * SIDE :].reshape(-1, 3)
+    shadow = (0.55 * np.array(GREEN) + 0.45 * np.array(RED)).astype(np.uint8)
+    for colour, there in ((RED, True), (shadow, True), (COLOURS["brain"], True), (COLOURS["left out"], False)):
+        assert (legend == colour).all(axis=1).any() == there
     axial, coronal = picture[:SIDE, :SIDE], picture[:SIDE, SIDE : 2 * SIDE]
     sagittal, outside = picture[SIDE:, :SIDE], picture[SIDE:, SIDE : 2 * SIDE]
     # As radiologists have it, the right is on the left; half of the side is 61 mm.

@@ -34,8 +34,11 @@ COLOURS: dict[str, Colour] = {
     "opening": (70, 205, 110),
 }
 """What is drawn in what colour; the later over the earlier."""
+CORTEX: Colour = (176, 168, 164)
 # [m] Round the brain; thickness of the opening's line in a slice; share of colour over a scan.
 ROOM, RIND, TINT = 6e-3, 2.2e-3, 0.6
+# Share of the tumour's colour over the cortex that hides it.
+SHADOW = 0.45
 # Directions of RAS, against and along.
 SIDES = ("LR", "PA", "IS")
 # Of the light on the cortex: from the viewer's upper left.
@@ -87,25 +90,26 @@ def sheet(found: Inspection, masks: HeadMasks, subject: Subject, opened: np.ndar
     """The sheet (H, W, 3) uint8; `opened` (n,) bool says which points of the subject's cortex are in the opening."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     centre = subject.pieces[0].centre
-    panels = []
+    panels, drawn = [], {"opening"}
     for plane in PLANES:
         right, down = np.array(plane.right), np.array(plane.down)
         across = np.abs(right) + np.abs(down)
         reach = 0.5 * float(((high - low) * across).max()) + ROOM
         middle = 0.5 * (low + high) * across + centre * (1.0 - across)
         view = View(f"{plane.name}, through the tumour", right, down, middle, reach)
-        panels.append(_framed(_slice(view, masks, subject, opened), view))
+        colour, names = _slice(view, masks, subject, opened)
+        panels.append(_framed(colour, view))
+        drawn |= names
     panels.append(_outside(masks, subject, opened))
     picture = Image.new("RGB", (2 * SIDE + COLUMN, 2 * SIDE), GROUND)
     for number, panel in enumerate(panels):
         picture.paste(Image.fromarray(panel), (SIDE * (number % 2), SIDE * (number // 2)))
-    drawn = {"tumour", "left out", "opening", *masks.parts, *([] if subject.intensity else ["brain"])}
     _write(ImageDraw.Draw(picture), found, [name for name in COLOURS if name in drawn])
     return np.asarray(picture)
 
 
-def _slice(view: View, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
-    """Labels in colours, over the scan where there is one, and the opened cortex."""
+def _slice(view: View, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> tuple[np.ndarray, set[str]]:
+    """Labels in colours, over the scan where there is one, and the opened cortex; and the names of what is drawn."""
     points = view.points().reshape(-1, 3)
     inverse = np.linalg.inv(masks.affine)
     index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3]).astype(int)
@@ -133,15 +137,21 @@ def _slice(view: View, masks: HeadMasks, subject: Subject, opened: np.ndarray) -
         white = np.quantile(grey[layers["brain"]], 0.98) if layers["brain"].any() else grey.max()
         colour = np.repeat(np.clip(grey / (white or 1.0), 0.0, 1.0)[:, None] * 235.0, 3, axis=1)
         tint = TINT
+    drawn = {name for name, mask in layers.items() if mask.any() and (name != "brain" or subject.intensity is None)}
     for name, mask in layers.items():
-        if name != "brain" or subject.intensity is None:
-            colour[mask] = (1.0 - tint) * colour[mask] + tint * np.array(COLOURS[name])
+        if name in drawn:
+            colour[mask] = _over(colour[mask], COLOURS[name], tint)
     rind = np.flatnonzero(np.abs(solid) < RIND)
     if len(rind) and opened.any():
         apart = np.linalg.norm(points[rind, None] - subject.site, axis=2)[:, 0]
         near = rind[apart < np.linalg.norm(subject.cortex[opened] - subject.site, axis=1).max() + RIND]
         colour[near[_nearest_is(subject.cortex, opened, points[near])]] = COLOURS["opening"]
-    return np.rint(colour).astype(np.uint8).reshape(SIDE, SIDE, 3)
+    return np.rint(colour).astype(np.uint8).reshape(SIDE, SIDE, 3), drawn
+
+
+def _over(ground: np.ndarray, colour: Colour, share: float) -> np.ndarray:
+    """Colours (..., 3) with a share of another one."""
+    return (1.0 - share) * ground + share * np.array(colour)
 
 
 def _nearest_is(cortex: np.ndarray, chosen: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -164,7 +174,7 @@ def _outside(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarr
     across = subject.cortex - subject.site
     reach = float(np.abs(np.stack([across @ right, across @ down])).max(axis=1).mean()) * 0.8
     view = View("from outside, along the opening", right, down, subject.site, reach)
-    cell = max(2.0 * reach / SIDE, 1.2 * float(np.linalg.norm(masks.affine[:3, :3], axis=0).max()))
+    cell = max(2.0 * reach / SIDE, 1.5 * float(np.linalg.norm(masks.affine[:3, :3], axis=0).max()))
     seen = _seen(view, subject.cortex, inward, cell)
     colour = np.tile(np.array(GROUND, float), (SIDE, SIDE, 1))
     there = seen >= 0
@@ -172,10 +182,10 @@ def _outside(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarr
     normals = gradient(subject.brain, places, probe=cell)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     light = np.clip(normals @ np.stack([right, -down, -inward], axis=1) @ LIGHT, 0.0, 1.0)
-    base = np.where(opened[seen[there]][:, None], COLOURS["opening"], (176, 168, 164))
+    base = np.where(opened[seen[there]][:, None], COLOURS["opening"], CORTEX)
     colour[there] = base * (0.3 + 0.7 * light)[:, None]
     shadow = _seen(view, subject.interface, inward, cell) >= 0
-    colour[shadow] = 0.55 * colour[shadow] + 0.45 * np.array(COLOURS["tumour"])
+    colour[shadow] = _over(colour[shadow], COLOURS["tumour"], SHADOW)
     return _framed(np.rint(colour).astype(np.uint8), view)
 
 
@@ -226,8 +236,13 @@ def _write(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> Non
     rows += [("", TEXT), ("Research only; not a medical device.", FAINT)]
     for number, (text, colour) in enumerate(rows):
         ink.text((left, top + LINE * number), text, colour, ImageFont.load_default(SIZE))
-    for number, name in enumerate(reversed(shown)):
+    legend = [("tumour that is left out" if name == "left out" else name, [COLOURS[name]]) for name in shown]
+    grounds = np.array([COLOURS["opening"], CORTEX])
+    legend.append(("tumour under the opening, and under the skull", _over(grounds, COLOURS["tumour"], SHADOW).tolist()))
+    for number, (said, colours) in enumerate(reversed(legend)):
         row = 2 * SIDE - PAD - LINE * (number + 1)
-        ink.rectangle([left, row + 3, left + 15, row + 18], fill=COLOURS[name])
-        said = "tumour that is left out" if name == "left out" else name
+        for part, colour in enumerate(colours):
+            wide = 16 // len(colours)
+            at = left + wide * part
+            ink.rectangle([at, row + 3, at + wide - 1, row + 18], fill=tuple(int(value) for value in colour))
         ink.text((left + 24, row), said, TEXT, ImageFont.load_default(SIZE))
