@@ -13,6 +13,7 @@ import slicerio
 import trimesh
 
 from scenes.cli import main
+from scenes.warp.landmarks import NEAREST, landmarks_of
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.geometry.locate import locate
 from sim.geometry.tetmesh import signed_volumes
@@ -155,6 +156,31 @@ def test_points_go_the_way_that_tissue_goes(box, out):
     assert np.abs(now - truth).max() < 0.05e-3
 
 
+def test_each_landmark_is_a_place_in_tissue_that_the_field_for_points_carries(out):
+    field = sitk.ReadImage(str(out / "field_modeling.nrrd"), sitk.sitkVectorFloat64)
+    transform = sitk.DisplacementFieldTransform(field)
+    controls = json.loads((out / "landmarks.mrk.json").read_text())["markups"][0]["controlPoints"]
+    points = {point["label"]: np.array(point["position"]) for point in controls}
+    stated = json.loads((out / "warp.json").read_text())["grid_error_mm"]["landmarks_worst"]
+    for name in ("tumour", "open cortex"):
+        now = points[f"{name}, now"]
+        carried = transform.TransformPoint(points[f"{name}, in the scan"].tolist())
+        assert np.linalg.norm(carried - now) < stated + 0.05 and stated < 0.1
+        assert np.linalg.norm(points[f"{name}, in the scan"] - now) > 1.0
+
+
+def test_the_landmarks_of_a_tumour_that_is_hollow_say_so(box):
+    middles = box.mesh.nodes[box.mesh.tets].mean(axis=1)
+    tumour = np.flatnonzero(box.mesh.region == 2)
+    hollow = box.without(tumour[np.linalg.norm(middles[tumour] + [0.0, 0.0, 22e-3], axis=1) < 5e-3])
+    moved = bump(box.mesh.nodes)
+    nearest, cortex = landmarks_of(hollow, moved)
+    assert nearest.name == NEAREST and cortex.name == "open cortex"
+    np.testing.assert_allclose(
+        nearest.now, nearest.rest + locate(hollow.mesh, nearest.rest[None]).read(moved[None])[0, 0]
+    )
+
+
 def test_itk_finds_no_fold(out):
     for name in ("field_resampling.nii.gz", "field_modeling.nrrd"):
         field = sitk.ReadImage(str(out / name), sitk.sitkVectorFloat64)
@@ -221,7 +247,9 @@ def test_slicerio_reads_tumour_and_bound(box, out):
     assert np.isclose((voxels == tumour["labelValue"]).sum() * (1e-3 * edge) ** 3, size, rtol=0.03)
     middle = np.argwhere(voxels == 1).mean(axis=0)
     where = (read["ijkToLPS"] @ [*middle, 1.0])[:3] * LPS
-    assert np.linalg.norm(where - 1e3 * now[box.tumour_nodes].mean(axis=0)) < 1.0
+    controls = json.loads((out / "landmarks.mrk.json").read_text())["markups"][0]["controlPoints"]
+    (centroid,) = (point["position"] for point in controls if point["label"] == "centroid of the tumour now")
+    assert np.linalg.norm(where - LPS * centroid) < 0.05
     bound = json.loads((out / "warp.json").read_text())["bound_mm"]
     assert np.isclose(bound, 1e3 * np.sqrt(7.815 * 4e-6), rtol=1e-3)
     outer = np.argwhere(voxels > 0)

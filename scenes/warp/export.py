@@ -15,6 +15,7 @@ from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, forward_on, landmark_errors, warp_fields, warp_grid
 
 from .images import Picture, Warped, write_field_nifti, write_warped
+from .landmarks import CENTROID, centroid_now, landmarks_of
 from .markups import write_markups
 from .meshes import mesh_of, write_glb, write_stl, write_vtp
 from .moment import Moment
@@ -88,15 +89,25 @@ def _write_surfaces(place: Path, moment: Moment) -> None:
 
 
 def _write_points(place: Path, moment: Moment) -> None:
-    landmarks = moment.landmarks()
-    if landmarks:
-        write_markups(place / "landmarks.mrk.json", "Fiducial", landmarks)
+    points = named_points(moment)
+    if points:
+        write_markups(place / "landmarks.mrk.json", "Fiducial", points)
     gap = moment.gap()
     if gap is not None and moment.tip is not None:
         write_markups(place / "tip_to_tumour.mrk.json", "Line", {"tip": moment.tip, "tumour": gap[0]})
     tumour = moment.left.mesh.tets[moment.left.mesh.region == TUMOUR_LABEL]
     if len(tumour):
         write_segmentation(place / "tumour.seg.nrrd", moment.now, tumour, moment.bound)
+
+
+def named_points(moment: Moment) -> dict[str, np.ndarray]:
+    """Points (3,) [m] by name: of tissue in the scan and now, the tumour's centroid now, and the tool's tip."""
+    points = {}
+    for one in landmarks_of(moment.left, moment.displacement):
+        points |= {f"{one.name}, in the scan": one.rest, f"{one.name}, now": one.now}
+    centroid = centroid_now(moment.left, moment.displacement)
+    others = {CENTROID: centroid, "tip": moment.tip}
+    return points | {name: point for name, point in others.items() if point is not None}
 
 
 def _write_sequence(path: Path, sequence: Sequence[tuple[float, Moment]]) -> None:
@@ -117,6 +128,8 @@ def figures(moment: Moment, fields: WarpFields, warped: Sequence[Warped], frames
     moving = np.linalg.norm(moved[used], axis=1) > MOVED
     tumour = np.isin(used, moment.left.tumour_nodes)
     gap = moment.gap()
+    marks = landmarks_of(moment.left, moment.displacement)
+    off = [fields.grid.read(fields.forward, one.rest[None])[0] - (one.now - one.rest) for one in marks]
     return {
         "moved_by": moment.words,
         "space": "RAS",
@@ -134,7 +147,9 @@ def figures(moment: Moment, fields: WarpFields, warped: Sequence[Warped], frames
             "moved_p95": float(np.quantile(error[moving], 0.95)) if moving.any() else 0.0,
             "worst": float(error.max()),
             "tumour_worst": float(error[tumour].max(initial=0.0)),
+            "landmarks_worst": 1e3 * max((float(np.linalg.norm(each)) for each in off), default=0.0),
         },
+        "landmarks": [one.name for one in marks],
         "images": [vars(one) for one in warped],
         "sequence_frames": frames,
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -65,16 +65,6 @@ class Moment:
     def now(self) -> np.ndarray:
         """Where the vertices are (V, 3) [m]."""
         return self.anatomy.mesh.nodes + self.displacement
-
-    def landmarks(self) -> Mapping[str, np.ndarray]:
-        """Points (3,) [m] by name: the middles of tumour and open cortex, in the scan and now, and the tool's tip."""
-        found = {}
-        surfaces = {"tumour": self.left.tumour_nodes, "open cortex": np.unique(self.left.open_surface)}
-        for name, vertices in surfaces.items():
-            if len(vertices):
-                found[f"{name}, in the scan"] = self.anatomy.mesh.nodes[vertices].mean(axis=0)
-                found[f"{name}, now"] = self.now[vertices].mean(axis=0)
-        return found if self.tip is None else {**found, "tip": self.tip}
 
     def gap(self) -> tuple[np.ndarray, float] | None:
         """The tumour's point (3,) [m] nearest to the tip, and how far it is [m], 0 inside; None where there is none."""

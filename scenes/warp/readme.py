@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from .images import Warped
+from .landmarks import CENTROID, NEAREST, SAID, TUMOUR
 
 INTRODUCTION = """sulcus warp: a deformed brain, for other programs
 Research only. Not a medical device.
@@ -42,7 +43,7 @@ A voxel whose source lies outside the image, or in tissue that was cut away, is 
 {fold}
 Read between their nodes ({spacing:g} mm apart), the fields miss the finite elements' vertices by {median:.4f} mm in the
 median. They miss those that move by {moved:.3f} mm in 95 of 100, and the worst by {worst:.3f} mm. Of the tumour it
-is {tumour:.3f} mm.
+is {tumour:.3f} mm. From "in the scan" field_modeling leads each landmark to "now" within {landmarks:.3f} mm.
 These are errors of the grid. How far the tumour may be off: {bound}
 """
 
@@ -56,9 +57,13 @@ def page(report: dict, words: str, trust: Sequence[str], images: Sequence[Warped
     for one in images:
         lines += f"{one.name}\n    your image now, on its own grid: {one.moved:,} voxels moved.\n"
         lines += f"    0 as their source lies outside: {one.outside:,}; as it was cut away: {one.gone:,}.\n"
+    named = [*report["landmarks"], *([CENTROID] if {TUMOUR, NEAREST} & {*report["landmarks"]} else [])]
+    points = "".join(f"    {name}: {SAID[name]}\n" for name in named)
     surfaces = (
         "brain, cortex, tumour    .vtp, .stl, and all together deformed.glb: the deformed surfaces.\n"
-        "*.mrk.json               points, and the line from the tip to the tumour where there is a tool.\n"
+        "landmarks.mrk.json       points, in the scan and now:\n"
+        f"{points}"
+        "tip_to_tumour.mrk.json   the line from the tip to the tumour's nearest point, where there is a tool.\n"
         "tumour.seg.nrrd          the tumour, and if it is known the shell in which its surface may lie.\n"
     )
     error = report["grid_error_mm"]
@@ -70,6 +75,7 @@ def page(report: dict, words: str, trust: Sequence[str], images: Sequence[Warped
         moved=error["moved_p95"],
         worst=error["worst"],
         tumour=error["tumour_worst"],
+        landmarks=error["landmarks_worst"],
         bound=_bound(report),
     )
     start = INTRODUCTION.format(words=words, trust="\n".join(trust))
