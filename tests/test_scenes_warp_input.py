@@ -1,6 +1,7 @@
 """What `sulcus warp` is asked for: loads, moments of scenes, images as they come; what it refuses, and how."""
 
 import json
+from dataclasses import replace
 
 import nibabel
 import nrrd
@@ -173,6 +174,37 @@ def test_doubts_about_an_image_are_said(folder, box, capsys):
     }
     assert "another space" in said["empty.nii.gz"]
     assert all(word in said["part.nii.gz"] for word in ("neither sform", "of the brain", "without a number"))
+
+
+def test_a_map_of_a_small_tumour_raises_no_doubt(folder, box):
+    values = np.zeros((40, 40, 32), np.uint8)
+    values[18:23, 18:23, 12:17] = 2
+    save(folder / "small.nii.gz", values)
+    assert read_picture(folder / "small.nii.gz", box, True).warnings == ()
+    asked = " ".join(read_picture(folder / "small.nii.gz", box, False).warnings)
+    assert "another space" in asked and "--labels" in asked
+
+
+def test_what_is_empty_is_a_share_of_the_volume_and_not_of_vertices(folder, box):
+    index = np.rint((1e3 * box.mesh.nodes - AFFINE[:3, 3]) / 2.0).astype(int)
+    values = np.ones((40, 40, 32), np.float32)
+    values[tuple(index.T)] = 0.0  # one voxel round each vertex
+    save(folder / "pitted.nii.gz", values)
+    assert not any("is 0" in warning for warning in read_picture(folder / "pitted.nii.gz", box, False).warnings)
+
+
+def test_lps_that_is_stated_as_ras_is_doubted(folder, box):
+    moved = replace(box, mesh=replace(box.mesh, nodes=box.mesh.nodes + [0.0, 15e-3, 0.0]))
+    places = np.moveaxis(np.indices((60, 60, 32)), 0, -1) * 2.0 + [-60.0, -60.0, -50.0]
+    low, high = 1e3 * moved.mesh.nodes.min(axis=0), 1e3 * moved.mesh.nodes.max(axis=0)
+    values = np.random.default_rng(0).normal(5.0, 1.0, places.shape[:3])
+    values[((places >= low) & (places <= high)).all(axis=-1)] = 100.3
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    affine[:3, 3] = [-60.0, -60.0, -50.0]
+    for name, signs in (("right", [1.0, 1.0, 1.0, 1.0]), ("wrong", [-1.0, -1.0, 1.0, 1.0])):
+        save(folder / f"{name}.nii.gz", values.astype(np.float32), np.diag(signs) @ affine)
+        warnings = read_picture(folder / f"{name}.nii.gz", moved, False).warnings
+        assert any("LPS that is stated as RAS" in warning for warning in warnings) == (name == "wrong")
 
 
 def test_a_folder_of_somebody_elses_is_left_alone(folder, capsys):

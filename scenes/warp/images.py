@@ -16,6 +16,7 @@ from sim.errors import InputError
 from sim.fields.grid import Grid
 from sim.fields.warp_fields import WarpFields
 
+from .doubts import doubts, index_of, shown
 from .nrrd_files import DIGITS
 
 SUFFIXES = (".seg.nrrd", *READERS)
@@ -25,8 +26,6 @@ WHOLE = np.uint8, np.int16, np.uint16, np.int32
 """Types of whole numbers that every reader of NIfTI knows."""
 DISPLACEMENT = 1006
 """NIfTI's intent: vectors in millimetres, RAS."""
-# Less of the brain inside an image, or on voxels that are not empty, is worth a warning.
-ENOUGH = 0.98, 0.5
 # Voxels that move less [m] stay as they are.
 STILL = 1e-8
 # Slices that are looked at together: bounds the memory that it takes.
@@ -64,31 +63,16 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool) -> Picture:
     """
     volume = read_volume(path, finite=False)
     image = _as_nifti(path, volume)
-    values, shape = volume.values, np.array(volume.values.shape)
+    values = volume.values
     if labels and not np.array_equal(values, np.rint(values)):
         raise InputError(f"{path}: holds values that are not whole, so it is no label map. Give it by --image.")
-    index = _index(volume.affine, anatomy.mesh.nodes)
-    inside = ((index >= -0.5) & (index <= shape - 0.5)).all(axis=1)
-    share = float(inside.mean())
-    if share == 0.0:
+    if shown(volume.affine, values.shape, anatomy) == 0.0:
         low, high = (1e3 * end for end in (anatomy.mesh.nodes.min(axis=0), anatomy.mesh.nodes.max(axis=0)))
         raise InputError(
             f"{path}: shows none of this brain, which reaches from {_mm(low)} to {_mm(high)} mm (RAS). Give an image "
             "in the space of the labels that the anatomy was made from, or register it to them first."
         )
-    warnings = list(volume.notes)
-    if share < ENOUGH[0]:
-        warnings.append(f"shows {share:.0%} of the brain; what lies outside is not in it")
-    nearest = np.clip(np.rint(index[inside]), 0, shape - 1).astype(int)
-    full = float((values[tuple(nearest.T)] != 0).mean())
-    if full < ENOUGH[1]:
-        warnings.append(
-            f"is 0 in {1.0 - full:.0%} of the brain: it may be in another space than the labels that the anatomy was "
-            "made from"
-        )
-    lost = int((~np.isfinite(values)).sum())
-    if lost:
-        warnings.append(f"{lost} voxels without a number are taken as 0")
+    warnings = [*volume.notes, *doubts(values, volume.affine, labels, anatomy)]
     return Picture(path, image, volume, labels, tuple(warnings))
 
 
@@ -167,7 +151,7 @@ def warped_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, or
         if not len(rows):
             continue
         then = now[rows] + went
-        place = _index(affine, then)
+        place = index_of(affine, then)
         off = ((place < -0.5) | (place > last + 0.5)).any(axis=1)
         cut = np.zeros(len(rows), bool)
         if fields.gone.any():
@@ -197,11 +181,6 @@ def _as(values: np.ndarray, kind: np.dtype) -> np.ndarray:
         return values.astype(kind)
     limits = np.iinfo(kind)
     return np.clip(np.rint(values), limits.min, limits.max).astype(kind)
-
-
-def _index(affine: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Indices (n, 3) of points (n, 3) [m] in a volume of an affine (4, 4)."""
-    return (points - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
 
 
 def _mm(point: np.ndarray) -> str:

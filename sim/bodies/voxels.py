@@ -83,13 +83,18 @@ def checked(path: Path, volume: Volume, voxels: Voxels, finite: bool, layered: b
     Raises
     ------
     InputError
-        Colours or complex numbers; a slice or several volumes; unless not `finite`, values that are no numbers. An
-        affine that is singular, and voxels too fine or too coarse.
+        Colours or complex numbers; a slice or several volumes; segments that overlap, unless `layered`. Unless not
+        `finite`, values that are no numbers. An affine that is singular, and voxels too fine or too coarse.
     """
     values, affine = volume.values, volume.affine
     shape = " x ".join(map(str, values.shape))
     if values.dtype.kind not in "biuf":
         raise InputError(f"{path}: holds colours or complex numbers ({values.dtype}), not plain ones. {REMEDY}")
+    if not layered and volume.segments and values.ndim == 4 and values.shape[3] > 1:
+        raise InputError(
+            f"{path}: its segments overlap, in {values.shape[3]} layers, so it is no label map. Export them as a label "
+            "map (.nii.gz): there each voxel has one label."
+        )
     most = values.shape[3] if layered and volume.segments and values.ndim == 4 else 1
     if values.ndim < 3 or min(values.shape[:3]) < 2 or max(values.shape[3:], default=1) > most:
         raise InputError(f"{path}: measures {shape} voxels, which is not one volume. {REMEDY}")
