@@ -46,10 +46,15 @@ def warp(folder, *words, out="out", anatomy="box.vtu"):
     return main(["warp", str(folder / anatomy), *map(str, words), "--spacing", "4", "--out", str(folder / out)])
 
 
-def test_a_load_is_solved_and_its_tip_measured(folder, capsys):
+def test_a_load_is_solved_and_its_tip_measured(folder, box, capsys):
     words = "--load=1,2,0,0.1", "--device", "cpu", "--json"
     assert warp(folder, *words, out="load") == 0
     report = json.loads(capsys.readouterr().out)
+    said = report["cause"]
+    assert "a load of 0.1 N at 1.0, 2.0, 0.0 mm towards 0.00, 0.00, -1.00 (RAS)" in report["moved_by"]
+    assert (said["kind"], said["place_mm"], said["force_n"]) == ("load", [1.0, 2.0, 0.0], pytest.approx(0.1))
+    assert said["direction"] == [0.0, 0.0, -1.0] and "frame" not in said and "scene" not in report["moved_by"]
+    assert report["anatomy"] == {"file": "box.vtu", "digest": box.digest}
     assert "finite elements" in report["moved_by"] and report["largest_displacement_mm"] > 0.2
     assert report["bound_mm"] is None and min(report["least_jacobian"].values()) > 0.0
     line = json.loads((folder / "load" / "tip_to_tumour.mrk.json").read_text())["markups"][0]
@@ -58,13 +63,17 @@ def test_a_load_is_solved_and_its_tip_measured(folder, capsys):
         np.linalg.norm(ends[0] - ends[1]), report["tip_to_tumour_mm"], atol=1e-3
     )
     assert np.abs(ends[0, :2] - [-1.0, -2.0]).max() < 1.5  # LPS
-    assert "not known" in (folder / "load" / "README.txt").read_text()
+    text = (folder / "load" / "README.txt").read_text()
+    assert all(word in text for word in ("not known", "a load of 0.1 N at", f"box.vtu, digest {box.digest}"))
+    assert report["spaces"]["field_modeling.nrrd"] == "LPS, mm" and report["spaces"]["cause"] == "RAS, mm"
 
 
 def test_a_scene_is_a_sequence_in_time(folder, capsys):
     words = "--scene", "press", "--frame", "60", "--sequence", "60", "--device", "cpu", "--json"
     assert warp(folder, *words, out="scene") == 0
-    assert json.loads(capsys.readouterr().out)["sequence_frames"] == 3
+    report = json.loads(capsys.readouterr().out)
+    assert report["sequence_frames"] == 3
+    assert report["cause"] == {"kind": "scene", "scene": "press", "frame": 60, "time_s": 2.0}
     values, header = nrrd.read(str(folder / "scene" / "field_sequence.seq.nrrd"))
     assert header["kinds"] == ["vector", "domain", "domain", "domain", "list"] and values.shape[0::4] == (3, 3)
     assert header["axis 3 index values"] == "0 2 4" and header["units"][-1] == "s"

@@ -82,7 +82,10 @@ def load(text: str) -> tuple[float, float, float, float]:
 
 def run(args: argparse.Namespace) -> int:
     """Solve, write, say. 1: the answer did not converge, or space folds; all is written nevertheless."""
+    from tqdm import tqdm
+
     from ..play.deformers import open_theatre
+    from ..script.shipped_files import template_path
     from ..warp.export import Asked, write_warp
     from ..warp.images import read_picture
     from ..warp.output_folder import claimed_warp
@@ -96,7 +99,12 @@ def run(args: argparse.Namespace) -> int:
         for warning in picture.warnings:
             print(f"{picture.path}: {warning}", file=sys.stderr)
     moment, sequence = moments(args, theatre, scene)
-    report = write_warp(out, moment, pictures, Asked(1e-3 * args.spacing, args.interpolation), sequence)
+    source = (args.anatomy or template_path()).name
+    with tqdm(total=3 + len(pictures) + bool(sequence), unit="part", desc="fields, files", file=sys.stderr) as bar:
+        asked = Asked(1e-3 * args.spacing, args.interpolation, source, bar.update)
+        report = write_warp(out, moment, pictures, asked, sequence)
+    for warning in report["warnings"]:
+        print(f"sulcus warp: {warning}", file=sys.stderr)
     print(json_line({**report, "out": str(out)}) if args.json else sentences(report, out))
     wrong = "" if report["converged"] else "the answer did not converge"
     if not min(report["least_jacobian"].values()) > 0.0:
@@ -198,7 +206,9 @@ def moments(
     many = [] if args.sequence is None else list(range(0, len(scene.times), args.sequence))
     frames = sorted({wanted, *many})
     with tqdm(total=frames[-1] + 1, unit="frame", desc="finite elements", file=sys.stderr) as bar:
-        found = dict(zip(frames, Played(theatre, scene).moments(frames, bar.update), strict=True))
+        found = dict(
+            zip(frames, Played(theatre, scene, args.load is not None).moments(frames, bar.update), strict=True)
+        )
     return found[wanted], [(float(scene.times[number]), found[number]) for number in many]
 
 

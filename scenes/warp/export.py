@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,16 +32,23 @@ LOOKS = {
 """Surfaces, and their colours."""
 # A vertex that goes farther moves [m].
 MOVED = 1e-4
+# What the grid costs the tumour is worth a warning above this share of the largest motion.
+COARSE = 0.1
 # A sequence has nodes so far apart [m], and no more numbers than so many.
 SEQUENCE_SPACING, MOST_NUMBERS = 3e-3, 400_000_000
 
 
 @dataclass(frozen=True)
 class Asked:
-    """How fields and images are made: spacing of the fields [m], and the interpolation of images."""
+    """How fields and images are made: spacing of the fields [m], and the interpolation of images.
+
+    `source` is the name of the anatomy's file; `step` hears of how many more parts are done, whenever some are.
+    """
 
     spacing: float
     order: str
+    source: str
+    step: Callable[[int], object] = lambda more: None
 
 
 def write_warp(
@@ -55,19 +62,26 @@ def write_warp(
         As `written_warp`; a sequence that is too long.
     """
     fields = warp_fields(moment.anatomy, moment.displacement, asked.spacing, moment.left)
+    asked.step(1)
     with written_warp(folder) as place:
         write_field_nifti(place / "field_resampling.nii.gz", fields.grid, fields.backward)
         write_field_nrrd(place / "field_modeling.nrrd", fields.grid, fields.forward, "modeling")
+        asked.step(1)
         if sequence:
             _write_sequence(place / "field_sequence.seq.nrrd", sequence)
-        warped = [write_warped(place, picture, fields, asked.order) for picture in pictures]
+            asked.step(1)
+        warped = []
+        for picture in pictures:
+            warped.append(write_warped(place, picture, fields, asked.order))
+            asked.step(1)
         _write_surfaces(place, moment)
         _write_points(place, moment)
+        asked.step(1)
         report = figures(moment, fields, warped, len(sequence))
-        trust = () if moment.converged else ("THE ANSWER DID NOT CONVERGE: do not rely on it.",)
-        (place / "README.txt").write_text(page(report, moment.words, trust, warped, True))
+        report["anatomy"] = {"file": asked.source, "digest": moment.anatomy.digest}
+        (place / "README.txt").write_text(page(report, warped))
         files = sorted(path.name for path in place.iterdir())
-        report = {"format": FORMAT, "files": files, **report}
+        report = {"format": FORMAT, "files": files, "spaces": spaces(files), **report}
         (place / LISTED).write_text(json.dumps(report, indent=1) + "\n")
     return report
 
@@ -120,21 +134,30 @@ def _write_sequence(path: Path, sequence: Sequence[tuple[float, Moment]]) -> Non
     write_field_sequence(path, grid, fields, [time for time, _ in sequence])
 
 
+def spaces(files: Sequence[str]) -> dict[str, str]:
+    """In which space each file's coordinates are; `cause` is of those in `warp.json`."""
+    known = {"field_resampling.nii.gz": "RAS, mm", "deformed.glb": "left, head, front, m"}
+    endings = {".nii.gz": "that of the image", ".txt": ""}
+    found = {name: known.get(name, endings.get(name[name.find(".") :], "LPS, mm")) for name in files}
+    return {"cause": "RAS, mm", **{name: space for name, space in found.items() if space}}
+
+
 def figures(moment: Moment, fields: WarpFields, warped: Sequence[Warped], frames: int) -> dict[str, Any]:
-    """What a warp says of itself: millimetres, shares, and counts of voxels."""
+    """What a warp says of itself: millimetres, shares, counts of voxels, and warnings."""
     nodes, moved = moment.left.mesh.nodes, moment.displacement
     used = np.unique(moment.left.mesh.tets)
     error = 1e3 * landmark_errors(fields, nodes[used], moved[used])
     moving = np.linalg.norm(moved[used], axis=1) > MOVED
     tumour = np.isin(used, moment.left.tumour_nodes)
     gap = moment.gap()
+    largest, of_tumour = 1e3 * float(np.linalg.norm(moved, axis=1).max()), float(error[tumour].max(initial=0.0))
     marks = landmarks_of(moment.left, moment.displacement)
     off = [fields.grid.read(fields.forward, one.rest[None])[0] - (one.now - one.rest) for one in marks]
     return {
-        "moved_by": moment.words,
-        "space": "RAS",
+        "moved_by": moment.cause.words,
+        "cause": dict(moment.cause.record),
         "converged": moment.converged,
-        "largest_displacement_mm": 1e3 * float(np.linalg.norm(moved, axis=1).max()),
+        "largest_displacement_mm": largest,
         "tip_to_tumour_mm": None if gap is None else 1e3 * gap[1],
         "bound_mm": None if moment.bound is None else 1e3 * moment.bound,
         "bound_of": moment.bound_words,
@@ -146,10 +169,20 @@ def figures(moment: Moment, fields: WarpFields, warped: Sequence[Warped], frames
             "median": float(np.median(error)),
             "moved_p95": float(np.quantile(error[moving], 0.95)) if moving.any() else 0.0,
             "worst": float(error.max()),
-            "tumour_worst": float(error[tumour].max(initial=0.0)),
+            "tumour_worst": of_tumour,
             "landmarks_worst": 1e3 * max((float(np.linalg.norm(each)) for each in off), default=0.0),
         },
         "landmarks": [one.name for one in marks],
         "images": [vars(one) for one in warped],
         "sequence_frames": frames,
+        "warnings": _warnings(largest, of_tumour),
     }
+
+
+def _warnings(largest: float, of_tumour: float) -> list[str]:
+    if of_tumour <= COARSE * largest:
+        return []
+    return [
+        f"the grid is coarse for this tumour: its error of {of_tumour:.2f} mm is more than a tenth of the largest "
+        f"motion, {largest:.2f} mm. Give a smaller --spacing."
+    ]

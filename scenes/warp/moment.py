@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from ..play.player import Player
 from ..play.reference import past_matters, truth_of
 from ..play.stage import Stage
 from ..script.scene import Scene
+from .causes import Cause, file_cause, load_cause, scene_cause
 
 # Of three normal components within a ball: 95 %.
 CHI = 7.815
@@ -38,7 +39,7 @@ class Moment:
 
     Parameters
     ----------
-    words
+    cause
         What moved it.
     anatomy, left
         The body, and what is left of it where some was cut.
@@ -52,7 +53,7 @@ class Moment:
         Of the tool (3,) [m]; None without one.
     """
 
-    words: str
+    cause: Cause
     anatomy: Anatomy
     left: Anatomy
     displacement: np.ndarray
@@ -78,11 +79,11 @@ class Moment:
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """A scene on a theatre, and the finite elements that answer it."""
+    """A scene on a theatre, or a `load` that is one, and the finite elements that answer it."""
 
     theatre: Theatre
     scene: Scene
-    solved: dict[int, Deformation] = field(default_factory=dict)
+    load: bool = False
 
     def moments(self, frames: Sequence[int], progress: Callable[[int], object] = lambda more: None) -> list[Moment]:
         """The moments of some frames, in rising order."""
@@ -110,10 +111,13 @@ class Played:
         tip = None if scene.tool is None else player.tool(scene.tool, scene.path(time), now).tip
         known = self.theatre.uncertainty(scene)
         bound = None if known is None else known.at(time).prior
-        words = f"scene {scene.name}, frame {number}, {time:.2f} s, by finite elements: {answer.source}"
+        loads = self._loads(number)
+        cause = load_cause(loads) if self.load else scene_cause(scene, number)
         said = {} if bound is None else {"bound_words": ENSEMBLE}
-        left = stage.at(self._loads(number)).anatomy
-        return Moment(words, site.anatomy, left, moved, answer.outcome[0].good, bound, tip=tip, **said)
+        left = stage.at(loads).anatomy
+        return Moment(
+            cause.by(answer.source), site.anatomy, left, moved, answer.outcome[0].good, bound, tip=tip, **said
+        )
 
 
 def read_moment(path: Path, anatomy: Anatomy) -> Moment:
@@ -135,11 +139,11 @@ def read_moment(path: Path, anatomy: Anatomy) -> Moment:
     same = file.mesh.nodes.shape == mesh.nodes.shape and np.array_equal(file.mesh.tets, mesh.tets)
     if not same or np.abs(file.mesh.nodes - mesh.nodes).max() > SAME:
         raise InputError(f"{path}: is of another mesh than the anatomy. Give the anatomy that it was made with.")
-    words = f"displacement of {path.name}"
+    cause = file_cause(path)
     if "covariance" not in file.point_data:
-        return Moment(words, anatomy, anatomy, np.asarray(moved, np.float64))
+        return Moment(cause, anatomy, anatomy, np.asarray(moved, np.float64))
     xx, yy, zz, xy, yz, xz = np.asarray(file.point_data["covariance"])[np.unique(anatomy.tumour_surface)].T
     matrices = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
     bound = float(np.sqrt(CHI * np.linalg.eigvalsh(matrices)[:, -1].max()))
     said = "what was seen of the cortex, as the covariance in the file says, at the tumour's worst vertex"
-    return Moment(words, anatomy, anatomy, np.asarray(moved, np.float64), True, bound, said)
+    return Moment(cause, anatomy, anatomy, np.asarray(moved, np.float64), True, bound, said)

@@ -11,7 +11,7 @@ INTRODUCTION = """sulcus warp: a deformed brain, for other programs
 Research only. Not a medical device.
 
 What moved it: {words}
-The patient's space is RAS (right, anterior, superior), in which the anatomy was made.
+The anatomy: {file}, digest {digest}. Its space is RAS (right, anterior, superior).
 {trust}
 """
 
@@ -48,7 +48,7 @@ These are errors of the grid. How far the tumour may be off: {bound}
 """
 
 
-def page(report: dict, words: str, trust: Sequence[str], images: Sequence[Warped], meshes: bool) -> str:
+def page(report: dict, images: Sequence[Warped]) -> str:
     """The text of README.txt from the figures of a warp."""
     sequence = (
         "field_sequence.seq.nrrd  the same of many moments, which Slicer plays.\n" if report["sequence_frames"] else ""
@@ -78,8 +78,10 @@ def page(report: dict, words: str, trust: Sequence[str], images: Sequence[Warped
         landmarks=error["landmarks_worst"],
         bound=_bound(report),
     )
-    start = INTRODUCTION.format(words=words, trust="\n".join(trust))
-    return start + FILES.format(sequence=sequence, images=lines, surfaces=surfaces if meshes else "") + limits
+    failed = [] if report["converged"] else ["THE ANSWER DID NOT CONVERGE: do not rely on it."]
+    trust = "\n".join([*failed, *(f"WARNING: {warning}" for warning in report["warnings"])])
+    start = INTRODUCTION.format(words=report["moved_by"], trust=trust, **report["anatomy"])
+    return start + FILES.format(sequence=sequence, images=lines, surfaces=surfaces) + limits
 
 
 def _folds(report: dict) -> str:
