@@ -82,6 +82,16 @@ def test_a_scene_is_a_sequence_in_time(folder, capsys):
     assert largest[1] > 5 * largest[0]
 
 
+def test_a_grid_that_is_coarse_for_the_tumour_is_said(folder, box, capsys):
+    moved = np.zeros_like(box.mesh.nodes)
+    moved[box.tumour_nodes[0]] = [0.0, 0.0, 1e-3]  # of one vertex: no grid of 4 mm follows it
+    write_mesh(folder / "narrow.vtu", box.mesh, {"displacement": moved})
+    for name, coarse in (("narrow.vtu", True), ("located.vtu", False)):
+        assert warp(folder, "--located", folder / name, out="narrow") == 0
+        assert ("a smaller --spacing" in capsys.readouterr().err) == coarse
+        assert ("the grid is coarse" in (folder / "narrow" / "README.txt").read_text()) == coarse
+
+
 def test_intensities_keep_scale_and_type(folder, box, fields):
     image = nibabel.Nifti1Image(np.arange(40 * 40 * 32).reshape(40, 40, 32).astype(np.int16) % 700, AFFINE)
     image.header.set_slope_inter(0.5, -10.0)

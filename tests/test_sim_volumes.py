@@ -189,7 +189,7 @@ def test_what_slicer_wrote_is_read_as_others_read_it(name, layers):
     assert found.affine[0, :3] @ right > found.affine[0, :3] @ left
     if layers > 1:
         assert (found.segments[7].name, found.segments[7].layer) == ("overlapping sphere", 1)
-        with pytest.raises(InputError, match="its segments overlap, in 2 layers.*Export them as a label map"):
+        with pytest.raises(InputError, match=r"its segments overlap, in 2 layers.*Export them as a label map"):
             read_volume(path, Voxels(coarsest=0.011))
 
 

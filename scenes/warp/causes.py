@@ -23,7 +23,7 @@ class Cause:
 
     def by(self, solver: str) -> Cause:
         """The same, as a solver answered it."""
-        return replace(self, words=f"{self.words}, by finite elements: {solver}")
+        return replace(self, words=f"{self.words}, by {solver}")
 
 
 def scene_cause(scene: Scene, number: int) -> Cause:
@@ -43,8 +43,8 @@ def load_cause(loads: Loads) -> Cause:
         "kind": "load",
         "place_mm": _rounded(place),
         "direction": _rounded(direction),
-        "force_n": newton,
-        "radius_mm": radius,
+        "force_n": round(newton, 6),
+        "radius_mm": round(radius, 6),
     }
     x, y, z = (f"{value + 0.0:.1f}" for value in np.round(place, 1))
     right, anterior, superior = (f"{value + 0.0:.2f}" for value in np.round(direction, 2))

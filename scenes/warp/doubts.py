@@ -78,7 +78,7 @@ def _middles(anatomy: Anatomy) -> np.ndarray:
 def _voxels(affine: np.ndarray, shape: tuple[int, ...], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The nearest voxels (n, 3) to points (n, 3) [m], and which of these lie within the volume (n,)."""
     index, last = index_of(affine, points), np.array(shape) - 1
-    inside = ((index >= -0.5) & (index <= last + 0.5)).all(axis=1)
+    inside = np.asarray(((index >= -0.5) & (index <= last + 0.5)).all(axis=1))
     return np.clip(np.rint(index), 0, last).astype(int), inside
 
 
