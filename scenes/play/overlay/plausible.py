@@ -15,6 +15,8 @@ from ..stage import Stage
 # A reference is no farther from the opening, and a tool that works is at some time no farther from the head [m]. Nor
 # are its tip or its markers deeper inside the brain: no model knows of such a cut.
 REACH, NEAR, DEEP = 0.3, 0.2, 0.03
+# A tool that was near is laid aside no farther from the head [m]: beyond, no tracker of this patient sees it.
+FAR = 1.0
 
 
 def implausible(registration: Registration, stage: Stage, camera: Camera) -> str:
@@ -59,5 +61,7 @@ def misplaced_tool(
     if not near:
         never = f"the tool is {1e3 * away:.0f} mm from the head, and was never nearer than {1e3 * NEAR:.0f}"
         return f"{never}: {theirs}", near
+    if away > FAR:
+        return f"the tool is {away:.1f} m from the head, which is not plausible: {theirs}", near
     deep = "" if tool is None else buried(tool, T_scan_tool, stage)
     return f"{deep}: {theirs}" if deep else "", near
