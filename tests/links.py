@@ -54,9 +54,12 @@ async def peers(port, count=1):
 
 
 @asynccontextmanager
-async def linked(follower, registration=None, eye=None, tracking=1e-4, names=NAMES, source=None, stale=2.0):
+async def linked(
+    follower, registration=None, eye=None, tracking=1e-4, names=NAMES, source=None, stale=2.0, note=lambda line: None
+):
     answering = Answering(follower.motion, follower.tool, tracking, registration)
-    session = Session(answering, Outgoing(follower.motion.stage, registration is not None), Heard(names, stale), eye)
+    speaks = Outgoing(follower.motion.stage, registration is not None)
+    session = Session(answering, speaks, Heard(names, stale), eye, note=note)
     ready = asyncio.get_running_loop().create_future()
     serving = asyncio.create_task(session.serve(HOST, 0, np.inf, ready, source))
     try:

@@ -5,6 +5,7 @@ import socket
 import struct
 import time
 from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,11 +14,17 @@ from links import HOST, NAMES, Peer, corners_of, in_mm, linked, peers, played
 from theatres import template_theatre
 
 from scenes.link import clients as limits
+from scenes.link.answer import NOT_SEEN, Answer, late
 from scenes.link.clients import Clients
 from scenes.link.frame import HEADER, BadMessageError, framed, stamp_of
-from scenes.link.messages import points, string, transform
+from scenes.link.messages import points, read_points, string, transform
+from scenes.link.outgoing import Outgoing
+from scenes.play.overlay.follower import Known, State
+from scenes.play.overlay.tool_motion import Motion
 from scenes.script.registration_file import read_registration
 from scenes.script.scene import find_scene
+from sim.loads import Loads, Touching
+from surrogate.model.learned import predicted
 
 NOW = stamp_of(time.time())
 
@@ -184,19 +191,16 @@ def beside(follower, truth):
     return in_mm(follower.registration.T_patient_scan @ truth.T_scan_tool @ np.linalg.inv(follower.tool.T_cube_tool))
 
 
-def test_the_tumour_comes_where_it_is_with_the_time_of_its_pose(follower, truth, beside):
+def test_the_tumour_comes_where_it_is_with_the_time_of_its_pose(follower, registration, truth, beside):
     row, stamp = 10, NOW + 12345
     expected = 1e3 * (follower.motion.stage.tumour_at_rest.vertices + truth.displacement[row])
-    into = in_mm(np.linalg.inv(follower.registration.T_patient_scan))
 
     async def scene():
-        async with linked(follower, stale=0.5) as port, peers(port, 3) as (tracker, slicer, other):
+        async with linked(follower, registration, stale=0.5) as port, peers(port, 3) as (tracker, slicer, other):
             header, body = await slicer.next("POLYDATA", "TumourInScan")
             rest = corners_of(body)
             assert rest == pytest.approx(1e3 * follower.motion.stage.tumour_at_rest.vertices, abs=1e-3)
-            assert "no ReferenceToRas yet" in await slicer.said("Sulcus")
-            tracker.send("TRANSFORM", NAMES.registration, transform(into), NOW)
-            tracker.send("TRANSFORM", "ProbeToTracker", transform(into), NOW)
+            tracker.send("TRANSFORM", "ProbeToTracker", transform(beside[row]), NOW)
             while "no StylusTipToReference yet; other transforms heard: ProbeToTracker" not in await slicer.said(
                 "Sulcus"
             ):
@@ -215,7 +219,7 @@ def test_the_tumour_comes_where_it_is_with_the_time_of_its_pose(follower, truth,
                 assert header.stamp == stamp
                 assert rest @ T[:3, :3].T + T[:3, 3] == pytest.approx(expected, abs=1.0)
                 words = (await each.next("STRING", "TipToTumour"))[1][4:].decode()
-                assert "+-" in words and "not known of registration, tissue and segmentation" in words
+                assert "+-" in words and "registration and model; not known of tissue and segmentation" in words
             # Its pose is old soon: then nothing is drawn as if it were known.
             while len(corners_of((await slicer.next("POLYDATA", "TumourNow"))[1])):
                 pass
@@ -248,6 +252,83 @@ def test_a_pose_that_is_none_is_refused_and_counted(follower, registration, besi
     played(scene())
 
 
+@pytest.mark.parametrize("sent", [True, False])
+def test_a_registration_of_nobody_knows_whom_is_used_and_doubtful(follower, registration, beside, truth, sent):
+    into = in_mm(np.linalg.inv(registration.T_patient_scan))
+    expected = 1e3 * (follower.motion.stage.tumour_at_rest.vertices + truth.displacement[10])
+
+    async def scene():
+        own = None if sent else replace(registration, scanned=None)
+        async with linked(follower, own) as port, peers(port, 1) as (tracker,):
+            if sent:
+                assert "no ReferenceToRas yet" in await tracker.said("Sulcus")
+                tracker.send("TRANSFORM", NAMES.registration, transform(into), NOW)
+            tracker.send("POINT", "P", points(["a"], 1e3 * follower.motion.stage.tumour_at_rest.vertices[:1]))
+            tracker.send("TRANSFORM", NAMES.tool, transform(beside[10]), NOW)
+            while not len(found := corners_of((await tracker.next("POLYDATA", "TumourDoubtful"))[1])):
+                pass
+            assert found == pytest.approx(expected, abs=2e-2)
+            for name in ("TipToTumour", "TumourMotion"):
+                words = (await tracker.next("STRING", name))[1][4:].decode()
+                assert "+-" in words or "placed within" in words
+                assert "doubtful: not checked whose registration this is" in words
+                assert ("not known of registration" in words) == sent
+            assert not (await tracker.next("POINT", "PointsNow"))[1]
+            assert len((await tracker.next("POINT", "PointsDoubtful"))[1]) == 136
+            while "not checked whose registration" not in await tracker.said("Sulcus"):
+                pass
+
+    played(scene())
+
+
+def test_a_tool_that_was_near_and_is_then_too_far_for_any_tracker_is_doubtful(follower, registration, beside):
+    async def scene():
+        async with linked(follower, registration) as port, peers(port, 1) as (tracker,):
+            tracker.send("TRANSFORM", NAMES.tool, transform(beside[10]), NOW)
+            await tracker.next("TRANSFORM", "TumourToRas")
+            for number, (away, good) in enumerate(((500.0, True), (9000.0, False)), 1):
+                far = beside[10].copy()
+                far[2, 3] += away
+                tracker.send("TRANSFORM", NAMES.tool, transform(far), NOW + number)
+                while (found := await tracker.next("STRING", "TipToTumour"))[0].stamp != NOW + number:
+                    pass
+                words = found[1][4:].decode()
+                assert ("+-" in words) == good and ("m from the head, which is not plausible" in words) != good
+
+    played(scene())
+
+
+def test_places_inside_the_tumour_move_with_its_volume(stage):
+    anatomy, outgoing = stage.anatomy, Outgoing(stage)
+    rest = anatomy.mesh.nodes
+    inner = np.setdiff1d(anatomy.tumour_nodes, anatomy.tumour_surface)
+    tets = anatomy.mesh.tets[np.isin(anatomy.mesh.tets, anatomy.tumour_nodes).all(axis=1)]
+    at = rest[tets[np.isin(tets, inner).any(axis=1)][:3]].mean(axis=1)
+    # A stretch is no rigid motion and is linear: the volume's interpolation is exact, a surface point's is not.
+    stretched = stage.nodes, 0.3 * (rest[stage.nodes] - rest[stage.nodes].mean(axis=0))
+    moved = Known(0.0, State.GOOD, "", NOT_SEEN, motion_of(rest, *stretched), band=1e-3)
+    assert len(at) == 3
+    body = outgoing.messages(Answer(NOW, moved), outgoing.placed(["a", "b", "c"], at))[-2]
+    found = 1e-3 * read_points(body[HEADER.size :])[1]
+    assert found == pytest.approx(at + 0.3 * (at - rest[stage.nodes].mean(axis=0)), abs=1e-6)
+
+
+@pytest.mark.parametrize("state", [State.GOOD, State.UNSURE])
+def test_an_answer_with_a_bound_is_stale_when_it_is_old(stage, state):
+    known = Known(0.0, state, "words", NOT_SEEN, Motion(stage.anatomy.mesh.nodes), band=1e-3)
+    assert late(Answer(NOW, known), 0.2, 0.3).known is known
+    old = late(Answer(NOW, known), 0.4, 0.3).known
+    assert old.state is State.STALE and old.band is None and "0.4 s old" in old.words
+
+
+def motion_of(rest, nodes, displacement):
+    positions = rest.copy()
+    positions[nodes] += displacement
+    nothing = Loads((Touching(np.eye(4)[None, None]),))
+    answer = predicted(displacement[None], nodes, nothing, [False], 0.0, np.full((2, 1), np.nan), "")
+    return Motion(positions, True, answer=answer)
+
+
 def test_a_tool_where_none_can_be_is_doubtful(follower, registration, beside):
     far = beside[10].copy()
     far[:3, 3] += 1000.0
@@ -270,8 +351,10 @@ def test_places_on_the_tumour_move_with_it_and_a_million_points_are_passed_over(
             tracker.send("POINT", "P", bytes(136 * 10**6))
             assert "too long" in await tracker.said()
             tracker.send("POINT", "P", points(["a"], rest[:1] + 100.0))
-            assert "not on tumour or open cortex" in await tracker.said()
-            tracker.send("POINT", "P", points(["a", "b"], rest[:2]))
+            assert "nor on open cortex" in (said := await tracker.said()) and ": a 1" in said
+            mixed = np.vstack([rest[:1], rest[:2] + 100.0, rest[1:2]])
+            tracker.send("POINT", "P", points(["a", "", "far", "b"], mixed))
+            assert "number 2 1" in (said := await tracker.said()) and "far 1" in said and "others are followed" in said
             tracker.send("TRANSFORM", NAMES.tool, transform(beside[10]), NOW)
             while not len(body := (await tracker.next("POINT", "PointsNow"))[1]):
                 pass

@@ -68,7 +68,7 @@ class Answering:
     tracking
         Standard deviation of the tip's place along each axis [m]: no message says it.
     registration
-        From a file; None: it is sent, and its error is not known.
+        From a file; None: it is sent, and its error is not known, nor whose it is.
     """
 
     motion: ToolMotion
@@ -96,6 +96,8 @@ class Answering:
         if known.state is State.UNKNOWN:
             return Answer(stamp, known)
         known = self._with_band(known, registration)
+        if known.relied and registration.scanned is None:
+            known = replace(known, state=State.UNSURE, words=UNCHECKED)
         stage = self.motion.stage
         gauge = Painter(stage, self.tool).gauge(known, stage.tumour(motion.positions))
         return Answer(stamp, known, gauge)
@@ -133,8 +135,7 @@ class Answering:
         near = before is not None and before.near
         assert known.T_scan_tool is not None
         doubt, near = misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, THEIRS)
-        unchecked = self.registration is not None and self.registration.scanned is None
-        doubt = doubt or known.motion.doubt or (UNCHECKED if unchecked else "")
+        doubt = doubt or known.motion.doubt
         if doubt:
             return {"state": State.UNSURE, "words": doubt, "near": near}
         if not known.motion.known:
@@ -173,7 +174,7 @@ def bounded(known: Known, band: float, parts: dict[str, float]) -> Known:
 
 def late(answer: Answer, age: float, stale: float) -> Answer:
     """What is known of an answer to a pose that is so old by now [s]: beyond `stale` it is not relied on."""
-    if age <= stale or not answer.known.relied:
+    if age <= stale or answer.known.band is None:
         return answer
     words = f"stale, the answer is {age:.1f} s old: do not rely on it"
     return replace(answer, known=replace(answer.known, state=State.STALE, words=words, band=None), gauge=None)

@@ -70,12 +70,16 @@ class Clients:
         Which messages those are.
     most
         How many clients there may be; another one is sent away.
+    note
+        Is given a line when a client comes or goes, and when something is refused for a new reason.
     """
 
-    def __init__(self, receive: Receive, longest: Longest, most: int = 16) -> None:
+    def __init__(
+        self, receive: Receive, longest: Longest, most: int = 16, note: Callable[[str], None] = lambda line: None
+    ) -> None:
         self.refused: Counter[str] = Counter()
         """How often messages were refused, by why."""
-        self._receive, self._longest, self._most = receive, longest, most
+        self._receive, self._longest, self._most, self._note = receive, longest, most, note
         self._numbers = count()
         self._clients: dict[int, Client] = {}
         self._newest: dict[str, tuple[bytes, ...]] = {}
@@ -92,8 +96,9 @@ class Clients:
             if not client.asks:
                 client.offer(key, self._newest[key])
 
-    def say(self, number: int, code: Code, text: str) -> None:
-        """Send a STATUS to one client; of many at once it gets the newest."""
+    def refuse(self, number: int, code: Code, why: str, text: str) -> None:
+        """Count what was refused, and send a STATUS to one client; of many at once it gets the newest."""
+        self._count(why, text)
         client = self._clients.get(number)
         if client is not None and not client.asks:
             client.offer(REFUSED, (framed("STATUS", REFUSED, status(code, text), 0),))
@@ -106,9 +111,9 @@ class Clients:
         task.add_done_callback(self._attending.discard)
         _hold_little(writer)
         if len(self._clients) < self._most:
-            await self._attend(Client(next(self._numbers), writer), reader)
+            await self._noted(Client(next(self._numbers), writer), reader)
             return
-        self.refused["too many clients"] += 1
+        self._count("too many clients")
         text = f"{self._most} clients are connected, and no more are taken: end one of them"
         writer.write(framed("STATUS", REFUSED, status(Code.BUSY, text), 0))
         await _close(writer)
@@ -126,6 +131,15 @@ class Clients:
     async def listen(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Hear a server that was connected to, until it ends, and send nothing."""
         await self._attend(Client(next(self._numbers), writer, asks=True), reader)
+
+    async def _noted(self, client: Client, reader: asyncio.StreamReader) -> None:
+        peer = client.writer.get_extra_info("peername")
+        name = f"client {peer[0]}:{peer[1]}" if peer else "a client"
+        self._note(f"{name} comes; clients: {len(self) + 1}")
+        try:
+            await self._attend(client, reader)
+        finally:
+            self._note(f"{name} goes; clients: {len(self)}")
 
     async def _attend(self, client: Client, reader: asyncio.StreamReader) -> None:
         self._clients[client.number] = client
@@ -163,10 +177,10 @@ class Clients:
                     async with asyncio.timeout(PATIENCE):
                         await client.writer.drain()
         except TimeoutError:
-            self.refused["client that does not read"] += 1
+            self._count("client that does not read")
             client.writer.transport.abort()
         except OSError:
-            self.refused["client that vanished"] += 1
+            self._count("client that vanished")
 
     async def _read(self, client: Client, reader: asyncio.StreamReader) -> None:
         """Hear what a client sends, until it ends or sends what cannot be followed."""
@@ -180,13 +194,14 @@ class Clients:
                     await self._hear(client, reader, header)
                 await asyncio.sleep(0)  # One that sends without pause keeps nobody else waiting.
         except TimeoutError:
-            self._refuse(client, Code.TIMEOUT, "message that does not end", "a message did not end: connect anew")
+            self.refuse(client.number, Code.TIMEOUT, "message that does not end", "a message did not end: connect anew")
         except BadMessageError as error:
-            self._refuse(client, Code.OVERFLOW, "no message", f"{error}: connect anew")
+            self.refuse(client.number, Code.OVERFLOW, "no message", f"{error}: connect anew")
         except asyncio.IncompleteReadError as error:
-            self.refused["message that breaks off"] += bool(error.partial)
+            if error.partial:
+                self._count("message that breaks off")
         except OSError:
-            self.refused["client that vanished"] += 1
+            self._count("client that vanished")
 
     async def _hear(self, client: Client, reader: asyncio.StreamReader, header: Header) -> None:
         """Hear one message's body, and answer."""
@@ -199,7 +214,7 @@ class Clients:
         if header.size > longest:
             await _pass_over(reader, header.size)
             why, code = ("too long", Code.OVERFLOW) if longest else ("type not used", Code.UNKNOWN_INSTRUCTION)
-            self._refuse(client, code, why, f"{_named(header)} is passed over: {why}")
+            self.refuse(client.number, code, why, f"{_named(header)} is passed over: {why}")
             return
         body = await reader.readexactly(header.size)
         try:
@@ -207,7 +222,7 @@ class Clients:
         except BadMessageError as error:
             code = Code.CHECKSUM if str(error) == WRONG_CHECKSUM else Code.CONFIGURATION
             # What stands after a colon differs from message to message.
-            self._refuse(client, code, str(error).partition(":")[0], f"{_named(header)} is refused: {error}")
+            self.refuse(client.number, code, str(error).partition(":")[0], f"{_named(header)} is refused: {error}")
 
     def _ask(self, client: Client, header: Header) -> None:
         """A client that asks, or wants no stream, is sent what it asks for and nothing else."""
@@ -225,9 +240,11 @@ class Clients:
             client.waiting = dict(self._newest)
             client.news.set()
 
-    def _refuse(self, client: Client, code: Code, why: str, text: str) -> None:
+    def _count(self, why: str, text: str = "") -> None:
+        """Count what was refused, and note it if it is the first for that reason."""
         self.refused[why] += 1
-        self.say(client.number, code, text)
+        if self.refused[why] == 1:
+            self._note(f"refused: {text or why}")
 
 
 def _found(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> bytes | None:

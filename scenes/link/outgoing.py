@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ar.overlay.hud import bound_words, millimetres
 from sim.geometry.closest_point import closest
+from sim.geometry.locate import Located, locate
 
 from ..play.overlay.follower import Known, State
 from ..play.stage import Stage
@@ -19,14 +20,19 @@ from .messages import NOTHING, Code, Mesh, points, polydata, status, string, tra
 
 # A place that is asked for belongs to tumour or open cortex where the scan has it no farther from them [m].
 BESIDE = 2e-3
+# So many places that nobody can follow are named.
+MOST_NAMED = 5
 MOST_PLACES = 1000
 """So many places may be asked for at once."""
-NONE = np.empty((0, 3))
+STRANGE = "places that are not in or on the tumour, nor on open cortex, so that their motion is not known"
+"""Why places are not followed."""
+# A place of which a tetrahedron's corners make one this near lies in it [m].
+ON = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Places on tumour or open cortex.
+    """Places in or on the tumour, or on open cortex.
 
     Parameters
     ----------
@@ -35,13 +41,16 @@ class Places:
     rest
         Where the scan has them (n, 3) [m].
     vertices, weights
-        (n, 3): the mesh's vertices that they move with, and how much with each.
+        (n, 4): the mesh's vertices that they move with, and how much with each.
+    strange
+        Which other places were asked for, and how far they are from all that is followed; empty: none.
     """
 
     names: tuple[str, ...]
     rest: np.ndarray
     vertices: np.ndarray
     weights: np.ndarray
+    strange: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +79,7 @@ class Outgoing:
     def messages(self, answer: Answer, places: Places | None = None) -> tuple[bytes, ...]:
         """All messages of an answer, with its stamp: what is not known is sent without points."""
         known, stamp = answer.known, answer.stamp
-        none = polydata(NONE, NOTHING)
+        none = polydata(np.empty((0, 3)), NOTHING)
         out = []
         for name, vertices, mesh in self._surfaces:
             here = _follows(known, vertices)
@@ -83,9 +92,9 @@ class Outgoing:
         out.append(framed("STRING", "TipToTumour", string(self._distance_words(answer)), stamp))
         out.append(framed("STRING", "TumourMotion", string(self._motion_words(known)), stamp))
         if places is not None:
-            shown = known.relied and _follows(known, np.unique(places.vertices))
-            names, at = (places.names, self._carried(known, places)) if shown else ((), NONE)
-            out.append(framed("POINT", "PointsNow", points(list(names), 1e3 * at), stamp))
+            body = self._points(known, places)
+            for word, shown in (("Now", known.relied), ("Doubtful", known.state is State.UNSURE)):
+                out.append(framed("POINT", f"Points{word}", body if shown else b"", stamp))
         return tuple(out)
 
     def status(self, answer: Answer, refused: str) -> bytes:
@@ -96,31 +105,49 @@ class Outgoing:
         return framed("STATUS", "Sulcus", status(code, f"{words}{refused}"), answer.stamp)
 
     def placed(self, names: list[str], at: np.ndarray) -> Places:
-        """Find what places of the scan (n, 3) [m] move with.
+        """Find what places of the scan (n, 3) [m] move with: in the tumour its volume, else the nearest surface.
 
         Raises
         ------
         BadMessageError
-            No place or too many; one that is on neither surface, so that nobody knows how it moves.
+            No place or too many; none in or on the tumour or on open cortex, so that nobody knows how they move.
         """
         if not 0 < len(at) <= MOST_PLACES:
             raise BadMessageError(f"no place, or more than are followed: 1 to {MOST_PLACES}")
         anatomy = self.stage.anatomy
         triangles = np.concatenate([anatomy.tumour_surface, anatomy.open_surface])
         found = closest(at, self._rest[triangles])
-        away = float(np.linalg.norm(found.point - at, axis=1).max())
-        if away > BESIDE:
-            words = "a place that is not on tumour or open cortex, whose motion is not known"
-            raise BadMessageError(f"{words}: {1e3 * away:.0f} mm away")
-        return Places(tuple(names), at, triangles[found.triangle], found.weights)
+        away = np.linalg.norm(found.point - at, axis=1)
+        corners = triangles[found.triangle]
+        vertices = np.concatenate([corners, corners[:, :1]], axis=1)
+        weights = np.concatenate([found.weights, np.zeros((len(at), 1))], axis=1)
+        held = locate(anatomy.mesh, at)
+        inside = self._in_tumour(held, at)
+        vertices[inside], weights[inside], away[inside] = held.vertices[inside], held.weights[inside], 0.0
+        labels = [name or f"number {row}" for row, name in enumerate(names, 1)]
+        strange = _listed([f"{labels[row]} {1e3 * away[row]:.0f} mm away" for row in np.flatnonzero(away > BESIDE)])
+        good = np.flatnonzero(away <= BESIDE)
+        if not len(good):
+            raise BadMessageError(f"{STRANGE}: {strange}")
+        return Places(tuple(names[row] for row in good), at[good], vertices[good], weights[good], strange)
+
+    def _in_tumour(self, held: Located, at: np.ndarray) -> np.ndarray:
+        """Whether places (n, 3) [m] lie in tetrahedra of the tumour."""
+        there = np.linalg.norm(np.einsum("nk,nkd->nd", held.weights, self._rest[held.vertices]) - at, axis=1)
+        known = np.isin(held.vertices, self.stage.anatomy.tumour_nodes) | (held.weights <= 0.0)
+        return known.all(axis=1) & (there <= ON)
 
     @property
     def _rest(self) -> np.ndarray:
         return self.stage.anatomy.mesh.nodes
 
-    def _carried(self, known: Known, places: Places) -> np.ndarray:
+    def _points(self, known: Known, places: Places) -> bytes:
+        """Where those of the places are that the answer knows of."""
         moved = (known.motion.positions - self._rest)[places.vertices]
-        return places.rest + np.einsum("nk,nkd->nd", places.weights, moved)
+        at = 1e3 * (places.rest + np.einsum("nk,nkd->nd", places.weights, moved))
+        nodes = () if known.motion.answer is None else known.motion.answer.nodes
+        here = np.flatnonzero((np.isin(places.vertices, nodes) | (places.weights <= 0.0)).all(axis=1))
+        return points([places.names[row] for row in here], at[here])
 
     def _distance_words(self, answer: Answer) -> str:
         """The distance from tip to tumour with its error and what that is of; or why it is not known."""
@@ -128,14 +155,14 @@ class Outgoing:
         if gauge is None:
             return f"not known: {known.words}"
         inside = "inside the tumour, its edge " if gauge.inside else ""
-        return f"{inside}{millimetres(gauge.distance, gauge.error)} (95 %; {self._of})"
+        return f"{inside}{millimetres(gauge.distance, gauge.error)} (95 %; {self._of}){_but(known)}"
 
     def _motion_words(self, known: Known) -> str:
         """How far the tumour has moved, with its error and what that is of; or why that is not known."""
         if known.band is None:
             return f"not known: {known.words}"
         moved = millimetres(known.motion.moved, known.motion.error)
-        return f"moved {moved}, placed within {bound_words(known.band, 1)} (95 %; {self._of})"
+        return f"moved {moved}, placed within {bound_words(known.band, 1)} (95 %; {self._of}){_but(known)}"
 
     @property
     def _of(self) -> str:
@@ -143,6 +170,17 @@ class Outgoing:
         if self.registered:
             return "of tracking, registration and model; not known of tissue and segmentation"
         return "of tracking and model; not known of registration, tissue and segmentation"
+
+
+def _but(known: Known) -> str:
+    """Why figures may not be relied on all the same; empty where they may."""
+    return "" if known.relied else f"; doubtful: {known.words}"
+
+
+def _listed(names: list[str]) -> str:
+    """Some of many, and how many others there are."""
+    others = len(names) - MOST_NAMED
+    return ", ".join(names[:MOST_NAMED]) + (f" and {others} others" if others > 0 else "")
 
 
 def _follows(known: Known, vertices: np.ndarray) -> bool:

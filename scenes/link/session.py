@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import time as clock
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -20,10 +22,10 @@ from .clients import Clients
 from .frame import BadMessageError, Header, framed, stamp_of
 from .heard import Heard
 from .messages import IMAGE, POINT, Code, image, read_image, read_points, read_position, read_transform, status
-from .outgoing import MOST_PLACES, Places
+from .outgoing import MOST_PLACES, STRANGE, Places
 
-# How often what is not known is said anew, and a connection that is lost is tried again [s].
-TICK, AGAIN = 0.1, 1.0
+# How often what is not known is said anew, a STATUS that has not changed, and how often a server is tried again [s].
+TICK, BEAT, AGAIN = 0.1, 1.0, 1.0
 # Other transforms that are heard of, to be named where the wanted one does not come.
 MOST_OTHERS = 6
 # Types that are heard and not answered: a STATUS that answers a STATUS would have no end.
@@ -108,10 +110,21 @@ class Session:
         Draws into pictures that are sent; None: they are not wanted.
     most
         How many clients there may be.
+    note
+        Is given a line when something changes: clients, the source, what is known, and what is refused.
     """
 
-    def __init__(self, answers: Answers, speaks: Speaks, heard: Heard, eye: Eye | None = None, most: int = 16) -> None:
-        self.clients = Clients(self._receive, self._longest, most)
+    def __init__(
+        self,
+        answers: Answers,
+        speaks: Speaks,
+        heard: Heard,
+        eye: Eye | None = None,
+        most: int = 16,
+        note: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self.clients = Clients(self._receive, self._longest, most, note)
+        self._note = note
         self._answers, self._speaks, self._heard, self._eye = answers, speaks, heard, eye
         self._others: dict[str, None] = {}
         self._places: Places | None = None
@@ -149,9 +162,20 @@ class Session:
                 each.cancel()
 
     async def _connected(self, host: str, port: int) -> None:
+        reached, at = True, f"the server {host}:{port}"
         while True:
-            with suppress(OSError):
-                await self.clients.listen(*await asyncio.open_connection(host, port, limit=AHEAD))
+            try:
+                streams = await asyncio.open_connection(host, port, limit=AHEAD)
+            except OSError as error:
+                if reached:
+                    self._note(f"{at} cannot be reached ({error}): start it, or mend --client. It is tried again")
+                reached = False
+            else:
+                reached = True
+                self._note(f"{at} is heard")
+                with suppress(OSError):
+                    await self.clients.listen(*streams)
+                self._note(f"{at} has ended the connection")
             await asyncio.sleep(AGAIN)
 
     async def _work(self, seconds: float) -> None:
@@ -172,22 +196,28 @@ class Session:
 
     async def _answering(self, thread: ThreadPoolExecutor) -> None:
         """Answer the newest pose, again and again; say what is not known."""
-        said, refused = "", -1
+        said: object = None
+        beat, states, answer = 0.0, set[State](), None
         while True:
             with suppress(TimeoutError):
                 async with asyncio.timeout(TICK):
                     await self._posed.wait()
             fresh = self._posed.is_set()
             self._posed.clear()
-            if not fresh and self._known is not None and not self._gone():
-                continue
-            answer, messages = await self._loop.run_in_executor(thread, self._answered, self._heard, self._places)
-            self._known = answer.known
-            self.clients.publish("answer", messages)
-            words, count = answer.known.words, self.clients.refused.total()
-            if (words, count) != (said, refused) or not answer.known.relied:
-                said, refused = words, count
-                self.clients.publish("status", (self._speaks.status(answer, self._refused_words(answer.known)),))
+            if fresh or answer is None or self._gone():
+                answer, messages = await self._loop.run_in_executor(thread, self._answered, self._heard, self._places)
+                self._known = answer.known
+                self.clients.publish("answer", messages)
+            known = answer.known
+            if known.state not in states:
+                states.add(known.state)
+                self._note(f"the tumour: {known.state.value}" + (f", {known.words}" if known.words else ""))
+            now, kinds = self._loop.time(), frozenset(self.clients.refused)
+            # A number that grows is no news.
+            saying = known.state, re.sub(r"[\d.]+", "", known.words), kinds, tuple(self._others)
+            if saying != said or now - beat >= BEAT:
+                said, beat = saying, now
+                self.clients.publish("status", (self._speaks.status(answer, self._refused_words(known)),))
 
     def _gone(self) -> bool:
         """Whether the tool's pose is not known now."""
@@ -248,6 +278,9 @@ class Session:
                 names, places = read_points(content)
                 self._places = self._speaks.placed(names, 1e-3 * places)
                 self._posed.set()
+                if self._places.strange:
+                    words = f"{STRANGE}: {self._places.strange}; the others are followed"
+                    self.clients.refuse(number, Code.CONFIGURATION, STRANGE, words)
 
     def _hear_transform(self, number: int, header: Header, content: bytes) -> None:
         names = self._heard.names

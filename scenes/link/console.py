@@ -1,0 +1,37 @@
+"""Lines on a console: of many at once a few, and how many others there were."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+# So many lines in so long [s].
+MOST, WHILE = 10, 5.0
+PREFIX = "sulcus link: "
+
+
+def printed(line: str) -> None:
+    """Print a line to standard error, without what a terminal would obey; where nobody can read it, it is let go."""
+    plain = "".join(each if each.isprintable() else "?" for each in line)
+    with suppress(OSError):
+        print(f"{PREFIX}{plain}", file=sys.stderr, flush=True)
+
+
+def limited(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Callable[[str], None]:
+    """A function that writes lines, no more than 10 in 5 s; the next one says how many were left out."""
+    begun, count, left_out = -WHILE, 0, 0
+
+    def note(line: str) -> None:
+        nonlocal begun, count, left_out
+        if clock() - begun >= WHILE:
+            begun, count = clock(), 0
+        if count == MOST:
+            left_out += 1
+            return
+        count += 1
+        write(line + (f" ({left_out} lines left out)" if left_out else ""))
+        left_out = 0
+
+    return note
