@@ -37,6 +37,7 @@ with warnings.catch_warnings():
 
 EXAMPLES = Path("/usr/share/doc/openigtlink-examples/examples")
 ROW = 10
+SELF = "localhost", "127.0.0.1", socket.gethostname()
 
 
 @pytest.fixture(scope="module")
@@ -241,6 +242,7 @@ def test_the_command_serves_this_machine_alone_and_ends_at_a_signal():
         (["--stale", "0"], "--stale 0"),
         (["--tracking-mm", "-1"], "--tracking-mm -1"),
         (["--client", ":18944"], "--client :18944"),
+        *((["--client", host], f"--client {host}: port 18944 of this machine") for host in SELF),
         (["--registration", "none.json"], "none.json: no such file"),
         ([], "no model beside"),
         (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import socket
 import sys
 import threading
 from contextlib import ExitStack
@@ -54,7 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     names.add_argument("--camera-name", default="CameraToReference", help="default %(default)s")
     names.add_argument("--registration-name", default="ReferenceToRas", help="the scan's, RAS (default %(default)s)")
     parser.add_argument(
-        "--registration", metavar="R.json", help="from `sulcus register`, in place of a transform that is sent"
+        "--registration",
+        metavar="R.json",
+        help="from `sulcus register --anatomy`, in place of a transform that is sent, which "
+        "is not checked and makes every answer doubtful",
     )
     parser.add_argument(
         "--tool", metavar="TOOL.json",
@@ -95,6 +99,11 @@ def run(args: argparse.Namespace) -> int:
         said = "OpenIGTLink asks for no password: whoever reaches this address may move the tumour that all see"
         print(f"sulcus link: {said}", file=sys.stderr)
     source = None if args.client is None else address_of(args.client)
+    if source is not None and source[1] == args.port and is_here(source[0], args.host):
+        raise InputError(
+            f"--client {args.client}: port {args.port} of this machine is the one that is served here. Give --port "
+            f"another one, as --port {args.port % 65535 + 1}, or give --client the port of the other server."
+        )
     return until_ended(partial(_linked, args, source))
 
 
@@ -110,6 +119,27 @@ def address_of(text: str) -> tuple[str, int]:
     if not host or not (port or str(PORT)).isdecimal() or int(port or PORT) >= 1 << 16:
         raise InputError(f"--client {text}: give a host, and a port from 0 to 65535 after a colon.")
     return host, int(port or PORT)
+
+
+def is_here(host: str, served: str) -> bool:
+    """Whether a host is this machine, or the address that is served."""
+    if host == served:
+        return True
+    try:
+        found = socket.getaddrinfo(host, 0, type=socket.SOCK_DGRAM)
+    except OSError:
+        return False
+    return any(_is_own(family, address) for family, *_, address in found)
+
+
+def _is_own(family: int, address: tuple) -> bool:
+    """Whether a socket of this machine can have an address."""
+    with socket.socket(family, socket.SOCK_DGRAM) as tried:
+        try:
+            tried.bind(address)
+        except OSError:
+            return False
+        return True
 
 
 def _linked(args: argparse.Namespace, source: tuple[str, int] | None, closing: ExitStack) -> int:
@@ -147,6 +177,7 @@ def opened(args: argparse.Namespace) -> Session:
     from sim.runtime.device import find_device
 
     from ..link.answer import Answering
+    from ..link.console import limited, printed
     from ..link.heard import Heard, Names
     from ..link.outgoing import Outgoing
     from ..link.session import Eye, Session
@@ -161,7 +192,13 @@ def opened(args: argparse.Namespace) -> Session:
     registration = None if args.registration is None else read_registration(args.registration)
     tool = None if args.tool is None else read_tool(args.tool)
     theatre = open_theatre(args.anatomy, args.model, args.device)
-    said = "" if registration is None else other_mesh(registration, theatre.anatomy, str(args.registration))
+    said = (
+        f"whose the {args.registration_name} that is sent is cannot be checked"
+        if registration is None
+        else other_mesh(registration, theatre.anatomy, str(args.registration))
+    )
+    if registration is None or registration.scanned is None:
+        said += ". Every answer is doubtful: give --registration with a file of `sulcus register --anatomy`"
     if said:
         print(f"sulcus link: {said}", file=sys.stderr)
     tool = tool or _tool_of(theatre, args.anatomy)
@@ -177,7 +214,7 @@ def opened(args: argparse.Namespace) -> Session:
     print(f"{args.anatomy.name}; {tool.shape}; motion by {who}", flush=True)
     answering = Answering(ToolMotion(stage, deformer), tool, tracking, registration)
     heard = Heard(names, args.stale)
-    return Session(answering, Outgoing(stage, registration is not None), heard, eye, args.clients)
+    return Session(answering, Outgoing(stage, registration is not None), heard, eye, args.clients, limited(printed))
 
 
 def _tool_of(theatre: Theatre, path: Path) -> TrackedTool:
