@@ -193,7 +193,7 @@ def opened(args: argparse.Namespace) -> Session:
     tool = None if args.tool is None else read_tool(args.tool)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     said = (
-        f"whose the {args.registration_name} that is sent is cannot be checked"
+        f"a {args.registration_name} that is sent does not say whose registration it is"
         if registration is None
         else other_mesh(registration, theatre.anatomy, str(args.registration))
     )

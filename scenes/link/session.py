@@ -211,7 +211,7 @@ class Session:
             known = answer.known
             if known.state not in states:
                 states.add(known.state)
-                self._note(f"the tumour: {known.state.value}" + (f", {known.words}" if known.words else ""))
+                self._note(f"the tumour is {_found(known)}")
             now, kinds = self._loop.time(), frozenset(self.clients.refused)
             # A number that grows is no news.
             saying = known.state, re.sub(r"[\d.]+", "", known.words), kinds, tuple(self._others)
@@ -292,3 +292,10 @@ class Session:
         self._heard = self._heard.hearing(header.name, matrix, header.stamp, self._loop.time(), number)
         if header.name in (names.tool, names.registration):
             self._posed.set()
+
+
+def _found(known: Known) -> str:
+    """What is known of the tumour, for a console."""
+    if known.relied:
+        return f"known, {known.state.value}"
+    return f"{'doubtful' if known.state is State.UNSURE else 'not known'}: {known.words}"
