@@ -48,7 +48,9 @@ class Film:
 
 
 def write_png(path: Path, colour: np.ndarray, source: str = "") -> None:
-    """Write a picture (H, W, 3) uint8 sRGB, signed; the file appears whole. Raises OSError where it cannot be written.
+    """Write a picture (H, W, 3) uint8 sRGB, signed; the file appears whole, and its folder if there is none.
+
+    Raises OSError where it cannot be written.
 
     `source` is an ASCII text that says which run drew it: `signature` reads it.
     """
@@ -56,6 +58,7 @@ def write_png(path: Path, colour: np.ndarray, source: str = "") -> None:
     code = cv2.imencode(".png", colour[..., ::-1])[1].tobytes()
     text = KEYWORD + f" {source}".encode("ascii")
     chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
         part.write_bytes(code[:START] + chunk + code[START:])
         part.rename(path)

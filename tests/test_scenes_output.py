@@ -208,6 +208,8 @@ def test_frames_of_two_runs_are_not_mixed(tmp_path):
     notes = tmp_path / "frame_notes.png"
     notes.write_bytes(b"mine")
     write_png(one, picture, "run a")
+    write_png(tmp_path / "no" / "folder" / "yet.png", picture)
+    assert signature(tmp_path / "no" / "folder" / "yet.png") is not None
     write_png(other, picture, "run b")
     assert signature(one) == "run a" and signature(notes) is None
     with pytest.raises(InputError, match="holds 1 frames of another run"):

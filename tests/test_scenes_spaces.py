@@ -137,7 +137,8 @@ def test_surfaces_points_and_segments_are_where_the_tumour_is_now(folder):
     read = slicerio.read_segmentation(str(warp / "tumour.seg.nrrd"))
     middle = np.argwhere(read["voxels"] == read["segments"][0]["labelValue"]).mean(axis=0)
     near(LPS * (read["ijkToLPS"] @ [*middle, 1.0])[:3], now)
-    assert json.loads((warp / "warp.json").read_text())["space"] == "RAS"
+    said = json.loads((warp / "warp.json").read_text())["spaces"]
+    assert (said["field_resampling.nii.gz"], said["landmarks.mrk.json"]) == ("RAS, mm", "LPS, mm")
 
 
 def test_data_sets_and_registrations_name_their_spaces(folder, pretender):
