@@ -123,11 +123,13 @@ def test_a_clusters_script_is_one_command_for_all_machines(tmp_path, capsys):
     words = ["episodes", "small", "--count", "9", "--out", str(tmp_path / "a b"), "--device"]
     assert main([*words, "cuda", "--slurm", "3"]) == 0
     text = capsys.readouterr().out
-    assert "#SBATCH --array=1-3\n" in text and "#SBATCH --gpus-per-task=1\n" in text and "--workers" not in text
+    assert "#SBATCH --array=1-3\n" in text and "#SBATCH --gpus-per-task=1\n" in text
+    assert text.endswith(' --workers "$((SLURM_CPUS_PER_TASK * 3 / 2))"\n') and "#SBATCH --mem-per-cpu=5G\n" in text
     assert f"exec {sys.executable} -m scenes.cli episodes small" in text and not (tmp_path / "a b").exists()
     program = [sys.executable, "-c", "import sys, json; print(json.dumps(sys.argv[1:]))", "--out", "a b"]
-    script = sbatch_script(program, 4, "cpu", "mine")
     environment = {**os.environ, "SLURM_CPUS_PER_TASK": "16"}
-    done = subprocess.run(["bash"], input=script, capture_output=True, text=True, env=environment, check=True)
-    assert json.loads(done.stdout) == ["--out", "a b", "--workers", "16"]
+    for device, workers in (("cuda", "24"), ("cpu", "16")):
+        script = sbatch_script(program, 4, device, "mine")
+        done = subprocess.run(["bash"], input=script, capture_output=True, text=True, env=environment, check=True)
+        assert json.loads(done.stdout) == ["--out", "a b", "--workers", workers]
     assert script.startswith("#!/bin/bash\n#SBATCH --job-name=mine\n") and "--requeue" in script

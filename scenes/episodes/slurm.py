@@ -21,17 +21,19 @@ def sbatch_script(command: Sequence[str], machines: int, device: str, name: str)
     machines
         Jobs in the array.
     device
-        "cpu": as many processes as the job has cores. "cuda": one for each of its cards.
+        "cpu": as many processes as the job has cores. "cuda": half again as many, which share the job's card.
     name
         Of the job.
     """
     on_card = device == "cuda"
-    asked = ["--cpus-per-task=4", "--gpus-per-task=1"] if on_card else ["--cpus-per-task=16"]
-    workers = "" if on_card else ' --workers "$SLURM_CPUS_PER_TASK"'
+    # A process takes 1 to 3 GB.
+    asked = ["--gpus-per-task=1", "--mem-per-cpu=5G"] if on_card else ["--mem-per-cpu=4G"]
+    workers = "$((SLURM_CPUS_PER_TASK * 3 / 2))" if on_card else "$SLURM_CPUS_PER_TASK"
     options = [
         f"--job-name={name}",
         f"--array=1-{machines}",
         "--ntasks=1",
+        "--cpus-per-task=16",
         *asked,
         "--time=24:00:00",
         "--requeue",
@@ -43,7 +45,7 @@ def sbatch_script(command: Sequence[str], machines: int, device: str, name: str)
             "#!/bin/bash",
             *(f"#SBATCH {option}" for option in options),
             "# Every job gives the same command: what is there is skipped, and what is missing is made.",
-            f"exec {shlex.join(command)}{workers}",
+            f'exec {shlex.join(command)} --workers "{workers}"',
             "",
         ]
     )
