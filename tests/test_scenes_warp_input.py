@@ -10,6 +10,7 @@ import pytest
 
 from scenes.cli import main
 from scenes.warp.images import read_picture, warped_values, write_warped
+from scenes.warp.output_folder import FORMAT, own_files, written_warp
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.fields.warp_fields import warp_fields
 
@@ -261,3 +262,22 @@ def test_other_formats_give_the_same_picture_as_nifti(folder, box, fields, tmp_p
         assert image.header["sform_code"] > 0
         np.testing.assert_allclose(image.affine, AFFINE, atol=1e-5)
         np.testing.assert_array_equal(image.get_fdata(), found["a.nii.gz"].get_fdata())
+
+
+def test_a_list_of_files_that_names_others_is_not_believed(tmp_path):
+    """A folder may hold a list that somebody else wrote: what lies elsewhere is neither counted as ours nor removed."""
+    folder, other = tmp_path / "warp", tmp_path / "mine.txt"
+    other.write_text("mine")
+    folder.mkdir()
+    for name in (str(other), "../mine.txt"):
+        listed = {"format": FORMAT, "files": ["README.txt", name]}
+        (folder / "warp.json").write_text(json.dumps(listed))
+        assert own_files(folder) == set()
+        with written_warp(folder) as place:
+            (place / "README.txt").write_text("new")
+        assert other.read_text() == "mine"
+    (folder / "warp.json").write_text(json.dumps({"format": FORMAT, "files": ["README.txt", "old.stl"]}))
+    (folder / "old.stl").write_text("old")
+    with written_warp(folder) as place:
+        (place / "warp.json").write_text("{}")
+    assert [path.name for path in folder.iterdir()] == ["warp.json"]

@@ -16,12 +16,16 @@ LISTED, FORMAT = "warp.json", "sulcus warp 1"
 
 
 def own_files(folder: Path) -> set[str]:
-    """Names of the files in a folder that an earlier warp wrote; none where nothing says so."""
+    """Names of the files in a folder that an earlier warp wrote; none where nothing says so.
+
+    What lists a path to elsewhere was written by nobody of us.
+    """
     try:
         listed = json.loads((folder / LISTED).read_text())
-        return {LISTED, *map(str, listed["files"])} if listed["format"] == FORMAT else set()
+        names = {LISTED, *map(str, listed["files"])} if listed["format"] == FORMAT else set()
     except (OSError, ValueError, LookupError, TypeError):
         return set()
+    return names if all(Path(name).name == name for name in names) else set()
 
 
 def claimed_warp(folder: Path, force: bool) -> Path:
