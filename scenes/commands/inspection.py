@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from sim.bodies.head_masks import HeadMasks
+from sim.bodies.one_space import share_on
 from sim.bodies.placement import side_of
 from sim.bodies.subject import Subject
 
@@ -154,9 +155,7 @@ def _warnings(found: Inspection, subject: Subject) -> Iterator[str]:
     if max(found.voxel) > OBLONG * min(found.voxel):
         yield f"voxels are up to {max(found.voxel):.1f} mm long: surfaces have steps of that size"
     if subject.intensity is not None:
-        index = np.linalg.inv(subject.intensity.affine) @ np.c_[subject.cortex, np.ones(len(subject.cortex))].T
-        inside = (index[:3].T > -0.5) & (np.array(subject.intensity.values.shape) - 0.5 > index[:3].T)
-        covered = float(inside.all(axis=1).mean())
+        covered = share_on(subject.intensity.values.shape, subject.intensity.affine, subject.cortex)
         if covered < COVERED:
             yield f"the T1 holds {100.0 * covered:.0f} % of the brain's surface: is it of the same space?"
 

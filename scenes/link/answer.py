@@ -12,7 +12,7 @@ from ar.tracking.pose import Pose
 from ar.tracking.registration import Registration
 from ar.tracking.track import Tracked
 
-from ..play.overlay.follower import LIMIT, UNCHECKED, UNKNOWN, Known, State, tip_covariance
+from ..play.overlay.follower import LIMIT, UNCHECKED, UNKNOWN, Known, State, tip_covariance, wide_words
 from ..play.overlay.picture import Painter
 from ..play.overlay.plausible import misplaced_tool
 from ..play.overlay.tool_motion import ToolMotion
@@ -168,8 +168,7 @@ def bounded(known: Known, band: float, parts: dict[str, float]) -> Known:
     """What is known with a bound [m] on its place, and what that is of; beyond 5 mm it may not be relied on."""
     if band <= LIMIT:
         return replace(known, band=band, parts=parts)
-    words = f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
-    return replace(known, state=State.UNSURE, words=words, band=None, parts={})
+    return replace(known, state=State.UNSURE, words=wide_words(band), band=None, parts={})
 
 
 def late(answer: Answer, age: float, stale: float) -> Answer:

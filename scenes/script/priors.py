@@ -104,8 +104,8 @@ OF_SEGMENTATION = Prior(
     "raters agree with a Dice score of 74 - 85 %, which is 1.3 - 2.3 mm between two of them on 7 ml: Menze et al. "
     "2015, IEEE Trans. Med. Imaging 34:1993-2024",
 )  # fmt: skip
-PRIORS = (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, OF_MESH, OF_MESH_SLIDING, OF_MESH_SINKING)
-PRIORS += (OF_REGISTRATION, OF_SEGMENTATION)
+OF_MESHES = OF_MESH, OF_MESH_SLIDING, OF_MESH_SINKING
+PRIORS = (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, *OF_MESHES, OF_REGISTRATION, OF_SEGMENTATION)
 """All of them; what a trained model is off by is added where one answers."""
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sim.anatomy import Anatomy
-
-from .nrrd_files import LPS
+from sim.bodies.voxels import LPS
 
 # Less of the brain inside an image, or on voxels that are not empty, is worth a warning.
 ENOUGH = 0.98, 0.5
@@ -27,10 +26,10 @@ def shown(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float
 def doubts(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy: Anatomy) -> list[str]:
     """Sentences without their subject about a picture (I, J, K) that shows some of a brain."""
     found, middles, volumes = [], _middles(anatomy), anatomy.mesh.volumes
-    share = shown(affine, values.shape, anatomy)
+    index, inside = _voxels(affine, values.shape, middles)
+    share = float(np.average(inside, weights=volumes))
     if share < ENOUGH[0]:
         found.append(f"shows {share:.0%} of the brain; what lies outside is not in it")
-    index, inside = _voxels(affine, values.shape, middles)
     empty = float(np.average(values[tuple(index[inside].T)] == 0, weights=volumes[inside]))
     turned = _is_turned(values, affine, labels, middles, volumes)
     if turned:

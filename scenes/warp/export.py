@@ -15,7 +15,7 @@ from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, forward_on, landmark_errors, warp_fields, warp_grid
 
 from .images import Picture, Warped, write_field_nifti, write_warped
-from .landmarks import CENTROID, centroid_now, landmarks_of
+from .landmarks import CENTROID, Landmark, centroid_now, landmarks_of
 from .markups import write_markups
 from .meshes import mesh_of, write_glb, write_stl, write_vtp
 from .moment import Moment
@@ -75,9 +75,10 @@ def write_warp(
             warped.append(write_warped(place, picture, fields, asked.order))
             asked.step(1)
         _write_surfaces(place, moment)
-        _write_points(place, moment)
+        marks = landmarks_of(moment.left, moment.displacement)
+        _write_points(place, moment, marks)
         asked.step(1)
-        report = figures(moment, fields, warped, len(sequence))
+        report = figures(moment, fields, marks, warped, len(sequence))
         report["anatomy"] = {"file": asked.source, "digest": moment.anatomy.digest}
         (place / "README.txt").write_text(page(report, warped))
         files = sorted(path.name for path in place.iterdir())
@@ -102,8 +103,8 @@ def _write_surfaces(place: Path, moment: Moment) -> None:
     write_glb(place / "deformed.glb", meshes)
 
 
-def _write_points(place: Path, moment: Moment) -> None:
-    points = named_points(moment)
+def _write_points(place: Path, moment: Moment, marks: Sequence[Landmark]) -> None:
+    points = named_points(moment, marks)
     if points:
         write_markups(place / "landmarks.mrk.json", "Fiducial", points)
     gap = moment.gap()
@@ -114,10 +115,10 @@ def _write_points(place: Path, moment: Moment) -> None:
         write_segmentation(place / "tumour.seg.nrrd", moment.now, tumour, moment.bound)
 
 
-def named_points(moment: Moment) -> dict[str, np.ndarray]:
+def named_points(moment: Moment, marks: Sequence[Landmark]) -> dict[str, np.ndarray]:
     """Points (3,) [m] by name: of tissue in the scan and now, the tumour's centroid now, and the tool's tip."""
     points = {}
-    for one in landmarks_of(moment.left, moment.displacement):
+    for one in marks:
         points |= {f"{one.name}, in the scan": one.rest, f"{one.name}, now": one.now}
     centroid = centroid_now(moment.left, moment.displacement)
     others = {CENTROID: centroid, "tip": moment.tip}
@@ -142,7 +143,9 @@ def spaces(files: Sequence[str]) -> dict[str, str]:
     return {"cause": "RAS, mm", **{name: space for name, space in found.items() if space}}
 
 
-def figures(moment: Moment, fields: WarpFields, warped: Sequence[Warped], frames: int) -> dict[str, Any]:
+def figures(
+    moment: Moment, fields: WarpFields, marks: Sequence[Landmark], warped: Sequence[Warped], frames: int
+) -> dict[str, Any]:
     """What a warp says of itself: millimetres, shares, counts of voxels, and warnings."""
     nodes, moved = moment.left.mesh.nodes, moment.displacement
     used = np.unique(moment.left.mesh.tets)
@@ -151,7 +154,6 @@ def figures(moment: Moment, fields: WarpFields, warped: Sequence[Warped], frames
     tumour = np.isin(used, moment.left.tumour_nodes)
     gap = moment.gap()
     largest, of_tumour = 1e3 * float(np.linalg.norm(moved, axis=1).max()), float(error[tumour].max(initial=0.0))
-    marks = landmarks_of(moment.left, moment.displacement)
     off = [fields.grid.read(fields.forward, one.rest[None])[0] - (one.now - one.rest) for one in marks]
     return {
         "moved_by": moment.cause.words,

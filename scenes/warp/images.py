@@ -103,11 +103,10 @@ def write_warped(folder: Path, picture: Picture, fields: WarpFields, order: str)
     away, are 0.
     """
     image, shape = picture.image, picture.volume.values.shape
-    proxy = image.dataobj
-    whole, slope, shift = np.asanyarray(proxy), 1.0, 0.0
+    proxy, slope, shift = image.dataobj, 1.0, 0.0
     if isinstance(proxy, ArrayProxy):
-        whole, slope, shift = np.asanyarray(proxy.get_unscaled()), float(proxy.slope), float(proxy.inter)
-    stored = whole.reshape(shape)
+        proxy, slope, shift = proxy.get_unscaled(), float(proxy.slope), float(proxy.inter)
+    stored = np.asanyarray(proxy).reshape(shape)
     values, counts = warped_values(stored, picture.volume.affine, fields, 0 if picture.labels else ORDERS[order])
     blank = 0.0 if shift == 0.0 else -shift / slope
     if blank:

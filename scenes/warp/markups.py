@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .nrrd_files import LPS
+from sim.bodies.voxels import LPS
 
 SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"

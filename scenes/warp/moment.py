@@ -17,6 +17,7 @@ from sim.fem import Fem
 from sim.geometry.closest_point import closest
 from sim.geometry.surface import encloses
 from sim.resected_fem import Operated
+from surrogate.locating.calibration import RADIUS_SQUARED
 
 from ..play.deformers import AtRest, Theatre
 from ..play.player import Player
@@ -25,8 +26,6 @@ from ..play.stage import Stage
 from ..script.scene import Scene
 from .causes import Cause, file_cause, load_cause, scene_cause
 
-# Of three normal components within a ball: 95 %.
-CHI = 7.815
 ENSEMBLE = "registration, segmentation, tissue and skull, as `sulcus uncertainty` has it"
 """What the bound of a scene is of."""
 # Two meshes of one body have nodes so near [m].
@@ -93,10 +92,6 @@ class Played:
         rows = {number: row for row, number in enumerate(needed)}
         return [self._moment(number, answers.rows(np.array([rows[number]])), fem) for number in frames]
 
-    def steps(self, frames: Sequence[int]) -> int:
-        """How many frames at most are solved for those."""
-        return frames[-1] + 1
-
     def _loads(self, number: int):
         scene, time = self.scene, float(self.scene.times[number])
         return scene.loads(self.theatre.site, scene.path(time), time)
@@ -144,6 +139,6 @@ def read_moment(path: Path, anatomy: Anatomy) -> Moment:
         return Moment(cause, anatomy, anatomy, np.asarray(moved, np.float64))
     xx, yy, zz, xy, yz, xz = np.asarray(file.point_data["covariance"])[np.unique(anatomy.tumour_surface)].T
     matrices = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
-    bound = float(np.sqrt(CHI * np.linalg.eigvalsh(matrices)[:, -1].max()))
+    bound = float(np.sqrt(RADIUS_SQUARED * np.linalg.eigvalsh(matrices)[:, -1].max()))
     said = "what was seen of the cortex, as the covariance in the file says, at the tumour's worst vertex"
     return Moment(cause, anatomy, anatomy, np.asarray(moved, np.float64), True, bound, said)

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sim.bodies.voxels import LPS
 from sim.fields.grid import Grid
 
-LPS = np.array([-1.0, -1.0, 1.0])
-"""What makes RAS of LPS, and the other way."""
 TYPES = {"f4": "float", "u1": "unsigned char"}
 # Of the least effort: floats hardly get smaller by more.
 LEVEL = 1

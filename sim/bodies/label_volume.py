@@ -82,9 +82,8 @@ def masked_subject(
     ------
     InputError
         A region that is not known, or not marked. A T1 that `read_intensity` refuses, or in LPS that is stated as RAS
-        as far as it shows; a tumour outside the brain. What
-        `settings` refuse: by default a brain of less than 20 ml or more than 5,000 ml, and a tumour of fewer than 27
-        voxels.
+        as far as it shows; a tumour outside the brain. What `settings` refuse: by default a brain of less than 20 ml
+        or more than 5,000 ml, and a tumour of fewer than 27 voxels.
     """
     for name in regions:
         if name not in PART_LABELS or name not in masks.parts:

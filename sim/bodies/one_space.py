@@ -9,9 +9,8 @@ from scipy.spatial import ConvexHull
 
 from ..errors import InputError
 from .label_map import Mask
-from .voxels import Grid
+from .voxels import LPS, Grid
 
-TO_LPS = np.array([-1.0, -1.0, 1.0])
 # Share of what has to lie inside that does: less is amiss, and so much after x and y are negated says why.
 AMISS, EXPLAINED = 0.5, 0.9
 SAMPLED = 500
@@ -31,7 +30,7 @@ def in_one_space(brain: Mask, tumour: Mask) -> bool:
     apart = (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any()
     points = _places(tumour.grid, _thinned(np.argwhere(tumour.marked)))
     planes = ConvexHull(_corners(brain)).equations
-    within, turned = (_share_within(planes, points * signs) for signs in (np.ones(3), TO_LPS))
+    within, turned = (_share_within(planes, points * signs) for signs in (np.ones(3), LPS))
     if within < AMISS and turned > EXPLAINED:
         raise InputError(
             f"{tumour.path}: its tumour lies at {_box(boxes[1])}, and the brain of {brain.path} at {_box(boxes[0])}. "
@@ -56,7 +55,7 @@ def demand_scan_of(brain: Mask, scan: Grid, grids: Iterable[Grid]) -> None:
     for grid in grids:
         demand_not_negated(grid, scan)
     points = _thinned(brain.outline)
-    within, turned = (_share_on(scan, points * signs) for signs in (np.ones(3), TO_LPS))
+    within, turned = (share_on(scan.shape, scan.affine, points * signs) for signs in (np.ones(3), LPS))
     if within < AMISS and turned > EXPLAINED:
         raise InputError(
             f"{scan.path}: holds {100.0 * within:.0f} % of the brain of {brain.path}. With x and y negated it would "
@@ -72,7 +71,7 @@ def demand_not_negated(one: Grid, other: Grid) -> None:
     InputError
         Such grids.
     """
-    negated = np.array([*TO_LPS, 1.0])[:, None] * other.affine
+    negated = np.array([*LPS, 1.0])[:, None] * other.affine
     if _same(one, Grid(other.path, other.shape, negated)):
         raise InputError(f"{other.path}: has the grid of {one.path}, but with x and y negated: {ONE_OF_BOTH}")
 
@@ -91,11 +90,11 @@ def _places(grid: Grid, index: np.ndarray) -> np.ndarray:
     return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 
 
-def _share_on(grid: Grid, points: np.ndarray) -> float:
-    """The share of points (n, 3) that lie in a voxel."""
-    inverse = np.linalg.inv(grid.affine)
+def share_on(shape: tuple[int, ...], affine: np.ndarray, points: np.ndarray) -> float:
+    """The share of points (n, 3) [m] that lie in a voxel (I, J, K), whose affine (4, 4) leads to metres."""
+    inverse = np.linalg.inv(affine)
     index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3])
-    return float(((index >= 0) & (index < np.array(grid.shape))).all(axis=1).mean())
+    return float(((index >= 0) & (index < np.array(shape))).all(axis=1).mean())
 
 
 def _corners(mask: Mask) -> np.ndarray:

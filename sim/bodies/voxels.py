@@ -10,6 +10,8 @@ import numpy as np
 from ..errors import InputError
 
 REMEDY = "Give one three-dimensional volume (.nii, .nii.gz, .mgz, .mgh, .nrrd or .seg.nrrd)."
+LPS = np.array([-1.0, -1.0, 1.0])
+"""What makes RAS of LPS, and the other way."""
 # What lies behind the voxels and is read for the checksum after them [bytes], and what is read at once.
 SURPLUS, PIECE = 2**24, 2**20
 

@@ -13,8 +13,6 @@ from .grid import Grid
 TOGETHER = 500_000
 # A node so little outside [spacings] is inside: nodes on a face belong to both sides.
 ROUNDING = 1e-7
-# Nodes round a body that get what its outermost tetrahedra go on to [spacings]: all corners of cells that it cuts.
-COLLAR = 0
 
 
 class _Hits(NamedTuple):

@@ -207,8 +207,7 @@ class Follower:
             why = f"no picture for {apart:.1f} s" if apart > 0.0 else "the camera repeats a picture"
             return replace(known, state=State.STALE, words=f"stale, {why}: do not rely on it")
         if known.state in (State.GOOD, State.REST) and band > LIMIT:
-            words = f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
-            return replace(known, state=State.UNSURE, words=words)
+            return replace(known, state=State.UNSURE, words=wide_words(band))
         return known
 
     def _implausible(self, camera: Camera, tool: np.ndarray | None, before: Known | None) -> tuple[str, bool]:
@@ -303,6 +302,11 @@ class Follower:
             **({"shutter": shutter} if self.calibration.readout > 0.0 else {}),
         }
         return float(np.linalg.norm([across(tracked + camera + registered, at), motion.error, shutter])), parts
+
+
+def wide_words(band: float) -> str:
+    """Why a place that is known no better than to `band` [m] may not be relied on."""
+    return f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
 
 
 def tip_covariance(registration: Registration, tool: TrackedTool, beside: Pose) -> np.ndarray:
