@@ -65,7 +65,6 @@ def run(args: argparse.Namespace) -> int:
             bar.update()
     if args.out is not None:
         try:
-            args.out.mkdir(parents=True, exist_ok=True)
             for name, picture in pictures.items():
                 write_png(args.out / f"{name}.png", picture)
             write_png(args.out / "sheet.png", sheet(list(pictures.values())))
