@@ -8,6 +8,7 @@ from .deformation import Deformation
 from .discretisation.term import Cases
 from .errors import InputError
 from .fem import Fem
+from .geometry.surface import vertex_areas
 from .loads import Loads
 
 
@@ -41,8 +42,6 @@ def pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
         for term in fem.problem.barriers:
             term.add_gradient(u, gradient)
     force = np.linalg.norm(gradient.numpy().T.reshape(answer.displacement.shape), axis=2)
-    corners = (fem.space.nodes + answer.displacement)[:, surface]
-    sides = corners[:, :, 1:] - corners[:, :, :1]
-    third = np.linalg.norm(np.cross(sides[:, :, 0], sides[:, :, 1]), axis=2) / 6.0
-    area = np.array([np.bincount(surface.ravel(), np.repeat(row, 3), count) for row in third]).reshape(force.shape)
+    area = np.array([vertex_areas(fem.space.nodes + moved, surface) for moved in answer.displacement])
+    area = area.reshape(force.shape)
     return np.divide(force, area, out=np.zeros_like(area), where=area > 0.0)

@@ -269,7 +269,9 @@ def test_pictures_show_the_tool_where_it_is():
         ({"anatomy": 3}, "path of a .vtu file"),
         ({"anatomy": "nowhere.vtu"}, "nowhere.vtu"),
         ({"task": "juggle"}, "choose one of palpate, retract, debulk"),
-        ({"task": "retract", "physics": "model"}, "Give physics='fem'"),
+        ({"task": "debulk", "physics": "model"}, "Give physics='fem'"),
+        ({"model": 3}, "path of a .model.npz file"),
+        ({"task": "retract", "model": "nowhere.npz"}, "nowhere.npz"),
     ],
 )
 def test_what_cannot_be_had_is_said(given, said):

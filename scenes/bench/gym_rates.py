@@ -1,4 +1,4 @@
-"""How many steps a second the Gymnasium environments of one process make, all environments stepped together."""
+"""How many steps a second Gymnasium environments make, all of them stepped together."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from gymnasium.vector import VectorEnv
 
 from ..gym.scripted import scripted
-from ..gym.vector import Operations
 from .stopwatch import timed
 
 
@@ -36,7 +36,12 @@ class Rate:
 
 
 def rate_of(
-    environment: Operations, task: str, steps: int, repeats: int, progress: Callable[[], object] = lambda: None
+    environment: VectorEnv,
+    task: str,
+    observation: str,
+    steps: int,
+    repeats: int,
+    progress: Callable[[], object] = lambda: None,
 ) -> Rate:
     """Measure a task under its scripted policy; a first repeat is not counted, as it compiles and solves what is kept.
 
@@ -63,6 +68,6 @@ def rate_of(
     kept = np.array(rates[1:])
     touching = float(np.mean(touched[steps:]))
     return Rate(
-        task, environment.observation, environment.num_envs, float(np.median(kept)), float(kept.min()),
+        task, observation, environment.num_envs, float(np.median(kept)), float(kept.min()),
         float(kept.max()), touching,
     )  # fmt: skip

@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 from sim.arguments import at_least
 
 from .json_line import json_line
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
 
 # The tasks of scenes.gym, which loads Gymnasium and is imported only as this runs.
 TASKS = ("palpate", "retract", "debulk")
@@ -20,6 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)} (default: all)")
     parser.add_argument("--envs", type=int, default=64, help="environments, stepped together (default %(default)s)")
     parser.add_argument(
+        "--processes", action="store_true", help="every environment in a process of its own, by Gymnasium"
+    )
+    parser.add_argument(
         "--observation",
         nargs="+",
         choices=OBSERVATIONS,
@@ -30,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, default=40, help="of every environment in a repeat (default %(default)s)")
     parser.add_argument("--repeats", type=int, default=5, help="of which the median counts (default %(default)s)")
     parser.add_argument("--anatomy", default="template", help="a .vtu file (default: the template that ships)")
+    parser.add_argument("--model", help="a file of trained models (default: the one beside the anatomy)")
     parser.add_argument("--physics", default="auto", help="auto, model or fem (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:1 (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
@@ -42,20 +50,18 @@ def run(args: argparse.Namespace) -> int:
     from ..bench.frame import size_of
     from ..bench.gym_rates import rate_of
     from ..bench.stages import machine
-    from ..gym.vector import Operations
 
     for name in ("envs", "steps", "repeats"):
         at_least(f"--{name}", getattr(args, name), 1)
     size, rows = size_of(args.size), []
-    where = f"{machine(args.device)}; {args.envs} environments, pictures of {size[0]} x {size[1]}"
+    apart = ", each in a process of its own" if args.processes else ""
+    where = f"{machine(args.device)}; {args.envs} environments{apart}, pictures of {size[0]} x {size[1]}"
     for task in args.tasks or TASKS:
         for observation in args.observation:
-            environment = Operations(
-                args.envs, task=task, anatomy=args.anatomy, observation=observation, physics=args.physics,
-                device=args.device, size=size,
-            )  # fmt: skip
+            environment = _environment(args, task, observation, size)
             with tqdm(desc=f"{task}, {observation}", total=args.repeats + 1, unit="repeat", file=sys.stderr) as bar:
-                rows.append(rate_of(environment, task, args.steps, args.repeats, bar.update))
+                rows.append(rate_of(environment, task, observation, args.steps, args.repeats, bar.update))
+            environment.close()
     if args.json:
         print(json_line({"machine": where, "rows": [asdict(row) for row in rows]}))
         return 0
@@ -66,3 +72,22 @@ def run(args: argparse.Namespace) -> int:
             f"{100.0 * row.touching:.0f} % |"
         )
     return 0
+
+
+def _environment(args: argparse.Namespace, task: str, observation: str, size: tuple[int, int]) -> VectorEnv:
+    import gymnasium
+
+    from ..gym.registration import NAMESPACE, register_environments
+    from ..gym.tasks import find_task
+
+    register_environments()
+    given = {
+        "anatomy": args.anatomy, "observation": observation, "physics": args.physics, "device": args.device,
+        "size": size, "model": args.model,
+    }  # fmt: skip
+    name = f"{NAMESPACE}/{find_task(task).name.capitalize()}-v0"
+    if args.processes:
+        # Children begin anew: what holds a card is not forked.
+        started = {"context": "spawn"}
+        return gymnasium.make_vec(name, args.envs, vectorization_mode="async", vector_kwargs=started, **given)
+    return gymnasium.make_vec(name, args.envs, **given)

@@ -23,7 +23,7 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(
 
 def opened(
     task: str, anatomy: str | Path, observation: str, physics: str, device: str, size: tuple[int, int],
-    render_mode: str | None, together: bool | None = None,
+    render_mode: str | None, model: str | Path | None, together: bool | None = None,
 ) -> Setting:  # fmt: skip
     """What environments stand on, of the arguments that they were made with.
 
@@ -36,7 +36,7 @@ def opened(
         raise InputError(f"observation is {observation!r:.80}: choose one of {', '.join(KINDS)}.")
     if render_mode is not None and render_mode not in RENDERED:
         raise InputError(f"render_mode is {render_mode!r:.80}: choose {', '.join(RENDERED)}, or None.")
-    given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size}
+    given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size, "model": model}
     return open_setting(find_task(task), *checked(given), together)
 
 
@@ -47,7 +47,7 @@ class Operation(gymnasium.Env):
     ----------
     task
         "palpate", "retract" or "debulk".
-    anatomy, physics, device, size
+    anatomy, physics, device, size, model
         As `open_setting`.
     observation
         "states", or "rgbd": pictures too.
@@ -71,8 +71,9 @@ class Operation(gymnasium.Env):
         device: str = "auto",
         size: tuple[int, int] = (160, 120),
         render_mode: str | None = None,
+        model: str | Path | None = None,
     ):
-        self.setting = opened(task, anatomy, observation, physics, device, size, render_mode)
+        self.setting = opened(task, anatomy, observation, physics, device, size, render_mode, model)
         self.observation, self.render_mode = observation, render_mode
         self.observation_space = space_of(observation, size)
         self.action_space = twists()

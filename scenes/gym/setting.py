@@ -16,21 +16,26 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Resected
 from sim.runtime.device import find_device
+from surrogate.model.learned import Learned
+from surrogate.model.tool_pressure import knows_pressure
 
 from ..play.deformers import Theatre, open_theatre
 from ..play.stage import Stage
 from ..script.scene import Scene
+from ..script.shipped_files import spatula_model_path
 from ..script.site import Site
-from ..script.tool import Probe
+from ..script.tool import Blade, Probe
 from .cut_elements import CutElements
 from .hertz import Hertz
 from .posed_elements import PosedElements
+from .posed_model import PosedModel
 from .pressed_model import PressedModel
 from .tasks import Goal, Task
 from .touched import Answers
 
 PHYSICS = ("auto", "model", "fem")
 TEMPLATE = "template"
+ARGUMENTS = ("anatomy", "physics", "device", "size", "model")
 # A goal lies within so far of the place over the tumour's middle [m].
 SPREAD = 6e-3
 # A drained fluid stands so high at least, and at most, as a share of its height.
@@ -111,21 +116,29 @@ class Setting:
 
 @lru_cache(maxsize=8)
 def open_setting(
-    task: Task, anatomy: str, physics: str, device: str, size: tuple[int, int], together: bool | None = None
+    task: Task,
+    anatomy: str,
+    physics: str,
+    device: str,
+    size: tuple[int, int],
+    model: str | None = None,
+    together: bool | None = None,
 ) -> Setting:
     """A task on a body, read once for all environments of a process.
 
     Parameters
     ----------
     anatomy
-        "template", or the path of a .vtu file; models beside it are used.
+        "template", or the path of a .vtu file.
     physics
-        "model": the best trained model of pushes, where the task is a push with a ball. "fem": finite elements. "auto":
-        the model where there is one.
+        "model": the best trained model of the tool's poses, or of pushes where the tool is a ball. "fem": finite
+        elements. "auto": the model where there is one.
     device
         As of `Fem`.
     size
         Width and height of pictures [pixel].
+    model
+        A file of trained models. None: the one beside the anatomy; of the template and a spatula the one that ships.
     together
         Whether all environments are answered at once; None: on a card. On the CPU that is several times as fast, but
         the last digits depend on the neighbours.
@@ -136,7 +149,7 @@ def open_setting(
         Files that cannot be read; a body without tumour or open cortex; a model that is not there; a device that is
         not there.
     """
-    theatre = _theatre(anatomy, device)
+    theatre = _theatre(anatomy, _shipped(task) if model is None and anatomy == TEMPLATE else model, device)
     if not (theatre.anatomy.mesh.region == TUMOUR_LABEL).any():
         raise InputError(f"{anatomy}: has no tumour, which these tasks aim at: mesh one with region {TUMOUR_LABEL}.")
     scene, tool = task.scene(size), task.tool
@@ -145,16 +158,18 @@ def open_setting(
     tissue = next(effect.default for effect in scene.effects if isinstance(effect, Elasticity))
     assert tissue is not None
     ball = Hertz(tool.radius, tissue) if isinstance(tool, Probe) else None
-    pushes = Scene(task.name, task.title, effects=(Elasticity(tissue), Held(), Bonded(), ToolForce()), tool=tool)
-    models = {} if ball is None or task.cuts else theatre.knowing(pushes)
-    if physics == "model" and not models:
+    if physics != "fem" and not task.cuts:
+        posed = [each for each in theatre.knowing(scene).values() if ball is not None or knows_pressure(each)]
+        if posed := [each for each in posed if each.force is not None]:
+            return Setting(task, scene, theatre, PosedModel(min(posed, key=_bound), ball))
+        pushes = Scene(task.name, task.title, effects=(Elasticity(tissue), Held(), Bonded(), ToolForce()), tool=tool)
+        if ball is not None and (pushed := theatre.knowing(pushes).values()):
+            return Setting(task, scene, theatre, PressedModel(theatre.site, min(pushed, key=_bound), ball, at_once))
+    if physics == "model":
         raise InputError(
-            f"physics='model': no trained model beside {anatomy} answers the task {task.name}. Give physics='fem', or "
-            "for palpate train one with `sulcus train`."
+            f"physics='model': no trained model of {anatomy} answers the task {task.name}. Give physics='fem', or "
+            "train one: docs/gym.md has the commands."
         )
-    if models and ball is not None and physics != "fem":
-        model = min(models.values(), key=lambda each: each.bound)
-        return Setting(task, scene, theatre, PressedModel(theatre.site, model, ball, at_once))
     fem = theatre.fem(scene, LIVE, batch=64 if at_once else 1, live=not at_once)
     if isinstance(fem, Fem):
         return Setting(task, scene, theatre, PosedElements(fem, ball, at_once))
@@ -163,21 +178,32 @@ def open_setting(
 
 
 @lru_cache(maxsize=4)
-def _theatre(anatomy: str, device: str) -> Theatre:
-    return open_theatre(None if anatomy == TEMPLATE else Path(anatomy), None, device)
+def _theatre(anatomy: str, model: str | None, device: str) -> Theatre:
+    body = None if anatomy == TEMPLATE else Path(anatomy)
+    return open_theatre(body, None if model is None else Path(model), device)
 
 
-def checked(given: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int]]:
-    """Arguments `anatomy`, `physics`, `device` and `size` as `open_setting` takes them.
+def _shipped(task: Task) -> str | None:
+    return str(spatula_model_path()) if isinstance(task.tool, Blade) else None
+
+
+def _bound(model: Learned) -> float:
+    return model.bound
+
+
+def checked(given: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int], str | None]:
+    """Arguments `anatomy`, `physics`, `device`, `size` and `model` as `open_setting` takes them.
 
     Raises
     ------
     InputError
         What is none of those.
     """
-    anatomy, physics, device, size = (given[name] for name in ("anatomy", "physics", "device", "size"))
+    anatomy, physics, device, size, model = (given[name] for name in ARGUMENTS)
     if not isinstance(anatomy, str | Path):
         raise InputError(f"anatomy is {anatomy!r:.80}: give 'template', or the path of a .vtu file.")
+    if not isinstance(model, str | Path | None):
+        raise InputError(f"model is {model!r:.80}: give the path of a .model.npz file, or None.")
     if physics not in PHYSICS:
         raise InputError(f"physics is {physics!r:.80}: choose one of {', '.join(PHYSICS)}.")
     if not isinstance(device, str):
@@ -185,4 +211,4 @@ def checked(given: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int]
     sides = tuple(size) if isinstance(size, tuple | list) else ()
     if len(sides) != 2 or not all(type(side) is int and 16 <= side <= 4096 for side in sides):
         raise InputError(f"size is {size!r:.80}: give width and height in pixels, each from 16 to 4096.")
-    return str(anatomy), str(physics), device, (sides[0], sides[1])
+    return str(anatomy), str(physics), device, (sides[0], sides[1]), None if model is None else str(model)

@@ -57,11 +57,12 @@ class Operations(VectorEnv):
         device: str = "auto",
         size: tuple[int, int] = (160, 120),
         render_mode: str | None = None,
+        model: str | Path | None = None,
         together: bool | None = None,
     ):
         self.num_envs = at_least("num_envs", num_envs, 1)
         self.steps = at_least("max_episode_steps", max_episode_steps, 1)
-        self.setting = opened(task, anatomy, observation, physics, device, size, render_mode, together)
+        self.setting = opened(task, anatomy, observation, physics, device, size, render_mode, model, together)
         self.observation, self.render_mode = observation, render_mode
         self.single_observation_space = space_of(observation, size)
         self.single_action_space = twists()

@@ -9,3 +9,8 @@ from pathlib import Path
 def template_path() -> Path:
     """The template anatomy, a .vtu; its scan and its models lie beside it."""
     return Path(str(files("scenes"))) / "data" / "template.vtu"
+
+
+def spatula_model_path() -> Path:
+    """A model of a spatula on the template, by its pose, in tissue that does not relax."""
+    return template_path().with_suffix(".spatula.npz")

@@ -40,6 +40,12 @@ class Placed:
         """The same, moved by (3,) [m]."""
         return replace(self, middle=self.middle + way)
 
+    @property
+    def corners(self) -> np.ndarray:
+        """Of the box (8, 3) [m]."""
+        signs = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+        return self.middle + (signs * self.half) @ self.axes.T
+
     def nearest(self, corners: np.ndarray) -> Near:
         """The places nearest to it on triangles with `corners` (S, 3, 3) [m].
 

@@ -92,3 +92,8 @@ def areas(corners: np.ndarray) -> np.ndarray:
     """(S,) [m^2] of triangles with corners (S, 3, 3) [m]."""
     a, b, c = np.moveaxis(corners, 1, 0)
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def vertex_areas(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """A third (n,) [m^2] of the areas of the triangles (S, 3) at each of the nodes (n, 3) [m]."""
+    return np.bincount(triangles.ravel(), np.repeat(areas(nodes[triangles]) / 3.0, 3), len(nodes))

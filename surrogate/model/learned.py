@@ -29,6 +29,7 @@ from ..data.stated_tissue import stated_tissue
 from ..regressors.protocol import Fitted
 from ..regressors.rigid_contact import Contact
 from .conformal import LEVELS, Bound, features_of
+from .contact_start import going_on, held_of
 from .left_out import LeftOut
 from .relaxation import MEMORY, Relaxed, followed
 from .tip_distance import Distance, TipModel
@@ -126,6 +127,10 @@ class Learned:
         return np.unique(np.concatenate([part.basis.nodes for part in self.parts]))
 
     @cached_property
+    def _regressors(self) -> list[Fitted]:
+        return [part.regressor for part in self.parts]
+
+    @cached_property
     def _patch(self) -> Patch:
         return open_patch(self.anatomy)
 
@@ -190,10 +195,10 @@ class Learned:
             )
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Predict the static answer to `Pushed` loads, or to the poses of its tool; `start` has no influence.
+        """Predict the static answer to `Pushed` loads, or to the poses of its tool.
 
-        Where its tissue relaxes, it is what a tool is answered that goes on from the start within the time between.
-        Without a start the tool came and was held until the loads' time, as `data.holding` says.
+        From a start a rod or a blade goes on, which is faster; without one it comes straight in. Where tissue relaxes
+        the time between counts; without a start the tool was held until the loads' time, as `data.holding` says.
 
         Raises
         ------
@@ -215,11 +220,12 @@ class Learned:
         nodes = self.nodes if at is None else whole_numbers("at", at)
         self._demand_known(nodes)
         with one_thread() if len(loads) == 1 else nullcontext():
-            return self._summed(loads, pushed, nodes, begun, past)
+            return self._summed(loads, pushed, nodes, begun, past, going_on(self._regressors, start))
 
     def _summed(
-        self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float, past: Relaxed | None
-    ) -> Deformation:
+        self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float, past: Relaxed | None,
+        encoders: Mapping[str, Encoder],
+    ) -> Deformation:  # fmt: skip
         """The sum of the parts, asked at `begun` [s]."""
         known = measured(self._patch, pushed)
         outside = self.envelope.outside(pushed, known)
@@ -228,14 +234,17 @@ class Learned:
         promised = self.promised(self.bounds, pushed, known, outside)
         if past is not None:
             far = far | past.strange
-        answer = predicted(self.motion(pushed, nodes), nodes, loads, far, begun, promised, self.source)
+        motion = self.motion(pushed, nodes, encoders)
+        answer = predicted(motion, nodes, loads, far, begun, promised, self.source)
         if past is not None:
             answer = replace(answer, memory={MEMORY: past.memory})
+        if self.tool is not None:
+            answer = replace(answer, warm=held_of(self._regressors, self._patch, self.within(pushed)[1], encoders))
         if self.force is None or self.tool is None:
             return answer
         return replace(
             answer,
-            reaction=wrench(self.exerted(pushed), posed(loads, self.tool), self.tool),
+            reaction=wrench(self.exerted(pushed, encoders), posed(loads, self.tool), self.tool),
             reaction_bound=self.promised(self.force.bound, pushed, known, outside),
             cost=Cost({"predict": time.perf_counter() - begun}),
         )
@@ -245,7 +254,7 @@ class Learned:
 
         Beyond the forces of the training the response stays what it was at the nearest of them.
         """
-        magnitude, asked = self._within(pushed)
+        magnitude, asked = self.within(pushed)
         if not len(nodes):
             return np.zeros((len(magnitude), 0, 3))
         groups = self._modes_at(np.asarray(nodes, np.int64).tobytes())
@@ -257,12 +266,12 @@ class Learned:
         ]
         return magnitude[:, None, None] * reduce(add, responses).reshape(-1, len(nodes), 3)
 
-    def _within(self, pushed: Pushed) -> tuple[np.ndarray, Pushed]:
+    def within(self, pushed: Pushed) -> tuple[np.ndarray, Pushed]:
         """Sizes (B,) of forces [N] or depths [m], and the same loads no weaker and no stronger than any in training."""
         magnitude, direction = directions(pushed)
         return magnitude, replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
 
-    def exerted(self, pushed: Pushed) -> np.ndarray:
+    def exerted(self, pushed: Pushed, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
         """Forces (B, 3) [N] that the tool exerts at indentations; as `motion`, in proportion beyond the training.
 
         Raises
@@ -272,11 +281,11 @@ class Learned:
         """
         if self.force is None:
             raise InputError("this model does not know its tool's force: train it anew, on newly simulated poses.")
-        magnitude, asked = self._within(pushed)
+        magnitude, asked = self.within(pushed)
         found = np.zeros(pushed.force.shape) + self.force.added(self._patch, asked)
         for part in self.parts:
             if isinstance(part.regressor, Contact):
-                found += part.regressor.exerted(ENCODERS[part.encoder](self._patch, asked))
+                found += part.regressor.exerted(encoders[part.encoder](self._patch, asked))
         return magnitude[:, None] * found
 
     def promised(self, bound: Bound | None, pushed: Pushed, known: Measured, outside: Outside) -> np.ndarray:
@@ -310,7 +319,7 @@ class Learned:
                 answer = self.deform(loads, at=self.nodes)
             apart = tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.tool)
         tip = self.tip or TipModel()
-        magnitude, within = self._within(pushed)
+        magnitude, within = self.within(pushed)
         found = tip.corrected(apart, self._patch, within, magnitude)
         known = measured(self._patch, pushed)
         return Distance(found, self.promised(tip.bound, pushed, known, self.envelope.outside(pushed, known)))

@@ -37,6 +37,10 @@ REACH = 1.5
 TOLERANCE, MOST = 1e-6, 60
 # A rod or a blade goes in by so many radii at once, so that tissue stays before it; there a facet is entered by more.
 STRIDE, COARSER = 0.5, 1e-5
+# Where it only goes through, so many rounds do: more change the answer by less than what it is off, in twice the time.
+PASSING = 3
+# What is no farther from a tool [m] was touched by it when it stood there.
+TOUCHED = 5e-5
 # Constraints that bear nothing are dropped, which is faster; after so many rounds they stay: nothing goes in circles.
 FORGETFUL = 15
 # Places that give less than this share of what nodes do on average are bone's, which the tool enters: no force, or one
@@ -44,8 +48,9 @@ FORGETFUL = 15
 LEAST = 0.02
 # Straight from LAPACK: the problems are so small that a wrapper takes longer than the work.
 FACTORED, SOLVED = get_lapack_funcs(("potrf", "trtrs"), dtype=np.float64)
-# Points of neighbouring facets on a common edge are one: of the mean diagonal, so that their forces are distinct.
-APART = 1e-6
+# Points of neighbouring facets on a common edge are one: of the mean diagonal, so that their forces are distinct. The
+# first that makes single precision positive definite.
+APART = (1e-6, 1e-5, 1e-4)
 # Features of a ball, and of a rod or a blade.
 LYING, STANDING = 8, 17
 
@@ -54,7 +59,8 @@ LYING, STANDING = 8, 17
 class Contact:
     """A regressor that predicts the response to one metre of indentation.
 
-    It is given `tool_features` of a ball, and `core_features` of a rod or a blade.
+    It is given `tool_features` of a ball, and `core_features` of a rod or a blade. Behind those may stand what
+    `held` gave where the rod or blade stood last: it then goes on from there, which takes a fraction of the time.
 
     What nonlinearity adds far from the tool is nearly a factor of the force, that grows with depth over radius: a line,
     which is all that is learned. Where tissue relaxes there is another line, in proportion to the share that is gone.
@@ -100,10 +106,25 @@ class Contact:
         """The force (B, 3) [N/m] that the tool exerts, by one metre of depth; `grip` must have been learned."""
         return self._resultant(X) * (self._terms(X) @ self.grip)[:, None]
 
+    @property
+    def held_width(self) -> int:
+        """How many numbers `held` has a row."""
+        return self._width + len(self.compliance)
+
+    def held(self, X: np.ndarray) -> np.ndarray:
+        """Where rods or blades stand and what they exert (B, h): what the next pose may go on from."""
+        return np.hstack([X[:, : self._width], self.force(X)])
+
     def _terms(self, X: np.ndarray) -> np.ndarray:
         """What lines are of (B, 2), or of tissue that relaxes (B, 4)."""
-        depth = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]])
-        return depth if X.shape[1] == self._width else np.hstack([depth, X[:, -1:] * depth])
+        depth, relaxed = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]]), self._parted(X)[1]
+        return np.hstack([depth, relaxed * depth]) if relaxed.shape[1] else depth
+
+    def _parted(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of features: how the tool stands, how far tissue has relaxed, and what was `held`: both may be none."""
+        more = X[:, self._width :]
+        relaxed, held = np.split(more, [more.shape[1] % self.held_width], axis=1)
+        return X[:, : self._width], relaxed, held
 
     @property
     def _width(self) -> int:
@@ -117,14 +138,15 @@ class Contact:
 
     def force(self, X: np.ndarray) -> np.ndarray:
         """What the tool does to linear tissue at the nodes that it may touch (B, 3 k) [N]."""
-        X = np.ascontiguousarray(X[:, : self._width])
+        stands, _, held = self._parted(X)
+        X = np.ascontiguousarray(np.hstack([stands, held]))
         asked, (known, found) = X.tobytes(), self._last
         if asked == known:
             return found
         out = np.zeros((len(X), len(self.compliance)))
         with one_thread():
             for row in np.flatnonzero(X[:, 6] > 0.0):
-                out[row] = self._pressed(*self._placed(X[row]))
+                out[row] = self._pressed(*self._way(X[row]))
         out.flags.writeable = False
         self._last = asked, out
         return out
@@ -156,22 +178,40 @@ class Contact:
         """Middles (S, 3) and radii (S,) [m] of balls that hold a triangle each."""
         return bounding_balls(self.points[self.triangles])
 
-    def _placed(self, x: np.ndarray) -> tuple[list[Placed], float]:
-        """Where the tool of a row of features stands, from where it goes in on, and its radius [m]."""
+    def _way(self, x: np.ndarray) -> tuple[list[Placed], float, np.ndarray | None]:
+        """Where the tool of a row of features goes through, its radius [m], and what it exerts at the first place.
+
+        The first is where it stood last, if that is nearer than where it came in, and else the first on the way in.
+        """
         # Warp is loaded where a tool is pressed, not where a model is read.
         from sim.discretisation.nearest_places import Placed
 
         point, direction, depth, radius = x[:3], x[3:6], x[6], x[7]
         if not len(self.core):
-            return [Placed(point + (depth - radius) * direction, np.eye(3), np.zeros(3))], radius + THICKER
-        axes = np.column_stack([x[11:14], np.cross(x[14:17], x[11:14]), x[14:17]])
-        there = Placed(x[8:11], axes, self.core[:3])
-        steps = int(np.ceil(depth / (STRIDE * self.core[3])))
+            return [Placed(point + (depth - radius) * direction, np.eye(3), np.zeros(3))], radius + THICKER, None
+        there, stride = self._standing(x), STRIDE * self.core[3]
+        steps, last = int(np.ceil(depth / stride)), x[self._width :]
+        if len(last) and last[6] > 0.0:
+            begun = self._standing(last)
+            far = np.linalg.norm(there.corners - begun.corners, axis=1).max()
+            if (few := int(np.ceil(far / stride))) < steps:
+                back = begun.middle - there.middle
+                ways = [there.moved((1.0 - k / few) * back) for k in range(1, few + 1)] or [there]
+                return [begun, *ways], self.core[3] + THICKER, last[self._width :]
         ways = [(k / steps - 1.0) * depth * direction for k in range(1, steps + 1)]
-        return [there.moved(way) for way in ways], self.core[3] + THICKER
+        return [there.moved(way) for way in ways], self.core[3] + THICKER, None
 
-    def _pressed(self, stations: list[Placed], radius: float) -> np.ndarray:
-        """Nodal forces (3 k,) [N] of a tool of a radius [m] at the last of the stations that it goes through."""
+    def _standing(self, x: np.ndarray) -> Placed:
+        from sim.discretisation.nearest_places import Placed
+
+        axes = np.column_stack([x[11:14], np.cross(x[14:17], x[11:14]), x[14:17]])
+        return Placed(x[8:11], axes, self.core[:3])
+
+    def _pressed(self, stations: list[Placed], radius: float, begun: np.ndarray | None) -> np.ndarray:
+        """Nodal forces (3 k,) [N] of a tool of a radius [m] at the last of the stations that it goes through.
+
+        begun (3 k,) [N] is what it exerts at the first of them already; None: nothing is touched before.
+        """
         nodes, table, rows = self._touchable(stations, radius)
         compliance = self.compliance[np.ix_(rows, rows)].astype(np.float64)
         own = compliance.reshape(len(nodes), 3, len(nodes), 3)[np.arange(len(nodes)), :, np.arange(len(nodes))]
@@ -179,9 +219,15 @@ class Contact:
         tolerance = COARSER if len(self.core) else TOLERANCE
         moved, force = np.zeros((len(nodes), 3)), np.zeros(len(rows))
         facet, share = np.zeros(0, int), np.zeros((0, 3))
+        if begun is not None:
+            force, first, stations = begun[rows], stations[0], stations[1:]
+            moved = (compliance @ force).reshape(-1, 3)
+            near = first.nearest((self.points[nodes] + moved)[table])
+            facet = np.flatnonzero(near.distance < radius + TOUCHED)
+            share = near.share[facet]
         for station in stations:
-            settled = True
-            for iteration in range(MOST):
+            settled = begun is None
+            for iteration in range(MOST if station is stations[-1] else PASSING):
                 corners = (self.points[nodes] + moved)[table]
                 near = station.nearest(corners)
                 entered = np.flatnonzero(near.distance < radius - tolerance)
@@ -227,8 +273,11 @@ def _line(terms: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarra
 
 def _bearing(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """The least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m], gain positive semi-definite."""
-    gain.flat[:: len(gain) + 1] += APART * np.trace(gain) / len(gain)
-    lower, failed = FACTORED(gain, lower=True)
-    if failed:
-        raise np.linalg.LinAlgError("places that a tool touches do not give way")
-    return nnls(lower.T, SOLVED(lower, wanted, lower=True)[0])[0]
+    if not len(gain):
+        return wanted
+    mean = np.trace(gain) / len(gain)
+    for apart in APART:
+        lower, failed = FACTORED(gain + apart * mean * np.eye(len(gain)), lower=True)
+        if not failed:
+            return nnls(lower.T, SOLVED(lower, wanted, lower=True)[0])[0]
+    raise np.linalg.LinAlgError("places that a tool touches do not give way")
