@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from gymnasium.vector import VectorEnv
 
 from ..gym.scripted import scripted
+from ..gym.vector import VectorEnv
 from .stopwatch import timed
 
 

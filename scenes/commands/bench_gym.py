@@ -5,14 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import asdict
-from typing import TYPE_CHECKING
 
 from sim.arguments import at_least
 
 from .json_line import json_line
-
-if TYPE_CHECKING:
-    from gymnasium.vector import VectorEnv
 
 # The tasks of scenes.gym, which loads Gymnasium and is imported only as this runs.
 TASKS = ("palpate", "retract", "debulk")
@@ -50,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from ..bench.frame import size_of
     from ..bench.gym_rates import rate_of
     from ..bench.stages import machine
+    from ..gym.vector import many
 
     for name in ("envs", "steps", "repeats"):
         at_least(f"--{name}", getattr(args, name), 1)
@@ -58,7 +55,10 @@ def run(args: argparse.Namespace) -> int:
     where = f"{machine(args.device)}; {args.envs} environments{apart}, pictures of {size[0]} x {size[1]}"
     for task in args.tasks or TASKS:
         for observation in args.observation:
-            environment = _environment(args, task, observation, size)
+            environment = many(
+                task, args.envs, args.processes, anatomy=args.anatomy, observation=observation, physics=args.physics,
+                device=args.device, size=size, model=args.model,
+            )  # fmt: skip
             with tqdm(desc=f"{task}, {observation}", total=args.repeats + 1, unit="repeat", file=sys.stderr) as bar:
                 rows.append(rate_of(environment, task, observation, args.steps, args.repeats, bar.update))
             environment.close()
@@ -72,22 +72,3 @@ def run(args: argparse.Namespace) -> int:
             f"{100.0 * row.touching:.0f} % |"
         )
     return 0
-
-
-def _environment(args: argparse.Namespace, task: str, observation: str, size: tuple[int, int]) -> VectorEnv:
-    import gymnasium
-
-    from ..gym.registration import NAMESPACE, register_environments
-    from ..gym.tasks import find_task
-
-    register_environments()
-    given = {
-        "anatomy": args.anatomy, "observation": observation, "physics": args.physics, "device": args.device,
-        "size": size, "model": args.model,
-    }  # fmt: skip
-    name = f"{NAMESPACE}/{find_task(task).name.capitalize()}-v0"
-    if args.processes:
-        # Children begin anew: what holds a card is not forked.
-        started = {"context": "spawn"}
-        return gymnasium.make_vec(name, args.envs, vectorization_mode="async", vector_kwargs=started, **given)
-    return gymnasium.make_vec(name, args.envs, **given)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium import make_vec
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -18,7 +19,8 @@ from .environment import METADATA, opened
 from .episode import Episode, Step
 from .observation import space_of, twists
 from .pictures import Pictures
-from .registration import STEPS
+from .registration import NAMESPACE, STEPS
+from .tasks import find_task
 from .touched import Asked
 
 
@@ -140,3 +142,25 @@ class Operations(VectorEnv):
         """The truth as arrays with a row for each environment, and Gymnasium's masks of who has it: all."""
         infos = {name: np.stack([step.info[name] for step in steps]) for name in steps[0].info}
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
+
+
+def many(task: str, count: int, processes: bool = False, **given: Any) -> VectorEnv:
+    """So many environments of a task, as `gymnasium.make_vec` makes them.
+
+    Parameters
+    ----------
+    processes
+        Whether each has a process of its own. Children begin anew, for what holds a card cannot be forked: a script
+        that asks for them needs `if __name__ == "__main__":`.
+    given
+        Other arguments of `Operation`.
+
+    Raises
+    ------
+    InputError
+        As `Operation`.
+    """
+    name = f"{NAMESPACE}/{find_task(task).name.capitalize()}-v0"
+    if processes:
+        return make_vec(name, count, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **given)
+    return make_vec(name, count, **given)

@@ -45,7 +45,7 @@ def tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> np.ndarr
     held = answer.warm.get(HELD)
     if held is None:
         held = contact.held(ENCODERS[part.encoder](patch, model.within(model.asked(loads))[1]))
-    force = held[:, -len(contact.compliance) :].reshape(len(loads), -1, 3)
+    force = contact.held_force(held).reshape(len(loads), -1, 3)
     whole = np.linalg.norm(force.sum(axis=1), axis=1)
     size = np.linalg.norm(answer.reaction[:, 0, :3], axis=1)
     factor = np.divide(size, whole, out=np.zeros_like(size), where=whole > 0.0)

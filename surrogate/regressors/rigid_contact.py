@@ -39,8 +39,8 @@ TOLERANCE, MOST = 1e-6, 60
 STRIDE, COARSER = 0.5, 1e-5
 # Where it only goes through, so many rounds do: more change the answer by less than what it is off, in twice the time.
 PASSING = 3
-# What is no farther from a tool [m] was touched by it when it stood there.
-TOUCHED = 5e-5
+# So many places that bear a force are known of a tool that goes on: the strongest.
+HELD = 128
 # Constraints that bear nothing are dropped, which is faster; after so many rounds they stay: nothing goes in circles.
 FORGETFUL = 15
 # Places that give less than this share of what nodes do on average are bone's, which the tool enters: no force, or one
@@ -90,7 +90,7 @@ class Contact:
     line: np.ndarray
     grip: np.ndarray = field(default_factory=lambda: np.zeros(0))
     core: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    # Features that were last asked for, and their forces: motion and reaction of one load are had from one search.
+    # Features that were last asked for, and what was found: motion and reaction of one load are had from one search.
     _last: tuple[bytes, np.ndarray] = field(default=(b"", np.zeros(0)), init=False, repr=False)
 
     def predict(self, X: np.ndarray) -> np.ndarray:
@@ -109,11 +109,15 @@ class Contact:
     @property
     def held_width(self) -> int:
         """How many numbers `held` has a row."""
-        return self._width + len(self.compliance)
+        return self._width + len(self.compliance) + 4 * HELD
 
     def held(self, X: np.ndarray) -> np.ndarray:
-        """Where rods or blades stand and what they exert (B, h): what the next pose may go on from."""
-        return np.hstack([X[:, : self._width], self.force(X)])
+        """Where rods or blades stand, what they exert, and where (B, h): what the next pose may go on from."""
+        return np.hstack([X[:, : self._width], self._found(X)])
+
+    def held_force(self, held: np.ndarray) -> np.ndarray:
+        """The forces (B, 3 k) [N] in rows of `held`."""
+        return held[:, self._width : self._width + len(self.compliance)]
 
     def _terms(self, X: np.ndarray) -> np.ndarray:
         """What lines are of (B, 2), or of tissue that relaxes (B, 4)."""
@@ -138,12 +142,16 @@ class Contact:
 
     def force(self, X: np.ndarray) -> np.ndarray:
         """What the tool does to linear tissue at the nodes that it may touch (B, 3 k) [N]."""
+        return self._found(X)[:, : len(self.compliance)]
+
+    def _found(self, X: np.ndarray) -> np.ndarray:
+        """Forces (B, 3 k) [N], and then triangles and corner coordinates (4,) of the places that bear them, or -1."""
         stands, _, held = self._parted(X)
         X = np.ascontiguousarray(np.hstack([stands, held]))
         asked, (known, found) = X.tobytes(), self._last
         if asked == known:
             return found
-        out = np.zeros((len(X), len(self.compliance)))
+        out = np.zeros((len(X), len(self.compliance) + 4 * HELD))
         with one_thread():
             for row in np.flatnonzero(X[:, 6] > 0.0):
                 out[row] = self._pressed(*self._way(X[row]))
@@ -208,23 +216,22 @@ class Contact:
         return Placed(x[8:11], axes, self.core[:3])
 
     def _pressed(self, stations: list[Placed], radius: float, begun: np.ndarray | None) -> np.ndarray:
-        """Nodal forces (3 k,) [N] of a tool of a radius [m] at the last of the stations that it goes through.
+        """Of a tool of a radius [m] at the last of the stations that it goes through: a row of `_found`.
 
-        begun (3 k,) [N] is what it exerts at the first of them already; None: nothing is touched before.
+        begun is that of the first of them; None: nothing is touched before.
         """
-        nodes, table, rows = self._touchable(stations, radius)
+        facets, nodes, table, rows = self._touchable(stations, radius)
         compliance = self.compliance[np.ix_(rows, rows)].astype(np.float64)
         own = compliance.reshape(len(nodes), 3, len(nodes), 3)[np.arange(len(nodes)), :, np.arange(len(nodes))]
         least, own = LEAST * np.einsum("nii->", own) / max(3 * len(nodes), 1), own[table]
         tolerance = COARSER if len(self.core) else TOLERANCE
         moved, force = np.zeros((len(nodes), 3)), np.zeros(len(rows))
-        facet, share = np.zeros(0, int), np.zeros((0, 3))
+        facet, share, bears = np.zeros(0, int), np.zeros((0, 3)), np.zeros(0)
         if begun is not None:
-            force, first, stations = begun[rows], stations[0], stations[1:]
-            moved = (compliance @ force).reshape(-1, 3)
-            near = first.nearest((self.points[nodes] + moved)[table])
-            facet = np.flatnonzero(near.distance < radius + TOUCHED)
-            share = near.share[facet]
+            stations, moved = stations[1:], (compliance @ begun[rows]).reshape(-1, 3)
+            places = begun[len(self.compliance) :].reshape(HELD, 4)
+            places = places[np.isin(places[:, 0], facets)]
+            facet, share = np.searchsorted(facets, places[:, 0]), places[:, 1:]
         for station in stations:
             settled = begun is None
             for iteration in range(MOST if station is stations[-1] else PASSING):
@@ -246,14 +253,18 @@ class Contact:
                 force = bears @ lever
                 last, moved = moved, (compliance @ force).reshape(-1, 3)
                 kept = (bears > 0.0) | (iteration >= FORGETFUL)
-                facet, share = facet[kept], share[kept]
+                facet, share, bears = facet[kept], share[kept], bears[kept]
                 settled = bool(np.abs(moved - last).max() < tolerance)
-        out = np.zeros(len(self.compliance))
-        out[rows] = force
-        return out
+        whole, places = np.zeros(len(self.compliance)), np.full((HELD, 4), -1.0)
+        whole[rows] = force
+        strongest = np.argsort(-bears)[:HELD]
+        places[: len(strongest)] = np.column_stack([facets[facet], share])[strongest]
+        return np.concatenate([whole, places.ravel()])
 
-    def _touchable(self, stations: list[Placed], radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the facets that a tool may touch: nodes (n,), their positions there (S, 3), and rows of the compliance."""
+    def _touchable(
+        self, stations: list[Placed], radius: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Facets (S,) that a tool may touch; their nodes (n,), positions there (S, 3), and rows of the compliance."""
         around, wide = self._rounds
         reach = REACH * radius
         far = wide + reach + np.linalg.norm(stations[0].half)
@@ -262,7 +273,7 @@ class Contact:
         corners = self.points[self.triangles[some]]
         near = np.any([each.nearest(corners).distance < reach for each in ends], axis=0)
         nodes, table = np.unique(self.triangles[some[near]], return_inverse=True)
-        return nodes, table, (3 * nodes[:, None] + np.arange(3)).ravel()
+        return some[near], nodes, table, (3 * nodes[:, None] + np.arange(3)).ravel()
 
 
 def _line(terms: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
