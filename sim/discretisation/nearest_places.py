@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..runtime.device import Device, forward_kernel
+from ..runtime.device import forward_kernel, load
 from .footprint import on_triangle
 
 # How often a place on a triangle and the nearest one of a core that is no point take turns.
@@ -52,14 +52,7 @@ class Placed:
         A place of one takes turns with the nearest of the other, with momentum (Beck, Teboulle 2009, "A fast iterative
         shrinkage-thresholding algorithm", SIAM J. Imaging Sci. 2:183-202, equations 4.1 to 4.3).
         """
-        count = len(corners)
-        found = Near(np.empty((count, 3)), np.empty(count), np.empty((count, 3)))
-        kinds = (wp.vec3d, wp.float64, wp.vec3d)
-        out = [wp.array(each, dtype=kind, device="cpu", copy=False) for each, kind in zip(found, kinds, strict=True)]
-        known = wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device="cpu", copy=False)
-        stands = [wp.vec3d(*self.middle), wp.mat33d(*self.axes.ravel()), wp.vec3d(*self.half)]
-        Device("cpu", "float64").launch(_nearest, (count,), [known, *stands, TURNS if self.half.any() else 1], out)
-        return found
+        return Nearest(len(corners)).to(self, corners)
 
     def distances(self, corners: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far (n,) [m] the places of corner coordinates (n, 3) are from it, and the directions (n, 3)."""
@@ -72,6 +65,34 @@ class Placed:
             through = (np.abs(local[:, :2]) <= self.half[:2]).all(axis=1) & (local[:, 2] >= 0.0)
             return np.where(through, -local[:, 2], distance), np.where(through[:, None], -self.axes[:, 2], normal)
         return distance, normal
+
+
+class Nearest:
+    """Finds the places nearest to cores on so many triangles, again and again, in memory of its own."""
+
+    def __init__(self, count: int):
+        self._corners = np.empty((count, 3, 3))
+        self._found = Near(np.empty((count, 3)), np.empty(count), np.empty((count, 3)))
+        load(_nearest.module)
+        kinds = (wp.vec3d, wp.vec3d, wp.float64, wp.vec3d)
+        given = zip((self._corners, *self._found), kinds, strict=True)
+        arrays = [wp.array(each, dtype=kind, device="cpu", copy=False) for each, kind in given]
+        stands = [wp.vec3d(), wp.mat33d(), wp.vec3d(), 1]
+        # A launch that is recorded costs a tenth of one that is not.
+        self._launch = wp.launch(
+            _nearest, count, [arrays[0], *stands], arrays[1:], device="cpu", record_cmd=True, record_tape=False
+        )
+
+    def to(self, core: Placed, corners: np.ndarray) -> Near:
+        """As `Placed.nearest`; what it gave before is overwritten."""
+        if self._launch is None:  # of no triangles
+            return self._found
+        self._corners[:] = corners
+        stands = wp.vec3d(*core.middle), wp.mat33d(*core.axes.ravel()), wp.vec3d(*core.half)
+        for number, value in enumerate([*stands, TURNS if core.half.any() else 1], 1):
+            self._launch.set_param_at_index(number, value)
+        self._launch.launch()
+        return self._found
 
 
 @forward_kernel

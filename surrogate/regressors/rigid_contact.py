@@ -47,7 +47,9 @@ FORGETFUL = 15
 # beyond all bounds, would keep it out.
 LEAST = 0.02
 # Straight from LAPACK: the problems are so small that a wrapper takes longer than the work.
-FACTORED, SOLVED = get_lapack_funcs(("potrf", "trtrs"), dtype=np.float64)
+FACTORED, SOLVED_BY, SOLVED = get_lapack_funcs(("potrf", "trtrs", "posv"), dtype=np.float64)
+# Places are let go and taken up again so often at most; one that is let go may be entered by so much [m].
+TURNS, ENTERED = 10, 1e-8
 # Points of neighbouring facets on a common edge are one: of the mean diagonal, so that their forces are distinct. The
 # first that makes single precision positive definite.
 APART = (1e-6, 1e-5, 1e-4)
@@ -220,7 +222,10 @@ class Contact:
 
         begun is that of the first of them; None: nothing is touched before.
         """
+        from sim.discretisation.nearest_places import Nearest
+
         facets, nodes, table, rows = self._touchable(stations, radius)
+        nearest = Nearest(len(facets))
         compliance = self.compliance[np.ix_(rows, rows)].astype(np.float64)
         own = compliance.reshape(len(nodes), 3, len(nodes), 3)[np.arange(len(nodes)), :, np.arange(len(nodes))]
         least, own = LEAST * np.einsum("nii->", own) / max(3 * len(nodes), 1), own[table]
@@ -236,7 +241,7 @@ class Contact:
             settled = begun is None
             for iteration in range(MOST if station is stations[-1] else PASSING):
                 corners = (self.points[nodes] + moved)[table]
-                near = station.nearest(corners)
+                near = nearest.to(station, corners)
                 entered = np.flatnonzero(near.distance < radius - tolerance)
                 if len(entered):
                     share_of, way = near.share[entered], near.normal[entered]
@@ -283,12 +288,32 @@ def _line(terms: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarra
 
 
 def _bearing(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m], gain positive semi-definite."""
-    if not len(gain):
+    """The least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m], gain positive semi-definite.
+
+    Most places bear a force as before. So those that would pull are let go, and those that are entered then taken up
+    again, until neither is left (Portugal, Judice, Vicente 1994, "A comparison of block pivoting and interior-point
+    algorithms for linear least squares problems with nonnegative variables", Math. Comput. 63:625-643). Where that does
+    not end soon it is a nonnegative least-squares problem.
+    """
+    count = len(gain)
+    if not count:
         return wanted
-    mean = np.trace(gain) / len(gain)
+    mean = np.trace(gain) / count
     for apart in APART:
-        lower, failed = FACTORED(gain + apart * mean * np.eye(len(gain)), lower=True)
+        firm = gain + apart * mean * np.eye(count)
+        bearing = np.ones(count, bool)
+        for _ in range(TURNS):
+            free, bears = np.flatnonzero(bearing), np.zeros(count)
+            _, bears[free], failed = SOLVED(firm[np.ix_(free, free)], wanted[free])
+            if failed:
+                break
+            wrong = np.where(bearing, bears < 0.0, wanted - firm @ bears > ENTERED)
+            if not wrong.any():
+                return bears
+            bearing ^= wrong
+            if not bearing.any():
+                break
+        lower, failed = FACTORED(firm, lower=True)
         if not failed:
-            return nnls(lower.T, SOLVED(lower, wanted, lower=True)[0])[0]
+            return nnls(lower.T, SOLVED_BY(lower, wanted, lower=True)[0])[0]
     raise np.linalg.LinAlgError("places that a tool touches do not give way")
