@@ -18,8 +18,9 @@ from scenes.gym.registration import NAMES, register_environments
 from scenes.gym.reward import ENDED, OVER_LIMIT, STEP, Judged, earned
 from scenes.gym.scripted import scripted
 from scenes.gym.setting import open_setting
-from scenes.gym.tasks import DEBULK, PALPATE, TASKS
+from scenes.gym.tasks import DEBULK, PALPATE, RETRACT, TASKS
 from scenes.gym.touched import Asked
+from scenes.gym.vector import many as made_apart
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
 from sim.material import MATERIALS
@@ -307,3 +308,29 @@ def test_the_bench_counts_steps(boxed, capsys):
     assert all(0.0 < row["least"] <= row["median"] <= row["most"] and row["environments"] == 2 for row in rows)
     assert main([*words, "--repeats", "0"]) == 2 and main(["bench", "gym", "juggle", "--device", "cpu"]) == 2
     assert "choose one of palpate, retract, debulk" in capsys.readouterr().err
+
+
+def test_a_spatula_is_answered_by_its_model_alone_and_among_others():
+    """Byte for byte, through contact; and with a process of its own."""
+    alone = played(made("Retract"), 2, 16, "retract")
+    vector = many(2, "Retract")
+    seen, _ = vector.reset(seed=[5, 2])
+    true = alone[-1][2]
+    for expected, _, _ in alone[1:]:
+        seen, _, _, _, truth = vector.step(scripted("retract", seen))
+        assert seen[1].tobytes() == expected.tobytes()
+    assert truth["reliable"].all() and truth["force"][1].tobytes() == true["force"].tobytes()
+    assert np.linalg.norm(true["force"]) > 0.02 and 0.0 < true["model_error"] < 1e-3 and 0.0 < true["pressure"] < 4e3
+    apart = made_apart("retract", 1, True, device="cpu", size=SIZE)
+    assert apart.reset(seed=2)[0][0].tobytes() == alone[0][0].tobytes()
+    apart.close()
+
+
+def test_a_pose_that_the_model_refuses_ends_an_episode():
+    setting = open_setting(RETRACT, "template", "model", "cpu", SIZE)
+    site, tool = setting.site, RETRACT.tool
+    poses = [tool.pose(site.origin + depth * site.axis, site.axis, site.right) for depth in (2e-3, 40e-3)]
+    (first,) = setting.answers.answer([Asked(poses[0])])
+    (second,) = setting.answers.answer([Asked(poses[1], first)])
+    assert first.good and not second.good and second.error == np.inf
+    assert np.array_equal(second.motion, first.motion)
