@@ -290,10 +290,10 @@ def _line(terms: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarra
 def _bearing(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """The least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m], gain positive semi-definite.
 
-    Most places bear a force as before. So those that would pull are let go, and those that are entered then taken up
-    again, until neither is left (Portugal, Judice, Vicente 1994, "A comparison of block pivoting and interior-point
-    algorithms for linear least squares problems with nonnegative variables", Math. Comput. 63:625-643). Where that does
-    not end soon it is a nonnegative least-squares problem.
+    Most places bear a force as before. Those that would pull are let go. Those that are entered then are taken up
+    again, until neither is left. Where that does not end soon it is a nonnegative least-squares problem. (Portugal,
+    Judice, Vicente 1994, "Block pivoting and interior-point algorithms for linear least squares problems with
+    nonnegative variables", Math. Comput. 63:625-643.)
     """
     count = len(gain)
     if not count:
