@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,11 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import Material
 from surrogate.data.dataset import read_dataset
-from surrogate.data.simulate import simulate
+from surrogate.data.simulate import OF_ITS_MAKING, simulate
 from surrogate.data.stated_tissue import stating
 from surrogate.data.tool_loads import draw as draw_loads
 from surrogate.model.applicability import refusal
+from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
 from surrogate.training.expansion import Expansion
 from surrogate.training.train import train
@@ -31,7 +32,9 @@ from surrogate.training.train import train
 from ..play.deformers import Theatre, model_path, open_theatre
 from ..script.shipped_files import template_path
 from .draws import drawn, random_of
+from .half_made import DATA, forget, gone_on
 from .plan import NO_LEARNER, Bodies, Plan, digest_beside, fields_of
+from .run_folder import versions_here
 
 # Drawn tumours may reach out of the brain, or an opening have too few nodes: so many are tried.
 TRIES = 6
@@ -96,8 +99,16 @@ def drawn_body(bodies: Bodies, seed: int, number: int, attempt: int = 0) -> dict
     return found
 
 
-def write_body(folder: Path, plan: Plan, seed: int, number: int, device: str) -> Body:
-    """Make a body in an empty folder: anatomy, scan, trained model, and `body.json`, last.
+def write_body(folder: Path, plan: Plan, seed: int, number: int, device: str, others: Sequence[Path] = ()) -> bool:
+    """Make a body in a folder of its own: anatomy, scan, trained model, and `body.json`, last.
+
+    Loads that were solved there before, or in `others`, are not solved again; returns whether there were any. The files
+    have the same bytes all the same.
+
+    Parameters
+    ----------
+    others
+        Folders in which the same body was half made, or just now is.
 
     Raises
     ------
@@ -110,10 +121,11 @@ def write_body(folder: Path, plan: Plan, seed: int, number: int, device: str) ->
     write_anatomy(body.anatomy, anatomy)
     if scan is not None:
         write_intensity(sidecar(body.anatomy), scan)
+    before = False
     if bodies.learner.name != NO_LEARNER and not _shipped(body, anatomy):
-        _train(body, anatomy, plan, seed, number, device)
+        before = _train(body, anatomy, plan, seed, number, device, others)
     (folder / ABOUT).write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
-    return body
+    return before
 
 
 def read_body(folder: Path) -> Body:
@@ -168,8 +180,10 @@ def _shipped(body: Body, anatomy: Anatomy) -> bool:
     return any(refusal(model, effects, recommended(anatomy.mesh)) is None for model in models.values())
 
 
-def _train(body: Body, anatomy: Anatomy, plan: Plan, seed: int, number: int, device: str) -> None:
-    """Simulate loads on a body, and train its model on them; the data are not kept."""
+def _train(
+    body: Body, anatomy: Anatomy, plan: Plan, seed: int, number: int, device: str, others: Sequence[Path]
+) -> bool:
+    """Simulate loads on a body, and train its model on them; the data are not kept. Whether some were there before."""
     learner = plan.contents.bodies.learner
     effects = (*pushed_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"]), NodalForce())
     fem = Fem(anatomy, effects, TRAIN, device, 64)
@@ -178,10 +192,18 @@ def _train(body: Body, anatomy: Anatomy, plan: Plan, seed: int, number: int, dev
         "effects": repr(effects), **stating(body.tissue), "element": fem.space.element, "accuracy": repr(TRAIN),
         "preset": PRESET, "seed": str(first),
     }  # fmt: skip
-    data = body.folder / "training.h5"
+    data = body.folder / DATA
+    all_stated = {**stated, **versions_here(), "anatomy": anatomy.digest, "loads": str(learner.loads)}
+    before = gone_on(data, all_stated, others)
     simulate(data, fem, draw_loads(PRESET, anatomy, learner.loads, first), stated)
     known = read_dataset(data)
     batch = TOGETHER if fem.problem.device.on_cuda else None
     trained = train(known, [learner.name], expansion=Expansion(known, device, batch=batch))
-    save(model_path(body.anatomy), trained.models)
-    data.unlink()
+    save(model_path(body.anatomy), {name: _undated(model) for name, model in trained.models.items()})
+    forget(data)
+    return before
+
+
+def _undated(model: Learned) -> Learned:
+    """A model that says of its training nothing but what is the same whenever it is trained."""
+    return replace(model, training={key: text for key, text in model.training.items() if key not in OF_ITS_MAKING})

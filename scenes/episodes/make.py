@@ -15,7 +15,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.resected_fem import Operated
-from sim.runtime.atomic_files import partial_path, why
+from sim.runtime.atomic_files import partial_path, partials_of, remove_left_overs, why
 
 from ..play.deformers import Theatre
 from ..play.reference import following
@@ -23,6 +23,7 @@ from ..script.scene import Scene
 from .bodies import ABOUT, Body, read_body, write_body
 from .draws import random_of
 from .episode import Recording, collect
+from .half_made import begun, emptied
 from .plan import NO_LEARNER, Plan
 from .run_folder import BODIES, episode_name
 from .scripted import drawn_body_of, drawn_episode, scene_of
@@ -54,31 +55,33 @@ def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "a
     """Make a body, unless it is there; what cannot be made is said in `Made.failed`.
 
     It is made under another name, so that a folder of its name is whole. Who comes second
-    throws his own away: both are alike.
+    throws his own away: both are alike. Loads that somebody has solved for it before are not solved again.
     """
     path = body_path(folder, number)
     if (path / ABOUT).is_file():
         return Made(path, skipped=True)
     if path.exists() and not (path / ABOUT).is_file():  # asked again, as another may have made it meanwhile
         return Made(path, failed=f"{path}: is no whole body. Remove it, and give the same command with --again.")
-    partial = partial_path(path)
+    partial, resumed = partial_path(path), False
     try:
-        rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        write_body(partial, plan, seed, number, device)
+        emptied(partial)
+        resumed = write_body(partial, plan, seed, number, device, partials_of(path))
         if not path.exists():
             partial.rename(path)
     except InputError as error:
         if isinstance(error.__cause__, PASSING):
             raise
+        rmtree(partial, ignore_errors=True)
         return Made(path, failed=str(error))
     except OSError as error:
         if not (path / ABOUT).is_file():  # nobody else was faster
             raise InputError(f"{path}: cannot be made ({why(error)}). Choose another folder.") from error
     finally:
-        rmtree(partial, ignore_errors=True)
+        if not begun(partial):
+            rmtree(partial, ignore_errors=True)
+    remove_left_overs(path.parent, path.name)
     size = sum(file.stat().st_size for file in path.iterdir())
-    return Made(path, bytes=size)
+    return Made(path, bytes=size, resumed=resumed)
 
 
 def make_episode(folder: Path, plan: Plan, seed: int, number: int, device: str = "auto") -> Made:

@@ -71,7 +71,7 @@ def episode_name(number: int) -> str:
 def begin(folder: Path, run: Run, text: str, force: bool = False) -> bool:
     """Make a folder a run's own, or find that it is; tell whether no other run was there before.
 
-    What dead processes left of unfinished files is removed.
+    What dead processes left of unfinished files is removed; of a body that is not there yet it stays, to go on with.
 
     Parameters
     ----------
@@ -85,8 +85,9 @@ def begin(folder: Path, run: Run, text: str, force: bool = False) -> bool:
     InputError
         A folder of another plan, seed or device; without `force`, of other versions, or with files but no run.
     """
-    for inner in (folder, folder / FAILED, folder / BODIES, folder / RATES):
+    for inner in (folder, folder / FAILED, folder / RATES):
         remove_left_overs(inner)
+    remove_left_overs(folder / BODIES, kept=lambda name: not (folder / BODIES / name).exists())
     found = read_run(folder)
     if found is None:
         _demand_empty(folder, force)

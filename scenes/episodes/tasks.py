@@ -33,6 +33,8 @@ class Made:
         Why there is none; empty where there is.
     skipped
         Whether it was there before.
+    resumed
+        Whether a part of it was.
     """
 
     path: Path
@@ -40,6 +42,7 @@ class Made:
     bytes: int = 0
     failed: str = ""
     skipped: bool = False
+    resumed: bool = False
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import re
 import shutil
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
@@ -57,7 +57,12 @@ def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: boo
     return path
 
 
-def remove_left_overs(folder: Path, name: str | None = None, stale: float = STALE) -> None:
+def remove_left_overs(
+    folder: Path,
+    name: str | None = None,
+    stale: float = STALE,
+    kept: Callable[[str], bool] = lambda wanted: False,
+) -> None:
     """Remove what dead processes of this machine left unfinished in a folder, and what others have not touched lately.
 
     Parameters
@@ -66,12 +71,14 @@ def remove_left_overs(folder: Path, name: str | None = None, stale: float = STAL
         Of the file whose left-overs are meant; None means all files.
     stale
         How long others need not have touched theirs [s].
+    kept
+        Whether what was to become the file of a name stays all the same, as somebody may go on with it.
     """
-    form = re.compile(rf"\.sulcus-([0-9a-f]{{8}})-(\d{{1,9}})-{'.+' if name is None else re.escape(name)}")
+    form = _partial_form(name)
     try:
         for left in list(folder.iterdir()):
             found = form.fullmatch(left.name)
-            if found is None:
+            if found is None or kept(found[3]):
                 continue
             dead = not _alive(int(found[2])) if found[1] == _host() else time.time() - left.stat().st_mtime > stale
             if dead and left.is_dir():
@@ -224,6 +231,17 @@ def unfinished_path(path: Path) -> Path:
 def partial_path(path: Path) -> Path:
     """The hidden name under which this process writes `path`, a file or a folder; `remove_left_overs` knows it."""
     return path.with_name(f".sulcus-{_host()}-{os.getpid()}-{path.name}")
+
+
+def partials_of(path: Path) -> list[Path]:
+    """The hidden names under which any process of any machine writes `path`, or has left it unfinished."""
+    form = _partial_form(path.name)
+    return sorted(left for left in path.parent.glob(f".sulcus-*-{path.name}") if form.fullmatch(left.name))
+
+
+def _partial_form(name: str | None) -> re.Pattern[str]:
+    """Of hidden names: machine, process, and the name that is to be; None: any."""
+    return re.compile(rf"\.sulcus-([0-9a-f]{{8}})-(\d{{1,9}})-({'.+' if name is None else re.escape(name)})")
 
 
 def _alive(process: int) -> bool:

@@ -47,6 +47,9 @@ STAGES = {"unit": "unit responses", "answers": "loads"}
 # From this version of HDF5 on, the metadata of arrays have checksums.
 READERS = ("v108", "v108")
 UNTIMED = "not known"  # as wide as a number
+RATES = {"unit": "seconds a unit response", "answers": "seconds a load"}
+OF_ITS_MAKING = ("date", *RATES.values())
+"""What a data set states of itself that is another each time it is made."""
 T = TypeVar("T")
 
 
@@ -222,7 +225,7 @@ def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) 
         with h5py.File(path, "r") as file:
             before = provenance_of(file)
     rates = {}
-    for name, words in (("unit", "seconds a unit response"), ("answers", "seconds a load")):
+    for name, words in RATES.items():
         if solved[name]:
             rates[words] = f"{seconds[STAGES[name]] / solved[name]:.3e}"
         else:
