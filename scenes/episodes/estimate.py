@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +11,11 @@ from sim.errors import InputError
 
 from .engine import BODY, EPISODE
 from .rates import Rate
+from .tasks import FIRST, LATER, OF_BODY, OF_PROCESS
 
-HOUR, DAY = 3600.0, 86400.0
+DAY = 86400.0
+UNITS = (DAY, "days"), (3600.0, "h"), (60.0, "min")
+"""In which times are printed [s], where they are twice as long or longer."""
 PROCESSES = (1, 8, 64, 512)
 """For how many the time is printed."""
 
@@ -27,7 +30,7 @@ class Amount:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What episodes will take of one process in all.
+    """What episodes will take.
 
     Parameters
     ----------
@@ -36,7 +39,12 @@ class Estimate:
     measured, measured_bodies
         From which that is known.
     seconds, frames, bytes
-        [s], frames, and bytes, of all episodes and their bodies.
+        Of one process that has started [s], frames, and bytes, of all episodes and their bodies.
+    start, opening
+        How much longer than others its first episode takes a process, which loads and compiles; and the first of them
+        on each further body [s]. NaN: not known.
+    apart
+        Whether `seconds` are those of others; if not, they hold both.
     """
 
     episodes: int
@@ -46,6 +54,16 @@ class Estimate:
     seconds: Amount
     frames: Amount
     bytes: Amount
+    start: Amount
+    opening: Amount
+    apart: bool
+
+    def lasts(self, processes: int) -> Amount:
+        """How long so many processes take [s]."""
+        each = self.episodes / processes
+        further = self.bodies * -np.expm1(-each / self.bodies) - 1.0  # bodies that so many episodes of one meet
+        parts = (self.start, 1.0), (self.opening, max(0.0, further)), (self.seconds, 1.0 / processes)
+        return _added([Amount(part.mean * by, part.error * by) for part, by in parts if np.isfinite(part.mean)])
 
 
 def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
@@ -61,30 +79,49 @@ def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
         raise InputError(
             "no episode was measured there: make some first, by the same command with --count 8 and without --estimate."
         )
+    counts = {EPISODE: episodes, BODY: bodies}
+    by = {first: [rate for rate in own[EPISODE] if rate.first == first] for first in FIRST}
+    apart = len(by[LATER]) > 1
 
-    def amount(what: str, kinds: Sequence[str]) -> Amount:
-        counts = {EPISODE: episodes, BODY: bodies}
-        parts = [_sum([getattr(rate, what) for rate in own[kind]], counts[kind]) for kind in kinds if own[kind]]
-        return Amount(sum(part.mean for part in parts), float(np.hypot.reduce([part.error for part in parts])))
+    def amount(what: str, those: Mapping[str, Sequence[Rate]]) -> Amount:
+        return _added(
+            [_sum([getattr(one, what) for one in those[kind]], counts[kind]) for kind in those if those[kind]]
+        )
 
-    both = (EPISODE, BODY)
     return Estimate(
-        episodes,
-        bodies,
-        len(own[EPISODE]),
-        len(own[BODY]),
-        amount("seconds", both),
-        amount("frames", [EPISODE]),
-        amount("bytes", both),
-    )
+        episodes, bodies, len(own[EPISODE]), len(own[BODY]),
+        amount("seconds", {**own, EPISODE: by[LATER] if apart else own[EPISODE]}),
+        amount("frames", {EPISODE: own[EPISODE]}),
+        amount("bytes", own),
+        *(_longer(by[first], by[LATER] if apart else []) for first in (OF_PROCESS, OF_BODY)),
+        apart,
+    )  # fmt: skip
+
+
+def _longer(first: Sequence[Rate], others: Sequence[Rate]) -> Amount:
+    """How much longer the one take than the others, in the mean [s]; of one alone, all of that may be an error."""
+    if not (first and others):
+        return Amount(np.nan, np.nan)
+    one, other = (_mean([rate.seconds for rate in those]) for those in (first, others))
+    longer, error = max(0.0, one.mean - other.mean), float(np.hypot(one.error, other.error))
+    return Amount(longer, error if np.isfinite(error) else longer)
+
+
+def _mean(values: Sequence[float]) -> Amount:
+    """A mean and its standard error."""
+    error = float(np.std(values, ddof=1)) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+    return Amount(float(np.mean(values)), error)
 
 
 def _sum(values: Sequence[float], count: int) -> Amount:
     """Of `count` as these, whose mean is known to its standard error only; exactly where all were measured."""
-    if len(values) >= count:
-        return Amount(count * float(np.mean(values)), 0.0)
-    error = float(np.std(values, ddof=1)) / np.sqrt(len(values)) if len(values) > 1 else np.nan
-    return Amount(count * float(np.mean(values)), count * error)
+    mean = _mean(values)
+    return Amount(count * mean.mean, 0.0 if len(values) >= count else count * mean.error)
+
+
+def _added(amounts: Sequence[Amount]) -> Amount:
+    """A sum of independent amounts."""
+    return Amount(sum(one.mean for one in amounts), float(np.hypot.reduce([one.error for one in amounts])))
 
 
 def lines(estimate: Estimate) -> list[str]:
@@ -93,22 +130,35 @@ def lines(estimate: Estimate) -> list[str]:
     rows = [
         ("disk", _plus_minus(found.bytes, 1e9, "GB")),
         ("frames", _plus_minus(found.frames, 1e6, "million")),
-        ("work of one process", _plus_minus(found.seconds, HOUR, "h")),
-        *(
-            (f"time of {count} process{'es' * (count > 1)}", _plus_minus(found.seconds, count * DAY, "days"))
-            for count in PROCESSES
-        ),
+        ("work of one process", _time(found.seconds)),
+        ("start of a process", _time(found.start)),
+        ("its first on a body", _time(found.opening)),
+        *((f"time of {count} process{'es' * (count > 1)}", _time(found.lasts(count))) for count in PROCESSES),
         ("processes for one day", f"{int(np.ceil(found.seconds.mean / DAY))}"),
     ]
     width = max(len(name) for name, _ in rows)
     bodies = f" and {found.measured_bodies} bodies" if found.measured_bodies else ", and no body"
-    return [
+    said = [
         f"{found.episodes} episodes on {found.bodies} bodies, as measured of {found.measured} episodes{bodies}:",
         *(f"  {name:{width}}  {value}" for name, value in rows),
-        "One process is a core, or a card. The margin is the standard error of the mean, times the count.",
+        "The margin is the standard error of the mean, times the count. Processes are taken to be as fast as those "
+        "that were measured.",
     ]
+    if not found.apart:
+        said.append(
+            "Nearly all of these were their process's first on their body, which take longer: the times are too long. "
+            f"Make {2 * found.measured} or more for better ones."
+        )
+    return said
+
+
+def _time(amount: Amount) -> str:
+    unit, word = next((each for each in UNITS if amount.mean >= 2.0 * each[0]), (1.0, "s"))
+    return _plus_minus(amount, unit, word)
 
 
 def _plus_minus(amount: Amount, unit: float, word: str) -> str:
+    if not np.isfinite(amount.mean):
+        return "not known"
     margin = f"{amount.error / unit:.2g}" if np.isfinite(amount.error) else "not known"
     return f"{amount.mean / unit:.3g} ± {margin} {word}"

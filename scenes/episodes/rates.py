@@ -16,23 +16,27 @@ from sim.runtime.atomic_files import why
 from .run_folder import RATES
 from .tasks import Outcome
 
-COLUMNS = "kind,number,frames,bytes,seconds"
+COLUMNS = "kind,number,frames,bytes,seconds,first"
 
 
 @dataclass(frozen=True)
 class Rate:
-    """One task: "episode" or "body", its number, frames and bytes, and the seconds of one worker."""
+    """One task: "episode" or "body", its number, frames and bytes, and the seconds of one worker.
+
+    `first` says in what it was that worker's first: one of `tasks.FIRST`.
+    """
 
     kind: str
     number: int
     frames: int
     bytes: int
     seconds: float
+    first: str
 
 
 @contextmanager
 def written_rates(folder: Path) -> Iterator[Callable[[str, Outcome], None]]:
-    """What writes down each task that was done, into a file of this process alone.
+    """What writes down each task that was done, and not in part before, into a file of this process alone.
 
     Raises
     ------
@@ -49,8 +53,8 @@ def written_rates(folder: Path) -> Iterator[Callable[[str, Outcome], None]]:
         file.write(COLUMNS + "\n")
 
         def note(kind: str, one: Outcome) -> None:
-            if not (one.failed or one.skipped):
-                file.write(f"{kind},{one.number},{one.frames},{one.bytes},{one.seconds:.4f}\n")
+            if not (one.failed or one.skipped or one.resumed):
+                file.write(f"{kind},{one.number},{one.frames},{one.bytes},{one.seconds:.4f},{one.first}\n")
 
         yield note
 
@@ -63,8 +67,8 @@ def read_rates(folder: Path) -> list[Rate]:
             words = line.rstrip("\n").split(",")
             try:
                 if line.endswith("\n"):
-                    kind, number, frames, size, seconds = words
-                    found.append(Rate(kind, int(number), int(frames), int(size), float(seconds)))
+                    kind, number, frames, size, seconds, first = words
+                    found.append(Rate(kind, int(number), int(frames), int(size), float(seconds), first))
             except ValueError:
                 continue
     return found

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from sim.errors import InputError
 from sim.runtime.threads import one_thread
@@ -17,6 +18,8 @@ from .run_folder import Run, read_run, unlike, versions_here
 
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 """What no other episode gets round."""
+FIRST = OF_PROCESS, OF_BODY, LATER = "process", "body", "no"
+"""The first of its kind by a process; the first on its body by that process; neither."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,10 @@ class Outcome:
         Whether it was there.
     halt
         Why nothing else can be made either.
+    resumed
+        Whether a part of it was there.
+    first
+        In what it is the first of its worker, which then loads and compiles: one of `FIRST`.
     """
 
     number: int
@@ -88,11 +95,14 @@ class Outcome:
     lost: bool = False
     skipped: bool = False
     halt: str = ""
+    resumed: bool = False
+    first: str = LATER
 
 
 class _Process:
-    """Whether this process's card has failed: then all that it would answer may be wrong."""
+    """What this process has made; and whether its card has failed, so that all that it would answer may be wrong."""
 
+    made: ClassVar[set[object]] = set()
     spoilt = False
 
 
@@ -121,8 +131,14 @@ def attempted(make: Callable[[int], Made], number: int, folder: Path, run: Run, 
             return Outcome(number, halt=str(error))
         _Process.spoilt = run.device == "cuda" and not isinstance(error, InputError | OSError)
         raise
-    seconds = time.perf_counter() - begun
-    return Outcome(number, made.frames, made.bytes, seconds, made.failed, skipped=made.skipped)
+    seconds, kind = time.perf_counter() - begun, getattr(make, "func", make)
+    on_body = kind, None if body is None else body.number
+    first = OF_PROCESS if kind not in _Process.made else LATER if on_body in _Process.made else OF_BODY
+    if not (made.failed or made.skipped):
+        _Process.made |= {kind, on_body}
+    return Outcome(
+        number, made.frames, made.bytes, seconds, made.failed, skipped=made.skipped, resumed=made.resumed, first=first
+    )
 
 
 def _unfit(folder: Path, run: Run) -> str:
