@@ -39,10 +39,15 @@ Word = str | list[str] | Spread
 
 @dataclass(frozen=True)
 class Limits:
-    """Least and greatest value that a number of a plan may take."""
+    """Least and greatest value that a number of a plan may take, and their unit."""
 
     low: float
     high: float
+    unit: str = "1"
+
+    def __str__(self) -> str:
+        """In words."""
+        return f"{self.low:,g} to {self.high:,g}" + (f" {self.unit}" if self.unit != "1" else "")
 
 
 def random_of(seed: int, number: int, name: str) -> np.random.Generator:
@@ -131,4 +136,4 @@ def _check_value(value: float | str | bool, name: str, limits: Limits | None, wo
             raise InputError(f"{name}: {value!r} is not known: choose from {', '.join(map(str, words))}.")
         return
     if isinstance(value, str | bool) or not limits.low <= value <= limits.high:
-        raise InputError(f"{name}: {value!r} may be drawn, and {limits.low:g} to {limits.high:g} is possible.")
+        raise InputError(f"{name}: {value!r} may be drawn, and {limits} is possible.")

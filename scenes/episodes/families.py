@@ -28,34 +28,34 @@ REST = 0.3
 class Motion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How often a family is taken, beside the weights of the others."""
 
-    weight: float = 1.0
+    weight: Annotated[float, Limits(0, 100_000)] = 1.0
 
 
 class Pushing(Motion, frozen=True):
     """A ball is pushed with a force; `spread` is how far from the middle, as a share of the way to the bone."""
 
-    force_n: Annotated[Number, Limits(0.01, 2)] = (0.05, 0.35)
-    radius_mm: Annotated[Number, Limits(1, 15)] = (5.0, 7.5)
+    force_n: Annotated[Number, Limits(0.01, 2, "N")] = (0.05, 0.35)
+    radius_mm: Annotated[Number, Limits(1, 15, "mm")] = (5.0, 7.5)
     spread: Annotated[Number, Limits(0, 1)] = (0.0, 1.0)
 
 
 class Press(Pushing, frozen=True):
     """Press on one place, aslant, hold, and let go."""
 
-    tilt_deg: Annotated[Number, Limits(0, 45)] = (0.0, 25.0)
+    tilt_deg: Annotated[Number, Limits(0, 45, "°")] = (0.0, 25.0)
 
 
 class Slide(Pushing, frozen=True):
     """Press, slide along a straight line, and let go."""
 
-    force_n: Annotated[Number, Limits(0.01, 2)] = (0.05, 0.3)
+    force_n: Annotated[Number, Limits(0.01, 2, "N")] = (0.05, 0.3)
 
 
 class Draw(Pushing, frozen=True):
     """Lay on, and draw the tissue aside."""
 
-    force_n: Annotated[Number, Limits(0.01, 2)] = (0.05, 0.25)
-    tilt_deg: Annotated[Number, Limits(0, 45)] = (20.0, 40.0)
+    force_n: Annotated[Number, Limits(0.01, 2, "N")] = (0.05, 0.25)
+    tilt_deg: Annotated[Number, Limits(0, 45, "°")] = (20.0, 40.0)
 
 
 class Reach(Pushing, frozen=True):
@@ -67,22 +67,22 @@ class Reach(Pushing, frozen=True):
 class Walk(Pushing, frozen=True):
     """Wander at random in place and force, always in contact."""
 
-    force_n: Annotated[Number, Limits(0.01, 2)] = (0.05, 0.25)
+    force_n: Annotated[Number, Limits(0.01, 2, "N")] = (0.05, 0.25)
 
 
 class Palpate(Motion, frozen=True):
     """A ball is moved by its pose, and slides through the tissue; finite elements play."""
 
-    depth_mm: Annotated[Number, Limits(0.5, 10)] = (1.0, 4.0)
-    radius_mm: Annotated[Number, Limits(3, 15)] = 7.0
+    depth_mm: Annotated[Number, Limits(0.5, 10, "mm")] = (1.0, 4.0)
+    radius_mm: Annotated[Number, Limits(3, 15, "mm")] = 7.0
     spread: Annotated[Number, Limits(0, 1)] = (0.0, 0.8)
 
 
 class Retract(Motion, frozen=True):
     """A spatula draws the cortex aside while the tissue relaxes; finite elements play."""
 
-    depth_mm: Annotated[Number, Limits(0.5, 12)] = (3.0, 8.0)
-    tilt_deg: Annotated[Number, Limits(0, 40)] = (10.0, 30.0)
+    depth_mm: Annotated[Number, Limits(0.5, 12, "mm")] = (3.0, 8.0)
+    tilt_deg: Annotated[Number, Limits(0, 40, "°")] = (10.0, 30.0)
     spread: Annotated[Number, Limits(0, 1)] = (0.0, 0.3)
 
 
@@ -90,7 +90,7 @@ class Drain(Motion, frozen=True):
     """Fluid drains to a share of its height, and the head is turned; the skull lets go; finite elements play."""
 
     fluid: Annotated[Number, Limits(0, 1)] = (0.0, 0.7)
-    turn_deg: Annotated[Number, Limits(-60, 60)] = (-30.0, 30.0)
+    turn_deg: Annotated[Number, Limits(-60, 60, "°")] = (-30.0, 30.0)
 
 
 class Debulk(Motion, frozen=True):

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path, PurePath
-from typing import Annotated, get_args, get_type_hints
+from typing import Annotated, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -17,7 +17,7 @@ from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.material import LAWS
 from sim.runtime.outside_files import read_as
-from surrogate.training.train import check_learners
+from surrogate.training.train import LEARNERS, check_learners
 
 from ..script.camera_paths import PATHS
 from .decoding import said_plainly
@@ -37,11 +37,11 @@ FIXED = "fixed"
 class Tumour(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The template's tumour and opening, for anatomies that are drawn; as the options of `sulcus anatomy`."""
 
-    radius_mm: Annotated[Number, Limits(3, 35)] = (9.0, 16.0)
-    cover_mm: Annotated[Number, Limits(1, 60)] = (3.0, 12.0)
+    radius_mm: Annotated[Number, Limits(3, 35, "mm")] = (9.0, 16.0)
+    cover_mm: Annotated[Number, Limits(1, 60, "mm")] = (3.0, 12.0)
     shape: Annotated[Word, ("sphere", "lobed")] = msgspec.field(default_factory=lambda: ["sphere", "lobed"])
     site: Annotated[Word, tuple(SITES)] = msgspec.field(default_factory=lambda: list(SITES))
-    opening_mm: Annotated[Number, Limits(25, 90)] = (40.0, 60.0)
+    opening_mm: Annotated[Number, Limits(25, 90, "mm")] = (40.0, 60.0)
     nodes: Annotated[Number, Limits(2000, 250_000)] = 5300.0
 
 
@@ -49,7 +49,7 @@ class Tissue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a body is made of, and what the skull does to it."""
 
     law: Annotated[Word, LAWS] = "neo-hookean"
-    young_pa: Annotated[Number, Limits(100, 50_000)] = 3000.0
+    young_pa: Annotated[Number, Limits(100, 50_000, "Pa")] = 3000.0
     poisson: Annotated[Number, Limits(0.3, 0.495)] = 0.49
     tumour_ratio: Annotated[Number, Limits(0.1, 10)] = 1.0
     skull: Annotated[Word, tuple(SKULLS)] = "bonded"
@@ -58,8 +58,8 @@ class Tissue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Learner(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How the model of a body is trained: which learner, on how many loads. `name` "none": finite elements play."""
 
-    name: str = "series-gp"
-    loads: int = 200
+    name: Annotated[str, (NO_LEARNER, *LEARNERS)] = "series-gp"
+    loads: Annotated[int, Limits(40, 100_000)] = 200
 
 
 class Bodies(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -69,7 +69,7 @@ class Bodies(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     that ships; or an own .vtu, beside the plan.
     """
 
-    count: int = 1
+    count: Annotated[int, Limits(1, 100_000)] = 1
     anatomies: Word = "template"
     tumour: Tumour = Tumour()
     tissue: Tissue = Tissue()
@@ -79,15 +79,15 @@ class Bodies(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Camera, light and texture."""
 
-    distance_mm: Annotated[Number, Limits(80, 800)] = 200.0
-    tilt_deg: Annotated[Number, Limits(-75, 75)] = -46.0
-    fov_deg: Annotated[Number, Limits(4, 60)] = 16.0
+    distance_mm: Annotated[Number, Limits(80, 800, "mm")] = 200.0
+    tilt_deg: Annotated[Number, Limits(-75, 75, "°")] = -46.0
+    fov_deg: Annotated[Number, Limits(4, 60, "°")] = 16.0
     path: Annotated[Word, (FIXED, *PATHS)] = FIXED
     bent: Annotated[Number, Limits(-0.6, 0.6)] = 0.0
     stereo: Annotated[Number, Limits(0, 1)] = 0.0
     lamp: Annotated[Number, Limits(0.2, 3)] = 1.0
     ambient: Annotated[Number, Limits(0, 1)] = 0.16
-    lamp_turn_deg: Annotated[Number, Limits(-180, 180)] = 0.0
+    lamp_turn_deg: Annotated[Number, Limits(-180, 180, "°")] = 0.0
     vessels: Annotated[Number, Limits(0, 1)] = 0.0
     tint: Annotated[Number, Limits(0, 0.5)] = 0.0
     cottonoids: Annotated[Number, Limits(0, 5)] = 0.0
@@ -97,19 +97,19 @@ class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What sensors add; standard deviations of an episode."""
 
-    grey_levels: Annotated[Number, Limits(0, 40)] = 0.0
-    force_n: Annotated[Number, Limits(0, 1)] = 0.0
-    tool_mm: Annotated[Number, Limits(0, 20)] = 0.0
-    tool_deg: Annotated[Number, Limits(0, 20)] = 0.0
-    camera_mm: Annotated[Number, Limits(0, 20)] = 0.0
-    camera_deg: Annotated[Number, Limits(0, 20)] = 0.0
+    grey_levels: Annotated[Number, Limits(0, 40, "grey levels")] = 0.0
+    force_n: Annotated[Number, Limits(0, 1, "N")] = 0.0
+    tool_mm: Annotated[Number, Limits(0, 20, "mm")] = 0.0
+    tool_deg: Annotated[Number, Limits(0, 20, "°")] = 0.0
+    camera_mm: Annotated[Number, Limits(0, 20, "mm")] = 0.0
+    camera_deg: Annotated[Number, Limits(0, 20, "°")] = 0.0
 
 
 class Hand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The hand's tremor, beside what it means to do: as standard deviations."""
 
-    tremor_mm: Annotated[Number, Limits(0, 3)] = 0.0
-    tremor_n: Annotated[Number, Limits(0, 0.1)] = 0.0
+    tremor_mm: Annotated[Number, Limits(0, 3, "mm")] = 0.0
+    tremor_n: Annotated[Number, Limits(0, 0.1, "N")] = 0.0
 
 
 class Contents(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -117,10 +117,10 @@ class Contents(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     title: str
     motion: Motions
-    seconds: Annotated[Number, Limits(0.1, 600)] = 4.0
-    frames_per_second: float = 30.0
-    size: tuple[int, int] = (640, 480)
-    solved_every: int = 15
+    seconds: Annotated[Number, Limits(0.1, 600, "s")] = 4.0
+    frames_per_second: Annotated[float, Limits(1, 240, "1/s")] = 30.0
+    size: Annotated[tuple[int, int], Limits(32, 4096, "pixel")] = (640, 480)
+    solved_every: Annotated[int, Limits(1, 100_000, "frames")] = 15
     overlay: bool = False
     bodies: Bodies = Bodies()
     look: Look = Look()
@@ -224,41 +224,47 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> Plan:
 def fields_of(table: msgspec.Struct) -> list[tuple[str, object, Limits | None, tuple[str, ...]]]:
     """Of every field that may be drawn: name, value, limits of a number, and words that are known."""
     found = []
-    for name, kind in get_type_hints(type(table), include_extras=True).items():
-        value = getattr(table, name)
-        about = get_args(kind)[1] if hasattr(kind, "__metadata__") else None
-        if about is None and kind != Word:
-            continue
-        limits, words = (about, ()) if isinstance(about, Limits) else (None, about or ())
-        found.append((name, value, limits, words))
+    for name, (kind, about) in _kinds_of(type(table)).items():
+        if kind in (Number, Word):
+            limits, words = (about, ()) if isinstance(about, Limits) else (None, about or ())
+            found.append((name, getattr(table, name), limits, words))
     return found
 
 
+def fixed_of(table: msgspec.Struct) -> list[tuple[str, float, Limits]]:
+    """Of every number that is fixed: name, value and limits; one for each number of a pair."""
+    found = []
+    for name, (kind, about) in _kinds_of(type(table)).items():
+        if kind != Number and isinstance(about, Limits):
+            value = getattr(table, name)
+            found += [(name, each, about) for each in (value if isinstance(value, tuple) else (value,))]
+    return found
+
+
+def _kinds_of(table: type[msgspec.Struct]) -> dict[str, tuple[object, Limits | tuple[str, ...] | None]]:
+    """Of every field: what it may be, and its limits, or the words that are known."""
+    hints = get_type_hints(table, include_extras=True)
+    return {name: get_args(kind)[:2] if get_origin(kind) is Annotated else (kind, None) for name, kind in hints.items()}
+
+
 def tables_of(contents: Contents) -> dict[str, msgspec.Struct]:
-    """The tables of a plan whose fields are drawn for each episode, and for each body, by name."""
+    """The tables of a plan by name: those whose fields are drawn for each episode, and those of bodies."""
     bodies, motion = contents.bodies, {f"motion.{name}": each for name, each in contents.motion.named.items()}
-    of_bodies = {"bodies": bodies, "bodies.tumour": bodies.tumour, "bodies.tissue": bodies.tissue}
-    return {"": contents, **of_bodies, "look": contents.look, "hand": contents.hand, "noise": contents.noise, **motion}
+    of_bodies = {f"bodies.{name}": getattr(bodies, name) for name in ("tumour", "tissue", "learner")}
+    seen = {"look": contents.look, "hand": contents.hand, "noise": contents.noise}
+    return {"": contents, "bodies": bodies, **of_bodies, **seen, **motion}
 
 
 def _check(contents: Contents) -> None:
     for table, values in tables_of(contents).items():
         for name, value, limits, words in fields_of(values):
             check_spread(value, f"{table}.{name}".lstrip("."), limits, words)
-    for name, value, low, high in (
-        ("bodies.count", contents.bodies.count, 1, 100_000),
-        ("bodies.learner.loads", contents.bodies.learner.loads, 40, 100_000),
-        ("frames_per_second", contents.frames_per_second, 1.0, 240.0),
-        ("solved_every", contents.solved_every, 1, 100_000),
-        ("size, its width", contents.size[0], 32, 4096),
-        ("size, its height", contents.size[1], 32, 4096),
-    ):
-        if not low <= value <= high:
-            raise InputError(f"{name}: {value} is outside {low:g} to {high:g}.")
+        for name, value, limits in fixed_of(values):
+            if not limits.low <= value <= limits.high:
+                raise InputError(f"{f'{table}.{name}'.lstrip('.')}: {value} is outside {limits}.")
     if contents.bodies.learner.name != NO_LEARNER:
         check_learners([contents.bodies.learner.name], False, "bodies.learner.name")
-    weights = [each.weight for each in contents.motion.named.values()]
-    if not (weights and all(weight >= 0.0 for weight in weights) and 0.0 < sum(weights) < float("inf")):
+    if not any(each.weight > 0.0 for each in contents.motion.named.values()):
         raise InputError("motion: give one family or more, with a weight above 0.")
     if contents.bodies.tumour != Tumour() and "drawn" not in _anatomies(contents):
         raise InputError(
