@@ -188,8 +188,9 @@ def _progress(out: Path, there: Tally, total: int) -> Iterator[Heard]:
 
 def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, where: str, card: bool) -> None:
     from ..episodes.run_folder import failures
+    from ..episodes.weak_bodies import models_of, said_of_weak, weak_as_json
 
-    failed = tally.failed + tally.lost
+    failed, models = tally.failed + tally.lost, models_of(out)
     if args.json:
         said = {
             "out": str(out),
@@ -203,6 +204,8 @@ def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, w
             "seconds": seconds,
             "where": where,
             "card": card,
+            "bodies_with_a_model": len(models),
+            "weak_bodies": weak_as_json(models),
         }
         print(json_line(said))
         return
@@ -212,6 +215,7 @@ def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, w
             f"{tally.frames} frames, {tally.bytes / 1e6:.3g} MB in {seconds:.3g} s by {where}: "
             f"{tally.made / seconds:.3g} episodes and {tally.frames / seconds:.3g} frames a second."
         )
+    print("".join(f"{line}\n" for line in said_of_weak(models)), end="")
     if failed:
         print(
             f"{failed} failed: {out / 'failed'} says why of each. {tally.lost} of them are tried again by the same "

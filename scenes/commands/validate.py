@@ -41,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..episodes.reading.apart import validated
     from ..episodes.reading.windows import episode_paths
+    from ..episodes.weak_bodies import models_of, said_of_weak, weak_as_json
 
     if args.workers < 1:
         raise InputError(f"--workers {args.workers}: at least one process must look.")
@@ -60,10 +61,16 @@ def run(args: argparse.Namespace) -> int:
         bar = tqdm(reports, unit="episode", desc="solved again", file=sys.stderr)
         reports = [one if one.problems else solved_again(one, args.solve, args.device) for one in bar]
     broken = [report for report in reports if report.problems]
+    trained = {place: models_of(place) for place in args.episodes if place.is_dir()}
     if args.json:
-        print(json_line({"episodes": len(reports), "broken": len(broken), "files": [as_json(one) for one in reports]}))
+        files = [as_json(one) for one in reports]
+        weak = {str(place): weak_as_json(models) for place, models in trained.items()}
+        print(json_line({"episodes": len(reports), "broken": len(broken), "files": files, "weak_bodies": weak}))
     else:
-        print("\n".join(lines(reports, broken)))
+        said = lines(reports, broken)
+        for place, models in trained.items():
+            said += [line if line.startswith("-") else f"{place}: {line}" for line in said_of_weak(models)]
+        print("\n".join(said))
     return 1 if broken else 0
 
 

@@ -93,7 +93,8 @@ def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
         amount("seconds", {**own, EPISODE: by[LATER] if apart else own[EPISODE]}),
         amount("frames", {EPISODE: own[EPISODE]}),
         amount("bytes", own),
-        *(_longer(by[first], by[LATER] if apart else []) for first in (OF_PROCESS, OF_BODY)),
+        _longer(by[OF_PROCESS], by[LATER] if apart else []),
+        _longer(by[OF_BODY], by[LATER] if apart else []),
         apart,
     )  # fmt: skip
 

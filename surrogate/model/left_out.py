@@ -54,6 +54,28 @@ class LeftOut:
         return f"{100 * self.mean:.2f} % of the motion off alone, {behind}: {verdict}"
 
 
+@dataclass(frozen=True)
+class OffBy:
+    """What a model states of its errors on cortex left out of a training: `bound` and `left_out` as in `Learned`."""
+
+    bound: float
+    left_out: LeftOut | None
+
+    @property
+    def weak(self) -> bool:
+        """Whether that is too much to answer alone; where it is not known in the mean, of the worst vertex."""
+        return not (self.bound <= LIMIT if self.left_out is None else self.left_out.enough)
+
+    def __str__(self) -> str:
+        """In words."""
+        if self.left_out is None:
+            return f"{1e3 * self.bound:.2g} mm off at most in 95 of 100 loads, where {1e3 * LIMIT:g} mm are enough"
+        mean = f"{100 * self.left_out.mean:.2g} % of the motion off in the mean, where {100 * MEAN:g} % are enough"
+        if self.left_out.p999 is None:
+            return mean
+        return f"{mean}; {1e3 * self.left_out.p999:.2g} mm off at 99.9 %, where {1e3 * WORST:g} mm are enough"
+
+
 def handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np.ndarray:
     """Which loads (B,) bool finite elements answer behind a model: of no bound within the limit, or `outside`.
 

@@ -32,7 +32,7 @@ from ..regressors.series_residual import Remainder
 from ..regressors.svr import Svr
 from .conformal import GROWTH, Bound
 from .learned import Learned, Part
-from .left_out import LeftOut
+from .left_out import LeftOut, OffBy
 from .npz_archive import Archive
 from .own_learners import find_own, name_of
 from .tip_distance import TipModel
@@ -118,6 +118,26 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
         for name, model in models.items():
             demand_sound(name, model)
         return models
+
+
+def stated_errors(path: str | Path) -> dict[str, OffBy]:
+    """What the models of a file state of their errors, by name; their arrays are not read.
+
+    Raises
+    ------
+    InputError
+        A file that is missing, or no model file of this project.
+    """
+    path = path_of(path)
+    with read_as(path, "a model", "Make one with `sulcus train`."), path.open("rb") as raw:
+        models = json.loads(Archive(raw).text("header"))["models"]
+        return {name: OffBy(about["bound"], _left_out(about)) for name, about in models.items()}
+
+
+def _left_out(description: dict[str, Any]) -> LeftOut | None:
+    """Older files do not have it."""
+    stated = description.get("left_out")
+    return None if stated is None else LeftOut(**stated)
 
 
 def _keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
@@ -253,6 +273,6 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
         # Older files do not have these.
         stated_tool(description.get("tool"), description.get("ball")),
         _rebuilt_tip(description.get("tip"), arrays, envelope["reach"]),
-        None if (stated := description.get("left_out")) is None else LeftOut(**stated),
+        _left_out(description),
         _rebuilt_force(description.get("force"), arrays, envelope["reach"]),
     )

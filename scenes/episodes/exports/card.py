@@ -20,6 +20,7 @@ from ..reading.rows import numbers_in
 from ..reading.validation import solved_figures
 from ..reading.windows import episode_paths
 from ..run_folder import Run, read_run
+from ..weak_bodies import models_of, said_of_weak
 from .along import LICENCE as LICENCE_NAME
 from .along import SHEET
 from .croissant import COLUMNS, croissant
@@ -76,7 +77,9 @@ def write_card(
     inside = "episodes/*.h5" if (folder / "episodes").is_dir() else "*.h5"
     table = table_of(rows)
     failed = len(list((folder / "failed").glob("*.json")))
-    sheet = datasheet(folder.resolve().name, episodes, rows, failed, run_of(folder))
+    missing = [f"Of those asked for {failed} could not be made and are missing: `failed` says why."] if failed else []
+    notes = [*missing, *said_of_weak(models_of(folder))]
+    sheet = datasheet(folder.resolve().name, episodes, rows, notes, run_of(folder))
     description = (
         f"{len(rows)} episodes of scripted surgery on simulated brains with a tumour: pictures, depth, poses of camera "
         "and tool, forces, and where the tumour is by finite elements."

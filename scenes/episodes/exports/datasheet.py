@@ -19,18 +19,22 @@ MOST_LISTED = 12
 
 
 def datasheet(
-    name: str, episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]], failed: int, run: Run | None = None
+    name: str,
+    episodes: Sequence[Contents],
+    rows: Sequence[Mapping[str, Any]],
+    notes: Sequence[str] = (),
+    run: Run | None = None,
 ) -> str:
     """The sheet as Markdown, of what the files say: `rows` are those of the table of episodes.
 
-    `failed` is how many episodes were asked for and could not be made; `run` is the run whose folder it is.
+    `notes` are sentences on what is missing or weak; `run` is the run whose folder it is.
     """
     parts = (
         f"# Data sheet: {name}\n\n{MARK}\n",
         "Made by sulcus from the files themselves. The questions are those of Gebru et al. (2021), *Datasheets for "
         "Datasets*.\n",
         motivation(),
-        composition(episodes, rows, failed),
+        composition(episodes, rows, notes),
         collection(episodes, run),
         UNKNOWN,
         "## Preprocessing\n\nColour is JPEG, depth PNG of 16 bits and labels PNG of 8 bits. Nothing else was changed. "
@@ -53,7 +57,7 @@ def motivation() -> str:
     )
 
 
-def composition(episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]], failed: int) -> str:
+def composition(episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> str:
     """What it consists of: counts, sizes, arrays."""
     lines = ["## Composition\n", "| family | episodes | frames | solved | seconds | GB |", "|---|---|---|---|---|---|"]
     for family in [*sorted({row["family"] for row in rows}), None]:
@@ -63,9 +67,7 @@ def composition(episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]],
         )
         lines.append(f"| {family or 'all'} | {len(those)} | {frames} | {solved} | {seconds:.1f} | {size / 1e9:.3f} |")
     lines.append(f"\n*Solved* are frames that finite elements answered. {bodies_said(episodes)}")
-    if failed:
-        lines.append(f"Of those asked for {failed} could not be made and are missing: `failed` says why.")
-    lines.append("")
+    lines += [*notes, ""]
     lines += ["| array | unit | in episodes |", "|---|---|---|"]
     counts = Counter(name for one in episodes for name in one.shapes)
     for key, count in sorted(counts.items()):
