@@ -6,12 +6,23 @@ import shutil
 import subprocess
 import sys
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 from tiny_work import Made, Trouble, body_path, held, played, tiny_run, tried
 
 from scenes.episodes.engine import Tally, still_missing
-from scenes.episodes.run_folder import begin, failures, finished, read_run, unlike
+from scenes.episodes.run_folder import (
+    Failure,
+    begin,
+    failed,
+    failure_of,
+    failures,
+    finished,
+    mark_failed,
+    read_run,
+    unlike,
+)
 from scenes.episodes.tasks import attempted
 from scenes.episodes.workers import own_workers, scheduled_workers
 from sim.errors import InputError
@@ -187,8 +198,17 @@ def test_what_is_missing_is_known_by_name_alone(tmp_path):
     for number in (1, 3, 1234567):
         (tmp_path / f"episode_{number:06d}.h5").touch()
     (tmp_path / ".sulcus-0-0-episode_000002.h5").touch()
-    assert still_missing(tmp_path, range(5), True) == (Tally(skipped=2), [0, 2, 4])
-    assert still_missing(tmp_path, range(1234567, 1234568), True)[1] == []
-    there, shuffled = still_missing(tmp_path, range(100, 200), False)
+    assert still_missing(tmp_path, finished(tmp_path), range(5), True) == (Tally(skipped=2), [0, 2, 4])
+    assert still_missing(tmp_path, finished(tmp_path), range(1234567, 1234568), True)[1] == []
+    there, shuffled = still_missing(tmp_path, finished(tmp_path), range(100, 200), False)
     assert sorted(shuffled) == list(range(100, 200)) != shuffled and there == Tally()
     assert not body_path(tmp_path, 0).exists()
+
+
+def test_of_what_failed_only_what_is_said_is_read(tmp_path, monkeypatch):
+    for number in (3, 5):
+        mark_failed(tmp_path, Failure(number, f"no {number}", lost=False))
+    assert failed(tmp_path) == {3, 5} and failure_of(tmp_path, 5) == Failure(5, "no 5", lost=False)
+    assert failure_of(tmp_path, 4) is None
+    monkeypatch.setattr(Path, "read_text", lambda *given: pytest.fail("a file was read"))
+    assert failed(tmp_path) == {3, 5} and still_missing(tmp_path, set(), range(4), True, again=True)[1] == [0, 1, 2, 3]

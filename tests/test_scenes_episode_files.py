@@ -14,7 +14,7 @@ from scenes.episodes.plan import load_plan
 from scenes.episodes.rates import written_rates
 from scenes.episodes.reading.open_files import opened
 from scenes.episodes.reading.validation import validate_episode
-from scenes.episodes.run_folder import Run, begin, episode_name, read_run
+from scenes.episodes.run_folder import Run, begin, episode_name, finished, read_run
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
 from sim.runtime.atomic_files import remove_left_overs, written_whole
@@ -89,5 +89,5 @@ def test_times_of_files_decide_nothing(tmp_path, monkeypatch):
         path.touch()
         os.utime(path, (time, time))
     remove_left_overs(tmp_path)
-    tally, missing = still_missing(tmp_path, range(3), True)
+    tally, missing = still_missing(tmp_path, finished(tmp_path), range(3), True)
     assert (tally.skipped, missing) == (2, [1]) and left.exists()

@@ -23,6 +23,7 @@ from scenes.episodes.exports.statistics import Spread
 from scenes.episodes.exports.tasks import TASKS, held_out
 from scenes.episodes.exports.whole_folder import written_folder
 from scenes.episodes.reading.contents import read_contents
+from scenes.episodes.run_folder import finished
 from sim.errors import InputError
 
 FOREIGN = os.environ.get("SULCUS_FORMATS_PYTHON")
@@ -247,26 +248,29 @@ def test_a_sheet_names_what_is_there_most_often():
 
 
 def test_a_card_is_kept_as_episodes_come(box, tmp_path):
-    assert keep_card(tmp_path, True) is None and not list(tmp_path.iterdir())  # no episode is whole
+    def kept(changed):
+        return keep_card(tmp_path, finished(tmp_path), changed)
+
+    assert kept(True) is None and not list(tmp_path.iterdir())  # no episode is whole
     write_episode(tmp_path / "episode_000000.h5", box)
 
     def rows():
         return (tmp_path / "episodes.csv").read_text().count("\n") - 1
 
-    assert keep_card(tmp_path, False) is None and rows() == 1
+    assert kept(False) is None and rows() == 1
     made = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir() if path.is_file()}
-    assert keep_card(tmp_path, False) is None and len(made) == 5
+    assert kept(False) is None and len(made) == 5
     assert made == {name: (tmp_path / name).stat().st_mtime_ns for name in made}
-    assert keep_card(tmp_path, True) is None and made["DATASHEET.md"] < (tmp_path / "DATASHEET.md").stat().st_mtime_ns
+    assert kept(True) is None and made["DATASHEET.md"] < (tmp_path / "DATASHEET.md").stat().st_mtime_ns
     write_episode(tmp_path / "episode_000001.h5", box)
     (tmp_path / ".sulcus-00000000-1-episode_000002.h5").write_text("half")
-    assert keep_card(tmp_path, False) is None and rows() == 2
+    assert kept(False) is None and rows() == 2
     written = (tmp_path / "DATASHEET.md").stat().st_mtime_ns
-    assert keep_card(tmp_path, False) is None and (tmp_path / "DATASHEET.md").stat().st_mtime_ns == written
+    assert kept(False) is None and (tmp_path / "DATASHEET.md").stat().st_mtime_ns == written
     (tmp_path / "croissant.json").unlink()
-    assert keep_card(tmp_path, False) is None and (tmp_path / "croissant.json").exists()
+    assert kept(False) is None and (tmp_path / "croissant.json").exists()
     (tmp_path / "LICENSE.md").write_text("mine")
-    assert "is not of a card" in (keep_card(tmp_path, True) or "") and (tmp_path / "LICENSE.md").read_text() == "mine"
+    assert "is not of a card" in (kept(True) or "") and (tmp_path / "LICENSE.md").read_text() == "mine"
 
 
 @pytest.mark.skipif(FOREIGN is None, reason="needs SULCUS_FORMATS_PYTHON, a Python with mlcroissant")

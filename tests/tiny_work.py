@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from scenes.episodes.engine import make_all, still_missing
-from scenes.episodes.run_folder import BODIES, Run, begin, episode_name, versions_here
+from scenes.episodes.run_folder import BODIES, Run, begin, episode_name, finished, versions_here
 from scenes.episodes.tasks import Made, Work
 from sim.runtime.atomic_files import written_stream
 
@@ -92,7 +92,7 @@ def played(folder, workers, count, trouble=None, heard=lambda *words: None, agai
     """A run as the command makes one."""
     run = tiny_run(device=workers.device)
     first = begin(folder, run, 'title = "tiny"\n')
-    there, missing = still_missing(folder, range(count), first, again)
+    there, missing = still_missing(folder, finished(folder), range(count), first, again)
     return make_all(tiny_work(folder, trouble), folder, run, missing, workers, heard, there)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
 def _made(args: argparse.Namespace, plan: Plan, out: Path) -> int:
     from ..episodes.engine import make_all, still_missing
     from ..episodes.make import body_of, make_body, make_episode
-    from ..episodes.run_folder import Run, begin, read_run, versions_here
+    from ..episodes.run_folder import Run, begin, finished, read_run, versions_here
     from ..episodes.tasks import Work
 
     before = read_run(out)
@@ -107,7 +107,8 @@ def _made(args: argparse.Namespace, plan: Plan, out: Path) -> int:
     with _workers(args, device) as workers:
         run = Run(plan.name, plan.digest, args.seed, workers.device, versions_here())
         first_client = begin(out, run, plan.text, args.force)
-        there, missing = still_missing(out, range(args.first, args.first + args.count), first_client, args.again)
+        found = finished(out)
+        there, missing = still_missing(out, found, range(args.first, args.first + args.count), first_client, args.again)
         given = out, plan, args.seed
         work = Work(
             partial(body_of, plan, args.seed),
@@ -118,21 +119,22 @@ def _made(args: argparse.Namespace, plan: Plan, out: Path) -> int:
         with _progress(out, there, args.count) as heard:
             tally = make_all(work, out, run, missing, workers, heard, there)
         seconds = time.perf_counter() - begun
-        lacking = _card(out, tally != there)
+        changed = tally != there
+        lacking = _card(out, finished(out) if changed else found, changed)
         _report(args, out, tally, seconds, workers.where, lacking is None and tally.made + tally.skipped > 0)
     if lacking is not None:
         print(lacking, file=sys.stderr)
     return int(tally.failed + tally.lost > 0)
 
 
-def _card(out: Path, changed: bool) -> str | None:
+def _card(out: Path, numbers: Set[int], changed: bool) -> str | None:
     """Keep the data sheet up to date; why it is not, in words."""
     from tqdm import tqdm
 
     from ..episodes.exports.card import keep_card
 
     bar = partial(tqdm, unit="episode", desc="data sheet", file=sys.stderr, leave=False, mininterval=1.0, disable=None)
-    return keep_card(out, changed, bar)
+    return keep_card(out, numbers, changed, bar)
 
 
 def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Workers]:
@@ -187,10 +189,10 @@ def _progress(out: Path, there: Tally, total: int) -> Iterator[Heard]:
 
 
 def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, where: str, card: bool) -> None:
-    from ..episodes.run_folder import failures
+    from ..episodes.run_folder import failed, failure_of
     from ..episodes.weak_bodies import models_of, said_of_weak, weak_as_json
 
-    failed, models = tally.failed + tally.lost, models_of(out)
+    count, models = tally.failed + tally.lost, models_of(out)
     if args.json:
         said = {
             "out": str(out),
@@ -216,14 +218,15 @@ def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, w
             f"{tally.made / seconds:.3g} episodes and {tally.frames / seconds:.3g} frames a second."
         )
     print("".join(f"{line}\n" for line in said_of_weak(models)), end="")
-    if failed:
+    if count:
         print(
-            f"{failed} failed: {out / 'failed'} says why of each. {tally.lost} of them are tried again by the same "
+            f"{count} failed: {out / 'failed'} says why of each. {tally.lost} of them are tried again by the same "
             "command; with --again all are."
         )
-        known = failures(out)
-        for number in sorted(set(known).intersection(range(args.first, args.first + args.count)))[:1]:
-            print(f"Episode {number}: {known[number].reason}")
+        number = min(failed(out).intersection(range(args.first, args.first + args.count)), default=0)
+        one = failure_of(out, number)
+        if one is not None:
+            print(f"Episode {number}: {one.reason}")
 
 
 def _print_estimate(args: argparse.Namespace, plan: Plan, out: Path) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -18,7 +18,7 @@ from distributed.scheduler import KilledWorker
 
 from sim.errors import InputError
 
-from .run_folder import Failure, Run, episode_name, failures, finished, mark_failed, unmark
+from .run_folder import Failure, Run, episode_name, failed, failures, mark_failed, unmark
 from .tasks import Made, Outcome, Work, attempted
 from .workers import MOST_DEATHS, Workers, scheduler_ended
 
@@ -61,7 +61,9 @@ class Tally:
         return replace(self, made=self.made + 1, frames=frames, bytes=size)
 
 
-def still_missing(folder: Path, numbers: range, first_client: bool, again: bool = False) -> tuple[Tally, list[int]]:
+def still_missing(
+    folder: Path, found: Set[int], numbers: range, first_client: bool, again: bool = False
+) -> tuple[Tally, list[int]]:
     """What is there of some episodes or has failed for good, and what is missing, in the order of its turn.
 
     The first client goes upwards. Who comes later goes in a random order, so that two in one folder seldom make the
@@ -69,16 +71,18 @@ def still_missing(folder: Path, numbers: range, first_client: bool, again: bool 
 
     Parameters
     ----------
+    found
+        Numbers of all episodes that are there.
     again
         Whether to try those again that failed for good.
     """
-    there = finished(folder).intersection(numbers)
-    failed = {one.number for one in failures(folder).values() if not one.lost and not again}
-    failed = failed.intersection(numbers) - there
-    missing = [number for number in numbers if number not in there and number not in failed]
+    there = found & set(numbers)
+    gone = set() if again else {number for number, one in failures(folder).items() if not one.lost}
+    gone = gone.intersection(numbers) - there
+    missing = [number for number in numbers if number not in there and number not in gone]
     if not first_client:
         random.shuffle(missing)
-    return Tally(skipped=len(there), failed=len(failed)), missing
+    return Tally(skipped=len(there), failed=len(gone)), missing
 
 
 def make_all(
@@ -99,7 +103,7 @@ def make_all(
     ended: SimpleQueue[Future] = SimpleQueue()
     busy: dict[str, tuple[str, int, Future]] = {}
     bodies: dict[int, Future] = {}
-    failed_before, token = set(failures(folder)), uuid4().hex
+    failed_before, token = failed(folder), uuid4().hex
     tally, count, counted = before, workers.count(), monotonic()
 
     def hand_out(kind: str, number: int, make: Callable[[int], Made], *needed: Future) -> Future:

@@ -136,11 +136,19 @@ def finished(folder: Path) -> set[int]:
 
 def failures(folder: Path) -> dict[int, Failure]:
     """The episodes that could not be made, by number."""
-    found = {}
-    for number, _ in _numbered(folder / FAILED):
-        with suppress(OSError, ValueError, TypeError):  # of another client, who removes it just now
-            found[number] = Failure(**json.loads(_failed_path(folder, number).read_text()))
-    return found
+    return {number: one for number in failed(folder) if (one := failure_of(folder, number)) is not None}
+
+
+def failed(folder: Path) -> set[int]:
+    """Numbers of the episodes that could not be made; no file is read."""
+    return {number for number, _ in _numbered(folder / FAILED)}
+
+
+def failure_of(folder: Path, number: int) -> Failure | None:
+    """Why an episode could not be made; None where it is there by now, or that cannot be read."""
+    with suppress(OSError, ValueError, TypeError):  # of another client, who removes it just now
+        return Failure(**json.loads(_failed_path(folder, number).read_text()))
+    return None
 
 
 def mark_failed(folder: Path, failure: Failure) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
@@ -19,7 +19,7 @@ from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from ..reading.validation import solved_figures
 from ..reading.windows import episode_paths
-from ..run_folder import Run, read_run
+from ..run_folder import Run, episode_name, failed, read_run
 from ..weak_bodies import models_of, said_of_weak
 from .along import LICENCE as LICENCE_NAME
 from .along import SHEET
@@ -76,8 +76,8 @@ def write_card(
         rows.append(row_of(episodes[-1], folder))
     inside = "episodes/*.h5" if (folder / "episodes").is_dir() else "*.h5"
     table = table_of(rows)
-    failed = len(list((folder / "failed").glob("*.json")))
-    missing = [f"Of those asked for {failed} could not be made and are missing: `failed` says why."] if failed else []
+    gone = len(failed(folder))
+    missing = [f"Of those asked for {gone} could not be made and are missing: `failed` says why."] if gone else []
     notes = [*missing, *said_of_weak(models_of(folder))]
     sheet = datasheet(folder.resolve().name, episodes, rows, notes, run_of(folder))
     description = (
@@ -99,26 +99,37 @@ def write_card(
     }
 
 
-def keep_card(folder: Path, changed: bool, progress: Callable[[Iterable], Iterable] = iter) -> str | None:
+def keep_card(
+    folder: Path, numbers: Set[int], changed: bool, progress: Callable[[Iterable], Iterable] = iter
+) -> str | None:
     """Write the card of a run's folder anew, where it is not that of the episodes there; why not, in words.
 
     Nothing is written where no episode is whole. Files that are of no card stay.
 
     Parameters
     ----------
+    numbers
+        Of the episodes that are there.
     changed
         Whether episodes were made, or failed, since the card was written.
     """
-    there = {path.name: path.stat().st_size for path in folder.glob("*.h5") if not path.name.startswith(".")}
-    if not there or not (changed or there != (listed_files(folder) if has_card(folder) else {})):
+    if not numbers or not (changed or _differs(folder, {episode_name(number) for number in numbers})):
         return None
-    if len(there) > MOST_EPISODES:
+    if len(numbers) > MOST_EPISODES:
         return f"No data sheet of more than {MOST_EPISODES} episodes: `sulcus convert {folder} --to card` writes it."
     try:
         write_card(folder, progress=progress)
     except (InputError, OSError) as error:  # what a run has made is none the worse for it
         return f"No data sheet was written: {error}"
     return None
+
+
+def _differs(folder: Path, names: set[str]) -> bool:
+    """Whether a folder's card lists other episodes than these; of many, sizes are not asked for."""
+    listed = listed_files(folder) if has_card(folder) else {}
+    if listed.keys() != names or len(names) > MOST_EPISODES:
+        return listed.keys() != names
+    return any((folder / name).stat().st_size != size for name, size in listed.items())
 
 
 def has_card(folder: Path) -> bool:
