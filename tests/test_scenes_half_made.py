@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,9 @@ from conftest import make_box
 from tiny_work import tiny_run
 
 from scenes.episodes import bodies
-from scenes.episodes.half_made import DATA, begun, gone_on
+from scenes.episodes.half_made import DATA, TABLE, begun, gone_on
 from scenes.episodes.make import body_path, make_body
-from scenes.episodes.plan import load_plan
+from scenes.episodes.plan import load_plan, plan_from
 from scenes.episodes.run_folder import begin
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
@@ -122,6 +123,25 @@ def test_a_killed_body_goes_on_and_has_the_same_bytes(plan, undisturbed, solved,
     assert not left.exists()  # of a body that is there nobody goes on with it
 
 
+def test_a_series_that_was_tabulated_is_not_tabulated_again(plan, tmp_path, monkeypatch):
+    """An error comes once it is there; the model has the same bytes as without any."""
+    text = plan.text.replace('"linear"', '"series"').replace("loads = 70", "loads = 40")
+    again = replace(plan_from(text, "own", plan.folder), own=plan.own)
+
+    def full(*given, **more):
+        raise InputError("no memory is left just now") from MemoryError()
+
+    with monkeypatch.context() as held:
+        held.setattr(bodies, "save", full)
+        with pytest.raises(InputError, match="just now"):
+            make_body(tmp_path, again, 1, 0, "cpu")
+    with monkeypatch.context() as held:
+        held.setattr("surrogate.training.expansion.tabulated", full)
+        assert make_body(tmp_path, again, 1, 0, "cpu").resumed
+    assert not make_body(tmp_path / "other", again, 1, 0, "cpu").resumed
+    assert files_of(tmp_path) == files_of(tmp_path / "other")
+
+
 def test_an_error_that_passes_keeps_what_was_solved(plan, undisturbed, solved, tmp_path, monkeypatch):
     def full(*given, **more):
         raise InputError("no memory is left just now") from MemoryError()
@@ -148,6 +168,9 @@ def test_the_most_that_anybody_has_is_taken_and_other_loads_are_not(tmp_path):
     own = folders[0] / DATA
     assert gone_on(own, stated, folders) and unfinished_path(own).stat().st_size == 30
     (folders[1] / DATA).write_bytes(b"whole")
+    for folder in (folders[1], folders[3]):
+        (folder / DATA).with_suffix(TABLE).write_text(folder.name)
     assert gone_on(own, stated, folders) and own.read_bytes() == b"whole"
+    assert own.with_suffix(TABLE).read_text() == "1"
     assert not gone_on(own, {"seed": "3"}, folders) and not begun(folders[0])
     assert {path.name for path in folders[0].iterdir()} == {Path(DATA).with_suffix(".json").name}

@@ -32,7 +32,7 @@ from surrogate.training.train import train
 from ..play.deformers import Theatre, model_path, open_theatre
 from ..script.shipped_files import template_path
 from .draws import drawn, random_of
-from .half_made import DATA, forget, gone_on
+from .half_made import DATA, TABLE, forget, gone_on
 from .plan import NO_LEARNER, Bodies, Plan, digest_beside, fields_of
 from .run_folder import versions_here
 
@@ -198,7 +198,8 @@ def _train(
     simulate(data, fem, draw_loads(PRESET, anatomy, learner.loads, first), stated)
     known = read_dataset(data)
     batch = TOGETHER if fem.problem.device.on_cuda else None
-    trained = train(known, [learner.name], expansion=Expansion(known, device, batch=batch))
+    expansion = Expansion(known, device, kept=data.with_suffix(TABLE), batch=batch)
+    trained = train(known, [learner.name], expansion=expansion)
     save(model_path(body.anatomy), {name: _undated(model) for name, model in trained.models.items()})
     forget(data)
     return before

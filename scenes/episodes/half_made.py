@@ -1,4 +1,4 @@
-"""What a half-made body has solved of its loads: whoever makes it next goes on with that.
+"""What a half-made body has solved for its model: whoever makes it next goes on with that.
 
 Each process makes a body in a hidden folder of its own, and copies what others have of the same body. So there are no
 locks: records of loads prove themselves (`surrogate.data.journal`), those of who is at work just now, too.
@@ -16,12 +16,14 @@ from sim.runtime.atomic_files import unfinished_path, written_whole
 
 DATA = "training.h5"
 """The loads that a body's model is trained on, until it is trained."""
-NOTE = ".json"
-"""The ending of what says beside it of which loads it is."""
+NOTE, TABLE = ".json", ".series.npz"
+"""Endings of what lies beside it: of which loads it is; and the table of their series, where the learner has one."""
 
 
 def gone_on(data: Path, stated: Mapping[str, str], others: Sequence[Path]) -> bool:
-    """See that a data set goes on with the most that it, or one like it in other folders, has; tell if that is any.
+    """See that a data set and its table go on with the most that any like it has; tell if that is any.
+
+    They are looked for in its own folder and in `others`.
 
     Parameters
     ----------
@@ -38,42 +40,49 @@ def gone_on(data: Path, stated: Mapping[str, str], others: Sequence[Path]) -> bo
         forget(data)
         with written_whole(data.with_suffix(NOTE), NOTE, sweep=False) as partial:
             partial.write_text(said, encoding="utf-8")
-    alike = [data, *(other / data.name for other in others if other != data.parent)]
-    found = sorted(max(_kept(each), default=(False, 0, each)) for each in alike if _is_of(each, said))
-    whole, size, best = found[-1]
-    target = data if whole else unfinished_path(data)
-    if size and best != target:
-        with (
-            suppress(FileNotFoundError),  # of a maker who is done with it by now
-            best.open("rb") as source,
-            written_whole(target, target.suffix, sweep=False) as partial,
-            partial.open("wb") as copy,
-        ):
-            shutil.copyfileobj(source, copy)
+    alike = [data, *(each for other in others if _is_of(each := other / data.name, said))]
+    *_, (whole, size, best) = sorted(max(_kept(each), default=(False, 0, each)) for each in alike)
+    if size:
+        _copy(best, data if whole else unfinished_path(data))
+    for table in (each.with_suffix(TABLE) for each in alike):
+        if table.exists() and not data.with_suffix(TABLE).exists():
+            _copy(table, data.with_suffix(TABLE))
     return begun(data.parent)
 
 
+def _copy(source: Path, target: Path) -> None:
+    if source == target:
+        return
+    with (
+        suppress(FileNotFoundError),  # of a maker who is done with it by now
+        source.open("rb") as file,
+        written_whole(target, target.suffix, sweep=False) as partial,
+        partial.open("wb") as copy,
+    ):
+        shutil.copyfileobj(file, copy)
+
+
 def begun(folder: Path) -> bool:
-    """Whether a folder holds loads that were solved for a body."""
+    """Whether a folder holds what was solved for a body."""
     return any(path.exists() for path in _files(folder / DATA)[1:])
 
 
 def emptied(folder: Path) -> None:
-    """Make a folder, or empty it of all but the loads that were solved for a body."""
+    """Make a folder, or empty it of all but what was solved for a body."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in set(folder.iterdir()) - set(_files(folder / DATA)):
         path.unlink()
 
 
 def forget(data: Path) -> None:
-    """Remove a data set, or what there is of it."""
+    """Remove a data set, or what there is of it, and its table."""
     for path in _files(data):
         path.unlink(missing_ok=True)
 
 
-def _files(data: Path) -> tuple[Path, Path, Path]:
-    """What says of which loads a data set is; the part of it that is solved; the whole."""
-    return data.with_suffix(NOTE), unfinished_path(data), data
+def _files(data: Path) -> tuple[Path, ...]:
+    """What says of which loads a data set is; the part of it that is solved; the whole; the table."""
+    return data.with_suffix(NOTE), unfinished_path(data), data, data.with_suffix(TABLE)
 
 
 def _is_of(data: Path, said: str) -> bool:
@@ -84,6 +93,6 @@ def _is_of(data: Path, said: str) -> bool:
 
 def _kept(data: Path) -> Iterator[tuple[bool, int, Path]]:
     """Whether a file of a data set is all of it, its bytes, and its name."""
-    for path in _files(data)[1:]:
+    for path in (data, unfinished_path(data)):
         with suppress(OSError):
             yield path == data, path.stat().st_size, path
