@@ -247,7 +247,7 @@ def test_a_sheet_names_what_is_there_most_often():
     assert list(listed("tool", ["a"])) == ["- tool: a (in 1)"]
 
 
-def test_a_card_is_kept_as_episodes_come(box, tmp_path):
+def test_a_card_is_kept_as_episodes_come(box, tmp_path, monkeypatch):
     def kept(changed):
         return keep_card(tmp_path, finished(tmp_path), changed)
 
@@ -259,6 +259,10 @@ def test_a_card_is_kept_as_episodes_come(box, tmp_path):
 
     assert kept(False) is None and rows() == 1
     made = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir() if path.is_file()}
+    with monkeypatch.context() as held:  # the folder was listed once, by who gives the numbers
+        for name in ("glob", "iterdir"):
+            held.setattr(Path, name, lambda *given: pytest.fail("the folder was listed again"))
+        assert keep_card(tmp_path, {0}, False) is None
     assert kept(False) is None and len(made) == 5
     assert made == {name: (tmp_path / name).stat().st_mtime_ns for name in made}
     assert kept(True) is None and made["DATASHEET.md"] < (tmp_path / "DATASHEET.md").stat().st_mtime_ns
