@@ -10,10 +10,12 @@ import numpy as np
 from .errors import InputError
 from .geometry.tetmesh import TetMesh, digest_of
 
-BRAIN_LABEL, TUMOUR_LABEL = 1, 2
+BRAIN_LABEL, TUMOUR_LABEL, NECROSIS_LABEL = 1, 2, 5
 """Region labels that the project's own anatomies use."""
-PART_LABELS = {"oedema": 3, "ventricles": 4}
-"""Region labels of parts of the brain that have a stiffness of their own, where an anatomy tells them."""
+TUMOUR_LABELS = (TUMOUR_LABEL, NECROSIS_LABEL)
+"""What together is the tumour, whose surface is followed."""
+PART_LABELS = {"oedema": 3, "ventricles": 4, "necrosis": NECROSIS_LABEL}
+"""Region labels of parts that have a stiffness of their own, where an anatomy tells them: of brain, and of tumour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +25,7 @@ class Anatomy:
     Parameters
     ----------
     mesh
-        The tetrahedra; regions `BRAIN_LABEL` and `TUMOUR_LABEL` where there is a tumour.
+        The tetrahedra; regions `BRAIN_LABEL`, `TUMOUR_LABELS` where there is a tumour, and those of `PART_LABELS`.
     held
         (V, 3) bool: displacement components that are prescribed (zero, unless a load says otherwise).
     slide_normal
@@ -95,14 +97,19 @@ class Anatomy:
         )
 
     @cached_property
+    def in_tumour(self) -> np.ndarray:
+        """(T,) bool: the tetrahedra of the tumour, with those of its necrosis."""
+        return self.mesh.within(*TUMOUR_LABELS)
+
+    @cached_property
     def tumour_nodes(self) -> np.ndarray:
         """Sorted vertex numbers (n,) of the tumour."""
-        return self.mesh.nodes_of(TUMOUR_LABEL)
+        return self.mesh.nodes_of(*TUMOUR_LABELS)
 
     @cached_property
     def tumour_surface(self) -> np.ndarray:
-        """Triangles (S, 3), outwards, of the tumour's surface."""
-        return self.mesh.boundary_of(TUMOUR_LABEL)
+        """Triangles (S, 3), outwards, of the tumour's surface; none between it and its necrosis."""
+        return self.mesh.boundary_of(*TUMOUR_LABELS)
 
     @cached_property
     def open_surface(self) -> np.ndarray:

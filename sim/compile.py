@@ -281,12 +281,12 @@ def _elasticity(
     absent = set() if pulsation is None else set(pulsation.regions or ()) - set(labels)
     if absent:
         raise InputError(f"Pulsation is asked of region {min(absent)}, but the mesh has the regions {labels}.")
-    unknown = sorted(set(effect.regions) - set(labels))
+    unknown = sorted(set(effect.regions) - set(effect.on(labels).regions))
     if unknown:
         raise InputError(f"a law is given for region {unknown[0]}, but the mesh has the regions {labels}.")
     materials: dict[int, Tissue] = {}
     for label in labels:
-        material = effect.regions.get(label, effect.default)
+        material = effect.of(label)
         if material is None:
             raise InputError(f"region {label} has no tissue law: name one for it, or a default.")
         materials[label] = material

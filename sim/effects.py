@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import index
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
-from .anatomy import Anatomy
+from .anatomy import NECROSIS_LABEL, TUMOUR_LABEL, Anatomy
 from .errors import InputError
 from .material import BRAIN, Tissue, check_described
 from .skulls import Bonded, SkullContact, Slide, check_gap
@@ -29,7 +29,7 @@ LARGEST_WAVE = 0.3
 class Elasticity:
     """Tissue resists deformation. `regions` names the law of each region label; the rest obeys `default`.
 
-    `default=None` makes a region without a law an error.
+    Necrosis without a law of its own obeys the tumour's. `default=None` makes a region without a law an error.
 
     Raises
     ------
@@ -45,10 +45,24 @@ class Elasticity:
             if tissue is not None:
                 check_described(tissue)
 
+    def of(self, label: int) -> Tissue | None:
+        """The law of a region, if it has any."""
+        return self.regions.get(label, self.regions.get(_around(label), self.default))
+
+    def on(self, labels: Iterable[int]) -> Elasticity:
+        """The same for a body of these regions: without laws that none of them obeys."""
+        obeyed = {each for label in labels for each in (label, _around(label))}
+        return replace(self, regions={label: law for label, law in self.regions.items() if label in obeyed})
+
     def __str__(self) -> str:
         """The tissues as they are named beside every answer."""
         named = [] if self.default is None else [str(self.default)]
         return "; ".join([*named, *(f"region {label}: {tissue}" for label, tissue in self.regions.items())])
+
+
+def _around(label: int) -> int:
+    """The region that a region lies in, or itself."""
+    return TUMOUR_LABEL if label == NECROSIS_LABEL else label
 
 
 @dataclass(frozen=True)

@@ -191,14 +191,13 @@ def finite_elements(
 
 def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:
     """Effects without what they say of regions that are gone altogether."""
-    gone = set(whole.mesh.region.tolist()) - set(body.mesh.region.tolist())
+    present = set(body.mesh.region.tolist())
+    gone = set(whole.mesh.region.tolist()) - present
 
     def kept(effect: Effect) -> Effect | None:
         if isinstance(effect, Pulsation) and effect.regions is not None:
             left = tuple(label for label in effect.regions if label not in gone)
             return replace(effect, regions=left) if left else None
-        if not isinstance(effect, Elasticity):
-            return effect
-        return replace(effect, regions={label: law for label, law in effect.regions.items() if label not in gone})
+        return effect.on(present | set(effect.regions) - gone) if isinstance(effect, Elasticity) else effect
 
     return tuple(effect for effect in map(kept, effects) if effect is not None)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.accuracy import Accuracy
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import Anatomy
 from sim.discretisation.footprint import nearest_on
 from sim.effects import pushed_effects
 from sim.errors import InputError
@@ -111,5 +111,5 @@ def _measured(anatomy: Anatomy, element: str, poisson: float, press: Press, devi
 def tumour_motion(anatomy: Anatomy, displacement: np.ndarray) -> np.ndarray:
     """Mean motion (B, 3) [m] of the tumour by volume, of displacements (B, V, 3) [m]."""
     mesh = anatomy.mesh
-    inside = mesh.region == TUMOUR_LABEL
+    inside = anatomy.in_tumour
     return np.average(displacement[:, mesh.tets[inside]].mean(axis=2), axis=1, weights=mesh.volumes[inside])

@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from sim.anatomy import PART_LABELS, TUMOUR_LABEL, Anatomy
+from sim.anatomy import PART_LABELS, Anatomy
 from sim.bodies.head_masks import head_masks
 from sim.bodies.intensity import sidecar, write_intensity
 from sim.bodies.label_volume import masked_subject
 from sim.bodies.mesher import lost_pieces, lost_words, surface_errors
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.placement import side_of
-from sim.bodies.subject import MeshPlan, Subject, make_anatomy
+from sim.bodies.subject import MeshPlan, Part, Subject, make_anatomy
 from sim.errors import InputError
-from sim.geometry.tetmesh import dihedral_angles
+from sim.geometry.tetmesh import TetMesh, dihedral_angles
 from sim.runtime.timing import stage
 
 from .companion_files import demand_no_strangers
@@ -45,6 +45,7 @@ PRESETS = {
     # Tonutti et al. 2017: forces from 20 mm off the centre of a tumour of 12 mm radius, 98 cm2 of cortex left free.
     "seed": {"cover": 8.0, "craniotomy": 110.0},
 }
+PART_NAMES = {label: name for name, label in PART_LABELS.items()}
 NOTED = 3.0
 """Per cent of the tumour's volume: a mesh that misses more of it is noted."""
 
@@ -102,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
             beside.unlink(missing_ok=True)  # of an earlier mesh of this name
         else:
             write_intensity(beside, intensity)
-    tumour = anatomy.mesh.tets[anatomy.mesh.region == TUMOUR_LABEL]
+    tumour = anatomy.mesh.tets[anatomy.in_tumour]
     lost = lost_pieces(subject.pieces, anatomy.mesh.nodes, tumour)
     if any(lost):
         said = lost_words(subject.pieces, lost)
@@ -115,6 +116,10 @@ def run(args: argparse.Namespace) -> int:
             f"{source(args)}: where that matters, ask for more nodes.",
             file=sys.stderr,
         )
+    for part in subject.parts:
+        if not anatomy.mesh.within(part.label).any():
+            said = f"has no {PART_NAMES[part.label]}, of which the labels mark {1e6 * part.volume:.2g} ml"
+            print(f"{args.out}: {said}: where it matters, ask for more nodes.", file=sys.stderr)
     files = {"mesh": str(args.out), "t1": None if intensity is None else str(beside)}
     summary = {**files, **figures, "seconds": round(time.perf_counter() - began, 2)}
     print(json.dumps(summary) if args.json else _sentences(summary))
@@ -140,8 +145,9 @@ def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
 
 def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost: list[bool]) -> dict[str, Any]:
     mesh = anatomy.mesh
-    volume = mesh.volumes[mesh.region == TUMOUR_LABEL].sum()
+    volume = mesh.volumes[anatomy.in_tumour].sum()
     error, weight = surface_errors(mesh.nodes, mesh.surface, subject.brain)
+    regions = {PART_NAMES[part.label]: (_volume(mesh, part), part) for part in subject.parts}
     return {
         "nodes": len(mesh.nodes),
         "tets": len(mesh.tets),
@@ -152,10 +158,10 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost:
         "worst_dihedral_deg": round(float(dihedral_angles(mesh.nodes, mesh.tets).min()), 2),
         "brain_ml": round(float(mesh.volumes.sum()) * 1e6, 2),
         "tumour_ml": round(float(volume) * 1e6, 4),
-        "regions_ml": {
-            name: round(1e6 * float(mesh.volumes[mesh.region == label].sum()), 3)
-            for name, label in PART_LABELS.items()
-            if label in dict(subject.parts)
+        "regions_ml": {name: round(1e6 * held, 3) for name, (held, _) in regions.items()},
+        "regions_volume_error_percent": {
+            name: round(100.0 * (held / part.volume - 1.0), 3) if part.volume else None
+            for name, (held, part) in regions.items()
         },
         "tumour_volume_error_percent": round(100.0 * float(volume / subject.tumour_volume - 1.0), 3),
         "surface_error_mean_mm": round(1e3 * float(np.average(error, weights=weight)), 3),
@@ -167,6 +173,11 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost:
         ],
         "digest": anatomy.digest,
     }
+
+
+def _volume(mesh: TetMesh, part: Part) -> float:
+    """[m^3] of the tetrahedra of a part."""
+    return float(mesh.volumes[mesh.within(part.label)].sum())
 
 
 def _place(subject: Subject, place: np.ndarray) -> dict[str, Any]:
@@ -190,12 +201,19 @@ def _pieces(pieces: list[dict[str, Any]], over: str) -> list[str]:
     return [f"tumour: {len(pieces)} pieces; the skull is opened over {over}", *listed]
 
 
+def _region(name: str, volume: float, figures: dict) -> str:
+    """A region's line."""
+    missed = figures["regions_volume_error_percent"][name]
+    off = "" if missed is None else f" ({missed:+} % of the label's)"
+    return f"{name} {volume:g} ml{off}, region {PART_LABELS[name]}{' of the tumour' if name == 'necrosis' else ''}"
+
+
 def _sentences(figures: dict) -> str:
     lines = [
         "{nodes} nodes, {tets} tetrahedra; worst dihedral angle {worst_dihedral_deg} deg",
         "brain {brain_ml} ml; surface off by {surface_error_mean_mm} mm mean, {surface_error_p95_mm} mm p95",
         "tumour {tumour_ml} ml ({tumour_volume_error_percent:+} % of the label's), {tumour_nodes} nodes",
-        *(f"{name} {volume:g} ml, region {PART_LABELS[name]}" for name, volume in figures["regions_ml"].items()),
+        *(_region(name, volume, figures) for name, volume in figures["regions_ml"].items()),
         *_pieces(figures["tumour_pieces"], figures["opening"]["over"]),
         f"opening: {_said(figures['opening'])}",
         "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} sliding, {held_nodes} held",

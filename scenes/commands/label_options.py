@@ -34,13 +34,14 @@ def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None
         "--tumour-in", type=Path, metavar="FILE", help="the file in which the tumour is marked, on a grid of its own"
     )
     for name, number in PART_LABELS.items():
+        counts = "tumour" if name == "necrosis" else "brain"
         parser.add_argument(
             f"--{name}", type=labels, metavar="LABELS",
-            help=f"labels that are {name}: they count as brain, and become region {number} for a stiffness of its own",
+            help=f"labels that are {name}: they count as {counts}, and become region {number} for its own stiffness",
         )  # fmt: skip
     parser.add_argument(
         "--regions", type=lambda text: tuple(text.split(",")), default=(), metavar="NAMES",
-        help=f"parts that the convention marks and that become regions: {' or '.join(PART_LABELS)}, or both",
+        help=f"parts that the convention marks and that become regions, of {', '.join(PART_LABELS)}",
     )  # fmt: skip
 
 
@@ -60,7 +61,7 @@ def sources_of(args: argparse.Namespace) -> Sources:
 
 
 def regions_asked(args: argparse.Namespace) -> tuple[str, ...]:
-    """The parts of the brain that become regions of their own."""
+    """The parts of brain and tumour that become regions of their own."""
     return tuple(dict.fromkeys((*_parts(args), *args.regions)))
 
 

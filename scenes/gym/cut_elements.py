@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import Deformation
 from sim.geometry.closest_point import closest
 from sim.geometry.surface import vertex_normals
@@ -105,8 +104,8 @@ class CutElements:
         return self._surfaces[done]
 
     def _near(self, done: int) -> Healthy:
-        left = self.fem.remains(done).anatomy.mesh
-        brain = left.region != TUMOUR_LABEL
+        body = self.fem.remains(done).anatomy
+        left, brain = body.mesh, ~body.in_tumour
         surface = TetMesh(left.nodes, left.tets[brain], left.region[brain]).surface
         tumour = self.site.anatomy.tumour_nodes
         way = np.linspace(self.site.origin, left.nodes[tumour].mean(axis=0), 8)

@@ -150,7 +150,7 @@ def open_setting(
         not there.
     """
     theatre = _theatre(anatomy, _shipped(task) if model is None and anatomy == TEMPLATE else model, device)
-    if not (theatre.anatomy.mesh.region == TUMOUR_LABEL).any():
+    if not theatre.anatomy.in_tumour.any():
         raise InputError(f"{anatomy}: has no tumour, which these tasks aim at: mesh one with region {TUMOUR_LABEL}.")
     scene, tool = task.scene(size), task.tool
     card = find_device(device, LIVE.precision).name != "cpu"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.accuracy import TRAIN
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import Anatomy
 from sim.effects import NodalForce, pushed_effects
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
@@ -27,7 +27,7 @@ SHARE = 0.2
 def debulked(anatomy: Anatomy) -> Anatomy:
     """The body without a fifth of its tumour, from the middle outwards; what no tetrahedron is left at is gone too."""
     mesh = anatomy.mesh
-    tumour = np.flatnonzero(mesh.region == TUMOUR_LABEL)
+    tumour = np.flatnonzero(anatomy.in_tumour)
     middle, volume = mesh.nodes[mesh.tets[tumour]].mean(axis=1), mesh.volumes[tumour]
     far = np.linalg.norm(middle - np.average(middle, axis=0, weights=volume), axis=1)
     inside = np.argsort(far, kind="stable")

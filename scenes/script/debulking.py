@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import Anatomy
 from sim.effects import Resection
 from sim.errors import InputError
 
@@ -41,7 +41,7 @@ class Debulking:
             No open cortex, or no tumour of so many shares.
         """
         mesh, site = anatomy.mesh, site_of(anatomy)
-        tumour = np.flatnonzero(mesh.region == TUMOUR_LABEL)
+        tumour = np.flatnonzero(anatomy.in_tumour)
         shares = len(self.times)
         if len(tumour) < shares:
             raise InputError(f"the tumour has {len(tumour)} tetrahedra, and {shares} shares are asked for: mesh finer.")
@@ -52,7 +52,7 @@ class Debulking:
         along = (middle - site.origin) @ way / length
         across = np.linalg.norm(middle - site.origin - np.outer(along, way / length), axis=1)
         radius = max(self.corridor, float(np.cbrt(6.0 * mesh.volumes.mean())))
-        on_the_way = (across < radius) & (along < length) & (mesh.region != TUMOUR_LABEL)
+        on_the_way = (across < radius) & (along < length) & ~anatomy.in_tumour
         from_the_top = tumour[np.argsort(along[tumour], kind="stable")]
         *taken, _ = np.array_split(from_the_top, shares)
         return Resection(tuple(tuple(step.tolist()) for step in (np.flatnonzero(on_the_way), *taken)))

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from sim.anatomy import TUMOUR_LABEL
 from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, forward_on, landmark_errors, warp_fields, warp_grid
 
@@ -110,7 +109,7 @@ def _write_points(place: Path, moment: Moment, marks: Sequence[Landmark]) -> Non
     gap = moment.gap()
     if gap is not None and moment.tip is not None:
         write_markups(place / "tip_to_tumour.mrk.json", "Line", {"tip": moment.tip, "tumour": gap[0]})
-    tumour = moment.left.mesh.tets[moment.left.mesh.region == TUMOUR_LABEL]
+    tumour = moment.left.mesh.tets[moment.left.in_tumour]
     if len(tumour):
         write_segmentation(place / "tumour.seg.nrrd", moment.now, tumour, moment.bound)
 

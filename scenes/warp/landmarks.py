@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.geometry.closest_point import closest
 from sim.geometry.locate import locate
@@ -42,7 +42,7 @@ def landmarks_of(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, ...
     They move linearly in their tetrahedron or triangle, as the fields do.
     """
     mesh, found = body.mesh, []
-    if (mesh.region == TUMOUR_LABEL).any():
+    if body.in_tumour.any():
         point = tumour_share(body) @ mesh.nodes
         at = locate(mesh, point[None])
         if np.linalg.norm(at.read(mesh.nodes[None])[0, 0] - point) < ROUNDING:
@@ -60,7 +60,7 @@ def landmarks_of(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, ...
 
 def centroid_now(body: Anatomy, displacement: np.ndarray) -> np.ndarray | None:
     """The centroid (3,) [m] of the tumour's volume as it is now; None without a tumour."""
-    tumour = body.mesh.tets[body.mesh.region == TUMOUR_LABEL]
+    tumour = body.mesh.tets[body.in_tumour]
     if not len(tumour):
         return None
     now = body.mesh.nodes + displacement

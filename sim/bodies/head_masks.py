@@ -18,6 +18,8 @@ from .voxels import Grid
 
 # Share of what is labelled that may lie outside of a mask without a word.
 OUTSIDE = 0.01
+NECROSIS = "necrosis"
+"""The part that lies in the tumour; all others lie in the brain."""
 # Voxels that are kept round a brain: more than a tumour at the cortex goes on beyond it.
 SURROUNDINGS = 10
 
@@ -37,9 +39,10 @@ class Sources:
     mask
         A volume whose voxels other than 0 are brain, in place of `brain`.
     tumour_in
-        A label map that the labels `tumour` are of, all of them if there are none.
+        A label map that the labels `tumour` are of, all of them if there are none, and those of necrosis.
     parts
-        Labels of other tissues by name, `oedema` and `ventricles`, in place of the convention's; they count as brain.
+        Labels of other tissues by name of `PART_LABELS`, in place of the convention's. Necrosis counts as tumour, and
+        all else as brain.
     """
 
     labels: Path
@@ -103,9 +106,12 @@ def head_masks(sources: Sources) -> HeadMasks:
     marked = {} if sources.mask else {"brain": whole.mask(brain)}
     marked |= {} if sources.tumour_in else {"tumour": whole.mask(tumour)}
     parts = {} if convention is None else _parts(whole, convention)
-    parts |= {name: whole.mask(labels) for name, labels in sources.parts.items()}
-    if not sources.mask:
-        marked["brain"] = np.logical_or.reduce([marked["brain"], *(parts[name] for name in sources.parts)])
+    named = {name: labels for name, labels in sources.parts.items() if name != NECROSIS or not sources.tumour_in}
+    parts |= {name: whole.mask(labels) for name, labels in named.items()}
+    for name in named:
+        around = "tumour" if name == NECROSIS else "brain"
+        if around in marked:
+            marked[around] = marked[around] | parts[name]
     marked |= parts
     others = _others(sources, tumour)
     either = False
@@ -133,7 +139,10 @@ def head_masks(sources: Sources) -> HeadMasks:
         notes,
         on_border(others["brain"].marked if sources.mask else whole.mask(brain)),
         marked,
-        (Grid(Path(sources.labels), whole.layers.shape[:3], whole.affine), *(one.grid for one in others.values())),
+        (
+            Grid(Path(sources.labels), whole.layers.shape[:3], whole.affine),
+            *(one.grid for name, one in others.items() if name != NECROSIS),
+        ),
     )
 
 
@@ -173,9 +182,10 @@ def _meant(
 ) -> tuple[tuple[Label, ...], tuple[Label, ...]]:
     """The labels of brain and tumour: those given, or the convention's that are there."""
     brain, tumour = sources.brain, sources.tumour
-    parts = tuple(label for labels in sources.parts.values() for label in labels)
+    necrosis = sources.parts.get(NECROSIS, ())
+    parts = tuple(label for name, labels in sources.parts.items() if name != NECROSIS for label in labels)
     if convention is not None:
-        own = brain + parts + (() if sources.tumour_in else tumour)
+        own = brain + parts + (() if sources.tumour_in else tumour + necrosis)
         demand_fits(sources.labels, convention, whole.labels, {value for _, value in whole.places(own)})
         _demand_sides(whole, convention)
         if not brain and not sources.mask:
@@ -183,7 +193,7 @@ def _meant(
         if not tumour and not sources.tumour_in:
             tumour = _there(convention.tumour, whole)
     if not sources.tumour_in:
-        _demand_apart(whole, brain + parts, tumour)
+        _demand_apart(whole, brain + parts, tumour + necrosis)
     return brain, tumour
 
 
@@ -193,7 +203,7 @@ def _there(labels: Sequence[int], whole: LabelMap) -> tuple[int, ...]:
 
 def _parts(whole: LabelMap, convention: Convention) -> dict[str, np.ndarray]:
     """Masks of the other tissues that the file marks."""
-    groups = {"necrosis": convention.necrosis, "oedema": convention.oedema, "ventricles": convention.ventricles}
+    groups = {NECROSIS: convention.necrosis, "oedema": convention.oedema, "ventricles": convention.ventricles}
     return {name: whole.mask(found) for name, of in groups.items() if (found := _there(of, whole))}
 
 
@@ -204,8 +214,11 @@ def _others(sources: Sources, tumour: Sequence[Label]) -> dict[str, Mask]:
         volume = read_volume(sources.mask)
         others["brain"] = Mask(Path(sources.mask), volume.values != 0, volume.affine, volume.notes)
     if sources.tumour_in:
-        second = read_labels(sources.tumour_in)
-        others["tumour"] = Mask(Path(sources.tumour_in), second.mask(tumour), second.affine, second.notes)
+        second, necrosis = read_labels(sources.tumour_in), sources.parts.get(NECROSIS, ())
+        whole = second.mask((*tumour, *necrosis) if tumour else ())
+        others["tumour"] = Mask(Path(sources.tumour_in), whole, second.affine, second.notes)
+        if necrosis:
+            others[NECROSIS] = Mask(Path(sources.tumour_in), second.mask(necrosis), second.affine)
     return others
 
 

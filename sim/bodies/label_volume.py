@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
-from ..anatomy import PART_LABELS
+from ..anatomy import NECROSIS_LABEL, PART_LABELS
 from ..errors import InputError
 from ..runtime.outside_files import path_of
 from .head_masks import HeadMasks, Sources, head_masks
@@ -19,7 +19,7 @@ from .label_map import Label, Mask, on_border
 from .one_space import demand_scan_of
 from .placement import Piece, site_over
 from .signed_distance import Blur, mask_field
-from .subject import Subject, rim
+from .subject import Part, Subject, rim
 from .voxels import Grid
 
 
@@ -76,7 +76,7 @@ def masked_subject(
 
     The solid is brain or tumour, its largest component, with holes filled; tumour components outside it are left out,
     and each such change is noted. The skull is opened over the largest of them. `t1` is a volume of intensities in the
-    same space. Parts of the brain named in `regions`, of `PART_LABELS`, become regions of their own.
+    same space. Parts of brain and tumour named in `regions`, of `PART_LABELS`, become regions of their own.
 
     Raises
     ------
@@ -112,8 +112,22 @@ def masked_subject(
         intensity=intensity,
         notes=tuple(notes),
         pieces=pieces,
-        parts=tuple((PART_LABELS[name], mask_field(masks.parts[name], affine, settings.blur)) for name in regions),
+        parts=_parts(masks, solid, inside, regions, settings),
     )
+
+
+def _parts(
+    masks: HeadMasks, solid: np.ndarray, tumour: np.ndarray, regions: Sequence[str], settings: Labelling
+) -> tuple[Part, ...]:
+    """The parts that become regions; their volumes are those that lie in brain or tumour, as the mesh has it."""
+    voxel, parts = abs(float(np.linalg.det(masks.affine[:3, :3]))), []
+    taken = np.zeros_like(solid)
+    for name in reversed(regions):  # of two that overlap the later counts
+        mask, label = masks.parts[name], PART_LABELS[name]
+        own = mask & (tumour if label == NECROSIS_LABEL else solid & ~tumour) & ~taken
+        taken |= own
+        parts.append(Part(label, mask_field(mask, masks.affine, settings.blur), float(own.sum() * voxel)))
+    return tuple(reversed(parts))
 
 
 def whole_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelling()) -> np.ndarray:

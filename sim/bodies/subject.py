@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import product
 from typing import cast
 
 import numpy as np
 from scipy import ndimage
 
-from ..anatomy import BRAIN_LABEL, Anatomy
+from ..anatomy import BRAIN_LABEL, NECROSIS_LABEL, TUMOUR_LABEL, Anatomy
 from ..errors import InputError
 from ..geometry.tetmesh import TetMesh
 from .boundary_conditions import bounded
@@ -18,6 +19,8 @@ from .placement import Piece, Placement, within_outline
 from .signed_distance import Field
 
 FEWEST_NODES, MOST_NODES = 2_000, 250_000
+# Points spread over a tetrahedron (20, 4), by their shares of its corners.
+SPREAD = np.array([corners for corners in product(range(4), repeat=4) if sum(corners) == 3]) / 4.0 + 1.0 / 16.0
 SMALLEST_CRANIOTOMY, LARGEST_CRANIOTOMY = 0.015, 0.120  # [m]
 
 
@@ -58,6 +61,18 @@ class MeshPlan:
 
 
 @dataclass(frozen=True, eq=False)
+class Part:
+    """A part of brain or tumour that has a stiffness of its own: region label, field, and volume [m^3] in the labels.
+
+    Necrosis is a part of the tumour, all else of the brain.
+    """
+
+    label: int
+    inside: Field
+    volume: float
+
+
+@dataclass(frozen=True, eq=False)
 class Subject:
     """A brain with a tumour, in the volume's RAS frame [m].
 
@@ -78,7 +93,7 @@ class Subject:
     pieces
         Of the tumour, the largest first.
     parts
-        Region labels of parts of the brain, each with its field; of two that overlap the later counts.
+        Regions of their own; of two that overlap the later counts.
     outline
         (n, 3) [m]: a closed curve round the opening, in place of a disc.
     """
@@ -92,7 +107,7 @@ class Subject:
     intensity: Intensity | None = None
     notes: tuple[str, ...] = ()
     pieces: tuple[Piece, ...] = ()
-    parts: tuple[tuple[int, Field], ...] = ()
+    parts: tuple[Part, ...] = ()
     outline: np.ndarray | None = None
 
 
@@ -114,10 +129,19 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
 
 
 def _with_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
-    """The mesh with the regions of the subject's parts: tetrahedra of the brain whose middle lies in one."""
-    region, middles = mesh.region.copy(), mesh.nodes[mesh.tets].mean(axis=1)
-    for label, inside in subject.parts:
-        region[(mesh.region == BRAIN_LABEL) & (inside(middles) < 0.0)] = label
+    """The mesh with the regions of the subject's parts.
+
+    Each has those tetrahedra that lie in it with the largest share, as many as come nearest to its volume.
+    """
+    region = mesh.region.copy()
+    for part in reversed(subject.parts):
+        around = TUMOUR_LABEL if part.label == NECROSIS_LABEL else BRAIN_LABEL
+        free = np.flatnonzero(region == around)
+        points = np.einsum("pk,tki->tpi", SPREAD, mesh.nodes[mesh.tets[free]])
+        share = (part.inside(points.reshape(-1, 3)) < 0.0).reshape(points.shape[:2]).mean(axis=1)
+        touched = np.argsort(-share, kind="stable")[: np.count_nonzero(share)]
+        taken = np.concatenate([[0.0], np.cumsum(mesh.volumes[free[touched]])])
+        region[free[touched[: np.abs(taken - part.volume).argmin()]]] = part.label
     return TetMesh(mesh.nodes, mesh.tets, region) if subject.parts else mesh
 
 

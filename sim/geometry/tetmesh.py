@@ -136,13 +136,17 @@ class TetMesh:
         """Outer triangles (S, 3), outwards, by their corners."""
         return faces_once(self.tets)
 
-    def boundary_of(self, label: int) -> np.ndarray:
-        """Triangles (S, 3), outwards, by their corners, round the elements of one region."""
-        return faces_once(self.tets[self.region == label])
+    def within(self, *labels: int) -> np.ndarray:
+        """(T,) bool: the elements of these regions."""
+        return np.isin(self.region, labels)
 
-    def nodes_of(self, label: int) -> np.ndarray:
-        """Sorted node numbers (n,) of the elements of one region."""
-        return np.unique(self.table[self.region == label])
+    def boundary_of(self, *labels: int) -> np.ndarray:
+        """Triangles (S, 3), outwards, by their corners, round the elements of these regions together."""
+        return faces_once(self.tets[self.within(*labels)])
+
+    def nodes_of(self, *labels: int) -> np.ndarray:
+        """Sorted node numbers (n,) of the elements of these regions."""
+        return np.unique(self.table[self.within(*labels)])
 
     @cached_property
     def digest(self) -> str:

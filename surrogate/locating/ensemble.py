@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.accuracy import Accuracy
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import Anatomy
 from sim.deformation import Deformation
 from sim.effects import SKULLS
 from sim.errors import InputError
@@ -113,7 +113,8 @@ def members(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Motions (n, V, 3) float32 [m] and kinds (n,) of one group: those that converged and move the open cortex."""
     fem = Fem(anatomy, group.effects(causes.swellings), ACCURACY, device)
-    local = Fem(anatomy, group.effects(causes.tumour_swellings, (TUMOUR_LABEL,)), ACCURACY, device)
+    tumour = tuple(np.unique(anatomy.mesh.region[anatomy.in_tumour]).tolist())
+    local = Fem(anatomy, group.effects(causes.tumour_swellings, tumour), ACCURACY, device)
     answers = [
         fem.deform(pushes(group, anatomy, seed, causes)),
         fem.deform(swellings(anatomy, causes.swellings)),

@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import Anatomy
 from sim.effects import SKULLS
 from sim.errors import InputError
 
@@ -265,7 +265,7 @@ def middle_of(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
 def tumour_share(anatomy: Anatomy) -> np.ndarray:
     """Share (V,) of each vertex in the middle of the tumour's volume."""
     mesh = anatomy.mesh
-    inside = mesh.region == TUMOUR_LABEL
+    inside = anatomy.in_tumour
     share = np.zeros(len(mesh.nodes))
     np.add.at(share, mesh.tets[inside], np.repeat(mesh.volumes[inside][:, None] / 4.0, 4, axis=1))
     return share / share.sum()
