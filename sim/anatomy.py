@@ -17,6 +17,19 @@ TUMOUR_LABELS = (TUMOUR_LABEL, NECROSIS_LABEL)
 PART_LABELS = {"oedema": 3, "ventricles": 4, "necrosis": NECROSIS_LABEL}
 """Region labels of parts that have a stiffness of their own, where an anatomy tells them: of brain, and of tumour."""
 
+REGION_NAMES = {"brain": BRAIN_LABEL, "tumour": TUMOUR_LABEL, **PART_LABELS}
+"""Region labels by name."""
+
+
+def region_name(label: int) -> str:
+    """A region's name; "region 7" where it has none."""
+    return next((name for name, number in REGION_NAMES.items() if number == label), f"region {label}")
+
+
+def region_words(label: int) -> str:
+    """A region by its label, and by its name if it has one."""
+    return f"region {label} ({region_name(label)})" if label in REGION_NAMES.values() else region_name(label)
+
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from .anatomy import Anatomy
+from .anatomy import Anatomy, region_words
 from .discretisation.body import Body
 from .discretisation.constraint import Constraint
 from .discretisation.element import Elements
@@ -283,7 +283,7 @@ def _elasticity(
         raise InputError(f"Pulsation is asked of region {min(absent)}, but the mesh has the regions {labels}.")
     unknown = sorted(set(effect.regions) - set(effect.on(labels).regions))
     if unknown:
-        raise InputError(f"a law is given for region {unknown[0]}, but the mesh has the regions {labels}.")
+        raise InputError(f"a law is given for {region_words(unknown[0])}, but the mesh has the regions {labels}.")
     materials: dict[int, Tissue] = {}
     for label in labels:
         material = effect.of(label)

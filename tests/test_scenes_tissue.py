@@ -93,11 +93,11 @@ def test_regions_relax_as_the_rest_does(name: str, text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("2:9000,0.3", "write LABEL:C1,M1;C2,M2;K"),
+        ("2:9000,0.3", "write REGION:C1,M1;C2,M2;K"),
         ("2:1e4", "--region 2:1e4: Ogden's law has no terms"),
-        ("2:500,2", "write LABEL:C1,M1;C2,M2;K"),
+        ("2:500,2", "write REGION:C1,M1;C2,M2;K"),
         ("2:500,2;0", "bulk modulus is 0.0 Pa"),
-        ("grey:500,2;1e4", "write LABEL"),
+        ("grey:500,2;1e4", "write REGION"),
     ],
 )
 def test_regions_of_another_form_are_refused(text: str, sentence: str) -> None:

@@ -23,16 +23,20 @@ from sim.resected_fem import Operated, finite_elements
 STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=300.0)
 
 
-@pytest.fixture(scope="module")
-def hollow(small_box):
-    """The small box, with necrosis in the tumour's tetrahedra that are nearest to its middle."""
-    mesh = small_box.mesh
+def hollowed(anatomy):
+    """A body with necrosis in the tumour's tetrahedra that are nearest to its middle."""
+    mesh = anatomy.mesh
     tumour = np.flatnonzero(mesh.region == TUMOUR_LABEL)
     middle = mesh.nodes[mesh.tets[tumour]].mean(axis=1)
     near = np.argsort(np.linalg.norm(middle - middle.mean(axis=0), axis=1), kind="stable")[: len(tumour) // 3]
     region = mesh.region.copy()
     region[tumour[near]] = NECROSIS_LABEL
-    return replace(small_box, mesh=replace(mesh, region=region))
+    return replace(anatomy, mesh=replace(mesh, region=region))
+
+
+@pytest.fixture(scope="module")
+def hollow(small_box):
+    return hollowed(small_box)
 
 
 def pushed(anatomy, tissue):
@@ -42,14 +46,25 @@ def pushed(anatomy, tissue):
     return fem.deform(push(place.point, 0.1 * place.inward, footprint=7e-3), at=anatomy.tumour_nodes).displacement[0]
 
 
+def necrotic(places):
+    """A head with a ball in it, and in that another."""
+    labels = head(places)
+    labels[np.linalg.norm(places - TUMOUR - [1.5, -1.0, 0.5], axis=-1) < 8.0] = 6
+    return labels
+
+
+def necrotic_labels(folder):
+    affine, places = grid()
+    return nifti(folder / "own.nii", necrotic(places), affine)
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     """Own labels, and the same as a mask of the brain and labels of BraTS."""
     folder = tmp_path_factory.mktemp("necrosis")
+    necrotic_labels(folder)
     affine, places = grid()
-    labels = head(places)
-    labels[np.linalg.norm(places - TUMOUR - [1.5, -1.0, 0.5], axis=-1) < 8.0] = 6
-    nifti(folder / "own.nii", labels, affine)
+    labels = necrotic(places)
     nifti(folder / "brain.nii", (labels > 0).astype(np.int16), affine)
     nifti(folder / "brats.nii", np.select([labels == 3, labels == 6], [4, 1], 0).astype(np.int16), affine)
     return folder
@@ -111,7 +126,7 @@ def test_its_stiffness_is_its_own_or_the_tumours(small_box, hollow):
 
 
 def test_a_law_of_a_region_that_is_not_there_is_refused(small_box):
-    with pytest.raises(InputError, match="a law is given for region 5, but the mesh has the regions"):
+    with pytest.raises(InputError, match=r"a law is given for region 5 \(necrosis\), but the mesh has the regions"):
         Fem(small_box, pushed_effects(small_box, Elasticity(BRAIN, {NECROSIS_LABEL: SOFT})))
 
 

@@ -167,9 +167,10 @@ def test_models_are_judged_by_loads_that_they_have_never_seen(folder, small_box,
     printed = capsys.readouterr().out
     assert "linear: states no bounds\n" in printed and "bounds held for" not in printed
     other, few_loads = str(folder / "other.h5"), ["--count", "6", "--device", "cpu"]
-    assert main(["simulate", str(folder / "box.vtu"), "--out", other, "--young", "6000", *few_loads]) == 0
-    assert main(["judge", model, other]) == 2
-    assert "difference of two bodies" in capsys.readouterr().err
+    for words in (["--young", "6000"], ["--region", "tumour:6000", "--force"]):
+        assert main(["simulate", str(folder / "box.vtu"), "--out", other, *words, *few_loads]) == 0
+        assert main(["judge", model, other]) == 2
+        assert "difference of two bodies" in capsys.readouterr().err
     assert main(["judge", model, data]) == 2
     assert "was trained: simulate others" in capsys.readouterr().err
 

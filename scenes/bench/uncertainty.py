@@ -84,7 +84,12 @@ def changed(scene: Scene, draw: Draw) -> Scene:
     """
     tissue = tissue_of(scene)
     brain = replace(tissue, young=draw.stiffness * tissue.young, poisson=draw.poisson)
-    elasticity = Elasticity(brain, {TUMOUR_LABEL: replace(brain, young=draw.ratio * brain.young)})
+    others = {
+        label: replace(one, young=draw.stiffness * one.young, poisson=draw.poisson)
+        for label, one in scene.elasticity.regions.items()
+        if isinstance(one, Material)
+    }
+    elasticity = Elasticity(brain, {TUMOUR_LABEL: replace(brain, young=draw.ratio * brain.young), **others})
     skull = SKULLS[chosen(draw.skull, skulls_of(scene))]
 
     def other(effect: Effect) -> Effect:
@@ -126,17 +131,19 @@ def mesh_deviations(scene: Scene, draws: Sequence[Draw]) -> np.ndarray:
 
 
 def tissue_of(scene: Scene) -> Material:
-    """The one tissue of a scene.
+    """The brain's tissue in a scene; regions but the tumour may have another.
 
     Raises
     ------
     InputError
-        Another than of Young's modulus and Poisson's ratio, or several.
+        Another than of Young's modulus and Poisson's ratio, or one that the tumour has for itself.
     """
-    elasticity = next((effect for effect in scene.effects if isinstance(effect, Elasticity)), None)
-    if elasticity is None or not isinstance(elasticity.default, Material) or elasticity.regions:
+    elasticity = scene.elasticity
+    known = all(isinstance(one, Material) for one in elasticity.regions.values())
+    if not isinstance(elasticity.default, Material) or not known or TUMOUR_LABEL in elasticity.regions:
         raise InputError(
-            "priors are of Young's modulus and Poisson's ratio of one tissue: give the scene such a tissue."
+            "priors draw Young's modulus and Poisson's ratio of the brain, and how much stiffer the tumour is. "
+            "Give the scene such a tissue, and the tumour none of its own."
         )
     return elasticity.default
 

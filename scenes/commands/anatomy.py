@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.anatomy import PART_LABELS, Anatomy
+from sim.anatomy import PART_LABELS, Anatomy, region_name
 from sim.bodies.head_masks import head_masks
 from sim.bodies.intensity import sidecar, write_intensity
 from sim.bodies.label_volume import masked_subject
@@ -45,7 +45,6 @@ PRESETS = {
     # Tonutti et al. 2017: forces from 20 mm off the centre of a tumour of 12 mm radius, 98 cm2 of cortex left free.
     "seed": {"cover": 8.0, "craniotomy": 110.0},
 }
-PART_NAMES = {label: name for name, label in PART_LABELS.items()}
 NOTED = 3.0
 """Per cent of the tumour's volume: a mesh that misses more of it is noted."""
 
@@ -118,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
         )
     for part in subject.parts:
         if not anatomy.mesh.within(part.label).any():
-            said = f"has no {PART_NAMES[part.label]}, of which the labels mark {1e6 * part.volume:.2g} ml"
+            said = f"has no {region_name(part.label)}, of which the labels mark {1e6 * part.volume:.2g} ml"
             print(f"{args.out}: {said}: where it matters, ask for more nodes.", file=sys.stderr)
     files = {"mesh": str(args.out), "t1": None if intensity is None else str(beside)}
     summary = {**files, **figures, "seconds": round(time.perf_counter() - began, 2)}
@@ -147,7 +146,7 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost:
     mesh = anatomy.mesh
     volume = mesh.volumes[anatomy.in_tumour].sum()
     error, weight = surface_errors(mesh.nodes, mesh.surface, subject.brain)
-    regions = {PART_NAMES[part.label]: (_volume(mesh, part), part) for part in subject.parts}
+    regions = {region_name(part.label): (_volume(mesh, part), part) for part in subject.parts}
     return {
         "nodes": len(mesh.nodes),
         "tets": len(mesh.tets),

@@ -41,9 +41,9 @@ def run(args: argparse.Namespace) -> int:
     if args.batch is not None:
         at_least("--batch", args.batch, 1)
     width, height = size_of(args.size)
-    scene = scene_asked(args, args.scene)
-    scene = replace(scene, viewpoint=replace(scene.viewpoint, width=width, height=height))
     theatre = theatre_asked(args)
+    scene = scene_asked(args, args.scene, theatre)
+    scene = replace(scene, viewpoint=replace(scene.viewpoint, width=width, height=height))
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
     where = f"{machine(args.device)}; {scene.name} by {name}, {width} x {height}"

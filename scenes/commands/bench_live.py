@@ -19,7 +19,7 @@ from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 
 from ..script.shipped_files import template_path
-from .tissue_options import add_tissue_arguments, tissue_of
+from .tissue_options import add_tissue_arguments, elasticity_of
 
 if TYPE_CHECKING:
     from ..bench.live import Tally
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
             f"--frames {args.frames} --checked {checked} measures nothing: give 1 <= --checked <= --frames."
         )
     site = site_of(read_anatomy(args.anatomy or template_path()))
-    scene = replace(find_scene("press"), effects=pushed_effects(site.anatomy, tissue_of(args)))
+    scene = replace(find_scene("press"), effects=pushed_effects(site.anatomy, elasticity_of(args, site.anatomy.mesh)))
     fem = live_fem(scene, site, args.device, args.element)
     found = []
     for ride in RIDES:

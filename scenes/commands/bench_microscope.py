@@ -37,12 +37,13 @@ def run(args: argparse.Namespace) -> int:
 
     at_least("--seeds", args.seeds, 1)
     at_least("--every", args.every, 1)
-    scene = scene_asked(args, args.scene)
+    theatre = theatre_asked(args)
+    scene = scene_asked(args, args.scene, theatre)
     if isinstance(scene.sight, StereoSight):
         sight = replace(scene.sight, named=not args.cloud, vessels=not args.plain)
         scene = replace(scene, sight=sight)
     with bar("estimates") as heard:
-        found = list(rows(theatre_asked(args), scene, range(args.seeds), args.every, heard))
+        found = list(rows(theatre, scene, range(args.seeds), args.every, heard))
     if args.json:
         print(json.dumps([asdict(row) for row in found]))
         return 0

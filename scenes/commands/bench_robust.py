@@ -19,7 +19,7 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import check_output
 
 from ..script.shipped_files import template_path
-from .tissue_options import add_tissue_arguments, tissue_of
+from .tissue_options import add_tissue_arguments, elasticity_of
 
 if TYPE_CHECKING:
     from ..bench.robustness import Tally
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     if args.count < 2 or args.batch < 1:
         raise InputError(f"--count {args.count} --batch {args.batch} tries nothing: give --count >= 2, --batch >= 1.")
     anatomy = read_anatomy(args.anatomy or template_path())
-    effects = pushed_effects(anatomy, tissue_of(args))
+    effects = pushed_effects(anatomy, elasticity_of(args, anatomy.mesh))
     trial = Trial(anatomy, effects, args.element, args.device, args.batch)
     stated = f"{anatomy.digest} {effects!r} {args.element} count {args.count} seed {args.seed}"
     if args.out:

@@ -34,8 +34,9 @@ def run(args: argparse.Namespace) -> int:
     from ..script.scene import SCENES, find_scene
 
     at_least("--batch", args.batch, 1)
+    theatre = theatre_asked(args)
     try:
-        scene = scene_asked(args, args.scene)
+        scene = scene_asked(args, args.scene, theatre)
     except InputError as error:
         raise InputError(f"{error} What else is measured has a word of its own: `sulcus bench --help`.") from error
     if not any(isinstance(effect, ToolForce) for effect in scene.effects):
@@ -43,7 +44,6 @@ def run(args: argparse.Namespace) -> int:
             name for name in SCENES if find_scene(name).sight is None and ToolForce() in find_scene(name).effects
         )
         raise InputError(f"in the scene {scene.name} no tool pushes, which is what is measured: choose {pushing}.")
-    theatre = theatre_asked(args)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
     found, solvers = [], []

@@ -20,7 +20,7 @@ from sim.runtime.outside_files import read_as
 from .camera_options import add_camera, filmed_with_targets
 from .demo import add_bodies, scene_asked
 from .json_line import json_line
-from .tissue_options import add_element_argument, add_tissue_arguments
+from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
     add_bodies(parser)
-    add_tissue_arguments(parser)
+    add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
     add_camera(parser, "hand-held")
     parser.add_argument(
@@ -109,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
         if not 0.0 <= value < 1e4:
             raise InputError(f"{name} {value:g}: give a number that is not below 0.")
     theatre = open_theatre(args.anatomy, args.model, args.device)
-    scene = _seen(args)
+    scene = _seen(args, theatre)
     calibration, site = scene.viewpoint.calibration, theatre.site
     assert calibration is not None
     known = _known(args, calibration)
@@ -139,7 +139,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _seen(args: argparse.Namespace) -> Scene:
+def _seen(args: argparse.Namespace, theatre: Theatre) -> Scene:
     """The scene as a calibrated camera films it.
 
     Raises
@@ -147,7 +147,7 @@ def _seen(args: argparse.Namespace) -> Scene:
     InputError
         A scene whose tumour is found by what is seen, or a camera that zooms.
     """
-    scene = scene_asked(args, args.scene)
+    scene = scene_asked(args, args.scene, theatre)
     if scene.sight is not None:
         raise InputError(
             f"the scene {scene.name} finds its tumour by what is seen, and says its error: choose another."

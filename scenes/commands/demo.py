@@ -16,7 +16,7 @@ from sim.errors import InputError
 
 from .camera_options import add_camera, filmed
 from .style_option import add_style
-from .tissue_options import add_element_argument, add_tissue_arguments, tissue_asked
+from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
@@ -63,7 +63,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
         metavar="MS",
         help="take the most accurate deformer that needs at most this a frame [ms]",
     )
-    add_tissue_arguments(parser)
+    add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
 
@@ -86,17 +86,17 @@ def theatre_asked(args: argparse.Namespace) -> Theatre:
     return replace(theatre, limit=1e-3 * args.guard_mm)
 
 
-def scene_asked(args: argparse.Namespace, name: str) -> Scene:
+def scene_asked(args: argparse.Namespace, name: str, theatre: Theatre) -> Scene:
     """A scene by name, of the tissue and on the element that `add_theatre`'s arguments ask for, if they ask for any.
 
     Raises
     ------
     InputError
-        As `find_scene`, `tissue_of` and `Scene.made_of`.
+        As `find_scene` and `dressed`.
     """
     from ..script.scene import find_scene
 
-    return find_scene(name).made_of(tissue_asked(args), args.element)
+    return dressed(args, find_scene(name), theatre)
 
 
 def playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]) -> list[Scene]:
@@ -188,11 +188,12 @@ def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitSta
 
     from ..play.page.demo import Demo
 
+    theatre = theatre_asked(args)
+
     def asked(scene: str) -> Scene:
-        return filmed(args, scene_asked(args, scene))
+        return filmed(args, scene_asked(args, scene, theatre))
 
     scene = asked(args.scene)
-    theatre = theatre_asked(args)
     name = deformer_name(args, theatre, scene)
     anatomy = "the average of 152 healthy adults (ICBM 152)" if args.anatomy is None else args.anatomy.name
     try:

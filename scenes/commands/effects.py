@@ -11,7 +11,7 @@ from pathlib import Path
 from sim.arguments import at_least
 
 from .demo import scene_asked
-from .tissue_options import add_element_argument, add_tissue_arguments
+from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", "")
 
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument("--every", type=int, default=5, help="solve one frame in so many (default %(default)s)")
     parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
-    add_tissue_arguments(parser)
+    add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON line")
@@ -35,8 +35,8 @@ def run(args: argparse.Namespace) -> int:
     from ..play.effect_ablation import rows
 
     at_least("--every", args.every, 1)
-    scene = scene_asked(args, args.scene)
     theatre = open_theatre(args.anatomy, device=args.device)
+    scene = scene_asked(args, args.scene, theatre)
     table = sys.stderr if args.json else sys.stdout
     who = theatre.described("fem", scene)
     print(f"{scene.name} by {who}: all effects together, then what each adds to the others\n", file=table)

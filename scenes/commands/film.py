@@ -22,6 +22,7 @@ from .json_line import json_line
 from .outputs import add_force, claimed, claimed_folder, claimed_frames
 
 if TYPE_CHECKING:
+    from ..play.deformers import Theatre
     from ..play.overlay.filming import Shot
     from ..play.player import Player
     from ..script.scene import Scene
@@ -106,14 +107,14 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"{name} {value:g}: give a number that is not below 0.")
     shift, turn = args.registered
     taking = Taking(args.blur, args.noise, tuple(Trouble(*each) for each in args.trouble), args.seed)
-    scene = _scene(args)
+    theatre = theatre_asked(args)
+    scene = _scene(args, theatre)
     if all("gap" in taking.happening(time) for time in scene.times[:: args.every].tolist()):
         raise InputError("no picture would be taken: give --seconds and --trouble that leave some.")
     calibration = scene.viewpoint.calibration
     assert calibration is not None
     folder = claimed_folder(args.out, "film and its truth")
     paths = {name: claimed(folder / name, Path(name).suffix, kind, args.force) for name, kind in FILES.items()}
-    theatre = theatre_asked(args)
     player = theatre.player(args.deformer or "fem", scene)
     mounts = mounted(player)
     shots: list[Shot] = []
@@ -137,9 +138,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _scene(args: argparse.Namespace) -> Scene:
+def _scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
     """The scene as the camera sees it, and no longer than is asked for."""
-    scene = filmed_with_targets(args, scene_asked(args, args.scene))
+    scene = filmed_with_targets(args, scene_asked(args, args.scene, theatre))
     if args.readout is not None:
         view = scene.viewpoint
         assert view.calibration is not None

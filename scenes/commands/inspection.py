@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from sim.bodies.head_masks import HeadMasks
+from sim.anatomy import NECROSIS_LABEL, region_name
+from sim.bodies.head_masks import NECROSIS, HeadMasks
 from sim.bodies.one_space import share_on
 from sim.bodies.placement import side_of
 from sim.bodies.subject import Subject
+from sim.effects import Elasticity
+from sim.material import Tissue
 
 # [ml] Brains of adults, with their ventricles: beyond, a mask lacks a part or holds more than brain.
 SMALL, LARGE = 850.0, 2000.0
@@ -41,6 +44,8 @@ class Inspection:
         Of the tumour: volume and place in words, the largest first.
     parts
         Volumes of the other tissues that the labels tell.
+    regions
+        Those of them that become regions, and what they are made of, in words.
     depth
         From the tumour to the nearest cortex.
     opening
@@ -61,6 +66,7 @@ class Inspection:
     tumour: float
     pieces: tuple[tuple[float, str], ...]
     parts: dict[str, float]
+    regions: dict[str, str]
     depth: float
     opening: tuple[float, float, float]
     place: str
@@ -82,12 +88,16 @@ class Inspection:
             f"brain {self.brain:.0f} ml; tumour {self.tumour:.2f} ml in {_counted(len(pieces), 'piece')}",
             *shown,
             *([f"  and {hidden} smaller"] if hidden > 0 else []),
-            *(f"{name} {volume:.2f} ml" for name, volume in self.parts.items()),
+            *(f"{name} {volume:.2f} ml: {self._made_of(name)}" for name, volume in self.parts.items()),
             f"tumour {self.depth:.0f} mm under the nearest cortex, give or take a voxel of {error:.1f} mm",
             f"opening: {self.place}, at {at} mm (RAS), {self.distance:.0f} mm from the tumour",
             f"voxels {' x '.join(f'{edge:.3g}' for edge in self.voxel)} mm, stored {self.axes} "
             f"({'mirrored, as many scanners do' if self.mirrored else 'not mirrored'}; left is where its affine says)",
         ]
+
+    def _made_of(self, part: str) -> str:
+        around = "tumour" if part == NECROSIS else "brain"
+        return f"a region of its own, {self.regions[part]}" if part in self.regions else f"{around} like the rest"
 
     def figures(self) -> dict[str, Any]:
         """The same as JSON, with units in the names: volumes to a microlitre, lengths to 0.1 mm, voxels to 1 um."""
@@ -97,6 +107,7 @@ class Inspection:
             "tumour_ml": round(self.tumour, 3),
             "tumour_pieces": pieces,
             "parts_ml": {name: round(volume, 3) for name, volume in self.parts.items()},
+            "regions": self.regions,
             "depth_mm": round(self.depth, 1),
             "opening": {"at_mm": [round(value, 1) + 0.0 for value in self.opening], "side": self.place},
             "distance_mm": round(self.distance, 1),
@@ -107,8 +118,8 @@ class Inspection:
         }
 
 
-def inspected(masks: HeadMasks, subject: Subject) -> Inspection:
-    """What would be made of `masks` and of the `subject` in them."""
+def inspected(masks: HeadMasks, subject: Subject, regions: Mapping[int, Tissue]) -> Inspection:
+    """What would be made of `masks` and of the `subject` in them, with tissues of regions by label."""
     affine = masks.affine
     edges, voxel = 1e3 * np.linalg.norm(affine[:3, :3], axis=0), 1e6 * abs(float(np.linalg.det(affine[:3, :3])))
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
@@ -118,6 +129,7 @@ def inspected(masks: HeadMasks, subject: Subject) -> Inspection:
         tumour=1e6 * subject.tumour_volume,
         pieces=tuple((1e6 * one.volume, side_of(one.centre, low, high)) for one in subject.pieces),
         parts={name: voxel * float(mask.sum()) for name, mask in masks.parts.items()},
+        regions={region_name(part.label): _tissue(part.label, regions) for part in subject.parts},
         depth=1e3 * float(KDTree(subject.cortex).query(subject.interface)[0].min()),
         opening=tuple((1e3 * subject.site).tolist()),
         place=side_of(subject.site, low, high),
@@ -128,6 +140,13 @@ def inspected(masks: HeadMasks, subject: Subject) -> Inspection:
         warnings=(),
     )
     return replace(found, warnings=(*subject.notes, *_warnings(found, subject)))
+
+
+def _tissue(label: int, regions: Mapping[int, Tissue]) -> str:
+    """What a region is made of, in words."""
+    tissue = Elasticity(None, regions).of(label)
+    around = "tumour" if label == NECROSIS_LABEL else "brain"
+    return f"of the {around}'s tissue" if tissue is None else str(tissue)
 
 
 def axes_of(affine: np.ndarray) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 
 import numpy as np
@@ -40,12 +41,12 @@ def run(args: argparse.Namespace) -> int:
     nodes = data.anatomy.tumour_nodes
     truth = data.displacement(nodes)[data.good]
     for name, model in models.items():
-        for what in ("tissue", "element"):
-            trained, here = model.training.get(what), data.provenance.get(what)
-            if trained != here:
+        trained, here = _physics(model.training), _physics(data.provenance)
+        for what in here:
+            if trained[what] != here[what]:
                 raise InputError(
-                    f"{args.data}: its {what} is {here}, but {name} was trained on {trained}: that would judge the "
-                    "difference of two bodies. Simulate with the model's own."
+                    f"{args.data}: its {what} is {here[what]}, but {name} was trained on {trained[what]}: that would "
+                    "judge the difference of two bodies. Simulate with the model's own."
                 )
     for name, model in models.items():
         if model.envelope.repeats(model.asked(loads).point, data.anatomy.mesh.nodes):
@@ -84,3 +85,10 @@ def run(args: argparse.Namespace) -> int:
             if name in forces:
                 print(f"{name}: the tool's force: {forces[name]}")
     return 0
+
+
+def _physics(stated: Mapping[str, str]) -> dict[str, object]:
+    """What bodies must share to be compared, as a file states it: tissue, with that of regions, and element."""
+    from surrogate.data.stated_tissue import BRAIN, stated_tissue
+
+    return {"tissue": stated_tissue(stated) if BRAIN in stated else None, "element": stated.get("element")}

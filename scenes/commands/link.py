@@ -17,7 +17,7 @@ import numpy as np
 from sim.errors import InputError
 
 from .interrupt import until_ended
-from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments
+from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments
 from .tracked_scene import mover, tracked_scene
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--camera", metavar="K.yaml", help="from `sulcus calibrate`: IMAGE is drawn into and sent back")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after so long (default: never)")
-    add_tissue_arguments(parser)
+    add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_skull_argument(parser)
     add_element_argument(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for finite elements and pictures")
@@ -202,7 +202,7 @@ def opened(args: argparse.Namespace) -> Session:
     if said:
         print(f"sulcus link: {said}", file=sys.stderr)
     tool = tool or _tool_of(theatre, args.anatomy)
-    scene = tracked_scene(args, tool.shape)
+    scene = tracked_scene(args, tool.shape, theatre)
     deformer, who = mover(args, theatre, scene, True)
     stage, tracking = theatre.stage(scene), 1e-3 * args.tracking_mm
     eye = None

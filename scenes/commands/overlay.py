@@ -23,7 +23,7 @@ from .json_line import json_line
 from .outputs import add_force, claimed
 from .poses_options import add_poses, demand_poses, elsewhere_of
 from .style_option import add_style
-from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments
+from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments
 from .tracked_scene import REST, mover, tracked_scene
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=8080, help="of the page, or the next free (default %(default)s)")
     parser.add_argument("--seconds", type=float, default=np.inf, help="end the page after so long (default: never)")
     add_poses(parser)
-    add_tissue_arguments(parser)
+    add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_skull_argument(parser)
     add_element_argument(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for finite elements and pictures")
@@ -240,7 +240,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     said = other_mesh(registration, theatre.anatomy, args.registration)
     if said:
         print(f"sulcus overlay: {said}", file=sys.stderr)
-    scene = tracked_scene(args, None if tool is None else tool.shape)
+    scene = tracked_scene(args, None if tool is None else tool.shape, theatre)
     stage = theatre.stage(scene)
     deformer, who = mover(args, theatre, scene, tool is not None)
     motion = ToolMotion(stage, deformer)

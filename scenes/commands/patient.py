@@ -6,14 +6,16 @@ import argparse
 import json
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
+from sim.anatomy import PART_LABELS, REGION_NAMES, TUMOUR_LABEL
 from sim.bodies.head_masks import head_masks
 from sim.bodies.label_volume import masked_subject
 from sim.bodies.subject import MeshPlan, opened_cortex
 from sim.elements import RECOMMENDED
 from sim.errors import InputError
-from sim.material import BRAIN, LAWS
+from sim.material import BRAIN, LAWS, Tissue
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.timing import listened
 from surrogate.data.disc_split import APART, FEWEST
@@ -23,7 +25,7 @@ from .devices_option import add_devices
 from .label_options import add_label_arguments, label_words, regions_asked, sources_of
 from .outputs import add_force, claimed
 from .placement_options import add_opening_arguments, opened, opening_words
-from .tissue_options import add_element_argument
+from .tissue_options import OWN, add_element_argument, add_region_argument, regions_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,6 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Default: %(default)s",
     )  # fmt: skip
     parser.add_argument("--material", choices=LAWS, default=BRAIN.law, help="tissue law (default %(default)s)")
+    add_region_argument(parser)
     add_element_argument(parser)
     parser.add_argument(
         "--learners",
@@ -74,9 +77,15 @@ def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; an interrupted run goes on when the same command is given again."""
     # What can be said now is, not after minutes of reading and meshing.
     plan = MeshPlan(args.nodes, 1e-3 * args.craniotomy)
+    regions = regions_of(args.region, replace(BRAIN, law=args.material))
+    strange = set(regions) - set(REGION_NAMES.values())
+    if strange:
+        raise InputError(f"--region {min(strange)}: a patient has no such region. Choose from {', '.join(OWN)}.")
+    # A part of another stiffness must be a region.
+    args.regions = (*args.regions, *(name for name, label in PART_LABELS.items() if label in regions))
     claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, [args.labels, args.mask, args.tumour_in, args.t1])
     if args.inspect:
-        return _inspect(args, plan)
+        return _inspect(args, plan, regions)
     from sim.runtime.device import device_names
     from surrogate.training.train import check_learners
 
@@ -99,7 +108,8 @@ def run(args: argparse.Namespace) -> int:
          "--out", str(args.out), *force],
         ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--preset", args.preset,
          "--device", args.device, "--material", args.material,
-         *([] if args.element is None else ["--element", args.element]), *force],
+         *([] if args.element is None else ["--element", args.element]),
+         *(f"--region={text}" for text in args.region), *force],
         ["train", str(data), "--out", str(model), "--learners", args.learners, "--device", args.device,
          *force],
     ]  # fmt: skip
@@ -118,11 +128,12 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({"anatomy": str(args.out), "model": str(model), "seconds": seconds, "total": whole}))
     else:
         print(f"{_shares(seconds, whole)}\nready: sulcus demo --anatomy {args.out}{_physics(args)}")
-        print(f"for the error of the tumour: sulcus uncertainty press --anatomy {args.out}{_physics(args)}")
+        if TUMOUR_LABEL not in regions:  # which priors draw
+            print(f"for the error of the tumour: sulcus uncertainty press --anatomy {args.out}{_physics(args)}")
     return 0
 
 
-def _inspect(args: argparse.Namespace, plan: MeshPlan) -> int:
+def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tissue]) -> int:
     """Print what would be made, and draw it."""
     from ar.screen import write_png
 
@@ -134,7 +145,7 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan) -> int:
     claimed(picture, ".png", "a picture of sulcus", args.force, [args.labels, args.mask, args.tumour_in, args.t1])
     masks = head_masks(sources_of(args))
     subject = opened(masked_subject(masks, args.t1, regions=regions_asked(args)), args)
-    found = inspected(masks, subject)
+    found = inspected(masks, subject, regions)
     with written_whole(picture, ".png") as partial:
         write_png(partial, sheet(found, masks, subject, opened_cortex(subject, plan.craniotomy)))
     took = round(time.perf_counter() - began, 2)

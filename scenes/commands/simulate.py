@@ -20,7 +20,7 @@ from sim.deformation import Outcome
 from sim.effects import Effect, NodalForce, ToolContact, ToolForce, pushed_effects
 from sim.errors import InputError
 from sim.loads import Loads
-from sim.material import Tissue, tissue_to_json
+from sim.material import Tissue
 from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.device import device_names
 from sim.runtime.memory import Budget
@@ -30,6 +30,7 @@ from surrogate.data.crew import Asked, solving
 from surrogate.data.dataset import read_outcomes
 from surrogate.data.holding import HISTORY, drawn_times
 from surrogate.data.simulate import Solved, simulate
+from surrogate.data.stated_tissue import stating
 from surrogate.data.tool_loads import PRESETS, draw, refused_share, refused_words
 from surrogate.data.tool_poses import draw_poses, tool_of
 
@@ -38,7 +39,7 @@ from .companion_files import batch_begun, remove_data
 from .devices_option import add_devices
 from .interrupt import INTERRUPTED
 from .outputs import add_force, claimed
-from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
+from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, elasticity_of, tissue_of
 
 # Sizes [mm] of tools that press on a brain.
 SMALLEST_MM, LARGEST_MM = 0.1, 200.0
@@ -98,10 +99,11 @@ def run(args: argparse.Namespace) -> int:
     out = claimed(args.out, ".h5", DATA, args.force)
     with stage("draw"):
         anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
+        elasticity = elasticity_of(args, anatomy.mesh)
         tissue = tissue_of(args)
         tool, loads = _drawn(args, anatomy, tissue)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
-    effects: tuple[Effect, ...] = (*pushed_effects(anatomy, tissue, args.skull), NodalForce())
+    effects: tuple[Effect, ...] = (*pushed_effects(anatomy, elasticity, args.skull), NodalForce())
     if tool is not None:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
         effects = (*passive, ToolContact((tool,)))
@@ -113,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
             solver = closing.enter_context(solving(wanted, devices, partial(print, file=sys.stderr)))
         provenance = {
             "effects": repr(effects),
-            "tissue": tissue_to_json(tissue),
+            **stating(elasticity),
             "element": solver.element,
             "accuracy": repr(accuracy),
             "device": devices[0].split(":")[0],

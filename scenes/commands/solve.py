@@ -12,14 +12,14 @@ from sim.accuracy import FLOOR, Accuracy
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import UNITS, MeshFile, read_mesh, write_mesh
 from sim.deformation import Deformation, guess
-from sim.effects import SKULLS, Effect, Elasticity, Held, NodalForce
+from sim.effects import SKULLS, Effect, Held, NodalForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Cause, Loads, Nodal, Prescribed
 
 from .json_line import json_line
 from .outputs import add_force, claimed
-from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, regions_of, tissue_of
+from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, elasticity_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,13 +33,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_tissue_arguments(parser, whole=True)
     add_element_argument(parser, "p1, the file's linear tetrahedra as every other program takes them")
-    parser.add_argument(
-        "--region",
-        action="append",
-        default=[],
-        metavar="LABEL:YOUNG,POISSON",
-        help="other constants for one region, LABEL:C1,M1;C2,M2;K for ogden; may be repeated",
-    )
     parser.add_argument("--tolerance", type=float, default=1e-6, help="relative residual (default %(default)g)")
     parser.add_argument(
         "--precision",
@@ -67,14 +60,13 @@ def run(args: argparse.Namespace) -> int:
     """
     out = claimed(args.out, ".vtu", "a result of `sulcus solve`", args.force, [args.mesh])
     accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision)
-    tissue = tissue_of(args)
-    regions = regions_of(args.region, tissue)
     file = read_mesh(args.mesh, args.unit)
+    tissue = elasticity_of(args, file.mesh)
     anatomy, loads, notes = problem_of(file, args.mesh, UNITS[args.unit])
     for note in (*file.notes, *notes):
         print(f"{args.mesh}: {note}", file=sys.stderr)
     clock = time.perf_counter()
-    effects: list[Effect] = [Elasticity(tissue, regions), Held(), NodalForce()]
+    effects: list[Effect] = [tissue, Held(), NodalForce()]
     if anatomy.slide_normal.any():
         effects.append(SKULLS[args.skull])
     # The file's own elements: who compares with another program means the same discretisation.
@@ -99,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
         "residual": float(deformation.residual[0]),
         "load_fraction": reached,
         "element": fem.space.element,
-        "tissue": str(effects[0]),
+        "tissue": str(tissue),
         "skull": args.skull if anatomy.slide_normal.any() else None,
         "nodes": fem.space.count,
         "seconds": round(seconds, 4),

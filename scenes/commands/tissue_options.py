@@ -5,15 +5,32 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from sim.effects import SKULLS
+import numpy as np
+
+from sim.anatomy import REGION_NAMES, region_words
+from sim.effects import SKULLS, Elasticity
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
+from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
 
+if TYPE_CHECKING:
+    from ..play.deformers import Theatre
+    from ..script.scene import Scene
 
-def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False) -> None:
-    """Declare --material and the constants of its laws; the help describes each tissue if `whole`, else names it."""
+OWN = tuple(name for name in REGION_NAMES if name != "brain")
+"""Names of regions that may have a stiffness of their own."""
+AS_BRAIN = "the tissue of the brain"
+AS_LEARNED = f"what the models beside the anatomy learned, or {AS_BRAIN}"
+
+
+def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, default_regions: str = AS_BRAIN) -> None:
+    """Declare --material, the constants of its laws, and --region, of which the `default_regions` are said.
+
+    The help describes each tissue if `whole`, else names it.
+    """
     sets = f"{', '.join(MATERIALS)} (`sulcus solve --help` gives their time scales and sources)"
     if whole:
         each = (f"{name} holds for {known.time_scale}. Source: {known.source}" for name, known in MATERIALS.items())
@@ -44,6 +61,20 @@ def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False) -
         metavar="G1,TAU1;G2,TAU2",
         help="how the resistance to a change of shape relaxes: the share G goes with the time TAU [s]. In the scene "
         'retract it is "0.45,0.5;0.365,50"',
+    )
+    add_region_argument(parser, default_regions)
+
+
+def add_region_argument(parser: argparse.ArgumentParser, default: str = AS_BRAIN) -> None:
+    """Declare --region, and say what the `default` is."""
+    parser.add_argument(
+        "--region",
+        action="append",
+        default=[],
+        metavar="REGION:YOUNG[,POISSON]",
+        help=f"a region's own Young's modulus [Pa], and Poisson's ratio if it is another. Regions have a number or a "
+        f"name ({', '.join(OWN)}), as in oedema:2000 or 3:2000,0.45; with Ogden's law REGION:C1,M1;C2,M2;K. May be "
+        f"repeated. Default: {default}; necrosis that of the tumour",
     )
 
 
@@ -121,6 +152,18 @@ def _elastic(args: argparse.Namespace) -> Material | Ogden:
     )
 
 
+def elasticity_of(args: argparse.Namespace, mesh: TetMesh) -> Elasticity:
+    """The tissue asked for, of a mesh and its regions.
+
+    Raises
+    ------
+    InputError
+        As `tissue_of` and `regions_of`.
+    """
+    tissue = tissue_of(args)
+    return Elasticity(tissue, regions_of(args.region, tissue, mesh))
+
+
 def tissue_asked(args: argparse.Namespace) -> Tissue | None:
     """The tissue asked for, or None where no option of it is given."""
     constants = (args.young, args.poisson, args.ogden, args.bulk, args.prony)
@@ -137,24 +180,74 @@ def refuse(given: Mapping[str, object], material: str, owner: str) -> None:
             )
 
 
-def regions_of(texts: Sequence[str], tissue: Tissue) -> dict[int, Tissue]:
+def dressed(args: argparse.Namespace, scene: Scene, theatre: Theatre) -> Scene:
+    """A scene of the tissue and on the element that are asked for, if any are.
+
+    Other regions are as the anatomy's models learned them, unless the scene says what they are. In scenes of another
+    brain they are as many times as stiff as it.
+
+    Raises
+    ------
+    InputError
+        As `tissue_of`, `regions_of` and `Scene.made_of`.
+    """
+    made = scene.made_of(tissue_asked(args), args.element)
+    brain, own, learned = made.elasticity.default, made.elasticity.regions, theatre.learned_tissue
+    if args.region:
+        return made.with_regions(regions_of(args.region, brain or BRAIN, theatre.anatomy.mesh))
+    if learned is None or brain is None or learned.default is None:
+        return made
+    others = {label: one for label, one in learned.regions.items() if label not in own}
+    return made.with_regions({label: _beside(brain, one, learned.default) for label, one in others.items()})
+
+
+def _beside(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
+    """A region's tissue in a scene of this brain, where models learned it beside another; the brain's of other laws."""
+    if isinstance(region, Material | Ogden) and _at_once(brain) == _at_once(learned):
+        return replace(region, prony=brain.prony)
+    if not isinstance(brain, Material) or not isinstance(region, Material) or not isinstance(learned, Material):
+        return brain
+    poisson = brain.poisson if region.poisson == learned.poisson else region.poisson
+    return replace(brain, young=brain.young * region.young / learned.young, poisson=poisson)
+
+
+def _at_once(tissue: Tissue) -> Tissue:
+    """A tissue as if it did not relax."""
+    return replace(tissue, prony=()) if isinstance(tissue, Material | Ogden) else tissue
+
+
+def regions_of(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | None = None) -> dict[int, Tissue]:
     """Tissues by region label, of the law of `tissue`.
 
     Raises
     ------
     InputError
-        As `parse_region`; and a label that is given twice.
+        As `parse_region`; a region that is given twice, or that a `mesh` does not have.
     """
     pairs = [parse_region(text, tissue) for text in texts]
     labels = [label for label, _ in pairs]
     for label in labels:
         if labels.count(label) > 1:
-            raise InputError(f"--region {label} is given twice: give each label once.")
-    return dict(pairs)
+            raise InputError(f"--region {label} is given twice: give each region once.")
+        if mesh is not None and not mesh.within(label).any():
+            has = ", ".join(map(region_words, np.unique(mesh.region).tolist()))
+            raise InputError(f"--region {label}: the mesh has no {region_words(label)}. It has {has}.")
+    return dict(sorted(pairs))
+
+
+def region_label(text: str) -> int:
+    """A region's label, by its number or its name.
+
+    Raises
+    ------
+    ValueError
+        Neither.
+    """
+    return REGION_NAMES[text] if text in OWN else int(text)
 
 
 def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
-    """Read "LABEL:YOUNG,POISSON", or "LABEL:C1,M1;C2,M2;K" where `tissue` obeys Ogden's law.
+    """Read "REGION:YOUNG[,POISSON]", or "REGION:C1,M1;C2,M2;K" where `tissue` obeys Ogden's law.
 
     Raises
     ------
@@ -166,14 +259,17 @@ def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
         label, constants = text.split(":")
         if ogden:
             *terms, bulk = constants.split(";")
-            return int(label), Ogden(parse_terms(terms), float(bulk), tissue.prony)
-        young, poisson = constants.split(",")
-        return int(label), Material(tissue.law, float(young), float(poisson), tissue.prony)
+            return region_label(label), Ogden(parse_terms(terms), float(bulk), tissue.prony)
+        if not isinstance(tissue, Material):
+            raise InputError(f"tissue of the law {tissue.law} has no Young's modulus.")
+        young, *poisson = map(float, constants.split(","))
+        (ratio,) = poisson or (tissue.poisson,)
+        return region_label(label), replace(tissue, young=young, poisson=ratio)
     except InputError as error:
         raise InputError(f"--region {text}: {error}") from error
     except ValueError as error:
-        form = "LABEL:C1,M1;C2,M2;K, as in 2:1340,-19;148000" if ogden else "LABEL:YOUNG,POISSON, as in 2:9000,0.45"
-        raise InputError(f"--region {text}: write {form}.") from error
+        form = "REGION:C1,M1;C2,M2;K, as in 2:1340,-19;148000" if ogden else "REGION:YOUNG, as in oedema:2000"
+        raise InputError(f"--region {text}: write {form}. REGION is a number, or one of {', '.join(OWN)}.") from error
 
 
 def parse_terms(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:

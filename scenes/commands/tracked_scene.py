@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
-from .tissue_options import tissue_of
+from .tissue_options import dressed
 
 if TYPE_CHECKING:
     from sim.deformation import Deformer
@@ -21,15 +21,15 @@ REST = "rest"
 """The deformer that lets the brain stay as in the scan."""
 
 
-def tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
+def tracked_scene(args: argparse.Namespace, shape: BuiltIn | None, theatre: Theatre) -> Scene:
     """What acts on the brain: the tool, moved by pose, and the skull."""
     from sim.effects import SKULLS, Elasticity, Held, ToolContact
 
     from ..script.scene import Scene
 
     touched = () if shape is None else (ToolContact((shape,)),)
-    effects = (Elasticity(tissue_of(args)), Held(), SKULLS[args.skull], *touched)
-    return Scene(args.command, "A tracked tool.", effects=effects, element=args.element)
+    effects = (Elasticity(), Held(), SKULLS[args.skull], *touched)
+    return dressed(args, Scene(args.command, "A tracked tool.", effects=effects), theatre)
 
 
 def mover(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool) -> tuple[Deformer | None, str]:

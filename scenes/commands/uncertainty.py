@@ -19,7 +19,7 @@ from .demo import add_bodies, scene_asked
 from .fit import fitted_beside
 from .json_line import json_line
 from .outputs import claimed
-from .tissue_options import add_element_argument, add_tissue_arguments
+from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("scenes", nargs="*", help="built-in scenes, or MY_SCENE.py (default: all built-in scenes)")
     add_bodies(parser)
-    add_tissue_arguments(parser)
+    add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
     parser.add_argument(
         "--draws", type=int, default=40, help=f"bodies to draw and solve, {FEWEST} or more (default %(default)s)"
@@ -72,8 +72,8 @@ def run(args: argparse.Namespace) -> int:
 
     at_least("--draws", args.draws, FEWEST)
     at_least("--twins", args.twins, 0)
-    scenes = [scene_asked(args, name) for name in args.scenes or SCENES]
     theatre = open_theatre(args.anatomy, args.model, args.device)
+    scenes = [scene_asked(args, name, theatre) for name in args.scenes or SCENES]
     out = args.out or uncertainty_path(args.anatomy or template_path())
     # Before hours are spent; a file that is there is read, and scenes are added to it.
     claimed(out, ".json", "uncertainties", force=True)

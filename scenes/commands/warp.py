@@ -14,7 +14,7 @@ from sim.errors import InputError
 
 from .json_line import json_line
 from .outputs import add_force
-from .tissue_options import add_element_argument, add_tissue_arguments, tissue_asked
+from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--spacing", type=float, default=1.0, metavar="MM", help="of the fields' nodes [mm] (default %(default)s)"
     )
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for all that is written")
-    add_tissue_arguments(parser)
+    add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
     add_force(parser)
@@ -146,10 +146,9 @@ def scene_of(args: argparse.Namespace, theatre: Theatre) -> Scene:
     """
     from ..script.scene import find_scene
 
-    tissue = tissue_asked(args)
     if args.load is not None:
-        return replace(pushing(theatre, args.load), name="load").made_of(tissue, args.element)
-    scene = find_scene(args.scene).made_of(tissue, args.element)
+        return dressed(args, replace(pushing(theatre, args.load), name="load"), theatre)
+    scene = dressed(args, find_scene(args.scene), theatre)
     last = len(scene.times) - 1
     if not 0 <= args.frame <= last:
         raise InputError(f"--frame {args.frame}: {scene.name} has the frames 0 to {last}.")

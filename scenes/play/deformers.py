@@ -15,11 +15,13 @@ from sim.bodies.intensity import Intensity, read_intensity, sidecar
 from sim.bodies.meshfile import read_anatomy
 from sim.deformation import Deformation, Deformer, guess
 from sim.discretisation.space import recommended
+from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.fem import Fem, solver_named
 from sim.loads import Loads
 from sim.resected_fem import Operated, finite_elements
 from sim.runtime.device import find_device
+from surrogate.data.stated_tissue import BRAIN, stated_tissue
 from surrogate.locating.locator import Locator
 from surrogate.locating.locator_files import load_locator, locator_path
 from surrogate.model.applicability import refusal
@@ -81,6 +83,18 @@ class Theatre:
                 "makes it, in up to 13 minutes on two cores."
             )
         return load_locator(path, self.anatomy)
+
+    @cached_property
+    def learned_tissue(self) -> Elasticity | None:
+        """What its models learned from, with the tissue of regions; None where none states it.
+
+        Raises
+        ------
+        InputError
+            A statement that is no tissue.
+        """
+        stated = next((model.training for model in self.models.values() if BRAIN in model.training), None)
+        return None if stated is None else stated_tissue(stated)
 
     def lacks_locator(self, scene: Scene) -> bool:
         """Whether a scene has a sight, and no locator lies beside this anatomy."""

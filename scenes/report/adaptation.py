@@ -52,7 +52,7 @@ def simulate_debulked(study: Study, progress: Callable[[int], object]) -> None:
         return
     whole = not unfinished_path(path).exists()
     body, data = debulked(study.anatomy), study.dataset
-    effects = (*pushed_effects(body, study.tissue), NodalForce())
+    effects = (*pushed_effects(body, study.tissue_on(body)), NodalForce())
     begun = clock.perf_counter()
     fem = Fem(body, effects, TRAIN, study.device, None, study.element)
     reported = [0]

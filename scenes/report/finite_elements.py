@@ -11,7 +11,7 @@ from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.refine import refined
 from sim.discretisation.footprint import nearest_on
-from sim.effects import pushed_effects
+from sim.effects import Elasticity, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.locate import locate
@@ -93,7 +93,7 @@ def _adapt(study: Study, spec: Elements, load: Loads) -> float:
 
 def _fem(study: Study, spec: Elements, body: Anatomy) -> Fem:
     """Set up for single loads."""
-    effects = pushed_effects(body, tissue_of(study.tissue, spec.law))
+    effects = pushed_effects(body, tissue_of(study.tissue_on(body), spec.law))
     return Fem(body, effects, spec.accuracy, study.device, None, spec.element or study.element, live=True)
 
 
@@ -114,8 +114,13 @@ def body_of(study: Study, mesh: str) -> Anatomy:
     return read_anatomy(template_mesh(study.folder / "meshes", int(mesh)))
 
 
-def tissue_of(tissue: Tissue, law: str | None) -> Tissue:
-    """The tissue with another law of the same constants.
+def law_of(tissue: Elasticity) -> str | None:
+    """The name of the brain's law."""
+    return None if tissue.default is None else tissue.default.law
+
+
+def tissue_of(tissue: Elasticity, law: str | None) -> Elasticity:
+    """The tissue, in all regions, with another law of the same constants.
 
     Raises
     ------
@@ -124,9 +129,14 @@ def tissue_of(tissue: Tissue, law: str | None) -> Tissue:
     """
     if law is None:
         return tissue
-    if not isinstance(tissue, Material):
-        raise InputError(f"the data's tissue obeys {tissue.law}, whose constants no other law has: nothing to compare.")
-    return replace(tissue, law=law)
+
+    def obeying(one: Tissue | None) -> Tissue:
+        if not isinstance(one, Material):
+            has = "a law for each region" if one is None else f"{one.law}, whose constants no other law has"
+            raise InputError(f"the data's tissue obeys {has}: nothing to compare.")
+        return replace(one, law=law)
+
+    return Elasticity(obeying(tissue.default), {label: obeying(one) for label, one in tissue.regions.items()})
 
 
 def onto(body: Anatomy, loads: Loads) -> Loads:

@@ -40,7 +40,7 @@ def solve_reference(study: Study, progress: Callable[[int], object], accuracy: A
 
     def made() -> tuple[Fem, Located]:
         body = refined(study.anatomy) if study.fine else study.anatomy
-        fem = Fem(body, pushed_effects(body, study.tissue), accuracy, study.device, None, "p2")
+        fem = Fem(body, pushed_effects(body, study.tissue_on(body)), accuracy, study.device, None, "p2")
         return fem, locate(body.mesh, study.anatomy.mesh.nodes[study.drawn])
 
     _solve(study, "reference", study.played, made, progress)
@@ -51,7 +51,7 @@ def solve_beyond(study: Study, progress: Callable[[int], object]) -> None:
 
     def made() -> tuple[Fem, Located]:
         body = study.anatomy
-        fem = Fem(body, pushed_effects(body, study.tissue), TRAIN, study.device, None, study.element)
+        fem = Fem(body, pushed_effects(body, study.tissue_on(body)), TRAIN, study.device, None, study.element)
         return fem, locate(body.mesh, body.mesh.nodes[body.tumour_nodes])
 
     _solve(study, "beyond", study.outside, made, progress)

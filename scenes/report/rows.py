@@ -26,7 +26,7 @@ from sim.runtime.atomic_files import written_whole
 from surrogate.training.published_models import MACHINES
 from surrogate.training.train import LEARNERS
 
-from .finite_elements import HALVED, OWN, STANDARD, Elements
+from .finite_elements import HALVED, OWN, STANDARD, Elements, law_of
 from .learner import Learner
 from .measure import FAMILY, Spec, measured, ready
 from .row import Row
@@ -49,7 +49,7 @@ def star(study: Study, remesh: bool = True) -> tuple[Elements, ...]:
         *(Elements(f"FEM {name}", mesh=mesh) for name, mesh in meshes.items()),
         *(Elements(f"FEM {_power(size)}", tolerance=size) for size in TOLERANCES if size != STANDARD),
         Elements("FEM float64", precision="float64"),
-        *(Elements(f"FEM {law} law", law=law) for law in LAWS if law != study.tissue.law),
+        *(Elements(f"FEM {law} law", law=law) for law in LAWS if law != law_of(study.tissue)),
     )
 
 

@@ -12,15 +12,16 @@ import numpy as np
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy
+from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Pushed
-from sim.material import BRAIN, Tissue, tissue_from_json
 from sim.runtime.device import find_device
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.disc_split import Split, leave_discs_out
 from surrogate.data.encode import directions
+from surrogate.data.stated_tissue import BRAIN, stated_tissue
 from surrogate.training.expansion import Expansion
 
 from ..script.shipped_files import template_path
@@ -80,10 +81,14 @@ class Study:
         return self.anatomy.digest == read_anatomy(template_path()).digest
 
     @cached_property
-    def tissue(self) -> Tissue:
-        """The tissue that the data was made with."""
-        stated = self.dataset.provenance.get("tissue")
-        return BRAIN if stated is None else tissue_from_json(stated)
+    def tissue(self) -> Elasticity:
+        """The tissue that the data was made with, and that of regions."""
+        stated = self.dataset.provenance
+        return stated_tissue(stated) if BRAIN in stated else Elasticity()
+
+    def tissue_on(self, body: Anatomy) -> Elasticity:
+        """The same for a body that may lack some of the regions."""
+        return self.tissue.on(np.unique(body.mesh.region).tolist())
 
     @property
     def element(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Real
@@ -155,6 +156,20 @@ class Scene:
             return replace(effect, default=replace(cast(Any, tissue), **series))
 
         return replace(self, effects=tuple(made(effect) for effect in self.effects), element=element or self.element)
+
+    @property
+    def elasticity(self) -> Elasticity:
+        """What its tissue is; without laws where it has none."""
+        return next((effect for effect in self.effects if isinstance(effect, Elasticity)), Elasticity(None))
+
+    def with_regions(self, regions: Mapping[int, Tissue]) -> Scene:
+        """The scene with tissues of some regions by label, in place of those that it has of them."""
+
+        def made(effect: Effect) -> Effect:
+            own = isinstance(effect, Elasticity)
+            return replace(effect, regions={**effect.regions, **regions}) if own else effect
+
+        return replace(self, effects=tuple(map(made, self.effects))) if regions else self
 
     @property
     def times(self) -> np.ndarray:

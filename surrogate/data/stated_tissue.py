@@ -8,15 +8,16 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity
 from sim.material import tissue_from_json, tissue_to_json
 
-BRAIN, TUMOUR = "tissue", "tumour's tissue"
-"""The keys of both; a tumour that is made of what the brain is has none."""
+BRAIN = "tissue"
+"""The key of the brain's tissue. A region that is made of what the brain is has none of its own."""
+TUMOUR, REGION = "tumour's tissue", "tissue of region "
+"""The key of the tumour's tissue, and how that of another region's begins, before its label."""
 
 
 def stating(tissue: Elasticity) -> dict[str, str]:
     """What the provenance of data of this tissue states of it; nothing of a brain without law."""
     stated = {} if tissue.default is None else {BRAIN: tissue_to_json(tissue.default)}
-    other = tissue.regions.get(TUMOUR_LABEL)
-    return stated if other is None else {**stated, TUMOUR: tissue_to_json(other)}
+    return stated | {_key(label): tissue_to_json(tissue.regions[label]) for label in sorted(tissue.regions)}
 
 
 def stated_tissue(stated: Mapping[str, str]) -> Elasticity:
@@ -27,5 +28,11 @@ def stated_tissue(stated: Mapping[str, str]) -> Elasticity:
     InputError
         A text that is no tissue.
     """
-    tumour = {TUMOUR_LABEL: tissue_from_json(stated[TUMOUR])} if TUMOUR in stated else {}
-    return Elasticity(tissue_from_json(stated[BRAIN]), tumour)
+    numbers = (key.removeprefix(REGION) for key in stated if key.startswith(REGION))
+    labels = {TUMOUR_LABEL, *(int(number) for number in numbers if number.lstrip("-").isdecimal())}
+    regions = {label: tissue_from_json(stated[_key(label)]) for label in sorted(labels) if _key(label) in stated}
+    return Elasticity(tissue_from_json(stated[BRAIN]), regions)
+
+
+def _key(label: int) -> str:
+    return TUMOUR if label == TUMOUR_LABEL else f"{REGION}{label}"

@@ -8,9 +8,8 @@ from html import escape
 import numpy as np
 
 from ar.overlay import hud
-from sim.anatomy import TUMOUR_LABEL
+from sim.anatomy import region_name
 from sim.deformation import Deformation, Outcome
-from sim.effects import Elasticity
 from sim.material import Material, Tissue
 
 from ...script.scene import Scene
@@ -120,10 +119,9 @@ def side(site: Site) -> str:
 
 def fem_words(theatre: Theatre, scene: Scene) -> str:
     """Element and tissue that the theatre's finite elements have in a scene."""
-    elasticity = next((effect for effect in scene.effects if isinstance(effect, Elasticity)), Elasticity(None))
-    element, tumour = theatre.element_of(scene), elasticity.regions.get(TUMOUR_LABEL)
-    own = "" if tumour is None else f"; the tumour of {tissue_words(tumour)}"
-    return f"{ELEMENTS.get(element, element)}, {tissue_words(elasticity.default)}{own}"
+    element, elasticity = theatre.element_of(scene), scene.elasticity
+    own = (f"; the {region_name(label)} of {tissue_words(one)}" for label, one in elasticity.regions.items())
+    return f"{ELEMENTS.get(element, element)}, {tissue_words(elasticity.default)}{''.join(own)}"
 
 
 def tissue_words(tissue: Tissue | None) -> str:

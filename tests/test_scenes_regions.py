@@ -1,0 +1,162 @@
+"""Regions of a stiffness of their own, by `--region`: from simulate and train to the scenes that play the models."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_sim_necrosis import hollowed, necrotic_labels
+from theatres import short, small
+
+from scenes.bench.uncertainty import changed, tissue_of
+from scenes.builtin.retract import RELAXING
+from scenes.cli import main
+from scenes.commands.tissue_options import add_element_argument, add_tissue_arguments, dressed
+from scenes.play.deformers import open_theatre
+from scenes.script.priors import Draw
+from scenes.script.scene import find_scene
+from sim.accuracy import TRAIN
+from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
+from sim.bodies.meshfile import write_anatomy
+from sim.effects import Elasticity, pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.material import BRAIN, Material
+from surrogate.data.dataset import read_dataset
+from surrogate.data.stated_tissue import stated_tissue, stating
+from surrogate.training.expansion import Expansion
+
+STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=500.0)
+TISSUE = Elasticity(BRAIN, {TUMOUR_LABEL: STIFF, NECROSIS_LABEL: SOFT})
+WORDS = "--region", "necrosis:500", "--region", "tumour:9000"
+
+
+@pytest.fixture(scope="module")
+def data(small_box, tmp_path_factory):
+    """Two loads of a body with a soft core, simulated by the command."""
+    folder = tmp_path_factory.mktemp("regions")
+    write_anatomy(folder / "body.vtu", hollowed(small_box))
+    assert main(["simulate", str(folder / "body.vtu"), "--out", str(folder / "a.h5"), *RUN, *WORDS]) == 0
+    return folder / "a.h5"
+
+
+RUN = "--count", "2", "--device", "cpu", "--element", "p1", "--json"
+
+
+@pytest.fixture(scope="module")
+def theatre():
+    """The template with a soft core, and a model that states that it learned from it."""
+    whole = open_theatre(device="cpu")
+    body, model = hollowed(whole.anatomy), whole.models["series-gp"]
+    learned = replace(model, anatomy=body, training={**model.training, **stating(TISSUE)})
+    return replace(whole, anatomy=body, models={"series-gp": learned})
+
+
+def asked(theatre, scene, *words):
+    """The scene as a command makes it."""
+    parser = argparse.ArgumentParser()
+    add_tissue_arguments(parser)
+    add_element_argument(parser)
+    return dressed(parser.parse_args(words), scene, theatre)
+
+
+class TestData:
+    def test_are_of_the_regions_tissue_and_state_it(self, data):
+        found = read_dataset(data)
+        assert stated_tissue(found.provenance) == TISSUE
+        truth = Fem(found.anatomy, pushed_effects(found.anatomy, TISSUE), TRAIN, "cpu", element="p1").deform(
+            found.loads
+        )
+        stored = found.displacement(np.arange(len(found.anatomy.mesh.nodes)))
+        assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
+
+    def test_are_trained_on_with_it(self, data):
+        assert TISSUE in Expansion(read_dataset(data), "cpu").fem().effects
+
+    def test_do_not_go_on_with_another(self, data, capsys):
+        command = ["simulate", str(data.with_name("body.vtu")), "--out", str(data), *RUN]
+        assert main([*command, "--region", "necrosis:600"]) == 2
+        assert "was made with effects" in capsys.readouterr().err
+
+
+class TestScenes:
+    def test_have_what_the_models_learned(self, theatre):
+        scene = asked(theatre, short())
+        assert scene.elasticity == TISSUE and theatre.refusals(scene) == {"series-gp": None}
+
+    def test_that_ask_for_another_are_refused_the_model(self, theatre):
+        scene = asked(theatre, short(), "--region", "5:400")
+        assert scene.elasticity == Elasticity(BRAIN, {NECROSIS_LABEL: replace(BRAIN, young=400.0)})
+        with pytest.raises(InputError, match=r"E 0\.5 kPa.*, and here it is .*\(necrosis\): neo-hookean, E 0\.4 kPa"):
+            theatre.deformer("series-gp", scene)
+        assert theatre.refusals(short())["series-gp"] is not None  # as the scene has it, without a command
+
+    def test_of_another_brain_have_it_as_many_times_as_stiff(self, theatre):
+        for scene in (asked(theatre, short(), "--young", "2100", "--poisson", "0.45"), find_scene("brain_shift")):
+            found = asked(theatre, scene).elasticity
+            assert found.default == Material(BRAIN.law, 2100.0, 0.45)
+            assert found.of(NECROSIS_LABEL) == Material(BRAIN.law, 350.0, 0.45)
+        minutes = asked(theatre, short(), "--material", "minutes").elasticity
+        assert minutes.of(NECROSIS_LABEL) == minutes.default  # Ogden's constants are no Young's modulus
+
+    def test_that_relax_do_so_in_every_region(self, theatre):
+        found = asked(theatre, find_scene("retract")).elasticity
+        assert found.default == RELAXING
+        assert found.of(NECROSIS_LABEL) == replace(SOFT, prony=RELAXING.prony)
+
+    def test_keep_what_they_say_themselves(self, theatre):
+        own = find_scene("sag").elasticity
+        found = asked(theatre, find_scene("sag")).elasticity
+        assert found.of(TUMOUR_LABEL) == own.of(TUMOUR_LABEL) != STIFF and found.of(NECROSIS_LABEL) != own.of(5)
+
+    def test_of_a_region_that_is_not_there_are_refused(self, theatre):
+        for word in ("oedema:2000", "3:2000", "-1:5"):
+            with pytest.raises(InputError, match=r"the mesh has no region .* It has region 1 \(brain\), region 2"):
+                asked(theatre, short(), f"--region={word}")
+
+    def test_draw_bodies_that_are_as_many_times_as_stiff(self):
+        scene = small().with_regions({NECROSIS_LABEL: SOFT})
+        assert tissue_of(scene) == BRAIN
+        draw = Draw(stiffness=2.0, poisson=0.45, ratio=3.0, skull=0.5, tip=(0.0, 0.0, 0.0), mesh=0.0)
+        found = changed(scene, draw).elasticity
+        assert found.of(TUMOUR_LABEL) == replace(BRAIN, young=6.0 * BRAIN.young, poisson=0.45)
+        assert found.of(NECROSIS_LABEL) == replace(BRAIN, young=1000.0, poisson=0.45)
+        with pytest.raises(InputError, match="the tumour none of its own"):
+            tissue_of(small().with_regions({TUMOUR_LABEL: STIFF}))
+
+
+class TestPatient:
+    def test_hands_them_on(self, tmp_path, monkeypatch):
+        steps: list[list[str]] = []
+        monkeypatch.setattr("scenes.cli.main", lambda step: steps.append(step) or 0)
+        labels = ["a.nii", "--brain", "1", "--tumour", "3", "--necrosis", "6", *WORDS, "--region", "oedema:2000"]
+        assert main(["patient", *labels, "--out", str(tmp_path / "me.vtu"), "--device", "cpu"]) == 0
+        assert "--necrosis=6" in steps[0] and "--regions=oedema,necrosis" in steps[0]
+        assert steps[1][-3:] == ["--region=necrosis:500", "--region=tumour:9000", "--region=oedema:2000"]
+
+    def test_shows_them_first(self, tmp_path, capsys):
+        path = necrotic_labels(tmp_path)
+        words = [
+            "patient",
+            str(path),
+            "--brain",
+            "1",
+            "--tumour",
+            "3",
+            "--necrosis",
+            "6",
+            "--out",
+            str(tmp_path / "a.vtu"),
+        ]
+        assert main([*words, "--inspect"]) == 0
+        assert "ml: a region of its own, of the tumour's tissue\n" in capsys.readouterr().out
+        assert main([*words, "--inspect", "--force", "--json", "--region", "necrosis:500"]) == 0
+        assert json.loads(capsys.readouterr().out)["regions"] == {"necrosis": "neo-hookean, E 0.5 kPa, nu 0.49"}
+
+    def test_refuses_a_region_that_no_patient_has(self, tmp_path, capsys):
+        words = "patient", "a.nii", "--brain", "1", "--tumour", "3", "--out", str(tmp_path / "a.vtu")
+        assert main([*words, "--region", "7:300"]) == 2
+        assert "a patient has no such region. Choose from tumour, oedema" in capsys.readouterr().err
