@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from sim.anatomy import PART_LABELS, Anatomy, region_name
+from sim.bodies.dural_septa import SEPTA, walled
 from sim.bodies.head_masks import head_masks
 from sim.bodies.intensity import sidecar, write_intensity
 from sim.bodies.label_volume import masked_subject
@@ -131,7 +132,7 @@ def _given(args: argparse.Namespace) -> dict[str, float | str]:
 
 def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
     if args.labels is None:
-        for name in ("brain", "tumour", "convention", "tumour_in", *PART_LABELS, "regions"):
+        for name in ("brain", "tumour", "convention", "tumour_in", *PART_LABELS, *SEPTA, "regions"):
             if getattr(args, name):
                 option = name.replace("_", "-")
                 raise InputError(
@@ -146,6 +147,7 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost:
     mesh = anatomy.mesh
     volume = mesh.volumes[anatomy.in_tumour].sum()
     error, weight = surface_errors(mesh.nodes, mesh.surface, subject.brain)
+    septa = [int((walled(mesh, one) & anatomy.held.all(axis=1)).sum()) for one in subject.septa]
     regions = {region_name(part.label): (_volume(mesh, part), part) for part in subject.parts}
     return {
         "nodes": len(mesh.nodes),
@@ -153,6 +155,7 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost:
         "tumour_nodes": len(anatomy.tumour_nodes),
         "craniotomy_nodes": int(anatomy.craniotomy.sum()),
         "held_nodes": int(anatomy.held.any(axis=1).sum()),
+        "septa_nodes": {septum.name: held for septum, held in zip(subject.septa, septa, strict=True)},
         "sliding_nodes": int(anatomy.slide_normal.any(axis=1).sum()),
         "worst_dihedral_deg": round(float(dihedral_angles(mesh.nodes, mesh.tets).min()), 2),
         "brain_ml": round(float(mesh.volumes.sum()) * 1e6, 2),
@@ -213,6 +216,7 @@ def _sentences(figures: dict) -> str:
         "brain {brain_ml} ml; surface off by {surface_error_mean_mm} mm mean, {surface_error_p95_mm} mm p95",
         "tumour {tumour_ml} ml ({tumour_volume_error_percent:+} % of the label's), {tumour_nodes} nodes",
         *(_region(name, volume, figures) for name, volume in figures["regions_ml"].items()),
+        *(f"{name} {held} nodes that do not move" for name, held in figures["septa_nodes"].items()),
         *_pieces(figures["tumour_pieces"], figures["opening"]["over"]),
         f"opening: {_said(figures['opening'])}",
         "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} sliding, {held_nodes} held",

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from sim.anatomy import NECROSIS_LABEL, region_name
+from sim.bodies.dural_septa import SEPTA
 from sim.bodies.head_masks import NECROSIS, HeadMasks
 from sim.bodies.one_space import share_on
 from sim.bodies.placement import side_of
@@ -27,6 +28,8 @@ FAR = 0.040
 OBLONG = 2.5
 # Share of the brain that a T1 in the same space covers, at least.
 COVERED = 0.98
+# [ml] Of a sheet of dura, a few voxels thick.
+THICK = 40.0
 AXES = ("LR", "PA", "IS")
 # Pieces that are listed.
 MOST = 4
@@ -96,6 +99,8 @@ class Inspection:
         ]
 
     def _made_of(self, part: str) -> str:
+        if part in SEPTA:
+            return "a wall, which does not move"
         around = "tumour" if part == NECROSIS else "brain"
         return f"a region of its own, {self.regions[part]}" if part in self.regions else f"{around} like the rest"
 
@@ -167,6 +172,11 @@ def _warnings(found: Inspection, subject: Subject) -> Iterator[str]:
         yield f"the tumour has {100.0 * found.tumour / found.brain:.0f} % of the brain: are these its labels?"
     if found.depth <= max(found.voxel):
         yield "the tumour touches the cortex"
+    for septum in subject.septa:
+        if found.parts[septum.name] > THICK:
+            yield f"a {septum.name} of {found.parts[septum.name]:.0f} ml is no sheet: are these its labels?"
+        if KDTree(septum.points).query(subject.interface)[0].min() <= 1e-3 * max(found.voxel):
+            yield f"the tumour touches the {septum.name}, where it does not move"
     if len(found.pieces) > 1:
         yield f"the tumour lies in {len(found.pieces)} pieces, and the skull is opened over one of them"
     if 1e-3 * found.distance > FAR:

@@ -28,6 +28,8 @@ COLOURS: dict[str, Colour] = {
     "brain": BRAIN,
     "ventricles": (66, 132, 214),
     "oedema": (222, 178, 72),
+    "falx": (236, 236, 226),
+    "tentorium": (236, 236, 226),
     "tumour": (214, 62, 62),
     "necrosis": (122, 28, 58),
     "left out": (206, 92, 206),

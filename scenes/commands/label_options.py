@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sim.anatomy import PART_LABELS
 from sim.bodies.conventions import CONVENTIONS
+from sim.bodies.dural_septa import SEPTA
 from sim.bodies.head_masks import Sources
 from sim.bodies.label_map import Label
 
@@ -39,6 +40,12 @@ def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None
             f"--{name}", type=labels, metavar="LABELS",
             help=f"labels that are {name}: they count as {counts}, and become region {number} for its own stiffness",
         )  # fmt: skip
+    for name in SEPTA:
+        parser.add_argument(
+            f"--{name}", type=labels, metavar="LABELS",
+            help=f"labels that are {name}, a sheet of dura: they count as brain, and what lies at them does not move. "
+            "No convention marks it",
+        )  # fmt: skip
     parser.add_argument(
         "--regions", type=lambda text: tuple(text.split(",")), default=(), metavar="NAMES",
         help=f"parts that the convention marks and that become regions, of {', '.join(PART_LABELS)}",
@@ -62,11 +69,11 @@ def sources_of(args: argparse.Namespace) -> Sources:
 
 def regions_asked(args: argparse.Namespace) -> tuple[str, ...]:
     """The parts of brain and tumour that become regions of their own."""
-    return tuple(dict.fromkeys((*_parts(args), *args.regions)))
+    return tuple(dict.fromkeys((*(name for name in _parts(args) if name in PART_LABELS), *args.regions)))
 
 
 def _parts(args: argparse.Namespace) -> dict[str, tuple[Label, ...]]:
-    return {name: getattr(args, name) for name in PART_LABELS if getattr(args, name) is not None}
+    return {name: getattr(args, name) for name in (*PART_LABELS, *SEPTA) if getattr(args, name) is not None}
 
 
 def label_words(args: argparse.Namespace) -> list[str]:

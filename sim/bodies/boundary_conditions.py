@@ -1,6 +1,9 @@
-"""Where a brain is held: at the brainstem; where a skull stands over it; and where it is open."""
+"""Where a brain is held: at the brainstem and at sheets of dura; where a skull stands over it; and where it is open."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
 
 import numpy as np
 
@@ -9,17 +12,24 @@ from ..errors import InputError
 from ..geometry.geodesic import distances
 from ..geometry.surface import vertex_normals
 from ..geometry.tetmesh import TetMesh
+from .dural_septa import Septum, walled
 from .placement import Placement, within_outline
 
 
 def bounded(
-    mesh: TetMesh, site: np.ndarray, craniotomy: float, settings: Placement, outline: np.ndarray | None = None
+    mesh: TetMesh,
+    site: np.ndarray,
+    craniotomy: float,
+    settings: Placement,
+    outline: np.ndarray | None = None,
+    septa: Sequence[Septum] = (),
 ) -> Anatomy:
     """The anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
 
     The stem is held: surface nodes within a share of the brain's height from the lowest one (least superior). The
     craniotomy is free: surface nodes within half of the diameter `craniotomy` [m] along the surface from the point
-    nearest to `site`. An `outline` (n, 3) [m] frees those within it instead.
+    nearest to `site`. An `outline` (n, 3) [m] frees those within it instead. Sheets of dura, `septa`, hold what is at
+    them, but for the craniotomy.
 
     The skull covers the rest of the surface, and effects say what it does. Each of its nodes has its
     unit normal n_i, along the integral of grad N_i. A body of linear tetrahedra whose nodes do not move along theirs
@@ -47,10 +57,11 @@ def bounded(
             f"{said} holds {opened.sum()} mesh nodes, and {settings.fewest_open} are "
             "needed: ask for a larger one, or for more nodes."
         )
+    held = reduce(np.logical_or, (walled(mesh, septum) & ~opened for septum in septa), stem)
     rest = np.zeros(len(mesh.nodes), bool)
     rest[outer] = True
-    rest &= ~stem & ~opened
+    rest &= ~held & ~opened
     if not rest.any():
         raise InputError(f"{said} leaves no skull: ask for a smaller one.")
     normals = np.where(rest[:, None], vertex_normals(mesh.nodes, surface), 0.0)
-    return Anatomy(mesh, np.repeat(stem[:, None], 3, axis=1), normals, opened)
+    return Anatomy(mesh, np.repeat(held[:, None], 3, axis=1), normals, opened)

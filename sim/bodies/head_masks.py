@@ -41,8 +41,8 @@ class Sources:
     tumour_in
         A label map that the labels `tumour` are of, all of them if there are none, and those of necrosis.
     parts
-        Labels of other tissues by name of `PART_LABELS`, in place of the convention's. Necrosis counts as tumour, and
-        all else as brain.
+        Labels of other tissues by name of `PART_LABELS` or `SEPTA`, in place of the convention's. Necrosis counts as
+        tumour, and all else as brain.
     """
 
     labels: Path
@@ -71,7 +71,7 @@ class HeadMasks:
     grids
         Of the files that were read.
     parts
-        Other tissues that a convention tells, by name: necrosis, oedema, ventricles.
+        Other tissues by name, as `Sources.parts`, or as a convention tells them.
     affine
         (4, 4) from indices to metres (RAS).
     notes

@@ -13,6 +13,7 @@ from scipy import ndimage
 from ..anatomy import NECROSIS_LABEL, PART_LABELS
 from ..errors import InputError
 from ..runtime.outside_files import path_of
+from .dural_septa import SEPTA, Septum
 from .head_masks import HeadMasks, Sources, head_masks
 from .intensity import read_intensity
 from .label_map import Label, Mask, on_border
@@ -113,7 +114,15 @@ def masked_subject(
         notes=tuple(notes),
         pieces=pieces,
         parts=_parts(masks, solid, inside, regions, settings),
+        septa=tuple(_septum(name, masks) for name in SEPTA if name in masks.parts),
     )
+
+
+def _septum(name: str, masks: HeadMasks) -> Septum:
+    """A sheet of dura where voxels mark it."""
+    edges = masks.affine[:3, :3]
+    points = np.argwhere(masks.parts[name]) @ edges.T + masks.affine[:3, 3]
+    return Septum(name, points, 0.5 * float(np.sqrt((edges**2).sum())))
 
 
 def _parts(

@@ -13,6 +13,7 @@ from ..anatomy import BRAIN_LABEL, NECROSIS_LABEL, TUMOUR_LABEL, Anatomy
 from ..errors import InputError
 from ..geometry.tetmesh import TetMesh
 from .boundary_conditions import bounded
+from .dural_septa import Septum
 from .intensity import Intensity
 from .mesher import Meshing, Solids, mesh_solids
 from .placement import Piece, Placement, within_outline
@@ -94,6 +95,8 @@ class Subject:
         Of the tumour, the largest first.
     parts
         Regions of their own; of two that overlap the later counts.
+    septa
+        Sheets of dura that do not move.
     outline
         (n, 3) [m]: a closed curve round the opening, in place of a disc.
     """
@@ -108,6 +111,7 @@ class Subject:
     notes: tuple[str, ...] = ()
     pieces: tuple[Piece, ...] = ()
     parts: tuple[Part, ...] = ()
+    septa: tuple[Septum, ...] = ()
     outline: np.ndarray | None = None
 
 
@@ -125,7 +129,7 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
         subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening, subject.pieces
     )
     mesh = _with_parts(mesh_solids(solids, plan.nodes, plan.meshing), subject)
-    return bounded(mesh, subject.site, plan.craniotomy, plan.placement, subject.outline)
+    return bounded(mesh, subject.site, plan.craniotomy, plan.placement, subject.outline, subject.septa)
 
 
 def _with_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
