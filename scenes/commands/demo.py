@@ -21,6 +21,7 @@ from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_argumen
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
     from ..script.scene import Scene
+    from ..script.site import Site
 
 
 FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
@@ -32,6 +33,18 @@ def add_bodies(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
     parser.add_argument(
         "--model", type=Path, help="MODEL.npz made by `sulcus train` (default: MESH.model.npz beside the anatomy)"
+    )
+    add_trajectory(parser)
+
+
+def add_trajectory(parser: argparse.ArgumentParser) -> None:
+    """Declare --trajectory."""
+    parser.add_argument(
+        "--trajectory",
+        type=Path,
+        metavar="LINE.mrk.json",
+        help="from 3D Slicer: the tool goes in where this line enters the open cortex, and along it. A point says only "
+        "where; the tool then goes straight inwards. Default: at the middle of the opening",
     )
 
 
@@ -92,11 +105,29 @@ def scene_asked(args: argparse.Namespace, name: str, theatre: Theatre) -> Scene:
     Raises
     ------
     InputError
-        As `find_scene` and `dressed`.
+        As `find_scene`, `dressed`, `read_markup` and `approach_of`.
     """
     from ..script.scene import find_scene
 
-    return dressed(args, find_scene(name), theatre)
+    scene = dressed(args, find_scene(name), theatre)
+    return scene if args.trajectory is None else _approached(args, scene, theatre.site)
+
+
+def _approached(args: argparse.Namespace, scene: Scene, site: Site) -> Scene:
+    """The scene whose tool follows the trajectory; what keeps it from that is said."""
+    from sim.bodies.markups import read_markup
+
+    from ..script.approach import approach_of
+    from ..script.tool_paths import idle
+
+    approach = approach_of(read_markup(args.trajectory), site)
+    if scene.tool is None:
+        print(f"sulcus {args.command}: {scene.name} has no tool that could follow {args.trajectory}", file=sys.stderr)
+        return scene
+    stopped = scene.stopped(site, approach.followed(idle)(0.0))
+    if stopped:
+        print(f"sulcus {args.command}: where {args.trajectory} enters, {stopped}", file=sys.stderr)
+    return replace(scene, path=approach.followed(scene.path))
 
 
 def playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]) -> list[Scene]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sim.arguments import at_least
 
-from .demo import scene_asked
+from .demo import add_trajectory, scene_asked
 from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", "")
@@ -21,6 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument("--every", type=int, default=5, help="solve one frame in so many (default %(default)s)")
     parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    add_trajectory(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")

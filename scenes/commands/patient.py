@@ -24,7 +24,7 @@ from surrogate.data.tool_loads import PRESETS
 from .devices_option import add_devices
 from .label_options import add_label_arguments, label_words, regions_asked, sources_of
 from .outputs import add_force, claimed
-from .placement_options import add_opening_arguments, opened, opening_words
+from .placement_options import add_opening_arguments, opened, opening_words, trajectory_given
 from .tissue_options import OWN, add_element_argument, add_region_argument, regions_of
 
 
@@ -159,9 +159,11 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
 
 
 def _physics(args: argparse.Namespace) -> str:
-    """The options with which a scene is played with the tissue and the element of these data."""
+    """The options with which a scene is played as these data are: tissue, element, and the planned trajectory."""
     tissue = "" if args.material == BRAIN.law else f" --material {args.material}"
-    return tissue + ("" if args.element in (None, RECOMMENDED) else f" --element {args.element}")
+    element = "" if args.element in (None, RECOMMENDED) else f" --element {args.element}"
+    trajectory = trajectory_given(args)
+    return tissue + element + ("" if trajectory is None else f" --trajectory {trajectory}")
 
 
 def _shares(seconds: Mapping[str, float], whole: float) -> str:

@@ -63,6 +63,12 @@ def opening_words(args: argparse.Namespace) -> list[str]:
     return [f"{name}={text}" for name, text in texts.items()]
 
 
+def trajectory_given(args: argparse.Namespace) -> Path | None:
+    """The file of the trajectory that the options name, if they name one."""
+    given = args.opening_over if args.opening_at is None else args.opening_at
+    return given if isinstance(given, Path) and read_markup(given).kind == "Line" else None
+
+
 def opened_over(args: argparse.Namespace) -> str:
     """What the skull is opened over, in words."""
     given = args.opening_over if args.opening_at is None else args.opening_at

@@ -12,6 +12,7 @@ import numpy as np
 
 from sim.errors import InputError
 
+from .demo import add_trajectory, scene_asked
 from .json_line import json_line
 from .outputs import add_force
 from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
@@ -64,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--spacing", type=float, default=1.0, metavar="MM", help="of the fields' nodes [mm] (default %(default)s)"
     )
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for all that is written")
+    add_trajectory(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
@@ -128,6 +130,8 @@ def demand_options(args: argparse.Namespace) -> None:
         raise InputError(f"--spacing {args.spacing:g}: give {FINEST:g} to {COARSEST:g} mm.")
     if args.scene is None and (args.frame is not None or args.sequence is not None):
         raise InputError("--frame and --sequence are of a --scene: give one, or leave them out.")
+    if args.scene is None and args.trajectory is not None:
+        raise InputError("--trajectory is of a --scene: a --load has its own place. Leave one of them out.")
     if args.scene is not None and args.frame is None:
         raise InputError("--frame: say which moment of the scene, by its number; `sulcus demo` shows them.")
     names = [warped_name(path) for path in (*args.image, *args.labels)]
@@ -144,11 +148,9 @@ def scene_of(args: argparse.Namespace, theatre: Theatre) -> Scene:
     InputError
         A scene or a frame that there is not; a force that is no push, or too hard; a place that is not on the cortex.
     """
-    from ..script.scene import find_scene
-
     if args.load is not None:
         return dressed(args, replace(pushing(theatre, args.load), name="load"), theatre)
-    scene = dressed(args, find_scene(args.scene), theatre)
+    scene = scene_asked(args, args.scene, theatre)
     last = len(scene.times) - 1
     if not 0 <= args.frame <= last:
         raise InputError(f"--frame {args.frame}: {scene.name} has the frames 0 to {last}.")

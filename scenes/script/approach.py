@@ -1,0 +1,105 @@
+"""Where a planned trajectory enters the open cortex, and which way it goes on: what a scene's hand then follows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim.bodies.markups import Markup
+from sim.errors import InputError
+
+from .site import Site
+from .tool_paths import Path, Touch
+
+# A tool that goes in more obliquely slides along the cortex [rad]; a point farther from it marks another place [m].
+STEEPEST, NEAR = np.radians(60.0), 10e-3
+# Corrections after which a place in the tangent plane is that of a point of the curved cortex.
+CORRECTIONS = 6
+
+
+@dataclass(frozen=True)
+class Approach:
+    """Where a hand goes in, in the tangent plane (x, y) [m], and how its way is tilted against the axis [rad].
+
+    Both as `Touch` has them.
+    """
+
+    x: float
+    y: float
+    tilt: tuple[float, float] = (0.0, 0.0)
+
+    def followed(self, path: Path) -> Path:
+        """The same motion of the hand, begun at the entry instead of the middle, and along the trajectory."""
+
+        def along(time: float) -> Touch:
+            touch = path(time)
+            right, up = (float(np.arctan(np.tan(a) + np.tan(b))) for a, b in zip(self.tilt, touch.tilt, strict=True))
+            return replace(touch, x=self.x + touch.x, y=self.y + touch.y, tilt=(right, up))
+
+        return along
+
+
+def approach_of(markup: Markup, site: Site) -> Approach:
+    """The approach that a line marks, or a point, from which it goes straight inwards.
+
+    Raises
+    ------
+    InputError
+        Markups of another kind. A line that passes beside the opening, or runs along it; a point that is not at it.
+    """
+    points, path = markup.points, markup.path
+    if markup.kind == "Fiducial" and len(points) == 1:
+        entry = site.nearest(points[0]).point
+        apart = float(np.linalg.norm(entry - points[0]))
+        if apart > NEAR:
+            raise InputError(
+                f"{path}: its point lies {1e3 * apart:.0f} mm from the open cortex, and {1e3 * NEAR:g} mm is the most. "
+                "Open the skull there (--opening-at), or mark another entry."
+            )
+        return _approach(site, entry, site.axis)
+    if markup.kind != "Line" or len(points) != 2 or not np.ptp(points, axis=0).any():
+        raise InputError(f"{path}: is no trajectory. Save a line of two points, or one point, from 3D Slicer.")
+    outer, deep = sorted(points, key=lambda point: float((point - site.origin) @ site.axis))
+    way = (deep - outer) / np.linalg.norm(deep - outer)
+    angle = float(np.arccos(np.clip(way @ site.axis, -1.0, 1.0)))
+    if angle > STEEPEST:
+        raise InputError(
+            f"{path}: runs at {np.degrees(angle):.0f} degrees to the opening's axis, and {np.degrees(STEEPEST):.0f} is "
+            "the most. Open the skull where it enters: --opening-at with this file."
+        )
+    entry = _entry(site.corners, outer, way)
+    if entry is None:
+        arm = site.corners.reshape(-1, 3) - outer
+        beside = float(np.linalg.norm(arm - np.outer(arm @ way, way), axis=1).min())
+        raise InputError(
+            f"{path}: passes {1e3 * beside:.0f} mm beside the open cortex. Open the skull where it enters: "
+            "--opening-at with this file."
+        )
+    return _approach(site, entry, way)
+
+
+def _approach(site: Site, entry: np.ndarray, way: np.ndarray) -> Approach:
+    """The approach at a point (3,) [m] of the cortex, in a direction (3,)."""
+    axes = np.stack([site.right, site.up])
+    place = axes @ (entry - site.origin)
+    for _ in range(CORRECTIONS):
+        place = place + axes @ (entry - site.nearest(site.origin + place @ axes).point)
+    right, up = np.arctan(axes @ way / (way @ site.axis)).tolist()
+    return Approach(float(place[0]), float(place[1]), (right, up))
+
+
+def _entry(corners: np.ndarray, start: np.ndarray, way: np.ndarray) -> np.ndarray | None:
+    """Where a line first meets triangles (S, 3, 3) from outside (3,) [m]; None where it passes beside them.
+
+    Möller, Trumbore 1997, J. Graphics Tools 2:21-28.
+    """
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across, arm = np.cross(way, second), start - corners[:, 0]
+    turned = np.cross(arm, first)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / np.einsum("si,si->s", first, across)
+        u, v = scale * np.einsum("si,si->s", arm, across), scale * (turned @ way)
+        far = scale * np.einsum("si,si->s", second, turned)
+    met = np.isfinite(scale) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
+    return start + far[met].min() * way if met.any() else None

@@ -1,0 +1,136 @@
+"""A scene's tool goes in where a planned trajectory enters, and along it; what does not fit the opening is refused."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_sim_septa import PLAN
+from test_sim_volumes import grid, head, nifti
+from theatres import short
+
+from scenes.cli import main
+from scenes.commands.placement_options import add_opening_arguments, trajectory_given
+from scenes.play.deformers import Theatre
+from scenes.script.approach import Approach, approach_of
+from scenes.script.scene import find_scene
+from scenes.script.site import Site, site_of
+from scenes.script.tool_paths import Touch, idle, press
+from sim.bodies.label_volume import volume_subject
+from sim.bodies.markups import read_markup
+from sim.bodies.meshfile import write_anatomy
+from sim.bodies.subject import make_anatomy
+from sim.errors import InputError
+from sim.loads import Pushed
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A curved cortex, open over a tumour to the right and above."""
+    affine, places = grid()
+    path = nifti(tmp_path_factory.mktemp("approach") / "a.nii", head(places), affine)
+    return site_of(make_anatomy(volume_subject(path, (1,), (3,)), PLAN))
+
+
+def marked(folder: Path, points: np.ndarray, kind: str = "Line") -> Path:
+    """Points (n, 3) [m, RAS] as 3D Slicer saves them: in mm, LPS."""
+    controls = [{"position": (1e3 * point * [-1.0, -1.0, 1.0]).tolist()} for point in points]
+    markup = {"type": kind, "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": controls}
+    path = folder / "plan.mrk.json"
+    path.write_text(json.dumps({"markups": [markup]}))
+    return path
+
+
+def planned(
+    site: Site, right: float, up: float, tilt: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A point of the cortex, a direction, and a line through it from 40 mm outside to 30 mm inside."""
+    entry = site.nearest(site.origin + right * site.right + up * site.up).point
+    way = site.direction(Touch(tilt=tilt))
+    return entry, way, entry + np.outer([-40e-3, 30e-3], way)
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize(("right", "up", "tilt"), [(0.0, 0.0, (0.0, 0.0)), (9e-3, -6e-3, (0.5, -0.3))])
+def test_the_tool_enters_there_and_pushes_along_it(site, tmp_path, right, up, tilt, swapped):
+    """Whichever end was drawn first; the scene's own places and tilts are added."""
+    entry, way, line = planned(site, right, up, tilt)
+    approach = approach_of(read_markup(marked(tmp_path, line[::-1] if swapped else line)), site)
+    touch = approach.followed(press(0.3))(2.0)
+    assert np.linalg.norm(site.nearest(site.origin + touch.x * site.right + touch.y * site.up).point - entry) < 1e-4
+    np.testing.assert_allclose(site.direction(touch), way, atol=1e-9)
+    assert touch.force == pytest.approx(0.3)
+    aside = approach.followed(lambda time: Touch(2e-3, 1e-3, tilt=(0.2, 0.0)))(0.0)
+    assert aside.x == pytest.approx(touch.x + 2e-3) and aside.y == pytest.approx(touch.y + 1e-3)
+    assert np.tan(aside.tilt[0]) == pytest.approx(np.tan(touch.tilt[0]) + np.tan(0.2))
+
+
+def test_a_point_is_an_entry_straight_inwards(site, tmp_path):
+    entry, _, _ = planned(site, 5e-3, 5e-3, (0.0, 0.0))
+    approach = approach_of(read_markup(marked(tmp_path, entry[None] - 2e-3 * site.axis, "Fiducial")), site)
+    assert approach.tilt == pytest.approx((0.0, 0.0), abs=1e-12)
+    assert np.hypot(approach.x - 5e-3, approach.y - 5e-3) < 2e-3
+
+
+def test_what_misses_the_opening_is_refused(site, tmp_path):
+    _, _, line = planned(site, 0.0, 0.0, (0.0, 0.0))
+    beside = line + 60e-3 * site.right
+    oblique = site.origin + np.outer([-40e-3, 40e-3], site.direction(Touch(tilt=(1.3, 0.0))))
+    for points, kind, reason in (
+        (beside, "Line", r"passes \d\d mm beside the open cortex\. Open the skull where it enters: --opening-at"),
+        (oblique, "Line", "runs at 74 degrees to the opening's axis, and 60 is the most"),
+        (line[:1], "Fiducial", "its point lies 40 mm from the open cortex, and 10 mm is the most"),
+        (line, "Fiducial", "is no trajectory"),
+        (np.concatenate([line, line]), "Line", "is no trajectory"),
+        (line, "ClosedCurve", "is no trajectory"),
+    ):
+        with pytest.raises(InputError, match=reason):
+            approach_of(read_markup(marked(tmp_path, points, kind)), site)
+
+
+def test_commands_play_scenes_along_it(site, tmp_path, capsys):
+    """The push of `press`; near the rim the bone stops the tool and that is said; a scene without a tool stays."""
+    from scenes.commands.demo import add_theatre, scene_asked
+
+    def asked(name: str, line: np.ndarray):
+        parser = argparse.ArgumentParser()
+        add_theatre(parser)
+        words = parser.parse_args(["--trajectory", str(marked(tmp_path, line))], argparse.Namespace(command="demo"))
+        return scene_asked(words, name, Theatre(site.anatomy, None, {}, "cpu"))
+
+    entry, way, line = planned(site, 6e-3, 4e-3, (0.3, 0.1))
+    scene = asked("press", line)
+    pushed = scene.loads(site, scene.path(2.0), 2.0).of(Pushed)
+    assert pushed is not None and np.linalg.norm(pushed.point[0] - entry) < 1e-4
+    np.testing.assert_allclose(pushed.force[0] / np.linalg.norm(pushed.force[0]), way, atol=1e-9)
+    assert capsys.readouterr().err == ""
+    asked("press", planned(site, site.clearance - 2e-3, 0.0, (0.0, 0.0))[2])
+    assert "plan.mrk.json enters, the bone's edge stops the tool" in capsys.readouterr().err
+    assert asked("sag", line).path(1.0) == find_scene("sag").path(1.0) == idle(1.0)
+    assert "sag has no tool that could follow" in capsys.readouterr().err
+
+
+def test_it_is_an_option_of_the_command(site, tmp_path, capsys):
+    write_anatomy(tmp_path / "a.vtu", site.anatomy)
+    line = marked(tmp_path, planned(site, 0.0, 0.0, (0.0, 0.0))[2] + 60e-3 * site.right)
+    words = ["render", "press", "--anatomy", str(tmp_path / "a.vtu"), "--out", str(tmp_path / "out"), "--device", "cpu"]
+    assert main([*words, "--trajectory", str(line)]) == 2
+    assert "mm beside the open cortex" in capsys.readouterr().err
+
+
+def test_a_patient_says_how_its_scenes_follow_it(site, tmp_path):
+    parser = argparse.ArgumentParser()
+    add_opening_arguments(parser)
+    line = planned(site, 0.0, 0.0, (0.0, 0.0))[2]
+    for points, kind, found in ((line, "Line", True), (line[:1], "Fiducial", False)):
+        path = marked(tmp_path, points, kind)
+        for option in ("--opening-at", "--opening-over"):
+            assert trajectory_given(parser.parse_args([option, str(path)])) == (path if found else None)
+    assert trajectory_given(parser.parse_args([])) is None
+
+
+def test_no_trajectory_is_the_middle():
+    assert Approach(0.0, 0.0).followed(short().path)(0.7) == short().path(0.7)
