@@ -21,11 +21,11 @@ from scenes.play.player import STAGES
 from scenes.play.stage import CORTEX, DRAPE, TOOL
 from scenes.script.tool_paths import press
 from sim.accuracy import TRAIN
-from sim.effects import Elasticity, Held, ToolForce
+from sim.effects import Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import push
-from sim.material import tissue_from_json
+from surrogate.data.stated_tissue import stated_tissue
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ class TestEpisode:
         """Tissue, element, tool and load are those that the file names; so is what solved it."""
         _, file, _, _ = episode
         said, number = file.attrs, 3
-        effects = (Elasticity(tissue_from_json(said["tissue"])), Held(), ToolForce())
+        effects = (stated_tissue({name: str(text) for name, text in said.items()}), Held(), ToolForce())
         fem = Fem(box, effects, TRAIN, "cpu", element=said["element"])
         assert said["anatomy"] == box.digest and said["finite_elements"] == fem.description
         load = push(file["contact"][number], file["force"][number], float(said["footprint_m"]))

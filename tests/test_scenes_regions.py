@@ -16,6 +16,8 @@ from scenes.builtin.retract import RELAXING
 from scenes.cli import main
 from scenes.commands.tissue_options import add_element_argument, add_tissue_arguments, dressed
 from scenes.play.deformers import open_theatre
+from scenes.report.finite_elements import tissue_of as tissue_of_law
+from scenes.report.study import Study
 from scenes.script.priors import Draw
 from scenes.script.scene import find_scene
 from sim.accuracy import TRAIN
@@ -72,6 +74,14 @@ class TestData:
         )
         stored = found.displacement(np.arange(len(found.anatomy.mesh.nodes)))
         assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
+
+    def test_are_reported_in_every_law_of_it(self, data):
+        study = Study(data, data.parent)
+        assert study.tissue == TISSUE
+        linear = tissue_of_law(study.tissue, "linear")
+        assert linear.of(NECROSIS_LABEL) == Material("linear", 500.0, BRAIN.poisson)
+        whole = study.anatomy.without(np.flatnonzero(study.anatomy.mesh.within(NECROSIS_LABEL)))
+        assert study.tissue_on(whole) == Elasticity(BRAIN, {TUMOUR_LABEL: STIFF})
 
     def test_are_trained_on_with_it(self, data):
         assert TISSUE in Expansion(read_dataset(data), "cpu").fem().effects

@@ -23,13 +23,12 @@ import numpy as np
 from ar.optics.camera import Camera
 from ar.overlay.outlines import silhouette
 from sim.deformation import Deformation
-from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Posture, Pushed, Resected, Retracted, Touching
-from sim.material import tissue_to_json
 from sim.resected_fem import Operated
 from sim.runtime.atomic_files import demand_space, written_stream
+from surrogate.data.stated_tissue import stating
 from surrogate.model.guarded import model_of
 from surrogate.model.learned import Learned
 
@@ -330,7 +329,6 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, r
     for name, meaning in MEANINGS.items():
         if name in file:
             file[name].attrs["meaning"] = meaning
-    elasticity = next(effect for effect in scene.effects if isinstance(effect, Elasticity))
     file.attrs.update(
         {
             "format": FORMAT,
@@ -340,7 +338,8 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, r
             "finite_elements": theatre.described("fem", scene),
             "answered_by": theatre.described(deformer, scene),
             "element": theatre.element_of(scene),
-            "tissue": "none" if elasticity.default is None else tissue_to_json(elasticity.default),
+            "tissue": "none",
+            **stating(scene.elasticity),
             "tool": repr(scene.tool),
             "footprint_m": np.nan if scene.tool is None else scene.tool.radius,
             "model_digest": "none" if model is None else digest_of_model(model),
