@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import re
 import socket
 import sys
 import threading
@@ -45,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--client",
         metavar="HOST[:PORT]",
-        help="hear this server, too, as that of PLUS, and send it nothing; --port is then another one than its own",
+        help="hear this server, too, as that of PLUS, and send it nothing; --port is then another one than its own. An "
+        "IPv6 address stands in brackets",
     )
     parser.add_argument("--clients", type=int, default=16, help="how many there may be (default %(default)s)")
     what = "transforms that are heard, in mm; AToB takes places in A's frame to B's; the scan's space is RAS"
@@ -108,17 +110,31 @@ def run(args: argparse.Namespace) -> int:
 
 
 def address_of(text: str) -> tuple[str, int]:
-    """Host and port of `HOST[:PORT]`.
+    """Host and port of `HOST[:PORT]`, `[IPv6]:PORT` or an IPv6 address alone.
 
     Raises
     ------
     InputError
         A text that is none.
     """
-    host, _, port = text.partition(":")
-    if not host or not (port or str(PORT)).isdecimal() or int(port or PORT) >= 1 << 16:
-        raise InputError(f"--client {text}: give a host, and a port from 0 to 65535 after a colon.")
-    return host, int(port or PORT)
+    whole = f"[{text}]" if is_ipv6(text) else text
+    found = re.fullmatch(r"(\[[^\[\]]+\]|[^:\[\]]+)(?::([0-9]*))?", whole)
+    host, port = (found[1].strip("[]"), int(found[2] or PORT)) if found else ("", PORT)
+    if not host or port >= 1 << 16 or (whole.startswith("[") and not is_ipv6(host)):
+        raise InputError(
+            f"--client {text}: give a host, and a port from 0 to 65535 after a colon; an IPv6 address in brackets, as "
+            f"[::1]:{PORT}."
+        )
+    return host, port
+
+
+def is_ipv6(text: str) -> bool:
+    """Whether a text is an IPv6 address; a zone may follow it after %."""
+    try:
+        socket.inet_pton(socket.AF_INET6, text.partition("%")[0])
+    except OSError:
+        return False
+    return True
 
 
 def is_here(host: str, served: str) -> bool:
@@ -143,6 +159,8 @@ def _is_own(family: int, address: tuple) -> bool:
 
 
 def _linked(args: argparse.Namespace, source: tuple[str, int] | None, closing: ExitStack) -> int:
+    from ..link.console import address_words
+
     over = threading.Event()
 
     async def work() -> None:
@@ -151,7 +169,7 @@ def _linked(args: argparse.Namespace, source: tuple[str, int] | None, closing: E
         closing.callback(session.end)
         ready = asyncio.get_running_loop().create_future()
         ready.add_done_callback(
-            lambda port: print(f"sulcus: serves {args.host}:{port.result()} (Ctrl-C ends)", flush=True)
+            lambda port: print(f"sulcus: serves {address_words(args.host, port.result())} (Ctrl-C ends)", flush=True)
         )
         await session.serve(args.host, args.port, args.seconds, ready, source)
 

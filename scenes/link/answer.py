@@ -20,6 +20,7 @@ from ..script.tracked_tool import TrackedTool
 from ..script.uncertainty import LEVEL
 from .frame import stamp_of, time_of
 from .heard import Heard
+from .picture_time import placed_at
 
 THEIRS = "are these its poses and registration?"
 NOT_SEEN = Tracked(0, {}, {}, {})
@@ -48,7 +49,7 @@ class Answer:
 class Seen:
     """How the scan lies before a camera: T_camera_scan (4, 4) [m].
 
-    `moved` is how far the tumour may have gone between the picture and the camera's pose [m].
+    `moved` is how far off the tumour may be [m], as no pose is of the picture's very time.
     """
 
     T_camera_scan: np.ndarray
@@ -108,18 +109,11 @@ class Answering:
         registration, body = self._registration(heard), heard.beside(name, now)
         if isinstance(registration, str) or isinstance(body, str):
             return registration if isinstance(registration, str) else str(body)
-        stamped = stamp and body.stamp
-        apart = abs(time_of(stamp) - time_of(body.stamp)) if stamped else now - body.arrived
-        if apart > heard.stale:
-            return f"no {name} within {heard.stale:g} s of the picture's time"
-        before = heard.earlier(name)
-        if before is None:
-            return f"one {name} alone, which does not say how fast the camera moves"
-        between = time_of(body.stamp) - time_of(before.stamp) if stamped else body.arrived - before.arrived
-        middle = self.motion.stage.tumour_at_rest.vertices.mean(axis=0)
-        T, U = (np.linalg.inv(each.T) @ registration.T_patient_scan for each in (body, before))
-        way = float(np.linalg.norm((T - U)[:3] @ np.append(middle, 1.0)))
-        return Seen(T, way * apart / between if between > 0.0 else np.inf)
+        middle = registration.T_patient_scan @ np.append(self.motion.stage.tumour_at_rest.vertices.mean(axis=0), 1.0)
+        placed = placed_at(heard.course(name), now, stamp, middle[:3], heard.stale)
+        if isinstance(placed, str):
+            return placed.format(name=name)
+        return Seen(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.moved)
 
     def _registration(self, heard: Heard) -> Registration | str:
         """From the file, or as it was sent; or why there is none."""

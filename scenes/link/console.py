@@ -35,3 +35,8 @@ def limited(write: Callable[[str], None], clock: Callable[[], float] = time.mono
         left_out = 0
 
     return note
+
+
+def address_words(host: str, port: int) -> str:
+    """HOST:PORT, as people write it: an IPv6 address stands in brackets."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -16,6 +16,8 @@ SQUARE = 2e-3
 FARTHEST = 10.0
 # A time stamp that is older than the last one is out of order, but for a clock that was set back by more [s].
 SET_BACK = 5.0
+# So many earlier transforms of one name are kept, for pictures that come later than the poses round them.
+KEPT = 32
 
 
 @dataclass(frozen=True)
@@ -62,14 +64,14 @@ class Heard:
         Which are listened to.
     stale
         How old one of a moving body may be [s].
-    sent, last
-        The newest, and those before them.
+    sent, earlier
+        The newest, and some before them, the oldest first.
     """
 
     names: Names
     stale: float
     sent: Mapping[str, Sent] = field(default_factory=dict)
-    last: Mapping[str, Sent] = field(default_factory=dict)
+    earlier: Mapping[str, tuple[Sent, ...]] = field(default_factory=dict)
 
     def hearing(self, name: str, matrix: np.ndarray, stamp: int, now: float, sender: int) -> Heard:
         """With a transform (4, 4) [mm] of one client.
@@ -91,8 +93,9 @@ class Heard:
                 raise BadMessageError("the same time stamp again")
             if 0 < last.stamp - stamp < SET_BACK * TICKS:
                 raise BadMessageError("a time stamp before the last one")
-        before = {} if last is None else {name: last}
-        return replace(self, sent={**self.sent, name: Sent(T, stamp, now, sender)}, last={**self.last, **before})
+        kept = () if last is None or (stamp and stamp < last.stamp) else (*self.earlier[name][1 - KEPT :], last)
+        newest = {**self.sent, name: Sent(T, stamp, now, sender)}
+        return replace(self, sent=newest, earlier={**self.earlier, name: kept})
 
     def beside(self, name: str, now: float) -> Sent | str:
         """A body beside the patient's reference, with its own time stamp; or why that is not known."""
@@ -105,10 +108,11 @@ class Heard:
                 return f"no new {each} for {age:.1f} s"
         return self._in_reference(name, self.sent[name])
 
-    def earlier(self, name: str) -> Sent | None:
-        """The same by the transform before the newest, beside the reference as it is now; None where there is none."""
-        sent = self.last.get(name)
-        return None if sent is None else self._in_reference(name, sent)
+    def course(self, name: str) -> tuple[Sent, ...]:
+        """A body's transforms by one sender, the oldest first, beside the reference as it is now."""
+        newest = self.sent[name]
+        every = (*self.earlier.get(name, ()), newest)
+        return tuple(self._in_reference(name, sent) for sent in every if sent.sender == newest.sender)
 
     def _in_reference(self, name: str, body: Sent) -> Sent:
         if not self.names.by_tracker(name):

@@ -19,6 +19,7 @@ from ..play.overlay.follower import Known, State, across
 from ..play.overlay.picture import Painter
 from .answer import Answer, Seen, bounded, late
 from .clients import Clients
+from .console import address_words
 from .frame import BadMessageError, Header, framed, stamp_of
 from .heard import Heard
 from .messages import IMAGE, POINT, Code, image, read_image, read_points, read_position, read_transform, status
@@ -162,7 +163,7 @@ class Session:
                 each.cancel()
 
     async def _connected(self, host: str, port: int) -> None:
-        reached, at = True, f"the server {host}:{port}"
+        reached, at = True, f"the server {address_words(host, port)}"
         while True:
             try:
                 streams = await asyncio.open_connection(host, port, limit=AHEAD)

@@ -1,0 +1,107 @@
+"""Where the link takes a camera to be when a picture was taken; and addresses of servers that it hears."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scenes.commands.link import address_of
+from scenes.link.console import address_words
+from scenes.link.frame import stamp_of
+from scenes.link.heard import Heard, Names
+from scenes.link.picture_time import placed_at
+from sim.errors import InputError
+
+BEGUN, STEP = 1e9, 1.0 / 30.0
+TUMOUR = np.array([0.02, -0.01, 0.4])
+"""From the camera [m]."""
+
+
+def camera(time):
+    """A hand that sways by 20 mm and 4 degrees, once in 1.5 s: T (4, 4) [mm]."""
+    T = np.eye(4)
+    sway = np.sin(2.0 * np.pi * time / 1.5)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec([0.0, 0.07 * sway, 0.0]).as_matrix(), [20.0 * sway, 0.0, 300.0]
+    return T
+
+
+def heard_of(times, stamped=True, sender=0):
+    """A camera's transforms as they came, each 5 ms after its time."""
+    names = Names()
+    heard = Heard(names, 0.3)
+    for time in times:
+        stamp = stamp_of(BEGUN + time) if stamped else 0
+        heard = heard.hearing(names.camera, camera(time), stamp, time + 5e-3, sender)
+    return heard
+
+
+def off(placed, time):
+    """How far the tumour is from where it is in the picture of a time [m]."""
+    truth = camera(time)
+    truth[:3, 3] *= 1e-3
+    return np.linalg.norm(placed.T[:3, :3] @ TUMOUR + placed.T[:3, 3] - truth[:3, :3] @ TUMOUR - truth[:3, 3])
+
+
+def at(heard, time, now=None, stamped=True):
+    middle = camera(0.0)[:3, :3] @ TUMOUR + 1e-3 * camera(0.0)[:3, 3]
+    stamp = stamp_of(BEGUN + time) if stamped else 0
+    return placed_at(heard.course(heard.names.camera), time if now is None else now, stamp, middle, heard.stale)
+
+
+def test_a_picture_between_two_poses_has_a_pose_between_and_its_error_says_what_is_left():
+    times = STEP * np.arange(40)
+    heard = heard_of(times)
+    for late, share in ((2, 0.5), (5, 0.3), (12, 0.9), (1, 0.6)):  # poses that came after the picture's
+        time = times[-1 - late] + (share - 1.0) * STEP
+        placed = at(heard, time)
+        newest = replace(placed, T=heard.course(heard.names.camera)[-1].T)
+        assert off(placed, time) <= placed.moved < 0.2e-3 and off(placed, time) < 0.1 * off(newest, time)
+    ahead = at(heard, times[-1] + 0.03)
+    assert off(ahead, times[-1] + 0.03) <= ahead.moved < 4e-3
+
+
+def test_where_no_two_poses_are_round_a_picture_the_newest_counts_with_how_far_the_camera_went():
+    times = STEP * np.arange(12)
+    for heard, time, stamped in (
+        (heard_of(times), times[-1] + 0.2, True),
+        (heard_of(times[-2:]), times[-1] - 0.5 * STEP, True),
+        (heard_of(times, stamped=False), times[-1] + 0.02, False),
+    ):
+        placed = at(heard, time, stamped=stamped)
+        newest = camera(times[-1])
+        assert np.allclose(placed.T[:3, :3], newest[:3, :3]) and placed.moved > 1e-4
+    assert at(heard_of(times), times[-1] + 1.0) == "no {name} within 0.3 s of the picture's time"
+    assert "alone" in at(heard_of(times[-1:]), times[-1])
+
+
+def test_poses_of_another_client_or_before_a_clock_was_set_back_are_no_neighbours():
+    heard = heard_of(STEP * np.arange(9))
+    name = heard.names.camera
+    taken_over = heard.hearing(name, camera(0.4), stamp_of(BEGUN + 0.4), 1.0, 1)
+    assert len(heard.course(name)) == 9 and len(taken_over.course(name)) == 1
+    set_back = heard.hearing(name, camera(0.4), stamp_of(BEGUN - 60.0), 0.4, 0)
+    assert [sent.stamp for sent in set_back.course(name)] == [stamp_of(BEGUN - 60.0)]
+    assert len(heard_of(STEP * np.arange(200)).course(name)) == 33
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("localhost", ("localhost", 18944)),
+        ("plus.example:18945", ("plus.example", 18945)),
+        ("192.0.2.7:", ("192.0.2.7", 18944)),
+        ("[::1]:18945", ("::1", 18945)),
+        ("[fe80::1%eth0]", ("fe80::1%eth0", 18944)),
+        ("::1", ("::1", 18944)),
+    ],
+)
+def test_an_address_is_a_host_or_one_of_ipv6_in_brackets(text, address):
+    assert address_of(text) == address
+    assert address_of(address_words(*address)) == address
+
+
+@pytest.mark.parametrize("text", ["", ":18944", "[::1", "[localhost]:3", "::1:99999", "host:65536", "host:x", "a:b:1"])
+def test_an_address_that_is_none_is_refused(text):
+    with pytest.raises(InputError, match="in brackets"):
+        address_of(text)
