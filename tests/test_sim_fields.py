@@ -8,7 +8,7 @@ from sim.fields.folds import jacobians, unfold
 from sim.fields.grid import Grid, grid_around
 from sim.fields.in_tetrahedra import in_tetrahedra
 from sim.fields.inversion import inverted
-from sim.fields.warp_fields import landmark_errors, warp_fields
+from sim.fields.warp_fields import faded, faint_of, warp_fields
 from sim.geometry.locate import locate
 
 
@@ -57,13 +57,33 @@ def test_every_grid_node_on_a_shared_face_is_inside():
     assert np.array_equal(inside.ravel(), first | second)
 
 
-def test_the_backward_field_leads_each_vertex_back(box, moved, fields):
-    error = landmark_errors(fields, box.mesh.nodes, moved)
-    assert np.median(error) < 1e-6 and error.max() < 0.15e-3
+def errors(box, moved, fields):
+    """How far the fields, read between nodes, are from what moves a body: at its vertices, (2, V) [m]."""
+    rest, grid = box.mesh.nodes, fields.grid
+    off = grid.read(fields.forward, rest) - moved, grid.read(fields.backward, rest + moved) + moved
+    return np.linalg.norm(off, axis=-1)
+
+
+def test_both_fields_lead_each_vertex_where_it_goes(box, moved, fields):
+    """Sampling alone is off by 0.15 mm, and by 0.1 mm below the surface."""
+    error = errors(box, moved, fields)
+    assert np.median(error) < 6e-6 and error.max() < 0.1e-3
     inner = box.mesh.nodes[:, 2] < -12e-3
-    assert np.quantile(error, 0.98) < 0.05e-3 and error[inner].max() < 0.1e-3
-    forward = fields.grid.read(fields.forward, box.mesh.nodes)
-    assert np.abs(forward - moved).max() < 0.15e-3
+    assert np.quantile(error, 0.98) < 0.04e-3 and error[:, inner].max() < 0.05e-3
+
+
+def test_what_is_too_faint_to_count_is_left_and_the_grid_need_not_hold_it(box, moved, fields):
+    rest = warp_fields(box, 1e-3 * moved, 1e-3)
+    faint = faint_of(moved)
+    assert faint_of(1e-3 * moved) == pytest.approx(2.5e-6 * np.linalg.norm(moved, axis=1).max())
+    assert faint_of(1e-3 * moved) < faint <= 2e-5
+    size, left = np.linalg.norm(moved, axis=1), faded(moved)
+    assert not left[size < faint].any() and np.array_equal(left[size > 2 * faint], moved[size > 2 * faint])
+    assert np.linalg.norm(left - moved, axis=1).max() < 1.1 * faint
+    assert np.prod(rest.grid.shape) < np.prod(fields.grid.shape) and rest.forward.any()
+    still = np.where(box.mesh.nodes[:, :1] > 0.0, moved, 0.0)
+    half = warp_fields(box, still, 1e-3).grid
+    assert half.shape[0] < fields.grid.shape[0]
 
 
 def test_nothing_folds_and_least_jacobians_are_those_of_the_fields(fields):
@@ -80,7 +100,7 @@ def test_no_tear_at_skull_or_opening_and_zero_at_the_edge(box, fields):
         steps = max(np.abs(np.diff(field, axis=axis)).max() for axis in (1, 2, 3))
         assert steps < 0.9 * fields.grid.spacing
         for axis in (1, 2, 3):
-            assert not np.take(field, [0, -1], axis=axis).any()
+            assert np.abs(np.take(field, [0, -1], axis=axis)).max() < 1e-12
     below = np.array([[x, y, -43.5e-3] for x in (-20e-3, 0.0, 20e-3) for y in (-20e-3, 0.0)])
     assert np.abs(fields.grid.read(fields.forward, below)).max() < 1e-9  # a skull that holds is left where it is
 
@@ -110,15 +130,26 @@ def test_a_twist_that_no_fixed_point_inverts_is_inverted():
     assert np.abs(found + grid.read(field, points + found)).max() < 2e-6
 
 
-def test_folds_outside_are_smoothed_and_those_inside_are_reported():
+def test_folds_are_undone_outside_a_body_first():
     rng = np.random.default_rng(1)
     field = np.zeros((3, 20, 20, 20), np.float32)
     field[:, 8:12, 8:12, 8:12] = rng.uniform(-1.5e-3, 1.5e-3, (3, 4, 4, 4))
     assert jacobians(field, 1e-3).min() < 0.0
-    nothing = np.zeros(field.shape[1:], bool)
-    free, kept = field.copy(), field.copy()
-    assert unfold(free, nothing, 1e-3) > 0.0
-    assert unfold(kept, ~nothing, 1e-3) < 0.0 and np.array_equal(kept, field)
+    inside = np.zeros(field.shape[1:], bool)
+    free = field.copy()
+    assert unfold(free, inside, 1e-3) == jacobians(free, 1e-3).min() > 0.0
+    inside[:10] = True
+    held = field.copy()
+    assert unfold(held, inside, 1e-3) > 0.0
+    moved = np.linalg.norm(held - field, axis=0)
+    assert moved[10:].max() > 2.0 * moved[:10].max() and not moved[:4].any()
+
+
+def test_a_fold_at_any_corner_of_a_cell_is_found():
+    for corner in np.ndindex(2, 2, 2):
+        field = np.zeros((3, 2, 2, 2), np.float32)
+        field[(slice(None), *corner)] = 0.7e-3 * (1 - 2 * np.array(corner))  # past the middle of its neighbours
+        assert jacobians(field, 1e-3).min() < 0.0 < jacobians(0.3 * field, 1e-3).min()
 
 
 def test_what_is_filled_in_is_no_larger_than_what_is_known():

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
     from ..warp.moment import Moment
 
-FINEST, COARSEST = 0.3, 5.0
-"""Spacings of a field [mm]."""
 ORDERS = ("linear", "cubic")
 # A push harder than this [N], or so far off the open cortex [mm], is a slip of the keyboard.
 HARDEST, FARTHEST = 20.0, 20.0
@@ -62,8 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--interpolation", choices=ORDERS, default=ORDERS[0], help="between voxels of images (default %(default)s)"
     )
     parser.add_argument(
-        "--spacing", type=float, default=1.0, metavar="MM", help="of the fields' nodes [mm] (default %(default)s)"
-    )
+        "--spacing", type=float, metavar="MM",
+        help="of the fields' nodes, 0.3 to 5 mm (default: 1, or finer until the tumour is within 0.05 mm)",
+    )  # fmt: skip
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for all that is written")
     add_trajectory(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
@@ -103,13 +102,14 @@ def run(args: argparse.Namespace) -> int:
     moment, sequence = moments(args, theatre, scene)
     source = (args.anatomy or template_path()).name
     with tqdm(total=3 + len(pictures) + bool(sequence), unit="part", desc="fields, files", file=sys.stderr) as bar:
-        asked = Asked(1e-3 * args.spacing, args.interpolation, source, bar.update)
+        spacing = None if args.spacing is None else 1e-3 * args.spacing
+        asked = Asked(spacing, args.interpolation, source, bar.update)
         report = write_warp(out, moment, pictures, asked, sequence)
     for warning in report["warnings"]:
         print(f"sulcus warp: {warning}", file=sys.stderr)
     print(json_line({**report, "out": str(out)}) if args.json else sentences(report, out))
     wrong = "" if report["converged"] else "the answer did not converge"
-    if not min(report["least_jacobian"].values()) > 0.0:
+    if report["fields_fold"]:
         wrong = "space folds, see README.txt"
     if wrong:
         print(f"sulcus warp: {wrong}: do not rely on what was written", file=sys.stderr)
@@ -125,9 +125,10 @@ def demand_options(args: argparse.Namespace) -> None:
         One that is missing, is no use, or has such a value; two images whose names would be one.
     """
     from ..warp.images import warped_name
+    from ..warp.spacing import COARSEST, FINEST
 
-    if not FINEST <= args.spacing <= COARSEST:
-        raise InputError(f"--spacing {args.spacing:g}: give {FINEST:g} to {COARSEST:g} mm.")
+    if args.spacing is not None and not 1e3 * FINEST <= args.spacing <= 1e3 * COARSEST:
+        raise InputError(f"--spacing {args.spacing:g}: give {1e3 * FINEST:g} to {1e3 * COARSEST:g} mm.")
     if args.scene is None and (args.frame is not None or args.sequence is not None):
         raise InputError("--frame and --sequence are of a --scene: give one, or leave them out.")
     if args.scene is None and args.trajectory is not None:
@@ -218,7 +219,8 @@ def sentences(report: dict, out: Path) -> str:
     error, bound = report["grid_error_mm"], report["bound_mm"]
     lines = [
         f"Moved by: {report['moved_by']}. The largest displacement is {report['largest_displacement_mm']:.2f} mm.",
-        f"On the grid the tumour is off the finite elements by at most {error['tumour_worst']:.3f} mm.",
+        f"On a grid of {report['spacing_mm']:g} mm the tumour is off the finite elements by at most "
+        f"{error['tumour']['worst']:.3f} mm, and the open cortex by {error['cortex']['worst']:.3f} mm.",
         f"How far the tumour may be off in the patient is not known: {report['bound_of']}."
         if bound is None
         else f"In the patient, with 95 %, no point of the tumour is off by more than {bound:.1f} mm.",

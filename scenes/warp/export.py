@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sim.errors import InputError
-from sim.fields.warp_fields import WarpFields, forward_on, landmark_errors, warp_fields, warp_grid
+from sim.fields.warp_fields import WarpFields, faded, faint_of, forward_on, warp_grid
 
 from .images import Picture, Warped, write_field_nifti, write_warped
 from .landmarks import CENTROID, Landmark, centroid_now, landmarks_of
@@ -20,8 +20,10 @@ from .meshes import mesh_of, write_glb, write_stl, write_vtp
 from .moment import Moment
 from .nrrd_files import write_field_nrrd, write_field_sequence
 from .output_folder import FORMAT, LISTED, written_warp
+from .places import Folded, folds_of, places_of
 from .readme import page
 from .segmentation import write_segmentation
+from .spacing import ENOUGH, fields_of
 
 LOOKS = {
     "brain": (0.86, 0.72, 0.66, 0.35),
@@ -39,12 +41,12 @@ SEQUENCE_SPACING, MOST_NUMBERS = 3e-3, 400_000_000
 
 @dataclass(frozen=True)
 class Asked:
-    """How fields and images are made: spacing of the fields [m], and the interpolation of images.
+    """How fields and images are made: spacing of the fields [m] (None: as `fields_of`), and interpolation of images.
 
     `source` is the name of the anatomy's file; `step` hears of how many more parts are done, whenever some are.
     """
 
-    spacing: float
+    spacing: float | None
     order: str
     source: str
     step: Callable[[int], object] = lambda more: None
@@ -58,9 +60,9 @@ def write_warp(
     Raises
     ------
     InputError
-        As `written_warp`; a sequence that is too long.
+        As `written_warp` and `fields_of`; a sequence that is too long.
     """
-    fields = warp_fields(moment.anatomy, moment.displacement, asked.spacing, moment.left)
+    fields = fields_of(moment, asked.spacing, asked.step)
     asked.step(1)
     with written_warp(folder) as place:
         write_field_nifti(place / "field_resampling.nii.gz", fields.grid, fields.backward)
@@ -126,11 +128,12 @@ def named_points(moment: Moment, marks: Sequence[Landmark]) -> dict[str, np.ndar
 
 def _write_sequence(path: Path, sequence: Sequence[tuple[float, Moment]]) -> None:
     anatomy = sequence[0][1].anatomy
-    moved = np.stack([moment.displacement for _, moment in sequence])
+    moved = np.stack([faded(moment.displacement) for _, moment in sequence])
     grid = warp_grid(anatomy, moved, SEQUENCE_SPACING)
     if 3 * np.prod(grid.shape) * len(sequence) > MOST_NUMBERS:
         raise InputError(f"--sequence: {len(sequence)} moments are too many. Give a larger step.")
-    fields = [forward_on(grid, moment.left, moment.displacement)[0] for _, moment in sequence]
+    pairs = zip(sequence, moved, strict=True)
+    fields = [forward_on(grid, moment.left, displacement)[0] for (_, moment), displacement in pairs]
     write_field_sequence(path, grid, fields, [time for time, _ in sequence])
 
 
@@ -146,14 +149,13 @@ def figures(
     moment: Moment, fields: WarpFields, marks: Sequence[Landmark], warped: Sequence[Warped], frames: int
 ) -> dict[str, Any]:
     """What a warp says of itself: millimetres, shares, counts of voxels, and warnings."""
-    nodes, moved = moment.left.mesh.nodes, moment.displacement
-    used = np.unique(moment.left.mesh.tets)
-    error = 1e3 * landmark_errors(fields, nodes[used], moved[used])
-    moving = np.linalg.norm(moved[used], axis=1) > MOVED
-    tumour = np.isin(used, moment.left.tumour_nodes)
-    gap = moment.gap()
-    largest, of_tumour = 1e3 * float(np.linalg.norm(moved, axis=1).max()), float(error[tumour].max(initial=0.0))
+    places = places_of(moment)
+    error = 1e3 * places.errors(fields)
+    moving = np.linalg.norm(places.moved, axis=1) > MOVED
+    gap, largest = moment.gap(), 1e3 * float(np.linalg.norm(moment.displacement, axis=1).max())
+    of_tumour = _errors(error[places.tumour])
     off = [fields.grid.read(fields.forward, one.rest[None])[0] - (one.now - one.rest) for one in marks]
+    folds = folds_of(moment, fields)
     return {
         "moved_by": moment.cause.words,
         "cause": dict(moment.cause.record),
@@ -165,25 +167,51 @@ def figures(
         "spacing_mm": round(1e3 * fields.grid.spacing, 6),
         "nodes": list(fields.grid.shape),
         "reach_mm": 1e3 * fields.reach,
+        "faint_mm": 1e3 * faint_of(moment.displacement),
         "least_jacobian": dict(zip(("modeling", "resampling", "tetrahedra"), fields.least, strict=True)),
         "grid_error_mm": {
             "median": float(np.median(error)),
-            "moved_p95": float(np.quantile(error[moving], 0.95)) if moving.any() else 0.0,
+            "moved_p95": _errors(error[moving])["p95"],
             "worst": float(error.max()),
-            "tumour_worst": of_tumour,
+            "tumour": of_tumour,
+            "cortex": _errors(error[places.cortex]),
             "landmarks_worst": 1e3 * max((float(np.linalg.norm(each)) for each in off), default=0.0),
         },
         "landmarks": [one.name for one in marks],
         "images": [vars(one) for one in warped],
         "sequence_frames": frames,
-        "warnings": _warnings(largest, of_tumour),
+        "fields_fold": fields.folds,
+        "folds": [_said(fold) for fold in folds],
+        "warnings": _warnings(largest, of_tumour["worst"], folds),
     }
 
 
-def _warnings(largest: float, of_tumour: float) -> list[str]:
-    if of_tumour <= COARSE * largest:
-        return []
-    return [
-        f"the grid is coarse for this tumour: its error of {of_tumour:.2f} mm is more than a tenth of the largest "
-        f"motion, {largest:.2f} mm. Give a smaller --spacing."
-    ]
+def _errors(error: np.ndarray) -> dict[str, float]:
+    if not len(error):
+        return {"p95": 0.0, "worst": 0.0}
+    return {"p95": float(np.quantile(error, 0.95)), "worst": float(error.max())}
+
+
+def _said(fold: Folded) -> dict[str, Any]:
+    return {
+        "tetrahedra": fold.tetrahedra,
+        "middle_in_scan_mm": [round(1e3 * value, 3) for value in fold.middle],
+        "volume_in_scan_mm3": 1e9 * fold.volume,
+        "fields_off_mm": 1e3 * fold.off,
+    }
+
+
+def _warnings(largest: float, of_tumour: float, folds: Sequence[Folded]) -> list[str]:
+    found = []
+    for fold in folds:
+        x, y, z = (f"{1e3 * value:.1f}" for value in fold.middle)
+        found.append(
+            f"the finite elements fold {1e9 * fold.volume:.2f} mm3 at {x}, {y}, {z} mm in the scan (RAS). The fields "
+            f"do not: there they differ by up to {1e3 * fold.off:.2f} mm, and are not to be relied on."
+        )
+    if of_tumour > max(COARSE * largest, 1e3 * ENOUGH):
+        found.append(
+            f"the grid is coarse for this tumour: its error of {of_tumour:.2f} mm is more than a tenth of the largest "
+            f"motion, {largest:.2f} mm. Give a smaller --spacing."
+        )
+    return found

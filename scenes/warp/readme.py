@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from .images import Warped
 from .landmarks import CENTROID, NEAREST, SAID, TUMOUR
+from .places import WITHIN
 
 INTRODUCTION = """sulcus warp: a deformed brain, for other programs
 Research only. Not a medical device.
@@ -40,10 +41,15 @@ Only the brain was computed. Skull, air and skin were not: there the fields are 
 Outside the brain they go on from its surface, and fade to zero within {reach:.0f} mm. So an image shows no tear
 there. Bone above an opening may seem to move: it does not.
 A voxel whose source lies outside the image, or in tissue that was cut away, is 0.
+What moves by less than {faint:.3g} mm is left where it is.
 {fold}
-Read between their nodes ({spacing:g} mm apart), the fields miss the finite elements' vertices by {median:.4f} mm in the
-median. They miss those that move by {moved:.3f} mm in 95 of 100, and the worst by {worst:.3f} mm. Of the tumour it
-is {tumour:.3f} mm. From "in the scan" field_modeling leads each landmark to "now" within {landmarks:.3f} mm.
+How far the fields, read between their nodes ({spacing:g} mm apart), are from the finite elements [mm]:
+            95 of 100   worst
+tumour      {tumour[p95]:9.3f}   {tumour[worst]:5.3f}
+open cortex {cortex[p95]:9.3f}   {cortex[worst]:5.3f}
+what moves  {moved:9.3f}   {worst:5.3f}
+That is over the mesh's vertices and {between} places in each tetrahedron, the farther one of both fields at each. The
+median is {median:.4f} mm. From "in the scan" field_modeling leads each landmark to "now" within {landmarks:.3f} mm.
 These are errors of the grid. How far the tumour may be off: {bound}
 """
 
@@ -74,7 +80,10 @@ def page(report: dict, images: Sequence[Warped]) -> str:
         median=error["median"],
         moved=error["moved_p95"],
         worst=error["worst"],
-        tumour=error["tumour_worst"],
+        tumour=error["tumour"],
+        cortex=error["cortex"],
+        between=len(WITHIN),
+        faint=report["faint_mm"],
         landmarks=error["landmarks_worst"],
         bound=_bound(report),
     )
@@ -85,11 +94,14 @@ def page(report: dict, images: Sequence[Warped]) -> str:
 
 
 def _folds(report: dict) -> str:
-    least = ", ".join(f"{value:.3f}" for value in report["least_jacobian"].values())
+    shares = report["least_jacobian"]
+    least = ", ".join(f"{value:.3f}" for value in shares.values())
     said = f"Least volume that is left, as a share (modeling, resampling, tetrahedra): {least}."
-    if min(report["least_jacobian"].values()) > 0.0:
-        return f"{said} All are above 0: nothing folds."
-    return f"{said} NOT ALL ARE ABOVE 0: SPACE FOLDS, and what lies there is not to be relied on."
+    if report["fields_fold"]:
+        return f"{said} THE FIELDS ARE NOT ABOVE 0: SPACE FOLDS, and what lies there is not to be relied on."
+    if report["folds"]:
+        return f"{said} The fields are above 0. Where the finite elements fold, see WARNING above, they were unfolded."
+    return f"{said} All are above 0: nothing folds."
 
 
 def _bound(report: dict) -> str:

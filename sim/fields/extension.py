@@ -15,17 +15,28 @@ def extended(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:
     They have the nearest known value, the less of it the farther away it is, and are smoothed. No value exceeds those
     that are known.
     """
+    filled = np.where(known, field, np.float32(0.0))
+    moving = np.argwhere(filled.any(axis=0))
+    if not len(moving):
+        return filled
+    away = int(np.ceil(reach)) + SWEEPS
+    low, high = np.maximum(moving.min(axis=0) - away, 0), moving.max(axis=0) + away + 1
+    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    _fill(filled[(slice(None), *window)], known[window], reach)
+    return filled
+
+
+def _fill(field: np.ndarray, known: np.ndarray, reach: float) -> None:
+    """As `extended`, in place, where what is known and moves is farther than that from the edge."""
     nearest = np.empty((3, *known.shape), np.int32)
     away = np.asarray(ndimage.distance_transform_edt(~known, return_indices=True, indices=nearest), np.float64)
     free = (away > 0.0) & (away < reach)
-    source = np.ravel_multi_index(tuple(nearest[:, free]), known.shape)
+    source = tuple(nearest[:, free])
     left = 1.0 - away[free] / reach
     fade = (left * left * (3.0 - 2.0 * left)).astype(np.float32)
-    filled = np.where(known, field, np.float32(0.0))
-    for part in filled:
-        part[free] = fade * part.reshape(-1)[source]
-    smooth(filled, free, SWEEPS)
-    return filled
+    for part in field:
+        part[free] = fade * part[source]
+    smooth(field, free, SWEEPS)
 
 
 def smooth(field: np.ndarray, free: np.ndarray, sweeps: int) -> None:

@@ -1,55 +1,126 @@
-"""Whether a field folds space, and how folds outside the body are smoothed away."""
+"""Whether a field folds space, and how folds are undone."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
+from scipy.optimize import minimize
 
-from .extension import smooth
-
-# Cells so much compressed or worse are smoothed, together with nodes so near; so often, with so many sweeps.
-TIGHT, ROUND, TIMES, SWEEPS = 0.1, 3, 20, 8
+# Cells so much compressed or worse are mended, until they have so much of their volume.
+TIGHT, WANTED = 0.05, 0.15
+# Nodes so near to such a cell may move; so often it is tried, in so many steps each.
+ROUND, TIMES, STEPS = 2, 12, 200
+# A move of one node by one spacing costs as much as so much lost volume of one cell: of a node of the body, and others.
+STIFF, SOFT = 1.0, 1e-4
+# A cell whose edges change by less has no corner that folds.
+GENTLE = 0.15
 # Slices that are looked at together: bounds the memory that it takes.
-TOGETHER = 16
+TOGETHER = 4
+# A cell's corners, and from each the three nodes along its edges, in the order that keeps the sign of a volume.
+CORNERS = np.array(list(np.ndindex(2, 2, 2)))
+ALONG = np.array([[corner, *np.where(np.eye(3, dtype=int), 1 - corner, corner)] for corner in CORNERS])
+SIGNS = (1.0 - 2.0 * CORNERS).prod(axis=1)
 
 
 def jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
-    """Determinants (I - 1, J - 1, K - 1) of 1 + the gradient of a field (3, I, J, K) [m], cells of a spacing [m].
+    """Least determinants (I - 1, J - 1, K - 1) of 1 + the gradient of a field (3, I, J, K) [m], cells of a spacing [m].
 
-    Gradients are differences along the three edges that meet at a cell's first node. Below 0 the field folds there.
+    A cell has eight corners; at each, gradients are differences along the three edges that meet there. These are the
+    gradients of what is read between nodes. Below 0 the field folds there. Of cells that hardly change one corner is
+    looked at.
     """
     found = np.empty(tuple(side - 1 for side in field.shape[1:]), np.float32)
     for first in range(0, len(found), TOGETHER):
         part = field[:, first : first + TOGETHER + 1] / np.float32(spacing)
-        here = part[:, :-1, :-1, :-1]
-        ax, ay, az = part[:, 1:, :-1, :-1] - here
-        bx, by, bz = part[:, :-1, 1:, :-1] - here
-        cx, cy, cz = part[:, :-1, :-1, 1:] - here
-        for diagonal in (ax, by, cz):
-            diagonal += 1.0
-        found[first : first + TOGETHER] = ax * (by * cz - bz * cy) - ay * (bx * cz - bz * cx) + az * (bx * cy - by * cx)
+        ax, ay, az = np.diff(part, axis=1)
+        bx, by, bz = np.diff(part, axis=2)
+        cx, cy, cz = np.diff(part, axis=3)
+        sides = tuple(side - 1 for side in part.shape[1:])
+        most = np.zeros(sides, np.float32)
+        for edges in (ax, ay, az, bx, by, bz, cx, cy, cz):
+            size = np.abs(edges)
+            for axis, side in enumerate(sides):
+                if size.shape[axis] > side:
+                    near, far = (np.take(size, range(at, at + side), axis) for at in (0, 1))
+                    size = np.maximum(near, far)
+            np.maximum(most, size, out=most)
+        at = tuple(slice(side) for side in sides)
+        ax, ay, az, bx, by, bz, cx, cy, cz = (edges[at] for edges in (ax, ay, az, bx, by, bz, cx, cy, cz))
+        ax, by, cz = ax + 1.0, by + 1.0, cz + 1.0
+        least = ax * (by * cz - bz * cy) - ay * (bx * cz - bz * cx) + az * (bx * cy - by * cx)
+        strong = np.argwhere(most > GENTLE)
+        places = part.reshape(3, -1).T.astype(np.float64) + np.moveaxis(np.indices(part.shape[1:]), 0, -1).reshape(
+            -1, 3
+        )
+        least[tuple(strong.T)] = volumes(places, corner_nodes(strong, part.shape[1:])).min(axis=1)
+        found[first : first + TOGETHER] = least
     return found
 
 
-def unfold(field: np.ndarray, fixed: np.ndarray, spacing: float) -> float:
-    """Smooth a field (3, I, J, K) [m] in place where it folds, or nearly, but at fixed nodes (I, J, K).
+def corner_nodes(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Numbers (n, 8, 4) of nodes in a grid of a shape: each corner of cells (n, 3), and the ends of its edges."""
+    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(cells[:, None, None] + ALONG, -1, 0)), shape))
 
-    Returns the least determinant that is left.
+
+def volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Volumes (n, 8) at the corners (n, 8, 4) of cells, from the places (N, 3) of nodes in units of the spacing."""
+    at = places[corners]
+    return SIGNS * np.linalg.det(at[:, :, 1:] - at[:, :, :1])
+
+
+def unfold(field: np.ndarray, inside: np.ndarray, spacing: float) -> float:
+    """Change a field (3, I, J, K) [m] in place where it folds, or nearly: least at nodes inside a body (I, J, K).
+
+    The sum of squares of what corners of cells lack in volume is made small [as Escobar et al., Simultaneous untangling
+    and smoothing of tetrahedral meshes, 2003, have it for meshes]. Returns the least determinant that is left.
     """
     found = jacobians(field, spacing)
-    for _ in range(TIMES):
-        bad = np.argwhere(found < TIGHT)
-        if not len(bad):
+    for turn in range(TIMES):
+        bad = found < TIGHT
+        if not bad.any():
             break
-        low = np.maximum(bad.min(axis=0) - ROUND - 2, 0)
-        high = np.minimum(bad.max(axis=0) + ROUND + 3, fixed.shape)
-        window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        cells = tuple(slice(a, b - 1) for a, b in zip(low, high, strict=True))
-        near = np.pad(found[cells] < TIGHT, [(0, 1)] * 3)
-        near = ndimage.binary_dilation(near, iterations=ROUND) & ~fixed[window]
-        if not near.any():
-            break
-        part = field[(slice(None), *window)]
-        smooth(part, near, SWEEPS)
-        found[cells] = jacobians(part, spacing)
+        grown = ROUND + turn
+        labels = np.empty(bad.shape, np.int32)
+        ndimage.label(ndimage.maximum_filter(bad, 2 * grown + 5), output=labels)
+        for where in ndimage.find_objects(labels):
+            window = tuple(slice(each.start, each.stop + 1) for each in where)
+            part = field[(slice(None), *window)]
+            near = ndimage.maximum_filter(np.pad(bad[where], [(0, 1)] * 3), 2 * grown + 2)
+            _mend(part, near, inside[window], spacing)
+            found[where] = jacobians(part, spacing)
     return float(found.min())
+
+
+def _mend(part: np.ndarray, near: np.ndarray, inside: np.ndarray, spacing: float) -> None:
+    """Move nodes (I, J, K) that are near of a part of a field (3, I, J, K) [m] until its cells have volume."""
+    shape = near.shape
+    near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
+    free = np.flatnonzero(near)
+    cells = np.argwhere(ndimage.maximum_filter(near, 2, origin=-1)[:-1, :-1, :-1])
+    corners = corner_nodes(cells, shape).reshape(-1, 4)
+    signs = np.tile(SIGNS, len(cells))
+    rest = part.reshape(3, -1).T / spacing + np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 3)
+    stiff = np.where(inside.reshape(-1)[free], STIFF, SOFT)[:, None]
+
+    def cost(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        change = flat.reshape(-1, 3)
+        places = rest.copy()
+        places[free] += change
+        at = places[corners]
+        a, b, c = np.moveaxis(at[:, 1:] - at[:, :1], 1, 0)
+        ends = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+        lack = np.maximum(WANTED - signs * (a * ends[:, 0]).sum(axis=1), 0.0)
+        some = lack > 0.0
+        pull = -2.0 * (signs * lack)[some, None, None] * ends[some]
+        slope = np.zeros_like(places)
+        np.add.at(slope, corners[some, 1:], pull)
+        np.add.at(slope, corners[some, 0], -pull.sum(axis=1))
+        return float((lack * lack).sum() + (stiff * change * change).sum()), (
+            slope[free] + 2.0 * stiff * change
+        ).ravel()
+
+    found = minimize(cost, np.zeros(3 * len(free)), jac=True, method="L-BFGS-B", options={"maxiter": STEPS})
+    for axis in range(3):
+        values = part[axis].reshape(-1).copy()
+        values[free] += (spacing * found.x.reshape(-1, 3)[:, axis]).astype(part.dtype)
+        part[axis] = values.reshape(shape)

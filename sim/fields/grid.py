@@ -31,6 +31,17 @@ class Grid:
         """Places (n, 3) [m] of nodes by their numbers (n,) in the flat grid."""
         return self.origin + self.spacing * np.stack(np.unravel_index(numbers, self.shape), axis=-1)
 
+    def corners(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers (n, 8) of the nodes of the cells in which points (n, 3) [m] lie, and their weights (n, 8)."""
+        index = self.index(points)
+        first = np.clip(np.floor(index).astype(int), 0, np.array(self.shape) - 2)
+        share = index - first
+        strides = np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
+        numbers = (first @ strides)[:, None] + np.array(list(np.ndindex(2, 2, 2))) @ strides
+        x, y, z = np.stack([1.0 - share, share], axis=-1).transpose(1, 0, 2)
+        weights = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
+        return numbers, weights.reshape(-1, 8)
+
     def read(self, field: np.ndarray, points: np.ndarray) -> np.ndarray:
         """A field (3, I, J, K) at points (n, 3) [m]: linear between nodes, and zero (n, 3) outside."""
         index = self.index(points).T

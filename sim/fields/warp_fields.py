@@ -15,11 +15,14 @@ from .folds import unfold
 from .grid import Grid, grid_around
 from .in_tetrahedra import in_tetrahedra
 from .inversion import inverted
+from .projection import Body, project
 
 # Beyond the body the field fades to zero within so much [m], and so many times what the body moves by.
 LEAST_REACH, REACHES = 5e-3, 2.0
 # Nodes from there to the edge of the grid; what moves less [m] has no inverse to look for.
-EDGE, STILL = 2, 1e-5
+EDGE, STILL, TINY = 3, 1e-5, 1e-30
+FAINT, SHARE = 2e-5, 2.5e-3
+"""What moves by less than this [m], or this share of the most, is left where it is; twice as much is not touched."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +41,7 @@ class WarpFields:
         (I, J, K) bool: nodes at rest in tissue that was taken away.
     least
         The least determinants of the two fields' gradients, and the least volume of a tetrahedron as a share of that
-        at rest. Where one is not above 0 something folds.
+        at rest. Where one is not above 0 something folds: the fields, or the body and not they.
     reach
         How far from the body the field fades to zero [m].
     """
@@ -52,8 +55,8 @@ class WarpFields:
 
     @property
     def folds(self) -> bool:
-        """Whether anything folds."""
-        return not min(self.least) > 0.0
+        """Whether one of the fields folds."""
+        return not min(self.least[:2]) > 0.0
 
 
 def reach_of(displacement: np.ndarray) -> float:
@@ -61,24 +64,48 @@ def reach_of(displacement: np.ndarray) -> float:
     return LEAST_REACH + REACHES * float(np.linalg.norm(displacement, axis=-1).max())
 
 
+def faint_of(displacement: np.ndarray) -> float:
+    """What is too faint to count of displacements (..., 3) [m], so that the grid need not hold all of a body [m]."""
+    return min(FAINT, SHARE * float(np.linalg.norm(displacement, axis=-1).max()))
+
+
+def faded(displacement: np.ndarray) -> np.ndarray:
+    """Displacements (..., 3) [m] without those that are too faint to count."""
+    size = np.linalg.norm(displacement, axis=-1, keepdims=True)
+    share = np.clip(size / max(faint_of(displacement), TINY) - 1.0, 0.0, 1.0)
+    return displacement * (share * share * (3.0 - 2.0 * share))
+
+
 def warp_grid(anatomy: Anatomy, displacements: np.ndarray, spacing: float) -> Grid:
-    """The grid of a spacing [m] for a body and its displacements (B, V, 3) [m]."""
-    nodes = anatomy.mesh.nodes
-    places = np.concatenate([nodes, (nodes + displacements).reshape(-1, 3)])
-    return grid_around(places, spacing, reach_of(displacements) + EDGE * spacing)
+    """The grid of a spacing [m] for what moves of a body by displacements (B, V, 3) [m], and for all round that."""
+    mesh = anatomy.mesh
+    moves = np.asarray(displacements.any(axis=(0, 2)))
+    tets, faces = (of[moves[of].any(axis=1)] for of in (mesh.tets, mesh.surface))
+    held, outer = np.unique(tets if len(tets) else mesh.tets), np.unique(faces)
+    reach = reach_of(displacements)
+    places = [mesh.nodes[held], *(mesh.nodes[held] + displacements[:, held])]
+    for some in (mesh.nodes[outer], *(mesh.nodes[outer] + displacements[:, outer])):
+        places += [some - reach, some + reach]
+    return grid_around(np.concatenate(places), spacing, EDGE * spacing)
+
+
+def collar_of(inside: np.ndarray) -> np.ndarray:
+    """Nodes (I, J, K) outside a body that are corners of its surface's cells, by the nodes inside."""
+    return np.asarray(ndimage.maximum_filter(inside, 3) & ~inside)
 
 
 def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.ndarray, float]:
     """The field (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian.
 
-    It is linear in each tetrahedron. Just outside it goes on as it is, so that what is read between the grid's nodes
-    is right up to the surface. From there it fades to zero.
+    It is linear in each tetrahedron, and fitted where sampling that is not exact between the grid's nodes. Just outside
+    it goes on as it is, so that what is read there is right up to the surface. From there it fades to zero.
     """
     nodes, tets = body.mesh.nodes, body.mesh.tets
     field, inside = in_tetrahedra(grid, nodes, tets, displacement)
-    collar = ndimage.binary_dilation(inside, np.ones((3, 3, 3))) & ~inside
+    collar = collar_of(inside)
     numbers = np.flatnonzero(collar)
     field.reshape(3, -1)[:, numbers] = beyond_surface(nodes, tets, displacement, grid.points(numbers)).T
+    project(grid, field, inside, collar, Body(nodes, tets, displacement))
     filled = extended(field, inside | collar, reach_of(displacement) / grid.spacing)
     return filled, unfold(filled, inside, grid.spacing)
 
@@ -86,7 +113,7 @@ def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.
 def backward_on(grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np.ndarray) -> tuple[np.ndarray, float]:
     """The inverse (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian.
 
-    Within the deformed body it is linear in each tetrahedron. Outside it is the inverse of the forward field.
+    Within the deformed body it is linear in each tetrahedron, and fitted. Outside it is the forward field's inverse.
     """
     now, tets = body.mesh.nodes + displacement, body.mesh.tets
     field, inside = in_tetrahedra(grid, now, tets, -displacement)
@@ -95,6 +122,7 @@ def backward_on(grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np
     numbers = np.flatnonzero(~inside & moving)
     flat = filled.reshape(3, -1)
     flat[:, numbers] = inverted(grid, forward, grid.points(numbers), flat[:, numbers].T.astype(np.float64)).T
+    project(grid, filled, inside, collar_of(inside), Body(now, tets, -displacement))
     return filled, unfold(filled, inside, grid.spacing)
 
 
@@ -103,6 +131,7 @@ def warp_fields(anatomy: Anatomy, displacement: np.ndarray, spacing: float, left
 
     `left` is what is left of a body that was cut. Round a body nothing is known: there the fields fade.
     """
+    displacement = faded(displacement)
     body, grid = left or anatomy, warp_grid(anatomy, displacement[None], spacing)
     mesh = body.mesh
     forward, least_forward = forward_on(grid, body, displacement)
@@ -114,9 +143,3 @@ def warp_fields(anatomy: Anatomy, displacement: np.ndarray, spacing: float, left
         gone &= ~in_tetrahedra(grid, mesh.nodes, mesh.tets, displacement)[1]
     least = least_forward, least_backward, share
     return WarpFields(grid, forward, backward, gone, least, reach_of(displacement))
-
-
-def landmark_errors(fields: WarpFields, nodes: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """How far [m] the field for images takes places (n, 3) [m], displaced by (n, 3) [m], from where they were (n,)."""
-    now = nodes + displacement
-    return np.linalg.norm(now + fields.grid.read(fields.backward, now) - nodes, axis=1)

@@ -1,0 +1,98 @@
+"""Where a warp's fields are compared with the finite elements, and where the finite elements are folded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from sim.anatomy import TUMOUR_LABEL
+from sim.fields.warp_fields import WarpFields
+from sim.geometry.tetmesh import signed_volumes
+
+from .moment import Moment
+
+# Weights of corners at the places between vertices: of a tetrahedron, of a triangle. No field is fitted there.
+WITHIN, ON = 0.55 * np.eye(4) + 0.15 * (1.0 - np.eye(4)), 0.58 * np.eye(3) + 0.21 * (1.0 - np.eye(3))
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Vertices of a body, then places in its tetrahedra and on its open cortex.
+
+    Parameters
+    ----------
+    rest, moved
+        Where they are in the scan, and by how much they are displaced (n, 3) [m].
+    tumour, cortex
+        Whether each is of the tumour, and of the open cortex (n,).
+    """
+
+    rest: np.ndarray
+    moved: np.ndarray
+    tumour: np.ndarray
+    cortex: np.ndarray
+
+    def errors(self, fields: WarpFields) -> np.ndarray:
+        """How far [m] fields are from the finite elements at each (n,): the farther one of the two fields."""
+        grid, now = fields.grid, self.rest + self.moved
+        forward = grid.read(fields.forward, self.rest) - self.moved
+        backward = grid.read(fields.backward, now) + self.moved
+        return np.maximum(np.linalg.norm(forward, axis=1), np.linalg.norm(backward, axis=1))
+
+
+def places_of(moment: Moment) -> Places:
+    """The vertices of what is left of a body, four places in each tetrahedron and three on each open triangle."""
+    body, mesh = moment.left, moment.left.mesh
+    used = np.unique(mesh.tets)
+    of_tumour = np.repeat(mesh.region == TUMOUR_LABEL, len(WITHIN))
+    count = len(ON) * len(body.open_surface)
+
+    def at(values: np.ndarray) -> np.ndarray:
+        between = (WITHIN @ values[mesh.tets]).reshape(-1, 3), (ON @ values[body.open_surface]).reshape(-1, 3)
+        return np.concatenate([values[used], *between])
+
+    return Places(
+        at(mesh.nodes),
+        at(moment.displacement),
+        np.concatenate([np.isin(used, body.tumour_nodes), of_tumour, np.zeros(count, bool)]),
+        np.concatenate([np.isin(used, body.open_surface), np.zeros(len(of_tumour), bool), np.ones(count, bool)]),
+    )
+
+
+@dataclass(frozen=True)
+class Folded:
+    """Tetrahedra that meet and lie inside out: how many, their middle in the scan [m, RAS] and their volume there [m3].
+
+    `off` is by how much the fields are off the finite elements there [m]: no field can follow a fold.
+    """
+
+    tetrahedra: int
+    middle: tuple[float, ...]
+    volume: float
+    off: float
+
+
+def folds_of(moment: Moment, fields: WarpFields) -> tuple[Folded, ...]:
+    """Where the finite elements are folded, the largest first."""
+    mesh = moment.left.mesh
+    bad = mesh.tets[signed_volumes(mesh.nodes + moment.displacement, mesh.tets) <= 0.0]
+    if not len(bad):
+        return ()
+    count = len(bad)
+    sides = np.repeat(np.arange(count), 4), count + bad.ravel()
+    graph = coo_matrix((np.ones(4 * count), sides), (count + len(mesh.nodes),) * 2)
+    groups = connected_components(graph, directed=False)[1][:count]
+    errors = places_of(moment).errors(fields)
+    off = np.zeros(len(mesh.nodes))
+    used = np.unique(mesh.tets)
+    off[used] = errors[: len(used)]
+    found = []
+    for group in np.unique(groups):
+        tets = bad[groups == group]
+        volumes = signed_volumes(mesh.nodes, tets)
+        middle = np.average(mesh.nodes[tets].mean(axis=1), axis=0, weights=volumes)
+        found.append(Folded(len(tets), tuple(middle.tolist()), float(volumes.sum()), float(off[tets].max())))
+    return tuple(sorted(found, key=lambda fold: -fold.volume))

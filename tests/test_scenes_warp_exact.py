@@ -1,0 +1,88 @@
+"""How exact a warp is: its error by part, the spacing that follows from it, and folds of the finite elements."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes.cli import main
+from scenes.warp.causes import Cause
+from scenes.warp.moment import Moment
+from scenes.warp.places import folds_of, places_of
+from scenes.warp.spacing import ENOUGH, FINEST, fields_of, finer_spacing
+from sim.bodies.meshfile import write_anatomy, write_mesh
+from sim.errors import InputError
+from sim.fields.warp_fields import warp_fields
+from sim.geometry.tetmesh import signed_volumes
+
+
+def moment_of(body, displacement):
+    return Moment(Cause("a test", {}), body, body, displacement)
+
+
+@pytest.fixture(scope="module")
+def kinked(small_box):
+    """One vertex of the tumour goes 2.6 mm aside; its neighbours, 6 mm away, stay."""
+    moved = np.zeros_like(small_box.mesh.nodes)
+    moved[small_box.tumour_nodes[0]] = [0.0, 2.6e-3, 0.0]
+    return moment_of(small_box, moved)
+
+
+@pytest.fixture(scope="module")
+def fields(kinked):
+    return warp_fields(kinked.anatomy, kinked.displacement, 2e-3)
+
+
+def test_the_error_of_each_part_is_that_of_the_worse_field(kinked, fields):
+    places = places_of(kinked)
+    errors = places.errors(fields)
+    off = replace(fields, backward=fields.backward + np.float32(1e-3))
+    assert 0.05e-3 < errors[places.tumour].max() < 1e-3 and errors[places.cortex].max() < 1e-6
+    # Beside the grid there is no field.
+    held = fields.grid.index(places.rest[places.cortex])
+    inside = ((held > 0.0) & (held < np.array(fields.grid.shape) - 1)).all(axis=1)
+    assert np.allclose(places.errors(off)[places.cortex][inside], 3**0.5 * 1e-3, rtol=1e-3)
+    assert places.tumour.sum() > 4 * (kinked.anatomy.mesh.region == 2).sum()
+
+
+def test_a_spacing_follows_from_the_tumours_error(kinked, fields):
+    finer = finer_spacing(kinked, fields)
+    assert FINEST <= finer < fields.grid.spacing
+    found = fields_of(kinked, None, lambda more: None)
+    places = places_of(kinked)
+    assert places.errors(found)[places.tumour].max() <= ENOUGH and found.grid.spacing < 1e-3
+    assert finer_spacing(kinked, found) is None
+    still = moment_of(kinked.anatomy, 1e-2 * kinked.displacement)
+    assert fields_of(still, None, lambda more: None).grid.spacing == 1e-3
+
+
+def test_a_spacing_of_too_many_nodes_is_refused(small_box):
+    with pytest.raises(InputError, match="million are the most"):
+        fields_of(moment_of(small_box, np.full_like(small_box.mesh.nodes, 40e-3)), 0.3e-3, lambda more: None)
+
+
+def test_where_the_finite_elements_fold_the_fields_do_not_and_it_is_said(small_box, tmp_path, capsys):
+    mesh = small_box.mesh
+    middle = mesh.nodes.mean(axis=0)
+    vertex = int(np.linalg.norm(mesh.nodes - middle, axis=1).argmin())
+    moved = np.zeros_like(mesh.nodes)
+    moved[vertex] = [6.5e-3, 1e-3, 0.0]  # past its neighbours, 6 mm away
+    bad = signed_volumes(mesh.nodes + moved, mesh.tets) <= 0.0
+    moment = moment_of(small_box, moved)
+    fields = warp_fields(small_box, moved, 2e-3)
+    (fold,) = folds_of(moment, fields)
+    assert not fields.folds and fields.least[2] < 0.0 and min(fields.least[:2]) > 0.0
+    assert fold.tetrahedra == bad.sum() > 0 and fold.volume == pytest.approx(mesh.volumes[bad].sum())
+    assert np.linalg.norm(fold.middle - mesh.nodes[vertex]) < 8e-3 and fold.off > 0.2e-3
+    write_anatomy(tmp_path / "box.vtu", small_box)
+    write_mesh(tmp_path / "folded.vtu", mesh, {"displacement": moved})
+    words = ["warp", str(tmp_path / "box.vtu"), "--located", str(tmp_path / "folded.vtu"), "--spacing", "2"]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    x = f"{1e3 * fold.middle[0]:.1f}"
+    said = capsys.readouterr().err
+    assert "the finite elements fold" in said and x in said and "mm3" in said
+    report = json.loads((tmp_path / "out" / "warp.json").read_text())
+    assert report["folds"][0]["fields_off_mm"] == pytest.approx(1e3 * fold.off) and not report["fields_fold"]
+    text = (tmp_path / "out" / "README.txt").read_text()
+    assert "WARNING: the finite elements fold" in text and "they were unfolded" in text and "nothing folds" not in text
