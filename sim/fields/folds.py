@@ -71,8 +71,8 @@ def volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
 def unfold(field: np.ndarray, inside: np.ndarray, spacing: float) -> float:
     """Change a field (3, I, J, K) [m] in place where it folds, or nearly: least at nodes inside a body (I, J, K).
 
-    The sum of squares of what corners of cells lack in volume is made small [as Escobar et al., Simultaneous untangling
-    and smoothing of tetrahedral meshes, 2003, have it for meshes]. Returns the least determinant that is left.
+    What corners of cells lack in volume is made small, in squares. So do Escobar et al. with meshes (Simultaneous
+    untangling and smoothing of tetrahedral meshes, 2003). Returns the least determinant that is left.
     """
     found = jacobians(field, spacing)
     for turn in range(TIMES):
