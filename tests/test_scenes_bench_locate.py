@@ -28,6 +28,7 @@ from scenes.bench.locate_twins import CAUSES, Twin, drawn, effects_of, loads_of,
 from scenes.cli import main
 from sim.accuracy import REFERENCE
 from sim.bodies.meshfile import write_anatomy
+from sim.bodies.open_cortex import open_cortex
 from sim.bodies.refine import refined
 from sim.effects import Bonded, Elasticity, Held, NodalForce
 from sim.errors import InputError
@@ -220,6 +221,9 @@ def test_every_twin_is_seen_on_points_of_its_own(locator, body):
     assert [each.estimator for each in clouds] == [OURS, ORACLE] and len(given) == 4
     seen = [observed(body, some[0].motion, PointsSeen(30, 50, 0, named), (0, 0)) for named in (True, False)]
     assert seen[1].rest is None and np.array_equal(seen[0].now, seen[1].now)
+    slipped = observed(body, some[0].motion, PointsSeen(30, 50, 0, slip=8e-3), (0, 0)).now - seen[0].now
+    assert slipped == pytest.approx(np.tile(slipped[0], (30, 1))) and np.linalg.norm(slipped[0]) == pytest.approx(8e-3)
+    assert slipped[0] @ open_cortex(body).axis == pytest.approx(0.0, abs=1e-9)
     with pytest.raises(InputError, match="level 3"):
         list(rows(some, sights_of([30], [50], [3]), spy, locator))
     with pytest.raises(InputError, match="no twin"):
@@ -361,6 +365,7 @@ def test_the_command_prints_a_row_for_each_estimator_and_goes_on(body, locator, 
         (["--points", "5"], "--points is 5"),
         (["--cover", "101"], "--cover 101"),
         (["--seed", "-1"], "--seed is -1"),
+        (["--slip", "51"], "--slip 51"),
         (["--anatomy", "own.vtu"], "--anatomy needs --finer"),
     ],
 )

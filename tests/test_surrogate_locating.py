@@ -219,7 +219,7 @@ def test_most_of_the_tumours_motion_is_found_and_ellipsoids_hold_it(locator, bod
         assert np.linalg.eigvalsh(found.centroid_covariance).min() > 0.0
         covariance = found.covariance(body.tumour_nodes)
         assert covariance.shape == (len(body.tumour_nodes), 3, 3) and np.linalg.eigvalsh(covariance).min() > 0.0
-        assert sum(found.causes.values()) == pytest.approx(1.0) and found.calibrated
+        assert sum(found.causes.values()) == pytest.approx(float(not found.within_errors)) and found.calibrated
     assert left < 0.35 * all_of_it and np.mean(held) > 0.85
 
 
@@ -248,7 +248,7 @@ def test_a_rigid_error_is_no_motion(locator, body, truth):
 
 
 def test_a_rigid_error_that_is_stated_is_found(locator, body, truth):
-    """One of 4 mm is believed if it is said that there may be one, and none is if it is said that there is none."""
+    """One of 4 mm is believed if it is said that there may be one. If not, none is, or one that makes doubtful."""
     off = np.zeros(3)
     for seed, (motion, _) in enumerate(truth[::2]):
         seen = observed(body, motion, seed, bias=4e-3)
@@ -256,7 +256,7 @@ def test_a_rigid_error_that_is_stated_is_found(locator, body, truth):
         cloud = Observation(seen.now, sigma=np.full(60, 3e-3), rigid=0.0)
         tipped = replace(seen, tips=seen.now[:1], rigid=0.0)
         for exact in (found[0], locator.locate(cloud), locator.locate(tipped)):
-            assert not exact.bias.any() and not exact.rotation.any()
+            assert exact.slipped or np.abs([exact.bias, exact.rotation]).max() < 1e-6
         off += [np.linalg.norm(each.centroid - middle_of(body, motion[None])[0]) for each in found]
     assert off[2] < off[1] < off[0]
 
@@ -396,5 +396,5 @@ def test_bad_observations_are_refused_with_the_reason(locator, body, truth, spoi
 def test_a_file_in_lps_is_named_as_such(locator, body):
     there = observed(body, np.zeros_like(body.mesh.nodes))
     turned = replace(there, now=there.now * [-1.0, -1.0, 1.0], rest=there.rest * [-1.0, -1.0, 1.0])
-    with pytest.raises(InputError, match=r"they are LPS\. Give RAS"):
+    with pytest.raises(InputError, match=r"they are LPS\. Give mm and RAS"):
         locator.locate(turned)

@@ -9,9 +9,9 @@ from scipy.stats import multivariate_normal
 
 from sim.geometry.locate import Located
 from surrogate.locating.causes import DRAINAGE, SWELLING, TOOL, TUMOUR_SWELLING
-from surrogate.locating.evidence import SHIFT, SIGMA, TURN, of_motions
+from surrogate.locating.evidence import SHIFT, SIGMA, SLIPPED, TURN, of_motions
 from surrogate.locating.posterior import COARSENED, MIXED, SeenPrior, conditioned, seen_prior
-from surrogate.locating.prior import NOWHERE, SETS, WITH_PLACE, Prior
+from surrogate.locating.prior import NOWHERE, RIGIDS, SETS, WITH_PLACE, Prior
 from surrogate.locating.whitened import whitened
 
 POINTS = 30
@@ -67,10 +67,10 @@ def test_what_is_seen_of_shapes_is_their_motion_at_the_points(prior):
 
 
 def test_hypotheses_are_sets_of_causes_in_one_skull_with_and_without_a_tool(prior):
-    assert len(prior.hypotheses) == 3 * len(SETS) * 2
+    assert len(prior.hypotheses) == 3 * len(SETS) * len(RIGIDS)
     taking = set()
     for number, hypothesis in enumerate(prior.hypotheses):
-        kinds, skull = prior.kind[hypothesis.rows], number // (2 * len(SETS))
+        kinds, skull = prior.kind[hypothesis.rows], number // (len(RIGIDS) * len(SETS))
         taking.add((skull, tuple(sorted(set(kinds.tolist())))))
         assert set(prior.skull[hypothesis.rows[kinds != TOOL]]) <= {skull}
         pressed = set(prior.skull[hypothesis.rows[kinds == TOOL]]) | set(prior.skull[hypothesis.places.ravel()])
@@ -78,7 +78,7 @@ def test_hypotheses_are_sets_of_causes_in_one_skull_with_and_without_a_tool(prio
         causes = tuple(sorted(set(kinds.tolist()) - {TOOL}))
         assert len(hypothesis.places) == (2 if causes in WITH_PLACE else 0)
     assert taking == {(skull, tuple(sorted((*some, TOOL)))) for skull in range(3) for some in SETS}
-    assert {hypothesis.rigid for hypothesis in prior.hypotheses} == {0.1, 1.0}
+    assert {hypothesis.rigid for hypothesis in prior.hypotheses} == {0.1, 1.0, np.inf}
 
 
 @pytest.mark.parametrize("single", [False, True])
@@ -87,7 +87,7 @@ def test_an_answer_is_that_of_the_normal_equations_and_its_evidence_that_of_the_
 
     Of whole motions, and of one with a row less, so that axes are not alike. A skull has fewer shapes of swelling.
     """
-    _, evidence = drawn(prior, np.random.default_rng(1), 2)
+    _, evidence = drawn(prior, np.random.default_rng(1), 3)
     evidence = evidence.rows(np.arange(len(evidence) - single))
     kept = np.ones(len(prior.kind), bool)
     kept[np.flatnonzero((prior.kind == SWELLING) & (prior.skull == 1))[1:]] = False
@@ -97,14 +97,12 @@ def test_an_answer_is_that_of_the_normal_equations_and_its_evidence_that_of_the_
     unknown = seen_unknowns(prior, evidence).T
     logs, density = [], []
     for hypothesis, found in zip(prior.hypotheses, sight.logs, strict=True):
-        pressed = len(hypothesis.places)
+        pressed, rigid = len(hypothesis.places), min(hypothesis.rigid, SLIPPED / SHIFT)
         assert np.isfinite(found[: 1 + pressed]).all() and (found[1 + pressed :] == -np.inf).all()
         for number, log in enumerate(found[: 1 + pressed]):
             place = hypothesis.places[number - 1] if number else np.zeros(0, int)
             answer = sight.answer(hypothesis, place, 1.0)
-            size = np.concatenate(
-                [sight.scale * hypothesis.size, np.full(6, hypothesis.rigid), np.full(len(place), sight.scale)]
-            )
+            size = np.concatenate([sight.scale * hypothesis.size, np.full(6, rigid), np.full(len(place), sight.scale)])
             some = unknown[answer.rows]
             spread = np.linalg.inv(some @ np.linalg.solve(noise, some.T) + np.diag(size**-2.0))
             assert answer.back.T @ answer.back == pytest.approx(spread, rel=1e-4, abs=1e-8)
@@ -153,9 +151,9 @@ def test_rows_of_unknowns_and_their_products_are_those_of_all_points(prior, coun
 
 
 def test_ellipsoids_hold_what_is_drawn(prior):
-    random, hypothesis, square = np.random.default_rng(3), prior.hypotheses[2], []
+    random, hypothesis, square = np.random.default_rng(3), prior.hypotheses[3], []
     for _ in range(200):
-        truth, evidence = drawn(prior, random, 2)
+        truth, evidence = drawn(prior, random, 3)
         # What shapes lack is no part of these draws, and their size is known.
         sight = SeenPrior(prior, 3.0, whitened(prior, evidence, 0.0), np.zeros(3))
         answer = sight.answer(hypothesis, hypothesis.places[0], 1.0)
@@ -238,11 +236,11 @@ def test_what_is_seen_may_be_little_because_a_motion_and_a_rigid_error_cancel(pr
 
 def test_a_rigid_error_is_believed_to_be_as_large_as_is_stated(prior):
     """A shift beyond what was stated moves the tumour; of none, none is found."""
-    truth, evidence = drawn(prior, np.random.default_rng(10), 2)
+    truth, evidence = drawn(prior, np.random.default_rng(10), 3)
     shifted = replace(evidence, value=evidence.value + evidence.rigid[:, :3] @ [2e-3, -2e-3, 2e-3])
     off, bias = [], []
     for shift in (0.0, 0.2e-3, 2e-3):
         found = conditioned(prior, replace(shifted, shift=shift))
         off.append(np.linalg.norm((found.weight - truth[:-6]) @ prior.middle))
         bias.append(np.linalg.norm(found.rigid[:3]))
-    assert bias[0] == 0.0 and bias[1] < 0.5 * bias[2] and off[2] < 0.5 * off[0]
+    assert bias[0] < 1e-5 and bias[1] < 0.5 * bias[2] and off[2] < 0.5 * off[0]

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sim.anatomy import Anatomy
+from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
 from sim.runtime.threads import one_thread
 from surrogate.locating.calibration import RADIUS_SQUARED, seen_patch
@@ -36,13 +37,14 @@ TRANSLATIONS = (0.0, 1e-3, 2e-3)
 class PointsSeen:
     """What is seen: so many points, on a round share `cover` [%] of the open cortex, at a level of noise.
 
-    Points without names are a cloud.
+    Points without names are a cloud. A registration that slips displaces all by `slip` [m], along the open cortex.
     """
 
     points: int
     cover: int
     noise: int
     named: bool = True
+    slip: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,8 @@ class Estimate:
         What it took, what is made once for a body apart; None of the oracle and of what was refused.
     refused
         Whether the observation was refused: the tumour is then believed where the scan shows it.
+    doubted
+        Whether it was said that the registration may have slipped.
     """
 
     error: np.ndarray
@@ -66,6 +70,7 @@ class Estimate:
     square: float | None
     seconds: float | None
     refused: bool = False
+    doubted: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,8 +87,8 @@ class Row:
         Share of the twins [%] whose centroid lies in the ellipsoid that is said to hold 95 %; None: none is stated.
     milliseconds
         Median of an estimate; None of the oracle, which is none.
-    twins, refused
-        How many there were, and how many of them were refused.
+    twins, refused, doubted
+        How many there were, how many of them were refused, and of how many a slip was suspected.
     """
 
     points: int
@@ -97,6 +102,7 @@ class Row:
     milliseconds: float | None
     twins: int
     refused: int
+    doubted: int
 
 
 def observed(body: Anatomy, motion: np.ndarray, sight: PointsSeen, seed: tuple[int, ...]) -> Observation:
@@ -107,12 +113,20 @@ def observed(body: Anatomy, motion: np.ndarray, sight: PointsSeen, seed: tuple[i
     place = np.random.default_rng([*seed, sight.points, sight.cover])
     evidence = seen_patch(body, motion, place, sight.points, 1e-2 * sight.cover)
     rest, moved = evidence.at[::3], evidence.value.reshape(-1, 3)
+    if sight.slip:
+        moved = moved + sight.slip * _along(body, np.random.default_rng([*seed, sight.points, sight.cover, 3]))
     known = rest if sight.named else None
     if not sight.noise:
         return Observation(rest + moved, known, np.full(len(rest), EXACT), rigid=0.0)
     random = np.random.default_rng([*seed, sight.points, sight.cover, sight.noise])
     translation = TRANSLATIONS[sight.noise]
     return Observation(spoilt(rest, rest + moved, translation, random), known, rigid=translation / np.sqrt(3.0))
+
+
+def _along(body: Anatomy, random: np.random.Generator) -> np.ndarray:
+    """A unit vector (3,) across the open cortex's axis, by chance."""
+    way = np.cross(open_cortex(body).axis, random.standard_normal(3))
+    return way / np.linalg.norm(way)
 
 
 def spoilt(rest: np.ndarray, now: np.ndarray, translation: float, random: np.random.Generator) -> np.ndarray:
@@ -166,10 +180,10 @@ def rows(
 
 
 def sights_of(
-    points: Sequence[int], covers: Sequence[int], noises: Sequence[int], named: bool = True
+    points: Sequence[int], covers: Sequence[int], noises: Sequence[int], named: bool = True, slip: float = 0.0
 ) -> tuple[PointsSeen, ...]:
     """Every combination."""
-    return tuple(PointsSeen(*each, named) for each in product(points, covers, noises))
+    return tuple(PointsSeen(*each, named, slip) for each in product(points, covers, noises))
 
 
 def row(sight: PointsSeen, name: str, estimates: Sequence[Estimate]) -> Row:
@@ -187,15 +201,21 @@ def row(sight: PointsSeen, name: str, estimates: Sequence[Estimate]) -> Row:
         milliseconds=1e3 * float(np.median(seconds)) if seconds else None,
         twins=len(estimates),
         refused=sum(each.refused for each in estimates),
+        doubted=sum(each.doubted for each in estimates),
     )  # fmt: skip
 
 
 def estimate(
-    found: np.ndarray, true: np.ndarray, square: float | None, seconds: float | None, refused: bool = False
+    found: np.ndarray,
+    true: np.ndarray,
+    square: float | None,
+    seconds: float | None,
+    refused: bool = False,
+    doubted: bool = False,
 ) -> Estimate:
     """An estimate of the motion (q, 3) [m] of the tumour's vertices, beside the truth (q, 3) [m]."""
     error, motion = np.linalg.norm(found - true, axis=1), np.linalg.norm(true, axis=1)
-    return Estimate(error, motion, square, seconds, refused)
+    return Estimate(error, motion, square, seconds, refused, doubted)
 
 
 def ours(locator: Locator, motion: np.ndarray, seen: Observation) -> Estimate:
@@ -208,7 +228,7 @@ def ours(locator: Locator, motion: np.ndarray, seen: Observation) -> Estimate:
         return estimate(np.zeros_like(true), true, None, None, refused=True)
     off = found.centroid - middle_of(body, motion[None])[0]
     square = float(off @ np.linalg.solve(found.centroid_covariance, off))
-    return estimate(found.at(body.tumour_nodes), true, square, found.seconds)
+    return estimate(found.at(body.tumour_nodes), true, square, found.seconds, doubted=found.slipped)
 
 
 def _rivalling(body: Anatomy, twin: Twin, rival: Rival, seen: Observation) -> Estimate:

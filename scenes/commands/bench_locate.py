@@ -25,8 +25,11 @@ if TYPE_CHECKING:
 
 HEADS = (
     "points", "cover [%]", "noise", "estimator", "removed [%]", "error: mean [mm]", "p95 [mm]", "in the 95 % ellipsoid",
-    "refused", "ms",
+    "refused", "in doubt", "ms",
 )  # fmt: skip
+
+# Farther no registration slips unnoticed [mm].
+MOST_SLIPPED = 50.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -56,6 +59,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--clouds", action="store_true", help="points have no names: where the surface is; rivals need names, and rest"
     )
+    parser.add_argument(
+        "--slip", type=float, default=0.0, metavar="MM",
+        help="all points are displaced so far along the open cortex, as by a registration that slipped (default 0)",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of the twins and of what is seen (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument(
@@ -85,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     table = sys.stderr if args.json else sys.stdout
     where = f"{machine(args.device)}; truths of {len(finer.mesh.nodes)} nodes, {args.element}"
     print(f"{where}\n\n{len(some)} twins\n\n| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", file=table)
-    sights = sights_of(args.points, args.cover, args.noise, not args.clouds)
+    sights = sights_of(args.points, args.cover, args.noise, not args.clouds, 1e-3 * args.slip)
     made = []
     with bar("observations") as heard:
         for row in rows(some, sights, rivals(body), locator, args.seed, heard):
@@ -113,6 +120,10 @@ def _check(args: argparse.Namespace) -> None:
     for cover in args.cover:
         if not 1 <= cover <= 100:
             raise InputError(f"--cover {cover}: give a share of the open cortex, from 1 to 100 [%].")
+    if not 0.0 <= args.slip <= MOST_SLIPPED:
+        raise InputError(
+            f"--slip {args.slip:g}: give how far all points are displaced, from 0 to {MOST_SLIPPED:g} [mm]."
+        )
     check_finer(args)
 
 
@@ -177,5 +188,5 @@ def _cells(row: Row) -> Iterable[str]:
     took = "" if row.milliseconds is None else f"{row.milliseconds:.3g}"
     return (
         f"{row.points}", f"{row.cover}", f"{row.noise}", row.estimator, f"{row.removed:.0f}", f"{row.mean:.2f}",
-        f"{row.p95:.2f}", held, f"{row.refused or ''}", took,
+        f"{row.p95:.2f}", held, f"{row.refused or ''}", f"{row.doubted or ''}", took,
     )  # fmt: skip

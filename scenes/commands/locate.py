@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -113,11 +113,14 @@ def _numbers(found: Location, points: int, out: Path | None) -> dict[str, object
         "explained": found.explained,
         "explained_by_rigid_error": found.rigid_only[0],
         "causes": found.causes,
+        "told_apart": [asdict(share) for share in found.cause_shares],
+        "within_errors": found.within_errors,
         "bias_mm": (1e3 * found.bias).tolist(),
         "bias_degrees": np.degrees(found.rotation).tolist(),
         "points": points,
         "outliers": found.outliers.tolist(),
         "tips_left_out": found.tips_left_out.tolist(),
+        "slipped": found.slipped,
         "calibrated": found.calibrated,
         "milliseconds": 1e3 * found.seconds,
         "of": "the tumour, as far as the causes that were tried go; not of a model",
@@ -140,10 +143,8 @@ def _sentences(found: Location, out: Path | None) -> str:
             f"A registration that is off by {1e3 * shift:.0f} mm would explain {share:.0%}, with a brain at rest. "
             "If it may be off so far, say so by --rigid."
         )
-    if not found.calibrated:
-        lines.append(
-            "It is a guess: ellipsoids were not tried on so few or many points, or motions so near or far above errors."
-        )
+    if found.doubt:
+        lines.append(found.doubt)
     if len(found.outliers):
         rows = ", ".join(str(number + 2) for number in found.outliers[:20]) + (
             " ..." if len(found.outliers) > 20 else ""

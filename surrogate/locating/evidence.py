@@ -25,6 +25,9 @@ SHIFT = 0.8e-3
 # How far they are turned about each axis [rad], for each metre of that.
 TURN = float(np.radians(0.3)) / SHIFT
 
+# The rigid error of a registration that slipped [m], along each axis; and one that any has, whatever is stated.
+SLIPPED, LEAST_SHIFT = 10e-3, 1e-5
+
 # Triangular matrices that are inverted at once have fewer rows than twice this.
 SMALL = 48
 (trtri,) = get_lapack_funcs(("trtri",), dtype=np.float64)
@@ -80,9 +83,19 @@ class Evidence:
         return np.concatenate([self.axis, np.cross(self.at - self.middle, self.axis)], axis=1)
 
     @property
+    def rigid_alone(self) -> np.ndarray:
+        """The rigid error (6,) [m, rad] that explains most with a body at rest, by least squares, however large."""
+        return np.linalg.lstsq(self.rigid, self.value, rcond=None)[0]
+
+    @property
     def rigid_scale(self) -> np.ndarray:
         """Standard deviations (6,) of the prior of a rigid error: translation [m], rotation [rad]."""
-        return np.repeat([self.shift, TURN * self.shift], 3)
+        return max(self.shift, LEAST_SHIFT) * np.repeat([1.0, TURN], 3)
+
+    @property
+    def slip(self) -> float:
+        """Standard deviation of the rigid error of a registration that slipped, as a share of the stated one."""
+        return max(SLIPPED / max(self.shift, LEAST_SHIFT), 1.0)
 
     def noise(self, scale: float = 0.0) -> np.ndarray:
         """Covariance (m, m) [m^2] of errors that are not rigid, and of what shapes lack where `scale` [m] is seen."""

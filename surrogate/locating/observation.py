@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
 from sim.anatomy import Anatomy
+from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
 from sim.geometry.closest_point import closest
 from sim.geometry.locate import Located, locate
@@ -26,6 +28,18 @@ NEAR, FAR, NEAR_NOW = 6e-3, 12e-3, 18e-3
 FARTHEST_TIP, ONE_PLACE = 30e-3, 1e-3
 # Motions [m] beyond which no brain goes, and rigid errors that no tracker has.
 LONGEST_MOTION, FARTHEST_OFF = 0.025, 0.02
+# What points may be by mistake: times which scale they would lie on the cortex, and with axes turned how.
+UNITS = (
+    (1.0, ""),
+    (1e-3, "if they were a thousandth of that: files are in mm, arrays in metres"),
+    (1e3, "if they were a thousand times of that: files are in mm, arrays in metres"),
+    (10.0, "if they were ten times of that: they look like centimetres"),
+    (1e-2, "if they were a hundredth of that: they look like an array of centimetres"),
+    (25.4, "if they were 25.4 times of that: they look like inches"),
+)
+FRAMES = (((1.0, 1.0, 1.0), ""), ((-1.0, -1.0, 1.0), "if x and y were turned: they are LPS"))
+# So many times as wide as the open cortex, or as narrow, points have other units.
+SPANS = 6.0
 MOST = 400
 """Points of a cloud that are looked at, spread over it: more tell no more."""
 
@@ -216,11 +230,11 @@ def _mostly_off(off: np.ndarray, near: float) -> bool:
 def _elsewhere(anatomy: Anatomy, points: np.ndarray, off: float, near: float) -> str:
     """Why half of some points (n, 3) [m] may be so far `off` the open cortex, farther than is `near` [m]."""
     start = f"half of the points lie more than {1e3 * off:.3g} mm off the open cortex"
-    for scale, unit_meant in ((1e-3, "a thousandth"), (1e3, "a thousand times")):
-        if not _mostly_off(_off_surface(anatomy, scale * points), near):
-            return f"{start}, and would lie on it if they were {unit_meant} of that: files are in mm, arrays in metres."
-    if not _mostly_off(_off_surface(anatomy, 10.0 * points), near):
-        return f"{start}, and would lie on it if they were ten times of that: they look like centimetres. Give mm."
-    if not _mostly_off(_off_surface(anatomy, points * [-1.0, -1.0, 1.0]), near):
-        return f"{start}, and would lie on it if x and y were turned: they are LPS. Give RAS."
+    for (scale, unit_meant), (turned, frame_meant) in product(UNITS, FRAMES):
+        if not _mostly_off(_off_surface(anatomy, scale * points * turned), near):
+            meant = " and ".join(filter(None, (unit_meant, frame_meant)))
+            return f"{start}, and would lie on it {meant}. Give mm and RAS."
+    span, own = (float(np.linalg.norm(np.ptp(some, axis=0))) for some in (points, open_cortex(anatomy).corners))
+    if not own / SPANS < span < own * SPANS:
+        return f"{start}. They span {1e3 * span:.3g} mm, and it {1e3 * own:.3g} mm: check units. Give mm and RAS."
     return f"{start}: they are of another brain or frame. Give the scan's own RAS, in millimetres."

@@ -17,7 +17,7 @@ from scipy.special import chdtri
 
 from .causes import TOOL
 from .elimination import Equations
-from .evidence import Evidence, triangular_inverse
+from .evidence import SHIFT, SLIPPED, Evidence, triangular_inverse
 from .prior import RIGIDS, SETS, WITH_PLACE, Hypothesis, Prior
 from .whitened import Whitened, whitened
 
@@ -61,6 +61,9 @@ class Posterior:
         Mean over points of how improbable each is by all others, as a share of what is expected: 1 where all fits.
     outliers
         Numbers of the points that were left out.
+    slipped
+        Logarithm of how many times more probable what is seen is, if the registration slipped, than if it did not: of
+        the best hypothesis of each.
     factor
         What covariances are larger by than the mixture's.
     """
@@ -70,6 +73,7 @@ class Posterior:
     unknown: np.ndarray
     surprise: float
     outliers: np.ndarray
+    slipped: float
     factor: float = 1.0
 
     @property
@@ -113,16 +117,33 @@ class SeenPrior:
         What unit weights, and a rigid error of one standard deviation, do where something is seen.
     odds
         As `Prior.odds`.
+    slip
+        As `Evidence.slip`.
     """
 
     prior: Prior
     scale: float
     rows: Whitened
     odds: np.ndarray
+    slip: float = SLIPPED / SHIFT
 
-    def answers(self) -> list[Answer]:
-        """Of the most probable hypotheses, the best first; their shares sum to 1."""
-        logs = self.logs
+    @property
+    def slipped(self) -> float:
+        """As that of a `Posterior`."""
+        best = self.logs.max(axis=1)
+        return COARSENED * float(best[self._slips].max() - best[~self._slips].max())
+
+    @property
+    def _slips(self) -> np.ndarray:
+        """Which of the hypotheses (h,) are of a registration that slipped."""
+        return np.isinf([hypothesis.rigid for hypothesis in self.prior.hypotheses])
+
+    def answers(self, free: bool = False) -> list[Answer]:
+        """Of the most probable hypotheses, the best first; their shares sum to 1.
+
+        Those of a registration that slipped are among them if it is `free`.
+        """
+        logs = self.logs if free else np.where(self._slips[:, None], -np.inf, self.logs)
         best = np.argsort(-logs, axis=None, kind="stable")[: min(MIXED, np.isfinite(logs).sum())]
         share = np.exp(logs.flat[best] - logs.flat[best[0]])
         share /= share.sum()
@@ -140,7 +161,7 @@ class SeenPrior:
         First without a tool, then with one on each place; -inf where none may press.
         """
         # Tools all over the cortex and the rigid error take part in all hypotheses, and a set extends an earlier one.
-        rigid = self._equations().eliminated(TOOL).varied(RIGID, np.array(RIGIDS)).eliminated(RIGID)
+        rigid = self._equations().eliminated(TOOL).varied(RIGID, np.minimum(RIGIDS, self.slip)).eliminated(RIGID)
         found: dict[tuple[int, ...], Equations] = {(): rigid}
         for some in SETS[1:]:
             found[some] = found[some[:-1]].eliminated(some[-1])
@@ -178,7 +199,7 @@ class SeenPrior:
         own = np.concatenate([hypothesis.rows, self._rigid, place])
         size = np.full(len(own), self.scale)
         size[: len(hypothesis.rows)] *= hypothesis.size
-        size[len(hypothesis.rows) : len(own) - len(place)] = hypothesis.rigid
+        size[len(hypothesis.rows) : len(own) - len(place)] = min(hypothesis.rigid, self.slip)
         # The inverse of the Cholesky factor of the precision of unknowns, each over its prior standard deviation.
         inner = self.rows.products[own[:, None], own] * size * size[:, None]
         inner[np.diag_indices(len(own))] += 1.0
@@ -191,16 +212,19 @@ def seen_prior(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> 
     seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
     # A motion and a rigid error may cancel, so that little is seen of either; and noise hides what is smaller.
     scale = 1e3 * max(float(np.hypot(seen, np.sqrt(3.0) * evidence.shift)), float(np.median(evidence.sigma)))
-    return SeenPrior(prior, scale, whitened(prior, evidence, seen), prior.odds(tips))
+    return SeenPrior(prior, scale, whitened(prior, evidence, seen), prior.odds(tips), evidence.slip)
 
 
-def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> Posterior:
-    """Condition a prior on evidence, without points that no other supports. Tips (k, 3) [m] touch the cortex."""
+def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS, free: bool = False) -> Posterior:
+    """Condition a prior on evidence, without points that no other supports. Tips (k, 3) [m] touch the cortex.
+
+    The rigid error is as large as is stated, or `free`: then it may be that of a registration that slipped.
+    """
     kept, point = np.ones(len(evidence), bool), evidence.point
     while True:
         some = evidence.rows(kept)
         seen = seen_prior(prior, some, tips)
-        answers = seen.answers()
+        answers = seen.answers(free)
         odd = _oddness(seen.rows, answers[0], some.point)
         excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], IMPROBABLE)
         if excess.max() <= 1.0 or len(excess) <= FEWEST:
@@ -209,7 +233,8 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) ->
     unknown = np.zeros(len(prior.kind) + 6)
     for answer in answers:
         unknown[answer.rows] += answer.share * answer.mean
-    return Posterior(some, answers, unknown, float(odd.sum() / len(some)), np.setdiff1d(point, some.point))
+    outliers = np.setdiff1d(point, some.point)
+    return Posterior(some, answers, unknown, float(odd.sum() / len(some)), outliers, seen.slipped)
 
 
 def _oddness(rows: Whitened, answer: Answer, point: np.ndarray) -> np.ndarray:

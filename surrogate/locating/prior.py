@@ -28,8 +28,9 @@ PLACES, PLACE_SHAPES, REACH = 30, 6, 6e-3
 # Sizes as shares of the seen motion: of what takes part; of a tumour's swelling where a brain swells; of forces all
 # over the cortex, which make good what the other shapes lack.
 SIZE = {DRAINAGE: 1.0, SWELLING: 1.0, TUMOUR_SWELLING: 0.3, TOOL: 0.15}
-# The rigid error, as shares of what an observation states: a brain that sinks looks much like one.
-RIGIDS = (0.1, 1.0)
+# The rigid error, as shares of what an observation states: a brain that sinks looks much like one. The last is that of
+# a registration that slipped, which nobody states.
+RIGIDS = (0.1, 1.0, np.inf)
 # A skull that lets go holds what tools press against it, as one does in which the brain slides.
 PRESSED = {"bonded": "bonded", "slide": "slide", "contact": "slide"}
 # What may take part beside tools.
@@ -52,7 +53,7 @@ class Hypothesis:
     size
         (k,) standard deviations of their weights, as shares of the seen motion.
     rigid
-        That of the rigid error, as a share of what an observation states.
+        That of the rigid error, as a share of what an observation states; inf of a registration that slipped.
     places
         (p, q) rows of shapes, of which those of one line may take part too: of a tool that presses on one place.
     """
@@ -138,6 +139,12 @@ class Prior:
         tumour = self.anatomy.tumour_nodes
         return np.einsum("v,rvi->ri", tumour_share(self.anatomy)[tumour], self.at(tumour))
 
+    @cached_property
+    def on_cortex(self) -> np.ndarray:
+        """(r, r) [m^2]: products of the shapes with each other, summed over the open cortex's vertices."""
+        flat = self.at(np.unique(self.anatomy.open_surface)).reshape(len(self.shape), -1).astype(float)
+        return flat @ flat.T
+
     def _columns(self, nodes: np.ndarray) -> np.ndarray:
         """Where vertices (k,) are among those that are known."""
         if self.nodes is None:
@@ -180,7 +187,7 @@ class Prior:
 
     @cached_property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """Every set of causes in every skull, with and without much of a rigid error."""
+        """Every set of causes in every skull, with little of a rigid error, with much, and where it slipped."""
         made = []
         for number in range(len(SKULLS)):
             rows, places = self._in_skull(number)

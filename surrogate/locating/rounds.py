@@ -16,8 +16,10 @@ from .prior import Prior
 ROUNDS, STEADY = 6, 0.2e-3
 
 
-def settled(prior: Prior, observation: Observation) -> tuple[Posterior, np.ndarray]:
+def settled(prior: Prior, observation: Observation, free: bool = False) -> tuple[Posterior, np.ndarray]:
     """What an observation leaves of a prior, and the numbers (k,) of its named points that were looked at.
+
+    The rigid error may be `free`, as in `conditioned`.
 
     Raises
     ------
@@ -27,14 +29,14 @@ def settled(prior: Prior, observation: Observation) -> tuple[Posterior, np.ndarr
     anatomy, tips, count = prior.anatomy, observation.tips, len(observation.now)
     evidence = placed(anatomy, observation)
     named = np.unique(evidence.point[evidence.point < count])
-    found = conditioned(prior, evidence, tips)
+    found = conditioned(prior, evidence, tips, free)
     if observation.rest is None or len(tips):
         cortex, motion = np.unique(anatomy.open_surface), np.zeros_like(anatomy.mesh.nodes)
         for _ in range(ROUNDS):
             motion[cortex] = np.tensordot(found.weight, prior.at(cortex), 1)
             evidence = placed_anew(anatomy, observation, named, motion, found.bias_at)
             supported = np.delete(np.arange(len(tips)), found.outliers[found.outliers >= count] - count)
-            before, found = found, conditioned(prior, evidence, tips[supported])
+            before, found = found, conditioned(prior, evidence, tips[supported], free)
             if np.linalg.norm((found.weight - before.weight) @ prior.middle) < STEADY:
                 break
     return found, named

@@ -242,7 +242,7 @@ def estimated(found: Estimate) -> list[str]:
         ]
     moved = unbroken(found.moved, found.location.p95)
     held = "inside" if found.held else "outside of"
-    guess = "" if found.location.calibrated else " It is a guess: such observations were not tried."
+    guess = f" {found.location.doubt}" if found.location.doubt else ""
     still = "" if found.noticed else " No motion is seen beyond its error."
     return [
         f'<p class="number">tumour moved {moved} by the estimate ({truth})</p>',

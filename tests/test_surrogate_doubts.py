@@ -1,0 +1,91 @@
+"""What `sulcus locate` does not know, it says: registrations that slip, causes that look alike, and stillness.
+
+Of the template and the locator that ship.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes.bench.locate_study import PointsSeen, observed
+from scenes.script.shipped_files import template_path
+from sim.bodies.meshfile import read_anatomy
+from sim.bodies.open_cortex import open_cortex
+from sim.effects import SKULLS
+from surrogate.locating.cause_shares import cause_shares
+from surrogate.locating.causes import DRAINAGE, KINDS
+from surrogate.locating.locator_files import load_locator, locator_path
+from surrogate.locating.prior import middle_of
+
+NAMED, CLOUD = PointsSeen(100, 44, 1), PointsSeen(100, 44, 1, named=False)
+
+
+@pytest.fixture(scope="module")
+def locator():
+    return load_locator(locator_path(template_path()), read_anatomy(template_path()))
+
+
+@pytest.fixture(scope="module")
+def sunk(locator):
+    """A motion (V, 3) [m] of the vertices that tell: the cortex sinks by 6 mm, and slides in its skull."""
+    prior, body = locator.prior, locator.anatomy
+    first = np.flatnonzero((prior.kind == DRAINAGE) & (prior.skull == list(SKULLS).index("slide")))[0]
+    motion = np.zeros_like(body.mesh.nodes)
+    motion[prior.nodes] = prior.shape[first]
+    inward = float((motion[np.unique(body.open_surface)] @ open_cortex(body).axis).mean())
+    return motion * 6e-3 / inward
+
+
+def sideways(body, length):
+    """A shift (3,) [m] along the open cortex."""
+    return length * open_cortex(body).right
+
+
+@pytest.mark.parametrize("length", [8e-3, 12e-3, 20e-3])
+def test_points_that_slip_sideways_are_in_doubt_and_the_error_spans_it(locator, length):
+    """Nothing moved but the registration."""
+    seen = observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), NAMED, (0, 0))
+    found = locator.locate(replace(seen, now=seen.now + sideways(locator.anatomy, length)))
+    assert found.slipped and not found.calibrated and "may have slipped" in found.doubt
+    assert np.linalg.norm(found.centroid) < found.p95 and np.linalg.norm(found.bias) > 0.3 * length
+    assert not found.cause_shares and "may have slipped" in found.named_causes
+
+
+@pytest.mark.parametrize("sight", [NAMED, CLOUD])
+def test_a_brain_that_sinks_is_not_taken_for_a_slip(locator, sunk, sight):
+    """Its tumour is found, and the error holds."""
+    found = locator.locate(observed(locator.anatomy, sunk, sight, (0, 0)))
+    off = np.linalg.norm(found.centroid - middle_of(locator.anatomy, sunk[None])[0])
+    assert not found.slipped and found.calibrated and not found.doubt and off < found.p95
+    assert not found.within_errors and sum(found.causes.values()) == pytest.approx(1.0)
+
+
+def test_a_cloud_that_sinks_has_drained_though_a_brain_that_shrinks_looks_alike(locator):
+    """All of it by 5 mm, along the opening's axis."""
+    body = locator.anatomy
+    still = observed(body, np.zeros_like(body.mesh.nodes), PointsSeen(100, 90, 1, named=False), (0, 0))
+    found = locator.locate(replace(still, now=still.now + 5e-3 * open_cortex(body).axis))
+    largest = found.cause_shares[0]
+    assert largest.causes == KINDS[1:3] and largest.low > 0.8 and "not told apart" in found.named_causes
+    assert found.causes["drainage"] > found.causes["swelling"]
+
+
+@pytest.mark.parametrize("sight", [NAMED, CLOUD])
+def test_where_nothing_moved_no_cause_is_named(locator, sight):
+    found = locator.locate(observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), sight, (0, 0)))
+    assert found.within_errors and not found.cause_shares and not any(found.causes.values())
+    assert found.named_causes == "none, as what was seen is within its errors"
+
+
+def test_causes_are_grouped_as_finely_as_their_shares_are_known():
+    """Two that trade places are named together; one that is always the same, alone; one of nothing, not at all."""
+    first = np.random.default_rng(0).uniform(0.0, 0.8, 2000)
+    drawn = np.stack([np.full(2000, 0.2), first, 0.8 - first, np.zeros(2000)], axis=1)
+    both, alone = cause_shares(drawn)
+    assert both.causes == KINDS[1:3] and (both.share, both.low, both.high) == pytest.approx((0.8, 0.8, 0.8))
+    assert str(alone) == "tool 20% (20% to 20%)"
+    assert str(both) == "drainage or swelling or shrinking (not told apart) 80% (80% to 80%)"
+    narrow = cause_shares(np.stack([first / 4.0, 1.0 - first / 4.0, 0.0 * first, 0.0 * first], axis=1))
+    assert [each.causes for each in narrow] == [("drainage",), ("tool",)]
+    assert narrow[1].low == pytest.approx(0.01, abs=0.003) and narrow[1].high == pytest.approx(0.19, abs=0.003)
