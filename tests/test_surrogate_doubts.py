@@ -67,7 +67,7 @@ def test_a_cloud_that_sinks_has_drained_though_a_brain_that_shrinks_looks_alike(
     still = observed(body, np.zeros_like(body.mesh.nodes), PointsSeen(100, 90, 1, named=False), (0, 0))
     found = locator.locate(replace(still, now=still.now + 5e-3 * open_cortex(body).axis))
     largest = found.cause_shares[0]
-    assert largest.causes == KINDS[1:3] and largest.low > 0.8 and "not told apart" in found.named_causes
+    assert largest.causes == KINDS[1:3] and largest.low > 0.8 and "not separable" in found.named_causes
     assert found.causes["drainage"] > found.causes["swelling"]
 
 
@@ -85,7 +85,7 @@ def test_causes_are_grouped_as_finely_as_their_shares_are_known():
     both, alone = cause_shares(drawn)
     assert both.causes == KINDS[1:3] and (both.share, both.low, both.high) == pytest.approx((0.8, 0.8, 0.8))
     assert str(alone) == "tool 20% (20% to 20%)"
-    assert str(both) == "drainage or swelling or shrinking (not told apart) 80% (80% to 80%)"
+    assert str(both) == "drainage or swelling or shrinking (not separable) 80% (80% to 80%)"
     narrow = cause_shares(np.stack([first / 4.0, 1.0 - first / 4.0, 0.0 * first, 0.0 * first], axis=1))
     assert [each.causes for each in narrow] == [("drainage",), ("tool",)]
     assert narrow[1].low == pytest.approx(0.01, abs=0.003) and narrow[1].high == pytest.approx(0.19, abs=0.003)

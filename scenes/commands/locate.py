@@ -113,7 +113,7 @@ def _numbers(found: Location, points: int, out: Path | None) -> dict[str, object
         "explained": found.explained,
         "explained_by_rigid_error": found.rigid_only[0],
         "causes": found.causes,
-        "told_apart": [asdict(share) for share in found.cause_shares],
+        "cause_groups": [asdict(share) for share in found.cause_shares],
         "within_errors": found.within_errors,
         "bias_mm": (1e3 * found.bias).tolist(),
         "bias_degrees": np.degrees(found.rotation).tolist(),

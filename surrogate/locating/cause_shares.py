@@ -1,6 +1,6 @@
-"""Which causes moved the cortex, as far as what is seen tells them apart; and whether anything is seen to have moved.
+"""Which causes moved the cortex, as far as what is seen separates them; and whether anything is seen to have moved.
 
-Shares are those of draws from the posterior. Causes whose own shares scatter widely are not told apart: of all ways to
+Shares are those of draws from the posterior. Causes whose own shares scatter widely are not separable. Of all ways to
 group them, the finest is taken in which the joint share of each group is known.
 """
 
@@ -30,12 +30,12 @@ LEAST_NAMED = 0.005
 
 @dataclass(frozen=True)
 class CauseShare:
-    """What causes that are not told apart move together.
+    """What causes that are not separable move together.
 
     Parameters
     ----------
     causes
-        Of `KINDS`; one, where it is told from all others.
+        Of `KINDS`; one, where it is separable from all others.
     share, low, high
         Their joint share in what causes move the open cortex by, in mean square: mean, and an interval of 90 %.
     """
@@ -47,12 +47,12 @@ class CauseShare:
 
     def __str__(self) -> str:
         named = " or ".join(WORDS.get(cause, cause) for cause in self.causes)
-        apart = "" if len(self.causes) == 1 else " (not told apart)"
+        apart = "" if len(self.causes) == 1 else " (not separable)"
         return f"{named}{apart} {self.share:.0%} ({self.low:.0%} to {self.high:.0%})"
 
 
 def cause_shares(drawn: np.ndarray) -> tuple[CauseShare, ...]:
-    """Groups of `KINDS` that drawn shares (n, kinds) tell apart, the largest first, without those of next to nothing.
+    """Groups of `KINDS` that drawn shares (n, kinds) separate, the largest first, without those of next to nothing.
 
     Of several finest ways to group them, the one whose intervals are narrowest together.
     """

@@ -117,7 +117,7 @@ class Location:
 
     @cached_property
     def cause_shares(self) -> tuple[CauseShare, ...]:
-        """What moved the open cortex, as far as causes are told apart, the largest share first.
+        """What moved the open cortex, as far as causes are separable, the largest share first.
 
         None where what was seen is within its errors, or the registration may have slipped.
         """
@@ -127,7 +127,7 @@ class Location:
     def causes(self) -> dict[str, float]:
         """Mean share of each of `KINDS` in what they move the open cortex by, in mean square; they sum to 1.
 
-        All are 0 where no cause is named. Single shares are guesses where causes are not told apart.
+        All are 0 where no cause is named. Single shares are guesses where causes are not separable.
         """
         share = self._drawn_shares.mean(axis=0) if self.cause_shares else np.zeros(len(KINDS))
         return dict(zip(KINDS, share.tolist(), strict=True))
