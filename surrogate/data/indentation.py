@@ -94,16 +94,16 @@ def indented(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     """
     pose, core = posed(loads, tool), core_of(tool)
     foot = pose[:, :3, 3] + pose[:, :3, :3] @ (core.centre - [0.0, 0.0, core.half[2]])
-    point, distance = _off(patch, foot)
+    at = np.einsum("bij,kj->bki", pose[:, :3, :3], _places(core)) + pose[:, None, :3, 3]
+    near, off = _off(patch, np.concatenate([foot, at.reshape(-1, 3)]))
+    point, distance = near[: len(pose)], off[: len(pose)]
     inward = patch.normal_near(point)
-    near = np.abs(distance) < ON_IT
-    direction = np.where(near[:, None], inward, (point - foot) / np.where(near, 1.0, distance)[:, None])
+    on_it = np.abs(distance) < ON_IT
+    direction = np.where(on_it[:, None], inward, (point - foot) / np.where(on_it, 1.0, distance)[:, None])
     if isinstance(tool, Ball):
         depth = np.maximum(core.radius - distance, 0.0)
         return Pushed(point, depth[:, None] * direction, np.full(len(pose), core.radius))
-    places = _places(core)
-    at = np.einsum("bij,kj->bki", pose[:, :3, :3], places) + pose[:, None, :3, 3]
-    deepest = core.radius - _off(patch, at.reshape(-1, 3))[1].reshape(len(pose), -1).min(axis=1)
+    deepest = core.radius - off[len(pose) :].reshape(len(pose), -1).min(axis=1)
     force = np.maximum(deepest, 0.0)[:, None] * direction
     axes = pose[:, :3, :3]
     if isinstance(tool, Capsule):  # which is round: however it is turned about its shaft, it is the same

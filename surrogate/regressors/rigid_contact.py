@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 THICKER = 0.5 * ToolContact((Ball(1.0),)).gap
 # Facets within so many radii of what a tool lies round may come to touch.
 REACH = 1.5
-# A facet entered by less [m], and motions smaller than that, end the search, which so many rounds bound.
-TOLERANCE, MOST = 1e-6, 60
+# A facet entered by less [m], and motions smaller than so many times that, end the search, which so many rounds bound.
+TOLERANCE, SETTLED, MOST = 1e-6, 3.0, 60
 # A rod or a blade goes in by so many radii at once, so that tissue stays before it; there a facet is entered by more.
 STRIDE, COARSER = 0.5, 1e-5
 # Where it only goes through, so many rounds do: more change the answer by less than what it is off, in twice the time.
@@ -259,7 +259,7 @@ class Contact:
                 last, moved = moved, (compliance @ force).reshape(-1, 3)
                 kept = (bears > 0.0) | (iteration >= FORGETFUL)
                 facet, share, bears = facet[kept], share[kept], bears[kept]
-                settled = bool(np.abs(moved - last).max() < tolerance)
+                settled = bool(np.abs(moved - last).max() < SETTLED * tolerance)
         whole, places = np.zeros(len(self.compliance)), np.full((HELD, 4), -1.0)
         whole[rows] = force
         strongest = np.argsort(-bears)[:HELD]
