@@ -67,9 +67,13 @@ def _size(rows: np.ndarray) -> float:
     return float(np.sqrt((rows**2).sum(axis=-2).mean()))
 
 
-def errors(evidence: Evidence) -> tuple[np.ndarray, float]:
-    """Cholesky factor (m, m) of the covariance of all errors, and the root mean square that is seen [m]."""
-    value = evidence.value
+def errors(evidence: Evidence, believed: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+    """Cholesky factor (m, m) of the covariance of all errors, and the root mean square that is seen [m].
+
+    What tissue lacks is a share of the motion that is `believed` (m,) [m]; None: of what is seen. That has errors, too:
+    points that seem to move farther then count less, so that motions seem smaller than they are.
+    """
+    value = evidence.value if believed is None else believed
     length = np.sqrt(np.bincount(evidence.point, value**2))[evidence.point]
     seen = float(np.sqrt((value**2).mean()))
     off = LACK * np.maximum(length, LEAST * np.sqrt(3.0) * seen)
