@@ -37,12 +37,14 @@ class Demo:
         self.solve.join()
         print("all closed", flush=True)
 
-theatre = Names(models={"linear": Names(left_out=None)}, best=lambda scene: "linear", usual=lambda scene: "linear",
+theatre = Names(models={"linear": Names(left_out=None)}, learned_tissue=None,
+                best=lambda scene: "linear", usual=lambda scene: "linear",
                 knowing=lambda scene: True, refusals=lambda scene: {}, described=lambda name, scene: name)
 sys.modules["ar.overlay.composite"] = Names(load_kernels=lambda: None)
 sys.modules["sim.runtime.device"] = Names(find_device=lambda *words: None)
 sys.modules["scenes.play.page.demo"] = Names(Demo=Demo)
-scene = Names(name="none", viewpoint=None, made_of=lambda tissue, element: scene)
+scene = Names(name="none", viewpoint=None, elasticity=Names(default=None, regions={}),
+              made_of=lambda tissue, element: scene)
 sys.modules["scenes.script.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",))
 sys.modules["scenes.play.deformers"] = Names(open_theatre=lambda *words: theatre)
 from scenes.commands.demo import add_arguments, run

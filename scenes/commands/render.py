@@ -45,14 +45,14 @@ def run(args: argparse.Namespace) -> int:
 
     from ..play.player import labelled
 
-    theatre = theatre_asked(args)
-    scene = filmed(args, scene_asked(args, args.scene, theatre))
     at_least("--every", args.every, 1)
     claimed_folder(args.out, "frames")
     if args.film is not None:
         if args.film.suffix not in (".mp4", ".gif", ".webp"):
             raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
         claimed(args.film, args.film.suffix, "a film of `sulcus render`", args.force, [args.camera])
+    theatre = theatre_asked(args)
+    scene = filmed(args, scene_asked(args, args.scene, theatre))
     name = deformer_name(args, theatre, scene)
     player = replace(theatre.player(name, scene), style=args.style)
     run_of = _run(args, theatre, scene, name)
