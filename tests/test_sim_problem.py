@@ -135,7 +135,7 @@ def test_a_cause_that_does_not_act_is_not_launched(launches: list[str]) -> None:
         ([Elasticity(), Held(), "gravity"], "no effect is called str: choose from Elasticity"),
         (
             [Elasticity(regions={4: Material("linear", 1.0, 0.0)}), Held()],
-            r"region 4, but the mesh has the regions \[0",
+            r"region 4 \(ventricles\), but the mesh has the regions \[0",
         ),
         ([Elasticity(default=None), Held()], "region 0 has no tissue law"),
         ([Elasticity(), NodalForce()], "can move rigidly"),
