@@ -166,7 +166,6 @@ class TestEveryDeformer:
         picked = answer.nodes[[5, 2, 11]]
         some = deformer.deform(loads(), at=picked)
         np.testing.assert_array_equal(some.nodes, picked)
-        # A product of matrices may round its last column otherwise where there are fewer.
         np.testing.assert_allclose(some.displacement, answer.displacement[:, [5, 2, 11]], rtol=0.0, atol=1e-10)
         np.testing.assert_array_equal(answer.at(picked).displacement, answer.displacement[:, [5, 2, 11]])
         with pytest.raises(InputError, match=f"vertex {COUNT}"):
