@@ -86,6 +86,8 @@ def test_it_comes_straight_in_where_that_is_nearer(model: Learned, box: Anatomy)
     strange = replace(starts[2], warm={HELD: np.ones((1, 5))})
     alone = there.rows(np.array([2]))
     assert model.deform(alone, strange).displacement.tobytes() == model.deform(alone).displacement.tobytes()
+    spoiled = replace(starts[2], warm={HELD: np.nan * starts[2].warm[HELD]})
+    assert model.deform(alone, spoiled).displacement.tobytes() == model.deform(alone).displacement.tobytes()
 
 
 def test_pressure_is_that_of_the_finite_elements(model: Learned, box: Anatomy) -> None:

@@ -14,14 +14,14 @@ from ..data.encode import ENCODERS, Encoder
 from ..regressors.protocol import Fitted
 from ..regressors.rigid_contact import Contact
 
-HELD = "tool contact"
+HELD = "where a blade touches"
 """What is warm in an answer: rows of `Contact.held`."""
 
 
 def going_on(regressors: Sequence[Fitted], start: Deformation | None) -> Mapping[str, Encoder]:
     """Encoders whose features of rods and blades hold where a start had them, where it says so."""
     contact, held = _contact(regressors), None if start is None else start.warm.get(HELD)
-    if contact is None or held is None or held.shape[1:] != (contact.held_width,):
+    if contact is None or held is None or held.shape[1:] != (contact.held_width,) or not np.isfinite(held).all():
         return ENCODERS
     core = ENCODERS["core"]
 
