@@ -11,6 +11,7 @@ from scenes.warp.causes import Cause
 from scenes.warp.moment import Moment
 from scenes.warp.places import folds_of, places_of
 from scenes.warp.spacing import ENOUGH, FINEST, fields_of, finer_spacing
+from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.errors import InputError
 from sim.fields.warp_fields import warp_fields
@@ -44,6 +45,15 @@ def test_the_error_of_each_part_is_that_of_the_worse_field(kinked, fields):
     inside = ((held > 0.0) & (held < np.array(fields.grid.shape) - 1)).all(axis=1)
     assert np.allclose(places.errors(off)[places.cortex][inside], 3**0.5 * 1e-3, rtol=1e-3)
     assert places.tumour.sum() > 4 * (kinked.anatomy.mesh.region == 2).sum()
+
+
+def test_places_in_necrosis_are_the_tumours(kinked):
+    """One half of the tumour's tetrahedra is necrosis; the places are those of the whole."""
+    mesh = kinked.anatomy.mesh
+    region = mesh.region.copy()
+    region[np.flatnonzero(region == TUMOUR_LABEL)[::2]] = NECROSIS_LABEL
+    body = replace(kinked.anatomy, mesh=replace(mesh, region=region))
+    assert np.array_equal(places_of(moment_of(body, kinked.displacement)).tumour, places_of(kinked).tumour)
 
 
 def test_a_spacing_follows_from_the_tumours_error(kinked, fields):

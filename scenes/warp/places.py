@@ -8,7 +8,6 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from sim.anatomy import TUMOUR_LABEL
 from sim.fields.warp_fields import WarpFields
 from sim.geometry.tetmesh import signed_volumes
 
@@ -47,7 +46,7 @@ def places_of(moment: Moment) -> Places:
     """The vertices of what is left of a body, four places in each tetrahedron and three on each open triangle."""
     body, mesh = moment.left, moment.left.mesh
     used = np.unique(mesh.tets)
-    of_tumour = np.repeat(mesh.region == TUMOUR_LABEL, len(WITHIN))
+    of_tumour = np.repeat(body.in_tumour, len(WITHIN))
     count = len(ON) * len(body.open_surface)
 
     def at(values: np.ndarray) -> np.ndarray:
