@@ -123,13 +123,15 @@ def test_a_killed_body_goes_on_and_has_the_same_bytes(plan, undisturbed, solved,
     assert not left.exists()  # of a body that is there nobody goes on with it
 
 
+def full(*given, **more):
+    """What stands in for a step that finds no memory, which passes."""
+    raise InputError("no memory is left just now") from MemoryError()
+
+
 def test_a_series_that_was_tabulated_is_not_tabulated_again(plan, tmp_path, monkeypatch):
     """An error comes once it is there; the model has the same bytes as without any."""
     text = plan.text.replace('"linear"', '"series"').replace("loads = 70", "loads = 40")
     again = replace(plan_from(text, "own", plan.folder), own=plan.own)
-
-    def full(*given, **more):
-        raise InputError("no memory is left just now") from MemoryError()
 
     with monkeypatch.context() as held:
         held.setattr(bodies, "save", full)
@@ -143,9 +145,6 @@ def test_a_series_that_was_tabulated_is_not_tabulated_again(plan, tmp_path, monk
 
 
 def test_an_error_that_passes_keeps_what_was_solved(plan, undisturbed, solved, tmp_path, monkeypatch):
-    def full(*given, **more):
-        raise InputError("no memory is left just now") from MemoryError()
-
     with monkeypatch.context() as held:
         held.setattr(bodies, "train", full)
         with pytest.raises(InputError, match="just now"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,6 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Resected
 from sim.runtime.device import find_device
-from surrogate.model.learned import Learned
 from surrogate.model.tool_pressure import knows_pressure
 
 from ..play.deformers import Theatre, open_theatre
@@ -36,6 +36,8 @@ from .touched import Answers
 PHYSICS = ("auto", "model", "fem")
 TEMPLATE = "template"
 ARGUMENTS = ("anatomy", "physics", "device", "size", "model")
+# Of several models the one of the least error bound answers.
+TIGHTEST = attrgetter("bound")
 # A goal lies within so far of the place over the tumour's middle [m].
 SPREAD = 6e-3
 # A drained fluid stands so high at least, and at most, as a share of its height.
@@ -155,16 +157,16 @@ def open_setting(
     scene, tool = task.scene(size), task.tool
     card = find_device(device, LIVE.precision).name != "cpu"
     at_once = card if together is None else together
-    tissue = next(effect.default for effect in scene.effects if isinstance(effect, Elasticity))
+    tissue = scene.elasticity.default
     assert tissue is not None
     ball = Hertz(tool.radius, tissue) if isinstance(tool, Probe) else None
     if physics != "fem" and not task.cuts:
-        posed = [each for each in theatre.knowing(scene).values() if ball is not None or knows_pressure(each)]
-        if posed := [each for each in posed if each.force is not None]:
-            return Setting(task, scene, theatre, PosedModel(min(posed, key=_bound), ball))
+        known = [each for each in theatre.knowing(scene).values() if each.force is not None]
+        if posed := [each for each in known if ball is not None or knows_pressure(each)]:
+            return Setting(task, scene, theatre, PosedModel(min(posed, key=TIGHTEST), ball))
         pushes = Scene(task.name, task.title, effects=(Elasticity(tissue), Held(), Bonded(), ToolForce()), tool=tool)
         if ball is not None and (pushed := theatre.knowing(pushes).values()):
-            return Setting(task, scene, theatre, PressedModel(theatre.site, min(pushed, key=_bound), ball, at_once))
+            return Setting(task, scene, theatre, PressedModel(theatre.site, min(pushed, key=TIGHTEST), ball, at_once))
     if physics == "model":
         raise InputError(
             f"physics='model': no trained model of {anatomy} answers the task {task.name}. Give physics='fem', or "
@@ -185,10 +187,6 @@ def _theatre(anatomy: str, model: str | None, device: str) -> Theatre:
 
 def _shipped(task: Task) -> str | None:
     return str(spatula_model_path()) if isinstance(task.tool, Blade) else None
-
-
-def _bound(model: Learned) -> float:
-    return model.bound
 
 
 def checked(given: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int], str | None]:

@@ -40,7 +40,7 @@ STRIDE, COARSER = 0.5, 1e-5
 # Where it only goes through, so many rounds do: more change the answer by less than what it is off, in twice the time.
 PASSING = 3
 # So many places that bear a force are known of a tool that goes on: the strongest.
-HELD = 128
+MOST_HELD = 128
 # Constraints that bear nothing are dropped, which is faster; after so many rounds they stay: nothing goes in circles.
 FORGETFUL = 15
 # Places that give less than this share of what nodes do on average are bone's, which the tool enters: no force, or one
@@ -111,7 +111,7 @@ class Contact:
     @property
     def held_width(self) -> int:
         """How many numbers `held` has a row."""
-        return self._width + len(self.compliance) + 4 * HELD
+        return self._width + len(self.compliance) + 4 * MOST_HELD
 
     def held(self, X: np.ndarray) -> np.ndarray:
         """Where rods or blades stand, what they exert, and where (B, h): what the next pose may go on from."""
@@ -153,7 +153,7 @@ class Contact:
         asked, (known, found) = X.tobytes(), self._last
         if asked == known:
             return found
-        out = np.zeros((len(X), len(self.compliance) + 4 * HELD))
+        out = np.zeros((len(X), len(self.compliance) + 4 * MOST_HELD))
         with one_thread():
             for row in np.flatnonzero(X[:, 6] > 0.0):
                 out[row] = self._pressed(*self._way(X[row]))
@@ -189,9 +189,10 @@ class Contact:
         return bounding_balls(self.points[self.triangles])
 
     def _way(self, x: np.ndarray) -> tuple[list[Placed], float, np.ndarray | None]:
-        """Where the tool of a row of features goes through, its radius [m], and what it exerts at the first place.
+        """Where the tool of a row of features goes through, its radius [m], and a row of `_found`, or None.
 
-        The first is where it stood last, if that is nearer than where it came in, and else the first on the way in.
+        The first place is where it stood last, if that is nearer than where it came in; then the row is what was found
+        there. Else it is the first on the way in.
         """
         # Warp is loaded where a tool is pressed, not where a model is read.
         from sim.discretisation.nearest_places import Placed
@@ -234,7 +235,7 @@ class Contact:
         facet, share, bears = np.zeros(0, int), np.zeros((0, 3)), np.zeros(0)
         if begun is not None:
             stations, moved = stations[1:], (compliance @ begun[rows]).reshape(-1, 3)
-            places = begun[len(self.compliance) :].reshape(HELD, 4)
+            places = begun[len(self.compliance) :].reshape(MOST_HELD, 4)
             places = places[np.isin(places[:, 0], facets)]
             facet, share = np.searchsorted(facets, places[:, 0]), places[:, 1:]
         for station in stations:
@@ -260,9 +261,9 @@ class Contact:
                 kept = (bears > 0.0) | (iteration >= FORGETFUL)
                 facet, share, bears = facet[kept], share[kept], bears[kept]
                 settled = bool(np.abs(moved - last).max() < SETTLED * tolerance)
-        whole, places = np.zeros(len(self.compliance)), np.full((HELD, 4), -1.0)
+        whole, places = np.zeros(len(self.compliance)), np.full((MOST_HELD, 4), -1.0)
         whole[rows] = force
-        strongest = np.argsort(-bears)[:HELD]
+        strongest = np.argsort(-bears)[:MOST_HELD]
         places[: len(strongest)] = np.column_stack([facets[facet], share])[strongest]
         return np.concatenate([whole, places.ravel()])
 
