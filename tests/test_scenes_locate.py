@@ -10,8 +10,22 @@ from locators import dent, locator_of
 
 from scenes.cli import main
 from sim.bodies.meshfile import read_mesh, write_anatomy
+from sim.effects import Elasticity
+from sim.loads import Pushed
+from sim.material import Material
+from surrogate.data.cortex_patch import open_patch
+from surrogate.data.encode import Basis
+from surrogate.data.stated_tissue import stating
+from surrogate.data.tool_loads import draw
 from surrogate.locating.causes import KINDS
 from surrogate.locating.locator_files import load_locator, save_locator
+from surrogate.locating.regions import Region
+from surrogate.model.learned import Learned, Part
+from surrogate.model.store import save
+from surrogate.model.training_range import envelope_of
+from surrogate.regressors.compliance_table import Linear
+
+TUMOUR = (Region(2, 3.0),)
 
 
 @pytest.fixture(scope="module")
@@ -157,10 +171,10 @@ def test_a_locator_is_made_beside_its_anatomy(files, body, tmp_path, capsys, mon
     folder, _ = files
     whole, asked = load_locator(folder / "box.locator.npz", body), []
 
-    def make(anatomy, seed, device, folder, progress):
+    def make(anatomy, seed, device, causes, folder, progress):
         folder.mkdir()
         asked.append((anatomy.digest, seed, device))
-        return whole
+        return replace(whole, regions=causes.regions)
 
     monkeypatch.setattr("surrogate.locating.setup.make_locator", make)
     path = tmp_path / "box.vtu"
@@ -173,5 +187,41 @@ def test_a_locator_is_made_beside_its_anatomy(files, body, tmp_path, capsys, mon
     said, small = json.loads(capsys.readouterr().out), load_locator(beside, body)
     assert not said["whole"] and np.array_equal(small.prior.nodes, whole.small().prior.nodes)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["box.locator.npz", "box.vtu"]
+    assert main(["locator", str(path), "--region", "tumour:9000,0.45"]) == 0
+    assert "region 2 (tumour) 3 times as stiff as the brain, Poisson's ratio 0.45" in capsys.readouterr().out
+    assert load_locator(beside, body).regions == (Region(2, 3.0, 0.45),)
     beside.write_text("mine")
     assert main(["locator", str(path)]) == 2 and "not recognised as a locator" in capsys.readouterr().err
+
+
+def test_a_locator_that_knows_other_regions_is_refused(files, body, tmp_path, capsys):
+    """Of a patient's regions, those count that the locator was made with."""
+    folder, _ = files
+    write_anatomy(tmp_path / "box.vtu", body)
+    seen = [str(tmp_path / "box.vtu"), str(folder / "vessels.csv"), "--json"]
+    save_locator(tmp_path / "box.locator.npz", replace(load_locator(folder / "box.locator.npz", body), regions=TUMOUR))
+    assert main(["locate", *seen]) == main(["locate", *seen, "--region", "tumour:9000"]) == 0
+    assert main(["locate", *seen, "--region", "tumour:6000"]) == 2
+    assert "knows other regions" in capsys.readouterr().err
+    assert main(["locate", *seen, "--region", "oedema:6000"]) == 2
+    assert "has no region 3 (oedema)" in capsys.readouterr().err
+
+
+def test_regions_are_those_that_the_models_beside_learned(body, tmp_path, capsys, monkeypatch):
+    """A patient's own stiffness is said once, where the models are made."""
+    asked = []
+
+    def make(anatomy, seed, device, causes, folder, progress):
+        asked.append(causes.regions)
+        return locator_of(body)
+
+    monkeypatch.setattr("surrogate.locating.setup.make_locator", make)
+    path = tmp_path / "box.vtu"
+    write_anatomy(path, body)
+    learned = Elasticity(Material("neo-hookean", 2000.0, 0.49), {2: Material("neo-hookean", 6000.0, 0.49)})
+    patch, nodes = open_patch(body), body.tumour_nodes
+    still = Linear().fit(np.eye(3 * len(patch.nodes)), np.zeros((3 * len(patch.nodes), 1)))
+    part = Part("nodal", still, Basis(nodes, np.zeros((1, 3 * len(nodes)))))
+    known = envelope_of(patch, draw("palpation", body, 2, 0).of(Pushed))
+    save(tmp_path / "box.model.npz", {"linear": Learned(body, (part,), known, training=stating(learned))})
+    assert main(["locator", str(path), "--device", "cpu"]) == 0 and asked == [TUMOUR]

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 from sim.errors import InputError
 
 from .json_line import json_line
-from .locator import located_by
+from .locator import REGIONS, located_by
 from .outputs import add_force, claimed
+from .tissue_options import add_region_argument
 
 if TYPE_CHECKING:
     from surrogate.fitting.frame import Frame
@@ -47,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--locator", metavar="FILE.npz", type=Path,
         help="as of `sulcus locate`; made where there is none, which takes minutes (default: beside the anatomy)",
     )  # fmt: skip
+    add_region_argument(parser, REGIONS)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of a locator that is made (default %(default)s)")
     add_force(parser)

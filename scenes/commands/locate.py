@@ -13,8 +13,9 @@ import numpy as np
 from sim.arguments import at_least
 
 from .json_line import json_line
-from .locator import located_by
+from .locator import REGIONS, located_by
 from .outputs import add_force, claimed
+from .tissue_options import add_region_argument
 
 # Nobody sees so small a motion [m].
 UNSEEN = 1e-5
@@ -55,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="what is made once for an anatomy; made where there is none, which takes minutes (default: beside it)",
     )
+    add_region_argument(parser, REGIONS)
     parser.add_argument(
         "--device",
         default="auto",

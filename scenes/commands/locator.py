@@ -6,19 +6,24 @@ import argparse
 import json
 import shutil
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim.arguments import at_least
 from sim.errors import InputError
+from sim.material import BRAIN
 
 from .outputs import add_force, claimed
+from .tissue_options import AS_LEARNED, add_region_argument, regions_of
 
 if TYPE_CHECKING:
     from sim.anatomy import Anatomy
     from surrogate.locating.locator import Locator
+    from surrogate.locating.regions import Region
 
 KIND = "a locator of `sulcus locate`"
+REGIONS = f"{AS_LEARNED}. A locator knows how many times a region is as stiff as a brain of {1e-3 * BRAIN.young:g} kPa"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="keep open cortex and tumour alone, a tenth of the file: enough for scenes, `sulcus fit`, and "
         "`sulcus locate` without --out",
     )
+    add_region_argument(parser, REGIONS)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="from which causes are drawn (default %(default)s)")
     add_force(parser)
@@ -44,24 +50,28 @@ def run(args: argparse.Namespace) -> int:
     from sim.bodies.meshfile import read_anatomy
     from sim.runtime.device import find_device
     from surrogate.locating.locator_files import locator_path, save_locator
+    from surrogate.locating.regions import regions_words
 
     path = claimed(args.out or locator_path(args.anatomy), ".npz", KIND, args.force, [args.anatomy])
     at_least("--seed", args.seed, 0)
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
-    locator = made(path, anatomy, args.seed, args.device)
+    locator = made(path, anatomy, args.seed, args.device, regions_known(args, anatomy))
     save_locator(path, locator.small() if args.small else locator)
     forget_parts(path)
     size = path.stat().st_size
     written = {"out": str(path), "shapes": len(locator.prior.shape), "bytes": size, "whole": not args.small}
-    print(json.dumps(written) if args.json else f"written: {path}, {size / 1e6:.1f} MB")
+    written["regions"] = [asdict(one) for one in locator.regions]
+    beside = f"; knows {words}" if (words := regions_words(locator.regions)) else ""
+    print(json.dumps(written) if args.json else f"written: {path}, {size / 1e6:.1f} MB{beside}")
     return 0
 
 
-def made(path: Path, anatomy: Anatomy, seed: int, device: str) -> Locator:
+def made(path: Path, anatomy: Anatomy, seed: int, device: str, regions: tuple[Region, ...]) -> Locator:
     """Make a locator, with a bar of progress; what a stopped run kept beside its `path` is not made again."""
     from tqdm import tqdm
 
+    from surrogate.locating.causes import Causes
     from surrogate.locating.setup import make_locator
 
     print(f"sulcus: {path} takes minutes to make; if it is stopped, the same command goes on", file=sys.stderr)
@@ -71,7 +81,7 @@ def made(path: Path, anatomy: Anatomy, seed: int, device: str) -> Locator:
             bar.total, bar.n = total, done
             bar.set_description(stage)
 
-        return make_locator(anatomy, seed, device, folder=_parts(path), progress=progress)
+        return make_locator(anatomy, seed, device, Causes(regions=regions), folder=_parts(path), progress=progress)
 
 
 def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) -> Locator:
@@ -80,13 +90,19 @@ def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) 
     Raises
     ------
     InputError
-        As `load_locator`; a small one.
+        As `load_locator`; a small one; one that knows other regions than those that are asked for.
     """
     from surrogate.locating.locator_files import load_locator, locator_path, save_locator
+    from surrogate.locating.regions import regions_words
 
     path = args.locator or locator_path(args.anatomy)
     if path.is_file():
         locator = load_locator(path, anatomy)
+        if args.region and locator.regions != regions_known(args, anatomy):
+            raise InputError(
+                f"{path}: knows other regions than --region says ({regions_words(locator.regions) or 'none'}). Leave "
+                "--region out, or name another file by --locator: one that knows them is made there."
+            )
         if locator.prior.nodes is not None and not small:
             raise InputError(
                 f"{path}: is small, and knows nothing of most vertices that a result has. Leave out --out for the "
@@ -94,10 +110,31 @@ def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) 
             )
         return locator
     path = claimed(path, ".npz", KIND, args.force)
-    locator = made(path, anatomy, args.seed, args.device)
+    locator = made(path, anatomy, args.seed, args.device, regions_known(args, anatomy))
     save_locator(path, locator)
     forget_parts(path)
     return locator
+
+
+def regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Region, ...]:
+    """The regions of --region; without it those of which the models beside the anatomy state a tissue.
+
+    Raises
+    ------
+    InputError
+        As `regions_of` and `known_regions`; a statement that is no tissue.
+    """
+    from sim.effects import Elasticity
+    from surrogate.locating.regions import known_regions
+    from surrogate.model.store import learned_tissue
+
+    from ..play.deformers import model_path
+
+    if args.region:
+        return known_regions(Elasticity(BRAIN, regions_of(args.region, BRAIN, anatomy.mesh)))
+    models = model_path(Path(args.anatomy))
+    learned = learned_tissue(models, anatomy) if models.is_file() else None
+    return known_regions(learned) if learned is not None else ()
 
 
 def forget_parts(path: Path) -> None:

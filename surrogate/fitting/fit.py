@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from sim.anatomy import TUMOUR_LABEL
 from sim.runtime.threads import one_thread
 
 from ..locating.locator import Locator
 from ..locating.observation import placed
+from ..locating.regions import Region
 from .frame import Frame, check_frames, foot
 from .responses import POISSONS, RATIOS, Responses, drained_loads, force_loads, responses
 from .stiffness import young_moduli
@@ -39,10 +41,15 @@ def fit_tissue(
     """
     anatomy = locator.anatomy
     check_frames(anatomy, frames)
-    drained, pressed = None, None
+    drained, pressed, regions = None, None, beside_tumour(locator)
     if any(not frame.tools for frame in frames):
         drained = responses(
-            anatomy, drained_loads(anatomy), device, folder, lambda done, total: progress("drained fluid", done, total)
+            anatomy,
+            drained_loads(anatomy),
+            device,
+            folder,
+            lambda done, total: progress("drained fluid", done, total),
+            regions,
         )
     tools = [tool for frame in frames for tool in frame.tools]
     if tools:
@@ -53,6 +60,7 @@ def fit_tissue(
             device,
             folder,
             lambda done, total: progress("tools", done, total),
+            regions,
         )
     return fitted(locator, frames, drained, pressed, device, lambda done, total: progress("forces", done, total))
 
@@ -70,6 +78,11 @@ def fitted(
         probability = probability_of(weighed(locator, frames, drained, pressed))
     tissue = FittedTissue(locator.anatomy.digest, len(frames), probability, np.zeros(0))
     return replace(tissue, young=young_moduli(locator.anatomy, frames, tissue, pressed, device, progress))
+
+
+def beside_tumour(locator: Locator) -> tuple[Region, ...]:
+    """The regions that a locator knows, but the tumour, whose stiffness a fit finds."""
+    return tuple(one for one in locator.regions if one.label != TUMOUR_LABEL)
 
 
 def weighed(

@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from sim.accuracy import Accuracy
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import Anatomy
 from sim.bodies.fluid_level import fluid_level
 from sim.bodies.open_cortex import open_cortex
-from sim.effects import SKULLS, Elasticity, Gravity, Held, ToolForce
+from sim.effects import SKULLS, Gravity, Held, ToolForce
 from sim.fem import Fem
 from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Posture, Pushed
-from sim.material import Material
 
-from ..locating.causes import SPREAD, SUPINE, USUAL, YOUNG, directions
+from ..locating.causes import SPREAD, SUPINE, USUAL, directions, linear
 from ..locating.locator import telling_nodes
+from ..locating.regions import Region, beside
 from ..model.npz_archive import kept_arrays
 
 RATIOS = np.geomspace(0.4, 3.2, 4)
@@ -45,11 +45,14 @@ class Responses:
     nodes
         (n,) sorted mesh vertices.
     motion
-        By skull: (poissons, ratios, loads, n, 3) [m], of tissue of Young's modulus `YOUNG`.
+        By skull: (poissons, ratios, loads, n, 3) [m], of tissue as stiff as that of `locating.causes`.
+    regions
+        Beside which it was solved.
     """
 
     nodes: np.ndarray
     motion: dict[str, np.ndarray]
+    regions: tuple[Region, ...] = ()
 
 
 def drained_loads(anatomy: Anatomy) -> Loads:
@@ -78,8 +81,9 @@ def responses(
     device: str = "auto",
     folder: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
+    regions: tuple[Region, ...] = (),
 ) -> Responses:
-    """Solve each tissue. Those that a `folder` keeps, of the same loads, are read.
+    """Solve each tissue, beside known `regions`. Those that a `folder` keeps, of the same loads, are read.
 
     `progress` hears how many tissues are done, and of how many.
     """
@@ -87,17 +91,17 @@ def responses(
     every = list(product(LINEAR, POISSONS, RATIOS))
     progress(0, len(every))
     for done, (skull, poisson, ratio) in enumerate(every, start=1):
-        found.append(_kept(anatomy, nodes, loads, (skull, float(poisson), float(ratio)), device, folder))
+        found.append(_kept(anatomy, nodes, loads, (skull, float(poisson), float(ratio), regions), device, folder))
         progress(done, len(every))
     whole = np.array(found).reshape(len(LINEAR), len(POISSONS), len(RATIOS), *found[0].shape)
-    return Responses(nodes, dict(zip(LINEAR, whole, strict=True)))
+    return Responses(nodes, dict(zip(LINEAR, whole, strict=True)), regions)
 
 
 def _kept(
     anatomy: Anatomy,
     nodes: np.ndarray,
     loads: Loads,
-    tissue: tuple[str, float, float],
+    tissue: tuple[str, float, float, tuple[Region, ...]],
     device: str,
     folder: Path | None,
 ) -> np.ndarray:
@@ -105,9 +109,8 @@ def _kept(
     numbers = [array.tobytes() for cause in loads.causes for array in vars(cause).values()]
     stated = digest_of(np.frombuffer(b"".join([repr((anatomy.digest, tissue, ACCURACY)).encode(), *numbers]), np.uint8))
     path = None if folder is None else folder / f"{stated}.npz"
-    skull, poisson, ratio = tissue
-    brain, tumour = (Material("linear", YOUNG * times, poisson) for times in (1.0, ratio))
-    effects = (Elasticity(brain, {TUMOUR_LABEL: tumour}), Held(), SKULLS[skull], ToolForce(), Gravity())
+    skull, poisson, ratio, regions = tissue
+    effects = (beside(linear, poisson, ratio, regions), Held(), SKULLS[skull], ToolForce(), Gravity())
 
     def solved() -> dict[str, np.ndarray]:
         answer = Fem(anatomy, effects, ACCURACY, device).deform(loads)

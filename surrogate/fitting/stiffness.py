@@ -87,7 +87,7 @@ def _weighed(
     asked = np.log(YOUNG * np.maximum(reading + sigma * READINGS, 0.1 * reading)[:, None] / YOUNGS)
     shapes, inside = [], []
     for exponent in EXPONENTS:
-        group = Group(list(SKULLS).index(skull), skull, poisson, ratio, exponent)
+        group = Group(list(SKULLS).index(skull), skull, poisson, ratio, exponent, pressed.regions)
         sizes, rows = _dents(anatomy, tool, group, evidence, pressed, force * np.array(TIMES), direction, device)
         inside.append((asked >= np.log(sizes[0])) & (asked <= np.log(sizes[-1])))
         shapes.append(CubicSpline(np.log(sizes), rows)(np.clip(asked, *np.log(sizes[[0, -1]]))))

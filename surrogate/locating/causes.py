@@ -6,14 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import Anatomy
 from sim.bodies.fluid_level import fluid_level
 from sim.bodies.open_cortex import open_cortex
-from sim.effects import SKULLS, Effect, Elasticity, Gravity, Held, Pulsation, ToolForce, Wave
+from sim.effects import SKULLS, Effect, Gravity, Held, Pulsation, ToolForce, Wave
 from sim.loads import Loads, Posture, Pushed
 from sim.material import Material, Ogden
 
 from ..data.tool_loads import draw
+from .regions import Region, beside
 
 KINDS = ("tool", "drainage", "swelling", "tumour swelling")
 """The causes of an ensemble, by name."""
@@ -46,6 +47,8 @@ class Causes:
         Greatest angle [rad] between gravity and the open cortex's inward axis: surgeons turn the opening up.
     swellings, tumour_swellings
         Changes of the brain's volume in each group, and of the tumour's alone.
+    regions
+        Those whose stiffness is known: it is no draw.
     """
 
     poisson: tuple[float, ...] = (0.45, 0.47, 0.49)
@@ -58,6 +61,7 @@ class Causes:
     cone: float = np.radians(60.0)
     swellings: tuple[float, ...] = (0.06, 0.04, 0.02, -0.02, -0.04)
     tumour_swellings: tuple[float, ...] = (0.2, -0.15)
+    regions: tuple[Region, ...] = ()
 
 
 USUAL = Causes()
@@ -69,6 +73,11 @@ SPREAD = 7e-3
 LETS_GO = "contact"
 # Which way gravity pulls in the scan, as `Gravity` has it.
 SUPINE = np.array(Gravity().direction)
+
+
+def linear(times: float, poisson: float) -> Material:
+    """Linear tissue so many times as stiff as the brain, at small strain."""
+    return Material("linear", YOUNG * times, poisson)
 
 
 @dataclass(frozen=True)
@@ -83,6 +92,8 @@ class Group:
         One of `sim.effects.SKULLS`.
     poisson, ratio, exponent
         Of the brain; tumour stiffness over the brain's; -m of Ogden's law, by which both stiffen.
+    regions
+        Others whose stiffness is known.
     """
 
     number: int
@@ -90,18 +101,17 @@ class Group:
     poisson: float
     ratio: float
     exponent: float
+    regions: tuple[Region, ...] = ()
 
     def effects(self, swelling: tuple[float, ...], regions: tuple[int, ...] | None = None) -> tuple[Effect, ...]:
         """What its finite elements are made of, if these regions (None: all) swell by at most such shares."""
-        brain, tumour = (self._tissue(YOUNG * times) for times in (1.0, self.ratio))
         swells = Pulsation(Wave(RISE.frequency, max(map(abs, swelling))), RISE, regions)
-        return (
-            Elasticity(brain, {TUMOUR_LABEL: tumour}), Held(), SKULLS[self.skull], ToolForce(), Gravity(), swells,
-        )  # fmt: skip
+        tissue = beside(self._tissue, self.poisson, self.ratio, self.regions)
+        return (tissue, Held(), SKULLS[self.skull], ToolForce(), Gravity(), swells)
 
-    def _tissue(self, young: float) -> Ogden:
-        """Tissue with Young's modulus `young` [Pa] at small strain."""
-        mu, lam = Material("neo-hookean", young, self.poisson).lame
+    def _tissue(self, times: float, poisson: float) -> Ogden:
+        """Tissue so many times as stiff as the brain at small strain."""
+        mu, lam = Material("neo-hookean", YOUNG * times, poisson).lame
         return Ogden(((2.0 * mu, -self.exponent),), lam + 2.0 * mu / 3.0)
 
 
@@ -115,7 +125,8 @@ def groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Gro
         some = [poisson for poisson in causes.poisson if skull != LETS_GO or poisson <= causes.poisson_let_go]
         random = np.random.default_rng([seed, number])
         ratio, exponent = (_all_over(random, len(some), limits) for limits in (causes.stiffness, causes.exponent))
-        made += [Group(len(made) + n, skull, *each) for n, each in enumerate(zip(some, ratio, exponent, strict=True))]
+        drawn = enumerate(zip(some, ratio, exponent, strict=True))
+        made += [Group(len(made) + n, skull, *each, causes.regions) for n, each in drawn]
     return tuple(made)
 
 

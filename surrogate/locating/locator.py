@@ -19,6 +19,7 @@ from .causes import KINDS
 from .observation import MOST, Observation
 from .posterior import Posterior
 from .prior import Prior
+from .regions import Region
 from .rounds import settled
 
 # More points than this share are no outliers, and no cause of the ensemble moves what this is more surprised by.
@@ -171,10 +172,13 @@ class Locator:
         What is believed of motions before they are seen.
     tried
         (k, 4): what came of trials (`calibration.trials`).
+    regions
+        Those whose stiffness was known.
     """
 
     prior: Prior
     tried: np.ndarray
+    regions: tuple[Region, ...] = ()
 
     @property
     def anatomy(self) -> Anatomy:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from ..model.npz_archive import Archive
 from .causes import KINDS
 from .locator import Locator
 from .prior import NOWHERE, Prior
+from .regions import Region, check_regions
 
 FORMAT = "sulcus locator 3"
 LABELS = ("kind", "skull", "place")
@@ -41,7 +43,7 @@ def save_locator(path: str | Path, locator: Locator) -> None:
     prior = locator.prior
     header = {
         "format": FORMAT, "anatomy": prior.anatomy.digest, "version": version("sulcus"), "kinds": KINDS,
-        "whole": prior.nodes is None, "space": "RAS [m]",
+        "whole": prior.nodes is None, "space": "RAS [m]", "regions": [asdict(one) for one in locator.regions],
     }  # fmt: skip
     arrays = {name: getattr(prior, name) for name in _names(header)}
     with written_whole(path, ".npz") as unfinished:
@@ -66,10 +68,12 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
             raise InputError(f"{path}: is no locator of this version: move it away, and `sulcus locate` makes it anew.")
         if header["anatomy"] != anatomy.digest:
             raise InputError(f"{path}: was made for another anatomy: give that one, or another locator.")
+        regions = tuple(Region(**one) for one in header.get("regions", ()))
+        check_regions(regions, anatomy)
         arrays = archive.arrays([*_names(header), "tried"])
         _check(path, anatomy, arrays)
         tried = arrays.pop("tried")
-        return Locator(Prior(anatomy, **arrays), tried)
+        return Locator(Prior(anatomy, **arrays), tried, regions)
 
 
 def _names(header: dict[str, Any]) -> tuple[str, ...]:

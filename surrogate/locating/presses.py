@@ -8,13 +8,13 @@ from itertools import product
 import numpy as np
 
 from sim.accuracy import Accuracy
-from sim.anatomy import TUMOUR_LABEL, Anatomy
-from sim.effects import SKULLS, Elasticity, Held, ToolForce
+from sim.anatomy import Anatomy
+from sim.effects import SKULLS, Held, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, Pushed
-from sim.material import Material
 
-from .causes import SPREAD
+from .causes import SPREAD, linear
+from .regions import Region, beside
 
 # Points of the open cortex, and tissues: Poisson's ratio of the brain, tumour stiffness over the brain's.
 POINTS, TISSUES = 70, ((0.45, 2.0), (0.49, 0.7))
@@ -37,16 +37,17 @@ class Presses:
     motion: dict[str, np.ndarray]
 
 
-def pressed(anatomy: Anatomy, skulls: tuple[str, ...], device: str = "auto") -> Presses:
-    """Solve linear tissue under forces of 0.01 N, spread over 7 mm, in each of some skulls."""
+def pressed(
+    anatomy: Anatomy, skulls: tuple[str, ...], device: str = "auto", regions: tuple[Region, ...] = ()
+) -> Presses:
+    """Solve linear tissue under forces of 0.01 N, spread over 7 mm, in each of some skulls, with known `regions`."""
     nodes = anatomy.mesh.nodes[np.unique(anatomy.open_surface)]
     points = nodes[spaced(nodes, POINTS)]
     force = np.tile(0.01 * np.eye(3), (len(points), 1))
     loads = Loads((Pushed(np.repeat(points, 3, axis=0), force, np.full(len(force), SPREAD)),))
     found: dict[str, list[np.ndarray]] = {name: [] for name in skulls}
     for name, (poisson, ratio) in product(skulls, TISSUES):
-        stiff = [Material("linear", 3000.0 * times, poisson) for times in (1.0, ratio)]
-        effects = (Elasticity(stiff[0], {TUMOUR_LABEL: stiff[1]}), Held(), SKULLS[name], ToolForce())
+        effects = (beside(linear, poisson, ratio, regions), Held(), SKULLS[name], ToolForce())
         motion = Fem(anatomy, effects, ACCURACY, device).deform(loads).displacement
         found[name].append(motion.reshape(len(points), 3, -1, 3).astype(np.float32))
     return Presses(points, {name: np.stack(parts) for name, parts in found.items()})

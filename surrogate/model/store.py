@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from sim.anatomy import Anatomy
+from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from sim.runtime.atomic_files import written_whole
@@ -19,6 +21,7 @@ from sim.runtime.outside_files import path_of, read_as
 from sim.tools import stated_tool
 
 from ..data.encode import Basis
+from ..data.stated_tissue import BRAIN, stated_tissue
 from ..regressors.ann import Ann
 from ..regressors.bayesian import Bayesian
 from ..regressors.compliance_table import Linear
@@ -128,10 +131,32 @@ def stated_errors(path: str | Path) -> dict[str, OffBy]:
     InputError
         A file that is missing, or no model file of this project.
     """
+    with _described_in(path) as header:
+        return {name: OffBy(about["bound"], _left_out(about)) for name, about in header["models"].items()}
+
+
+def learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
+    """The tissue that the models of a file learned, with that of regions; their arrays are not read.
+
+    None where none states it, or where they are of another anatomy.
+
+    Raises
+    ------
+    InputError
+        As `stated_errors`; a statement that is no tissue.
+    """
+    with _described_in(path) as header:
+        training = [about["training"] for about in header["models"].values() if BRAIN in about["training"]]
+        known = bool(training) and header["anatomy"] == anatomy.digest
+        return stated_tissue(training[0]) if known else None
+
+
+@contextmanager
+def _described_in(path: str | Path) -> Iterator[dict[str, Any]]:
+    """The header of a model file; whatever fails in the block is said of the file."""
     path = path_of(path)
     with read_as(path, "a model", "Make one with `sulcus train`."), path.open("rb") as raw:
-        models = json.loads(Archive(raw).text("header"))["models"]
-        return {name: OffBy(about["bound"], _left_out(about)) for name, about in models.items()}
+        yield json.loads(Archive(raw).text("header"))
 
 
 def _left_out(description: dict[str, Any]) -> LeftOut | None:

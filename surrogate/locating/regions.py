@@ -1,0 +1,89 @@
+"""Regions whose stiffness is known, in a brain whose stiffness is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.anatomy import TUMOUR_LABEL, Anatomy, region_words
+from sim.effects import Elasticity
+from sim.errors import InputError
+from sim.material import Material, Tissue
+
+
+@dataclass(frozen=True)
+class Region:
+    """What is known of a region's tissue.
+
+    Parameters
+    ----------
+    label
+        As the mesh has it.
+    ratio
+        Its Young's modulus over the brain's.
+    poisson
+        Its Poisson's ratio; None: the brain's.
+
+    Raises
+    ------
+    InputError
+        Numbers that no tissue has.
+    """
+
+    label: int
+    ratio: float
+    poisson: float | None = None
+
+    def __post_init__(self) -> None:
+        Material("linear", self.ratio, 0.25 if self.poisson is None else self.poisson)
+
+
+def beside(
+    tissue: Callable[[float, float], Tissue], poisson: float, ratio: float, regions: tuple[Region, ...]
+) -> Elasticity:
+    """Brain, tumour and known regions of `tissue(times, poisson)`, `times` as stiff as the brain.
+
+    `poisson` is the brain's, and `ratio` the tumour's stiffness over it, unless the tumour is a known region.
+    """
+    known = {one.label: tissue(one.ratio, poisson if one.poisson is None else one.poisson) for one in regions}
+    return Elasticity(tissue(1.0, poisson), {TUMOUR_LABEL: tissue(ratio, poisson), **known})
+
+
+def known_regions(elasticity: Elasticity) -> tuple[Region, ...]:
+    """Regions that have a tissue of their own beside the brain's.
+
+    Raises
+    ------
+    InputError
+        Tissue that states no Young's modulus.
+    """
+    brain = elasticity.default
+    if not elasticity.regions:
+        return ()
+    if not all(isinstance(tissue, Material) for tissue in (brain, *elasticity.regions.values())):
+        raise InputError("a locator knows regions by their Young's modulus over the brain's: give them by --region.")
+    assert isinstance(brain, Material)
+    return tuple(
+        Region(label, tissue.young / brain.young, None if tissue.poisson == brain.poisson else tissue.poisson)
+        for label, tissue in sorted(elasticity.regions.items())
+        if isinstance(tissue, Material)
+    )
+
+
+def check_regions(regions: tuple[Region, ...], anatomy: Anatomy) -> None:
+    """Raise InputError for a region that an anatomy does not have."""
+    for one in regions:
+        if not anatomy.mesh.within(one.label).any():
+            has = ", ".join(map(region_words, np.unique(anatomy.mesh.region).tolist()))
+            raise InputError(f"the mesh has no {region_words(one.label)}. It has {has}.")
+
+
+def regions_words(regions: tuple[Region, ...]) -> str:
+    """What regions are known, in words; empty where none are."""
+    return "; ".join(
+        f"{region_words(one.label)} {one.ratio:.3g} times as stiff as the brain"
+        + ("" if one.poisson is None else f", Poisson's ratio {one.poisson:g}")
+        for one in regions
+    )

@@ -1,0 +1,110 @@
+"""Regions of known stiffness in a brain of unknown one: what a locator of them knows, keeps and refuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from locators import in_a_skull
+
+from sim.anatomy import PART_LABELS
+from sim.effects import Elasticity
+from sim.errors import InputError
+from sim.material import BRAIN, Material, Ogden
+from surrogate.fitting.fit import beside_tumour
+from surrogate.fitting.responses import force_loads, responses
+from surrogate.locating.causes import Causes, groups
+from surrogate.locating.ensemble import members, surface_size
+from surrogate.locating.locator_files import load_locator, save_locator
+from surrogate.locating.observation import Observation
+from surrogate.locating.regions import Region, check_regions, known_regions, regions_words
+from surrogate.locating.setup import make_locator
+
+OEDEMA = PART_LABELS["oedema"]
+STIFF = Region(OEDEMA, 20.0)
+FEW = Causes(
+    poisson=(0.45, 0.48),
+    tools=(6, 2),
+    drainages=2,
+    levels=(0.4,),
+    swellings=(0.04, -0.02),
+    tumour_swellings=(0.2,),
+)
+
+
+@pytest.fixture(scope="module")
+def body():
+    """A slab of another region lies between the open cortex and the tumour."""
+    box = in_a_skull()
+    middle = box.mesh.nodes[box.mesh.tets[:, :4]].mean(axis=1)
+    tumour = box.mesh.nodes[box.tumour_nodes]
+    near = np.abs(middle[:, :2] - tumour[:, :2].mean(axis=0)).max(axis=1) < 14e-3
+    slab = near & (middle[:, 2] > tumour[:, 2].max() - 1e-3) & ~box.in_tumour
+    assert slab.any()
+    return replace(box, mesh=replace(box.mesh, region=np.where(slab, OEDEMA, box.mesh.region)))
+
+
+@pytest.fixture(scope="module")
+def locators(body):
+    """One that knows the slab, and one that takes it for brain."""
+    both = (replace(FEW, regions=(STIFF,)), FEW)
+    return [make_locator(body, causes=causes, device="cpu", count=60) for causes in both]
+
+
+def test_who_knows_a_stiff_region_finds_the_tumour_better(body, locators):
+    """Motions by other draws of a brain with the slab, seen at all nodes of the open cortex, without errors."""
+    nodes, off = np.unique(body.open_surface), []
+    for group in groups(body, seed=5, causes=replace(FEW, regions=(STIFF,)))[:2]:
+        motion, _ = members(body, group, seed=5, device="cpu", causes=FEW)
+        for one in motion[:6] * (3e-3 / surface_size(body, motion[:6]))[:, None, None]:
+            seen = Observation(body.mesh.nodes[nodes] + one[nodes], body.mesh.nodes[nodes], rigid=0.0)
+            truth = one[body.tumour_nodes]
+            off.append([np.linalg.norm(each.locate(seen).at(body.tumour_nodes) - truth) for each in locators])
+    knowing, other = np.median(off, axis=0)
+    assert knowing < 0.7 * other, (knowing, other)
+
+
+def test_a_region_is_in_every_group_and_beside_every_force(body):
+    """Its stiffness goes with the brain's; its Poisson's ratio is its own where it is given."""
+    known = (replace(STIFF, poisson=0.3),)
+    for group in groups(body, causes=replace(FEW, regions=known)):
+        tissue = group.effects(FEW.swellings)[0]
+        assert isinstance(tissue, Elasticity)
+        slab, brain = tissue.regions[OEDEMA], tissue.default
+        assert isinstance(slab, Ogden) and isinstance(brain, Ogden)
+        (mu, lam), (soft, _) = slab.lame, brain.lame
+        assert mu * (1.0 + 0.3) == pytest.approx(20.0 * soft * (1.0 + group.poisson))
+        assert lam / (2.0 * (lam + mu)) == pytest.approx(0.3)
+    loads = force_loads(body, body.mesh.nodes[np.unique(body.open_surface)][:1], np.array([6e-3]))
+    stiff, plain = (responses(body, loads, "cpu", regions=regions) for regions in (known, ()))
+    assert stiff.regions == known and np.abs(stiff.motion["slide"] - plain.motion["slide"]).max() > 1e-6
+
+
+def test_a_file_keeps_the_regions_and_an_older_one_has_none(body, locators, tmp_path):
+    knowing, other = locators
+    for name, locator in (("knows.npz", knowing), ("not.npz", other)):
+        save_locator(tmp_path / name, locator)
+        assert load_locator(tmp_path / name, body).regions == locator.regions
+    assert knowing.regions == (STIFF,) and knowing.small().regions == (STIFF,) and other.regions == ()
+
+
+def test_a_fit_finds_the_tumours_stiffness_whatever_the_locator_knew(locators):
+    both = replace(locators[0], regions=(Region(2, 3.0), STIFF))
+    assert beside_tumour(both) == (STIFF,)
+
+
+def test_what_regions_are_known_by(body):
+    soft = Material("neo-hookean", 1500.0, 0.45)
+    assert known_regions(Elasticity(BRAIN, {OEDEMA: soft, 2: replace(BRAIN, young=9000.0)})) == (
+        Region(2, 3.0), Region(OEDEMA, 0.5, 0.45),
+    )  # fmt: skip
+    assert known_regions(Elasticity(BRAIN)) == ()
+    assert regions_words((Region(OEDEMA, 0.5, 0.45),)) == (
+        "region 3 (oedema) 0.5 times as stiff as the brain, Poisson's ratio 0.45"
+    )
+    with pytest.raises(InputError, match="--region"):
+        known_regions(Elasticity(BRAIN, {2: Ogden(((1340.0, -19.0),), 148000.0)}))
+    with pytest.raises(InputError, match=r"no region 4 \(ventricles\)"):
+        check_regions((Region(PART_LABELS["ventricles"], 0.5),), body)
+    for bad in ((2, -1.0), (2, float("nan")), (2, 1.0, 0.6)):
+        with pytest.raises(InputError):
+            Region(*bad)
