@@ -85,6 +85,7 @@ def test_an_episode_is_drawn_by_itself_and_each_value_by_its_name():
         ("[motion.press]\n[bodies]\nanatomies = 'mine'", "bodies.anatomies: 'mine' is none"),
         ("[motion.press]\n[bodies]\nanatomies = '../../etc/x.vtu'", "leaves the plan's folder"),
         ("[motion.press]\n[bodies]\nanatomies = '/etc/x.vtu'", "leaves the plan's folder"),
+        ("[motion.press]\n[bodies.tissue]\noedema_ratio = 0.5", "only an own anatomy may have oedema"),
         ("[motion.press]\n[bodies.learner]\nname = 'gpt'", "no learner is called gpt"),
         ("[motion.press]\nforce_n = {choice = [1, 2], weights = [1e308, 1e308]}", "weights .* are none"),
         ("[motion.press]\nweight = inf", "motion.press.weight: inf is outside 0 to 100,000"),

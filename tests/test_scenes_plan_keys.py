@@ -84,7 +84,8 @@ def with_value(key: Key, value: float) -> str:
     """A plan with one value."""
     *tables, last = key.name.split(".")
     size = f"[{value}, 64]" if last == "size" else str(value)
-    more = 'anatomies = "drawn"\n' if tables == ["bodies", "tumour"] else ""
+    kinds = {"tumour": "drawn", "tissue": "own.vtu"} if tables[:1] == ["bodies"] else {}
+    more = f'anatomies = "{kinds[tables[1]]}"\n' if tables[1:] and tables[1] in kinds else ""
     own = f"[{'.'.join(tables)}]\n{last} = {size}\n" if tables else ""
     play = "" if key.name.startswith("motion.") else "[motion.press]\n"
     return f'title = "x"\n{"" if tables else f"{last} = {size}"}\n{play}{"[bodies]" if more else ""}\n{more}{own}'

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sim.accuracy import TRAIN
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import PART_LABELS, REGION_NAMES, Anatomy
 from sim.bodies.intensity import Intensity, read_intensity, sidecar, write_intensity
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
@@ -33,7 +33,7 @@ from ..play.deformers import Theatre, model_path, open_theatre
 from ..script.shipped_files import template_path
 from .draws import drawn, random_of
 from .half_made import DATA, TABLE, forget, gone_on
-from .plan import NO_LEARNER, Bodies, Plan, digest_beside, fields_of
+from .plan import NO_LEARNER, Bodies, Plan, digest_beside, fields_of, ratio_of
 from .run_folder import versions_here
 
 # Drawn tumours may reach out of the brain, or an opening have too few nodes: so many are tried.
@@ -79,12 +79,24 @@ class Body:
 
 def tissue_of(values: Mapping[str, Any]) -> Elasticity:
     """The tissue of drawn values."""
-    about = {name: values[f"bodies.tissue.{name}"] for name in ("law", "young_pa", "poisson", "tumour_ratio")}
-    brain = Material(about["law"], about["young_pa"], about["poisson"])
-    if about["tumour_ratio"] == 1.0:
-        return Elasticity(brain)
-    tumour = Material(about["law"], about["tumour_ratio"] * about["young_pa"], about["poisson"])
-    return Elasticity(brain, {TUMOUR_LABEL: tumour})
+    law, young, poisson = (values[f"bodies.tissue.{name}"] for name in ("law", "young_pa", "poisson"))
+    ratio = {name: values.get(_ratio(name), 1.0) for name in ("tumour", *PART_LABELS)}
+    times = {**ratio, "necrosis": ratio["necrosis"] * ratio["tumour"]}
+    regions = {
+        REGION_NAMES[name]: Material(law, times[name] * young, poisson) for name, one in ratio.items() if one != 1.0
+    }
+    return Elasticity(Material(law, young, poisson), regions)
+
+
+def _ratio(region: str) -> str:
+    """Under which name a region's stiffness is drawn."""
+    return f"bodies.tissue.{ratio_of(region)}"
+
+
+def _of_regions_in(values: Mapping[str, Any], anatomy: Anatomy) -> dict[str, Any]:
+    """What was drawn, without the stiffness of regions that an anatomy does not have."""
+    absent = {_ratio(name) for name, label in PART_LABELS.items() if not anatomy.mesh.within(label).any()}
+    return {name: value for name, value in values.items() if name not in absent}
 
 
 def drawn_body(bodies: Bodies, seed: int, number: int, attempt: int = 0) -> dict[str, Any]:
@@ -154,7 +166,8 @@ def _anatomy(plan: Plan, seed: int, number: int) -> tuple[Anatomy, Intensity | N
         if kind in plan.own and digest_beside(plan, kind) != plan.own[kind]:
             raise InputError(f"{path}: has changed since the plan was read. Begin another folder with it.")
         known = {name: value for name, value in values.items() if not name.startswith("bodies.tumour.")}
-        return read_anatomy(path), read_intensity(scan) if scan.is_file() else None, known
+        anatomy = read_anatomy(path)
+        return anatomy, read_intensity(scan) if scan.is_file() else None, _of_regions_in(known, anatomy)
     refused: list[str] = []
     for attempt in range(TRIES):
         values = drawn_body(bodies, seed, number, attempt)
@@ -167,7 +180,7 @@ def _anatomy(plan: Plan, seed: int, number: int) -> tuple[Anatomy, Intensity | N
             refused.append(str(error))
             continue
         scan = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy], anatomy.mesh)
-        return anatomy, scan, values
+        return anatomy, scan, _of_regions_in(values, anatomy)
     raise InputError(f"none of {TRIES} anatomies that were drawn can be meshed; the last: {refused[-1]}")
 
 

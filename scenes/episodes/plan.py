@@ -11,6 +11,7 @@ from typing import Annotated, get_args, get_origin, get_type_hints
 
 import msgspec
 
+from sim.anatomy import PART_LABELS
 from sim.bodies.intensity import sidecar
 from sim.bodies.template import SITES
 from sim.effects import SKULLS
@@ -52,6 +53,9 @@ class Tissue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     young_pa: Annotated[Number, Limits(100, 50_000, "Pa")] = 3000.0
     poisson: Annotated[Number, Limits(0.3, 0.495)] = 0.49
     tumour_ratio: Annotated[Number, Limits(0.1, 10)] = 1.0
+    necrosis_ratio: Annotated[Number, Limits(0.01, 10)] = 1.0
+    oedema_ratio: Annotated[Number, Limits(0.01, 10)] = 1.0
+    ventricles_ratio: Annotated[Number, Limits(0.01, 10)] = 1.0
     skull: Annotated[Word, tuple(SKULLS)] = "bonded"
 
 
@@ -270,12 +274,24 @@ def _check(contents: Contents) -> None:
         raise InputError(
             'bodies.tumour: only drawn anatomies have such a tumour. Say anatomies = "drawn", or leave it out.'
         )
+    for name in PART_LABELS:
+        key = ratio_of(name)
+        if getattr(contents.bodies.tissue, key) != 1.0 and not _own_anatomies(contents):
+            raise InputError(
+                f"bodies.tissue.{key}: only an own anatomy may have {name}. Name one in bodies.anatomies, or leave "
+                "it out."
+            )
     for each in _own_anatomies(contents):
         path = PurePath(each)
         if path.suffix != ".vtu":
             raise InputError(f"bodies.anatomies: {each!r} is none: give drawn, template, or a .vtu beside the plan.")
         if path.is_absolute() or ".." in path.parts:
             raise InputError(f"bodies.anatomies: {each!r} leaves the plan's folder: put the file beside the plan.")
+
+
+def ratio_of(region: str) -> str:
+    """The key of a region's stiffness in `bodies.tissue`, by the region's name."""
+    return f"{region}_ratio"
 
 
 def _own_anatomies(contents: Contents) -> list[str]:
