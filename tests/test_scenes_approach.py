@@ -75,6 +75,16 @@ def test_a_point_is_an_entry_straight_inwards(site, tmp_path):
     assert np.hypot(approach.x - 5e-3, approach.y - 5e-3) < 2e-3
 
 
+def test_a_line_that_ends_near_the_cortex_is_drawn_out(site, tmp_path):
+    entry, way, _ = planned(site, 9e-3, -6e-3, (0.5, -0.3))
+    through, *short = (
+        approach_of(read_markup(marked(tmp_path, entry + np.outer(ends, way))), site)
+        for ends in ([-40e-3, 30e-3], [9e-3, 30e-3], [-40e-3, -9e-3])
+    )
+    for approach in short:
+        assert [approach.x, approach.y, *approach.tilt] == pytest.approx([through.x, through.y, *through.tilt])
+
+
 def test_what_misses_the_opening_is_refused(site, tmp_path):
     _, _, line = planned(site, 0.0, 0.0, (0.0, 0.0))
     beside = line + 60e-3 * site.right
@@ -82,6 +92,12 @@ def test_what_misses_the_opening_is_refused(site, tmp_path):
     for points, kind, reason in (
         (beside, "Line", r"passes \d\d mm beside the open cortex\. Open the skull where it enters: --opening-at"),
         (oblique, "Line", "runs at 74 degrees to the opening's axis, and 60 is the most"),
+        (
+            line + 130e-3 * site.axis,
+            "Line",
+            "ends 90 mm from where it would enter the open cortex, and 10 mm is the most",
+        ),
+        (line - 45e-3 * site.axis, "Line", "ends 15 mm from where it would enter"),
         (line[:1], "Fiducial", "its point lies 40 mm from the open cortex, and 10 mm is the most"),
         (line, "Fiducial", "is no trajectory"),
         (np.concatenate([line, line]), "Line", "is no trajectory"),

@@ -97,9 +97,13 @@ class TestScenes:
         scene = asked(theatre, short())
         assert scene.elasticity == TISSUE and theatre.refusals(scene) == {"series-gp": None}
 
-    def test_that_ask_for_another_are_refused_the_model(self, theatre):
+    def test_that_ask_for_another_keep_the_rest_and_are_refused_the_model(self, theatre, capsys):
         scene = asked(theatre, short(), "--region", "5:400")
-        assert scene.elasticity == Elasticity(BRAIN, {NECROSIS_LABEL: replace(BRAIN, young=400.0)})
+        assert scene.elasticity == Elasticity(BRAIN, {TUMOUR_LABEL: STIFF, NECROSIS_LABEL: replace(BRAIN, young=400.0)})
+        kept = "press keeps, as the models beside the anatomy have it: region 2 (tumour): neo-hookean, E 9 kPa, nu 0.49"
+        assert capsys.readouterr().err == f"{kept}\n"
+        asked(theatre, short(), *WORDS)
+        assert capsys.readouterr().err == ""
         with pytest.raises(InputError, match=r"E 0\.5 kPa.*, and here it is .*\(necrosis\): neo-hookean, E 0\.4 kPa"):
             theatre.deformer("series-gp", scene)
         assert theatre.refusals(short())["series-gp"] is not None  # as the scene has it, without a command
@@ -164,7 +168,20 @@ class TestPatient:
         assert main([*words, "--inspect"]) == 0
         assert "ml: a region of its own, of the tumour's tissue\n" in capsys.readouterr().out
         assert main([*words, "--inspect", "--force", "--json", "--region", "necrosis:500"]) == 0
-        assert json.loads(capsys.readouterr().out)["regions"] == {"necrosis": "neo-hookean, E 0.5 kPa, nu 0.49"}
+        made = {"tumour": "of the brain's tissue", "necrosis": "neo-hookean, E 0.5 kPa, nu 0.49"}
+        assert json.loads(capsys.readouterr().out)["regions"] == made
+
+    def test_shows_the_tumours_and_doubts_what_no_tissue_has(self, tmp_path, capsys):
+        words = ["patient", str(necrotic_labels(tmp_path)), "--brain", "1", "--tumour", "3", "--necrosis", "6"]
+        words += ["--out", str(tmp_path / "a.vtu"), "--inspect", "--region", "necrosis:500", "--region"]
+        assert main([*words, "tumour:9000"]) == 0
+        said = capsys.readouterr()
+        assert "in 1 piece, neo-hookean, E 9 kPa, nu 0.49\n" in said.out and "Pa is" not in said.out + said.err
+        with pytest.warns(UserWarning, match=r"--region tumour:9: a Young's modulus of 9 Pa is .* for 9 kPa give 9000"):
+            assert main([*words, "tumour:9", "--force", "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert found["regions"]["tumour"] == "neo-hookean, E 0.009 kPa, nu 0.49"
+        assert any(one.startswith("tumour: a Young's modulus of 9 Pa") for one in found["warnings"])
 
     def test_refuses_a_region_that_no_patient_has(self, tmp_path, capsys):
         words = "patient", "a.nii", "--brain", "1", "--tumour", "3", "--out", str(tmp_path / "a.vtu")

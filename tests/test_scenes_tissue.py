@@ -14,7 +14,7 @@ from boxes import box, top_forces
 from oracle import internal_forces
 
 from scenes.cli import main
-from scenes.commands.tissue_options import add_tissue_arguments, regions_of, tissue_of
+from scenes.commands.tissue_options import add_tissue_arguments, regions_of, stiffness_doubt, tissue_of
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
@@ -161,3 +161,13 @@ def test_other_helps_name_the_tissues_and_say_where_more_stands(command: str, ca
     words = " ".join(said.replace("-\n", "-").split())
     assert len(said.splitlines()) <= 10 and "`sulcus solve --help`" in words
     assert all(name in "".join(said.split()) for name in (*MATERIALS, *LAWS))
+
+
+@pytest.mark.parametrize(
+    ("young", "doubted"), [(99.0, "below 100 Pa"), (101.0, ""), (9.9e5, ""), (1.1e6, "above 1e+06")]
+)
+def test_a_stiffness_that_no_tissue_has_is_doubted(young, doubted):
+    assert doubted in (said := stiffness_doubt(replace(BRAIN, young=young))) and bool(said) == bool(doubted)
+    if doubted:
+        with pytest.warns(UserWarning, match=doubted.replace("+", r"\+")):
+            asked("--young", str(young))

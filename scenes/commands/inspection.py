@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from sim.anatomy import NECROSIS_LABEL, region_name
+from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL, region_name
 from sim.bodies.dural_septa import SEPTA
 from sim.bodies.head_masks import NECROSIS, HeadMasks
 from sim.bodies.one_space import share_on
@@ -17,6 +17,8 @@ from sim.bodies.placement import side_of
 from sim.bodies.subject import Subject
 from sim.effects import Elasticity
 from sim.material import Tissue
+
+from .tissue_options import stiffness_doubt
 
 # [ml] Brains of adults, with their ventricles: beyond, a mask lacks a part or holds more than brain.
 SMALL, LARGE = 850.0, 2000.0
@@ -48,7 +50,7 @@ class Inspection:
     parts
         Volumes of the other tissues that the labels tell.
     regions
-        Those of them that become regions, and what they are made of, in words.
+        What the tumour is made of, and those of the parts that become regions, in words.
     depth
         From the tumour to the nearest cortex.
     opening
@@ -88,7 +90,8 @@ class Inspection:
         shown, hidden = pieces[:MOST], len(pieces) - MOST
         at = ", ".join(f"{value:.0f}" for value in self.opening)
         return [
-            f"brain {self.brain:.0f} ml; tumour {self.tumour:.2f} ml in {_counted(len(pieces), 'piece')}",
+            f"brain {self.brain:.0f} ml; tumour {self.tumour:.2f} ml in {_counted(len(pieces), 'piece')}, "
+            f"{self.regions['tumour']}",
             *shown,
             *([f"  and {hidden} smaller"] if hidden > 0 else []),
             *(f"{name} {volume:.2f} ml: {self._made_of(name)}" for name, volume in self.parts.items()),
@@ -134,7 +137,10 @@ def inspected(masks: HeadMasks, subject: Subject, regions: Mapping[int, Tissue])
         tumour=1e6 * subject.tumour_volume,
         pieces=tuple((1e6 * one.volume, side_of(one.centre, low, high)) for one in subject.pieces),
         parts={name: voxel * float(mask.sum()) for name, mask in masks.parts.items()},
-        regions={region_name(part.label): _tissue(part.label, regions) for part in subject.parts},
+        regions={
+            region_name(label): _tissue(label, regions)
+            for label in (TUMOUR_LABEL, *(part.label for part in subject.parts))
+        },
         depth=1e3 * float(KDTree(subject.cortex).query(subject.interface)[0].min()),
         opening=tuple((1e3 * subject.site).tolist()),
         place=side_of(subject.site, low, high),
@@ -144,7 +150,8 @@ def inspected(masks: HeadMasks, subject: Subject, regions: Mapping[int, Tissue])
         mirrored=bool(np.linalg.det(affine[:3, :3]) < 0.0),
         warnings=(),
     )
-    return replace(found, warnings=(*subject.notes, *_warnings(found, subject)))
+    stiffness = (f"{region_name(label)}: {doubt}" for label, one in regions.items() if (doubt := stiffness_doubt(one)))
+    return replace(found, warnings=(*subject.notes, *stiffness, *_warnings(found, subject)))
 
 
 def _tissue(label: int, regions: Mapping[int, Tissue]) -> str:

@@ -12,7 +12,8 @@ from sim.errors import InputError
 from .site import Site
 from .tool_paths import Path, Touch
 
-# A tool that goes in more obliquely slides along the cortex [rad]; a point farther from it marks another place [m].
+# A tool that goes in more obliquely slides along the cortex [rad]. A point farther from it marks another place [m], and
+# so does a line that would have to be drawn out by more to enter.
 STEEPEST, NEAR = np.radians(60.0), 10e-3
 # Corrections after which a place in the tangent plane is that of a point of the curved cortex.
 CORRECTIONS = 6
@@ -46,7 +47,8 @@ def approach_of(markup: Markup, site: Site) -> Approach:
     Raises
     ------
     InputError
-        Markups of another kind. A line that passes beside the opening, or runs along it; a point that is not at it.
+        Markups of another kind. A line that passes beside the opening, runs along it, or ends far from it; a point that
+        is not at it.
     """
     points, path = markup.points, markup.path
     if markup.kind == "Fiducial" and len(points) == 1:
@@ -75,6 +77,13 @@ def approach_of(markup: Markup, site: Site) -> Approach:
         raise InputError(
             f"{path}: passes {1e3 * beside:.0f} mm beside the open cortex. Open the skull where it enters: "
             "--opening-at with this file."
+        )
+    before, beyond = float((outer - entry) @ way), float((entry - deep) @ way)
+    apart = max(before, beyond)
+    if apart > NEAR:
+        raise InputError(
+            f"{path}: ends {1e3 * apart:.0f} mm from where it would enter the open cortex, and {1e3 * NEAR:g} mm is "
+            "the most that a line is drawn out by. See that it is of this opening, and draw it through the cortex."
         )
     return _approach(site, entry, way)
 

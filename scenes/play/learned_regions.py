@@ -1,0 +1,39 @@
+"""What a scene's regions are made of, where the models beside its anatomy learned them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+
+from sim.effects import Elasticity
+from sim.material import Material, Ogden, Tissue
+
+
+def learned_regions(
+    here: Elasticity, learned: Elasticity | None, named: Collection[int] = frozenset()
+) -> dict[int, Tissue]:
+    """Tissues by label of the regions that a scene, whose tissue is `here`, leaves to the models.
+
+    These are the regions that models learned, that the scene gives no tissue, and that are not among the `named`. In
+    scenes of another brain they are as many times as stiff as it.
+    """
+    brain = here.default
+    if learned is None or brain is None or learned.default is None:
+        return {}
+    others = {label: one for label, one in learned.regions.items() if label not in {*here.regions, *named}}
+    return {label: _beside(brain, one, learned.default) for label, one in others.items()}
+
+
+def _beside(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
+    """A region's tissue in a scene of this brain, where models learned it beside another; the brain's of other laws."""
+    if isinstance(region, Material | Ogden) and _at_once(brain) == _at_once(learned):
+        return replace(region, prony=brain.prony)
+    if not isinstance(brain, Material) or not isinstance(region, Material) or not isinstance(learned, Material):
+        return brain
+    poisson = brain.poisson if region.poisson == learned.poisson else region.poisson
+    return replace(brain, young=brain.young * region.young / learned.young, poisson=poisson)
+
+
+def _at_once(tissue: Tissue) -> Tissue:
+    """A tissue as if it did not relax."""
+    return replace(tissue, prony=()) if isinstance(tissue, Material | Ogden) else tissue
