@@ -26,7 +26,7 @@ from sim.bodies.meshfile import write_anatomy
 from sim.effects import Elasticity, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.material import BRAIN, Material
+from sim.material import BRAIN, MATERIALS, Material
 from surrogate.data.dataset import read_dataset
 from surrogate.data.stated_tissue import stated_tissue, stating
 from surrogate.training.expansion import Expansion
@@ -138,8 +138,11 @@ class TestScenes:
         found = changed(scene, draw).elasticity
         assert found.of(TUMOUR_LABEL) == replace(BRAIN, young=6.0 * BRAIN.young, poisson=0.45)
         assert found.of(NECROSIS_LABEL) == replace(BRAIN, young=1000.0, poisson=0.45)
-        with pytest.raises(InputError, match="the tumour none of its own"):
-            tissue_of(small().with_regions({TUMOUR_LABEL: STIFF}))
+        stated = changed(scene.with_regions({TUMOUR_LABEL: STIFF}), draw).elasticity  # three times as stiff, as such
+        assert stated.of(TUMOUR_LABEL) == replace(BRAIN, young=18.0 * BRAIN.young, poisson=0.45)
+        assert stated.of(NECROSIS_LABEL) == found.of(NECROSIS_LABEL) and stated.default == found.default
+        with pytest.raises(InputError, match=r"the scene .* has another tissue: ogden"):
+            tissue_of(small().with_regions({TUMOUR_LABEL: MATERIALS["minutes"].tissue}))
 
 
 class TestPatient:

@@ -164,7 +164,7 @@ def test_other_helps_name_the_tissues_and_say_where_more_stands(command: str, ca
 
 
 @pytest.mark.parametrize(
-    ("young", "doubted"), [(99.0, "below 100 Pa"), (101.0, ""), (9.9e5, ""), (1.1e6, "above 1e+06")]
+    ("young", "doubted"), [(99.0, "is below 100,"), (101.0, ""), (9.9e5, ""), (1.1e6, "above 1e+06")]
 )
 def test_a_stiffness_that_no_tissue_has_is_doubted(young, doubted):
     assert doubted in (said := stiffness_doubt(replace(BRAIN, young=young))) and bool(said) == bool(doubted)

@@ -373,9 +373,13 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
     assert "written as .json" in capsys.readouterr().err
 
 
-def test_other_tissues_are_refused(theatre):
+def test_other_tissues_are_refused(theatre, tmp_path, monkeypatch, capsys):
     from sim.material import MATERIALS
 
     scene = short().made_of(MATERIALS["minutes"].tissue, None)
     with pytest.raises(InputError, match="Young's modulus"):
         changed(scene, SAME)
+    monkeypatch.setattr("scenes.bench.uncertainty.nominal", None)  # before anything is solved
+    out = tmp_path / "found.json"
+    assert main(["uncertainty", "press", "--material", "minutes", "--device", "cpu", "--out", str(out)]) == 2
+    assert "the scene press has another tissue: ogden" in capsys.readouterr().err

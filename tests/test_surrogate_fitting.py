@@ -119,6 +119,8 @@ def test_what_is_drawn_is_what_was_fitted():
     assert ((poisson == FINE_POISSONS[9]) == (ratio == FINE_RATIOS[30])).all()
     draws = drawn_from(tissue, 3000.0, ("slide", "contact"), 30, 2)
     assert {draw.stiffness for draw in draws} == {0.5} and all(draw.skull == 0.25 for draw in draws)
+    stiff = drawn_from(tissue, 3000.0, ("slide", "contact"), 30, 2, ratio=2.0)
+    assert [draw.ratio for draw in stiff] == [draw.ratio / 2.0 for draw in draws]  # of a tumour that is stated as such
     with pytest.raises(InputError, match="cannot have"):
         drawn_from(tissue, 3000.0, ("contact",), 8)
 

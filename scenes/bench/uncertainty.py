@@ -13,7 +13,7 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import Deformation
 from sim.effects import SKULLS, Effect, Elasticity, Gravity
 from sim.errors import InputError
-from sim.material import Material
+from sim.material import LAWS, Material
 from sim.skulls import Bonded, SkullContact, Slide
 
 from ..play.deformers import Theatre
@@ -83,13 +83,12 @@ def changed(scene: Scene, draw: Draw) -> Scene:
         A tissue that is not described by Young's modulus and Poisson's ratio.
     """
     tissue = tissue_of(scene)
-    brain = replace(tissue, young=draw.stiffness * tissue.young, poisson=draw.poisson)
-    others = {
-        label: replace(one, young=draw.stiffness * one.young, poisson=draw.poisson)
-        for label, one in scene.elasticity.regions.items()
-        if isinstance(one, Material)
-    }
-    elasticity = Elasticity(brain, {TUMOUR_LABEL: replace(brain, young=draw.ratio * brain.young), **others})
+
+    def drawn(one: Material, times: float = 1.0) -> Material:
+        return replace(one, young=times * draw.stiffness * one.young, poisson=draw.poisson)
+
+    regions = {label: drawn(one) for label, one in scene.elasticity.regions.items() if isinstance(one, Material)}
+    elasticity = Elasticity(drawn(tissue), {**regions, TUMOUR_LABEL: drawn(tumour_of(scene), draw.ratio)})
     skull = SKULLS[chosen(draw.skull, skulls_of(scene))]
 
     def other(effect: Effect) -> Effect:
@@ -131,21 +130,34 @@ def mesh_deviations(scene: Scene, draws: Sequence[Draw]) -> np.ndarray:
 
 
 def tissue_of(scene: Scene) -> Material:
-    """The brain's tissue in a scene; regions but the tumour may have another.
+    """The brain's tissue in a scene; regions may have another.
 
     Raises
     ------
     InputError
-        Another than of Young's modulus and Poisson's ratio, or one that the tumour has for itself.
+        Another than of Young's modulus and Poisson's ratio, here or in a region.
     """
     elasticity = scene.elasticity
-    known = all(isinstance(one, Material) for one in elasticity.regions.values())
-    if not isinstance(elasticity.default, Material) or not known or TUMOUR_LABEL in elasticity.regions:
+    strange = [one for one in elasticity.regions.values() if not isinstance(one, Material)]
+    if not isinstance(elasticity.default, Material) or strange:
+        has = strange[0] if strange else elasticity.default or "none that all regions share"
         raise InputError(
-            "priors draw Young's modulus and Poisson's ratio of the brain, and how much stiffer the tumour is. "
-            "Give the scene such a tissue, and the tumour none of its own."
+            f"priors draw Young's modulus and Poisson's ratio, and the scene {scene.name} has another tissue: {has}. "
+            f"Give it one of the laws {', '.join(LAWS)}, by --material or in its file."
         )
     return elasticity.default
+
+
+def tumour_of(scene: Scene) -> Material:
+    """The tumour's tissue in a scene, or the brain's where it has none of its own.
+
+    Raises
+    ------
+    InputError
+        As `tissue_of`.
+    """
+    brain, tumour = tissue_of(scene), scene.elasticity.regions.get(TUMOUR_LABEL)
+    return tumour if isinstance(tumour, Material) else brain
 
 
 def _aside(path: Path, tip: Sequence[float]) -> Path:

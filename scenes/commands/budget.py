@@ -145,13 +145,16 @@ def _seen(args: argparse.Namespace, theatre: Theatre) -> Scene:
     Raises
     ------
     InputError
-        A scene whose tumour is found by what is seen, or a camera that zooms.
+        A scene whose tumour is found by what is seen, or whose tissue is none that is drawn; a camera that zooms.
     """
+    from ..bench.uncertainty import tissue_of
+
     scene = scene_asked(args, args.scene, theatre)
     if scene.sight is not None:
         raise InputError(
             f"the scene {scene.name} finds its tumour by what is seen, and says its error: choose another."
         )
+    tissue_of(scene)
     filmed = filmed_with_targets(args, scene)
     calibration = filmed.viewpoint.calibration
     if args.readout_ms is None or calibration is None:

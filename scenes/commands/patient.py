@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from sim.anatomy import PART_LABELS, REGION_NAMES, TUMOUR_LABEL
+from sim.anatomy import PART_LABELS, REGION_NAMES
 from sim.bodies.head_masks import head_masks
 from sim.bodies.label_volume import masked_subject
 from sim.bodies.subject import MeshPlan, opened_cortex
@@ -128,8 +128,7 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({"anatomy": str(args.out), "model": str(model), "seconds": seconds, "total": whole}))
     else:
         print(f"{_shares(seconds, whole)}\nready: sulcus demo --anatomy {args.out}{_physics(args)}")
-        if TUMOUR_LABEL not in regions:  # which priors draw
-            print(f"for the error of the tumour: sulcus uncertainty press --anatomy {args.out}{_physics(args)}")
+        print(f"for the error of the tumour: sulcus uncertainty press --anatomy {args.out}{_physics(args)}")
     return 0
 
 

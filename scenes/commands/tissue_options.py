@@ -28,8 +28,7 @@ DOUBTED = 100.0, 1e6
 """Young's moduli [Pa] below and above which no tissue in a skull was measured, by far.
 
 Operated brains have 7.3 kPa, and their tumours 11.4 to 33.1 kPa in the mean of each kind: Chauvet et al. 2016,
-Ultraschall Med. 37:584-590. At small rates brain has some 0.5 to 3 kPa: Budday, Ovaert, Holzapfel, Steinmann, Kuhl
-2019, Arch. Comput. Methods Eng. (10.1007/s11831-019-09352-w).
+Ultraschall Med. 37:584-590. The laws of brain in `MATERIALS` have 2.0 to 3.3 kPa.
 """
 AS_BRAIN = "the tissue of the brain"
 AS_LEARNED = f"what the models beside the anatomy learned, or {AS_BRAIN}"
@@ -243,9 +242,11 @@ def stiffness_doubt(tissue: Tissue) -> str:
     if least <= young <= most:
         return ""
     if young > most:
-        return f"a Young's modulus of {young:.3g} Pa is above {most:g} Pa, stiffer than any brain or tumour. The unit is Pa"
+        return (
+            f"a Young's modulus of {young:.3g} Pa is above {most:g}, stiffer than any brain or tumour. The unit is Pa"
+        )
     return (
-        f"a Young's modulus of {young:.3g} Pa is below {least:g} Pa, softer than any brain or tumour. "
+        f"a Young's modulus of {young:.3g} Pa is below {least:g}, softer than any brain or tumour. "
         f"The unit is Pa: for {young:.3g} kPa give {1e3 * young:g}"
     )
 

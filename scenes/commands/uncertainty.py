@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve an ensemble of each scene, and keep what it says."""
-    from ..bench.uncertainty import coverage, ensemble, nominal, skulls_of, tissue_of, uncertainty
+    from ..bench.uncertainty import coverage, ensemble, nominal, skulls_of, tissue_of, tumour_of, uncertainty
     from ..play.deformers import open_theatre
     from ..script.priors import drawn, drawn_from
     from ..script.scene import SCENES
@@ -75,7 +75,9 @@ def run(args: argparse.Namespace) -> int:
     theatre = open_theatre(args.anatomy, args.model, args.device)
     scenes = [scene_asked(args, name, theatre) for name in args.scenes or SCENES]
     out = args.out or uncertainty_path(args.anatomy or template_path())
-    # Before hours are spent; a file that is there is read, and scenes are added to it.
+    # Before hours are spent: tissue must be one that is drawn. A file that is there is read, and scenes are added.
+    for scene in scenes:
+        tissue_of(scene)
     claimed(out, ".json", "uncertainties", force=True)
     read_uncertainties(out)
     fitted = fitted_beside(args.tissue, args.anatomy or template_path(), theatre.anatomy.digest)
@@ -83,7 +85,8 @@ def run(args: argparse.Namespace) -> int:
     def draws_of(scene: Scene, count: int, seed: int) -> list[Draw]:
         if fitted is None:
             return drawn(count, seed)
-        return drawn_from(fitted, tissue_of(scene).young, skulls_of(scene), count, seed)
+        young = tissue_of(scene).young
+        return drawn_from(fitted, young, skulls_of(scene), count, seed, tumour_of(scene).young / young)
 
     rows, lines = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:

@@ -70,7 +70,7 @@ POISSON = Prior(
     "Tonutti, Gras, Yang 2017, Artif. Intell. Med. 80:39-47",
 )  # fmt: skip
 RATIO = Prior(
-    "tumour's stiffness", "log-uniform", (0.4, 2.5), "Young's modulus of the tumour over the brain's",
+    "tumour's stiffness", "log-uniform", (0.4, 2.5), "Young's modulus of the tumour over the brain's, over the scene's",
     "22 glioblastomas of 1.32 kPa beside 1.54 in healthy tissue, five of them stiffer, all of soft and stiff parts: "
     "Streitberger et al. 2014, PLoS ONE 9:e110588",
 )  # fmt: skip
@@ -116,7 +116,8 @@ class Draw:
     Parameters
     ----------
     stiffness, poisson, ratio
-        Young's modulus over the scene's; Poisson's ratio; the tumour's Young's modulus over the brain's.
+        Young's modulus over the scene's; Poisson's ratio; the tumour's Young's modulus over the brain's, as a multiple
+        of what the scene has.
     skull
         In [0, 1): which of the skulls that a scene may have.
     tip
@@ -146,11 +147,13 @@ def drawn(count: int, seed: int = 0) -> list[Draw]:
     return [Draw(young, nu, ratio, skull, tuple(tip), mesh) for young, nu, ratio, skull, *tip, mesh in rows]
 
 
-def drawn_from(tissue: FittedTissue, young: float, skulls: Sequence[str], count: int, seed: int = 0) -> list[Draw]:
+def drawn_from(
+    tissue: FittedTissue, young: float, skulls: Sequence[str], count: int, seed: int = 0, ratio: float = 1.0
+) -> list[Draw]:
     """So many draws whose tissue and skull are drawn from what was fitted; all else as in `drawn`.
 
-    `young` [Pa] is the scene's own modulus, and `skulls` are those that it may have. What was not fitted keeps its
-    prior.
+    `young` [Pa] is the scene's own modulus, `ratio` how many times as stiff its tumour is, and `skulls` are those that
+    it may have. What was not fitted keeps its prior.
 
     Raises
     ------
@@ -162,13 +165,13 @@ def drawn_from(tissue: FittedTissue, young: float, skulls: Sequence[str], count:
             f"the fitted tissue has a skull that this scene cannot have ({' or '.join(skulls)}): choose another scene, "
             "or another tissue by --tissue."
         )
-    names, poisson, ratio = tissue.drawn(count, seed, tuple(skulls))
+    names, poisson, ratios = tissue.drawn(count, seed, tuple(skulls))
     random, made = np.random.default_rng([seed, 3]), []
     moduli = random.choice(tissue.young, count) if len(tissue.young) else None
     for number, one in enumerate(drawn(count, seed)):
         stiffness = one.stiffness if moduli is None else float(moduli[number]) / young
         skull = (list(skulls).index(names[number]) + 0.5) / len(skulls)
-        own = {"poisson": float(poisson[number]), "ratio": float(ratio[number])}
+        own = {"poisson": float(poisson[number]), "ratio": float(ratios[number]) / ratio}
         made.append(replace(one, stiffness=stiffness, skull=skull, **own))
     return made
 
