@@ -9,11 +9,13 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from theatres import put, theatre_of
 
 import scenes.gym
 from scenes.cli import main
 from scenes.gym.hertz import Hertz
 from scenes.gym.observation import FELT, TRACKED
+from scenes.gym.pressed_model import PressedModel
 from scenes.gym.registration import NAMES, register_environments
 from scenes.gym.reward import ENDED, OVER_LIMIT, STEP, Judged, earned
 from scenes.gym.scripted import scripted
@@ -21,11 +23,16 @@ from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT, TASKS
 from scenes.gym.touched import Asked
 from scenes.gym.vector import many as made_apart
+from scenes.play.deformers import model_path
+from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
+from sim.effects import Elasticity
 from sim.errors import InputError
-from sim.material import MATERIALS
+from sim.material import BRAIN, MATERIALS
+from surrogate.data.stated_tissue import stating
 
 SIZE = (48, 36)
+STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: replace(BRAIN, young=9000.0)})
 DOWN = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0], np.float32)
 
 
@@ -334,3 +341,45 @@ def test_a_pose_that_the_model_refuses_ends_an_episode():
     (second,) = setting.answers.answer([Asked(poses[1], first)])
     assert first.good and not second.good and second.error == np.inf
     assert np.array_equal(second.motion, first.motion)
+
+
+@pytest.fixture(scope="module")
+def stiff(box, tmp_path_factory):
+    """A body whose models, of pushes, learned from a stiff tumour."""
+    theatre = theatre_of(box)
+    learned = {
+        name: replace(each, training={**each.training, **stating(STIFF)}) for name, each in theatre.models.items()
+    }
+    return put(replace(theatre, models=learned), tmp_path_factory.mktemp("stiff") / "stiff.vtu")
+
+
+def test_a_body_has_the_tissue_of_its_models(stiff):
+    setting = open_setting(PALPATE, str(stiff), "auto", "cpu", SIZE)
+    assert isinstance(setting.answers, PressedModel) and setting.scene.elasticity == STIFF
+    assert setting.answers.ball.tissue == BRAIN  # which lies over the tumour
+    exact = open_setting(DEBULK, str(stiff), "auto", "cpu", SIZE)  # drained brain: as many times as stiff
+    assert exact.scene.elasticity.of(TUMOUR_LABEL) == replace(MATERIALS["drained"].tissue, young=6300.0)
+
+
+def test_a_ball_presses_what_lies_at_the_cortex(stiff, box, tmp_path):
+    shallow = replace(box, mesh=replace(box.mesh, region=np.full_like(box.mesh.region, TUMOUR_LABEL)))
+    models = {
+        name: replace(each, anatomy=shallow, training={**each.training, **stating(STIFF)})
+        for name, each in theatre_of(box).models.items()
+    }
+    path = put(replace(theatre_of(box), anatomy=shallow, models=models), tmp_path / "shallow.vtu")
+    setting = open_setting(PALPATE, str(path), "fem", "cpu", SIZE)
+    assert setting.answers.ball.tissue == STIFF.of(TUMOUR_LABEL)
+
+
+def test_a_model_that_may_not_answer_is_named_with_the_reason(stiff):
+    """One that is asked for is refused; one that lies beside the body is warned of."""
+    beside, force = str(model_path(stiff)), "it was trained on what a tool's force does, and here is none"
+    with pytest.raises(InputError, match=rf"model\.npz: does not answer the task retract: {force}, but .*ToolContact"):
+        open_setting(RETRACT, str(stiff), "auto", "cpu", SIZE, beside)
+    with pytest.raises(InputError, match=r"model\.npz: does not answer the task debulk: tissue is cut away"):
+        open_setting(DEBULK, str(stiff), "auto", "cpu", SIZE, beside)
+    with pytest.raises(InputError, match=rf"no trained model of .*stiff\.vtu answers the task retract: {force}"):
+        open_setting(RETRACT, str(stiff), "model", "cpu", SIZE)
+    with pytest.warns(UserWarning, match=rf"finite elements answer the task retract on .*, no trained model: {force}"):
+        open_setting(RETRACT, str(stiff), "auto", "cpu", SIZE)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from operator import attrgetter
 from pathlib import Path
@@ -12,14 +13,16 @@ import numpy as np
 
 from sim.accuracy import LIVE
 from sim.anatomy import TUMOUR_LABEL
-from sim.effects import Bonded, Elasticity, Held, ToolForce
+from sim.effects import Bonded, Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Resected
+from sim.material import Tissue
 from sim.runtime.device import find_device
 from surrogate.model.tool_pressure import knows_pressure
 
 from ..play.deformers import Theatre, open_theatre
+from ..play.learned_regions import learned_regions
 from ..play.stage import Stage
 from ..script.scene import Scene
 from ..script.shipped_files import spatula_model_path
@@ -53,7 +56,7 @@ class Setting:
     Parameters
     ----------
     task, scene, theatre
-        What is done, in which scene, and on which body.
+        What is done, in which scene, and on which body. Regions are as the body's models learned them.
     answers
         Who answers the tool.
     """
@@ -134,13 +137,14 @@ def open_setting(
         "template", or the path of a .vtu file.
     physics
         "model": the best trained model of the tool's poses, or of pushes where the tool is a ball. "fem": finite
-        elements. "auto": the model where there is one.
+        elements. "auto": the model where there is one; where one lies there that may not answer, a warning says why.
     device
         As of `Fem`.
     size
         Width and height of pictures [pixel].
     model
         A file of trained models. None: the one beside the anatomy; of the template and a spatula the one that ships.
+        Regions have the tissue that its models learned.
     together
         Whether all environments are answered at once; None: on a card. On the CPU that is several times as fast, but
         the last digits depend on the neighbours.
@@ -148,35 +152,82 @@ def open_setting(
     Raises
     ------
     InputError
-        Files that cannot be read; a body without tumour or open cortex; a model that is not there; a device that is
-        not there.
+        Files that cannot be read; a body without tumour or open cortex; a device that is not there. A model that is not
+        there, or that is named and may not answer.
     """
     theatre = _theatre(anatomy, _shipped(task) if model is None and anatomy == TEMPLATE else model, device)
     if not theatre.anatomy.in_tumour.any():
         raise InputError(f"{anatomy}: has no tumour, which these tasks aim at: mesh one with region {TUMOUR_LABEL}.")
     scene, tool = task.scene(size), task.tool
+    scene = scene.with_regions(learned_regions(scene.elasticity, theatre.learned_tissue))
     card = find_device(device, LIVE.precision).name != "cpu"
     at_once = card if together is None else together
-    tissue = scene.elasticity.default
-    assert tissue is not None
-    ball = Hertz(tool.radius, tissue) if isinstance(tool, Probe) else None
-    if physics != "fem" and not task.cuts:
-        known = [each for each in theatre.knowing(scene).values() if each.force is not None]
-        if posed := [each for each in known if ball is not None or knows_pressure(each)]:
+    ball = Hertz(tool.radius, _touched(task, scene, theatre.site)) if isinstance(tool, Probe) else None
+    if physics != "fem":
+        refused = _refusals(task, scene, theatre)
+        known = [each for name, each in theatre.models.items() if refused[name] is None]
+        if posed := [each for each in known if each.tool is not None]:
             return Setting(task, scene, theatre, PosedModel(min(posed, key=TIGHTEST), ball))
-        pushes = Scene(task.name, task.title, effects=(Elasticity(tissue), Held(), Bonded(), ToolForce()), tool=tool)
-        if ball is not None and (pushed := theatre.knowing(pushes).values()):
-            return Setting(task, scene, theatre, PressedModel(theatre.site, min(pushed, key=TIGHTEST), ball, at_once))
-    if physics == "model":
-        raise InputError(
-            f"physics='model': no trained model of {anatomy} answers the task {task.name}. Give physics='fem', or "
-            "train one: docs/gym.md has the commands."
-        )
+        if ball is not None and known:
+            return Setting(task, scene, theatre, PressedModel(theatre.site, min(known, key=TIGHTEST), ball, at_once))
+        _say_none(task, anatomy, physics, model, next(iter(refused.values()), None))
     fem = theatre.fem(scene, LIVE, batch=64 if at_once else 1, live=not at_once)
     if isinstance(fem, Fem):
         return Setting(task, scene, theatre, PosedElements(fem, ball, at_once))
     assert ball is not None
     return Setting(task, scene, theatre, CutElements(theatre.site, fem, ball))
+
+
+def _touched(task: Task, scene: Scene, site: Site) -> Tissue:
+    """What a ball presses: of the tissues within its radius of the goals' middle the one that has most of the volume.
+
+    Where tissue is cut away, it is the brain's.
+    """
+    mesh, elasticity = site.anatomy.mesh, scene.elasticity
+    arm = mesh.nodes[site.anatomy.tumour_nodes].mean(axis=0) - site.origin
+    place = site.contact(float(arm @ site.right), float(arm @ site.up), task.tool.radius).point
+    near = np.linalg.norm(mesh.nodes[mesh.tets].mean(axis=1) - place, axis=1) < task.tool.radius
+    labels = [] if task.cuts else np.unique(mesh.region[near]).tolist()
+    most = max(labels, key=lambda label: mesh.volumes[near & (mesh.region == label)].sum(), default=None)
+    tissue = elasticity.default if most is None else elasticity.of(most)
+    assert tissue is not None
+    return tissue
+
+
+def _refusals(task: Task, scene: Scene, theatre: Theatre) -> dict[str, str | None]:
+    """Why each trained model may not answer a task, by name; None if it may. Of a ball a model of pushes may, too."""
+    if task.cuts:
+        return dict.fromkeys(theatre.models, "tissue is cut away, which no model learned")
+    ball = isinstance(task.tool, Probe)
+    pushes = replace(scene, effects=(scene.elasticity, Held(), Bonded(), ToolForce()))
+    moved, pushed = theatre.refusals(scene), theatre.refusals(pushes) if ball else {}
+    found = {}
+    for name, each in theatre.models.items():
+        found[name] = pushed.get(name, moved[name]) if each.tool is None else moved[name]
+        if found[name] is None and each.tool is not None and (each.force is None or not (ball or knows_pressure(each))):
+            found[name] = f"it does not know its tool's {'force' if each.force is None else 'pressure'}"
+    return found
+
+
+def _say_none(task: Task, anatomy: str, physics: str, model: str | None, why: str | None) -> None:
+    """Say that no trained model answers, and why.
+
+    Raises
+    ------
+    InputError
+        One was asked for.
+    """
+    remedy = "Give physics='fem', or train one: docs/gym.md has the commands."
+    if model is not None:
+        raise InputError(f"{model}: does not answer the task {task.name}: {why}. {remedy}")
+    because = f": {why or 'there is none'}"
+    if physics == "model":
+        raise InputError(
+            f"physics='model': no trained model of {anatomy} answers the task {task.name}{because}. {remedy}"
+        )
+    if why is not None and not task.cuts:
+        said = f"finite elements answer the task {task.name} on {anatomy}, no trained model{because}. {remedy}"
+        warnings.warn(said, stacklevel=2)
 
 
 @lru_cache(maxsize=4)
