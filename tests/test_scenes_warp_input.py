@@ -205,6 +205,14 @@ def test_a_map_of_a_small_tumour_raises_no_doubt(folder, box):
     assert "another space" in asked and "--labels" in asked
 
 
+def test_intensities_that_are_given_as_labels_are_doubted(folder, box):
+    smooth = 300.0 + 200.0 * np.sin(np.indices((40, 40, 32)).sum(axis=0) / 9.0)
+    for name, values, doubted in (("scan", smooth, True), ("many", 1.0 + smooth // 50.0, False)):
+        save(folder / f"{name}.nii.gz", values.astype(np.int16))
+        said = " ".join(read_picture(folder / f"{name}.nii.gz", box, True).warnings)
+        assert ("as intensities do: give them by --image" in said) == doubted
+
+
 def test_what_is_empty_is_a_share_of_the_volume_and_not_of_vertices(folder, box):
     index = np.rint((1e3 * box.mesh.nodes - AFFINE[:3, 3]) / 2.0).astype(int)
     values = np.ones((40, 40, 32), np.float32)

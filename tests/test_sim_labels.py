@@ -162,7 +162,7 @@ def test_the_skull_is_opened_over_cortex_that_can_be_reached(tmp_path):
     ("brain", "tumour", "reason"),
     [
         ((1, 7), (3,), "has no label 7. Choose from 1, 2, 3, 4"),
-        ((1, 2), (2, 3), "named as brain and as tumour"),
+        ((1, 2), (2, 3), "label 2 is named by --brain and by --tumour"),
         ((0, 1), (3,), "background"),
         ((), (3,), "at least one label"),
     ],

@@ -88,7 +88,7 @@ class TestLabels:
         assert (found[0].parts["necrosis"] & ~found[0].tumour).sum() == 0 < found[0].parts["necrosis"].sum()
 
     def test_they_are_no_brain_and_must_be_there(self, files):
-        with pytest.raises(InputError, match="labels 1 are named as brain and as tumour"):
+        with pytest.raises(InputError, match="label 1 is named by --brain and by --necrosis"):
             head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (1,)}))
         with pytest.raises(InputError, match="has no label 9"):
             head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (9,)}))

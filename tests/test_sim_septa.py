@@ -97,8 +97,11 @@ def test_an_opening_over_it_is_free(said, labels, subject):
 
 def test_it_counts_as_brain(labels, subject, tmp_path, capsys):
     assert subject.notes == () and [septum.name for septum in subject.septa] == ["falx"]
-    with pytest.raises(InputError, match="labels 3 are named as brain and as tumour"):
+    with pytest.raises(InputError, match="label 3 is named by --tumour and by --tentorium"):
         head_masks(Sources(labels, (1,), (3,), parts={"tentorium": (3,)}))
+    for other in ("tentorium", "ventricles"):
+        with pytest.raises(InputError, match=f"label 7 is named by --falx and by --{other}: give it to one of them"):
+            head_masks(Sources(labels, (1,), (3,), parts={"falx": (7,), other: (7,)}))
     assert main(["anatomy", "--falx", "7", "--out", str(tmp_path / "a.vtu")]) == 2
     assert "--falx belongs to a label volume" in capsys.readouterr().err
     words = ["patient", str(labels), "--tumour", "3", "--out", str(tmp_path / "a.vtu"), "--inspect"]

@@ -200,7 +200,7 @@ def test_segments_are_called_by_their_names(tmp_path):
         volume_subject(path, ("Whole brain",), ("Tumor",))
     with pytest.raises(InputError, match="several segments have the label 1: name one of Tumour, Whole brain"):
         volume_subject(path, (1,), ("Tumour",))
-    with pytest.raises(InputError, match="labels tumour are named as brain and as tumour"):
+    with pytest.raises(InputError, match="label Tumour is named by --brain and by --tumour"):
         volume_subject(path, ("Whole brain", "tumour"), ("Tumour",))
 
 
@@ -293,9 +293,11 @@ def test_oedema_and_ventricles_become_regions(tmp_path):
     assert set(np.unique(mesh.region)) == {1, 2, 3, 4}
     everywhere = make_anatomy(replace(subject, parts=(Part(3, subject.brain, 1.0),)), MeshPlan(nodes=2500)).mesh
     assert ((everywhere.region == 2) == (mesh.region == 2)).all()  # a tumour stays one
-    with pytest.raises(InputError, match=r"marks no necrosis, so it is no region\. Choose from oedema, ventricles"):
+    with pytest.raises(
+        InputError, match=r"marks no necrosis.*\. Choose from oedema, ventricles, or name .* by --necrosis"
+    ):
         masked_subject(masks, regions=("necrosis",))
-    with pytest.raises(InputError, match="labels 3 are named as brain and as tumour"):
+    with pytest.raises(InputError, match="label 3 is named by --tumour and by --oedema"):
         head_masks(Sources(path, (1,), (3,), parts={"oedema": (3,)}))
 
 

@@ -15,6 +15,8 @@ BRIGHTEST, DARK = 99.0, 0.1
 BETTER, WELL = 0.05, 0.7
 # No more distinct whole values than so many are labels; one voxel in so many along an axis is looked at.
 FEW, SAMPLED = 120, 3
+# Labels fill areas: fewer neighbours of one value than this share are intensities.
+ALIKE = 0.5
 
 
 def shown(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float:
@@ -44,6 +46,11 @@ def doubts(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy: Anatom
         )
     if not labels and _like_labels(values):
         found.append("holds few values, all whole, as label maps do: give one by --labels, or labels are mixed")
+    elif labels and (alike := _alike(values)) < ALIKE:
+        found.append(
+            f"has the same value in {alike:.0%} of neighbouring voxels, as intensities do: give them by --image, or "
+            "values are not interpolated"
+        )
     lost = int((~np.isfinite(values)).sum())
     if lost:
         found.append(f"{lost} voxels without a number are taken as 0")
@@ -67,6 +74,13 @@ def _is_turned(
 def _like_labels(values: np.ndarray) -> bool:
     part = values[::SAMPLED, ::SAMPLED, ::SAMPLED]
     return 1 < len(np.unique(part)) <= FEW and np.array_equal(part, np.rint(part))
+
+
+def _alike(values: np.ndarray) -> float:
+    """The share of voxels, but for those that are 0, that have the value of the next along the first axis."""
+    one, two = values[:-1:SAMPLED, ::SAMPLED, ::SAMPLED], values[1::SAMPLED, ::SAMPLED, ::SAMPLED]
+    full = (one != 0) & (two != 0)
+    return float((one == two)[full].mean()) if full.any() else 1.0
 
 
 def _middles(anatomy: Anatomy) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -109,8 +110,7 @@ def head_masks(sources: Sources) -> HeadMasks:
     named = {name: labels for name, labels in sources.parts.items() if name != NECROSIS or not sources.tumour_in}
     parts |= {name: whole.mask(labels) for name, labels in named.items()}
     for name in named:
-        around = "tumour" if name == NECROSIS else "brain"
-        if around in marked:
+        if (around := _around(name)) in marked:
             marked[around] = marked[around] | parts[name]
     marked |= parts
     others = _others(sources, tumour)
@@ -182,9 +182,9 @@ def _meant(
 ) -> tuple[tuple[Label, ...], tuple[Label, ...]]:
     """The labels of brain and tumour: those given, or the convention's that are there."""
     brain, tumour = sources.brain, sources.tumour
-    necrosis = sources.parts.get(NECROSIS, ())
-    parts = tuple(label for name, labels in sources.parts.items() if name != NECROSIS for label in labels)
     if convention is not None:
+        necrosis = sources.parts.get(NECROSIS, ())
+        parts = tuple(label for name, labels in sources.parts.items() if name != NECROSIS for label in labels)
         own = brain + parts + (() if sources.tumour_in else tumour + necrosis)
         demand_fits(sources.labels, convention, whole.labels, {value for _, value in whole.places(own)})
         _demand_sides(whole, convention)
@@ -192,8 +192,12 @@ def _meant(
             brain = _there(convention.brain, whole)
         if not tumour and not sources.tumour_in:
             tumour = _there(convention.tumour, whole)
-    if not sources.tumour_in:
-        _demand_apart(whole, brain + parts, tumour + necrosis)
+    options = {"brain": "--brain" if sources.brain else "--convention", "tumour": "--tumour"}
+    own = {"brain": brain, "tumour": tumour, **sources.parts}
+    elsewhere = ("tumour", NECROSIS) if sources.tumour_in else ()
+    _demand_one_meaning(
+        whole, {name: (options.get(name, f"--{name}"), of) for name, of in own.items() if name not in elsewhere}
+    )
     return brain, tumour
 
 
@@ -252,11 +256,25 @@ def _demand_named(sources: Sources, convention: Convention | None) -> None:
         )
 
 
-def _demand_apart(whole: LabelMap, brain: Sequence[Label], tumour: Sequence[Label]) -> None:
-    places = {place: label for place, label in zip(whole.places(brain), brain, strict=True)}
-    both = [places[place] for place in whole.places(tumour) if place in places]
-    if both:
-        raise InputError(f"labels {listed(both)} are named as brain and as tumour: give each to one of them.")
+def _demand_one_meaning(whole: LabelMap, named: Mapping[str, tuple[str, Sequence[Label]]]) -> None:
+    """Refuse a label that two options name: by name of a tissue the option and its labels.
+
+    Brain may be named again as a part of brain, and tumour as necrosis.
+    """
+    for (one, (option, labels)), (two, (other, others)) in combinations(named.items(), 2):
+        if one == _around(two):
+            continue
+        places = whole.places(labels)
+        both = [label for label, place in zip(others, whole.places(others), strict=True) if place in places]
+        if both:
+            raise InputError(
+                f"{whole.path}: label {listed(both)} is named by {option} and by {other}: give it to one of them."
+            )
+
+
+def _around(part: str) -> str:
+    """What a part of a head counts as; empty of brain and tumour themselves."""
+    return "" if part in ("brain", "tumour") else "tumour" if part == NECROSIS else "brain"
 
 
 def _demand_sides(whole: LabelMap, convention: Convention) -> None:

@@ -88,11 +88,9 @@ def masked_subject(
     """
     for name in regions:
         if name not in PART_LABELS or name not in masks.parts:
-            known = [one for one in PART_LABELS if one in masks.parts]
-            raise InputError(
-                f"{masks.name}: marks no {name}, so it is no region. Choose from {', '.join(known) or 'none'}, or name "
-                "its labels."
-            )
+            known = ", ".join(one for one in PART_LABELS if one in masks.parts) or "none"
+            own = f", or name its labels by --{name}" if name in PART_LABELS else ""
+            raise InputError(f"{masks.name}: marks no {name}, so it is no region. Choose from {known}{own}.")
     intensity = None if t1 is None else read_intensity(t1)
     if t1 is not None and intensity is not None:
         scan = Grid(path_of(t1), intensity.values.shape, intensity.affine)
