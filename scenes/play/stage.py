@@ -227,14 +227,14 @@ class Stage:
 
     @cached_property
     def scan(self) -> Solid | None:
-        """The scan as a solid texture."""
-        if self.intensity is None:
-            return None
+        """The scan as a solid texture, with vessels where the scene has some; None where there is neither."""
         sight, seed = self.scene.sight, self.scene.look.vessels
         if isinstance(sight, StereoSight) and sight.vessels:
             seed = sight.seed
         if seed is not None:
             return with_vessels(self.intensity, self.site, seed, DARK, RELIEF)
+        if self.intensity is None:
+            return None
         values = self.intensity.windowed(self.site.anatomy.mesh)
         return Solid(values, np.linalg.inv(self.intensity.affine), DARK, RELIEF)
 

@@ -26,20 +26,23 @@ DARK, MOTTLE, MOTTLED = 0.75, 0.12, 0.35e-3
 
 
 @lru_cache(maxsize=2)
-def with_vessels(intensity: Intensity, site: Site, seed: int, dark: tuple[float, float, float], relief: float) -> Solid:
+def with_vessels(
+    intensity: Intensity | None, site: Site, seed: int, dark: tuple[float, float, float], relief: float
+) -> Solid:
     """The scan round an opening as a solid texture with vessels upon it, which the seed draws.
 
-    They go with the tissue, and have no height. `dark` and `relief` as of `Solid`.
+    They go with the tissue, and have no height. Without a scan, tissue is evenly bright. `dark` and `relief` as of
+    `Solid`.
     """
     half = site.radius + BEYOND
     across, along = np.arange(-half, half, FINE), np.arange(-ABOVE, BELOW, ALONG)
     T = np.eye(4)
     T[:3, :3] = np.column_stack([FINE * site.right, FINE * site.up, ALONG * site.axis])
     T[:3, 3] = site.origin + across[0] * (site.right + site.up) + along[0] * site.axis
-    inside = np.linalg.inv(intensity.affine) @ T
-    shape = len(across), len(across), len(along)
-    grey = intensity.windowed(site.anatomy.mesh)
-    scan = affine_transform(grey, inside, output_shape=shape, order=1, mode="nearest")
+    scan = np.ones((len(across), len(across), len(along)), np.float32)
+    if intensity is not None:
+        grey, inside = intensity.windowed(site.anatomy.mesh), np.linalg.inv(intensity.affine) @ T
+        scan = affine_transform(grey, inside, output_shape=scan.shape, order=1, mode="nearest")
     light = 1.0 - taken(across, np.random.default_rng([seed, 1])).astype(np.float32)
     return Solid(scan * light[:, :, None], np.linalg.inv(T), dark, relief, height=scan)
 
