@@ -11,7 +11,7 @@ from theatres import SIGHTED, short, small
 from ar.overlay.outlines import ink_of
 from ar.overlay.refind import of_ink
 from scenes.cli import main
-from scenes.play.checks import measure, within
+from scenes.play.checks import measure, objections, within
 from scenes.play.deformers import Theatre, open_theatre
 from scenes.play.observer import ELLIPSOID_COLOUR, Observer
 from scenes.play.page.text import estimated, legend, report
@@ -207,6 +207,20 @@ def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
     labelled(frame, "fem")
     assert any(line == f"estimate: refused, {found.refusal}" for line in said)
     assert "What is seen was refused" in report(frame, play.stage, "fem", "", (), 100)
+
+
+def test_check_says_what_the_locator_holds_against_its_answers(refused, frames):
+    """Refusals, slips, and a tumour that lies still in most frames, each with its reason; else nothing."""
+    _, wild = refused
+    best = max(frames, key=lambda frame: np.linalg.norm(frame.estimate.true))
+    slipped = replace(best.estimate, location=replace(best.estimate.location, slipped=True))
+    still = replace(best, estimate=replace(best.estimate, true=np.zeros(3)))
+    assert objections([best, best]) == [] and objections([replace(best, estimate=None)]) == []
+    assert objections([wild, best]) == [f"the locator refuses what is seen in 1 of 2 frames: {wild.estimate.refusal}"]
+    (doubt,) = objections([replace(best, estimate=slipped), best])
+    assert "doubts its answer in 1 of 2 frames" in doubt and "may have slipped" in doubt
+    (sparse,) = objections([still, best, still])
+    assert "moves in 1 of 3 frames" in sparse and "give a smaller --every" in sparse
 
 
 def test_a_visitor_reads_number_and_errors_before_what_explains_them(play, frames):

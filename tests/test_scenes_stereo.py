@@ -122,6 +122,14 @@ def test_without_names_points_are_a_cloud_on_the_moved_cortex(moved, shot):
     assert found.rest is None and len(found.now) > 60 and np.median(off) < 0.3e-3
 
 
+def test_a_cortex_without_a_scan_has_vessels_to_follow(observer):
+    """A head without T1 gets the same vessels, on even tissue; before, it was bare and nothing was found on it."""
+    bare = replace(observer, stage=replace(observer.stage, intensity=None))
+    assert len(bare.first.rest) > 60
+    plain = replace(bare, stage=replace(bare.stage, scene=replace(MICROSCOPE, sight=StereoSight(vessels=False))))
+    assert plain.stage.scan is None
+
+
 class TestRefusals:
     def refusal(self, observer, shot):
         with pytest.raises(InputError) as refused:
@@ -131,6 +139,10 @@ class TestRefusals:
     def test_an_eye_that_is_dark(self, observer, shot):
         dark = replace(shot, pictures=(shot.pictures[0], np.zeros_like(shot.pictures[1])))
         assert "the right eye sees nothing" in self.refusal(observer, dark)
+
+    def test_a_cortex_that_moved_farther_than_is_searched(self, observer, rest):
+        far = observer.shot(30, rest + 12e-3 * observer.stage.site.right)
+        assert "begin with a new scan" in self.refusal(observer, far)
 
     def test_swapped_eyes(self, observer, shot, rest):
         assert "which is which" in self.refusal(observer, replace(shot, cameras=shot.cameras[::-1]))

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     """Check scene by scene. 1: a bound was not kept."""
     from tqdm import tqdm
 
-    from ..play.checks import measure
+    from ..play.checks import measure, objections
     from ..play.error_text import error_lines
     from ..play.reference import truth_of
     from ..script.scene import SCENES
@@ -79,10 +79,12 @@ def run(args: argparse.Namespace) -> int:
         played = {"scene": scene.name, "deformer": name, "solver": theatre.described(name, scene)}
         promised, error = _errors(frames)
         rows.append({**played, "frames": len(frames), **figures.row(), "broken": broken})
+        against = objections(frames)
         rows[-1] |= {
             "model_error_mm": _mm(promised),
             "tumour_error_mm": _mm(error.bound),
             "largest_part": error.largest,
+            "objections": against,
             "tumour_error_unobserved_mm": _mm(error.prior),
         }
         print(
@@ -96,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
             print(f"{'':11s} {sentence}", file=table)
         if args.certify:
             rows[-1]["certificates"] = _certificates(theatre, scene, frames, truth, table)
-        for sentence in broken:
+        for sentence in (*broken, *against):
             print(f"{'':11s} {sentence}", file=table)
     tracking = _tracking(args, theatre, table) if TRACKING in asked else None
     passed = not any(row["broken"] for row in (*rows, *([] if tracking is None else [tracking])))

@@ -17,6 +17,8 @@ from ..script.scene import Bounds
 from .picture_checks import beside_tip, drawn_off, honest, printed, silhouette_of, truth_off
 from .player import Frame, Player
 
+# A tumour that has moved by less than this share of its largest motion lies still.
+STILL = 0.25
 NOWHERE = 0.0, np.inf, np.inf, np.inf, False
 """Of a tumour whose place is no number: overlap, distance [m], two in the picture [pixel], whether that is honest."""
 
@@ -180,6 +182,30 @@ def _doubts(frames: Sequence[Frame], truth: Deformation) -> list[str]:
     for frame, true in zip(frames, truth.outcome, strict=True):
         outcomes = {"as drawn": frame.deformation.outcome[0], "by the finite elements": true}
         found += [f"frame {frame.number} {whose}, {one.value}" for whose, one in outcomes.items() if not one.good]
+    return found
+
+
+def objections(frames: Sequence[Frame]) -> list[str]:
+    """What speaks against the estimates of a scene with a sight, or against what they were tried on.
+
+    How many frames the locator refuses or doubts, and why the first. Whether the tumour lies still in most frames:
+    then a share that is removed is mostly of the rigid error. They explain limits that are not kept, and are none.
+    """
+    estimates = [frame.estimate for frame in frames if frame.estimate is not None]
+    refused = [estimate.refusal for estimate in estimates if estimate.location is None]
+    slipped = [estimate.location.doubt for estimate in estimates if estimate.location and estimate.location.slipped]
+    found = [
+        f"the locator {does} in {len(why)} of {len(estimates)} frames: {why[0]}"
+        for does, why in {"refuses what is seen": refused, "doubts its answer": slipped}.items()
+        if why
+    ]
+    motion = np.linalg.norm([estimate.true for estimate in estimates], axis=1) if estimates else np.zeros(0)
+    moving = np.count_nonzero(motion > STILL * motion.max(initial=0.0))
+    if moving < 0.5 * len(motion):
+        found.append(
+            f"the tumour moves in {moving} of {len(motion)} frames, and elsewhere the rigid error alone is estimated: "
+            "give a smaller --every"
+        )
     return found
 
 

@@ -28,6 +28,11 @@ OFF_DRAPE = 1.5e-3
 MISPLACED = 2.5e-3
 # Motions are searched for up to about this [m]; if half of them seem larger, eyes were swapped.
 FARTHEST = 10e-3
+MOVED_FAR = (
+    f" Or the cortex has moved by about {1e3 * FARTHEST:g} mm or more since the first pair, farther than it is "
+    "searched for: begin with a new scan."
+)
+"""Why points of the first pair may not be found again."""
 # A smaller share of the points that were looked for is no sight of the cortex.
 FEWEST = 0.3
 # What lies round the opening does not move: so many of its places are looked at, if they are enough, and a quarter of
@@ -130,7 +135,7 @@ def points_of(site: Site, first: First, shot: Shot, rigid: Rigid, tips: np.ndarr
     found = seen_points(site, view, there)
     now, rest = rigid(found.points), first.rest[which[found.which]]
     good = supported(rest, now - rest)
-    demand(int(good.sum()), first.asked)
+    demand(int(good.sum()), first.asked, MOVED_FAR)
     motion = float(np.median(np.linalg.norm(now - rest, axis=1)))
     if motion > FARTHEST:
         raise InputError(
@@ -221,10 +226,10 @@ def stated(sigma: np.ndarray) -> np.ndarray:
     return sigma * (SIGMA / WHITE)
 
 
-def demand(count: int, asked: int) -> None:
-    """Raise InputError where too few points are seen of those that were looked for."""
+def demand(count: int, asked: int, other_reason: str = "") -> None:
+    """Raise InputError where too few points are seen of those that were looked for; it may have another reason too."""
     if count < FEWEST * asked:
         raise InputError(
             f"both eyes see {count} of {asked} places of the cortex surely: check light, focus and texture, and what "
-            "hides it."
+            f"hides it.{other_reason}"
         )
