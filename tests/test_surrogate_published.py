@@ -20,6 +20,7 @@ from surrogate.regressors.bayesian import (
     expansion,
     first_weights,
     forward,
+    step,
     strengths,
     well_determined,
 )
@@ -224,6 +225,16 @@ def test_what_it_does_not_know_is_refused(model, box, loads, truth):
         trained_in_turn("published-ann", box, push([0, 0, 0], [0, 0, -0.1], 6e-3), truth[:1])
     with pytest.raises(InputError, match=r"have 40 positions.*--preset seed"):
         trained_in_turn("published-ann", box, draw("palpation", box, 40, 0), truth[:40])
+
+
+def test_damping_that_rounding_swallows_leaves_no_singular_matrix():
+    """Two slopes alike, and noise that counts as none: before, training on few loads stopped with a traceback."""
+    held = 1e20 * np.ones((1, 2, 2)) + 1e-6 * np.eye(2)
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.solve(held, np.ones((1, 2, 1)))
+    assert np.allclose(step(held, np.ones((1, 2))), 0.5e-20, rtol=1e-3)
+    regular = np.array([[[2.0, 1.0], [1.0, 3.0]]])
+    assert np.allclose(step(regular, np.array([[3.0, 4.0]])), 1.0)
 
 
 def test_the_command_scores_them(pretender, loads, tmp_path, capsys):

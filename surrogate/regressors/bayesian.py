@@ -148,7 +148,7 @@ def descended(
     while len(trying):
         held = beta[trying, None, None] * terms.curvature[trying]
         held += (alpha + damping)[trying, None, None] * np.eye(weights.shape[1])
-        trial = weights[trying] + np.linalg.solve(held, down[trying, :, None])[:, :, 0]
+        trial = weights[trying] + step(held, down[trying])
         error = np.square(forward(trial, x)[1] - y[trying]).sum(axis=1)
         gain = 1.0 - objective(trial, error, alpha[trying], beta[trying]) / before[trying]
         good = gain > 0.0
@@ -156,6 +156,20 @@ def descended(
         damping[trying] *= np.where(good, DOWN, UP)
         trying = trying[~good & (damping[trying] <= MOST_DAMPING)]
     return weights, gained, damping
+
+
+def step(held: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """What solves symmetric, positive semi-definite systems (r, P, P) for right-hand sides (r, P).
+
+    Fewer rows than weights may be matched exactly. Then noise counts as none, and damping is lost to rounding beside
+    what the rows say: all systems are held by as much as rounding is, so that none is singular.
+    """
+    try:
+        return np.linalg.solve(held, down[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        count = held.shape[1]
+        rounding = np.finfo(float).eps * count * np.trace(held, axis1=1, axis2=2)
+        return np.linalg.solve(held + rounding[:, None, None] * np.eye(count), down[:, :, None])[:, :, 0]
 
 
 def well_determined(curvature: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
