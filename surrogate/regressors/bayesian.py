@@ -162,7 +162,7 @@ def step(held: np.ndarray, down: np.ndarray) -> np.ndarray:
     """What solves symmetric, positive semi-definite systems (r, P, P) for right-hand sides (r, P).
 
     Fewer rows than weights may be matched exactly. Then noise counts as none, and damping is lost to rounding beside
-    what the rows say: all systems are held by as much as rounding is, so that none is singular.
+    what the rows say. So all systems are held by as much as rounding is, and none is singular.
     """
     try:
         return np.linalg.solve(held, down[:, :, None])[:, :, 0]
