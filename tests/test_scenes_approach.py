@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,9 @@ from scenes.cli import main
 from scenes.commands.placement_options import add_opening_arguments, trajectory_given
 from scenes.play.deformers import Theatre
 from scenes.script.approach import Approach, approach_of
-from scenes.script.scene import find_scene
+from scenes.script.scene import PALPATION, find_scene
 from scenes.script.site import Site, site_of
+from scenes.script.tool import Blade
 from scenes.script.tool_paths import Touch, idle, press
 from sim.bodies.label_volume import volume_subject
 from sim.bodies.markups import read_markup
@@ -85,6 +87,22 @@ def test_a_line_that_ends_near_the_cortex_is_drawn_out(site, tmp_path):
         assert [approach.x, approach.y, *approach.tilt] == pytest.approx([through.x, through.y, *through.tilt])
 
 
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.5, -0.3), (-0.2, 0.6)])
+def test_a_shaft_lies_along_a_line_and_the_ball_stays(site, tmp_path, tilt):
+    """That of a probe; a point, and a blade, leave the tool as it is."""
+    entry, way, line = planned(site, 4e-3, 2e-3, tilt)
+    approach = approach_of(read_markup(marked(tmp_path, line)), site)
+    held, plain = approach.held(PALPATION), PALPATION
+    turned, usual = (tool.pose(entry, site.axis, site.right) for tool in (held, plain))
+    np.testing.assert_allclose(turned[:3, 2], -way, atol=1e-9)
+    np.testing.assert_allclose(turned[:3, :3].T @ turned[:3, :3], np.eye(3), atol=1e-12)
+    assert np.linalg.det(turned[:3, :3]) == pytest.approx(1.0)
+    centres = [pose[:3, 3] + plain.radius * pose[:3, 2] for pose in (turned, usual)]
+    np.testing.assert_allclose(*centres, atol=1e-12)
+    point = approach_of(read_markup(marked(tmp_path, entry[None], "Fiducial")), site)
+    assert point.held(plain) == plain and approach.held(Blade()) == Blade()
+
+
 def test_what_misses_the_opening_is_refused(site, tmp_path):
     _, _, line = planned(site, 0.0, 0.0, (0.0, 0.0))
     beside = line + 60e-3 * site.right
@@ -120,6 +138,7 @@ def test_commands_play_scenes_along_it(site, tmp_path, capsys):
     entry, way, line = planned(site, 6e-3, 4e-3, (0.3, 0.1))
     scene = asked("press", line)
     pushed = scene.loads(site, scene.path(2.0), 2.0).of(Pushed)
+    assert scene.tool == replace(PALPATION, lean=scene.tool.lean, turn=scene.tool.turn) != PALPATION
     assert pushed is not None and np.linalg.norm(pushed.point[0] - entry) < 1e-4
     np.testing.assert_allclose(pushed.force[0] / np.linalg.norm(pushed.force[0]), way, atol=1e-9)
     assert capsys.readouterr().err == ""

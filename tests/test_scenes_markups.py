@@ -7,6 +7,7 @@ import pytest
 from balls import ball
 
 from scenes.cli import main
+from scenes.commands.placement_options import point_or_file
 from sim.bodies.markups import read_markup
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.placement import within_outline
@@ -41,6 +42,44 @@ def curve(count=9, wide=30.0, high=18.0, over=(0.0, 0.0, 1.0)):
 def test_coordinates_are_of_the_system_that_is_stated_or_else_of_slicers(tmp_path, system):
     found = read_markup(markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0], [1.0, 2.0, 3.0]], "Line", system))
     np.testing.assert_allclose(found.points, [[0.01, 0.02, 0.03], [0.001, 0.002, 0.003]])
+
+
+def fcsv(path, system, *rows, end="\n"):
+    """A file of 3D Slicer's older fiducials; a system of None is not stated."""
+    stated = "" if system is None else f"# CoordinateSystem = {system}{end}"
+    columns = "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
+    lines = "".join(row + end for row in (columns, *rows))
+    path.write_bytes(f"# Markups fiducial file version = 4.11{end}{stated}{lines}".encode())
+    return path
+
+
+OLD = '1,{},{},30,0,0,0,1,1,1,0,"F, 1",,'
+
+
+@pytest.mark.parametrize(("system", "sign"), [("LPS", -1), ("1", -1), ("RAS", 1), ("0", 1)])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_points_of_older_files_are_of_the_system_that_is_stated(tmp_path, system, sign, end):
+    """Slicer 5 has a carriage return before the status: 2 is placed, 1 is not."""
+    rows = (OLD.format(10 * sign, 20 * sign), OLD.format(sign, 2) + "\r,2,0", OLD.format(5, 6) + "\r,1,0")
+    found = read_markup(fcsv(tmp_path / "p.fcsv", system, *rows, end=end))
+    np.testing.assert_allclose(found.points, [[0.01, 0.02, 0.03], [0.001, 0.002 * sign, 0.03]])
+    assert found.kind == "Fiducial"
+
+
+@pytest.mark.parametrize(
+    ("system", "row", "reason"),
+    [
+        (None, OLD.format(1, 2), "does not state its coordinate system"),
+        ("2", OLD.format(1, 2), "its coordinate system is '2'"),
+        ("LPS", OLD.format(1, "nan"), "coordinates are no numbers"),
+        ("LPS", "1,2", "cannot be read as markups"),
+        ("LPS", OLD.format(1, 2).replace('1",', "1,"), "cannot be read as markups"),
+        ("LPS", "", "has 0 points that are placed"),
+    ],
+)
+def test_older_files_that_do_not_say_all_are_refused(tmp_path, system, row, reason):
+    with pytest.raises(InputError, match=reason):
+        read_markup(fcsv(tmp_path / "p.fcsv", system, row))
 
 
 def test_a_curve_is_smooth_through_its_points(tmp_path):
@@ -88,6 +127,8 @@ class TestOpenings:
 
     def test_at_a_point_and_where_a_trajectory_enters(self, folder, capsys):
         top = [0.0, 0.0, RADIUS]
+        old = fcsv(folder / "given.fcsv", "RAS", "1,0,0,60,0,0,0,1,1,1,0,F-1,,")
+        assert point_or_file(str(old)) == old
         np.testing.assert_allclose(self.found(folder, capsys, "--opening-at", [[0.0, 0.0, 60.0]]), top, atol=2.5)
         # From far outside and off the middle: neither end is where it enters, whichever is drawn first.
         entry = np.sqrt(RADIUS**2 - 24.0**2)

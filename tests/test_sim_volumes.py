@@ -125,7 +125,12 @@ def test_a_head_is_the_same_in_every_format(tmp_path, name, axes):
         ({"leave_out": ("endian",)}, "does not state its endian"),
         ({"more": 'space units: "inch" "inch" "inch"\n'}, "its space units are"),
         ({"coding": "hex"}, "coded as 'hex': raw, gzip and bzip2 are read"),
-        ({"more": "data file: voxels.raw\n"}, "has its voxels in another file"),
+        ({"more": "data file: voxels.raw\n"}, "has its voxels in 'voxels.raw', and no such file is beside it"),
+        ({"more": "data file: LIST\n"}, "no such file is beside it"),
+        ({"more": "datafile: ../voxels.raw\n"}, r"in '\.\./voxels.raw', and only a file beside it is read"),
+        ({"more": "data file: /etc/passwd\n"}, "only a file beside it is read"),
+        ({"more": "data file: sub\\\\voxels.raw\n"}, "only a file beside it is read"),
+        ({"more": "data file: ..\n"}, "only a file beside it is read"),
         ({"more": "byte skip: 16\n"}, "skips a part of itself"),
     ],
 )

@@ -127,7 +127,7 @@ def _approached(args: argparse.Namespace, scene: Scene, site: Site) -> Scene:
     stopped = scene.stopped(site, approach.followed(idle)(0.0))
     if stopped:
         print(f"sulcus {args.command}: where {args.trajectory} enters, {stopped}", file=sys.stderr)
-    return replace(scene, path=approach.followed(scene.path))
+    return replace(scene, path=approach.followed(scene.path), tool=approach.held(scene.tool))
 
 
 def playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]) -> list[Scene]:

@@ -44,7 +44,7 @@ def point(text: str) -> Point:
 
 def point_or_file(text: str) -> Point | Path:
     """X,Y,Z or a file of markups, for argparse."""
-    return Path(text) if text.lower().endswith(".json") else point(text)
+    return Path(text) if text.lower().endswith((".json", ".fcsv")) else point(text)
 
 
 def piece_point_or_file(text: str) -> int | Point | Path:

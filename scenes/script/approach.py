@@ -10,6 +10,7 @@ from sim.bodies.markups import Markup
 from sim.errors import InputError
 
 from .site import Site
+from .tool import Instrument, Probe
 from .tool_paths import Path, Touch
 
 # A tool that goes in more obliquely slides along the cortex [rad]. A point farther from it marks another place [m], and
@@ -23,12 +24,13 @@ CORRECTIONS = 6
 class Approach:
     """Where a hand goes in, in the tangent plane (x, y) [m], and how its way is tilted against the axis [rad].
 
-    Both as `Touch` has them.
+    Both as `Touch` has them; a `line` is also what a shaft lies along.
     """
 
     x: float
     y: float
     tilt: tuple[float, float] = (0.0, 0.0)
+    line: bool = False
 
     def followed(self, path: Path) -> Path:
         """The same motion of the hand, begun at the entry instead of the middle, and along the trajectory."""
@@ -39,6 +41,13 @@ class Approach:
             return replace(touch, x=self.x + touch.x, y=self.y + touch.y, tilt=(right, up))
 
         return along
+
+    def held(self, tool: Instrument) -> Instrument:
+        """The same tool with its shaft along the line; a blade, whose contact depends on its posture, keeps it."""
+        if not (self.line and isinstance(tool, Probe)):
+            return tool
+        right, up = -np.tan(self.tilt)
+        return replace(tool, lean=float(np.arctan(np.hypot(right, up))), turn=float(np.arctan2(up, right)))
 
 
 def approach_of(markup: Markup, site: Site) -> Approach:
@@ -85,7 +94,7 @@ def approach_of(markup: Markup, site: Site) -> Approach:
             f"{path}: ends {1e3 * apart:.0f} mm from where it would enter the open cortex, and {1e3 * NEAR:g} mm is "
             "the most that a line is drawn out by. See that it is of this opening, and draw it through the cortex."
         )
-    return _approach(site, entry, way)
+    return replace(_approach(site, entry, way), line=True)
 
 
 def _approach(site: Site, entry: np.ndarray, way: np.ndarray) -> Approach:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
@@ -79,14 +79,16 @@ class Probe:
         Radius of the shaft [m].
     length
         Of the shaft [m].
-    lean
-        Angle between the shaft and the outward normal [rad], away from the line of sight.
+    lean, turn
+        Angle between the shaft and the outward normal, and that about the normal, of the direction in which it leans
+        [rad]: 0 is away from the line of sight.
     """
 
     radius: float = 7e-3
     shaft: float = 1.8e-3
     length: float = 0.14
     lean: float = 0.75
+    turn: float = field(default=0.0, repr=False)  # stored uncertainties go by the text of a tool
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
@@ -107,9 +109,11 @@ class Probe:
     def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
         """T_world_tool (4, 4): the ball touches `tip` (3,) [m] from outside; the shaft leans towards `aside` (3,).
 
-        inward, aside: unit vectors (3,). The ball turns about its centre, so contact does not depend on the lean.
+        `turn` turns that from `aside` towards `aside` x `inward`; these are unit vectors (3,). The ball turns about its
+        centre, so contact does not depend on the lean.
         """
         centre = tip - self.radius * inward
+        aside = np.cos(self.turn) * aside + np.sin(self.turn) * np.cross(aside, inward)
         shaft = -np.cos(self.lean) * inward + np.sin(self.lean) * aside
         across = np.cross(inward, aside)
         T = np.eye(4)

@@ -1,8 +1,10 @@
-"""Points, lines and curves that 3D Slicer wrote as `.mrk.json`."""
+"""Points, lines and curves that 3D Slicer wrote as `.mrk.json`, and points as `.fcsv`."""
 
 from __future__ import annotations
 
+import csv
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +16,13 @@ from ..runtime.outside_files import path_of, read_as
 
 SIGNS = {"LPS": (-1.0, -1.0, 1.0), "RAS": (1.0, 1.0, 1.0)}
 """What coordinates become in RAS. Slicer writes LPS, and means it where a file does not say."""
+NUMBERED = {"0": "RAS", "1": "LPS"}
+"""What older files say in place of these words."""
 REMEDY = "Save a point, a line or a closed curve from 3D Slicer's Markups."
 # Bytes of a file, points of a curve, and points that a curve is drawn with.
 LARGEST, MOST, DRAWN = 2**22, 5000, 256
+# In a row of `.fcsv` after a number or name: the coordinates, and whether they are placed, if it is said.
+PLACE, STATUS, DEFINED = slice(1, 4), 14, "2"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +51,7 @@ class Markup:
 
 
 def read_markup(path: str | Path) -> Markup:
-    """The markup in a `.mrk.json` file.
+    """The markup in a `.mrk.json` file, or the points in a `.fcsv` file.
 
     Raises
     ------
@@ -57,22 +63,42 @@ def read_markup(path: str | Path) -> Markup:
     with read_as(path, "markups of 3D Slicer", REMEDY):
         if path.stat().st_size > LARGEST:
             raise InputError(f"{path}: is too large for markups. {REMEDY}")
-        markups = json.loads(path.read_text("utf-8"))["markups"]
-        if len(markups) != 1:
-            raise InputError(f"{path}: has {len(markups)} markups, and one is read. Save each to a file of its own.")
-        (markup,) = markups
-        system = str(markup.get("coordinateSystem", "LPS"))
+        text = path.read_bytes().decode("utf-8")
+        kind, system, placed = _fcsv(text) if path.name.lower().endswith(".fcsv") else _json(text)
         if system not in SIGNS:
-            raise InputError(f"{path}: its coordinate system is {system!r}: LPS and RAS are known. {REMEDY}")
-        units = markup.get("coordinateUnits", "mm")
-        if set([units] if isinstance(units, str) else units) != {"mm"}:
-            raise InputError(f"{path}: its coordinates are in {units}, and mm are read. {REMEDY}")
-        placed = [
-            one["position"] for one in markup["controlPoints"] if one.get("positionStatus", "defined") == "defined"
-        ]
+            said = f"its coordinate system is {system!r}" if system else "it does not state its coordinate system"
+            raise InputError(f"{path}: {said}: LPS and RAS are known. {REMEDY}")
         if not 1 <= len(placed) <= MOST:
             raise InputError(f"{path}: has {len(placed)} points that are placed; 1 to {MOST} are read. {REMEDY}")
         points = np.array(placed, np.float64).reshape(-1, 3)
         if not np.isfinite(points).all():
             raise InputError(f"{path}: has points whose coordinates are no numbers. {REMEDY}")
-        return Markup(path, str(markup["type"]), 1e-3 * points * SIGNS[system])
+        return Markup(path, kind, 1e-3 * points * SIGNS[system])
+
+
+def _json(text: str) -> tuple[str, str, list[list[float]]]:
+    """Kind, coordinate system, and placed points [mm] of the one markup in a `.mrk.json` file."""
+    markups = json.loads(text)["markups"]
+    if len(markups) != 1:
+        raise InputError(f"has {len(markups)} markups, and one is read. Save each to a file of its own.")
+    (markup,) = markups
+    units = markup.get("coordinateUnits", "mm")
+    if set([units] if isinstance(units, str) else units) != {"mm"}:
+        raise InputError(f"its coordinates are in {units}, and mm are read. {REMEDY}")
+    controls = markup["controlPoints"]
+    placed = [one["position"] for one in controls if one.get("positionStatus", "defined") == "defined"]
+    return str(markup["type"]), str(markup.get("coordinateSystem", "LPS")), placed
+
+
+def _fcsv(text: str) -> tuple[str, str, list[list[float]]]:
+    """Kind, coordinate system (empty: not stated), and placed points [mm] of a `.fcsv` file.
+
+    Its columns are id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID, and of Slicer 5 the status of the
+    point, before which Slicer for Windows leaves a carriage return.
+    """
+    stated = re.search(r"^# *CoordinateSystem *= *(\w+)", text, re.MULTILINE)
+    lines = (line for line in text.replace("\r", "").split("\n") if line.strip() and not line.startswith("#"))
+    rows = list(csv.reader(lines, strict=True))
+    placed = [[float(x) for x in row[PLACE]] for row in rows if row[STATUS : STATUS + 1] in ([], [DEFINED])]
+    system = stated[1] if stated else ""
+    return "Fiducial", NUMBERED.get(system, system), placed

@@ -1,4 +1,4 @@
-"""NRRD volumes, and the segmentations that 3D Slicer writes as `.seg.nrrd`."""
+"""NRRD volumes, in one file or with their voxels beside, and the segmentations that 3D Slicer writes as `.seg.nrrd`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import gzip
 import math
 import re
 from collections.abc import Mapping
-from pathlib import Path
+from contextlib import nullcontext
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
 import numpy as np
@@ -39,11 +40,11 @@ TYPES = {
 ENDIAN = {"little": "<", "big": ">"}
 # Characters of a line of a header, and lines: a segmentation of a hundred segments has a thousand.
 LONGEST, MOST_LINES = 2**16, 2**14
-BESIDE = "Save it as one file (.nrrd), with its header and voxels together."
+ONE_FILE = "Save it as one file (.nrrd), with its header and voxels together."
 
 
 def read_nrrd(path: Path, voxels: Voxels) -> Volume:
-    """The voxels of an NRRD file of one part; of a segmentation with layers, (I, J, K, L).
+    """The voxels of an NRRD file, or of the one file beside it that it names; of layers of segments, (I, J, K, L).
 
     NRRD states its unit, millimetres if none, and one affine: `voxels` say nothing about it.
 
@@ -51,7 +52,8 @@ def read_nrrd(path: Path, voxels: Voxels) -> Volume:
     ------
     InputError
         A file that is none, or whose header is not whole; one that does not state a space of a patient's sides.
-        Voxels in another file, or in another coding than raw, gzip or bzip2. Fewer of them than declared, or too many.
+        Voxels in several files, in a folder of their own, or in another coding than raw, gzip or bzip2. Fewer of them
+        than declared, or too many.
     """
     with path.open("rb") as file:
         fields, keys = _header(path, file)
@@ -64,7 +66,10 @@ def read_nrrd(path: Path, voxels: Voxels) -> Volume:
             )
         dtype = _dtype(path, fields)
         needed = math.prod(sizes) * dtype.itemsize
-        values = np.frombuffer(_voxels(path, file, fields, needed), dtype, math.prod(sizes)).reshape(sizes, order="F")
+        beside = _beside(path, fields)
+        with nullcontext(file) if beside is None else beside.open("rb") as voxels_file:
+            held = _voxels(beside or path, voxels_file, fields, needed)
+        values = np.frombuffer(held, dtype, math.prod(sizes)).reshape(sizes, order="F")
     values = values.astype(dtype.newbyteorder("="), copy=False)
     affine, across = _affine(path, fields, len(sizes))
     if across:
@@ -79,6 +84,8 @@ def _header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]
     fields, keys = {}, {}
     for _ in range(MOST_LINES):
         line = file.readline(LONGEST)
+        if not line and _named(fields):
+            return fields, keys
         if not line.endswith(b"\n"):
             break
         text = line.decode("utf-8", "replace").rstrip("\r\n")
@@ -93,6 +100,24 @@ def _header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]
             name, value = text.split(":", 1)
             fields[name.strip().lower()] = value.strip()
     raise InputError(f"{path}: its header has no end. Copy or save it again.")
+
+
+def _named(fields: Mapping[str, str]) -> str:
+    """The name of the file that holds the voxels; empty where it is this one."""
+    return fields.get("data file", fields.get("datafile", ""))
+
+
+def _beside(path: Path, fields: Mapping[str, str]) -> Path | None:
+    """The file beside this one that holds the voxels; None where this one does."""
+    name = _named(fields)
+    if not name:
+        return None
+    if name != PurePosixPath(name).name or name != PureWindowsPath(name).name or name == "..":
+        raise InputError(f"{path}: has its voxels in {name!r}, and only a file beside it is read. {ONE_FILE}")
+    found = path.parent / name
+    if not found.is_file():
+        raise InputError(f"{path}: has its voxels in {name!r}, and no such file is beside it. {ONE_FILE}")
+    return found
 
 
 def _field(path: Path, fields: Mapping[str, str], name: str) -> str:
@@ -115,10 +140,8 @@ def _dtype(path: Path, fields: Mapping[str, str]) -> np.dtype:
 
 def _voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) -> bytes:
     """All bytes of the voxels: no memory is taken for what the file cannot hold."""
-    if "data file" in fields or "datafile" in fields:
-        raise InputError(f"{path}: has its voxels in another file. {BESIDE}")
     if any(float(fields.get(skip, 0)) for skip in ("byte skip", "byteskip", "line skip", "lineskip")):
-        raise InputError(f"{path}: skips a part of itself before its voxels. {BESIDE}")
+        raise InputError(f"{path}: skips a part of itself before its voxels. {ONE_FILE}")
     coding = _field(path, fields, "encoding").lower()
     if coding in ("gzip", "gz"):
         stream, most = gzip.GzipFile(fileobj=file), INFLATION

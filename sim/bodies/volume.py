@@ -16,6 +16,7 @@ READERS = {
     ".mgz": ("a FreeSurfer volume", read_mgh),
     ".mgh": ("a FreeSurfer volume", read_mgh),
     ".nrrd": ("NRRD", read_nrrd),
+    ".nhdr": ("NRRD", read_nrrd),
 }
 """Endings of names, what they say of a file, and what reads it."""
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import InputError
 
-REMEDY = "Give one three-dimensional volume (.nii, .nii.gz, .mgz, .mgh, .nrrd or .seg.nrrd)."
+REMEDY = "Give one three-dimensional volume (.nii, .nii.gz, .mgz, .mgh, .nrrd, .seg.nrrd or .nhdr)."
 LPS = np.array([-1.0, -1.0, 1.0])
 """What makes RAS of LPS, and the other way."""
 # What lies behind the voxels and is read for the checksum after them [bytes], and what is read at once.
