@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from sim.fields.warp_fields import WarpFields
 from sim.geometry.tetmesh import signed_volumes
 
+from .landmarks import landmarks_of
 from .moment import Moment
 
 # Weights of corners at the places between vertices: of a tetrahedron, of a triangle. No field is fitted there.
@@ -19,20 +20,21 @@ WITHIN, ON = 0.55 * np.eye(4) + 0.15 * (1.0 - np.eye(4)), 0.58 * np.eye(3) + 0.2
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Vertices of a body, then places in its tetrahedra and on its open cortex.
+    """Vertices of a body, then places in its tetrahedra and on its open cortex, then its landmarks.
 
     Parameters
     ----------
     rest, moved
         Where they are in the scan, and by how much they are displaced (n, 3) [m].
-    tumour, cortex
-        Whether each is of the tumour, and of the open cortex (n,).
+    tumour, cortex, landmarks
+        Whether each is of the tumour, of the open cortex, and one of the landmarks (n,).
     """
 
     rest: np.ndarray
     moved: np.ndarray
     tumour: np.ndarray
     cortex: np.ndarray
+    landmarks: np.ndarray
 
     def errors(self, fields: WarpFields) -> np.ndarray:
         """How far [m] fields are from the finite elements at each (n,): the farther one of the two fields."""
@@ -43,22 +45,21 @@ class Places:
 
 
 def places_of(moment: Moment) -> Places:
-    """The vertices of what is left of a body, four places in each tetrahedron and three on each open triangle."""
+    """Vertices of what is left of a body, four places in each tetrahedron, three on each open triangle, landmarks."""
     body, mesh = moment.left, moment.left.mesh
-    used = np.unique(mesh.tets)
-    of_tumour = np.repeat(body.in_tumour, len(WITHIN))
-    count = len(ON) * len(body.open_surface)
+    used, marks = np.unique(mesh.tets), landmarks_of(body, moment.displacement)
+    within, on = len(WITHIN) * len(mesh.tets), len(ON) * len(body.open_surface)
+    part = np.repeat(np.arange(4), [len(used), within, on, len(marks)])
 
-    def at(values: np.ndarray) -> np.ndarray:
+    def at(values: np.ndarray, landmarks: list[np.ndarray]) -> np.ndarray:
         between = (WITHIN @ values[mesh.tets]).reshape(-1, 3), (ON @ values[body.open_surface]).reshape(-1, 3)
-        return np.concatenate([values[used], *between])
+        return np.concatenate([values[used], *between, np.reshape(landmarks, (-1, 3))])
 
-    return Places(
-        at(mesh.nodes),
-        at(moment.displacement),
-        np.concatenate([np.isin(used, body.tumour_nodes), of_tumour, np.zeros(count, bool)]),
-        np.concatenate([np.isin(used, body.open_surface), np.zeros(len(of_tumour), bool), np.ones(count, bool)]),
-    )
+    tumour, cortex = np.zeros((2, len(part)), bool)
+    tumour[part == 0], tumour[part == 1] = np.isin(used, body.tumour_nodes), np.repeat(body.in_tumour, len(WITHIN))
+    cortex[part == 0], cortex[part == 2] = np.isin(used, body.open_surface), True
+    rest = at(mesh.nodes, [one.rest for one in marks])
+    return Places(rest, at(moment.displacement, [one.now - one.rest for one in marks]), tumour, cortex, part == 3)
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def finer_spacing(moment: Moment, fields: WarpFields) -> float | None:
     """A spacing [m] at which the tumour is exact enough, or as near as size allows; None where no finer one helps."""
     now = fields.grid.spacing
     places = places_of(moment)
-    worst = float(places.errors(fields)[places.tumour].max(initial=0.0))
+    worst = float(places.errors(fields)[places.tumour | places.landmarks].max(initial=0.0))
     if worst <= ENOUGH:
         return None
     steps = max(math.floor(SPARE * now * ENOUGH / worst / STEP), round(FINEST / STEP))

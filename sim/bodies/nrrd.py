@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Mapping
 from contextlib import nullcontext
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 from typing import BinaryIO
 
 import numpy as np
@@ -112,7 +112,7 @@ def _beside(path: Path, fields: Mapping[str, str]) -> Path | None:
     name = _named(fields)
     if not name:
         return None
-    if name != PurePosixPath(name).name or name != PureWindowsPath(name).name or name == "..":
+    if name != PureWindowsPath(name).name or name == "..":
         raise InputError(f"{path}: has its voxels in {name!r}, and only a file beside it is read. {ONE_FILE}")
     found = path.parent / name
     if not found.is_file():

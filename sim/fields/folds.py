@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 TIGHT, WANTED = 0.05, 0.15
 # Nodes so near to such a cell may move; so often it is tried, in so many steps each.
 ROUND, TIMES, STEPS = 2, 12, 200
-# A move of one node by one spacing costs as much as so much lost volume of one cell: of a node of the body, and others.
+# A move of one node by one spacing costs as much as so much lost volume of one cell: of a node that is held, and others.
 STIFF, SOFT = 1.0, 1e-4
 # A cell whose edges change by less has no corner that folds.
 GENTLE = 0.15
@@ -68,8 +68,8 @@ def volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return SIGNS * np.linalg.det(at[:, :, 1:] - at[:, :, :1])
 
 
-def unfold(field: np.ndarray, inside: np.ndarray, spacing: float) -> float:
-    """Change a field (3, I, J, K) [m] in place where it folds, or nearly: least at nodes inside a body (I, J, K).
+def unfold(field: np.ndarray, held: np.ndarray, spacing: float) -> float:
+    """Change a field (3, I, J, K) [m] in place where it folds, or nearly: least at nodes that are held (I, J, K).
 
     What corners of cells lack in volume is made small, in squares. So do Escobar et al. with meshes (Simultaneous
     untangling and smoothing of tetrahedral meshes, 2003). Returns the least determinant that is left.
@@ -86,41 +86,40 @@ def unfold(field: np.ndarray, inside: np.ndarray, spacing: float) -> float:
             window = tuple(slice(each.start, each.stop + 1) for each in where)
             part = field[(slice(None), *window)]
             near = ndimage.maximum_filter(np.pad(bad[where], [(0, 1)] * 3), 2 * grown + 2)
-            _mend(part, near, inside[window], spacing)
+            _mend(part, near, held[window], spacing)
             found[where] = jacobians(part, spacing)
     return float(found.min())
 
 
-def _mend(part: np.ndarray, near: np.ndarray, inside: np.ndarray, spacing: float) -> None:
+def _mend(part: np.ndarray, near: np.ndarray, held: np.ndarray, spacing: float) -> None:
     """Move nodes (I, J, K) that are near of a part of a field (3, I, J, K) [m] until its cells have volume."""
     shape = near.shape
     near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
-    free = np.flatnonzero(near)
     cells = np.argwhere(ndimage.maximum_filter(near, 2, origin=-1)[:-1, :-1, :-1])
-    corners = corner_nodes(cells, shape).reshape(-1, 4)
+    used, corners = np.unique(corner_nodes(cells, shape), return_inverse=True)
+    corners = corners.reshape(-1, 4)
     signs = np.tile(SIGNS, len(cells))
-    rest = part.reshape(3, -1).T / spacing + np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 3)
-    stiff = np.where(inside.reshape(-1)[free], STIFF, SOFT)[:, None]
+    flat = part.reshape(3, -1)
+    rest = flat[:, used].T / spacing + np.stack(np.unravel_index(used, shape), axis=-1)
+    free = np.flatnonzero(near.reshape(-1)[used])
+    stiff = np.where(held.reshape(-1)[used[free]], STIFF, SOFT)[:, None]
 
-    def cost(flat: np.ndarray) -> tuple[float, np.ndarray]:
-        change = flat.reshape(-1, 3)
+    def cost(variables: np.ndarray) -> tuple[float, np.ndarray]:
+        change = variables.reshape(-1, 3)
         places = rest.copy()
         places[free] += change
         at = places[corners]
         a, b, c = np.moveaxis(at[:, 1:] - at[:, :1], 1, 0)
         ends = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
         lack = np.maximum(WANTED - signs * (a * ends[:, 0]).sum(axis=1), 0.0)
-        some = lack > 0.0
-        pull = -2.0 * (signs * lack)[some, None, None] * ends[some]
-        slope = np.zeros_like(places)
-        np.add.at(slope, corners[some, 1:], pull)
-        np.add.at(slope, corners[some, 0], -pull.sum(axis=1))
-        return float((lack * lack).sum() + (stiff * change * change).sum()), (
-            slope[free] + 2.0 * stiff * change
-        ).ravel()
+        some = np.flatnonzero(lack > 0.0)
+        pull = -2.0 * (signs[some] * lack[some])[:, None, None] * ends[some]
+        pulls, pulled = np.concatenate([-pull.sum(axis=1, keepdims=True), pull], axis=1), corners[some].ravel()
+        slope = np.stack([np.bincount(pulled, each.ravel(), len(rest)) for each in np.moveaxis(pulls, -1, 0)], axis=-1)
+        size = float((lack * lack).sum() + (stiff * change * change).sum())
+        return size, (slope[free] + 2.0 * stiff * change).ravel()
 
     found = minimize(cost, np.zeros(3 * len(free)), jac=True, method="L-BFGS-B", options={"maxiter": STEPS})
-    for axis in range(3):
-        values = part[axis].reshape(-1).copy()
-        values[free] += (spacing * found.x.reshape(-1, 3)[:, axis]).astype(part.dtype)
-        part[axis] = values.reshape(shape)
+    change = (spacing * found.x.reshape(-1, 3).T).astype(part.dtype)
+    for values, more in zip(part, change, strict=True):
+        values[np.unravel_index(used[free], shape)] += more

@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
+from ..geometry.tetmesh import faces_once
 from .grid import Grid
 
 # Tetrahedra in which the sampled field is off by more [m] are fitted.
 ENOUGH = 2e-5
 # Points along a tetrahedron's longest edge for each node of the grid, to find those and to fit them; and the most.
 LOOKED, FITTED, MOST = 1.0, 1.5, 10
+# The same along a triangle's edge; the square of the error on a cell's face of surface counts as in so many cells.
+ON_SURFACE, SURFACE = 2.0, 10.0
 # Points that are looked at together: bounds the memory that it takes.
 TOGETHER = 200_000
 # Against the square of the error: of a change, of a change from node to node, of a bend outside the body.
@@ -33,28 +38,28 @@ class Body:
     values: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class _Samples:
-    """Points (n, 3) [m]: their values (n, 3), their share of a cell's volume (n,), and their tetrahedra (n,)."""
+class _Samples(NamedTuple):
+    """Points (n, 3) [m]: their values (n, 3), their weights (n,), and their tetrahedra or triangles (n,)."""
 
     points: np.ndarray
     values: np.ndarray
     weights: np.ndarray
-    tet: np.ndarray
+    simplex: np.ndarray
 
 
 def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarray, body: Body) -> None:
     """Change a field (3, I, J, K), sampled inside a body and in a collar (I, J, K) round it, to fit it between nodes.
 
     It is done in place, where sampling is off by more than 0.02 mm, and in the collar where it moves. The square of the
-    error is least over points of the tetrahedra (a projection in L2). A small weight keeps changes small and even, and
-    the field straight in the collar.
+    error is least over points of the tetrahedra and of their surface (a projection in L2): there the field has a kink,
+    and what lies outside is free to bear it. A small weight keeps changes small and even, and the field straight in
+    the collar.
     """
     flat = field.reshape(3, -1)
     bad = np.zeros(len(body.tets), bool)
     for some in _samples(grid, body, np.arange(len(body.tets)), LOOKED):
         numbers, weights = grid.corners(some.points)
-        bad[some.tet[np.linalg.norm(_read(flat, numbers, weights) - some.values, axis=1) > ENOUGH]] = True
+        bad[some.simplex[np.linalg.norm(_read(flat, numbers, weights) - some.values, axis=1) > ENOUGH]] = True
     free = np.zeros(flat.shape[1], bool)
     for some in _samples(grid, body, np.flatnonzero(bad), FITTED):
         free[grid.corners(some.points)[0]] = True
@@ -67,7 +72,8 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
     touched = np.zeros(len(body.nodes), bool)
     touched[body.tets[bad]] = True
     matrix, side = _penalties(grid, flat, nodes, column, inside.reshape(-1), collar.reshape(-1))
-    for some in _samples(grid, body, np.flatnonzero(touched[body.tets].any(axis=1)), FITTED):
+    within = _samples(grid, body, np.flatnonzero(touched[body.tets].any(axis=1)), FITTED)
+    for some in chain(within, _on_surface(grid, body, touched)):
         numbers, weights = grid.corners(some.points)
         rows = _rows(column, numbers, weights)
         weighted = rows.T.multiply(some.weights).tocsr()
@@ -86,31 +92,48 @@ def _read(flat: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> np.ndar
 
 
 def _samples(grid: Grid, body: Body, which: np.ndarray, density: float) -> Iterator[_Samples]:
-    """Points in some tetrahedra, so many to a node's distance along the longest edge; each of a lattice, and evenly."""
+    """Points in some tetrahedra, so many to a node's distance along the longest edge; by their share of a cell."""
     corners = body.nodes[body.tets[which]]
-    edges = corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]]
     volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / (6.0 * grid.spacing**3)
-    longest = np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0)
+    for some in _lattices(grid, body, body.tets[which], volumes, density):
+        yield some._replace(simplex=which[some.simplex])
+
+
+def _on_surface(grid: Grid, body: Body, touched: np.ndarray) -> Iterator[_Samples]:
+    """Points of the surface's triangles of which a vertex is touched (V,)."""
+    faces = faces_once(body.tets)
+    faces = faces[touched[faces].any(axis=1)]
+    a, b, c = body.nodes[faces].transpose(1, 0, 2)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / (2.0 * grid.spacing**2)
+    return _lattices(grid, body, faces, SURFACE * areas, ON_SURFACE)
+
+
+def _lattices(grid: Grid, body: Body, simplices: np.ndarray, weights: np.ndarray, density: float) -> Iterator[_Samples]:
+    """Points of simplices (n, c) of vertices, each of a lattice, evenly; they share the weights (n,)."""
+    corners = body.nodes[simplices]
+    size = simplices.shape[1]
+    first, second = np.triu_indices(size, 1)
+    longest = np.linalg.norm(corners[:, first] - corners[:, second], axis=2).max(axis=1, initial=0.0)
     orders = np.clip(np.ceil(density * longest / grid.spacing), 1, MOST).astype(int)
     for order in np.unique(orders):
-        lattice, alike = _lattice(order), np.flatnonzero(orders == order)
+        lattice, alike = _lattice(order, size), np.flatnonzero(orders == order)
         step = max(1, TOGETHER // len(lattice))
-        for first in range(0, len(alike), step):
-            some = alike[first : first + step]
+        for begin in range(0, len(alike), step):
+            some = alike[begin : begin + step]
             yield _Samples(
                 (lattice @ corners[some]).reshape(-1, 3),
-                (lattice @ body.values[body.tets[which[some]]]).reshape(-1, 3),
-                np.repeat(volumes[some] / len(lattice), len(lattice)),
-                np.repeat(which[some], len(lattice)),
+                (lattice @ body.values[simplices[some]]).reshape(-1, 3),
+                np.repeat(weights[some] / len(lattice), len(lattice)),
+                np.repeat(some, len(lattice)),
             )
 
 
 @cache
-def _lattice(order: int) -> np.ndarray:
-    """Weights (n, 4) of a tetrahedron's corners at the points that cut its edges into so many parts."""
-    i, j, k = (axis.ravel() for axis in np.indices((order + 1,) * 3))
-    weights = np.stack([i, j, k, order - i - j - k], axis=1)
-    return weights[weights[:, 3] >= 0] / order
+def _lattice(order: int, size: int) -> np.ndarray:
+    """Weights (n, size) of a simplex's corners at the points that cut its edges into so many parts."""
+    parts = np.indices((order + 1,) * (size - 1)).reshape(size - 1, -1)
+    weights = np.stack([*parts, order - parts.sum(axis=0)], axis=1)
+    return weights[weights[:, -1] >= 0] / order
 
 
 def _rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> sparse.csr_matrix:

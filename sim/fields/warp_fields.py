@@ -107,7 +107,7 @@ def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.
     field.reshape(3, -1)[:, numbers] = beyond_surface(nodes, tets, displacement, grid.points(numbers)).T
     project(grid, field, inside, collar, Body(nodes, tets, displacement))
     filled = extended(field, inside | collar, reach_of(displacement) / grid.spacing)
-    return filled, unfold(filled, inside, grid.spacing)
+    return filled, unfold(filled, inside | collar, grid.spacing)
 
 
 def backward_on(grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np.ndarray) -> tuple[np.ndarray, float]:
@@ -117,13 +117,13 @@ def backward_on(grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np
     """
     now, tets = body.mesh.nodes + displacement, body.mesh.tets
     field, inside = in_tetrahedra(grid, now, tets, -displacement)
-    filled = extended(field, inside, reach_of(displacement) / grid.spacing)
-    moving = np.maximum(np.abs(filled).max(axis=0), np.abs(forward).max(axis=0)) > STILL
-    numbers = np.flatnonzero(~inside & moving)
-    flat = filled.reshape(3, -1)
-    flat[:, numbers] = inverted(grid, forward, grid.points(numbers), flat[:, numbers].T.astype(np.float64)).T
-    project(grid, filled, inside, collar_of(inside), Body(now, tets, -displacement))
-    return filled, unfold(filled, inside, grid.spacing)
+    numbers = np.flatnonzero(~inside & (np.abs(forward).max(axis=0) > STILL))
+    flat = field.reshape(3, -1)
+    guess = -forward.reshape(3, -1)[:, numbers].T.astype(np.float64)
+    flat[:, numbers] = inverted(grid, forward, grid.points(numbers), guess).T
+    collar = collar_of(inside)
+    project(grid, field, inside, collar, Body(now, tets, -displacement))
+    return field, unfold(field, inside | collar, grid.spacing)
 
 
 def warp_fields(anatomy: Anatomy, displacement: np.ndarray, spacing: float, left: Anatomy | None = None) -> WarpFields:
