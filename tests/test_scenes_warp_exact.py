@@ -8,6 +8,7 @@ import pytest
 
 from scenes.cli import main
 from scenes.warp.causes import Cause
+from scenes.warp.landmarks import landmarks_of
 from scenes.warp.moment import Moment
 from scenes.warp.places import folds_of, places_of
 from scenes.warp.spacing import ENOUGH, FINEST, fields_of, finer_spacing
@@ -65,6 +66,32 @@ def test_a_spacing_follows_from_the_tumours_error(kinked, fields):
     assert finer_spacing(kinked, found) is None
     still = moment_of(kinked.anatomy, 1e-2 * kinked.displacement)
     assert fields_of(still, None, lambda more: None).grid.spacing == 1e-3
+
+
+@pytest.fixture(scope="module")
+def dented(small_box):
+    """The open cortex's landmark goes 4.5 mm inwards, its neighbours, 6 mm away, stay; and the tumour."""
+    mesh, (_, mark) = small_box.mesh, landmarks_of(small_box, np.zeros_like(small_box.mesh.nodes))
+    moved = np.zeros_like(mesh.nodes)
+    moved[np.linalg.norm(mesh.nodes - mark.rest, axis=1).argmin()] = [0.0, 0.0, -4.5e-3]
+    return moment_of(small_box, moved)
+
+
+def test_a_dent_is_fitted_at_the_surface_by_what_lies_outside(dented):
+    """Points of the tetrahedra alone leave the cortex 0.9 mm off, and unfolding all nodes round it 0.1 mm."""
+    fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
+    places = places_of(dented)
+    errors = places.errors(fields)
+    assert places.landmarks.sum() == 2 and not fields.folds
+    assert errors[places.cortex].max() < 0.2e-3 and errors[places.landmarks].max() < 0.1e-3
+
+
+def test_a_spacing_follows_from_the_landmarks_error_too(dented):
+    fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
+    places = places_of(dented)
+    assert places.errors(fields)[places.tumour].max() < ENOUGH / 10.0
+    finer = finer_spacing(dented, fields)
+    assert finer is not None and finer < 1.5e-3
 
 
 def test_a_spacing_of_too_many_nodes_is_refused(small_box):

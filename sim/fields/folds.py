@@ -10,8 +10,8 @@ from scipy.optimize import minimize
 TIGHT, WANTED = 0.05, 0.15
 # Nodes so near to such a cell may move; so often it is tried, in so many steps each.
 ROUND, TIMES, STEPS = 2, 12, 200
-# A move of one node by one spacing costs as much as so much lost volume of one cell: of a node that is held, and others.
-STIFF, SOFT = 1.0, 1e-4
+# A move of one node by one spacing costs as much as so much lost volume of one cell: of a body, its collar, beyond.
+STIFF, COLLAR, SOFT = 1.0, 0.1, 1e-4
 # A cell whose edges change by less has no corner that folds.
 GENTLE = 0.15
 # Slices that are looked at together: bounds the memory that it takes.
@@ -68,13 +68,14 @@ def volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return SIGNS * np.linalg.det(at[:, :, 1:] - at[:, :, :1])
 
 
-def unfold(field: np.ndarray, held: np.ndarray, spacing: float) -> float:
-    """Change a field (3, I, J, K) [m] in place where it folds, or nearly: least at nodes that are held (I, J, K).
+def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: float) -> float:
+    """Change a field (3, I, J, K) [m] in place where it folds, or nearly: least at nodes inside a body (I, J, K), and less in the collar round it (I, J, K) than beyond.
 
     What corners of cells lack in volume is made small, in squares. So do Escobar et al. with meshes (Simultaneous
     untangling and smoothing of tetrahedral meshes, 2003). Returns the least determinant that is left.
     """
     found = jacobians(field, spacing)
+    stiff = np.where(inside, STIFF, np.where(collar, COLLAR, SOFT))
     for turn in range(TIMES):
         bad = found < TIGHT
         if not bad.any():
@@ -86,12 +87,12 @@ def unfold(field: np.ndarray, held: np.ndarray, spacing: float) -> float:
             window = tuple(slice(each.start, each.stop + 1) for each in where)
             part = field[(slice(None), *window)]
             near = ndimage.maximum_filter(np.pad(bad[where], [(0, 1)] * 3), 2 * grown + 2)
-            _mend(part, near, held[window], spacing)
+            _mend(part, near, stiff[window], spacing)
             found[where] = jacobians(part, spacing)
     return float(found.min())
 
 
-def _mend(part: np.ndarray, near: np.ndarray, held: np.ndarray, spacing: float) -> None:
+def _mend(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float) -> None:
     """Move nodes (I, J, K) that are near of a part of a field (3, I, J, K) [m] until its cells have volume."""
     shape = near.shape
     near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
@@ -102,7 +103,7 @@ def _mend(part: np.ndarray, near: np.ndarray, held: np.ndarray, spacing: float) 
     flat = part.reshape(3, -1)
     rest = flat[:, used].T / spacing + np.stack(np.unravel_index(used, shape), axis=-1)
     free = np.flatnonzero(near.reshape(-1)[used])
-    stiff = np.where(held.reshape(-1)[used[free]], STIFF, SOFT)[:, None]
+    held = stiff.reshape(-1)[used[free], None]
 
     def cost(variables: np.ndarray) -> tuple[float, np.ndarray]:
         change = variables.reshape(-1, 3)
@@ -116,8 +117,8 @@ def _mend(part: np.ndarray, near: np.ndarray, held: np.ndarray, spacing: float) 
         pull = -2.0 * (signs[some] * lack[some])[:, None, None] * ends[some]
         pulls, pulled = np.concatenate([-pull.sum(axis=1, keepdims=True), pull], axis=1), corners[some].ravel()
         slope = np.stack([np.bincount(pulled, each.ravel(), len(rest)) for each in np.moveaxis(pulls, -1, 0)], axis=-1)
-        size = float((lack * lack).sum() + (stiff * change * change).sum())
-        return size, (slope[free] + 2.0 * stiff * change).ravel()
+        size = float((lack * lack).sum() + (held * change * change).sum())
+        return size, (slope[free] + 2.0 * held * change).ravel()
 
     found = minimize(cost, np.zeros(3 * len(free)), jac=True, method="L-BFGS-B", options={"maxiter": STEPS})
     change = (spacing * found.x.reshape(-1, 3).T).astype(part.dtype)

@@ -107,7 +107,7 @@ def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.
     field.reshape(3, -1)[:, numbers] = beyond_surface(nodes, tets, displacement, grid.points(numbers)).T
     project(grid, field, inside, collar, Body(nodes, tets, displacement))
     filled = extended(field, inside | collar, reach_of(displacement) / grid.spacing)
-    return filled, unfold(filled, inside | collar, grid.spacing)
+    return filled, unfold(filled, inside, collar, grid.spacing)
 
 
 def backward_on(grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np.ndarray) -> tuple[np.ndarray, float]:
@@ -123,7 +123,7 @@ def backward_on(grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np
     flat[:, numbers] = inverted(grid, forward, grid.points(numbers), guess).T
     collar = collar_of(inside)
     project(grid, field, inside, collar, Body(now, tets, -displacement))
-    return field, unfold(field, inside | collar, grid.spacing)
+    return field, unfold(field, inside, collar, grid.spacing)
 
 
 def warp_fields(anatomy: Anatomy, displacement: np.ndarray, spacing: float, left: Anatomy | None = None) -> WarpFields:
