@@ -78,7 +78,7 @@ def dented(small_box):
 
 
 def test_a_dent_is_fitted_at_the_surface_by_what_lies_outside(dented):
-    """Points of the tetrahedra alone leave the cortex 0.9 mm off, and unfolding all nodes round it 0.1 mm."""
+    """Points of the tetrahedra alone leave the cortex 0.9 mm off."""
     fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
     places = places_of(dented)
     errors = places.errors(fields)

@@ -135,14 +135,18 @@ def test_folds_are_undone_outside_a_body_first():
     field = np.zeros((3, 20, 20, 20), np.float32)
     field[:, 8:12, 8:12, 8:12] = rng.uniform(-1.5e-3, 1.5e-3, (3, 4, 4, 4))
     assert jacobians(field, 1e-3).min() < 0.0
-    inside = np.zeros(field.shape[1:], bool)
+    inside, collar = np.zeros((2, *field.shape[1:]), bool)
     free = field.copy()
-    assert unfold(free, inside, 1e-3) == jacobians(free, 1e-3).min() > 0.0
+    assert unfold(free, inside, collar, 1e-3) == jacobians(free, 1e-3).min() > 0.0
     inside[:10] = True
     held = field.copy()
-    assert unfold(held, inside, 1e-3) > 0.0
+    assert unfold(held, inside, collar, 1e-3) > 0.0
     moved = np.linalg.norm(held - field, axis=0)
     assert moved[10:].max() > 2.0 * moved[:10].max() and not moved[:4].any()
+    collar[10] = True
+    round_body = field.copy()
+    assert unfold(round_body, inside, collar, 1e-3) > 0.0
+    assert np.linalg.norm(round_body - field, axis=0)[10].max() < 0.9 * moved[10].max()
 
 
 def test_a_fold_at_any_corner_of_a_cell_is_found():

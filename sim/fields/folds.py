@@ -69,13 +69,13 @@ def volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: float) -> float:
-    """Change a field (3, I, J, K) [m] in place where it folds, or nearly: least at nodes inside a body (I, J, K), and less in the collar round it (I, J, K) than beyond.
+    """Change a field (3, I, J, K) [m] in place where it folds, or nearly: least at nodes inside a body (I, J, K).
 
-    What corners of cells lack in volume is made small, in squares. So do Escobar et al. with meshes (Simultaneous
-    untangling and smoothing of tetrahedral meshes, 2003). Returns the least determinant that is left.
+    Nodes of the collar round it (I, J, K) come before those inside, and after all others: between these and the body
+    lies its surface. What corners of cells lack in volume is made small, in squares. So do Escobar et al. with meshes
+    (Simultaneous untangling and smoothing of tetrahedral meshes, 2003). Returns the least determinant that is left.
     """
     found = jacobians(field, spacing)
-    stiff = np.where(inside, STIFF, np.where(collar, COLLAR, SOFT))
     for turn in range(TIMES):
         bad = found < TIGHT
         if not bad.any():
@@ -87,7 +87,8 @@ def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: f
             window = tuple(slice(each.start, each.stop + 1) for each in where)
             part = field[(slice(None), *window)]
             near = ndimage.maximum_filter(np.pad(bad[where], [(0, 1)] * 3), 2 * grown + 2)
-            _mend(part, near, stiff[window], spacing)
+            stiff = np.where(inside[window], STIFF, np.where(collar[window], COLLAR, SOFT))
+            _mend(part, near, stiff, spacing)
             found[where] = jacobians(part, spacing)
     return float(found.min())
 
