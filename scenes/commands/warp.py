@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--spacing", type=float, metavar="MM",
-        help="of the fields' nodes, 0.3 to 5 mm (default: 1, or finer until the tumour is within 0.05 mm)",
+        help="of the fields' nodes, 0.3 to 5 mm (default: 1, or finer until tumour and landmarks are within 0.05 mm)",
     )  # fmt: skip
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for all that is written")
     add_trajectory(parser)
