@@ -51,7 +51,7 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
     """Change a field (3, I, J, K), sampled inside a body and in a collar (I, J, K) round it, to fit it between nodes.
 
     It is done in place, where sampling is off by more than 0.02 mm, and in the collar where it moves. The square of the
-    error is least over points of the tetrahedra and of their surface (a projection in L2): there the field has a kink,
+    error is least over points of the tetrahedra and of their surface (a projection in L2). There the field has a kink,
     and what lies outside is free to bear it. A small weight keeps changes small and even, and the field straight in
     the collar.
     """
