@@ -31,6 +31,14 @@ def region_words(label: int) -> str:
     return f"region {label} ({region_name(label)})" if label in REGION_NAMES.values() else region_name(label)
 
 
+def missing_region(mesh: TetMesh, label: int) -> str:
+    """That a mesh has no such region, and which it has, in words; empty where it has it."""
+    if mesh.within(label).any():
+        return ""
+    has = ", ".join(map(region_words, np.unique(mesh.region).tolist()))
+    return f"the mesh has no {region_words(label)}. It has {has}."
+
+
 @dataclass(frozen=True, eq=False)
 class Anatomy:
     """A mesh with its boundary conditions, in the volume's own RAS frame [m].

@@ -7,23 +7,17 @@ import numpy as np
 import pytest
 from conftest import make_box
 from locators import dent, locator_of
+from theatres import knowing_nothing
 
 from scenes.cli import main
 from sim.bodies.meshfile import read_mesh, write_anatomy
 from sim.effects import Elasticity
-from sim.loads import Pushed
 from sim.material import Material
-from surrogate.data.cortex_patch import open_patch
-from surrogate.data.encode import Basis
 from surrogate.data.stated_tissue import stating
-from surrogate.data.tool_loads import draw
 from surrogate.locating.causes import KINDS
 from surrogate.locating.locator_files import load_locator, save_locator
 from surrogate.locating.regions import Region
-from surrogate.model.learned import Learned, Part
 from surrogate.model.store import save
-from surrogate.model.training_range import envelope_of
-from surrogate.regressors.compliance_table import Linear
 
 TUMOUR = (Region(2, 3.0),)
 
@@ -219,9 +213,5 @@ def test_regions_are_those_that_the_models_beside_learned(body, tmp_path, capsys
     path = tmp_path / "box.vtu"
     write_anatomy(path, body)
     learned = Elasticity(Material("neo-hookean", 2000.0, 0.49), {2: Material("neo-hookean", 6000.0, 0.49)})
-    patch, nodes = open_patch(body), body.tumour_nodes
-    still = Linear().fit(np.eye(3 * len(patch.nodes)), np.zeros((3 * len(patch.nodes), 1)))
-    part = Part("nodal", still, Basis(nodes, np.zeros((1, 3 * len(nodes)))))
-    known = envelope_of(patch, draw("palpation", body, 2, 0).of(Pushed))
-    save(tmp_path / "box.model.npz", {"linear": Learned(body, (part,), known, training=stating(learned))})
+    save(tmp_path / "box.model.npz", {"linear": knowing_nothing(body, stating(learned))})
     assert main(["locator", str(path), "--device", "cpu"]) == 0 and asked == [TUMOUR]

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import make_box
+from theatres import knowing_nothing
 
 from scenes.bench.sensitivity import Study, change, moved_alike, rows
 from scenes.bench.sensitivity_variants import Aim, Body, aimed, variants
@@ -24,12 +25,8 @@ from sim.fem import Fem
 from sim.loads import Displaced, Pushed, push
 from sim.material import Material
 from surrogate.data.cortex_patch import open_patch
-from surrogate.data.encode import Basis
 from surrogate.data.tool_loads import draw
-from surrogate.model.learned import Learned, Part
 from surrogate.model.store import save
-from surrogate.model.training_range import envelope_of
-from surrogate.regressors.compliance_table import Linear
 
 TIGHT = Accuracy(tolerance=1e-9)
 LINEAR = Body(Material("linear", 3000.0, 0.45), element="p1")
@@ -193,12 +190,7 @@ def test_a_body_without_tumour_is_refused(anatomy):
 
 def trained(anatomy):
     """A model that knows nothing but its bound."""
-    patch, nodes = open_patch(anatomy), anatomy.tumour_nodes
-    width = 3 * len(patch.nodes)
-    part = Part("nodal", Linear().fit(np.eye(width), np.zeros((width, 1))), Basis(nodes, np.zeros((1, 3 * len(nodes)))))
-    pushed = draw("palpation", anatomy, 2, 0).of(Pushed)
-    training = {"learner": "table", "preset": "bipolar", "element": "p2"}
-    return Learned(anatomy, (part,), envelope_of(patch, pushed), 1.23e-4, training=training)
+    return knowing_nothing(anatomy, {"learner": "table", "preset": "bipolar", "element": "p2"})
 
 
 def test_the_command(tmp_path, capsys):

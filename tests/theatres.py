@@ -25,17 +25,31 @@ from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
 from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.fem import Fem
+from sim.loads import Pushed
+from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
+from surrogate.data.encode import Basis
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.model.learned import Learned
+from surrogate.model.learned import Learned, Part
 from surrogate.model.store import load, save
+from surrogate.model.training_range import envelope_of
+from surrogate.regressors.compliance_table import Linear
 from surrogate.training.train import train
 
 SIGHTED = tuple(name for name in SCENES if find_scene(name).sight is not None)
 """The built-in scenes in which a tumour is located."""
 PUSHING = tuple(name for name in SCENES if ToolForce() in find_scene(name).effects and name not in SIGHTED)
 """The others in which a tool pushes."""
+
+
+def knowing_nothing(anatomy: Anatomy, training: dict[str, str]) -> Learned:
+    """A model that answers rest, and knows but its bound and what it states of its training."""
+    patch, nodes = open_patch(anatomy), anatomy.tumour_nodes
+    width = 3 * len(patch.nodes)
+    part = Part("nodal", Linear().fit(np.eye(width), np.zeros((width, 1))), Basis(nodes, np.zeros((1, 3 * len(nodes)))))
+    pushed = draw("palpation", anatomy, 2, 0).of(Pushed)
+    return Learned(anatomy, (part,), envelope_of(patch, pushed), 1.23e-4, training=training)
 
 
 def trained_on(anatomy: Anatomy) -> dict[str, Learned]:

@@ -9,9 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from sim.anatomy import PART_LABELS, REGION_NAMES, region_name, region_words
+from sim.anatomy import PART_LABELS, REGION_NAMES, missing_region, region_name
 from sim.effects import SKULLS, Elasticity
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
@@ -226,10 +224,9 @@ def regions_of(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | None = None
     for label in labels:
         if labels.count(label) > 1:
             raise InputError(f"--region {label} is given twice: give each region once.")
-        if mesh is not None and not mesh.within(label).any():
-            has = ", ".join(map(region_words, np.unique(mesh.region).tolist()))
+        if mesh is not None and (missing := missing_region(mesh, label)):
             marks = f" `sulcus patient --{name}` marks it." if (name := region_name(label)) in PART_LABELS else ""
-            raise InputError(f"--region {label}: the mesh has no {region_words(label)}. It has {has}.{marks}")
+            raise InputError(f"--region {label}: {missing}{marks}")
     for text, (_, one) in zip(texts, pairs, strict=True):
         _warn(f"--region {text}", one)
     return dict(sorted(pairs))

@@ -21,7 +21,7 @@ from sim.fem import Fem, solver_named
 from sim.loads import Loads
 from sim.resected_fem import Operated, finite_elements
 from sim.runtime.device import find_device
-from surrogate.data.stated_tissue import BRAIN, stated_tissue
+from surrogate.data.stated_tissue import first_stated
 from surrogate.locating.locator import Locator
 from surrogate.locating.locator_files import load_locator, locator_path
 from surrogate.model.applicability import refusal
@@ -93,8 +93,7 @@ class Theatre:
         InputError
             A statement that is no tissue.
         """
-        stated = next((model.training for model in self.models.values() if BRAIN in model.training), None)
-        return None if stated is None else stated_tissue(stated)
+        return first_stated(model.training for model in self.models.values())
 
     def lacks_locator(self, scene: Scene) -> bool:
         """Whether a scene has a sight, and no locator lies beside this anatomy."""

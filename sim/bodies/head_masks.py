@@ -185,8 +185,8 @@ def _meant(
     if convention is not None:
         necrosis = sources.parts.get(NECROSIS, ())
         parts = tuple(label for name, labels in sources.parts.items() if name != NECROSIS for label in labels)
-        own = brain + parts + (() if sources.tumour_in else tumour + necrosis)
-        demand_fits(sources.labels, convention, whole.labels, {value for _, value in whole.places(own)})
+        given = brain + parts + (() if sources.tumour_in else tumour + necrosis)
+        demand_fits(sources.labels, convention, whole.labels, {value for _, value in whole.places(given)})
         _demand_sides(whole, convention)
         if not brain and not sources.mask:
             brain = _there(convention.brain, whole)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity
@@ -32,6 +32,12 @@ def stated_tissue(stated: Mapping[str, str]) -> Elasticity:
     labels = {TUMOUR_LABEL, *(int(number) for number in numbers if number.lstrip("-").isdecimal())}
     regions = {label: tissue_from_json(stated[_key(label)]) for label in sorted(labels) if _key(label) in stated}
     return Elasticity(tissue_from_json(stated[BRAIN]), regions)
+
+
+def first_stated(statements: Iterable[Mapping[str, str]]) -> Elasticity | None:
+    """`stated_tissue` of the first statement that states the brain's; None where none does."""
+    stated = next((one for one in statements if BRAIN in one), None)
+    return None if stated is None else stated_tissue(stated)
 
 
 def _key(label: int) -> str:

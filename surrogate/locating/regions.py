@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
-from sim.anatomy import TUMOUR_LABEL, Anatomy, region_words
+from sim.anatomy import TUMOUR_LABEL, Anatomy, missing_region, region_words
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import Material, Tissue
@@ -75,9 +73,8 @@ def known_regions(elasticity: Elasticity) -> tuple[Region, ...]:
 def check_regions(regions: tuple[Region, ...], anatomy: Anatomy) -> None:
     """Raise InputError for a region that an anatomy does not have."""
     for one in regions:
-        if not anatomy.mesh.within(one.label).any():
-            has = ", ".join(map(region_words, np.unique(anatomy.mesh.region).tolist()))
-            raise InputError(f"the mesh has no {region_words(one.label)}. It has {has}.")
+        if missing := missing_region(anatomy.mesh, one.label):
+            raise InputError(missing)
 
 
 def regions_words(regions: tuple[Region, ...]) -> str:

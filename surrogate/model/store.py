@@ -21,7 +21,7 @@ from sim.runtime.outside_files import path_of, read_as
 from sim.tools import stated_tool
 
 from ..data.encode import Basis
-from ..data.stated_tissue import BRAIN, stated_tissue
+from ..data.stated_tissue import first_stated
 from ..regressors.ann import Ann
 from ..regressors.bayesian import Bayesian
 from ..regressors.compliance_table import Linear
@@ -146,9 +146,9 @@ def learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
         As `stated_errors`; a statement that is no tissue.
     """
     with _described_in(path) as header:
-        training = [about["training"] for about in header["models"].values() if BRAIN in about["training"]]
-        known = bool(training) and header["anatomy"] == anatomy.digest
-        return stated_tissue(training[0]) if known else None
+        if header["anatomy"] != anatomy.digest:
+            return None
+        return first_stated(about["training"] for about in header["models"].values())
 
 
 @contextmanager
