@@ -1,5 +1,6 @@
 """A body that many tests share, and a deformer that answers in microseconds."""
 
+import gc
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,6 +29,12 @@ def pytest_collection_modifyitems(items):
         return LONGEST.index(name) if name in LONGEST else len(LONGEST)
 
     items.sort(key=place)
+
+
+def pytest_collection_finish():
+    """What was imported and collected stays: no search for garbage walks through it again."""
+    gc.collect()
+    gc.freeze()
 
 
 def make_box(cells=(12, 12, 7), spacing=6e-3, tumour=10e-3, depth=22e-3, opening=25e-3):

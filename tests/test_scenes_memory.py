@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator
 from types import FunctionType, ModuleType
 
 import numpy as np
@@ -40,12 +39,10 @@ TERMS = {
 
 
 @pytest.fixture(scope="module", autouse=True)
-def ours_alone() -> Iterator[None]:
+def ours_alone() -> None:
     """What other tests left is not looked through at each count."""
     gc.collect()
     gc.freeze()
-    yield
-    gc.unfreeze()
 
 
 def reached(thing: object, arrays: set[int]) -> set[int]:
