@@ -151,15 +151,20 @@ def test_a_tumour_is_drawn_in_a_mask_where_the_site_is_and_t1_goes_with_it(maske
     code, text, noted = run(capsys, *words, "--out", masked / "own.vtu")
     own = json.loads(text)
     assert code == 0 and f"{masked / 'brain.nii.gz'}: left out 0.064 ml" in noted
-    assert own["brain_ml"] == pytest.approx(4e-3 / 3 * np.pi * 55.0**3 * EGG.prod(), rel=0.01)
+    assert own["septa_nodes"] == {} and own["brain_ml"] == pytest.approx(
+        4e-3 / 3 * np.pi * 55.0**3 * EGG.prod(), rel=0.01
+    )
     # Of an ellipsoid round (10, 60, -40) the central site lies on the right and above.
     at = np.array(own["opening"]["at_mm"]) - [10.0, 60.0, -40.0]
     assert np.linalg.norm(at / (55.0 * EGG)) == pytest.approx(1.0, abs=0.05)
     direction = np.array([40.0, 3.4, 52.6])
     assert at @ direction > 0.99 * np.linalg.norm(at) * np.linalg.norm(direction)
-    code, text, _ = run(capsys, *words, "--brain-ml", 1400, "--out", masked / "large.vtu")
+    code, text, _ = run(capsys, *words, "--brain-ml", 1400, "--falx-depth", 20, "--out", masked / "large.vtu")
     large, factor = json.loads(text), (1400 / own["brain_ml"]) ** (1 / 3)
-    assert code == 0 and large["brain_ml"] == pytest.approx(1400, rel=0.01)
+    assert code == 0 and large["brain_ml"] == pytest.approx(1400, rel=0.01) and large["septa_nodes"]["falx"] > 10
+    walls = read_anatomy(masked / "large.vtu")
+    held = walls.mesh.nodes[walls.held.all(axis=1), 0]
+    assert (np.abs(held - 10e-3) < 10e-3).sum() > 0.8 * large["septa_nodes"]["falx"]  # round the mask's middle
     assert large["tumour_ml"] == pytest.approx(own["tumour_ml"], rel=0.02)  # the tumour keeps its size
     grown = np.array(large["opening"]["at_mm"]) - [10.0, 60.0, -40.0]
     assert grown == pytest.approx(at * factor, abs=1.5)
@@ -180,6 +185,8 @@ def test_a_tumour_is_drawn_in_a_mask_where_the_site_is_and_t1_goes_with_it(maske
         (("--mask", "brain.nii.gz", "--brain-ml", "nan"), "--brain-ml nan is outside 20 to 5000"),
         (("--mask", "brain.nii.gz", "--radius", "35", "--cover", "60"), "reaches out of the brain"),
         (("--mask", "brain.nii.gz", "--tumour", "2"), "--tumour belongs to a label volume"),
+        (("--mask", "brain.nii.gz", "--radius", "5", "--falx-depth", "70"), "a falx of 70 mm is outside 10 to 60 mm"),
+        (("--labels", "brain.nii.gz", "--falx-depth", "35"), "--falx-depth draws in a healthy head"),
         (("--head", "fsaverage", "--t1", "t1.nii.gz"), "give --labels or --mask"),
         (("--labels", "brain.nii.gz", "--brain", "1", "--tumour", "2", "--head", "template"), "leave it out with"),
     ],

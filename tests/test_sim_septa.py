@@ -11,7 +11,7 @@ from test_sim_volumes import MIDDLE, grid, head, nifti
 
 from scenes.cli import main
 from sim.bodies.boundary_conditions import bounded
-from sim.bodies.dural_septa import Septum, walled
+from sim.bodies.dural_septa import Septum, drawn_falx, walled
 from sim.bodies.head_masks import Sources, head_masks
 from sim.bodies.label_volume import masked_subject
 from sim.bodies.meshfile import read_anatomy
@@ -68,6 +68,24 @@ def test_each_edge_that_meets_the_sheet_has_an_end_that_is_held(box, edge):
     away = np.abs(side[held]) / np.hypot(1.0, 0.2)
     assert away.max() < 0.5 * 6e-3 * np.sqrt(3.0) + reach and not held[nodes[:, 2] < -25e-3].any()
     assert not walled(box.mesh, Septum("falx", sheet + [1.0, 0.0, 0.0], edge)).any()
+
+
+def test_a_drawn_falx_hangs_from_the_convexity_in_the_midline():
+    """Of an ellipsoid's points: upright in the middle, as deep as asked, above half of the height, without gaps."""
+    directions = np.random.default_rng(1).normal(size=(4000, 3))
+    radii, middle = np.array([70e-3, 90e-3, 65e-3]), np.array([3e-3, -20e-3, 10e-3])
+    cortex = middle + radii * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    falx = drawn_falx(cortex, 30e-3)
+    assert falx.name == "falx" and np.abs(falx.points[:, 0] - middle[0]).max() < 1e-3
+    y, z = ((falx.points - middle) / radii)[:, 1:].T
+    assert z.min() > -0.02 and 0.97 < np.hypot(y, z).max() < 1.0
+    top = falx.points[np.abs(falx.points[:, 1] - middle[1]) < 1e-3, 2]
+    assert top.max() - top.min() == pytest.approx(30e-3, abs=2e-3)
+    area = 0.5 * np.pi * (np.prod(radii[1:]) - np.prod(radii[1:] - 30e-3))
+    assert len(falx.points) * 1e-6 == pytest.approx(area, rel=0.05)
+    for depth in (9e-3, 61e-3, np.nan):
+        with pytest.raises(InputError, match="is outside 10 to 60 mm"):
+            drawn_falx(cortex, depth)
 
 
 def test_beyond_it_the_brain_moves_less(said, labels, subject):

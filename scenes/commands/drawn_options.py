@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from typing import Any
 
+from sim.bodies.dural_septa import drawn_falx
 from sim.bodies.healthy_heads import fsaverage_head, masked_head
 from sim.bodies.subject import Subject
 from sim.bodies.template import SITES, Head, Tumour, drawn_subject, template_subject
@@ -12,7 +14,7 @@ from sim.errors import InputError
 
 from .placement_options import point
 
-PLACED = ("radius", "cover", "tumour_shape", "site", "tumour_at", "head", "brain_ml")
+PLACED = ("radius", "cover", "tumour_shape", "site", "tumour_at", "head", "brain_ml", "falx_depth")
 SMALLEST_ML, LARGEST_ML = 20.0, 5000.0
 
 
@@ -36,6 +38,12 @@ def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
     drawn.add_argument("--site", choices=tuple(SITES), help="the cortex that it lies under (central)")
     drawn.add_argument(
         "--tumour-at", type=point, metavar="X,Y,Z", help="its middle [mm, RAS], in place of --site and --cover"
+    )
+    drawn.add_argument(
+        "--falx-depth",
+        type=float,
+        metavar="MM",
+        help="draw a falx in the midline, so deep [mm, 10 to 60]: it does not move (without it, there is none)",
     )
     drawn.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random lobed shape (default 0)")
 
@@ -70,7 +78,13 @@ def drawn(args: argparse.Namespace, chosen: dict[str, Any]) -> Subject:
         raise InputError("--tumour-at says where the tumour lies: leave out --site and --cover, or --tumour-at.")
     middle = None if args.tumour_at is None else tuple(1e-3 * value for value in args.tumour_at)
     lengths = 1e-3 * chosen["radius"], 1e-3 * chosen["cover"]
-    tumour = Tumour(*lengths, chosen["tumour_shape"], chosen["site"], args.seed, middle)
+    subject = _in_head(Tumour(*lengths, chosen["tumour_shape"], chosen["site"], args.seed, middle), args)
+    if args.falx_depth is None:
+        return subject
+    return replace(subject, septa=(drawn_falx(subject.cortex, 1e-3 * args.falx_depth),))
+
+
+def _in_head(tumour: Tumour, args: argparse.Namespace) -> Subject:
     volume = None if args.brain_ml is None else 1e-6 * args.brain_ml
     if args.mask is not None:
         return drawn_subject(tumour, masked_head(args.mask, args.t1, volume))

@@ -9,14 +9,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
+from scipy.spatial import ConvexHull, KDTree
 
+from ..errors import InputError
 from ..geometry.tetmesh import EDGES, TetMesh, row_keys
 
 SEPTA = ("falx", "tentorium")
 """Their names."""
 # Places of an edge that are held against a sheet, at least and at most.
 FEWEST, MOST = 5, 200
+SHALLOWEST, DEEPEST = 10e-3, 60e-3
+"""[m] Of a falx that is drawn."""
+SPACING = 1e-3
+"""[m] Of the points of a falx that is drawn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +31,32 @@ class Septum:
     name: str
     points: np.ndarray
     reach: float
+
+
+def drawn_falx(cortex: np.ndarray, depth: float) -> Septum:
+    """A falx in the midline of a head that has none, from points (n, 3) [m, RAS] of its surface.
+
+    It hangs from the convexity by a `depth` [m], the same everywhere, and ends at half of the head's height. A real
+    one is narrow in front and wide behind. The outline of the head is convex, as the skull is, and sulci are ignored.
+
+    Raises
+    ------
+    InputError
+        A depth outside 10 to 60 mm.
+    """
+    if not SHALLOWEST <= depth <= DEEPEST:
+        raise InputError(
+            f"a falx of {1e3 * depth:g} mm is outside {1e3 * SHALLOWEST:g} to {1e3 * DEEPEST:g} mm: "
+            "choose a depth between."
+        )
+    low, high = cortex.min(axis=0), cortex.max(axis=0)
+    middle = 0.5 * (low + high)
+    y, z = np.meshgrid(np.arange(low[1], high[1], SPACING), np.arange(middle[2], high[2], SPACING), indexing="ij")
+    side = np.column_stack([y.ravel(), z.ravel()])
+    outline = ConvexHull(cortex[:, 1:]).equations
+    under = -(side @ outline[:, :2].T + outline[:, 2]).max(axis=1)
+    sheet = side[(under >= 0.0) & (under <= depth)]
+    return Septum("falx", np.column_stack([np.full(len(sheet), middle[0]), sheet]), np.sqrt(0.5) * SPACING)
 
 
 def walled(mesh: TetMesh, septum: Septum) -> np.ndarray:
