@@ -1,0 +1,77 @@
+"""How `locate` fares on motions by causes that it may not know: those of built-in scenes, solved by finite elements.
+
+    python benchmarks/located_scenes.py [--anatomy A.vtu] [--scenes retract resection ...] [--sights N]
+
+A locator lies beside the anatomy (`sulcus locator A.vtu --small`). Five moments of each scene are seen by 30, 100 and
+300 points of the open cortex in turn, without the tool: nearly exact, and with the errors of the scene `sag`. A row
+has how far the tumour's middle moves and how far the answer is off [mm], the mean p95 [mm], the share of answers whose
+95 % ellipsoid holds the truth, and how many are in doubt or refused, as CSV.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from scenes.play.deformers import Theatre, open_theatre
+from scenes.play.observer import Estimate, Observer
+from scenes.script.scene import find_scene
+from scenes.script.shipped_files import template_path
+from scenes.script.sight import Sight
+
+MOMENTS, COUNTS = 5, (30, 100, 300)
+ERRORS = {"none": Sight(white=2e-5, smooth=2e-5, shift=0.0, turn=0.0), "of sag": Sight()}
+"""An error of 0.02 mm is none: an observation cannot state less than it can mean."""
+
+
+def estimates(theatre: Theatre, name: str, sights: int) -> dict[str, list[Estimate]]:
+    """What is answered of a scene, by the errors of what is seen."""
+    scene = find_scene(name)
+    player, last, found = theatre.player("fem", scene), None, {error: [] for error in ERRORS}
+    for number in np.linspace(0, len(scene.times), MOMENTS + 1, dtype=int)[1:] - 1:
+        last = player.answer(player.loads(number), last)
+        positions = player.positions(last)
+        for seed in range(sights):
+            for error, sight in ERRORS.items():
+                seen = replace(sight, seed=seed, points=COUNTS[seed % len(COUNTS)])
+                found[error].append(Observer(theatre.site, theatre.locator, seen).estimate(number, positions))
+    return found
+
+
+def row(answers: list[Estimate]) -> list[str]:
+    """Figures of answers to one scene."""
+    given = [answer for answer in answers if answer.location is not None]
+    moved = 1e3 * np.mean([np.linalg.norm(answer.true) for answer in answers])
+    doubted = sum(answer.location.slipped for answer in given if answer.location)
+    refused = len(answers) - len(given)
+    if not given:
+        return [f"{moved:.2f}", "", "", "", "0", str(refused)]
+    off = 1e3 * np.mean([answer.off for answer in given])
+    p95 = 1e3 * np.mean([answer.location.p95 for answer in given if answer.location])
+    held = 100.0 * np.mean([answer.held for answer in given])
+    return [f"{moved:.2f}", f"{off:.2f}", f"{p95:.2f}", f"{held:.0f}", str(doubted), str(refused)]
+
+
+def main() -> None:
+    """Print two rows for each scene."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--anatomy", type=Path, default=template_path(), metavar="A.vtu")
+    parser.add_argument("--scenes", nargs="+", default=["press", "draw", "retract", "brain_shift", "resection"])
+    parser.add_argument("--sights", type=int, default=12, metavar="N")
+    args = parser.parse_args()
+    theatre = open_theatre(args.anatomy, device="cpu")
+    table = csv.writer(sys.stdout)
+    table.writerow(["scene", "errors", "moved_mm", "off_mm", "p95_mm", "held_percent", "in_doubt", "refused"])
+    for name in args.scenes:
+        for error, answers in estimates(theatre, name, args.sights).items():
+            table.writerow([name, error, *row(answers)])
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
