@@ -11,6 +11,7 @@ import pytest
 import warp as wp
 from balls import ball
 from plain_english import too_long
+from test_scenes_approach import marked
 from theatres import put, theatre_of
 
 from ar.screen import read_png, signature
@@ -132,6 +133,8 @@ def test_frames_of_another_run_are_refused_or_removed(folder, tmp_path, monkeypa
         "frame_0000.png", "frame_0120.png", "frame_mine.png", "press.gif",
     ]  # fmt: skip
     assert main([*words, "--every", "120", "--film", str(tmp_path / "press.gif")]) == 0  # the same run once more
+    entry = marked(folder, np.array([[6e-3, 0.0, 0.0]]), "Fiducial")
+    assert main([*words, "--every", "120", "--trajectory", str(entry)]) == 2  # the tool goes elsewhere
 
 
 def test_checking_shows_how_far_it_is(folder, monkeypatch, capsys):

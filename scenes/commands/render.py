@@ -83,8 +83,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, theatre: Theatre, scene: Scene, name: str) -> str:
     """What tells this run's frames from another's: scene, deformer, anatomy and all that changes the pictures."""
-    model = theatre.models.get(name)
-    about = scene.effects_on(theatre.anatomy), scene.element, scene.tool, scene.viewpoint, scene.accuracy
+    model, touches = theatre.models.get(name), [scene.path(time) for time in scene.times.tolist()]
+    about = scene.effects_on(theatre.anatomy), scene.element, scene.tool, touches, scene.viewpoint, scene.accuracy
     trained = None if model is None else (model.bound, dict(model.training))
     marks = repr((scene.name, name, theatre.anatomy.digest, about, trained, args.every, args.plain, args.style))
     return f"run {sha256(marks.encode()).hexdigest()[:16]}"
