@@ -32,7 +32,18 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """What was imported and collected stays: no search for garbage walks through it again."""
+    """What was imported and collected stays."""
+    settle()
+
+
+@pytest.fixture(scope="module")
+def ours_alone():
+    """What other tests left is not looked through: for tests that ask again and again what lives."""
+    settle()
+
+
+def settle():
+    """No search for garbage walks again through what lives now."""
     gc.collect()
     gc.freeze()
 

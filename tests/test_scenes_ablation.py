@@ -21,6 +21,8 @@ from scenes.script.scene import SCENES, find_scene
 from sim.effects import Gravity, Held, ToolForce
 from sim.errors import InputError
 
+pytestmark = pytest.mark.usefixtures("ours_alone")
+
 
 @pytest.fixture(scope="module")
 def theatre(box):

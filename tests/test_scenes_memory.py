@@ -22,9 +22,10 @@ from sim.effects import Elasticity, Held, Pulsation, Resection
 from sim.loads import Resected
 from sim.runtime.device import find_device
 
+pytestmark = pytest.mark.usefixtures("ours_alone")
+
 BODY = slippery(make_box((4, 4, 4), spacing=18e-3, tumour=16e-3, depth=30e-3, opening=26e-3))
 SITE = site_of(BODY)
-
 
 # One scene for each set of effects: others keep the same.
 DISTINCT = {frozenset(type(effect) for effect in find_scene(name).effects): name for name in SCENES}.values()
@@ -36,13 +37,6 @@ TERMS = {
     "SkullContact": "skull contact",
     "Gravity": "gravity",
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def ours_alone() -> None:
-    """What other tests left is not looked through at each count."""
-    gc.collect()
-    gc.freeze()
 
 
 def reached(thing: object, arrays: set[int]) -> set[int]:
