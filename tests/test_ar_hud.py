@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ar.optics.camera import look_at
-from ar.overlay.hud import FINE, FONT, bearings, folded, lay, marked, millimetres, panel, towards
+from ar.overlay.hud import BREAK, FINE, FONT, bearings, folded, lay, marked, millimetres, panel, towards
 from ar.overlay.places import ASIDE, CLEAR, PAD, STEP, free_place
 
 
@@ -139,7 +139,7 @@ def test_a_folded_line_keeps_its_words_and_its_room(room):
     lines = folded(text, room)
     wide = [cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines]
     assert " ".join(lines) == text
-    assert all(width <= room or " " not in line for width, line in zip(wide, lines, strict=True))
+    assert all(width <= room or not BREAK.search(line) for width, line in zip(wide, lines, strict=True))
     assert (len(lines) == 1) is (room == 1000.0) and (room != 150.0 or max(wide) < 1.4 * min(wide))
 
 
@@ -148,3 +148,29 @@ def test_a_panel_folds_lines_that_are_wider_than_the_picture():
     shown = panel(colour, ["a line that is much wider than so narrow a picture", "short"])
     changed = (shown != colour).any(axis=2)
     assert not changed[:, 193:].any() and changed[:, 150:190].any()
+
+
+@pytest.mark.parametrize(
+    ("text", "held"),
+    [
+        ("ms: deform 5900.6, render 13.3, overlay 8.4", ["deform 5900.6,", "render 13.3,", "overlay 8.4"]),
+        ("t 2.00 s, tumour moved 2.20 mm", ["t 2.00 s,", "tumour moved 2.20 mm"]),
+        ("estimate moved 4.8 +- 2.9 mm", ["estimate moved 4.8 +- 2.9 mm"]),
+        ("the tool reads 0.48 N within 0.01 N", ["tool reads 0.48 N", "within 0.01 N"]),
+        ("neo-hookean, E 3 kPa, nu 0.49; to the left (0.87)", ["E 3 kPa,", "nu 0.49;", "left (0.87)"]),
+        ("blue 95 % of its middle", ["blue 95 %"]),
+    ],
+)
+def test_a_number_stays_beside_its_name_and_its_unit(text, held):
+    for room in (1.0, 60.0, 100.0):
+        lines = folded(text, room)
+        assert " ".join(lines) == text and all(any(each in line for line in lines) for each in held)
+
+
+def test_a_panel_leaves_out_its_last_lines_rather_than_hide_what_must_be_seen():
+    colour, hidden = np.full((300, 400, 3), 90, np.uint8), np.ones((300, 400), np.uint8)
+    hidden[40:120, 200:] = 0
+    lines = ["the first line", "the second", "the third", "the fourth", "the fifth", "the sixth"]
+    changed = (panel(colour, lines, sights=[np.ones_like(hidden), hidden]) != colour).any(axis=2)
+    assert changed.sum() > 1000 and not changed[hidden > 0].any()
+    assert (panel(colour, lines[:2], sights=[hidden]) != colour).any(axis=2).sum() < changed.sum()

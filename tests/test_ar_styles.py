@@ -8,12 +8,13 @@ import pytest
 import trimesh
 
 from ar.optics.camera import look_at
-from ar.overlay.composite import composite
+from ar.overlay.composite import composite, head_lines
 from ar.overlay.cut import EMPTY, Plane, plane_through, profile, section
 from ar.overlay.distances import distance_of_seen, signed_distance, tree_of
 from ar.overlay.gauge import GAUGE, Gauge, gauge_words
-from ar.overlay.hud import FINE, FONT, WHITE, panel
-from ar.overlay.legend import Names
+from ar.overlay.hud import FINE, FONT, HEAD, ROW, WHITE, folded, panel
+from ar.overlay.legend import SHEET, Names
+from ar.overlay.measured import Measure
 from ar.overlay.outlines import ink_of, key_of, silhouette
 from ar.overlay.refind import found_at, of_ink, outline_gap, stands
 from ar.overlay.rings import RING, RINGS, draw_rings
@@ -259,3 +260,51 @@ def test_a_cut_has_letters_at_both_ends_also_where_a_tool_hides_one():
         assert len(letters) == 2
         assert letters[0][0] < middle[0] - reach
         assert (letters[1][-1] > middle[0] + reach) is not tool and (letters[1][-1] < 360 or not tool)
+
+
+def test_words_at_the_head_are_broken_beside_a_tool():
+    tool = np.zeros((480, 640), bool)
+    texts = ["model: finite elements themselves", "tumour: within 5.7 mm of where it is (95 %), above all registration"]
+    assert head_lines(texts, tool) == texts
+    tool[:200, 330:390] = True
+    lines = head_lines(texts, tool)
+    assert len(lines) > 2 and " ".join(lines) == " ".join(texts)
+    assert max(cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines) < 330
+    tool[:, 40:] = True
+    assert head_lines(texts, tool) == texts  # there is no room beside it
+
+
+def test_a_ring_s_number_keeps_off_the_line_from_the_tip():
+    at = tumour((0.0, 0.0, -0.014))
+    roles = Roles((TOOL,), None, None)
+    plain, crossed = (np.zeros((480, 640, 4), np.uint8) for _ in range(2))
+    box = np.s_[0:480, 0:640]
+    measure = Measure("rings", seen(), CAMERA, at, roles)
+    measure.draw(plain, np.zeros_like(plain), box)
+    line = np.zeros_like(plain)
+    number = (plain[..., :3] == np.array(DARK, np.uint8)).all(axis=2) & (plain[..., 3] > 0)
+    boxes = cv2.erode(number.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0  # more than a line's rim
+    assert boxes.any()
+    line[boxes, 3] = 255
+    measure.draw(crossed, line, box)
+    again = (crossed[..., :3] == np.array(DARK, np.uint8)).all(axis=2) & (crossed[..., 3] > 0)
+    assert not (cv2.erode(again.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)[boxes].any()
+
+
+def test_a_ring_s_caption_stands_apart_from_the_number_beside_the_tip():
+    """Right under the number, it would read as its explanation."""
+    at, said = tumour((0.0, 0.0, -0.014)), "rings: mm to the surface; error not known"
+    tip = CAMERA.unproject(np.array([[440.0, 20.0]]), np.array([0.2]))[0]
+    shown = composite(seen(0.01), CAMERA, at, style="rings", gauge=Gauge(tip, at.vertices[0]), opening=OPENING).colour
+    number = found_at(shown, str(Gauge(tip, at.vertices[0])), GAUGE)
+    caption = found_at(shown, folded(said, 0.3 * 640)[0], FINE)
+    assert number is not None and caption is not None
+    left, top, right, foot = number
+    assert caption[1] > foot + ROW or caption[3] < top - ROW or caption[0] > right + ROW or caption[2] < left - ROW
+
+
+def test_a_cut_leaves_the_foot_to_its_words():
+    covered = np.zeros((480, 640), bool)
+    covered[:270] = True  # the inset stands low
+    over = composite(seen(0.01), CAMERA, tumour((0.0, 0.0, -0.014)), style="cut", covered=covered, opening=OPENING)
+    assert (over.taken == SHEET).any() and not (over.taken[-HEAD:] == SHEET).any()

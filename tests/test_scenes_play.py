@@ -16,7 +16,9 @@ from ar.overlay.outlines import ink_of
 from ar.overlay.refind import stands
 from scenes.cli import main
 from scenes.play.deformers import model_path, open_theatre
-from scenes.play.player import CARRIED, IN_BONE, STAGES, labelled
+from scenes.play.label import labelled
+from scenes.play.load_text import shortened
+from scenes.play.player import CARRIED, IN_BONE, STAGES
 from scenes.play.stage import CORTEX, TOOL
 from scenes.script.scene import Viewpoint, find_scene
 from scenes.script.shipped_files import template_path
@@ -24,7 +26,10 @@ from scenes.script.tool_paths import Touch
 from sim.bodies.intensity import sidecar
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome
+from sim.effects import Elasticity
 from sim.errors import InputError
+from sim.fem import solver_named
+from sim.material import Material, Ogden
 from surrogate.model.learned import Learned
 
 
@@ -239,21 +244,29 @@ def test_the_label_is_drawn_above_the_picture(play):
 
 def test_the_label_tells_source_time_and_motion(play, monkeypatch):
     said = []
-    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines, **more: said.extend(lines) or colour)
+    monkeypatch.setattr("scenes.play.label.panel", lambda colour, lines, **more: said.extend(lines) or colour)
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     labelled(frame, "linear")
     assert said[0] == frame.deformation.source
-    assert said[1] == f"t 1.70 s   tumour moved {1e3 * frame.moved:.2f} mm"
+    assert said[1:3] == [f"tumour moved {1e3 * frame.moved:.2f} mm", f"t 1.70 s, {frame.acts}"]
+
+
+def test_regions_of_a_tissue_of_their_own_are_named_in_short():
+    own = Elasticity(regions={2: Material("neo-hookean", 9e3, 0.49), 3: Ogden(((1.0, 2.0), (3.0, 4.0)), 1e5)})
+    whole = solver_named("p1", [replace(own, regions=own.regions | {7: Material("linear", 1e3, 0.4)})])
+    brief = solver_named("p1", [Elasticity()]).removesuffix(")")
+    assert shortened(f"linear, from {whole}") == f"linear, from {brief}; own tissue: tumour, oedema, region 7)"
+    assert shortened(f"{brief})") == f"{brief})"
 
 
 def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch):
     shown = []
-    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines, **more: shown.append(list(lines)) or colour)
+    monkeypatch.setattr("scenes.play.label.panel", lambda colour, lines, **more: shown.append(list(lines)) or colour)
     play = player(theatre, short(), "linear")
     for force in (0.2, 0.6):
         labelled(play.draw(0, 0.0, Touch(force=force)), "linear")
     within, beyond = shown
-    assert beyond[-1] == Outcome.EXTRAPOLATED.value and len(beyond) == len(within) + 1
+    assert beyond[2] == Outcome.EXTRAPOLATED.value and len(beyond) == len(within) + 1
 
 
 def test_a_theatre_is_read_from_its_files(theatre, tmp_path):

@@ -84,7 +84,7 @@ def test_its_effects_and_causes_are_the_body_s(theatre, scene):
     loads = scene.loads(theatre.site, Touch(), 0.12)
     assert [type(cause) for cause in loads.causes] == [Posture, Resected]
     assert loads.of(Resected).done.tolist() == [2] and "resection: 2 steps done" in acting(
-        loads, guess(np.zeros((1, 3, 3)))
+        loads, guess(np.zeros((1, 3, 3))), theatre.site.anatomy.mesh.nodes
     )
     assert theatre.names(scene) == ("fem",)
 

@@ -8,14 +8,16 @@ import pytest
 from locators import locator_of
 from theatres import SIGHTED, short, small
 
+from ar.overlay.hud import FINE, NARROW, folded, millimetres
 from ar.overlay.outlines import ink_of
-from ar.overlay.refind import of_ink
+from ar.overlay.refind import of_ink, stands
 from scenes.cli import main
 from scenes.play.checks import measure, objections, within
 from scenes.play.deformers import Theatre, open_theatre
+from scenes.play.label import labelled
 from scenes.play.observer import ELLIPSOID_COLOUR, Observer
 from scenes.play.page.text import estimated, legend, report
-from scenes.play.player import REFUSED, labelled
+from scenes.play.player import REFUSED
 from scenes.play.reference import truth_of
 from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.scene import Bounds, find_scene
@@ -203,12 +205,13 @@ def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
     assert np.array_equal(play.believed(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
     assert not of_ink(frame.shown, ink_of(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
     assert np.count_nonzero(of_ink(frame.shown, ink_of(TRUTH_COLOUR))) > 10
-    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines, **more: said.extend(lines) or colour)
+    monkeypatch.setattr("scenes.play.label.panel", lambda colour, lines, **more: said.extend(lines) or colour)
     labelled(frame, "fem")
     assert any(line == f"estimate: refused, {found.refusal}" for line in said)
     assert "What is seen was refused" in report(frame, play.stage, "fem", "", (), 100)
 
 
+<<<<<<< HEAD
 def test_check_says_what_the_locator_holds_against_its_answers(refused, frames):
     """Refusals, slips, and a tumour that lies still in most frames, each with its reason; else nothing."""
     _, wild = refused
@@ -221,6 +224,23 @@ def test_check_says_what_the_locator_holds_against_its_answers(refused, frames):
     assert "doubts its answer in 1 of 2 frames" in doubt and "may have slipped" in doubt
     (sparse,) = objections([still, best, still])
     assert "moves in 1 of 3 frames" in sparse and "give a smaller --every" in sparse
+=======
+def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
+    frame, said = frames[1], []
+    found = frame.estimate
+    monkeypatch.setattr("scenes.play.label.panel", lambda colour, lines, **more: said.extend(lines) or colour)
+    labelled(replace(frame, named=False), "fem")
+    truth = 1e3 * np.linalg.norm(found.true)
+    assert said[0] == f"truth: tumour moved {truth:.2f} mm, by {frame.deformation.source}"
+    assert said[1].startswith(f"estimate: tumour moved {1e3 * found.moved:.2f} mm, from ")
+    assert said[-1].startswith("lines: ") and not any("tumour moved" in line for line in said[2:])
+    foot = f"estimate moved {millimetres(found.moved, found.location.p95)}"
+    assert f"truth moved {truth:.1f} mm; estimate" in frame.remark
+    assert all(stands(frame.shown, line, FINE) for line in folded(foot, NARROW * frame.shown.shape[1]))
+    said.clear()
+    labelled(replace(frame, named=True), "fem")
+    assert not any(line.startswith("lines: ") for line in said)
+>>>>>>> b8583c4 (The panel hides no line, each motion says whose it is, and a number stays beside its name)
 
 
 def test_a_visitor_reads_number_and_errors_before_what_explains_them(play, frames):

@@ -35,6 +35,7 @@ from surrogate.model.tool_force import ForceModel
 from surrogate.model.training_range import Envelope
 from surrogate.training.condense_contact import condensed, side_by_side
 
+NODES = np.zeros((1, 3))
 SMALL = Viewpoint(width=160, height=120)
 
 
@@ -94,20 +95,20 @@ class TestPalpate:
     def test_the_page_says_what_it_reads(self, palpated):
         frame = palpated[6]
         reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
-        assert acting(frame.loads, frame.deformation) == f"the tool reads {reads:.2f} N"
+        assert frame.acts == f"the tool reads {reads:.2f} N"
 
     def test_what_a_learnt_model_does_not_know_is_not_said(self, palpated):
         """Trained on where a ball is, it answers without the force that it takes."""
         frame = palpated[6]
-        assert acting(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6)))) == ""
+        assert acting(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6))), NODES) == ""
 
     def test_what_a_model_knows_of_the_force_is_said_with_its_bound(self, palpated):
         frame = palpated[6]
         reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
         answer = replace(frame.deformation, reaction_bound=np.array([[0.012], [0.02]]), outcome=(Outcome.PREDICTED,))
-        assert acting(frame.loads, answer) == f"the tool reads {reads:.2f} N within 0.01 N"
+        assert acting(frame.loads, answer, NODES) == f"the tool reads {reads:.2f} N within 0.01 N"
         far = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
-        assert acting(frame.loads, far) == f"the tool reads {reads:.2f} N"
+        assert acting(frame.loads, far, NODES) == f"the tool reads {reads:.2f} N"
 
     @pytest.mark.parametrize("force", [ForceModel(), None])
     def test_guarded_frames_are_the_model_s_or_the_finite_elements(self, theatre, palpated, force):

@@ -20,6 +20,7 @@ from .hud import FINE, FONT, HEAD, NARROW, ROW, folded, lay, millimetres
 from .legend import Entry, Names, legend, place_sheet
 from .measured import Measure
 from .outlines import blank, box_around, dash, ink_of, joined, key_of, outlines, pieces
+from .places import CLEAR, PAD
 from .styles import STYLES, Opening, Style
 from .traces import BEFORE, DOTTED, Trace, draw_before, draw_trace
 from .window import DARK, FRONT, SHUT, Lines, Roles, overlaid
@@ -41,14 +42,22 @@ UNNAMED = Names()
 SHORT = 96
 # Rows of text by which words of the head may be lower to leave a line in sight.
 LOWER = 2
+# Shares of the picture's width that lines at the head may have, the first at which they run over no tool.
+HEAD_WIDTHS = 0.62, 0.5, 0.4, 0.32, 0.25
+# So far the words of a style stay from the number beside the tip [pixel].
+APART = 2 * ROW
 
 
 @dataclass(frozen=True, eq=False)
 class Overlaid:
-    """A picture with lines and words in it: colour (H, W, 3) uint8, and taken (H, W) uint8, above 0 where they are."""
+    """A picture with lines and words in it: colour (H, W, 3) uint8, and taken (H, W) uint8, above 0 where they are.
+
+    `named`: whether a legend names the lines.
+    """
 
     colour: np.ndarray
     taken: np.ndarray
+    named: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,26 +197,28 @@ def composite(
     if before is not None and box is not None:
         motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
         said = millimetres(motion) if moved is None else millimetres(*moved)
-        lay(out, taken, folded(f"moved {said}", NARROW * camera.width), (0, camera.height))
+        lay(out, taken, folded(f"{names.motion} {said}", NARROW * camera.width), (0, camera.height))
     write_doubt(drawn, doubt)
     if gauge is None and opening is None and style not in ("depth", "rings", "cut"):
         return drawn
     whole = roles.of(picture.segmentation)
     front = (whole == FRONT).view(np.uint8)
+    apart = np.zeros_like(taken)
     if gauge is not None:
+        before_it = taken.copy()
         write_gauge(out, taken, camera, gauge, front, lined)
+        # What explains the style is no explanation of the number.
+        apart = cv2.dilate(taken & ~before_it, np.ones((2 * APART + 1,) * 2, np.uint8))
     if ground is not None and around is not None:
         write_ground(drawn, around, ground, front, lined)
         sights = (whole != SHUT).view(np.uint8)
         needed = front.copy()
         for each in (sights, needed):
             each[around] |= ground.mask
-        measure.lay(out, taken, sights, needed)
+        measure.lay(out, taken, sights | apart, needed)
         keys = legend_entries(hidden, grown, before, traces, doubt, names)
-        if keys:
-            place_sheet(out, taken, legend(keys), sights)
-    else:
-        measure.lay(out, taken, front, front)
+        return replace(drawn, named=bool(keys) and place_sheet(out, taken, legend(keys), sights))
+    measure.lay(out, taken, front, front)
     return drawn
 
 
@@ -288,6 +299,17 @@ def write_ground(
 def ground_lines(words: str) -> list[str]:
     """What is said of the ground as it stands in a picture: short lines, which have room in a silhouette."""
     return folded(words, SHORT)
+
+
+def head_lines(texts: Sequence[str], tool: np.ndarray) -> list[str]:
+    """Lines for the head of a picture, broken no more than it takes to run over no tool (H, W) bool, if they can."""
+    width = tool.shape[1]
+    tried = [[part for text in texts for part in folded(text, share * width)] for share in HEAD_WIDTHS]
+    for lines in tried:
+        long = max((cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines), default=0)
+        if not tool[HEAD - CLEAR : HEAD + ROW * len(lines) + CLEAR, : PAD + long + CLEAR].any():
+            return lines
+    return tried[0]
 
 
 def write_head(drawn: Overlaid, lines: Sequence[str]) -> None:

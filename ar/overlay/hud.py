@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Sequence
 from typing import Literal
 
@@ -29,6 +30,10 @@ SIGN = 0.6
 SIDES = ("RL", "AP", "SI")
 # A direction's second letter is shown where it is more than so much of it.
 OBLIQUE = 0.38
+# Where a line of text may be broken: not between a name, its number, that number's error and their unit.
+BREAK = re.compile(
+    r"\s+(?!(?:moved |reads )?[-+]?\d|\(\d\.|\+- )(?<!\+- )(?<!\d (?=%))(?<!\d (?=(?:mm|s|ms|N|kPa|ml|points)\b))"
+)
 
 
 def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5, ink: Sequence[float] = WHITE) -> None:
@@ -109,7 +114,10 @@ def lay(
 
 
 def folded(text: str, room: float, scale: float = FINE) -> list[str]:
-    """Break a line of text into as few lines as fit into `room` [pixel] where its words allow it, about as wide."""
+    """Break a line of text into as few lines as fit into `room` [pixel] where its words allow it, about as wide.
+
+    A number stays beside its name, its error and its unit, even where that takes more room.
+    """
     if cv2.getTextSize(text, FONT, scale, 1)[0][0] <= room:
         return [text] if text else []
     lines = _broken(text, room, scale)
@@ -123,7 +131,7 @@ def folded(text: str, room: float, scale: float = FINE) -> list[str]:
 
 def _broken(text: str, room: float, scale: float) -> list[str]:
     lines: list[str] = []
-    for word in text.split():
+    for word in BREAK.split(text.strip()):
         longer = f"{lines[-1]} {word}" if lines else word
         if lines and cv2.getTextSize(longer, FONT, scale, 1)[0][0] <= room:
             lines[-1] = longer
@@ -159,13 +167,14 @@ def panel(
 ) -> np.ndarray:
     """The picture (H, W, 3) uint8 with lines of ASCII text on a dark translucent ground in one corner; a copy.
 
-    One at the top begins `below` so many rows. Lines for which the picture is too low are left out.
+    One at the top begins `below` so many rows. The last lines are left out where there is room for the others alone.
 
     Parameters
     ----------
     sights
         Each (H, W) uint8, above 0 where the panel hides what should stay in sight. It stands as near to its corner as
-        the first of them lets it, broken into narrower lines where it takes that; in the corner where none does.
+        the first of them lets it, broken into narrower lines where it takes that. Rather than hide what the last of
+        them has, it has fewer lines; it stands in the corner where even the first line has no room.
 
     Raises
     ------
@@ -179,26 +188,30 @@ def panel(
         return out
     height, width = out.shape[:2]
     rooms = [share * width for share in PANEL_WIDTHS]
-    for sight, letters, room in itertools.product(sights, (scale, SMALLER * scale), rooms):
-        broken, size, step = _block(lines, room, letters)
-        wish = 0 if "left" in corner else width, PAD + below if "top" in corner else height
+    shapes = [
+        (letters, [folded(line, room, letters) for line in lines])
+        for letters, room in itertools.product((scale, SMALLER * scale), rooms)
+    ]
+    wish = 0 if "left" in corner else width, PAD + below if "top" in corner else height
+    for kept, sight, (letters, parts) in itertools.product(range(len(lines), 0, -1), sights, shapes):
+        broken = [part for line in parts[:kept] for part in line]
+        size, step = _size(broken, letters)
         place = free_place(sight, size, wish)
         if place is not None:
             return _lettered(out, broken, place, size, step, letters)
-    broken, size, step = _block(lines, width - 4 * PAD, scale)
-    broken = broken[: max((height - below - 3 * PAD) // step, 1)]
-    broken, size, step = _block(broken, width - 4 * PAD, scale)
+    broken = [part for line in lines for part in folded(line, width - 4 * PAD, scale)]
+    broken = broken[: max((height - below - 3 * PAD) // _size(broken, scale)[1], 1)]
+    size, step = _size(broken, scale)
     top = PAD + below if "top" in corner else max(height - size[1] - PAD, 0)
     left = PAD if "left" in corner else max(width - size[0] - PAD, 0)
     return _lettered(out, broken, (left, top), size, step, scale)
 
 
-def _block(lines: Sequence[str], room: float, scale: float) -> tuple[list[str], tuple[int, int], int]:
-    """Lines folded into so much room, the width and height of a panel of them, and from one to the next [pixel]."""
-    broken = [part for line in lines for part in folded(line, room, scale)]
-    sizes = [cv2.getTextSize(line, FONT, scale, 1)[0] for line in broken]
+def _size(lines: Sequence[str], scale: float) -> tuple[tuple[int, int], int]:
+    """The width and height of a panel of lines, and from one to the next [pixel]."""
+    sizes = [cv2.getTextSize(line, FONT, scale, 1)[0] for line in lines]
     step = max(height for _, height in sizes) + PAD
-    return broken, (max(width for width, _ in sizes) + 2 * PAD, step * len(broken) + PAD), step
+    return (max(width for width, _ in sizes) + 2 * PAD, step * len(lines) + PAD), step
 
 
 def _lettered(

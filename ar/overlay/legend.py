@@ -33,12 +33,15 @@ class Names:
         The hidden surface, the dashed line round it, and where it was before.
     traces
         Other surfaces, in the order in which they are given.
+    motion
+        What the length at the foot is: how far the hidden surface has moved.
     """
 
     now: str = ""
     margin: str = ""
     before: str = ""
     traces: tuple[str, ...] = ()
+    motion: str = "moved"
 
 
 @dataclass(frozen=True)

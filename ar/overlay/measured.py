@@ -89,7 +89,7 @@ class Measure:
             draw_rings(
                 sheet,
                 distance_of_seen(tree, self.camera, box, self.picture.drawn.depth[0], free, reach),
-                free & (sheet[..., 3] == 0),
+                free & (sheet[..., 3] == 0) & (above[..., 3] == 0),
             )
         if self.style == "cut":
             plane, part = self.plane, self.camera.cropped(*box)
@@ -154,6 +154,7 @@ class Measure:
                 for line in folded(text, wide - PAD, SMALL)
             ]
             inset = captioned(np.zeros((round(ASPECT * wide), wide, 3), np.uint8), lines)
+            shut[-HEAD:] = 1  # words of the foot come there
             place = free_place(shut, inset.shape[1::-1], (taken.shape[1], HEAD))
             if place is not None:
                 drawn = section(

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     """Draw, frame by frame. 1: a frame was answered badly."""
     from tqdm import tqdm
 
-    from ..play.player import labelled
+    from ..play.label import labelled
 
     at_least("--every", args.every, 1)
     claimed_folder(args.out, "frames")

@@ -9,7 +9,8 @@ import numpy as np
 from ar.overlay.hud import panel
 from ar.screen import shrunk
 
-from .player import Frame, Player, labelled
+from .label import labelled
+from .player import Frame, Player
 
 # Frames that are drawn of each scene, evenly spaced; the first loads kernels and is not timed.
 DRAWN = 8

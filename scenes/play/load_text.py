@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from sim.deformation import Deformation, Outcome
@@ -11,6 +13,8 @@ from sim.loads import Cause, Loads, Posture, Pushed, Resected, Retracted, Touchi
 SIDES = (("right", "left"), ("front", "back"), ("crown", "feet"))
 # Components of a unit vector under this are not named.
 NAMED = 0.05
+# Regions with a tissue of their own, as `Elasticity` writes them, and the name of one.
+OWN_TISSUES, OWN = re.compile(r"; region \d.*?(?=\)(?:;|$))"), re.compile(r"(?:(?<=; )|\()([\w ]+)\)?: ")
 
 
 # What is written into a picture whose answer may not be relied on.
@@ -26,15 +30,15 @@ def doubt_of(outcome: Outcome) -> str:
     return "" if outcome.good else DOUBTS.get(outcome, "not solved to the end: do not rely on it")
 
 
-def acting(loads: Loads, answer: Deformation, nodes: np.ndarray | None = None) -> str:
+def acting(loads: Loads, answer: Deformation, nodes: np.ndarray) -> str:
     """What acts in the first load case, and its tool reads, as one line; empty where time alone goes on.
 
-    With the vertices (V, 3) [m] of the brain it is said how much of the brain stands in fluid.
+    `nodes` (V, 3) [m] are the vertices of the brain at rest: it is said how much of its height stands in fluid.
     """
     return ", ".join(words for words in (_words(cause, answer, nodes) for cause in loads.causes) if words)
 
 
-def _words(cause: Cause, answer: Deformation, nodes: np.ndarray | None) -> str:
+def _words(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str:
     match cause:
         case Pushed():
             return f"force {np.linalg.norm(cause.force[0]):.2f} N"
@@ -61,11 +65,13 @@ def _way(direction: np.ndarray) -> str:
     return " and the ".join(f"{name} ({abs(down[axis]):.2f})" for name, axis in zip(names, axes, strict=True))
 
 
-def _fluid(cause: Posture, nodes: np.ndarray | None) -> str:
-    """How high the fluid stands: as a share of the brain's height, or over the origin of the scan's coordinates."""
-    level = float(cause.csf_level[0])
-    if nodes is None:
-        return f"fluid up to {1e3 * level:.0f} mm over the scan's origin"
+def _fluid(cause: Posture, nodes: np.ndarray) -> str:
+    """How high the fluid stands, as a share of the brain's height."""
     height = -nodes @ (cause.direction[0] / np.linalg.norm(cause.direction[0]))
-    share = float(np.clip((level - height.min()) / np.ptp(height), 0.0, 1.0))
+    share = float(np.clip((cause.csf_level[0] - height.min()) / np.ptp(height), 0.0, 1.0))
     return f"fluid up to {100.0 * share:.0f} % of the brain's height"
+
+
+def shortened(source: str) -> str:
+    """What answers, as `Deformation.source` has it, with regions of a tissue of their own by name alone."""
+    return OWN_TISSUES.sub(lambda found: f"; own tissue: {', '.join(OWN.findall(found[0]))}", source)

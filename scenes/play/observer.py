@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from ar.overlay.hud import millimetres
 from ar.rendering.layer import Layer
 from sim.anatomy import Anatomy
 from sim.errors import InputError
@@ -85,6 +86,11 @@ class Estimate:
         return float(np.sqrt(RADIUS_SQUARED * largest))
 
     @property
+    def truly(self) -> float:
+        """How far the tumour's middle moved in truth [m]."""
+        return float(np.linalg.norm(self.true))
+
+    @property
     def off(self) -> float:
         """How far the tumour's middle is from where it is believed to be [m]."""
         return float(np.linalg.norm(self.motion - self.true))
@@ -109,7 +115,7 @@ class Estimate:
             return ""
         still = "" if self.noticed else "no motion beyond its error; "
         guess = "" if self.location.calibrated else "a guess; "
-        return f"{still}{guess}estimate {1e3 * self.off:.1f} mm off"
+        return f"{still}{guess}truth moved {millimetres(self.truly)}; estimate {millimetres(self.off)} off"
 
     @property
     def source(self) -> str:

@@ -18,7 +18,7 @@ from surrogate.locating.prior import middle_of
 from surrogate.model.guarded import answering
 
 from .player import TRUE_STROKES, Frame, Player
-from .stage import OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
+from .stage import ESTIMATED_LINES, OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
 
 # Barycentric weights (q, 3) at which the tumour's triangles are sampled: corners, edges and insides.
 STEPS = 24
@@ -138,7 +138,7 @@ def _estimate_printed(player: Player, frame: Frame) -> bool:
     off, length = float(np.linalg.norm(moved - true)), float(np.linalg.norm(moved))
     said = [
         line
-        for text in (f"moved {millimetres(length, found.location.p95)}", frame.remark)
+        for text in (f"{ESTIMATED_LINES.motion} {millimetres(length, found.location.p95)}", frame.remark)
         for line in folded(text, NARROW * frame.shown.shape[1])
     ]
     return frame.remark.endswith(f"{1e3 * off:.1f} mm off") and all(stands(frame.shown, text, FINE) for text in said)

@@ -10,10 +10,10 @@ from functools import cached_property
 import numpy as np
 
 from ar.optics.camera import Camera
-from ar.overlay.composite import Overlaid, composite, draw_points
+from ar.overlay.composite import Overlaid, composite, draw_points, head_lines
 from ar.overlay.gauge import Gauge
-from ar.overlay.hud import HEAD, NARROW, ROW, folded, lay, panel
-from ar.overlay.legend import SHEET, Names
+from ar.overlay.hud import NARROW, folded, lay
+from ar.overlay.legend import Names
 from ar.overlay.styles import Style
 from ar.overlay.traces import Trace
 from ar.rendering.layer import Layer
@@ -37,7 +37,7 @@ from .covers import COTTON, GLOVE
 from .error_text import error_lines
 from .load_text import acting, doubt_of
 from .observer import Estimate
-from .stage import CORTEX, DRAPE, ESTIMATED_LINES, OPENING, PREDICTED_LINES, TOOL, Stage
+from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, TOOL, Stage
 from .tip_reading import reading
 
 REFUSED = "what is seen was refused, and the scan is shown: do not rely on it"
@@ -45,14 +45,12 @@ REFUSED = "what is seen was refused, and the scan is shown: do not rely on it"
 TRUE_STROKES, ELLIPSOID_STROKES = (12, 4), (8, 5)
 COVERS = (TOOL, COTTON, GLOVE)
 """What is drawn in front of the overlay."""
-LINES = "green estimate, pink truth, blue 95 % of its middle"
-"""What lines beside an estimate are."""
 IN_BONE = "the bone is where this push needs the tool: do not rely on it"
 # Tissue may carry a tool into the bone's edge by so much before it is drawn elsewhere, and before its load counts as
 # none that a tool can make [m].
 CARRIED, BLOCKED = 0.5e-3, 2e-3
-# Of the picture's width, that the lines of errors may have; a picture of fewer pixels has them in few words.
-WIDE, FEW = 0.62, 480
+# A picture of fewer pixels in width has its lines of errors in few words.
+FEW = 480
 STAGES = ("deform", "render", "overlay")
 """What the time of a frame is spent on."""
 
@@ -77,8 +75,8 @@ class Frame:
         What the camera sees, without overlay.
     shown
         The picture with the predicted tumour in it (H, W, 3) uint8, where the scan had it, and the frame's number.
-    taken
-        (H, W) uint8: above 0 where lines and words stand in it.
+    taken, named
+        (H, W) uint8: above 0 where lines and words stand in it; and whether a legend names the lines.
     distance
         From the tool's tip to the tumour's predicted surface [m]; None without a tool.
     distance_error
@@ -92,6 +90,8 @@ class Frame:
         How far the tumour may be from where it is drawn, whatever answers.
     doubt
         Why the answer may not be relied on, in the words that are in the picture; empty where it may.
+    acts
+        What acts, and what its tool reads, in words; empty where time alone goes on.
     head
         The lines at the picture's head: the errors of model and tumour.
     remark
@@ -113,12 +113,14 @@ class Frame:
     picture: Picture
     shown: np.ndarray
     taken: np.ndarray
+    named: bool
     distance: float | None
     distance_error: float | None
     moved: float
     model_error: float | None
     tumour_error: TumourError
     doubt: str
+    acts: str
     head: tuple[str, ...]
     remark: str
     seconds: Mapping[str, float]
@@ -230,7 +232,7 @@ class Player:
         band = 0.0 if estimate is not None else error.bound or 0.0
         trained = answering(self.deformer, deformation) is not None
         lines = error_lines(promised, error, trained, doubt, camera.width < FEW)
-        head = [part for line in lines for part in folded(line, WIDE * camera.width)]
+        head = head_lines(lines, picture.segmentation == TOOL)
         remarks = self.scene.stopped(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
         if self.composed:
@@ -248,9 +250,11 @@ class Player:
         return Frame(
             number, float(loads.times[0]), touch, loads, deformation, camera,
             None if held is None else held.pose, None if held is None else held.tip, picture, over.colour, over.taken,
+            over.named,
             None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
             motion if moved is None else moved[0],
-            promised, error, doubt, tuple(head), remark, took, estimate,
+            promised, error, doubt, acting(loads, deformation, self.site.anatomy.mesh.nodes), tuple(head), remark, took,
+            estimate,
         )  # fmt: skip
 
     def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
@@ -356,22 +360,3 @@ def annotate(over: Overlaid, number: int, remark: str) -> None:
     height, width = over.taken.shape
     lay(over.colour, over.taken, folded(remark, NARROW * width), (0, height))
     lay(over.colour, over.taken, [f"frame {number}"], (width, height))
-
-
-def labelled(frame: Frame, name: str) -> np.ndarray:
-    """The shown picture (H, W, 3) with a panel: deformer, what acts, and milliseconds by stage; of an estimate too."""
-    stages = "  ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
-    acts = acting(frame.loads, frame.deformation)
-    lines = [frame.deformation.source or name, f"t {frame.time:.2f} s   tumour moved {1e3 * frame.moved:.2f} mm"]
-    lines += [*([acts] if acts else []), f"ms: {stages}"]
-    if frame.estimate is not None:
-        lines[0] = f"truth: {lines[0]}"
-        lines += [f"estimate: {frame.estimate.source}", f"lines: {LINES}"]
-    if not frame.deformation.outcome[0].good:
-        lines.append(frame.deformation.outcome[0].value)
-    seen = frame.picture.segmentation
-    # Least of all may it hide what explains the lines: the legend, a scale, a cut.
-    hides = [(frame.taken > 0) | (seen != DRAPE), (frame.taken > 0) | (seen == TOOL)]
-    hides += [(frame.taken == SHEET) | (seen == TOOL), frame.taken == SHEET]
-    sights = [each.view(np.uint8) for each in hides]
-    return panel(frame.shown, lines, below=HEAD + ROW * len(frame.head), sights=sights)

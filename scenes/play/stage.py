@@ -43,7 +43,7 @@ DARK, RELIEF = (0.33, 0.16, 0.17), 1.5e-3
 OPENING = Opening((CORTEX,), ((DRAPE, "under the drape"),), "seen through bone")
 """What the tumour is seen through, and what is said of the rest."""
 PREDICTED_LINES = Names("predicted tumour", "its error, 95 %", "in the scan")
-ESTIMATED_LINES = Names("estimated tumour", "", "in the scan", ("95 % of its middle", "truth"))
+ESTIMATED_LINES = Names("estimated tumour", "", "in the scan", ("95 % of its middle", "truth"), "estimate moved")
 """What the lines are called in a picture, and in one of an estimate."""
 # Grey matter's outer rim mixes with fluid in the scan: it is read this far under the surface [m].
 READ_BELOW = 2.0e-3

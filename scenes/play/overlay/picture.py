@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ar.optics.camera import Camera
-from ar.overlay.composite import Overlaid, composite, write_doubt, write_head
+from ar.overlay.composite import HEAD_WIDTHS, Overlaid, composite, write_doubt, write_head
 from ar.overlay.gauge import Gauge
 from ar.overlay.hud import bound_words, folded
 from ar.overlay.outlines import box_around, dash, ink_of, joined, outlines, silhouette
@@ -19,7 +19,7 @@ from ar.rendering.real_picture import real_picture
 
 from ...script.tracked_tool import TrackedTool
 from ...script.uncertainty import DEVIATIONS
-from ..player import WIDE, gauged
+from ..player import gauged
 from ..stage import CORTEX, PREDICTED_LINES, TOOL, TOOL_COLOUR, Stage
 from .follower import Known, State
 
@@ -72,7 +72,7 @@ class Painter:
         whole = slice(0, camera.height), slice(0, camera.width)
         picture = real_picture(colour, camera, layers, box or whole, self.device)
         lines = [*head_lines(known), *self._hidden_words(camera, tumour, covered)]
-        head = [part for line in lines for part in folded(line, WIDE * camera.width)]
+        head = [part for line in lines for part in folded(line, HEAD_WIDTHS[0] * camera.width)]
         return composite(
             picture, camera, tumour, (TOOL,), self.style, band, gauge, before, doubt,
             moved=(known.motion.moved, known.motion.error), head=head, opening=SEEN_THROUGH, error=known.band,

@@ -17,7 +17,6 @@ from ...script.site import Site
 from ...script.tool_paths import Touch
 from ...script.uncertainty import TumourError
 from ..deformers import GUARDED, Theatre
-from ..load_text import acting
 from ..observer import ELLIPSOID_COLOUR, Estimate
 from ..player import Frame
 from ..stage import TRUTH_COLOUR, TUMOUR_COLOUR, Stage
@@ -210,9 +209,8 @@ def report(
     frame: Frame, stage: Stage, name: str, verdict: str, rows: Sequence[Row], frames: int, without: Sequence[str] = ()
 ) -> str:
     """What was answered: the distance first, then how far to trust it, what acts, the verdict and the table."""
-    left, nodes = stage.at(frame.loads).left, stage.site.anatomy.mesh.nodes
-    acts = acting(frame.loads, frame.deformation, nodes) if frame.loads.causes else ""
-    facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([acts] if acts else [])]
+    left = stage.at(frame.loads).left
+    facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
     facts += [f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' by the estimate'}"]
     if frame.distance_error is not None and frame.distance_error < np.inf:
         facts += [
@@ -234,7 +232,7 @@ def report(
 
 def estimated(found: Estimate) -> list[str]:
     """What an estimate says, how far it is from the truth, and what it was given; or why it was refused."""
-    truth = f"truly {unbroken(float(np.linalg.norm(found.true)))}"
+    truth = f"truly {unbroken(found.truly)}"
     if found.location is None:
         return [
             f'<p class="number">where the tumour is, is not known ({truth})</p>',
