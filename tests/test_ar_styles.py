@@ -305,6 +305,6 @@ def test_a_ring_s_caption_stands_apart_from_the_number_beside_the_tip():
 
 def test_a_cut_leaves_the_foot_to_its_words():
     covered = np.zeros((480, 640), bool)
-    covered[:270] = True  # the inset stands low
+    covered[:270, 400:] = True  # the inset stands low
     over = composite(seen(0.01), CAMERA, tumour((0.0, 0.0, -0.014)), style="cut", covered=covered, opening=OPENING)
     assert (over.taken == SHEET).any() and not (over.taken[-HEAD:] == SHEET).any()
