@@ -68,7 +68,7 @@ class TestCauses:
     def test_they_are_reported_in_words(self, theatre):
         both = replace(short(), effects=(*EFFECTS, Gravity(), ToolForce()))
         height = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.04]])  # from -32 to 0 mm against gravity
-        words = acting(both.loads(theatre.site, Touch(force=0.2), 0.0), STILL, height)
+        words = acting(both.loads(theatre.site, Touch(force=0.2), 0.0), STILL, theatre.site.anatomy.mesh.nodes)
         assert "force 0.20 N" in words and "gravity pulls to the back, fluid up to" in words
         assert acting(Loads((), np.zeros(1)), STILL, height) == ""
         lying = posture(np.array([-3.0, 0.0, 4.0]), -0.012)
