@@ -171,6 +171,7 @@ def test_a_panel_leaves_out_its_last_lines_rather_than_hide_what_must_be_seen():
     colour, hidden = np.full((300, 400, 3), 90, np.uint8), np.ones((300, 400), np.uint8)
     hidden[40:120, 200:] = 0
     lines = ["the first line", "the second", "the third", "the fourth", "the fifth", "the sixth"]
-    changed = (panel(colour, lines, sights=[np.ones_like(hidden), hidden]) != colour).any(axis=2)
-    assert changed.sum() > 1000 and not changed[hidden > 0].any()
+    for sights in ([np.ones_like(hidden), hidden], [hidden, np.zeros_like(hidden)]):
+        changed = (panel(colour, lines, sights=sights) != colour).any(axis=2)
+        assert changed.sum() > 1000 and not changed[hidden > 0].any()
     assert (panel(colour, lines[:2], sights=[hidden]) != colour).any(axis=2).sum() < changed.sum()

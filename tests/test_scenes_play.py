@@ -247,8 +247,8 @@ def test_the_label_tells_source_time_and_motion(play, monkeypatch):
     monkeypatch.setattr("scenes.play.label.panel", lambda colour, lines, **more: said.extend(lines) or colour)
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     labelled(frame, "linear")
-    assert said[0] == frame.deformation.source
-    assert said[1:3] == [f"tumour moved {1e3 * frame.moved:.2f} mm", f"t 1.70 s, {frame.acts}"]
+    assert said[:2] == [f"linear: tumour moved {1e3 * frame.moved:.2f} mm", f"t 1.70 s, {frame.acts}"]
+    assert said[-1] == frame.deformation.source
 
 
 def test_regions_of_a_tissue_of_their_own_are_named_in_short():
@@ -266,7 +266,7 @@ def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch
     for force in (0.2, 0.6):
         labelled(play.draw(0, 0.0, Touch(force=force)), "linear")
     within, beyond = shown
-    assert beyond[2] == Outcome.EXTRAPOLATED.value and len(beyond) == len(within) + 1
+    assert beyond[1] == Outcome.EXTRAPOLATED.value and len(beyond) == len(within) + 1
 
 
 def test_a_theatre_is_read_from_its_files(theatre, tmp_path):

@@ -167,7 +167,7 @@ def composite(
     surfaces += [trace.layer.vertices for trace in traces]
     box = box_around(camera, np.concatenate([*surfaces, measure.reached]))
     around = box if gauge is None else joined(box, box_around(camera, np.stack([gauge.tip, gauge.nearest])))
-    taken, ground = np.zeros(shape, np.uint8), None
+    taken, faint, ground = np.zeros(shape, np.uint8), np.zeros(shape, bool), None
     if around is None:
         out = picture.colour.copy()
     else:
@@ -177,8 +177,10 @@ def composite(
         if before is not None:
             draw_before(under, camera, around, before, hidden)
         if grown is not None:
+            bare = under[..., 3] == 0
             wider = seen(part, grown.vertices, grown.triangles, device=device).mask
             dash(under, outlines(wider), margin_ink(hidden), DASHED, 1)
+            faint[around] = bare & (under[..., 3] > 0)
         if opening is not None:
             ground = ground_over(picture.segmentation[around], roles.of(picture.segmentation, around), found, opening)
         for trace in traces:
@@ -197,7 +199,9 @@ def composite(
     if before is not None and box is not None:
         motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
         said = millimetres(motion) if moved is None else millimetres(*moved)
-        lay(out, taken, folded(f"{names.motion} {said}", NARROW * camera.width), (0, camera.height))
+        firm = taken * ~faint  # it keeps its place, though it stands on the margin's line
+        lay(out, firm, folded(f"{names.motion} {said}", NARROW * camera.width), (0, camera.height))
+        taken |= firm
     write_doubt(drawn, doubt)
     if gauge is None and opening is None and style not in ("depth", "rings", "cut"):
         return drawn

@@ -173,8 +173,8 @@ def panel(
     ----------
     sights
         Each (H, W) uint8, above 0 where the panel hides what should stay in sight. It stands as near to its corner as
-        the first of them lets it, broken into narrower lines where it takes that. Rather than hide what the last of
-        them has, it has fewer lines; it stands in the corner where even the first line has no room.
+        the first of them lets it, broken into narrower lines or with fewer of them where it takes that. The next is
+        asked where even one line has no room, and the corner is taken where none has any.
 
     Raises
     ------
@@ -193,7 +193,7 @@ def panel(
         for letters, room in itertools.product((scale, SMALLER * scale), rooms)
     ]
     wish = 0 if "left" in corner else width, PAD + below if "top" in corner else height
-    for kept, sight, (letters, parts) in itertools.product(range(len(lines), 0, -1), sights, shapes):
+    for sight, kept, (letters, parts) in itertools.product(sights, range(len(lines), 0, -1), shapes):
         broken = [part for line in parts[:kept] for part in line]
         size, step = _size(broken, letters)
         place = free_place(sight, size, wish)

@@ -22,10 +22,11 @@ def label_lines(frame: Frame, name: str) -> list[str]:
     moment = f"t {frame.time:.2f} s{', ' if frame.acts else ''}{frame.acts}"
     rest = [*doubt, moment, "ms: " + ", ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in spent)]
     if found is None:
-        return [source, f"tumour moved {1e3 * frame.moved:.2f} mm", *rest]
-    estimated = "" if found.location is None else f"tumour moved {1e3 * found.moved:.2f} mm, from "
-    truth = f"truth: tumour moved {1e3 * found.truly:.2f} mm, by {source}"
-    return [truth, f"estimate: {estimated}{found.source}", *rest, *([] if frame.named else [f"lines: {LINES}"])]
+        return [f"{name}: tumour moved {1e3 * frame.moved:.2f} mm", *rest, source]
+    moved = [f"truth: tumour moved {1e3 * found.truly:.2f} mm"]
+    moved += [] if found.location is None else [f"estimate: tumour moved {1e3 * found.moved:.2f} mm"]
+    lines = [] if frame.named else [f"lines: {LINES}"]
+    return [*moved, *rest, f"truth: {source}", f"estimate: {found.source}", *lines]
 
 
 def labelled(frame: Frame, name: str) -> np.ndarray:
