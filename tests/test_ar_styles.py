@@ -308,3 +308,13 @@ def test_a_cut_leaves_the_foot_to_its_words():
     covered[:270, 400:] = True  # the inset stands low
     over = composite(seen(0.01), CAMERA, tumour((0.0, 0.0, -0.014)), style="cut", covered=covered, opening=OPENING)
     assert (over.taken == SHEET).any() and not (over.taken[-HEAD:] == SHEET).any()
+
+
+@pytest.mark.parametrize(("covered", "middle"), [(460, -0.014), (640, -0.014), (0, 0.3)])
+def test_a_cut_is_drawn_where_nothing_is_seen_along_it(covered, middle):
+    """A hand covers all that is seen of it, or the whole picture; or all of it lies behind the camera."""
+    hand = np.zeros((480, 640), bool)
+    hand[:, :covered] = True
+    at = tumour((0.0, 0.0, middle))
+    over = composite(seen(0.01), CAMERA, at, style="cut", covered=hand, opening=OPENING)
+    assert (over.taken == SHEET).any() == (covered < 640)

@@ -160,7 +160,7 @@ def _frame(
     places = plane.coordinates(hidden.vertices)
     held = [places.min(axis=0) - ROUND, places.max(axis=0) + ROUND]
     near = surface[(surface[:, 0] > held[0][0]) & (surface[:, 0] < held[1][0])]
-    held += [near.min(axis=0) - OVER] * bool(len(near))
+    held += [near.min(axis=0) - OVER] if len(near) else []
     held += [] if tip is None else [plane.coordinates(tip) - OVER, plane.coordinates(tip) + OVER]
     low, high = np.min(held, axis=0), np.max(held, axis=0)
     scale = float((np.array(size) / (high - low)).min())

@@ -126,7 +126,9 @@ def pieces(lines: Sequence[np.ndarray], where: np.ndarray) -> list[np.ndarray]:
 
 
 def runs(line: np.ndarray, kept: np.ndarray) -> list[np.ndarray]:
-    """The pieces of a line (n, 1, 2) whose points are kept (n,) bool."""
+    """The pieces of a line (n, 1, 2) whose points are kept (n,) bool; none of an empty one."""
+    if not len(line):
+        return []
     cuts = np.flatnonzero(np.diff(kept)) + 1
     return [piece for piece, wanted in zip(np.split(line, cuts), np.split(kept, cuts), strict=True) if wanted[0]]
 
