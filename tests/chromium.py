@@ -15,6 +15,7 @@ import numpy as np
 from websockets.sync.client import connect
 
 from ar.page.sight import PICTURE, SAID
+from ar.page.style import PAGE
 
 PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 """Where the browser is; None where there is none."""
@@ -131,11 +132,14 @@ def box_of(window: Chromium, element: str) -> np.ndarray:
 
 
 def assert_fits(window: Chromium, size: tuple[int, int], lines: tuple[str, ...]) -> None:
-    """Nothing is cut off: the page, its picture, and those of its words that hold some lines."""
+    """Nothing is cut off: the page, its picture, its words, and of them those that hold some lines are in sight."""
     whole, said = "document.documentElement", f"document.getElementById('{SAID}')"
     assert max(window.value(f"[{whole}.scrollWidth - innerWidth, {whole}.scrollHeight - innerHeight]")) <= 0
     left, top, right, bottom = box_of(window, f"document.querySelector('#{PICTURE} img')")
     assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1]
+    for name in (PAGE, SAID):
+        words = f"document.getElementById('{name}')"
+        assert window.wait(f"{words}.scrollHeight <= {words}.clientHeight"), name
     shut = "[...document.querySelectorAll('input:not([type=radio])')].filter(i => i.scrollWidth > i.clientWidth)"
     assert not window.value(f"{shut}.map(i => i.value)")
     room = box_of(window, said)

@@ -14,7 +14,7 @@ from ar.page.browser import Browser
 from ar.page.guard import LIMITS, Limits
 from ar.page.parts import Body, Choice, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
 from ar.page.recorder import RECORDS, STOPS
-from ar.page.sight import PICTURE, SAID, SLICES, coded
+from ar.page.sight import PICTURE, SAID, SLICES, coded, unparted
 from ar.page.style import NOTE, PAGE, STATUS, style
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
@@ -102,7 +102,7 @@ def test_picture_and_words_travel_as_one(page):
     numbers = [int(re.findall(r'data-number="(\d+)"', each)[0]) for each in sights()]
     assert numbers == sorted(set(numbers))
     for each in sights()[:-1]:
-        number = int(re.findall(r"said of frame (\d+)", each)[0])
+        number = int(re.findall(r"said of frame&nbsp;(\d+)", each)[0])
         assert coded(pictures[number]) in each
     assert coded(pictures[39]) in sights()[-1]
     assert not any("said" in str(each) for each in visitor.updates if "sulcus-next" not in str(each))
@@ -327,17 +327,20 @@ def test_saving_comes_before_the_controls_which_a_low_window_cuts_off(page):
 
 
 def test_on_a_phone_distance_and_playback_come_before_what_explains_the_picture(page):
-    """There all stands in one column: the report, which scrolls by itself, then playback and controls, then words."""
+    """There all stands in one column: the report, which scrolls by itself on a low one, then controls, then words."""
     assert page.folder is not None
     assert page.text.order < page.folder.order < page.words.order
-    phone = style(4 / 3).split("@media (max-width: 36em)")[1]
-    said = re.search(rf"#{SAID} {{ font-size: ([0-9.]+)rem; max-height: ([0-9.]+)rem; overflow-y: auto }}", phone)
-    assert said is not None
     # The distance, and eight lines more: whom to trust, what acts, and the verdict even on an earlier load.
-    size, high = map(float, said.groups())
+    phone, low = style(4 / 3).split("@media (max-width: 36em)")[1:]
+    (size,) = map(float, re.findall(rf"#{SAID} {{ font-size: ([0-9.]+)rem }}", phone))
+    (high,) = map(float, re.findall(rf"#{SAID} {{ max-height: ([0-9.]+)rem; overflow-y: auto;", low))
     assert high >= 1.25 * 1.4 + 8 * 1.4 * size
     page.fill([], Playback(30, print, print), [Slider("force [N]", 0.0, 1.0, 0.01, 0.2, print)])
     assert page.folder.order < page.words.order
+
+
+def test_no_new_line_parts_a_number_from_its_unit():
+    assert unparted('<p style="top: 3 px">in 4.72 mm (95 %)') == '<p style="top: 3 px">in&nbsp;4.72&nbsp;mm (95&nbsp;%)'
 
 
 def test_a_wide_window_has_its_controls_in_two_columns(page):

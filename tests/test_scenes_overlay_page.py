@@ -202,7 +202,8 @@ def window(page):
 def test_the_page_fits_and_is_in_register(page, window, size):
     assert seek(page, 6)
     window.size(*size)
-    assert window.wait(f"innerWidth == {size[0]} && document.getElementById('{SAID}').innerText.includes('picture 6')")
+    said = f"document.getElementById('{SAID}').innerText"
+    assert window.wait(f"innerWidth == {size[0]} && {said}.includes('picture\\u00a06')")
     assert_fits(window, size, ("Error of the overlay", "Error of the tumour"))
     assert_in_register(window, page.browser.shown[1])
     for number, place in ((1, SLICES), (2, HISTORY)):

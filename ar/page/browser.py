@@ -22,7 +22,7 @@ from .inputs import Inputs, noted
 from .parts import Body, Control, Deed, Fold, Note, Playback, Sign, Viewpoint
 from .recorder import Recorder
 from .scene import add_body, dress
-from .sight import ASIDE, PICTURE, SAID, coded, sight
+from .sight import ASIDE, PICTURE, SAID, coded, sight, unparted
 from .style import PAGE, STATUS, style
 
 # Behind all that is added later.
@@ -78,7 +78,7 @@ class Browser:
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
         gui.add_html(held(PICTURE, ""))
         # Last: where a low window has no room for them under the picture, the controls come before them.
-        self.words = gui.add_html(held(PAGE, words), order=LAST)
+        self.words = gui.add_html(held(PAGE, unparted(words)), order=LAST)
         self.line = gui.add_html("")
         self.text = gui.add_html(held(SAID, ""))
         # What is shown, newest first asked for: frame, picture and words; the picture as it is sent, and how many were.
@@ -123,7 +123,7 @@ class Browser:
                 self.folder.remove()
             self.server.gui.set_panel_label(title)
             self.title = title
-            self.words.content, self.line.content = held(PAGE, words), ""
+            self.words.content, self.line.content = held(PAGE, unparted(words)), ""
             self.wanted, self.shown = (0, self.shown[1], "", 0), (0, self.shown[1], self.shown[2], 0)
             self.report("")
             self.controls.clear()
@@ -195,7 +195,7 @@ class Browser:
     def put_sight(self, code: str, words: str) -> None:
         """Send a `coded` picture and words, HTML, at once."""
         self.sent += 1
-        self.sight.content = sight(self.sent, code, words)
+        self.sight.content = sight(self.sent, code, unparted(words))
         self.recorder.take(code)
 
     def show_beside(self, drawn: Callable[[], tuple[np.ndarray, str]]) -> None:

@@ -7,11 +7,14 @@ browser would show new words beside an old picture. So both wait, out of sight, 
 from __future__ import annotations
 
 import base64
+import re
 from dataclasses import dataclass
 from html import escape
 
 import cv2
 import numpy as np
+
+from ..overlay.hud import BREAK
 
 QUALITY = 88
 PICTURE, SAID, NEXT = "sulcus-picture", "sulcus-said", "sulcus-next"
@@ -43,6 +46,15 @@ if (number >= Number(picture.dataset.number || 0)) {
   said.replaceChildren(words.cloneNode(true));
 }
 """
+
+
+def unparted(words: str) -> str:
+    """Words, HTML, in which no new line parts a number from its name, its error and its unit: as in a picture."""
+    return re.sub(
+        r"<[^>]*>|\s+",
+        lambda part: part[0] if part[0][0] == "<" or BREAK.match(words, part.start()) else "&nbsp;",
+        words,
+    )
 
 
 def coded(colour: np.ndarray) -> str:

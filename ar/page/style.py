@@ -29,7 +29,7 @@ LOOKS_ON = f"<style>{PARTS} :is({DIMMED}) {{ opacity: 0.45; pointer-events: none
 
 RULES = """
 :root { --w: min(62vw, calc((100vh - 10.5rem) * var(--aspect))); --low: max(29vh, 9rem); }
-#PAGE { font-size: 0.82rem; line-height: 1.35; box-sizing: border-box; padding: 0.45rem 0.8rem;
+#PAGE { font-size: 0.8rem; line-height: 1.32; box-sizing: border-box; padding: 0.45rem 0.8rem;
   overflow-wrap: anywhere }
 #PAGE p, #SAID p { margin: 0 0 0.3rem 0 }
 #PAGE .legend { display: flex; flex-wrap: wrap; gap: 0.1rem 1rem; margin-bottom: 0.3rem }
@@ -89,9 +89,12 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
   PARTS > div:has(> button) + div:has(.mantine-Slider-root) { grid-column: 1 / -1 }
 }
 @media (min-width: 75em) and (min-aspect-ratio: 13/10) and (max-height: 50em) {
-  :root { --low: max(22vh, 9rem) }
+  :root { --low: max(20vh, 9rem) }
+  #SAID { font-size: 0.82rem; line-height: 1.3 }
 }
 @media (min-width: 36.01em) and (max-aspect-ratio: 13/10) {
+  :root { --low: max(25vh, 9rem) }
+  :root:has(TABBED:checked) { --low: max(29vh, 13rem) }
   PANEL { bottom: 0 !important }
   VIEW { inset: auto calc(100vw - var(--w)) 0 0 !important }
   #PAGE { bottom: var(--low) }
@@ -111,9 +114,12 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
   #PAGE { font-size: 0.78rem }
   #ASIDE { left: 0 }
   #STATUS span { font-size: 0.75rem }
-  #SAID { font-size: 0.82rem; max-height: 11.4rem; overflow-y: auto }
-  #SAID { mask-image: linear-gradient(#000 calc(100% - 1.1rem), transparent); padding-bottom: 1.1rem }
+  #SAID { font-size: 0.82rem }
   NOTES { left: 0.5rem !important }
+}
+@media (max-width: 36em) and (max-height: 50em) {
+  #SAID { max-height: 11.4rem; overflow-y: auto;
+    mask-image: linear-gradient(#000 calc(100% - 1.1rem), transparent); padding-bottom: 1.1rem }
 }
 """
 
