@@ -153,7 +153,7 @@ def test_a_panel_folds_lines_that_are_wider_than_the_picture():
 @pytest.mark.parametrize(
     ("text", "held"),
     [
-        ("ms: deform 5900.6, render 13.3, overlay 8.4", ["deform 5900.6,", "render 13.3,", "overlay 8.4"]),
+        ("ms: deform 5900.6, render 13.3, overlay 8.4", ["ms: deform 5900.6,", "render 13.3,", "overlay 8.4"]),
         ("t 2.00 s, tumour moved 2.20 mm", ["t 2.00 s,", "tumour moved 2.20 mm"]),
         ("estimate moved 4.8 +- 2.9 mm", ["estimate moved 4.8 +- 2.9 mm"]),
         ("the tool reads 0.48 N within 0.01 N", ["tool reads 0.48 N", "within 0.01 N"]),

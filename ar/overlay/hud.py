@@ -30,9 +30,10 @@ SIGN = 0.6
 SIDES = ("RL", "AP", "SI")
 # A direction's second letter is shown where it is more than so much of it.
 OBLIQUE = 0.38
-# Where a line of text may be broken: not between a name, its number, that number's error and their unit.
+# Where a line of text may be broken: not after a colon, nor between a name, its number, that number's error and their
+# unit.
 BREAK = re.compile(
-    r"\s+(?!(?:moved |reads )?[-+]?\d|\(\d\.|\+- )(?<!\+- )(?<!\d (?=%))(?<!\d (?=(?:mm|s|ms|N|kPa|ml|points)\b))"
+    r"\s+(?!(?:moved |reads )?[-+]?\d|\(\d\.|\+- )(?<![:-] )(?<!\d (?=%))(?<!\d (?=(?:mm|s|ms|N|kPa|ml|points)\b))"
 )
 
 
