@@ -86,16 +86,35 @@ def test_what_a_tracker_is_known_to_do_is_given_in_millimetres(files, capsys):
     assert bias[0] < 1e-4 < bias[1] < bias[2]
 
 
-def test_motions_in_metres_are_remarked_on_and_no_zero_has_a_sign(files, tmp_path, capsys):
+def test_motions_and_errors_in_metres_are_refused_and_no_zero_has_a_sign(files, tmp_path, capsys):
+    """Motions of nothing at all are answered."""
     folder, _ = files
-    table = np.loadtxt(folder / "plain.csv", delimiter=",", skiprows=1)
-    table[:, 3:] *= 1e-3
-    np.savetxt(tmp_path / "metres.csv", table, delimiter=",", header="x,y,z,dx,dy,dz", comments="")
-    for name, remarked in ((folder / "plain.csv", False), (tmp_path / "metres.csv", True)):
-        assert main(["locate", str(folder / "box.vtu"), str(name), "--out", str(tmp_path / "out.vtu")]) == 0
+    table, path = np.loadtxt(folder / "vessels.csv", delimiter=",", skiprows=1), tmp_path / "seen.csv"
+    for times, sigma, refused in ((1.0, 1.0, ""), (1e-3, 1.0, "no point moves"), (1.0, 1e-3, "sigma"), (0.0, 1.0, "")):
+        seen = table * np.repeat([1.0, times, sigma], [3, 3, 1])
+        np.savetxt(path, seen, delimiter=",", header="x,y,z,dx,dy,dz,sigma", comments="")
+        assert main(["locate", str(folder / "box.vtu"), str(path)]) == (2 if refused else 0)
         said = capsys.readouterr()
-        assert ("half of the points move by less than 0.01 mm. Give millimetres." in said.err) is remarked
-        assert "-0.0" not in said.out and ("by 0.0, 0.0, 0.0 mm" in said.out) is remarked
+        assert refused in said.err and ("rather than metres" in said.err) is bool(refused)
+        assert "-0.0" not in said.out and ("by 0.0, 0.0, 0.0 mm" in said.out) is (times == 0.0)
+
+
+def test_what_is_said_is_in_json_too(files, body, tmp_path, capsys):
+    """Sentences of warning, and the regions that the locator knows."""
+    folder, _ = files
+    path = tmp_path / "own.npz"
+    save_locator(path, replace(load_locator(folder / "box.locator.npz", body), regions=TUMOUR))
+    table = np.loadtxt(folder / "plain.csv", delimiter=",", skiprows=1)
+    table[:, 3:] = [8.0, 0.0, 0.0]
+    table[3, 3:] = [0.0, 0.0, 12.0]
+    np.savetxt(tmp_path / "slipped.csv", table, delimiter=",", header="x,y,z,dx,dy,dz", comments="")
+    words = ["locate", str(folder / "box.vtu"), str(tmp_path / "slipped.csv"), "--locator", str(path)]
+    assert main(words) == 0
+    sentences = capsys.readouterr().out.splitlines()[4:]
+    assert main([*words, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["regions"] == {"tumour": 3.0} and said["warnings"] == sentences and len(sentences) == 2
+    assert "off by 8.0 mm" in sentences[0] and "rows 5 of the file" in sentences[1]
 
 
 @pytest.mark.parametrize("words", [["plain.csv"], ["cloud.csv"], ["cloud.csv", "--tool", "tips.csv"]])

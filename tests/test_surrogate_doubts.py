@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from scenes.bench.locate_study import PointsSeen, observed
 from scenes.script.shipped_files import template_path
@@ -50,6 +51,40 @@ def test_points_that_slip_sideways_are_in_doubt_and_the_error_spans_it(locator, 
     assert found.slipped and not found.calibrated and "may have slipped" in found.doubt
     assert np.linalg.norm(found.centroid) < found.p95 and np.linalg.norm(found.bias) > 0.3 * length
     assert not found.cause_shares and "may have slipped" in found.named_causes
+
+
+@pytest.mark.parametrize("way", ["right", "axis"])
+def test_points_that_are_turned_are_in_doubt_as_those_that_slip(locator, way):
+    """By 10 degrees about their middle, tilted or twisted. They are shifted by 0.5 mm, as a brain that sinks."""
+    axis = open_cortex(locator.anatomy).axis
+    seen = observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), PointsSeen(100, 90, 0), (0, 0))
+    turn = Rotation.from_rotvec(np.radians(10.0) * getattr(open_cortex(locator.anatomy), way))
+    middle = seen.rest.mean(axis=0)
+    now = middle + turn.apply(seen.now - middle) + 0.5e-3 * axis
+    found = locator.locate(replace(seen, now=now, sigma=None, rigid=0.8e-3))
+    assert found.slipped and not found.calibrated and np.linalg.norm(found.centroid) < found.p95
+    assert np.degrees(found.rigid_only[2]) == pytest.approx(10.0, abs=0.1) and "is off by 0.5 mm and" in found.doubt
+    assert "degrees, where 0.8 mm and 0.3 degrees are stated," in found.doubt
+    assert "The two cannot be told apart" in found.doubt and found.warnings == (found.doubt,)
+
+
+def test_a_slip_is_held_against_what_is_stated(locator):
+    """A slip of 12 mm is no surprise where 8 mm along each axis are stated, but is where 4 are."""
+    body = locator.anatomy
+    seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
+    slipped = replace(seen, now=seen.now + sideways(body, 12e-3))
+    expected, far = (locator.locate(replace(slipped, rigid=rigid)) for rigid in (8e-3, 4e-3))
+    assert not expected.slipped and not expected.warnings and np.linalg.norm(expected.centroid) < expected.p95
+    assert far.slipped and "where 4 mm and 1.5 degrees are stated" in far.doubt
+
+
+def test_a_shift_along_the_axis_is_answered_as_sinking_and_said_to_look_alike(locator):
+    body = locator.anatomy
+    seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
+    found = locator.locate(replace(seen, now=seen.now + 12e-3 * open_cortex(body).axis))
+    assert not found.slipped and found.calibrated and not found.doubt
+    (said,) = found.warnings
+    assert "with a brain at rest. The two cannot be told apart. If it may be off so far" in said
 
 
 @pytest.mark.parametrize("sight", [NAMED, CLOUD])

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sim.anatomy import region_name
 from sim.arguments import at_least
 
 from .json_line import json_line
@@ -17,13 +17,9 @@ from .locator import REGIONS, located_by
 from .outputs import add_force, claimed
 from .tissue_options import add_region_argument
 
-# Nobody sees so small a motion [m].
-UNSEEN = 1e-5
-# A rigid error alone that explains such a share, and is so many times as large as stated, is named.
-RIGID, WIDE = 0.9, 2.0
-
 if TYPE_CHECKING:
     from surrogate.locating.locator import Location
+    from surrogate.locating.regions import Region
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,7 +85,8 @@ def run(args: argparse.Namespace) -> int:
     anatomy = read_anatomy(args.anatomy)
     observation = replace(read_observation(args.observed, args.tool), rigid=1e-3 * args.rigid)
     placed(anatomy, observation)  # what cannot be placed need not wait for a locator
-    found = located_by(args, anatomy, small=out is None).locate(observation)
+    locator = located_by(args, anatomy, small=out is None)
+    found = locator.locate(observation)
     if out is not None:
         every = np.arange(len(anatomy.mesh.nodes))
         covariance = found.covariance(every)
@@ -99,15 +96,14 @@ def run(args: argparse.Namespace) -> int:
             "covariance": covariance[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]],
         }
         write_mesh(out, anatomy.mesh, fields, "RAS")
-    if observation.rest is not None:
-        motions = np.linalg.norm(observation.now - observation.rest, axis=1)
-        if 0.0 < np.median(motions) < UNSEEN:
-            print(f"{args.observed}: half of the points move by less than 0.01 mm. Give millimetres.", file=sys.stderr)
-    print(json_line(_numbers(found, len(observation.now), out)) if args.json else _sentences(found, out))
+    if args.json:
+        print(json_line(_numbers(found, len(observation.now), locator.regions, out)))
+    else:
+        print(_sentences(found, out))
     return 0
 
 
-def _numbers(found: Location, points: int, out: Path | None) -> dict[str, object]:
+def _numbers(found: Location, points: int, regions: tuple[Region, ...], out: Path | None) -> dict[str, object]:
     return {
         "centroid_mm": (1e3 * found.centroid).tolist(),
         "covariance_mm2": (1e6 * found.centroid_covariance).tolist(),
@@ -124,6 +120,8 @@ def _numbers(found: Location, points: int, out: Path | None) -> dict[str, object
         "tips_left_out": found.tips_left_out.tolist(),
         "slipped": found.slipped,
         "calibrated": found.calibrated,
+        "warnings": _warnings(found),
+        "regions": {region_name(one.label): one.ratio for one in regions},
         "milliseconds": 1e3 * found.seconds,
         "of": "the tumour, as far as the causes that were tried go; not of a model",
         "out": None if out is None else str(out),
@@ -139,19 +137,16 @@ def _sentences(found: Location, out: Path | None) -> str:
         f"The motion explains {found.explained:.0%} of what was seen. Causes: {found.named_causes}.",
         f"The observation as a whole seems off by {1e3 * sum(found.bias**2) ** 0.5:.1f} mm.",
     ]
-    share, shift = found.rigid_only
-    if share > RIGID and shift > WIDE * found.posterior.evidence.shift:
-        lines.append(
-            f"A registration that is off by {1e3 * shift:.0f} mm would explain {share:.0%}, with a brain at rest. "
-            "If it may be off so far, say so by --rigid."
-        )
-    if found.doubt:
-        lines.append(found.doubt)
+    lines += _warnings(found)
+    return "\n".join(lines if out is None else [*lines, f"written: {out}"])
+
+
+def _warnings(found: Location) -> list[str]:
+    """What must be known of an answer beside its numbers, in sentences."""
+    said = list(found.warnings)
     if len(found.outliers):
         rows = ", ".join(str(number + 2) for number in found.outliers[:20]) + (
             " ..." if len(found.outliers) > 20 else ""
         )
-        lines.append(f"Left out, off the open cortex or without support by other points: rows {rows} of the file.")
-    for number in found.tips_left_out:
-        lines.append(f"Left out, as the points do not support it: tip {number + 1}.")
-    return "\n".join(lines if out is None else [*lines, f"written: {out}"])
+        said.append(f"Left out, off the open cortex or without support by other points: rows {rows} of the file.")
+    return said + [f"Left out, as the points do not support it: tip {number + 1}." for number in found.tips_left_out]

@@ -93,6 +93,11 @@ class Evidence:
         return max(self.shift, LEAST_SHIFT) * np.repeat([1.0, TURN], 3)
 
     @property
+    def beyond(self) -> float:
+        """How many times as large as is stated `rigid_alone` is: its shift or its turn, whichever is more."""
+        return float((np.linalg.norm(self.rigid_alone.reshape(2, 3), axis=1) / self.rigid_scale[[0, 3]]).max())
+
+    @property
     def slip(self) -> float:
         """Standard deviation of the rigid error of a registration that slipped, as a share of the stated one."""
         return max(SLIPPED / max(self.shift, LEAST_SHIFT), 1.0)

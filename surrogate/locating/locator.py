@@ -27,6 +27,8 @@ MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
 # The registration may have slipped where that makes what is seen so many times as probable, as a logarithm. On twins it
 # does so for one of 432 motions, and for all slips of 8 to 20 mm along the cortex (docs/locate.md).
 DOUBTFUL = -2.0
+# A rigid error alone that explains such a share, and is so many times as large as stated, is named.
+RIGID, WIDE = 0.9, 2.0
 # Normal numbers by which a radius is found that holds 95 in 100.
 DRAWS = 4000
 
@@ -101,15 +103,16 @@ class Location:
         return max(0.0, 1.0 - float(left @ left) / whole) if whole else 0.0
 
     @property
-    def rigid_only(self) -> tuple[float, float]:
-        """What no motion at all, but another rigid error would explain of what was seen, and how far it shifts [m].
+    def rigid_only(self) -> tuple[float, float, float]:
+        """What no motion at all, but another rigid error would explain of what was seen; its shift [m] and turn [rad].
 
         A share in mean square, by least squares, however large that error is.
         """
         evidence = self.posterior.evidence
         found = evidence.rigid_alone
         left, whole = evidence.value - evidence.rigid @ found, float(evidence.value @ evidence.value)
-        return (1.0 - float(left @ left) / whole if whole else 0.0), float(np.linalg.norm(found[:3]))
+        shift, turn = np.linalg.norm(found.reshape(2, 3), axis=1)
+        return (1.0 - float(left @ left) / whole if whole else 0.0), float(shift), float(turn)
 
     @cached_property
     def within_errors(self) -> bool:
@@ -139,11 +142,11 @@ class Location:
 
     @property
     def doubt(self) -> str:
-        """Why ellipsoids may not hold, in a sentence; none if they were tried."""
+        """Why ellipsoids may not hold, in sentences; none if they were tried."""
         if self.slipped:
             return (
-                "It is a guess, as the registration may have slipped: a rigid error far beyond what is stated explains "
-                "what was seen about as well as any motion does. Check it."
+                f"It is a guess, as the registration may have slipped. {self._rigid_words} explains what was seen "
+                "about as well as any motion does. The two cannot be told apart: check it."
             )
         if not self.calibrated:
             return (
@@ -151,6 +154,29 @@ class Location:
                 "errors."
             )
         return ""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What else must be known of the answer, in sentences: `doubt`, and a registration that would look alike."""
+        evidence, alike = self.posterior.evidence, self.posterior.slipped >= DOUBTFUL
+        share = self.rigid_only[0]
+        named = not self.slipped and evidence.beyond > WIDE and (alike or share > RIGID)
+        apart = " The two cannot be told apart." if alike else ""
+        rigid = (
+            f"{self._rigid_words} would explain {share:.0%}, with a brain at rest.{apart} If it may be off so far, say "
+            "so by --rigid."
+        )
+        return tuple(said for said in (rigid if named else "", self.doubt) if said)
+
+    @property
+    def _rigid_words(self) -> str:
+        """The rigid error that explains most with a body at rest, and what was stated."""
+        _, shift, turn = self.rigid_only
+        stated = self.posterior.evidence.rigid_scale
+        return (
+            f"A registration that is off by {1e3 * shift:.1f} mm and {np.degrees(turn):.1f} degrees, where "
+            f"{1e3 * stated[0]:.2g} mm and {np.degrees(stated[3]):.2g} degrees are stated,"
+        )
 
     @property
     def named_causes(self) -> str:
@@ -245,15 +271,18 @@ def _normal() -> np.ndarray:
 
 
 def _may_have_slipped(anatomy: Anatomy, found: Posterior) -> bool:
-    """Whether a slip makes what is seen nearly as probable as a motion does, and it lies along the open cortex.
+    """Whether a slip beyond what is stated makes what is seen nearly as probable as a motion does, and does not sink.
 
     A brain that sinks by a centimetre moves as rigidly as one whose registration is off, but mostly along its opening's
-    axis.
+    axis, and all of it alike. A slip shifts it across, or turns it.
     """
-    if found.slipped < DOUBTFUL:
+    if found.slipped < DOUBTFUL or found.evidence.beyond <= WIDE:
         return False
-    axis, shift = open_cortex(anatomy).axis, found.evidence.rigid_alone[:3]
-    return bool(np.linalg.norm(np.cross(axis, shift)) > abs(axis @ shift))
+    evidence, axis = found.evidence, open_cortex(anatomy).axis
+    shift, turn = np.split(evidence.rigid_alone, 2)
+    sunk = axis @ shift
+    other = shift - sunk * axis + np.cross(turn, evidence.at - evidence.middle)
+    return bool((other**2).sum(axis=1).mean() > sunk**2)
 
 
 def _demand_explained(found: Posterior, outliers: int, points: int) -> None:

@@ -28,6 +28,8 @@ NEAR, FAR, NEAR_NOW = 6e-3, 12e-3, 18e-3
 FARTHEST_TIP, ONE_PLACE = 30e-3, 1e-3
 # Motions [m] beyond which no brain goes, and rigid errors that no tracker has.
 LONGEST_MOTION, FARTHEST_OFF = 0.025, 0.02
+# Smaller errors of a point [m] no tracker has: they are metres in a file of millimetres. Less is no motion at all [m].
+LEAST_SIGMA, STILL = 0.01e-3, 1e-9
 # What points may be by mistake: times which scale they would lie on the cortex, and with axes turned how.
 UNITS = (
     (1.0, ""),
@@ -80,9 +82,9 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
     Raises
     ------
     InputError
-        Numbers that are not finite, too few points, points on a line, a sigma that is not positive, a rigid error
-        beyond any tracker's, motions beyond any brain's. Points that lie off the brain's surface, with the likely
-        reason: units, LPS for RAS, another anatomy.
+        Numbers that are not finite, too few points, points on a line, a sigma that is smaller than any tracker's, a
+        rigid error beyond any tracker's, motions beyond any brain's or too small to be seen. Points that lie off the
+        brain's surface, with the likely reason: units, LPS for RAS, another anatomy.
     """
     _check(observation)
     where, near = (observation.now, NEAR_NOW) if observation.rest is None else (observation.rest, NEAR)
@@ -91,12 +93,7 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
         raise InputError(_elsewhere(anatomy, where, float(np.median(off)), near))
     _demand_spread(where)
     if observation.rest is not None:
-        motion = np.median(np.linalg.norm(observation.now - observation.rest, axis=1))
-        if motion > LONGEST_MOTION:
-            raise InputError(
-                f"half of the points move by more than {1e3 * motion:.0f} mm, which no brain does: give motions in "
-                "millimetres, rather than centimetres or new positions."
-            )
+        _demand_motions(np.linalg.norm(observation.now - observation.rest, axis=1))
     for number, away in enumerate(_off_surface(anatomy, observation.tips), start=1):
         if away > FARTHEST_TIP:
             raise InputError(
@@ -191,6 +188,11 @@ def _check(observation: Observation) -> None:
             raise InputError(f"`{name}` has a value that is not finite: leave such points out.")
     if not (sigma > 0.0).all():
         raise InputError("a sigma is not positive: give each point the standard deviation of its error [mm].")
+    if sigma.min() < LEAST_SIGMA:
+        raise InputError(
+            f"a sigma is {1e3 * sigma.min():.2g} mm, which no tracker has: give each point the standard deviation of "
+            "its error in millimetres, rather than metres."
+        )
     if not 0.0 <= observation.rigid <= FARTHEST_OFF:
         raise InputError(
             f"a rigid error of {1e3 * observation.rigid:g} mm is none that a tracker has: give its standard deviation "
@@ -198,6 +200,23 @@ def _check(observation: Observation) -> None:
         )
     if count < FEWEST:
         raise InputError(f"{count} points say too little: give at least {FEWEST}, spread over the open cortex.")
+
+
+def _demand_motions(length: np.ndarray) -> None:
+    """Raise InputError where lengths (n,) [m] of motions are no brain's, or where a brain's were given in metres.
+
+    Where none of them is anything, nothing moved.
+    """
+    if np.median(length) > LONGEST_MOTION:
+        raise InputError(
+            f"half of the points move by more than {1e3 * np.median(length):.0f} mm, which no brain does: give motions "
+            "in millimetres, rather than centimetres or new positions."
+        )
+    if STILL < length.max() < 1e-3 * LONGEST_MOTION:
+        raise InputError(
+            f"no point moves by more than {1e3 * length.max():.2g} mm, which nobody sees: give motions in millimetres, "
+            "rather than metres. If nothing moved, give zeros."
+        )
 
 
 def _demand_spread(where: np.ndarray) -> None:
