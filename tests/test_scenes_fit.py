@@ -71,6 +71,8 @@ def test_bad_input_is_one_sentence(folder, capsys):
     assert "frames 1 and 2 are the same" in capsys.readouterr().err
     assert main(["fit", body, first, "--tool", str(folder / "tools.csv")]) == 2
     assert "is of frame 2, but there are 1" in capsys.readouterr().err
+    assert main(["fit", body, first, "--region", "tumour:9000"]) == 2
+    assert "--region tumour: its stiffness is what `sulcus fit` finds" in capsys.readouterr().err
 
 
 def test_fitted_tissue_lies_beside_its_anatomy(tmp_path):

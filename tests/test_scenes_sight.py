@@ -25,10 +25,12 @@ from scenes.script.shipped_files import template_path
 from scenes.script.sight import Sight
 from scenes.script.tool_paths import press
 from scenes.script.uncertainty import TumourError, Uncertainty
+from sim.anatomy import PART_LABELS
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
 from surrogate.locating.locator_files import locator_path, save_locator
 from surrogate.locating.prior import middle_of
+from surrogate.locating.regions import Region
 
 # Small errors, as a tumour in a box moves little.
 SIGHT = Sight(points=80, white=1e-4, smooth=1e-4, shift=1e-4, turn=0.0)
@@ -280,6 +282,13 @@ def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
     said = capsys.readouterr().err
     assert "has no locator at" in said and not (tmp_path / "out").exists()
     assert "sulcus train" not in said and "is the truth, as finite elements have it" in said
+
+
+def test_a_locator_that_knows_other_regions_than_the_scene_is_refused(theatre, scene):
+    other = replace(theatre)
+    other.__dict__["locator"] = replace(theatre.locator, regions=(Region(PART_LABELS["oedema"], 0.5),))
+    with pytest.raises(InputError, match=r"another stiffness of region 3 \(oedema\) than the scene has"):
+        other.stage(scene)
 
 
 def test_no_trained_model_is_the_truth(scene):

@@ -16,7 +16,7 @@ from surrogate.locating.causes import Causes, groups
 from surrogate.locating.ensemble import members, surface_size
 from surrogate.locating.locator_files import load_locator, save_locator
 from surrogate.locating.observation import Observation
-from surrogate.locating.regions import Region, check_regions, known_regions, regions_words
+from surrogate.locating.regions import Region, check_regions, differing, known_regions, regions_words
 from surrogate.locating.setup import make_locator
 
 OEDEMA = PART_LABELS["oedema"]
@@ -105,6 +105,25 @@ def test_what_regions_are_known_by(body):
         known_regions(Elasticity(BRAIN, {2: Ogden(((1340.0, -19.0),), 148000.0)}))
     with pytest.raises(InputError, match=r"no region 4 \(ventricles\)"):
         check_regions((Region(PART_LABELS["ventricles"], 0.5),), body)
-    for bad in ((2, -1.0), (2, float("nan")), (2, 1.0, 0.6)):
+    for bad in ((2, -1.0), (2, float("nan")), (2, 1.0, 0.6), ([2], 1.0), (2.5, 1.0)):
         with pytest.raises(InputError):
             Region(*bad)
+
+
+def test_a_locator_is_held_against_a_scenes_own_regions(body):
+    """But for the tumour; a region as stiff as the brain is none."""
+    own, tumour = Region(OEDEMA, 0.5, 0.45), Region(2, 3.0)
+    scene = Elasticity(BRAIN, {OEDEMA: Material("neo-hookean", 1500.0, 0.45), 2: replace(BRAIN, young=5000.0)})
+    assert not differing(scene, (own,)) and not differing(scene, (own, tumour))
+    assert not differing(Elasticity(BRAIN, {OEDEMA: BRAIN}), (tumour,))
+    for known in ((), (STIFF,), (replace(own, poisson=None),)):
+        assert differing(scene, known) == (OEDEMA,)
+    assert differing(Elasticity(BRAIN), (own,)) == (OEDEMA,)
+
+
+def test_a_file_whose_label_is_a_list_is_refused(body, locators, tmp_path):
+    spoilt = replace(STIFF)
+    object.__setattr__(spoilt, "label", [OEDEMA])
+    save_locator(tmp_path / "list.npz", replace(locators[0], regions=(spoilt,)))
+    with pytest.raises(InputError, match=r"a region's label is \[3\]: give the whole number"):
+        load_locator(tmp_path / "list.npz", body)

@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sim.anatomy import TUMOUR_LABEL
 from sim.errors import InputError
+from sim.material import BRAIN
 
 from .json_line import json_line
 from .locator import REGIONS, located_by
 from .outputs import add_force, claimed
-from .tissue_options import add_region_argument
+from .tissue_options import add_region_argument, regions_of
 
 if TYPE_CHECKING:
     from surrogate.fitting.frame import Frame
@@ -70,6 +72,8 @@ def run(args: argparse.Namespace) -> int:
     frames = _frames(args)
     anatomy = read_anatomy(args.anatomy)
     check_frames(anatomy, frames)  # bad frames need not wait for a locator
+    if TUMOUR_LABEL in regions_of(args.region, BRAIN, anatomy.mesh):
+        raise InputError("--region tumour: its stiffness is what `sulcus fit` finds. Give other regions alone.")
     locator = located_by(args, anatomy, small=True)
     with tqdm(file=sys.stderr) as bar:
 

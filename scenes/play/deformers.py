@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.accuracy import LIVE, Accuracy
-from sim.anatomy import Anatomy
+from sim.anatomy import Anatomy, region_words
 from sim.bodies.intensity import Intensity, read_intensity, sidecar
 from sim.bodies.meshfile import read_anatomy
 from sim.deformation import Deformation, Deformer, guess
@@ -24,6 +24,7 @@ from sim.runtime.device import find_device
 from surrogate.data.stated_tissue import first_stated
 from surrogate.locating.locator import Locator
 from surrogate.locating.locator_files import load_locator, locator_path
+from surrogate.locating.regions import differing
 from surrogate.model.applicability import refusal
 from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
@@ -105,9 +106,15 @@ class Theatre:
         Raises
         ------
         InputError
-            A scene with a sight, on an anatomy without a locator.
+            A scene with a sight, on an anatomy without a locator, or with one that knows regions otherwise.
         """
         device = find_device(self.device, LIVE.precision).name
+        if scene.sight is not None and (unlike := differing(scene.elasticity, self.locator.regions)):
+            raise InputError(
+                f"{scene.name}: the locator at {self.locator_file} knows another stiffness of "
+                f"{' and '.join(map(region_words, unlike))} than the scene has. Make it anew: `sulcus locator "
+                "ANATOMY.vtu`, with the same --region."
+            )
         stage = Stage(scene, self.site, self.intensity, device=device)
         match scene.sight:
             case None:

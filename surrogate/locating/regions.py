@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import isclose
+from numbers import Integral
 
 from sim.anatomy import TUMOUR_LABEL, Anatomy, missing_region, region_words
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import Material, Tissue
+
+# Ratios of stiffness that differ by less are alike.
+ALIKE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class Region:
     Raises
     ------
     InputError
-        Numbers that no tissue has.
+        A label that is no whole number, or numbers that no tissue has.
     """
 
     label: int
@@ -35,6 +40,8 @@ class Region:
     poisson: float | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.label, Integral):
+            raise InputError(f"a region's label is {self.label!r:.80}: give the whole number that the mesh has.")
         Material("linear", self.ratio, 0.25 if self.poisson is None else self.poisson)
 
 
@@ -75,6 +82,24 @@ def check_regions(regions: tuple[Region, ...], anatomy: Anatomy) -> None:
     for one in regions:
         if missing := missing_region(anatomy.mesh, one.label):
             raise InputError(missing)
+
+
+def differing(elasticity: Elasticity, known: tuple[Region, ...]) -> tuple[int, ...]:
+    """Labels of regions that tissue has otherwise than is known of it, or that are as the brain in one alone.
+
+    The tumour is none: its stiffness may be unknown. Of tissue that states no Young's modulus none is.
+    """
+    if not all(isinstance(tissue, Material) for tissue in (elasticity.default, *elasticity.regions.values())):
+        return ()
+    has, knows = ({one.label: one for one in some} for some in (known_regions(elasticity), known))
+    labels = {*has, *knows} - {TUMOUR_LABEL}
+    as_brain = {label: Region(label, 1.0) for label in labels}
+    pairs = {label: ({**as_brain, **has}[label], {**as_brain, **knows}[label]) for label in labels}
+    return tuple(
+        label
+        for label, (one, other) in sorted(pairs.items())
+        if one.poisson != other.poisson or not isclose(one.ratio, other.ratio, rel_tol=ALIKE)
+    )
 
 
 def regions_words(regions: tuple[Region, ...]) -> str:
