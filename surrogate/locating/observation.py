@@ -82,7 +82,7 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
     Raises
     ------
     InputError
-        Numbers that are not finite, too few points, points on a line, a sigma that is smaller than any tracker's, a
+        Numbers that are not finite, too few points, points on a line, a sigma that is smaller than any tracker's. A
         rigid error beyond any tracker's, motions beyond any brain's or too small to be seen. Points that lie off the
         brain's surface, with the likely reason: units, LPS for RAS, another anatomy.
     """
