@@ -65,7 +65,7 @@ def test_points_that_are_turned_are_in_doubt_as_those_that_slip(locator, way):
     assert found.slipped and not found.calibrated and np.linalg.norm(found.centroid) < found.p95
     assert np.degrees(found.rigid_only[2]) == pytest.approx(10.0, abs=0.1) and "is off by 0.5 mm and" in found.doubt
     assert "degrees, where 0.8 mm and 0.3 degrees are stated," in found.doubt
-    assert "The two cannot be told apart" in found.doubt and found.warnings == (found.doubt,)
+    assert "The two cannot be distinguished" in found.doubt and found.warnings == (found.doubt,)
 
 
 def test_a_slip_is_held_against_what_is_stated(locator):
@@ -84,7 +84,7 @@ def test_a_shift_along_the_axis_is_answered_as_sinking_and_said_to_look_alike(lo
     found = locator.locate(replace(seen, now=seen.now + 12e-3 * open_cortex(body).axis))
     assert not found.slipped and found.calibrated and not found.doubt
     (said,) = found.warnings
-    assert "with a brain at rest. The two cannot be told apart. If it may be off so far" in said
+    assert "with a brain at rest. The two cannot be distinguished. If it may be off so far" in said
 
 
 @pytest.mark.parametrize("sight", [NAMED, CLOUD])

@@ -146,7 +146,7 @@ class Location:
         if self.slipped:
             return (
                 f"It is a guess, as the registration may have slipped. {self._rigid_words} explains what was seen "
-                "about as well as any motion does. The two cannot be told apart: check it."
+                "about as well as any motion does. The two cannot be distinguished: check it."
             )
         if not self.calibrated:
             return (
@@ -161,7 +161,7 @@ class Location:
         evidence, alike = self.posterior.evidence, self.posterior.slipped >= DOUBTFUL
         share = self.rigid_only[0]
         named = not self.slipped and evidence.beyond > WIDE and (alike or share > RIGID)
-        apart = " The two cannot be told apart." if alike else ""
+        apart = " The two cannot be distinguished." if alike else ""
         rigid = (
             f"{self._rigid_words} would explain {share:.0%}, with a brain at rest.{apart} If it may be off so far, say "
             "so by --rigid."
