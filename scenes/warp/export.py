@@ -15,13 +15,13 @@ from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, faded, faint_of, forward_on, warp_grid
 
 from .images import Picture, Warped, write_field_nifti, write_warped
-from .landmarks import CENTROID, Landmark, centroid_now, landmarks_of
+from .landmarks import CENTROID, Landmark, centroid_now
 from .markups import write_markups
 from .meshes import mesh_of, write_glb, write_stl, write_vtp
 from .moment import Moment
 from .nrrd_files import write_field_nrrd, write_field_sequence
 from .output_folder import FORMAT, LISTED, written_warp
-from .places import Folded, folds_of, places_of
+from .places import Folded, Places, folds_of, places_of
 from .readme import page
 from .segmentation import write_segmentation
 from .spacing import ENOUGH, fields_of
@@ -79,10 +79,10 @@ def write_warp(
             warped.append(write_warped(place, picture, fields, asked.order))
             asked.step(1)
         _write_surfaces(place, moment)
-        marks = landmarks_of(moment.left, moment.displacement)
-        _write_points(place, moment, marks)
+        places = places_of(moment)
+        _write_points(place, moment, places.marks)
         asked.step(1)
-        report = figures(moment, fields, marks, warped, len(sequence))
+        report = figures(moment, fields, places, warped, len(sequence))
         report["fields_cpu_s"] = round(seconds, 1)
         report["anatomy"] = {"file": asked.source, "digest": moment.anatomy.digest}
         (place / "README.txt").write_text(page(report, warped))
@@ -150,10 +150,9 @@ def spaces(files: Sequence[str]) -> dict[str, str]:
 
 
 def figures(
-    moment: Moment, fields: WarpFields, marks: Sequence[Landmark], warped: Sequence[Warped], frames: int
+    moment: Moment, fields: WarpFields, places: Places, warped: Sequence[Warped], frames: int
 ) -> dict[str, Any]:
     """What a warp says of itself: millimetres, shares, counts of voxels, and warnings."""
-    places = places_of(moment)
     error = 1e3 * places.errors(fields)
     moving = np.linalg.norm(places.moved, axis=1) > MOVED
     gap, largest = moment.gap(), 1e3 * float(np.linalg.norm(moment.displacement, axis=1).max())
@@ -180,7 +179,7 @@ def figures(
             "cortex": _errors(error[places.cortex]),
             "landmarks_worst": _errors(error[places.landmarks])["worst"],
         },
-        "landmarks": [one.name for one in marks],
+        "landmarks": [one.name for one in places.marks],
         "images": [vars(one) for one in warped],
         "sequence_frames": frames,
         "fields_fold": fields.folds,

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from sim.fields.warp_fields import WarpFields
 from sim.geometry.tetmesh import signed_volumes
 
-from .landmarks import landmarks_of
+from .landmarks import Landmark, landmarks_of
 from .moment import Moment
 
 # Weights of corners at the places between vertices: of a tetrahedron, of a triangle. No field is fitted there.
@@ -28,6 +28,8 @@ class Places:
         Where they are in the scan, and by how much they are displaced (n, 3) [m].
     tumour, cortex, landmarks
         Whether each is of the tumour, of the open cortex, and one of the landmarks (n,).
+    marks
+        Those landmarks, in the order of their places.
     """
 
     rest: np.ndarray
@@ -35,6 +37,7 @@ class Places:
     tumour: np.ndarray
     cortex: np.ndarray
     landmarks: np.ndarray
+    marks: tuple[Landmark, ...]
 
     def errors(self, fields: WarpFields) -> np.ndarray:
         """How far [m] fields are from the finite elements at each (n,): the farther one of the two fields."""
@@ -59,7 +62,8 @@ def places_of(moment: Moment) -> Places:
     tumour[part == 0], tumour[part == 1] = np.isin(used, body.tumour_nodes), np.repeat(body.in_tumour, len(WITHIN))
     cortex[part == 0], cortex[part == 2] = np.isin(used, body.open_surface), True
     rest = at(mesh.nodes, [one.rest for one in marks])
-    return Places(rest, at(moment.displacement, [one.now - one.rest for one in marks]), tumour, cortex, part == 3)
+    moved = at(moment.displacement, [one.now - one.rest for one in marks])
+    return Places(rest, moved, tumour, cortex, part == 3, marks)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How far apart a field's nodes are: as asked, or so near that the tumour is exact."""
+"""How far apart a field's nodes are: as asked, or so near that tumour and landmarks are exact."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .places import places_of
 FINEST, COARSEST, FIRST = 0.3e-3, 5e-3, 1e-3
 """Spacings of a field [m], and the one that is tried first."""
 ENOUGH = 0.05e-3
-"""The tumour's error that a spacing is looked for to reach [m]."""
+"""The error of tumour and landmarks that a spacing is looked for to reach [m]."""
 MOST, MOST_ASKED = 32_000_000, 96_000_000
 """Nodes of a field: where it is looked for, and where it is asked for. A million take 12 MB of memory."""
 # A spacing is looked for in steps of this [m]; the error falls with it, with so much to spare; so often it is tried.
@@ -24,7 +24,7 @@ STEP, SPARE, TIMES = 0.05e-3, 0.95, 3
 
 
 def fields_of(moment: Moment, spacing: float | None, step: Callable[[int], object]) -> WarpFields:
-    """The fields of a moment at a spacing [m]; None: at 1 mm, or finer where the tumour is off by more than 0.05 mm.
+    """The fields of a moment at a spacing [m]; None: at 1 mm, or finer where tumour or landmarks are off by more.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def fields_of(moment: Moment, spacing: float | None, step: Callable[[int], objec
 
 
 def finer_spacing(moment: Moment, fields: WarpFields) -> float | None:
-    """A spacing [m] at which the tumour is exact enough, or as near as size allows; None where no finer one helps."""
+    """A spacing [m] at which both are exact enough, or as near as size allows; None where no finer one helps."""
     now = fields.grid.spacing
     places = places_of(moment)
     worst = float(places.errors(fields)[places.tumour | places.landmarks].max(initial=0.0))
