@@ -82,7 +82,7 @@ def test_more_frames_say_more(body, locator, drained):
 
 
 def test_points_that_hardly_move_leave_the_prior(body, locator, drained):
-    frame = frame_of(body, np.random.default_rng(0).normal(scale=1e-6, size=body.mesh.nodes.shape))
+    frame = frame_of(body, np.random.default_rng(0).normal(scale=2e-5, size=body.mesh.nodes.shape))
     frame = replace(frame, observation=replace(frame.observation, sigma=np.full(60, 5e-3), rigid=5e-3))
     tissue = FittedTissue("", 1, probability_of(weighed(locator, [frame], drained, None)), np.zeros(0))
     assert "the tumour's stiffness" in tissue.not_known and "Young's modulus" in tissue.not_known
