@@ -273,7 +273,7 @@ def test_the_page_reads_what_the_frame_holds(theatre):
     frame = replace(player.draw(3, 0.1, Touch(force=0.25)), **known)
     said = report(frame, player.stage, "linear", "", (), 7)
     for line in (
-        ">tip to tumour 12.3 mm<",
+        ">tip to tumour 12.3&nbsp;mm<",
         "<p>frame 3 of 6; 0.10 s; force 0.25 N; tumour moved 1.23 mm; ",
         "; tip to tumour within 2.5 mm of the model&#x27;s finite elements (95 %)</p>",
         "<p>Error of the tumour: not known.",
@@ -281,9 +281,13 @@ def test_the_page_reads_what_the_frame_holds(theatre):
     ):
         assert line in said
     plain = report(replace(frame, distance_error=None), player.stage, "linear", "", (), 7)
-    assert "tip to tumour 12.3 mm<" in plain and "tip to tumour within" not in plain
+    assert "tip to tumour 12.3&nbsp;mm<" in plain and "tip to tumour within" not in plain
     known = TumourError(4.61e-3, "E"), TumourError(4.61e-3, "E", 1.11e-3)
     prior, seen = (report(replace(frame, tumour_error=one), player.stage, "linear", "", (), 7) for one in known)
     where = "95 of 100 times no point of it is more than"
     assert f"<p>Error of the tumour: {where} 4.7 mm from where it is; the largest part is E.</p>" in prior
     assert f"<p>Error of the tumour: {where} 1.2 mm from where it is; without observation 4.7 mm.</p>" in seen
+    for said, off in ((prior, "4.7"), (seen, "1.2")):
+        assert f"tip to tumour 12.3&nbsp;±&nbsp;{off}&nbsp;mm<" in said
+    doubted = replace(frame, tumour_error=known[0], doubt="why")
+    assert "tip to tumour 12.3&nbsp;mm<" in report(doubted, player.stage, "linear", "", (), 7)

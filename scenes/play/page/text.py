@@ -216,7 +216,8 @@ def report(
         facts += [
             f"tip to tumour within {hud.bound_words(frame.distance_error, 1)} of the model's finite elements (95 %)"
         ]
-    parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {hud.millimetres(frame.distance)}</p>']
+    off = None if frame.doubt else frame.tumour_error.bound
+    parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {unbroken(frame.distance, off)}</p>']
     number, *found = [""] if frame.estimate is None else estimated(frame.estimate)
     # A narrow window shows the first lines alone: both errors are among them.
     parts += [number, trust(frame.deformation, name), tumour_trust(frame.tumour_error), *found]
