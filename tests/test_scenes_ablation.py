@@ -163,8 +163,11 @@ class TestScenes:
         scene = short()
         wide = replace(scene, viewpoint=replace(scene.viewpoint, width=480, height=360))
         player = theatre.player("linear", wide)
-        foot = thumbnail(player, "linear").colour[-40:]
-        assert any(np.array_equal(foot, frame.shown[-40:]) for frame in player.frames())
+        foot, kept = thumbnail(player, "linear").colour[-40:], []
+        for frame in player.frames():
+            words = frame.taken[-40:] > 0
+            kept.append(words.any() and np.array_equal(foot[words], frame.shown[-40:][words]))
+        assert any(kept)
 
     def test_a_file_is_no_folder(self, anatomy, tmp_path, capsys):
         (tmp_path / "file").touch()
