@@ -46,7 +46,7 @@ def estimates(theatre: Theatre, name: str, sights: int) -> dict[str, list[Estima
 def row(answers: list[Estimate]) -> list[str]:
     """Figures of answers to one scene."""
     given = [answer for answer in answers if answer.location is not None]
-    moved = 1e3 * np.mean([np.linalg.norm(answer.true) for answer in answers])
+    moved = 1e3 * np.mean([answer.truly for answer in answers])
     doubted = sum(answer.location.slipped for answer in given if answer.location)
     refused = len(answers) - len(given)
     if not given:
