@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from scenes.commands.interrupt import until_ended
+from scenes.commands.interrupt import terminated_as_interrupted, until_ended
 
 COMMAND = """
 import argparse, sys, threading, time
@@ -91,4 +91,21 @@ def test_what_goes_wrong_is_reported_and_handlers_are_given_back():
         until_ended(work)
     assert closed == [True]
     assert until_ended(lambda closing: 7) == 7
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_that_a_finaliser_swallows_is_not_lost(number):
+    class Signalling:
+        def __del__(self):
+            signal.raise_signal(number)
+
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.raises(KeyboardInterrupt), terminated_as_interrupted() as stop_if_asked:
+        stop_if_asked()
+        Signalling()
+        went_on = True
+        stop_if_asked()
+    assert went_on
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before

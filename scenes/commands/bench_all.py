@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -77,8 +77,8 @@ def run(args: argparse.Namespace) -> int:
     for path in args.tables:
         read_page(path)
     try:
-        with terminated_as_interrupted():
-            record = read_record(args.source) if args.source else _measured(args)
+        with terminated_as_interrupted() as stop_if_asked:
+            record = read_record(args.source) if args.source else _measured(args, stop_if_asked)
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on from {args.json or OUT}", file=sys.stderr)
         return INTERRUPTED
@@ -98,7 +98,7 @@ def _only(record: Record, names: Sequence[str]) -> Record:
     return replace(record, rows=tuple(entry for entry in record.rows if entry.name in names))
 
 
-def _measured(args: argparse.Namespace) -> Record:
+def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Record:
     """The record, with what it lacked of the figures that were asked for."""
     from sim.bodies.meshfile import read_anatomy
 
@@ -117,6 +117,7 @@ def _measured(args: argparse.Namespace) -> Record:
     with tqdm(total=len(args.only), unit="figure", file=sys.stderr) as bar:
 
         def heard(line: str) -> None:
+            stop_if_asked()
             if line:
                 bar.write(line, file=sys.stderr)
             elif sys.stderr.isatty():  # the clock goes on

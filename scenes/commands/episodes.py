@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator, Set
+from collections.abc import Callable, Iterator, Set
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
@@ -89,14 +89,14 @@ def run(args: argparse.Namespace) -> int:
     if args.estimate:
         return _print_estimate(args, plan, out)
     try:
-        with terminated_as_interrupted():
-            return _made(args, plan, out)
+        with terminated_as_interrupted() as stop_if_asked:
+            return _made(args, plan, out, stop_if_asked)
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on in {out}", file=sys.stderr)
         return INTERRUPTED
 
 
-def _made(args: argparse.Namespace, plan: Plan, out: Path) -> int:
+def _made(args: argparse.Namespace, plan: Plan, out: Path, stop_if_asked: Callable[[], None]) -> int:
     from ..episodes.engine import make_all, still_missing
     from ..episodes.make import body_of, make_body, make_episode
     from ..episodes.run_folder import Run, begin, finished, read_run, versions_here
@@ -116,7 +116,7 @@ def _made(args: argparse.Namespace, plan: Plan, out: Path) -> int:
             partial(make_episode, *given, device=workers.device),
         )
         begun = time.perf_counter()
-        with _progress(out, there, args.count) as heard:
+        with _progress(out, there, args.count, stop_if_asked) as heard:
             tally = make_all(work, out, run, missing, workers, heard, there)
         seconds = time.perf_counter() - begun
         changed = tally != there
@@ -154,7 +154,7 @@ def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Wo
 
 
 @contextmanager
-def _progress(out: Path, there: Tally, total: int) -> Iterator[Heard]:
+def _progress(out: Path, there: Tally, total: int, stop_if_asked: Callable[[], None]) -> Iterator[Heard]:
     """A bar of episodes, with frames a second and what failed; and what each task took, into the folder."""
     from tqdm import tqdm
 
@@ -172,6 +172,7 @@ def _progress(out: Path, there: Tally, total: int) -> Iterator[Heard]:
 
         def heard(kind: str, outcome: Outcome | None, workers: int) -> None:
             nonlocal done
+            stop_if_asked()
             if outcome is None:
                 bar.set_description(
                     f"{workers} workers" if workers else "waits for workers", refresh=sys.stderr.isatty()

@@ -69,16 +69,31 @@ def until_ended(work: Callable[[ExitStack], int]) -> int:
 
 
 @contextmanager
-def terminated_as_interrupted() -> Iterator[None]:
-    """Do at SIGTERM what Ctrl-C does: clean up, and end what was started."""
+def terminated_as_interrupted() -> Iterator[Callable[[], None]]:
+    """Do at SIGTERM what Ctrl-C does: clean up, and end what was started.
+
+    Python drops an error that a finaliser raises, and so an interrupt that comes while one runs. Long work therefore
+    calls what this gives, now and then: it raises KeyboardInterrupt if a signal came.
+    """
+    came = threading.Event()
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        came.set()
+        raise KeyboardInterrupt
+
+    def stop_if_asked() -> None:
+        if came.is_set():
+            raise KeyboardInterrupt
+
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield stop_if_asked
         return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before = {number: signal.signal(number, hear) for number in CODES}
     try:
-        yield
+        yield stop_if_asked
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def leave(number: int, frame: FrameType | None) -> None:
