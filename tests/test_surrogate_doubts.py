@@ -63,7 +63,7 @@ def test_points_that_are_turned_are_in_doubt_as_those_that_slip(locator, way):
     now = middle + turn.apply(seen.now - middle) + 0.5e-3 * axis
     found = locator.locate(replace(seen, now=now, sigma=None, rigid=0.8e-3))
     assert found.slipped and not found.calibrated and np.linalg.norm(found.centroid) < found.p95
-    assert np.degrees(found.rigid_only[2]) == pytest.approx(10.0, abs=0.1) and "is off by 0.5 mm and" in found.doubt
+    assert np.degrees(found.rigid_alone.turn) == pytest.approx(10.0, abs=0.1) and "is off by 0.5 mm and" in found.doubt
     assert "degrees, where 0.8 mm and 0.3 degrees are stated," in found.doubt
     assert "The two cannot be distinguished" in found.doubt and found.warnings == (found.doubt,)
 
@@ -76,6 +76,16 @@ def test_a_slip_is_held_against_what_is_stated(locator):
     expected, far = (locator.locate(replace(slipped, rigid=rigid)) for rigid in (8e-3, 4e-3))
     assert not expected.slipped and not expected.warnings and np.linalg.norm(expected.centroid) < expected.p95
     assert far.slipped and "where 4 mm and 1.5 degrees are stated" in far.doubt
+
+
+def test_a_registration_that_was_checked_is_not_doubted(locator):
+    """By what does not move: what is seen is then a motion, however much it looks like a slip."""
+    body = locator.anatomy
+    seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
+    seen = replace(seen, now=seen.now + sideways(body, 12e-3))
+    doubted, believed = (locator.locate(replace(seen, checked=checked)) for checked in (False, True))
+    assert doubted.slipped and not believed.slipped and not believed.doubt and not believed.warnings
+    assert np.linalg.norm(believed.centroid) > np.linalg.norm(doubted.centroid) and believed.p95 < doubted.p95
 
 
 def test_a_shift_along_the_axis_is_answered_as_sinking_and_said_to_look_alike(locator):

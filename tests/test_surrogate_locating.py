@@ -343,9 +343,9 @@ def test_what_a_rigid_error_alone_would_explain_is_known(locator, body, truth):
     shifted = replace(observed(body, np.zeros_like(body.mesh.nodes)), rigid=0.8e-3)
     shifted = replace(shifted, now=shifted.rest + [0.0, 0.0, -4e-3])
     for seen in (shifted, replace(shifted, rest=None)):
-        share, shift, _ = locator.locate(seen).rigid_only
-        assert share == pytest.approx(1.0, abs=0.02) and shift == pytest.approx(4e-3, rel=0.05)
-    assert locator.locate(observed(body, truth[0][0], noise=0.2)).rigid_only[0] < 0.9
+        alone = locator.locate(seen).rigid_alone
+        assert alone.share == pytest.approx(1.0, abs=0.02) and alone.shift == pytest.approx(4e-3, rel=0.05)
+    assert locator.locate(observed(body, truth[0][0], noise=0.2)).rigid_alone.share < 0.9
 
 
 def test_causes_are_named(locator, body, truth):

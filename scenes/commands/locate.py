@@ -41,6 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "rotation in proportion (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
+        "--registration-checked", action="store_true",
+        help="it was checked by what does not move, as landmarks of the skull: no slip beyond --rigid is suspected",
+    )  # fmt: skip
+    parser.add_argument(
         "--out",
         metavar="RESULT.vtu",
         help="mean motion, deviation and covariance of every vertex. Left out, the tumour alone is said, for which a "
@@ -83,7 +87,9 @@ def run(args: argparse.Namespace) -> int:
     at_least("--seed", args.seed, 0)
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
-    observation = replace(read_observation(args.observed, args.tool), rigid=1e-3 * args.rigid)
+    observation = replace(
+        read_observation(args.observed, args.tool), rigid=1e-3 * args.rigid, checked=args.registration_checked
+    )
     placed(anatomy, observation)  # what cannot be placed need not wait for a locator
     locator = located_by(args, anatomy, small=out is None)
     found = locator.locate(observation)
@@ -109,7 +115,7 @@ def _numbers(found: Location, points: int, regions: tuple[Region, ...], out: Pat
         "covariance_mm2": (1e6 * found.centroid_covariance).tolist(),
         "p95_mm": 1e3 * found.p95,
         "explained": found.explained,
-        "explained_by_rigid_error": found.rigid_only[0],
+        "explained_by_rigid_error": found.rigid_alone.share,
         "causes": found.causes,
         "cause_groups": [asdict(share) for share in found.cause_shares],
         "within_errors": found.within_errors,
@@ -144,6 +150,8 @@ def _sentences(found: Location, out: Path | None) -> str:
 def _warnings(found: Location) -> list[str]:
     """What must be known of an answer beside its numbers, in sentences."""
     said = list(found.warnings)
+    if found.slipped:
+        said.append("If it was checked, say so by --registration-checked.")
     if len(found.outliers):
         rows = ", ".join(str(number + 2) for number in found.outliers[:20]) + (
             " ..." if len(found.outliers) > 20 else ""

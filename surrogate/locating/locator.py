@@ -33,6 +33,23 @@ RIGID, WIDE = 0.9, 2.0
 DRAWS = 4000
 
 
+@dataclass(frozen=True)
+class RigidAlone:
+    """The rigid error that explains most of what was seen, with a body at rest: of least squares, however large.
+
+    Parameters
+    ----------
+    share
+        Of what was seen, in mean square, that it explains.
+    shift, turn
+        Its size [m], [rad].
+    """
+
+    share: float
+    shift: float
+    turn: float
+
+
 @dataclass(frozen=True, eq=False)
 class Location:
     """Where a tumour is, of the tumour and not of a model: Gaussian, in RAS.
@@ -49,6 +66,8 @@ class Location:
         Numbers of points, and of tips, from 0. They lie off the open cortex, or no other point supports them.
     slipped
         Whether the registration may have slipped, by far more than is stated. Then the answer holds that too.
+    checked
+        Whether it was said that the registration was checked, so that no slip is suspected.
     calibrated
         Whether covariances were tried on observations like this: named points or a cloud, so many, and motions so far
         above errors, from a registration that did not slip.
@@ -62,6 +81,7 @@ class Location:
     outliers: np.ndarray
     tips_left_out: np.ndarray
     slipped: bool
+    checked: bool
     calibrated: bool
     seconds: float
 
@@ -103,16 +123,13 @@ class Location:
         return max(0.0, 1.0 - float(left @ left) / whole) if whole else 0.0
 
     @property
-    def rigid_only(self) -> tuple[float, float, float]:
-        """What no motion at all, but another rigid error would explain of what was seen; its shift [m] and turn [rad].
-
-        A share in mean square, by least squares, however large that error is.
-        """
+    def rigid_alone(self) -> RigidAlone:
+        """What another rigid error would explain of what was seen, if nothing had moved."""
         evidence = self.posterior.evidence
         found = evidence.rigid_alone
         left, whole = evidence.value - evidence.rigid @ found, float(evidence.value @ evidence.value)
         shift, turn = np.linalg.norm(found.reshape(2, 3), axis=1)
-        return (1.0 - float(left @ left) / whole if whole else 0.0), float(shift), float(turn)
+        return RigidAlone(1.0 - float(left @ left) / whole if whole else 0.0, float(shift), float(turn))
 
     @cached_property
     def within_errors(self) -> bool:
@@ -159,8 +176,8 @@ class Location:
     def warnings(self) -> tuple[str, ...]:
         """What else must be known of the answer, in sentences: `doubt`, and a registration that would look alike."""
         evidence, alike = self.posterior.evidence, self.posterior.slipped >= DOUBTFUL
-        share = self.rigid_only[0]
-        named = not self.slipped and evidence.beyond > WIDE and (alike or share > RIGID)
+        share = self.rigid_alone.share
+        named = not (self.slipped or self.checked) and evidence.beyond > WIDE and (alike or share > RIGID)
         apart = " The two cannot be distinguished." if alike else ""
         rigid = (
             f"{self._rigid_words} would explain {share:.0%}, with a brain at rest.{apart} If it may be off so far, say "
@@ -171,10 +188,10 @@ class Location:
     @property
     def _rigid_words(self) -> str:
         """The rigid error that explains most with a body at rest, and what was stated."""
-        _, shift, turn = self.rigid_only
+        alone = self.rigid_alone
         stated = self.posterior.evidence.rigid_scale
         return (
-            f"A registration that is off by {1e3 * shift:.1f} mm and {np.degrees(turn):.1f} degrees, where "
+            f"A registration that is off by {1e3 * alone.shift:.1f} mm and {np.degrees(alone.turn):.1f} degrees, where "
             f"{1e3 * stated[0]:.2g} mm and {np.degrees(stated[3]):.2g} degrees are stated,"
         )
 
@@ -232,7 +249,7 @@ class Locator:
     def _located(self, observation: Observation) -> Location:
         begun, prior, count = time.perf_counter(), self.prior, len(observation.now)
         found, named = settled(prior, observation)
-        slipped = _may_have_slipped(prior.anatomy, found)
+        slipped = not observation.checked and _may_have_slipped(prior.anatomy, found)
         if slipped:
             found, named = settled(prior, observation, free=True)
         off = np.setdiff1d(np.arange(count), named) if observation.rest is not None else np.zeros(0, int)
@@ -246,6 +263,7 @@ class Locator:
             outliers,
             found.outliers[found.outliers >= count] - count,
             slipped,
+            observation.checked,
             not slipped and was_tried(self.tried, found.evidence),
             time.perf_counter() - begun,
         )

@@ -62,6 +62,9 @@ class Observation:
         (k, 3): where tips of tools touch the surface.
     rigid
         Standard deviation of the rigid error along each axis: how far all points may be off together.
+    checked
+        Whether the registration was checked by what does not move, as landmarks of the skull: then no slip beyond
+        `rigid` is suspected.
     """
 
     now: np.ndarray
@@ -69,6 +72,7 @@ class Observation:
     sigma: np.ndarray | None = None
     tips: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     rigid: float = SHIFT
+    checked: bool = False
 
     @property
     def sigmas(self) -> np.ndarray:
