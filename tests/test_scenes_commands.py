@@ -46,6 +46,19 @@ def test_a_patient_in_one_go(tmp_path, capsys, short_fits):
     assert len(list((tmp_path / "frames").iterdir())) == 3
 
 
+@pytest.mark.parametrize(
+    "words",
+    ["render x --out o", "collect x --out o.h5", "film x --out o", "demo x", "check press x", "effects x", "budget x",
+     "uncertainty press x", "bench frame x", "bench stages x"],
+)  # fmt: skip
+def test_a_wrong_name_of_a_scene_is_refused_before_an_anatomy_is_opened(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([*words.split(), "--anatomy", "no.vtu"]) == 2
+    assert "no scene is called 'x'" in capsys.readouterr().err
+    assert main(["warp", "no.vtu", "--scene", "x", "--frame", "1", "--out", "o"]) == 2
+    assert "no scene is called 'x'" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
 def test_a_patient_says_in_json_where_the_time_went(tmp_path, monkeypatch, capsys):
     def step(words):
         assert words[-1] == "--json"

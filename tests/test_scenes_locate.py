@@ -90,13 +90,25 @@ def test_motions_and_errors_in_metres_are_refused_and_no_zero_has_a_sign(files, 
     """Motions of nothing at all are answered."""
     folder, _ = files
     table, path = np.loadtxt(folder / "vessels.csv", delimiter=",", skiprows=1), tmp_path / "seen.csv"
-    for times, sigma, refused in ((1.0, 1.0, ""), (1e-3, 1.0, "no point moves"), (1.0, 1e-3, "sigma"), (0.0, 1.0, "")):
+    said_of = ((1.0, 1.0, ""), (1e-3, 1.0, "no point moves"), (1.0, 1e-3, "a sigma is 0.00015 mm"), (0.0, 1.0, ""))
+    for times, sigma, refused in said_of:
         seen = table * np.repeat([1.0, times, sigma], [3, 3, 1])
         np.savetxt(path, seen, delimiter=",", header="x,y,z,dx,dy,dz,sigma", comments="")
         assert main(["locate", str(folder / "box.vtu"), str(path)]) == (2 if refused else 0)
         said = capsys.readouterr()
         assert refused in said.err and ("rather than metres" in said.err) is bool(refused)
         assert "-0.0" not in said.out and ("by 0.0, 0.0, 0.0 mm" in said.out) is (times == 0.0)
+
+
+def test_points_whose_errors_say_nothing_are_refused_unless_they_are_few(files, tmp_path, capsys):
+    folder, _ = files
+    table, path = np.loadtxt(folder / "vessels.csv", delimiter=",", skiprows=1), tmp_path / "unsure.csv"
+    for unsure, code in ((len(table) - 1, 2), (len(table) // 5, 0)):
+        seen = table.copy()
+        seen[:unsure, 6] = 30.0
+        np.savetxt(path, seen, delimiter=",", header="x,y,z,dx,dy,dz,sigma", comments="")
+        assert main(["locate", str(folder / "box.vtu"), str(path)]) == code
+        assert ("have a sigma of 30 mm or more" in capsys.readouterr().err) is (code == 2)
 
 
 def test_what_is_said_is_in_json_too(files, body, tmp_path, capsys):

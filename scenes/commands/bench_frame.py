@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     if args.batch is not None:
         at_least("--batch", args.batch, 1)
     width, height = size_of(args.size)
-    theatre = theatre_asked(args)
+    theatre = theatre_asked(args, args.scene)
     scene = scene_asked(args, args.scene, theatre)
     scene = replace(scene, viewpoint=replace(scene.viewpoint, width=width, height=height))
     name = deformer_name(args, theatre, scene)

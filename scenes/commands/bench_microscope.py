@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
 
     at_least("--seeds", args.seeds, 1)
     at_least("--every", args.every, 1)
-    theatre = theatre_asked(args)
+    theatre = theatre_asked(args, args.scene)
     scene = scene_asked(args, args.scene, theatre)
     if isinstance(scene.sight, StereoSight):
         sight = replace(scene.sight, named=not args.cloud, vessels=not args.plain)

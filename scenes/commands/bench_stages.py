@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     from ..script.scene import SCENES, find_scene
 
     at_least("--batch", args.batch, 1)
-    theatre = theatre_asked(args)
+    theatre = theatre_asked(args, args.scene)
     try:
         scene = scene_asked(args, args.scene, theatre)
     except InputError as error:

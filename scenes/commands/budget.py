@@ -96,6 +96,7 @@ def run(args: argparse.Namespace) -> int:
     from ..play.stage import Stage
     from ..script.reference_place import reference_beside
     from ..script.registration_file import other_mesh, read_registration
+    from ..script.scene import demand_scene
 
     at_least("--draws", args.draws, FEWEST)
     at_least("--samples", args.samples, FEWEST_SAMPLES)
@@ -108,6 +109,7 @@ def run(args: argparse.Namespace) -> int:
     ):
         if not 0.0 <= value < 1e4:
             raise InputError(f"{name} {value:g}: give a number that is not below 0.")
+    demand_scene(args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     scene = _seen(args, theatre)
     calibration, site = scene.viewpoint.calibration, theatre.site

@@ -59,8 +59,9 @@ def run(args: argparse.Namespace) -> int:
 
     at_least("--every", args.every, 1)
     asked = args.scenes or [*SCENES, TRACKING]
-    theatre = theatre_asked(args)
-    scenes = [filmed(args, scene_asked(args, name, theatre)) for name in asked if name != TRACKING]
+    names = [name for name in asked if name != TRACKING]
+    theatre = theatre_asked(args, *names)
+    scenes = [filmed(args, scene_asked(args, name, theatre)) for name in names]
     scenes = playable(args, theatre, scenes)
     rows, table = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:

@@ -81,16 +81,19 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
 
 
-def theatre_asked(args: argparse.Namespace) -> Theatre:
-    """The theatre that `add_theatre`'s arguments ask for.
+def theatre_asked(args: argparse.Namespace, *scenes: str) -> Theatre:
+    """The theatre that `add_theatre`'s arguments ask for, to play scenes of these names there.
 
     Raises
     ------
     InputError
-        As `open_theatre`; a limit of guarded models that is not above 0.
+        As `demand_scene`, before anything is read, and as `open_theatre`; a limit of guarded models not above 0.
     """
     from ..play.deformers import open_theatre
+    from ..script.scene import demand_scene
 
+    for name in scenes:
+        demand_scene(name)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     if args.guard_mm is None:
         return theatre
@@ -219,7 +222,7 @@ def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitSta
 
     from ..play.page.demo import Demo
 
-    theatre = theatre_asked(args)
+    theatre = theatre_asked(args, args.scene)
 
     def asked(scene: str) -> Scene:
         return filmed(args, scene_asked(args, scene, theatre))

@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"{name} {value:g}: give a number that is not below 0.")
     shift, turn = args.registered
     taking = Taking(args.blur, args.noise, tuple(Trouble(*each) for each in args.trouble), args.seed)
-    theatre = theatre_asked(args)
+    theatre = theatre_asked(args, args.scene)
     scene = _scene(args, theatre)
     if all("gap" in taking.happening(time) for time in scene.times[:: args.every].tolist()):
         raise InputError("no picture would be taken: give --seconds and --trouble that leave some.")

@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         if args.film.suffix not in (".mp4", ".gif", ".webp"):
             raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
         claimed(args.film, args.film.suffix, "a film of `sulcus render`", args.force, [args.camera])
-    theatre = theatre_asked(args)
+    theatre = theatre_asked(args, args.scene)
     scene = filmed(args, scene_asked(args, args.scene, theatre))
     name = deformer_name(args, theatre, scene)
     player = replace(theatre.player(name, scene), style=args.style)

@@ -86,12 +86,15 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..play.deformers import open_theatre
+    from ..script.scene import demand_scene
     from ..script.shipped_files import template_path
     from ..warp.export import Asked, write_warp
     from ..warp.images import read_picture
     from ..warp.output_folder import claimed_warp
 
     demand_options(args)
+    if args.scene is not None:
+        demand_scene(args.scene)
     out = claimed_warp(args.out, args.force)
     theatre = open_theatre(args.anatomy, None, args.device)
     scene = None if args.located else scene_of(args, theatre)

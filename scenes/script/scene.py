@@ -266,13 +266,18 @@ def find_scene(name: str) -> Scene:
         There is no scene of that name. Or the file is missing, does not run or has no SCENE. Or the scene's path gives
         no Touch, or its tissue fails `sim.check_tissue`.
     """
+    demand_scene(name)
     if name.endswith(".py"):
         return _own_scene(name)
-    if name not in SCENES:
+    return importlib.import_module(f"scenes.builtin.{name}").SCENE
+
+
+def demand_scene(name: str) -> None:
+    """Raise InputError where no scene is called so and it is no file of a user's. Nothing is run or read."""
+    if name not in SCENES and not name.endswith(".py"):
         raise InputError(
             f"no scene is called {name!r}: choose one of {', '.join(SCENES)}, or name a file of your own, MY_SCENE.py."
         )
-    return importlib.import_module(f"scenes.builtin.{name}").SCENE
 
 
 def _own_scene(path: str) -> Scene:

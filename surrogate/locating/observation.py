@@ -30,6 +30,8 @@ FARTHEST_TIP, ONE_PLACE = 30e-3, 1e-3
 LONGEST_MOTION, FARTHEST_OFF = 0.025, 0.02
 # Smaller errors of a point [m] no tracker has: they are metres in a file of millimetres. Less is no motion at all [m].
 LEAST_SIGMA, STILL = 0.01e-3, 1e-9
+# Larger errors of half of the points [m] say nothing of a brain, which moves by a few millimetres.
+LARGEST_SIGMA = 0.01
 # What points may be by mistake: times which scale they would lie on the cortex, and with axes turned how.
 UNITS = (
     (1.0, ""),
@@ -86,9 +88,9 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
     Raises
     ------
     InputError
-        Numbers that are not finite, too few points, points on a line, a sigma that is smaller than any tracker's. A
-        rigid error beyond any tracker's, motions beyond any brain's or too small to be seen. Points that lie off the
-        brain's surface, with the likely reason: units, LPS for RAS, another anatomy.
+        Numbers that are not finite, too few points, points on a line, a sigma that is smaller than any tracker's, or
+        sigmas that say nothing. A rigid error beyond any tracker's, motions beyond any brain's or too small to be
+        seen. Points that lie off the brain's surface, with the likely reason: units, LPS for RAS, another anatomy.
     """
     _check(observation)
     where, near = (observation.now, NEAR_NOW) if observation.rest is None else (observation.rest, NEAR)
@@ -196,6 +198,11 @@ def _check(observation: Observation) -> None:
         raise InputError(
             f"a sigma is {1e3 * sigma.min():.2g} mm, which no tracker has: give each point the standard deviation of "
             "its error in millimetres, rather than metres."
+        )
+    if np.median(sigma) > LARGEST_SIGMA:
+        raise InputError(
+            f"half of the points have a sigma of {1e3 * np.median(sigma):.3g} mm or more, and so say nothing of a "
+            f"brain. Give standard deviations of up to {1e3 * LARGEST_SIGMA:g} mm, or leave these points out."
         )
     if not 0.0 <= observation.rigid <= FARTHEST_OFF:
         raise InputError(
