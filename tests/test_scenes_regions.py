@@ -169,9 +169,9 @@ class TestPatient:
             str(tmp_path / "a.vtu"),
         ]
         assert main([*words, "--inspect"]) == 0
-        assert "ml: a region of its own, of the tumour's tissue\n" in capsys.readouterr().out
+        assert "ml: a region of its own, as stiff as the tumour\n" in capsys.readouterr().out
         assert main([*words, "--inspect", "--force", "--json", "--region", "necrosis:500"]) == 0
-        made = {"tumour": "of the brain's tissue", "necrosis": "neo-hookean, E 0.5 kPa, nu 0.49"}
+        made = {"tumour": "as stiff as the brain", "necrosis": "neo-hookean, E 0.5 kPa, nu 0.49"}
         assert json.loads(capsys.readouterr().out)["regions"] == made
 
     def test_shows_the_tumours_and_doubts_what_no_tissue_has(self, tmp_path, capsys):

@@ -173,6 +173,20 @@ def test_labels_that_cannot_be_used(tmp_path, brain, tumour, reason):
         volume_subject(path, brain, tumour)
 
 
+def test_labels_of_no_meaning_are_named_and_most_of_a_tumour_is_not_left_out(tmp_path):
+    """Oedema that nobody named, 5, is the brain's upper half; in the lower one is a small piece of the tumour."""
+    affine, places = grid(AFFINES["thick slices"])
+    labels = np.where(ellipsoid(places), np.where(places[..., 2] > MIDDLE[2], 5, 1), 0)
+    labels[ball(places) | ball(places, MIDDLE - [0.018, 0.0, 0.014], 0.006)] = 3
+    path = save(tmp_path / "l.nii", labels, affine)
+    with pytest.raises(InputError, match=r"4\.\d+ of 5\.\d+ ml of the tumour lie outside the brain"):
+        volume_subject(path, (1,), (3,))
+    assert volume_subject(path, (1, 5), (3,)).notes == ()
+    labels[ball(places, radius=0.004)] = 2
+    found = volume_subject(save(tmp_path / "l.nii", labels, affine), (1, 5), (3,))
+    assert found.notes[0] == "neither brain nor tumour: what is labelled 2" and "of holes" in found.notes[1]
+
+
 def test_volumes_that_cannot_be_used(tmp_path):
     affine, places = grid(AFFINES["thick slices"])
     labels = ellipsoid(places).astype(np.int16)

@@ -158,7 +158,7 @@ def _tissue(label: int, regions: Mapping[int, Tissue]) -> str:
     """What a region is made of, in words."""
     tissue = Elasticity(None, regions).of(label)
     around = "tumour" if label == NECROSIS_LABEL else "brain"
-    return f"of the {around}'s tissue" if tissue is None else str(tissue)
+    return f"as stiff as the {around}" if tissue is None else str(tissue)
 
 
 def axes_of(affine: np.ndarray) -> str:
@@ -185,7 +185,10 @@ def _warnings(found: Inspection, subject: Subject) -> Iterator[str]:
         if KDTree(septum.points).query(subject.interface)[0].min() <= 1e-3 * max(found.voxel):
             yield f"the tumour touches the {septum.name}, where it does not move"
     if len(found.pieces) > 1:
-        yield f"the tumour lies in {len(found.pieces)} pieces, and the skull is opened over one of them"
+        yield (
+            f"the tumour lies in {len(found.pieces)} pieces, and the skull is opened over one of them: --opening-over "
+            "chooses another"
+        )
     if 1e-3 * found.distance > FAR:
         yield f"the opening lies {found.distance:.0f} mm from the tumour: pressing there will hardly move it"
     if max(found.voxel) > OBLONG * min(found.voxel):

@@ -125,6 +125,8 @@ def head_masks(sources: Sources) -> HeadMasks:
         shape = tuple((np.array(shape) + lacking.sum(axis=1)).tolist())
     marked |= {name: other.onto(shape, affine) for name, other in others.items()}
     notes = whole.notes + tuple(f"{one.path}: {note}" for one in others.values() for note in one.notes)
+    if convention is None and not sources.mask and not sources.tumour_in:
+        notes += _unnamed(whole, (*brain, *tumour, *(label for labels in named.values() for label in labels)))
     if sources.mask:
         notes += _outside(marked, affine)
     if either:
@@ -144,6 +146,14 @@ def head_masks(sources: Sources) -> HeadMasks:
             *(one.grid for name, one in others.items() if name != NECROSIS),
         ),
     )
+
+
+def _unnamed(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
+    """A note on labels of the file that were given no meaning."""
+    names = {(one.layer, one.value): one.name for one in whole.segments}
+    found = {(layer, value) for layer, present in enumerate(whole.present) for value in present}
+    left = [names.get(place, place[1]) for place in sorted(found - set(whole.places(named)))]
+    return (f"neither brain nor tumour: what is labelled {listed(left)}",) if left else ()
 
 
 def _side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:

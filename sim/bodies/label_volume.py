@@ -83,8 +83,8 @@ def masked_subject(
     ------
     InputError
         A region that is not known, or not marked. A T1 that `read_intensity` refuses, or in LPS that is stated as RAS
-        as far as it shows; a tumour outside the brain. What `settings` refuse: by default a brain of less than 20 ml
-        or more than 5,000 ml, and a tumour of fewer than 27 voxels.
+        as far as it shows. A tumour of which more than half lies outside the brain. What `settings` refuse: by default
+        a brain of less than 20 ml or more than 5,000 ml, and a tumour of fewer than 27 voxels.
     """
     for name in regions:
         if name not in PART_LABELS or name not in masks.parts:
@@ -188,6 +188,12 @@ def _inside(
     inside = tumour & solid
     if not inside.any():
         raise InputError(f"{name}: the tumour lies outside the brain. Check the labels given as brain and as tumour.")
+    whole, lost = int(tumour.sum()), int((tumour & ~solid).sum())
+    if 2 * lost > whole:
+        raise InputError(
+            f"{name}: {lost * voxel * 1e6:.3g} of {whole * voxel * 1e6:.3g} ml of the tumour lie outside the brain, "
+            "without touching it. Say what is round it, such as oedema or necrosis: --brain takes several labels."
+        )
     component, count = cast(tuple[np.ndarray, int], ndimage.label(inside, np.ones((3, 3, 3))))
     size = np.bincount(component.ravel(), minlength=count + 1)
     fewest = settings.fewest_voxels
