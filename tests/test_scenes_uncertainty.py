@@ -349,7 +349,9 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
     )
     words = [str(own), "--anatomy", str(body), "--device", "cpu"]
     assert main(["uncertainty", *words, "--draws", "8", "--twins", "2", "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)["scenes"]
+    said = capsys.readouterr()
+    (row,) = json.loads(said.out)["scenes"]
+    assert "these parts are guesses: 8 numbers are fitted to 8 draws" in said.err and row["fitted_numbers"] == 8
     assert (
         row["scene"] == "brief" and row["draws"] == 8 and 0.0 <= row["held_twins"] <= 1.0 and 0.5 < row["held"] <= 1.0
     )

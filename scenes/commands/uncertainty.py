@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve an ensemble of each scene, and keep what it says."""
-    from ..bench.uncertainty import coverage, ensemble, nominal, skulls_of, tissue_of, tumour_of, uncertainty
+    from ..bench.uncertainty import causes, coverage, ensemble, nominal, skulls_of, tissue_of, tumour_of, uncertainty
     from ..play.deformers import open_theatre
     from ..script.priors import drawn, drawn_from
     from ..script.scene import SCENES, demand_scene
@@ -103,7 +103,8 @@ def run(args: argparse.Namespace) -> int:
         write_uncertainties(out, [found])
         tried = bar(ensemble(theatre, scene, twins), total=len(twins))
         held = coverage(scene, still, found, twins, tried, args.seed + 1) if twins else None
-        rows.append(_flat(theatre, scene, found, held))
+        fitted_numbers = sum(column.shape[1] for column in causes(draws, scene).values())
+        rows.append(_flat(theatre, scene, found, held) | {"fitted_numbers": fitted_numbers})
         print("\n".join(_lines(rows[-1])), file=lines, flush=True)
     if args.json:
         print(json_line({"seed": args.seed, "out": str(out), "scenes": rows}))
@@ -139,6 +140,11 @@ def _lines(row: dict[str, Any]) -> Sequence[str]:
         f"{row['middle_mm']:.1f} mm. Root mean square of each part [mm]:"
     )
     lines += [f"    {name:<20} {size:6.3f}" for name, size in row["parts_mm"].items()]
+    if row["draws"] - row["failed"] < 2 * row["fitted_numbers"]:
+        lines.append(
+            f"  these parts are guesses: {row['fitted_numbers']} numbers are fitted to {row['draws'] - row['failed']} "
+            f"draws. Give --draws {2 * row['fitted_numbers']} or more"
+        )
     if row["frames"]:
         lines.append(f"  bodies are of tissue that was fitted to {row['frames']} frames, and not of priors alone")
     without = f", {row['failed']} of them without equilibrium" if row["failed"] else ""
