@@ -1,5 +1,7 @@
 """`sulcus report`: which rows are measured at the same time, and what happens when one of them stops."""
 
+import subprocess
+import sys
 import threading
 from contextlib import contextmanager
 
@@ -92,3 +94,10 @@ def test_a_row_has_its_turn_when_its_process_is_ready(study, tmp_path):
 
     row = apart(turn(), study, Elements("FEM odd law", law="odd"), tmp_path / "odd.png")
     assert turns == ["begins", "ends"] and "odd" in row.state and row.state != "measured"
+
+
+def test_a_process_of_a_row_starts_without_the_notes_of_warp():
+    """They would stand before the line of --json."""
+    code = "from scenes.report.measure import ready; ready(False); import warp as wp; wp.zeros(1, device='cpu')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == ""

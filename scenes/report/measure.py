@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.errors import InputError
+from sim.runtime.device import find_device
 from sim.runtime.threads import one_thread
 
 from ..bench.process_memory import peak_memory
@@ -23,7 +24,8 @@ FAMILY = {Elements: "finite elements", Learner: "learnt"}
 
 
 def ready(on_card: bool) -> None:
-    """Import all that rows need; on a card also PyTorch, which takes seconds, and what draws."""
+    """Import all that rows need, and start Warp without its notes; on a card also PyTorch, and what draws."""
+    find_device("auto", "float32")
     if on_card:
         for name in ("torch", "scenes.report.picture"):
             import_module(name)
