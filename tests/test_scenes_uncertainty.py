@@ -11,6 +11,7 @@ from ar.overlay.hud import FINE, NARROW, folded, millimetres
 from ar.overlay.refind import stands
 from scenes.bench.uncertainty import (
     Motions,
+    Solved,
     causes,
     changed,
     coverage,
@@ -134,7 +135,7 @@ class TestEnsemble:
         """Under a known pose it cancels."""
         stiff = replace(SAME, stiffness=2.0)
         for scene, times in ((short(), 0.5), (small("palpate"), 1.0)):
-            ours, theirs = (solved(theatre, changed(scene, one))[2] for one in (SAME, stiff))
+            ours, theirs = (solved(theatre, changed(scene, one)).motions[2] for one in (SAME, stiff))
             lengths = [np.linalg.norm(field, axis=1).mean() for field in (theirs, ours)]
             assert lengths[1] > 1e-5 and lengths[0] / lengths[1] == pytest.approx(times, rel=0.12)
 
@@ -171,7 +172,7 @@ class TestEnsemble:
         still = Motions((0.0, 1.0), (0.0 * field, field), (normals, normals))
 
         def answers(draws):
-            return [(0.0 * field, field / one.stiffness) for one in draws]
+            return [Solved((0.0 * field, field / one.stiffness)) for one in draws]
 
         draws, twins = drawn(300, 0), drawn(300, 1)
         found = uncertainty(theatre, scene, still, draws, answers(draws))
@@ -183,8 +184,9 @@ class TestEnsemble:
     def test_draws_without_equilibrium_are_counted_and_too_many_refused(self, theatre):
         field = np.ones((9, 3))
         still, draws = Motions((0.0,), (field,), (field,)), drawn(10, 0)
-        answers = [(field,)] * 9
-        assert uncertainty(theatre, short(), still, draws, [*answers, None]).failed == 1
+        answers = [Solved((field,), inverted) for inverted in [0, 0, 5, 1, 0, 0, 0, 0, 0]]
+        found = uncertainty(theatre, short(), still, draws, iter([*answers, None]))
+        assert (found.failed, found.folded) == (1, 2)
         with pytest.raises(InputError, match="too few"):
             uncertainty(theatre, short(), still, draws, [*answers[:7], None, None, None])
 
@@ -197,10 +199,15 @@ class TestEnsemble:
         if len(failing) == 2:
             assert found is None
             return
-        for ours, theirs in zip(found, whole, strict=True):
+        for ours, theirs in zip(found.motions, whole.motions, strict=True):
             assert ours == pytest.approx(theirs, abs=2e-5)
         if failing:
             assert hasty.starts[1] is hasty.starts[2] is not None
+
+    def test_a_force_beyond_the_law_turns_tetrahedra_inside_out_and_is_counted(self, theatre):
+        """The scene itself turns none; at a tenth of its stiffness some are."""
+        weak = solved(theatre, changed(short(), replace(SAME, stiffness=0.1)))
+        assert solved(theatre, short()).inverted == 0 and weak is not None and weak.inverted > 0
 
     def test_the_moments_of_a_scene_end_where_it_does(self, theatre):
         still = nominal(theatre, short())

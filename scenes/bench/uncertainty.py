@@ -53,8 +53,18 @@ SHIFTS = 200
 
 
 SKULL_EFFECTS = Bonded | Slide | SkullContact
-Answer = tuple[np.ndarray, ...] | None
-"""Motions (n, 3) [m] of the tumour's surface at each moment; None where some has no equilibrium."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Motions (n, 3) [m] of the tumour's surface at each moment, and the most tetrahedra inside out at any of them."""
+
+    motions: tuple[np.ndarray, ...]
+    inverted: int = 0
+
+
+Answer = Solved | None
+"""None where some moment has no equilibrium."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,22 +195,23 @@ def nominal(theatre: Theatre, scene: Scene) -> Motions:
     """
     if not len(theatre.anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour to be uncertain of: make one with `sulcus anatomy`.")
-    found, normals = solved(theatre, scene), []
-    if found is None:
+    answer, normals = solved(theatre, scene), []
+    if answer is None:
         raise InputError(f"of the scene {scene.name} itself no equilibrium was found.")
     for time in moments(scene):
         loads = scene.loads(theatre.site, scene.path(time), time)
         tumour = Stage(scene, theatre.site).at(loads).tumour(theatre.anatomy.mesh.nodes)
         normals.append(vertex_normals(tumour.vertices, tumour.triangles))
-    return Motions(moments(scene), found, tuple(normals))
+    return Motions(moments(scene), answer.motions, tuple(normals))
 
 
 def solved(theatre: Theatre, scene: Scene) -> Answer:
-    """Motions (n, 3) [m] of the tumour's surface at each moment; None where some has no equilibrium.
+    """The tumour's motions at each moment; None where some has no equilibrium.
 
     A moment that has none from the one before is gone to by way of times between.
     """
     fem, last, found, stage, before = theatre.fem(scene, ACCURACY, batch=1), None, [], Stage(scene, theatre.site), 0.0
+    inverted = 0
 
     def gone_to(times: Sequence[float], start: Deformation | None) -> Deformation | None:
         for time in times:
@@ -215,9 +226,9 @@ def solved(theatre: Theatre, scene: Scene) -> Answer:
             answer = gone_to(np.linspace(before, time, 1 + PARTS)[1:].tolist(), last)
         if answer is None:
             return None
-        last, before = answer, time
+        last, before, inverted = answer, time, max(inverted, int(answer.inverted[0]))
         found.append(_surface(stage.at(scene.loads(theatre.site, scene.path(time), time)), last))
-    return tuple(found)
+    return Solved(tuple(found), inverted)
 
 
 def _surface(stage: Stage, answer: Deformation) -> np.ndarray:
@@ -232,7 +243,7 @@ def ensemble(theatre: Theatre, scene: Scene, draws: Sequence[Draw]) -> Iterator[
 
 def sound_of(draws: Sequence[Draw], answers: Iterable[Answer]) -> list[tuple[Draw, tuple[np.ndarray, ...]]]:
     """The draws that have an equilibrium at each moment, with their motions."""
-    return [(draw, answer) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
+    return [(draw, answer.motions) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
 
 
 def enough_of(
@@ -261,7 +272,9 @@ def uncertainty(
     InputError
         Too few draws have an equilibrium.
     """
+    answers = tuple(answers)
     sound = enough_of(scene, draws, answers)
+    folded = sum(answer is not None and answer.inverted > 0 for answer in answers)
     kept, shifts = [draw for draw, _ in sound], rigid(SHIFTS, seed)
     meshes = mesh_errors(scene, kept)
     rows, held = [], []
@@ -276,7 +289,9 @@ def uncertainty(
     mark, failed = mark_of(scene, theatre.site, theatre.element_of(scene)), len(draws) - len(sound)
     named = {name: tuple(row[name] for row in by_name) for name in by_name[0]}
     share = float(np.mean(held[1:] or held))
-    return Uncertainty(scene.name, mark, len(draws), failed, share, still.times, worst, middle, moved, named)
+    return Uncertainty(
+        scene.name, mark, len(draws), failed, share, still.times, worst, middle, moved, named, folded=folded
+    )
 
 
 def off_by(motion: np.ndarray, field: np.ndarray, meshes: np.ndarray) -> np.ndarray:

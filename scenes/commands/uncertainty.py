@@ -127,7 +127,8 @@ def _flat(theatre: Theatre, scene: Scene, found: Uncertainty, twins: float | Non
         "scene": scene.name, "said": error_lines(promised, error, model is not None), "time_s": found.times[moment],
         "model_mm": None if promised is None else 1e3 * promised, "tumour_mm": 1e3 * (error.bound or 0.0),
         "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment], "largest_part": error.largest,
-        "draws": found.draws, "failed": found.failed, "frames": found.frames, "held": found.held, "held_twins": twins,
+        "draws": found.draws, "failed": found.failed, "frames": found.frames, "folded": found.folded,
+        "held": found.held, "held_twins": twins,
         "parts_mm": ranked,
     }  # fmt: skip
 
@@ -151,4 +152,9 @@ def _lines(row: dict[str, Any]) -> Sequence[str]:
     lines.append(
         f"  {row['draws']} draws{without}. The bound held for {row['held']:.1%} of draws that it was not made of"
     )
+    if row["folded"]:
+        lines.append(
+            f"  in {row['folded']} draws tetrahedra lie inside out, as under a tool on soft tumour: the load is beyond "
+            "the law there, and the bound is a guess"
+        )
     return lines if row["held_twins"] is None else [*lines, f"  and for {row['held_twins']:.1%} of twins"]

@@ -82,6 +82,9 @@ class Uncertainty:
         Root mean square over draws, at the surface's worst point of each [m], by contributor.
     frames
         How many frames the draws' tissue was fitted to; 0: it was drawn from priors.
+    folded
+        In how many draws tetrahedra lie inside out, as under a tool on soft tumour: no tissue moves so. 0, too, in
+        files that do not say it.
     """
 
     scene: str
@@ -95,6 +98,7 @@ class Uncertainty:
     moved: tuple[float, ...]
     parts: Mapping[str, tuple[float, ...]]
     frames: int = 0
+    folded: int = 0
 
     def at(self, time: float, surrogate: float = 0.0) -> TumourError:
         """The error at a time [s], where a trained model adds its own bound [m]."""
@@ -155,9 +159,8 @@ def _read(row: dict) -> Uncertainty:
         if len(values) != len(lists["times"]) or not np.isfinite(values).all():
             raise InputError(f"{name} are not {len(lists['times'])} finite numbers.")
     counts = int(row["draws"]), int(row["failed"]), float(row["held"])
-    return Uncertainty(
-        str(row["scene"]), str(row["mark"]), *counts, **lists, parts=parts, frames=int(row.get("frames", 0))
-    )
+    frames, folded = (int(row.get(name, 0)) for name in ("frames", "folded"))
+    return Uncertainty(str(row["scene"]), str(row["mark"]), *counts, **lists, parts=parts, frames=frames, folded=folded)
 
 
 def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:
