@@ -17,6 +17,7 @@ from sim.effects import SKULLS
 from surrogate.locating.cause_shares import cause_shares
 from surrogate.locating.causes import DRAINAGE, KINDS
 from surrogate.locating.locator_files import load_locator, locator_path
+from surrogate.locating.observation import Observation
 from surrogate.locating.prior import middle_of
 
 NAMED, CLOUD = PointsSeen(100, 44, 1), PointsSeen(100, 44, 1, named=False)
@@ -121,6 +122,19 @@ def test_where_nothing_moved_no_cause_is_named(locator, sight):
     found = locator.locate(observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), sight, (0, 0)))
     assert found.within_errors and not found.cause_shares and not any(found.causes.values())
     assert found.named_causes == "none, as what was seen is within its errors"
+
+
+def test_a_dent_is_seen_by_its_form_though_it_is_no_larger_than_errors(locator):
+    """Of 3 mm, 12 mm wide, at 60 points that are off by less than is stated; and such points without a dent."""
+    body, random = locator.anatomy, np.random.default_rng(0)
+    cortex = body.mesh.nodes[np.unique(body.open_surface)]
+    rest = cortex[random.choice(len(cortex), 60, replace=False)]
+    middle = cortex[((cortex - cortex.mean(axis=0)) ** 2).sum(axis=1).argmin()]
+    away = ((rest - middle) ** 2).sum(axis=1)
+    dent = 3e-3 * np.exp(-away / (2.0 * 6e-3**2))[:, None] * open_cortex(body).axis
+    white = 0.2e-3 * random.standard_normal((60, 3))
+    dented, still = (locator.locate(Observation(rest + white + moved, rest)) for moved in (dent, 0.0))
+    assert not dented.within_errors and dented.cause_shares and still.within_errors
 
 
 def test_causes_are_grouped_as_finely_as_their_shares_are_known():

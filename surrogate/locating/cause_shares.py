@@ -1,4 +1,4 @@
-"""Which causes moved the cortex, as far as what is seen separates them; and whether anything is seen to have moved.
+"""Which causes moved the cortex, as far as what is seen separates them.
 
 Shares are those of draws from the posterior. Causes whose own shares scatter widely are not separable. Of all ways to
 group them, the finest is taken in which the joint share of each group is known.
@@ -11,17 +11,13 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.special import chdtrc
 
 from .causes import KINDS
-from .evidence import Evidence
 from .posterior import Posterior
 from .prior import Prior
 
 # Draws; the probability that a share's interval leaves out at either end; and how wide one is of a share that is known.
 DRAWS, BEYOND, KNOWN = 400, 0.05, 0.5
-# So improbable by errors alone is what is seen, in what is rigid or in the rest, where something moved.
-MOVED = 0.005
 # A brain that swells may do so by less than nothing.
 WORDS = {"swelling": "swelling or shrinking"}
 # A share that is less is not named.
@@ -98,18 +94,3 @@ def drawn_shares(prior: Prior, posterior: Posterior) -> np.ndarray:
             squares[begin:end, number] = ((part @ prior.on_cortex[shapes[:, None], shapes]) * part).sum(axis=1)
         begin = end
     return squares / squares.sum(axis=1, keepdims=True)
-
-
-def within_errors(evidence: Evidence) -> bool:
-    """Whether what is seen is no more than its errors, the rigid one as large as is stated: nothing need have moved.
-
-    The square Mahalanobis distance has a part of what is rigid, by generalised least squares, and one of the rest. Both
-    are chi-squared.
-    """
-    whitening, scale = evidence.whitening(0.0), evidence.rigid_scale
-    rigid, white = whitening.white(evidence.rigid * scale), whitening.white(evidence.value)
-    precision = rigid.T @ rigid
-    found = np.linalg.lstsq(precision, rigid.T @ white, rcond=None)[0]
-    together = found @ np.linalg.solve(np.eye(6) + precision, precision @ found)
-    rest = ((white - rigid @ found) ** 2).sum()
-    return bool(min(chdtrc(6, together), chdtrc(len(white) - 6, rest)) > MOVED)

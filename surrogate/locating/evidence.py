@@ -163,6 +163,11 @@ class Whitening:
         """R^T rows, (m, k) or (m,)."""
         return (self.root.T @ rows.reshape(len(self.root), -1)).reshape(rows.shape)
 
+    @property
+    def logarithm(self) -> float:
+        """Of the determinant of R."""
+        return self.copies * float(np.log(np.diag(self.root)).sum())
+
     def precision(self, table: np.ndarray) -> np.ndarray:
         """Blocks (n, c, c) of the inverse covariance, for rows (n, c): of all axes of points, where `copies` is 3."""
         columns = self.root.T[table[:, :: self.copies] // self.copies]

@@ -14,13 +14,14 @@ from sim.errors import InputError
 from sim.runtime.threads import one_thread
 
 from .calibration import covering_factor, was_tried
-from .cause_shares import CauseShare, cause_shares, drawn_shares, within_errors
+from .cause_shares import CauseShare, cause_shares, drawn_shares
 from .causes import KINDS
 from .observation import MOST, Observation
 from .posterior import Posterior
 from .prior import Prior
 from .regions import Region
 from .rounds import settled
+from .stillness import within_errors
 
 # More points than this share are no outliers, and no cause of the ensemble moves what this is more surprised by.
 MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
@@ -134,7 +135,7 @@ class Location:
     @cached_property
     def within_errors(self) -> bool:
         """Whether nothing need have moved for what was seen: it is no more than errors that are stated."""
-        return within_errors(self.posterior.evidence)
+        return within_errors(self.prior, self.posterior.evidence)
 
     @cached_property
     def cause_shares(self) -> tuple[CauseShare, ...]:

@@ -1,0 +1,42 @@
+"""Whether anything is seen to have moved, or what is seen is no more than its errors."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import chdtrc, logsumexp
+
+from .evidence import Evidence
+from .posterior import COARSENED, seen_prior
+from .prior import Prior
+
+# So improbable by errors alone is what is seen where something moved, by each of three tests.
+MOVED = 0.005
+
+
+def within_errors(prior: Prior, evidence: Evidence) -> bool:
+    """Whether what is seen is no more than its errors, the rigid one as large as is stated: nothing need have moved.
+
+    Two tests are of its size: the square Mahalanobis distance has a part of what is rigid, by generalised least
+    squares, and one of the rest. Both are chi-squared. The third is of its form: how many times as probable motions of
+    the prior make it, by their mean evidence, as errors alone do. By Markov's inequality errors alone exceed 1 / p with
+    a probability of p at most. So a dent is seen that is no larger in all than errors might be.
+    """
+    whitening, scale = evidence.whitening(0.0), evidence.rigid_scale
+    rigid, white = whitening.white(evidence.rigid * scale), whitening.white(evidence.value)
+    precision, gain = rigid.T @ rigid, rigid.T @ white
+    found = np.linalg.lstsq(precision, gain, rcond=None)[0]
+    together = found @ np.linalg.solve(np.eye(6) + precision, precision @ found)
+    rest = ((white - rigid @ found) ** 2).sum()
+    if min(chdtrc(6, together), chdtrc(len(white) - 6, rest)) <= MOVED:
+        return False
+    whole = np.eye(6) + precision
+    still = 0.5 * (gain @ np.linalg.solve(whole, gain) - np.linalg.slogdet(whole)[1] - white @ white)
+    return bool(_moving(prior, evidence) - still - whitening.logarithm < -np.log(MOVED))
+
+
+def _moving(prior: Prior, evidence: Evidence) -> float:
+    """Logarithm of the mean evidence of motions under a registration that is no more off than is stated."""
+    seen = seen_prior(prior, evidence)
+    rows, logs = seen.rows, COARSENED * seen.logs[np.isfinite([some.rigid for some in prior.hypotheses])]
+    logs = logs[np.isfinite(logs)]
+    return float(logsumexp(logs) - np.log(len(logs)) - 0.5 * rows.products[-1, -1] + rows.whitening.logarithm)
