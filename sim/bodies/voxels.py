@@ -101,7 +101,8 @@ def checked(path: Path, volume: Volume, voxels: Voxels, finite: bool, layered: b
     if values.ndim < 3 or min(values.shape[:3]) < 2 or max(values.shape[3:], default=1) > most:
         raise InputError(f"{path}: measures {shape} voxels, which is not one volume. {REMEDY}")
     if finite and not np.isfinite(values).all():
-        raise InputError(f"{path}: {int((~np.isfinite(values)).sum())} voxels are not finite. Replace them by 0.")
+        lacking = int((~np.isfinite(values)).sum())
+        raise InputError(f"{path}: {lacking} of its numbers are not finite. Replace them by 0.")
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) <= 1e-6 * spacing.prod():
         raise InputError(
