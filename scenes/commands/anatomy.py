@@ -213,7 +213,7 @@ def _region(name: str, volume: float, figures: dict) -> str:
 def _sentences(figures: dict) -> str:
     lines = [
         "{nodes} nodes, {tets} tetrahedra; worst dihedral angle {worst_dihedral_deg} deg",
-        "brain {brain_ml} ml; surface off by {surface_error_mean_mm} mm mean, {surface_error_p95_mm} mm p95",
+        "brain {brain_ml:.0f} ml; surface off by {surface_error_mean_mm} mm mean, {surface_error_p95_mm} mm p95",
         "tumour {tumour_ml} ml ({tumour_volume_error_percent:+} % of the label's), {tumour_nodes} nodes",
         *(_region(name, volume, figures) for name, volume in figures["regions_ml"].items()),
         *(f"{name} {held} nodes that do not move" for name, held in figures["septa_nodes"].items()),
