@@ -70,6 +70,8 @@ class TestCauses:
         height = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.04]])  # from -32 to 0 mm against gravity
         words = acting(both.loads(theatre.site, Touch(force=0.2), 0.0), STILL, theatre.site.anatomy.mesh.nodes)
         assert "force 0.20 N" in words and "gravity pulls to the back, fluid up to" in words
+        idle = acting(both.loads(theatre.site, Touch(force=0.0), 0.0), STILL, theatre.site.anatomy.mesh.nodes)
+        assert "the tool does not push" in idle and "force" not in idle
         assert acting(Loads((), np.zeros(1)), STILL, height) == ""
         lying = posture(np.array([-3.0, 0.0, 4.0]), -0.012)
         way = "gravity pulls to the crown (0.80) and the left (0.60), fluid up to "

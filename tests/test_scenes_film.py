@@ -175,6 +175,7 @@ def test_a_film_and_all_that_belongs_to_it_are_written(tmp_path, capsys):
         (["--path", "microscope"], "one calibration"),
         (["--noise", "-1"], "not below 0"),
         (["--trouble", "gap:0-9"], "no picture would be taken"),
+        (["--trouble", "tool:30-40"], "tool:30-40 meets no picture of this film"),
     ]:
         assert main([*words, *few, *more]) == 2
         assert why in capsys.readouterr().err

@@ -235,7 +235,9 @@ def test_the_command_draws_a_film_and_says_how_it_went(tmp_path, capsys):
     out, table = tmp_path / "shown.mp4", tmp_path / "rows.csv"
     more = ["--truth", str(FILM / "truth.npz"), "--out", str(out), "--table", str(table), "--device", "cpu", "--json"]
     assert main(["overlay", str(FILM / "film.mp4"), *GIVEN, *more]) == 1  # nobody says how the brain moved
-    said = json.loads(capsys.readouterr().out)
+    printed = capsys.readouterr()
+    said = json.loads(printed.out)
+    assert "camera.json states no covariance of the camera" in printed.err
     assert said["pictures"] == 17 and said["states"][State.UNKNOWN.value] == 11
     assert said["reference_seen_percent"] == pytest.approx(100.0 * 12 / 17)
     assert said["tool_seen_percent"] == 0.0 and "as in the scan" in said["motion_by"]

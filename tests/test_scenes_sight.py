@@ -166,8 +166,8 @@ def test_an_ellipsoid_holds_what_its_covariance_says(frames):
 
 def test_where_nothing_moves_that_is_said(play, frames):
     found = frames[0].estimate
-    assert not found.noticed and frames[0].remark.startswith("no motion beyond its error; ")
-    assert "No motion is seen beyond its error." in " ".join(estimated(found))
+    assert not found.noticed and frames[0].remark.startswith("the estimate sees no motion beyond its error; ")
+    assert "The estimate sees no motion beyond its error." in " ".join(estimated(found))
     tried, guess = (replace(found, location=replace(found.location, calibrated=known)) for known in (True, False))
     assert "guess" not in tried.words + " ".join(estimated(tried))
     assert "; a guess; " in guess.words and "It is a guess" in " ".join(estimated(guess))

@@ -99,6 +99,9 @@ def test_in_the_patient_s_frame_the_camera_is_of_no_account(folder, camera, tool
         assert off < 4.0 * float(row["tip_off_mm"])
     assert main(["track", str(folder), "--camera", camera, "--out", str(tmp_path / "p.csv"), "--body", "patient"]) == 0
     assert [row["state"] for row in rows_of(tmp_path / "p.csv")] == ["good"] * 5
+    capsys.readouterr()
+    boardless = ["track", str(folder), "--camera", camera, "--out", str(tmp_path / "b.csv"), "--frame", "board"]
+    assert main(boardless) == 1 and "60.0 %  board lost: too few corners" in capsys.readouterr().out
 
 
 def test_the_camera_s_pose_is_the_inverse_of_what_it_sees(folder, camera, tmp_path):
@@ -145,6 +148,7 @@ def test_what_cannot_be_followed_is_refused(folder, camera, pictures, tmp_path, 
     blank.mkdir()
     cv2.imwrite(str(blank / "a.png"), np.full((CAMERA.height, CAMERA.width), 120, np.uint8))
     assert main(["track", str(blank), "--camera", camera, "--out", str(out)]) == 1  # nothing is certain
+    assert "100.0 %  tool lost: too few corners" in capsys.readouterr().out
     assert rows_of(out)[0]["state"] == "lost"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ from .outputs import add_force, claimed, claimed_folder, claimed_frames
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
-    from ..play.overlay.filming import Shot
+    from ..play.overlay.filming import Shot, Trouble
     from ..play.player import Player
     from ..script.scene import Scene
 
@@ -111,6 +111,7 @@ def run(args: argparse.Namespace) -> int:
     scene = _scene(args, theatre)
     if all("gap" in taking.happening(time) for time in scene.times[:: args.every].tolist()):
         raise InputError("no picture would be taken: give --seconds and --trouble that leave some.")
+    _demand_troubles(taking.troubles, scene.times[:: args.every])
     calibration = scene.viewpoint.calibration
     assert calibration is not None
     folder = claimed_folder(args.out, "film and its truth")
@@ -136,6 +137,16 @@ def run(args: argparse.Namespace) -> int:
     said = f"{len(shots)} pictures of {scene.name}, in which the tumour moves by up to {moved:.2f} mm: {film}"
     print(json_line(report) if args.json else said)
     return 0
+
+
+def _demand_troubles(troubles: Sequence[Trouble], times: np.ndarray) -> None:
+    """Refuse a trouble in which no picture is taken, of those at `times` (F,) [s]: it would change nothing."""
+    for each in troubles:
+        if not ((each.since <= times) & (times < each.until)).any():
+            raise InputError(
+                f"--trouble {each.kind}:{each.since:g}-{each.until:g} meets no picture of this film, which ends at "
+                f"{times[-1]:.2f} s: give times within it, or a smaller --every."
+            )
 
 
 def _scene(args: argparse.Namespace, theatre: Theatre) -> Scene:

@@ -26,6 +26,11 @@ from .style_option import add_style
 from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments
 from .tracked_scene import REST, mover, tracked_scene
 
+UNSTATED = (
+    "{} states no covariance of the camera: the error has no part of its calibration in it. A wrong camera is then not "
+    "noticed. Calibrate yours by `sulcus calibrate`."
+)
+
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
 
@@ -232,6 +237,8 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
             raise InputError(f"{path}: no such file. See whether its name is right.")
     calibration, registration = read_calibration(args.camera), read_registration(args.registration)
     intrinsic = read_intrinsic_covariance(args.camera)
+    if intrinsic is None:
+        print(f"sulcus overlay: {UNSTATED.format(Path(args.camera).with_suffix('.json'))}", file=sys.stderr)
     if film:
         _demand_film(args, calibration)
     tool = None if args.tool is None else read_tool(args.tool)

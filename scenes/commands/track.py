@@ -67,15 +67,14 @@ def run(args: argparse.Namespace) -> int:
     rows = list(followed(args.pictures, calibration, args.body, args.frame, args.rate))
     seconds = time.perf_counter() - begun
     write_poses(out, rows, tip)
-    counts = Counter(row.verdict for row in rows)
     good = sum(row.pose is not None for row in rows)
     middle = 1e3 * float(np.median([row.seconds for row in rows]))
     if args.json:
-        said = {verdict.name.lower(): count for verdict, count in counts.items()}
+        said = {verdict.name.lower(): count for verdict, count in Counter(row.verdict for row in rows).items()}
         print(json_line({"out": str(out), "pictures": len(rows), "states": said, "ms": middle, "seconds": seconds}))
     else:
         print(f"{len(rows)} pictures of the {args.body}, {middle:.1f} ms each (median):")
-        for verdict, count in counts.most_common():
-            print(f"  {100.0 * count / len(rows):5.1f} %  {verdict.value}")
+        for (lacks, verdict), count in Counter((row.lacks, row.verdict) for row in rows).most_common():
+            print(f"  {100.0 * count / len(rows):5.1f} %  {f'{lacks} ' if lacks else ''}{verdict.value}")
         print(f"written: {out}, in the {args.frame}'s frame")
     return 0 if good else 1

@@ -41,7 +41,7 @@ def acting(loads: Loads, answer: Deformation, nodes: np.ndarray) -> str:
 def _words(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str:
     match cause:
         case Pushed():
-            return f"force {np.linalg.norm(cause.force[0]):.2f} N"
+            return f"force {np.linalg.norm(cause.force[0]):.2f} N" if cause.force[0].any() else "the tool does not push"
         case Posture():
             return f"gravity pulls to the {_way(cause.direction[0])}, {_fluid(cause, nodes)}"
         case Resected():

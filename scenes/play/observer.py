@@ -113,7 +113,7 @@ class Estimate:
         """What is said beside the picture, in a few words."""
         if self.location is None:
             return ""
-        still = "" if self.noticed else "no motion beyond its error; "
+        still = "" if self.noticed else "the estimate sees no motion beyond its error; "
         guess = "" if self.location.calibrated else "a guess; "
         return f"{still}{guess}truth moved {millimetres(self.truly)}; estimate {millimetres(self.off)} off"
 

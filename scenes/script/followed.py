@@ -39,10 +39,10 @@ def rows_of(film: Iterable[Named], calibration: Calibration, body: str, frame: s
     for picture in film:
         begun = time.perf_counter()
         state = tracker.track(picture.grey, state)
-        verdict, pose = _known(state, wanted)
+        verdict, pose, lacks = _known(state, wanted)
         if pose is not None and body == "camera":
             pose = AT_REST.seen_from(pose)
-        yield TrackedRow(picture.time, verdict, pose, time.perf_counter() - begun)
+        yield TrackedRow(picture.time, verdict, pose, time.perf_counter() - begun, lacks)
 
 
 def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: float) -> Iterator[TrackedRow]:
@@ -73,10 +73,10 @@ def _at_its_time(picture: Named) -> Named:
     return picture if stamp is None else replace(picture, time=stamp)
 
 
-def _known(state: Tracked, wanted: list[str]) -> tuple[Verdict, Pose | None]:
+def _known(state: Tracked, wanted: list[str]) -> tuple[Verdict, Pose | None, str]:
     """The pose of the first target, beside the second if there are two; else what is known of the one that lacks."""
     for name in wanted:
         if name not in state.poses:
-            return state.verdicts[name], None
+            return state.verdicts[name], None, name
     pose, *others = (state.poses[name] for name in wanted)
-    return Verdict.GOOD, pose.seen_from(others[0]) if others else pose
+    return Verdict.GOOD, pose.seen_from(others[0]) if others else pose, ""

@@ -117,12 +117,16 @@ def _are_covariances(matrices: np.ndarray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class TrackedRow:
-    """One picture: its time [s], what is known of the body, its pose if that is certain, and what it took [s]."""
+    """One picture: its time [s], what is known of the body, its pose if that is certain, and what it took [s].
+
+    Where there is no pose, `lacks` names the target that the verdict is of.
+    """
 
     time: float
     verdict: Verdict
     pose: Pose | None
     seconds: float
+    lacks: str = ""
 
 
 def write_poses(path: Path, rows: Iterable[TrackedRow], tip: np.ndarray) -> None:

@@ -284,24 +284,25 @@ class Follower:
     def _band(
         self, reference: Pose, middle: np.ndarray, motion: Motion, shutter: float
     ) -> tuple[float, dict[str, float]]:
-        """How far off the tumour's `middle` (3,) [m] may be across the line of sight, and by what."""
+        """How far off the tumour's `middle` (3,) [m] may be across the line of sight, by what is known of it."""
         place, beside = self.registration.point(middle)
         at, tracked = reference.point(place)
         turned = reference.T_camera_target[:3, :3]
         registered = turned @ beside @ turned.T
-        camera = np.zeros((3, 3))
+        camera = None
         if self.intrinsic is not None and (self.elsewhere is None or self.elsewhere.eye is None):
             corners = patient_reference().faces[0].corners
             camera = calibration_error(self.tracker.camera, reference.T_camera_target, corners, place, self.intrinsic)
+        seen = tracked + registered + (0.0 if camera is None else camera)
         parts = {
             "tracking": across(tracked, at),
-            "camera": across(camera, at),
+            **({} if camera is None else {"camera": across(camera, at)}),
             "registration": across(registered, at),
             "tool": motion.tool,
             "model": motion.model,
             **({"shutter": shutter} if self.calibration.readout > 0.0 else {}),
         }
-        return float(np.linalg.norm([across(tracked + camera + registered, at), motion.error, shutter])), parts
+        return float(np.linalg.norm([across(seen, at), motion.error, shutter])), parts
 
 
 def wide_words(band: float) -> str:

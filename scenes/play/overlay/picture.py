@@ -24,7 +24,6 @@ from ..stage import CORTEX, PREDICTED_LINES, TOOL, TOOL_COLOUR, Stage
 from .follower import Known, State
 
 ABOVE = "the tool does not touch: as in the scan"
-NOT_KNOWN = "error by tissue and segmentation: not known"
 SEEN_THROUGH = Opening((CORTEX,), (), "seen through bone or drape")
 """Where the drape has its hole, the opening is; all else may be bone."""
 IN_GREY = (State.NO_TOOL, State.STALE, State.NO_REFERENCE)
@@ -138,4 +137,5 @@ def head_lines(known: Known) -> Sequence[str]:
     if known.relied:
         lines.append(f"tumour: within {bound_words(known.band, 1)} across the view (95 %), above all {largest}")
     motion = "; of motion: not known" if not known.motion.known else ""
-    return (*lines, f"{NOT_KNOWN}{motion}")
+    camera = "" if "camera" in known.parts else ", camera"
+    return (*lines, f"error by tissue{camera} and segmentation: not known{motion}")

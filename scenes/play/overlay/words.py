@@ -76,8 +76,9 @@ def overlay_error(known: Known) -> str:
         return "<p>Error of the overlay: not known.</p>"
     stated = [f"{name} {bound_words(length, 2)}" for name, length in known.parts.items() if length > 0.0]
     none = ", ".join(name for name, length in known.parts.items() if not length > 0.0)
+    camera = "" if "camera" in known.parts else " What the camera's calibration adds is not known."
     parts = ", ".join([*stated, *([f"none stated of {none}"] if none else [])])
     return (
         f"<p>Error of the overlay: 95 of 100 times the tumour is within {bound_words(known.band, 1)} of where it is "
-        f"drawn, across the view ({parts}).</p>"
+        f"drawn, across the view ({parts}).{camera}</p>"
     )

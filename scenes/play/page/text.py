@@ -242,7 +242,7 @@ def estimated(found: Estimate) -> list[str]:
     moved = unbroken(found.moved, found.location.p95)
     held = "inside" if found.held else "outside of"
     guess = f" {found.location.doubt}" if found.location.doubt else ""
-    still = "" if found.noticed else " No motion is seen beyond its error."
+    still = "" if found.noticed else " The estimate sees no motion beyond its error."
     return [
         f'<p class="number">tumour moved {moved} by the estimate ({truth})</p>',
         f"<p><b>estimate</b> from {escape(found.source)}: {1e3 * found.off:.1f} mm off the truth, which is {held} the "
