@@ -67,6 +67,15 @@ def test_the_page_fits_and_is_in_register(demo, window, size):
     assert window.errors == []
 
 
+def test_in_a_low_window_what_switches_physics_off_is_in_sight(demo, window):
+    """The fold stands above the 3-D view, with room for a verdict's five lines over it."""
+    window.size(1280, 720)
+    fold = "[...document.querySelectorAll('legend, span, div')].findLast(e => e.innerText?.startsWith('more: switch'))"
+    window.value(f"document.getElementById('{TABS[0][1]}').click()")
+    view = box_of(window, "document.querySelector('canvas')")
+    assert box_of(window, fold)[3] + 5 * 16 <= view[1]
+
+
 def test_keys_and_names(demo, window):
     """Keys step, choose and open their list; a slider keeps its own; whatever can be set has a name."""
     window.size(1280, 720)

@@ -282,6 +282,8 @@ def test_the_page_reads_what_the_frame_holds(theatre):
         assert line in said
     plain = report(replace(frame, distance_error=None), player.stage, "linear", "", (), 7)
     assert "tip to tumour 12.3&nbsp;mm<" in plain and "tip to tumour within" not in plain
+    within = report(replace(frame, inside=True), player.stage, "linear", "", (), 7)
+    assert ">tip inside the tumour, its edge 12.3&nbsp;mm<" in within and ">tip to tumour" not in within
     known = TumourError(4.61e-3, "E"), TumourError(4.61e-3, "E", 1.11e-3)
     prior, seen = (report(replace(frame, tumour_error=one), player.stage, "linear", "", (), 7) for one in known)
     where = "95 of 100 times no point of it is more than"

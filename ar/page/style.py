@@ -89,8 +89,10 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
   PARTS > div:has(> button) + div:has(.mantine-Slider-root) { grid-column: 1 / -1 }
 }
 @media (min-width: 75em) and (min-aspect-ratio: 13/10) and (max-height: 50em) {
-  :root { --low: max(20vh, 9rem) }
-  #SAID { font-size: 0.82rem; line-height: 1.3 }
+  :root { --low: max(17vh, 7.6rem) }
+  #SAID { font-size: 0.8rem; line-height: 1.24 }
+  #SAID p { margin-bottom: 0.15rem }
+  #SAID .number { font-size: 1.1rem }
 }
 @media (min-width: 36.01em) and (max-aspect-ratio: 13/10) {
   :root { --low: max(25vh, 9rem) }

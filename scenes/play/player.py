@@ -81,6 +81,8 @@ class Frame:
         From the tool's tip to the tumour's predicted surface [m]; None without a tool.
     distance_error
         How far that may be from what the finite elements say [m]; None where nobody knows.
+    inside
+        Whether the tip is in the tumour: the distance is then to the surface round it.
     moved
         Mean distance of the tumour's predicted surface from where the scan has it [m]; by an estimate, its middle's.
     model_error
@@ -116,6 +118,7 @@ class Frame:
     named: bool
     distance: float | None
     distance_error: float | None
+    inside: bool
     moved: float
     model_error: float | None
     tumour_error: TumourError
@@ -252,6 +255,7 @@ class Player:
             None if held is None else held.pose, None if held is None else held.tip, picture, over.colour, over.taken,
             over.named,
             None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
+            gauge is not None and gauge.inside,
             motion if moved is None else moved[0],
             promised, error, doubt, acting(loads, deformation, self.site.anatomy.mesh.nodes), tuple(head), remark, took,
             estimate,

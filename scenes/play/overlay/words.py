@@ -8,7 +8,7 @@ from ar.overlay.composite import DOUBTFUL
 from ar.overlay.gauge import Gauge
 from ar.overlay.hud import bound_words
 
-from ..page.text import RESEARCH, keyed, stroked, unbroken
+from ..page.text import RESEARCH, keyed, stroked, tip_words, unbroken
 from ..stage import TUMOUR_COLOUR
 from .follower import Known, State
 from .run import Shown
@@ -66,8 +66,7 @@ def distance_words(gauge: Gauge | None, relied: bool) -> str:
     """The distance from tip to tumour with its error, where there is one that may be relied on."""
     if gauge is None:
         return '<p class="number">tip to tumour: not known</p>'
-    inside = "tip inside the tumour, its edge" if gauge.inside else "tip to tumour"
-    return f'<p class="number">{inside} {unbroken(gauge.distance, gauge.error if relied else None)}</p>'
+    return tip_words(gauge.distance, gauge.error if relied else None, gauge.inside)
 
 
 def overlay_error(known: Known) -> str:

@@ -217,7 +217,7 @@ def report(
             f"tip to tumour within {hud.bound_words(frame.distance_error, 1)} of the model's finite elements (95 %)"
         ]
     off = None if frame.doubt else frame.tumour_error.bound
-    parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {unbroken(frame.distance, off)}</p>']
+    parts = [] if frame.distance is None else [tip_words(frame.distance, off, frame.inside)]
     number, *found = [""] if frame.estimate is None else estimated(frame.estimate)
     # A narrow window shows the first lines alone: both errors are among them.
     parts += [number, trust(frame.deformation, name), tumour_trust(frame.tumour_error), *found]
@@ -248,6 +248,12 @@ def estimated(found: Estimate) -> list[str]:
         f"<p><b>estimate</b> from {escape(found.source)}: {1e3 * found.off:.1f} mm off the truth, which is {held} the "
         f"ellipsoid. Causes: {found.location.named_causes}.{still}{guess}</p>",
     ]
+
+
+def tip_words(distance: float, error: float | None, inside: bool) -> str:
+    """The page's first line: from the tip to the tumour's surface, with its error [m], as HTML; None: not known."""
+    what = "tip inside the tumour, its edge" if inside else "tip to tumour"
+    return f'<p class="number">{what} {unbroken(distance, error)}</p>'
 
 
 def unbroken(length: float, error: float | None = None) -> str:
