@@ -51,10 +51,30 @@ def test_likeness_is_of_motion_over_error_and_of_the_number_of_points(evidence):
     assert likeness(shifted)[:2] == pytest.approx(np.log([3e-3 / 5e-4, 60.0]))
 
 
+def test_likeness_is_of_the_size_of_the_patch_however_many_points_lie_on_it(body, evidence):
+    """The same patch twice as wide is as far off for few points as for many; a patch of half the area is smaller."""
+    wide = replace(evidence, at=2.0 * evidence.at)
+    few, many = (likeness(wide.rows(np.arange(n))) - likeness(evidence.rows(np.arange(n))) for n in (60, 180))
+    assert few == pytest.approx(many) and few[2] > 1.0 and few[[0, 1, 3]] == pytest.approx(np.zeros(3))
+    still, sizes = np.zeros_like(body.mesh.nodes), []
+    for cover in (0.2, 0.4, 0.8):
+        sizes.append([likeness(seen_patch(body, still, np.random.default_rng(n), 60, cover))[2] for n in range(5)])
+    assert max(sizes[0]) < min(sizes[1]) and max(sizes[1]) < min(sizes[2])
+
+
+def test_trials_on_patches_of_its_size_say_how_far_a_covariance_grows(evidence):
+    small = replace(evidence, at=0.5 * evidence.at)
+    tried = np.concatenate(
+        [np.tile(np.append(likeness(of), square), (NEAREST, 1)) for of, square in ((evidence, 1.0), (small, 9.0))]
+    )
+    assert covering_factor(tried, small) == pytest.approx(9.0 * covering_factor(tried, evidence))
+
+
 def test_a_cloud_is_like_no_named_points(evidence):
     """One row a point, as clouds have, and three."""
     cloud = evidence.rows(np.arange(0, 180, 3))
-    assert likeness(cloud)[1] == likeness(evidence)[1] and likeness(cloud)[2] > 100.0 + likeness(evidence)[2]
+    assert np.array_equal(likeness(cloud)[1:3], likeness(evidence)[1:3])
+    assert likeness(cloud)[3] > 100.0 + likeness(evidence)[3]
     named, unnamed = (
         np.tile(np.append(likeness(of), square), (NEAREST, 1)) for of, square in ((evidence, 1.0), (cloud, 9.0))
     )
@@ -84,19 +104,21 @@ def test_the_factor_makes_ellipsoids_hold_in_95_of_100_trials(evidence, times):
     """Squares that are chi-square of three degrees, times a number, need just that number."""
     random = np.random.default_rng(1)
     squares = times * chi2.ppf((np.arange(NEAREST) + 0.5) / NEAREST, 3)
-    spread = 0.01 * random.standard_normal((NEAREST, 3)) * [1.0, 1.0, 0.0]
+    spread = 0.01 * random.standard_normal((NEAREST, 4)) * [1.0, 1.0, 1.0, 0.0]
     tried = np.column_stack([likeness(evidence) + spread, squares])
     assert covering_factor(tried, evidence) == pytest.approx(times, rel=0.12)
     # Trials that are unlike it do not count.
-    other = np.column_stack([likeness(evidence) + np.full((500, 3), 3.0), np.full(500, 1e3)])
+    other = np.column_stack([likeness(evidence) + np.full((500, 4), 3.0), np.full(500, 1e3)])
     assert covering_factor(np.concatenate([other, tried]), evidence) == covering_factor(tried, evidence)
 
 
 def test_what_was_never_tried_is_said(evidence):
-    around = likeness(evidence) + np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.0]])
+    around = likeness(evidence) + np.array([[-0.1, -0.1, -0.1, 0.0], [0.1, 0.1, 0.1, 0.0]])
     assert was_tried(np.column_stack([around, [1.0, 1.0]]), evidence)
-    assert not was_tried(np.column_stack([around + [0.2, 0.0, 0.0], [1.0, 1.0]]), evidence)
-    assert not was_tried(np.column_stack([around - [0.0, 0.2, 0.0], [1.0, 1.0]]), evidence)
+    assert not was_tried(np.column_stack([around + [0.2, 0.0, 0.0, 0.0], [1.0, 1.0]]), evidence)
+    assert not was_tried(np.column_stack([around - [0.0, 0.2, 0.0, 0.0], [1.0, 1.0]]), evidence)
+    for size in (-0.2, 0.2):
+        assert not was_tried(np.column_stack([around + [0.0, 0.0, size, 0.0], [1.0, 1.0]]), evidence)
 
 
 def test_the_tumours_middle_is_that_of_its_volume(body):

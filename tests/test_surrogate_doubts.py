@@ -3,6 +3,7 @@
 Of the template and the locator that ship.
 """
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,8 @@ from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.effects import SKULLS
+from sim.errors import InputError
+from surrogate.locating.calibration import seen_patch
 from surrogate.locating.cause_shares import cause_shares
 from surrogate.locating.causes import DRAINAGE, KINDS
 from surrogate.locating.locator_files import load_locator, locator_path
@@ -148,3 +151,25 @@ def test_causes_are_grouped_as_finely_as_their_shares_are_known():
     narrow = cause_shares(np.stack([first / 4.0, 1.0 - first / 4.0, 0.0 * first, 0.0 * first], axis=1))
     assert [each.causes for each in narrow] == [("drainage",), ("tool",)]
     assert narrow[1].low == pytest.approx(0.01, abs=0.003) and narrow[1].high == pytest.approx(0.19, abs=0.003)
+
+
+def test_a_locator_of_trials_without_the_size_of_patches_is_refused(locator, tmp_path):
+    """Its format says so, before its arrays are looked at."""
+    with np.load(locator_path(template_path())) as file:
+        arrays = {name: file[name] for name in file.files}
+    header = json.loads(str(arrays["header"])) | {"format": "sulcus locator 3"}
+    path = tmp_path / "old.npz"
+    np.savez(path, **arrays | {"header": np.array(json.dumps(header)), "tried": arrays["tried"][:, 1:]})
+    with pytest.raises(InputError, match="is no locator of this version: move it away, and `sulcus locate` makes it"):
+        load_locator(path, locator.anatomy)
+
+
+def test_points_on_a_few_millimetres_were_not_tried(locator, sunk):
+    """On all of the open cortex they were, and on a tenth of it, named or not."""
+    body = locator.anatomy
+    for cover, known in ((0.12, True), (0.9, True), (0.01, False)):
+        evidence = seen_patch(body, sunk, np.random.default_rng(3), 60, cover)
+        rest = evidence.at[::3]
+        now = rest + evidence.value.reshape(-1, 3)
+        for seen in (Observation(now, rest), Observation(now)):
+            assert locator.locate(seen).calibrated == known, cover

@@ -227,7 +227,7 @@ def test_covariances_grow_by_what_trials_ask_for(locator, body, truth):
     """Errors twice as large in trials make covariances four times as large, and the radius twice."""
     seen = observed(body, truth[0][0])
     found = locator.locate(seen)
-    wider = Locator(locator.prior, locator.tried * [1.0, 1.0, 1.0, 4.0]).locate(seen)
+    wider = Locator(locator.prior, locator.tried * [1.0, 1.0, 1.0, 1.0, 4.0]).locate(seen)
     assert wider.centroid == pytest.approx(found.centroid)
     assert wider.centroid_covariance == pytest.approx(4.0 * found.centroid_covariance)
     assert wider.p95 == pytest.approx(2.0 * found.p95)

@@ -27,13 +27,13 @@ RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
 """The squared radius of a Gaussian's ellipsoid of that probability, in deviations: of chi-squared of three numbers."""
 # Trials in all. So many of those most like an observation say how far its covariance must grow.
 TRIALS, NEAREST = 960, 120
-# What makes a cloud unlike all named points, in logarithms.
-UNLIKE = 1e3
+# What makes a cloud unlike all named points, in logarithms; and how much more than others that of the extent counts.
+UNLIKE, EXTENT = 1e3, 4.0
 # What moves the brain in a trial.
 ALONE = (TOOL, DRAINAGE, SWELLING)
 # Points of a trial, the share of the open cortex that they lie on, how much softer its tissue is than the ensemble's,
 # and errors as shares of the usual. Rigid errors along each axis [m], and how often there is none.
-POINTS, COVER, SOFTER, ERRORS = (20, 300), (0.2, 0.6), (0.7, 2.0), (0.05, 1.0)
+POINTS, COVER, SOFTER, ERRORS = (20, 300), (0.1, 1.0), (0.7, 2.0), (0.05, 1.0)
 SHIFTS, UNSHIFTED = (0.05e-3, 3e-3), 0.25
 # Of motion over error, so that its logarithm is finite.
 LITTLE = 1e-3
@@ -47,7 +47,7 @@ def trials(
     progress: Callable[[int, int], object] = lambda done, total: None,
     count: int = TRIALS,
 ) -> np.ndarray:
-    """What came of `count` trials (k, 4): `likeness` of each, and its error's square by its own covariance.
+    """What came of `count` trials (k, 5): `likeness` of each, and its error's square by its own covariance.
 
     Groups are left out in turn, so that a trial's tissue, tumour and directions are unknown to its estimator. A motion
     in three is two causes' together. Rigid errors are as large as is stated, from none to 3 mm. In half of them the
@@ -98,19 +98,24 @@ def covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
 def was_tried(tried: np.ndarray, evidence: Evidence) -> bool:
     """Whether such an observation lies within the range of the trials."""
     own = likeness(evidence)
-    alike = tried[tried[:, 2] == own[2], :3]
+    alike = tried[tried[:, -2] == own[-1], :-1]
     return bool(len(alike) and (own >= alike.min(axis=0)).all() and (own <= alike.max(axis=0)).all())
 
 
 def likeness(evidence: Evidence) -> np.ndarray:
-    """Logarithms of the seen motion over its error, the rigid one too, and of the number of points; and 0, or `UNLIKE`.
+    """What trials are compared by (4,): three logarithms, then 0, or `UNLIKE` for a cloud.
 
-    The last of the (3,) tells named points, of which each gives three numbers, from clouds.
+    They are of the seen motion over its error, the rigid one too, of the number of points, and of how large the seen
+    patch is. That is their root mean square distance [m] from their middle, which counts `EXTENT` times. Of named
+    points each gives three numbers, of a cloud one.
     """
-    count = len(np.unique(evidence.point))
+    first = np.unique(evidence.point, return_index=True)[1]
+    count, at = len(first), evidence.at[first]
     seen = np.sqrt((evidence.value**2).sum() / count)
     ratio = max(seen / np.hypot(np.median(evidence.sigma), evidence.shift), LITTLE)
-    return np.append(np.log([ratio, count]), UNLIKE * (len(evidence) < 2 * count))
+    extent = np.sqrt(((at - at.mean(axis=0)) ** 2).sum(axis=1).mean())
+    logs = np.log([ratio, count, extent]) * [1.0, 1.0, EXTENT]
+    return np.append(logs, UNLIKE * (len(evidence) < 2 * count))
 
 
 def _trial(

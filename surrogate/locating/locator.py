@@ -168,8 +168,8 @@ class Location:
             )
         if not self.calibrated:
             return (
-                "It is a guess: ellipsoids were not tried on so few or many points, or motions so near or far above "
-                "errors."
+                "It is a guess: ellipsoids were not tried on so few or many points, so small or large a patch, or "
+                "motions so near or far above errors."
             )
         return ""
 
@@ -215,7 +215,7 @@ class Locator:
     prior
         What is believed of motions before they are seen.
     tried
-        (k, 4): what came of trials (`calibration.trials`).
+        (k, 5): what came of trials (`calibration.trials`).
     regions
         Those whose stiffness was known.
     """

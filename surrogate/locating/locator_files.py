@@ -22,7 +22,7 @@ from .locator import Locator
 from .prior import NOWHERE, Prior
 from .regions import Region, check_regions
 
-FORMAT = "sulcus locator 3"
+FORMAT = "sulcus locator 4"
 LABELS = ("kind", "skull", "place")
 ARRAYS = ("shape", *LABELS, "centre")
 
@@ -86,7 +86,7 @@ def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) ->
     shape, tried, every = arrays["shape"], arrays["tried"], np.arange(len(anatomy.mesh.nodes))
     nodes = arrays.get("nodes", every)
     fits = nodes.dtype.kind == "i" and np.array_equal(nodes, np.intersect1d(nodes, every))
-    fits = fits and shape.ndim == 3 and shape.shape[1:] == (len(nodes), 3) and tried.ndim == 2 and tried.shape[1] == 4
+    fits = fits and shape.ndim == 3 and shape.shape[1:] == (len(nodes), 3) and tried.ndim == 2 and tried.shape[1] == 5
     fits = fits and all(arrays[name].shape == (len(shape),) for name in LABELS) and len(shape) and len(tried)
     fits = fits and arrays["centre"].ndim == 2 and arrays["centre"].shape[1] == 3
     limits = ((0, len(KINDS)), (0, len(SKULLS)), (NOWHERE, len(arrays["centre"])))
