@@ -63,7 +63,7 @@ def locator(body):
     shape = np.einsum("nivj,ni->nvj", kelvinlets(nodes, source, 25e-3), force)
     shape *= 1e-3 / np.sqrt((shape**2).sum(axis=2).mean(axis=1))[:, None, None]
     prior = Prior(body, shape.astype(np.float32), *np.array(labels).T, centre=np.zeros((2, 3)))
-    return Locator(prior, np.tile([[0.0, 3.0, 0.0, 3.0], [3.0, 6.0, 0.0, 3.0]], (20, 1)))
+    return Locator(prior, np.tile([[0.0, 3.0, -20.0, 0.0, 3.0], [3.0, 6.0, -10.0, 0.0, 3.0]], (20, 1)))
 
 
 def some_motion(locator, number):

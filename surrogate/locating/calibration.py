@@ -96,10 +96,11 @@ def covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
 
 
 def was_tried(tried: np.ndarray, evidence: Evidence) -> bool:
-    """Whether such an observation lies within the range of the trials."""
+    """Whether such an observation lies within the range of the trials. They have the largest patch that there is."""
     own = likeness(evidence)
     alike = tried[tried[:, -2] == own[-1], :-1]
-    return bool(len(alike) and (own >= alike.min(axis=0)).all() and (own <= alike.max(axis=0)).all())
+    within = len(alike) and (own >= alike.min(axis=0)).all()
+    return bool(within and (own[[0, 1, 3]] <= alike[:, [0, 1, 3]].max(axis=0)).all())
 
 
 def likeness(evidence: Evidence) -> np.ndarray:

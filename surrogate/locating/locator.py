@@ -168,7 +168,7 @@ class Location:
             )
         if not self.calibrated:
             return (
-                "It is a guess: ellipsoids were not tried on so few or many points, so small or large a patch, or "
+                "It is a guess: ellipsoids were not tried on so few or many points, so small a patch, or "
                 "motions so near or far above errors."
             )
         return ""
