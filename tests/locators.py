@@ -50,4 +50,4 @@ def locator_of(body: Anatomy, solved: bool = False) -> Locator:
         found = pressed(body, ("bonded",), "cpu")
         presses = replace(found, motion=dict.fromkeys(presses.motion, found.motion["bonded"]))
     with one_thread():
-        return Locator(prior_of(ensemble, presses), trials(ensemble, presses, count=160))
+        return Locator(prior_of(ensemble, presses), trials(ensemble, presses, count=240))
