@@ -130,6 +130,16 @@ def test_a_twist_that_no_fixed_point_inverts_is_inverted():
     assert np.abs(found + grid.read(field, points + found)).max() < 2e-6
 
 
+def test_a_body_that_is_turned_inside_out_is_unfolded_too():
+    """Moves from there alone end in a minimum that still folds."""
+    x, y, z = np.indices((14, 14, 14)) - 6.5
+    core = np.exp(-(x**2 + y**2 + z**2) / 6.0)
+    field = np.stack([-4e-3 * x * core, 0.0 * y, 0.0 * z]).astype(np.float32)
+    assert jacobians(field, 1e-3).min() < -2.0
+    inside = np.ones(field.shape[1:], bool)
+    assert unfold(field, inside, ~inside, 1e-3) == jacobians(field, 1e-3).min() > 0.0
+
+
 def test_folds_are_undone_outside_a_body_first():
     rng = np.random.default_rng(1)
     field = np.zeros((3, 20, 20, 20), np.float32)

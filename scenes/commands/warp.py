@@ -91,6 +91,7 @@ def run(args: argparse.Namespace) -> int:
     from ..warp.export import Asked, write_warp
     from ..warp.images import read_picture
     from ..warp.output_folder import claimed_warp
+    from ..warp.spacing import steps_of
 
     demand_options(args)
     if args.scene is not None:
@@ -104,8 +105,9 @@ def run(args: argparse.Namespace) -> int:
             print(f"{picture.path}: {warning}", file=sys.stderr)
     moment, sequence = moments(args, theatre, scene)
     source = (args.anatomy or template_path()).name
-    with tqdm(total=3 + len(pictures) + bool(sequence), unit="part", desc="fields, files", file=sys.stderr) as bar:
-        spacing = None if args.spacing is None else 1e-3 * args.spacing
+    spacing = None if args.spacing is None else 1e-3 * args.spacing
+    total = steps_of(spacing) + 2 + len(pictures) + bool(sequence)
+    with tqdm(total=total, unit="part", desc="fields, files", file=sys.stderr) as bar:
         asked = Asked(spacing, args.interpolation, source, bar.update)
         report = write_warp(out, moment, pictures, asked, sequence)
     for warning in report["warnings"]:

@@ -66,7 +66,6 @@ def write_warp(
     begun = process_time()
     fields = fields_of(moment, asked.spacing, asked.step)
     seconds = process_time() - begun
-    asked.step(1)
     with written_warp(folder) as place:
         write_field_nifti(place / "field_resampling.nii.gz", fields.grid, fields.backward)
         write_field_nrrd(place / "field_modeling.nrrd", fields.grid, fields.forward, "modeling")

@@ -23,8 +23,15 @@ MOST, MOST_ASKED = 32_000_000, 96_000_000
 STEP, SPARE, TIMES = 0.05e-3, 0.95, 3
 
 
+def steps_of(spacing: float | None) -> int:
+    """How many steps `fields_of` takes: two fields, as often as a spacing is tried."""
+    return 2 * (1 + (TIMES if spacing is None else 0))
+
+
 def fields_of(moment: Moment, spacing: float | None, step: Callable[[int], object]) -> WarpFields:
     """The fields of a moment at a spacing [m]; None: at 1 mm, or finer where tumour or landmarks are off by more.
+
+    `step` hears of how many more of `steps_of` are done.
 
     Raises
     ------
@@ -36,13 +43,11 @@ def fields_of(moment: Moment, spacing: float | None, step: Callable[[int], objec
             f"--spacing {1e3 * spacing:g}: the fields would have {nodes / 1e6:.0f} million nodes, and "
             f"{MOST_ASKED / 1e6:.0f} million are the most. Give a larger one."
         )
-    fields = _fields(moment, spacing or FIRST)
-    for _ in range(TIMES if spacing is None else 0):
-        finer = finer_spacing(moment, fields)
-        if finer is None:
-            break
-        step(0)
-        fields = _fields(moment, finer)
+    left = steps_of(spacing) - 2
+    fields = _fields(moment, spacing or FIRST, step)
+    while left and (finer := finer_spacing(moment, fields)) is not None:
+        fields, left = _fields(moment, finer, step), left - 2
+    step(left)
     return fields
 
 
@@ -63,5 +68,5 @@ def _nodes(moment: Moment, spacing: float) -> float:
     return float(np.prod(warp_grid(moment.anatomy, moment.displacement[None], spacing).shape, dtype=float))
 
 
-def _fields(moment: Moment, spacing: float) -> WarpFields:
-    return warp_fields(moment.anatomy, moment.displacement, spacing, moment.left)
+def _fields(moment: Moment, spacing: float, step: Callable[[int], object]) -> WarpFields:
+    return warp_fields(moment.anatomy, moment.displacement, spacing, moment.left, lambda: step(1))

@@ -6,10 +6,14 @@ import numpy as np
 from scipy import ndimage
 from scipy.optimize import minimize
 
+from .extension import smooth
+
 # Cells so much compressed or worse are mended, until they have so much of their volume.
 TIGHT, WANTED = 0.05, 0.15
 # Nodes so near to such a cell may move; so often it is tried, in so many steps each.
 ROUND, TIMES, STEPS = 2, 12, 200
+# From this turn on folds are smoothed so often first: a minimum was found in which they stay.
+STUCK, SWEEPS = 4, 3
 # A move of one node by one spacing costs as much as so much lost volume of one cell: of a body, its collar, beyond.
 STIFF, COLLAR, SOFT = 1.0, 0.1, 1e-4
 # A cell whose edges change by less has no corner that folds.
@@ -73,7 +77,8 @@ def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: f
 
     Nodes of the collar round it (I, J, K) come before those inside, and after all others: between these and the body
     lies its surface. What corners of cells lack in volume is made small, in squares. So do Escobar et al. with meshes
-    (Simultaneous untangling and smoothing of tetrahedral meshes, 2003). Returns the least determinant that is left.
+    (Simultaneous untangling and smoothing of tetrahedral meshes, 2003). Folds that stay are smoothed, and tried again:
+    there the body itself may fold. Returns the least determinant that is left.
     """
     found = jacobians(field, spacing)
     for turn in range(TIMES):
@@ -86,7 +91,10 @@ def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: f
         for where in ndimage.find_objects(labels):
             window = tuple(slice(each.start, each.stop + 1) for each in where)
             part = field[(slice(None), *window)]
-            near = ndimage.maximum_filter(np.pad(bad[where], [(0, 1)] * 3), 2 * grown + 2)
+            nodes = np.pad(bad[where], [(0, 1)] * 3)
+            near = ndimage.maximum_filter(nodes, 2 * grown + 2)
+            if turn >= STUCK:
+                smooth(part, ndimage.maximum_filter(nodes, 2 * turn + 2), SWEEPS)
             stiff = np.where(inside[window], STIFF, np.where(collar[window], COLLAR, SOFT))
             _mend(part, near, stiff, spacing)
             found[where] = jacobians(part, spacing)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,16 +127,25 @@ def backward_on(grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np
     return field, unfold(field, inside, collar, grid.spacing)
 
 
-def warp_fields(anatomy: Anatomy, displacement: np.ndarray, spacing: float, left: Anatomy | None = None) -> WarpFields:
+def warp_fields(
+    anatomy: Anatomy,
+    displacement: np.ndarray,
+    spacing: float,
+    left: Anatomy | None = None,
+    made: Callable[[], object] = lambda: None,
+) -> WarpFields:
     """The fields of a displacement (V, 3) [m] on a grid of a spacing [m].
 
-    `left` is what is left of a body that was cut. Round a body nothing is known: there the fields fade.
+    `left` is what is left of a body that was cut. Round a body nothing is known: there the fields fade. `made` is
+    called when either field is made.
     """
     displacement = faded(displacement)
     body, grid = left or anatomy, warp_grid(anatomy, displacement[None], spacing)
     mesh = body.mesh
     forward, least_forward = forward_on(grid, body, displacement)
+    made()
     backward, least_backward = backward_on(grid, body, displacement, forward)
+    made()
     share = float((signed_volumes(mesh.nodes + displacement, mesh.tets) / mesh.volumes).min())
     gone = np.zeros(grid.shape, bool)
     if len(mesh.tets) < len(anatomy.mesh.tets):
