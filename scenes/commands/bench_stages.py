@@ -34,8 +34,8 @@ def run(args: argparse.Namespace) -> int:
     from ..script.scene import SCENES, find_scene
 
     at_least("--batch", args.batch, 1)
-    theatre = theatre_asked(args, args.scene)
     try:
+        theatre = theatre_asked(args, args.scene)
         scene = scene_asked(args, args.scene, theatre)
     except InputError as error:
         raise InputError(f"{error} What else is measured has a word of its own: `sulcus bench --help`.") from error
