@@ -106,6 +106,11 @@ def pose_of(
     return Verdict.GOOD, Pose(best, variance * _inverse_normal(camera, best, corners.points), residual, count)
 
 
+def squares_of(camera: Camera, target: Target, corners: Corners) -> float:
+    """The least sum of squared distances [pixel^2] of a target's corners, of all its poses; inf where none fits."""
+    return min((squares for _, squares in _fits(camera, target, corners)), default=np.inf)
+
+
 def _fits(camera: Camera, target: Target, corners: Corners) -> list[tuple[np.ndarray, float]]:
     """Poses (4, 4) that may be, and their squared distances of all corners [pixel^2]."""
     out = []

@@ -27,8 +27,8 @@ from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument
 from .tracked_scene import REST, mover, tracked_scene
 
 UNSTATED = (
-    "{} states no covariance of the camera: the error has no part of its calibration in it. A wrong camera is then not "
-    "noticed. Calibrate yours by `sulcus calibrate`."
+    "{} states no covariance of the camera: the error has no part of its calibration in it. Calibrate yours by `sulcus "
+    "calibrate`."
 )
 
 if TYPE_CHECKING:
@@ -227,6 +227,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     from ..play.overlay.picture import Painter
     from ..play.overlay.tool_motion import ToolMotion
     from ..script.calibration_file import read_calibration, read_intrinsic_covariance
+    from ..script.film_camera import demand_focal_length
     from ..script.registration_file import other_mesh, read_registration
     from ..script.tracked_tool import read_tool
 
@@ -241,6 +242,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
         print(f"sulcus overlay: {UNSTATED.format(Path(args.camera).with_suffix('.json'))}", file=sys.stderr)
     if film:
         _demand_film(args, calibration)
+        demand_focal_length(Path(args.pictures), args.rate, calibration, args.camera)
     tool = None if args.tool is None else read_tool(args.tool)
     elsewhere = elsewhere_of(args, calibration)
     theatre = open_theatre(args.anatomy, args.model, args.device)

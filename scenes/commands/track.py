@@ -46,12 +46,13 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        Pictures or a camera that cannot be read, pictures of another size than the camera's, a rate that is not above
-        0, a body in its own frame.
+        Pictures or a camera that cannot be read; pictures of another size or focal length than the camera's. A rate
+        that is not above 0, a body in its own frame.
     """
     from ar.tracking.targets import TIP
 
     from ..script.calibration_file import read_calibration
+    from ..script.film_camera import demand_focal_length
     from ..script.followed import followed
     from ..script.pose_file import write_poses
 
@@ -65,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--tip has a number that is not finite: give three numbers in millimetres.")
     calibration, begun = read_calibration(args.camera), time.perf_counter()
     rows = list(followed(args.pictures, calibration, args.body, args.frame, args.rate))
+    demand_focal_length(args.pictures, args.rate, calibration, args.camera)
     seconds = time.perf_counter() - begun
     write_poses(out, rows, tip)
     good = sum(row.pose is not None for row in rows)
