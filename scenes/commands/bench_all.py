@@ -127,8 +127,8 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
             bar.set_description(name)
             before = found.get(name)
             entry = found[name] = entry_of(NAMED[name], run, before, heard)
-            heard(f"{name}: {'kept' if entry is before else entry.state}{entry.reason and ': '}{entry.reason}")
             write_record(out, record_of(run.origin("auto"), list(found.values())))
+            heard(f"{name}: {'kept' if entry is before else entry.state}{entry.reason and ': '}{entry.reason}")
             bar.update()
     return read_record(out)
 

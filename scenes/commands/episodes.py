@@ -172,8 +172,8 @@ def _progress(out: Path, there: Tally, total: int, stop_if_asked: Callable[[], N
 
         def heard(kind: str, outcome: Outcome | None, workers: int) -> None:
             nonlocal done
-            stop_if_asked()
             if outcome is None:
+                stop_if_asked()
                 bar.set_description(
                     f"{workers} workers" if workers else "waits for workers", refresh=sys.stderr.isatty()
                 )

@@ -26,11 +26,6 @@ from .style_option import add_style
 from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments
 from .tracked_scene import REST, mover, tracked_scene
 
-UNSTATED = (
-    "{} states no covariance of the camera: the error has no part of its calibration in it. Calibrate yours by `sulcus "
-    "calibrate`."
-)
-
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
 
@@ -43,6 +38,10 @@ FILMS = (".mp4", ".gif", ".webp")
 TABLE = "a table of `sulcus overlay`"
 # Only this machine reaches the page.
 HOST = "127.0.0.1"
+UNSTATED = (
+    "{} states no covariance of the camera: the error has no part of its calibration in it. Calibrate yours by `sulcus "
+    "calibrate`."
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -207,11 +206,14 @@ def _demand_film(args: argparse.Namespace, calibration: Calibration) -> None:
     from ar.tracking.pictures import GIVE, film_of
     from ar.tracking.track import demand_picture
 
+    from ..script.film_camera import demand_focal_length
+
     try:
         first = next(iter(film_of(Path(args.pictures), args.rate)), None)
         if first is None:
             raise InputError(f"{args.pictures}: holds no picture. {GIVE}")
         demand_picture(first.grey, calibration.width, calibration.height)
+        demand_focal_length(Path(args.pictures), args.rate, calibration, args.camera)
     except ValueError as error:
         raise InputError(str(error)) from error
 
@@ -227,7 +229,6 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     from ..play.overlay.picture import Painter
     from ..play.overlay.tool_motion import ToolMotion
     from ..script.calibration_file import read_calibration, read_intrinsic_covariance
-    from ..script.film_camera import demand_focal_length
     from ..script.registration_file import other_mesh, read_registration
     from ..script.tracked_tool import read_tool
 
@@ -242,7 +243,6 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
         print(f"sulcus overlay: {UNSTATED.format(Path(args.camera).with_suffix('.json'))}", file=sys.stderr)
     if film:
         _demand_film(args, calibration)
-        demand_focal_length(Path(args.pictures), args.rate, calibration, args.camera)
     tool = None if args.tool is None else read_tool(args.tool)
     elsewhere = elsewhere_of(args, calibration)
     theatre = open_theatre(args.anatomy, args.model, args.device)

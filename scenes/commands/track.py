@@ -66,8 +66,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--tip has a number that is not finite: give three numbers in millimetres.")
     calibration, begun = read_calibration(args.camera), time.perf_counter()
     rows = list(followed(args.pictures, calibration, args.body, args.frame, args.rate))
-    demand_focal_length(args.pictures, args.rate, calibration, args.camera)
     seconds = time.perf_counter() - begun
+    demand_focal_length(args.pictures, args.rate, calibration, args.camera)
     write_poses(out, rows, tip)
     good = sum(row.pose is not None for row in rows)
     middle = 1e3 * float(np.median([row.seconds for row in rows]))

@@ -188,11 +188,12 @@ def _inside(
     inside = tumour & solid
     if not inside.any():
         raise InputError(f"{name}: the tumour lies outside the brain. Check the labels given as brain and as tumour.")
-    whole, lost = int(tumour.sum()), int((tumour & ~solid).sum())
-    if 2 * lost > whole:
+    outside = tumour & ~solid
+    if 2 * outside.sum() > tumour.sum():
         raise InputError(
-            f"{name}: {lost * voxel * 1e6:.3g} of {whole * voxel * 1e6:.3g} ml of the tumour lie outside the brain, "
-            "without touching it. Say what is round it, such as oedema or necrosis: --brain takes several labels."
+            f"{name}: {outside.sum() * voxel * 1e6:.3g} of {tumour.sum() * voxel * 1e6:.3g} ml of the tumour lie "
+            "outside the brain, without touching it. Say what is round it, such as oedema or necrosis: --brain takes "
+            "several labels."
         )
     component, count = cast(tuple[np.ndarray, int], ndimage.label(inside, np.ones((3, 3, 3))))
     size = np.bincount(component.ravel(), minlength=count + 1)
@@ -205,7 +206,7 @@ def _inside(
             "show its shape. Resample the volume more finely, or check the labels."
         )
     result = kept[component]
-    for lost, where in ((tumour & ~solid, "outside the brain"), (inside & ~result, "in specks")):
+    for lost, where in ((outside, "outside the brain"), (inside & ~result, "in specks")):
         if lost.any():
             notes.append(f"left out {lost.sum() * voxel * 1e6:.2g} ml of tumour {where}")
     return result

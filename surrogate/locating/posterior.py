@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, logsumexp
 
 from .causes import TOOL
 from .elimination import Equations
@@ -132,6 +132,13 @@ class SeenPrior:
         """As that of a `Posterior`."""
         best = self.logs.max(axis=1)
         return COARSENED * float(best[self._slips].max() - best[~self._slips].max())
+
+    @property
+    def moving(self) -> float:
+        """Logarithm of the mean evidence of motions under a registration that is no more off than is stated."""
+        logs = COARSENED * self.logs[~self._slips]
+        logs, rows = logs[np.isfinite(logs)], self.rows
+        return float(logsumexp(logs) - np.log(len(logs)) - 0.5 * rows.products[-1, -1] + rows.whitening.logarithm)
 
     @property
     def _slips(self) -> np.ndarray:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import chdtrc, logsumexp
+from scipy.special import chdtrc
 
 from .evidence import Evidence
-from .posterior import COARSENED, seen_prior
+from .posterior import seen_prior
 from .prior import Prior
 
 # So improbable by errors alone is what is seen where something moved, by each of three tests.
@@ -24,19 +24,11 @@ def within_errors(prior: Prior, evidence: Evidence) -> bool:
     whitening, scale = evidence.whitening(0.0), evidence.rigid_scale
     rigid, white = whitening.white(evidence.rigid * scale), whitening.white(evidence.value)
     precision, gain = rigid.T @ rigid, rigid.T @ white
+    whole = np.eye(6) + precision
     found = np.linalg.lstsq(precision, gain, rcond=None)[0]
-    together = found @ np.linalg.solve(np.eye(6) + precision, precision @ found)
+    together = found @ np.linalg.solve(whole, precision @ found)
     rest = ((white - rigid @ found) ** 2).sum()
     if min(chdtrc(6, together), chdtrc(len(white) - 6, rest)) <= MOVED:
         return False
-    whole = np.eye(6) + precision
     still = 0.5 * (gain @ np.linalg.solve(whole, gain) - np.linalg.slogdet(whole)[1] - white @ white)
-    return bool(_moving(prior, evidence) - still - whitening.logarithm < -np.log(MOVED))
-
-
-def _moving(prior: Prior, evidence: Evidence) -> float:
-    """Logarithm of the mean evidence of motions under a registration that is no more off than is stated."""
-    seen = seen_prior(prior, evidence)
-    rows, logs = seen.rows, COARSENED * seen.logs[np.isfinite([some.rigid for some in prior.hypotheses])]
-    logs = logs[np.isfinite(logs)]
-    return float(logsumexp(logs) - np.log(len(logs)) - 0.5 * rows.products[-1, -1] + rows.whitening.logarithm)
+    return bool(seen_prior(prior, evidence).moving - still - whitening.logarithm < -np.log(MOVED))
