@@ -41,8 +41,8 @@ def dent(body: Anatomy, random: np.random.Generator) -> np.ndarray:
 def locator_of(body: Anatomy, solved: bool = False) -> Locator:
     """Of dents: each cause in each skull, and tools on every place. What tools do may be solved."""
     random = np.random.default_rng(0)
-    members, count = np.array([dent(body, random) for _ in range(48)], np.float32), np.arange(48)
-    ensemble = Ensemble(body, members, count % 4, count // 4 % 3, count // 12)
+    members, count = np.array([dent(body, random) for _ in range(60)], np.float32), np.arange(60)
+    ensemble = Ensemble(body, members, count % 5, count // 5 % 3, count // 15)
     points = body.mesh.nodes[np.unique(body.open_surface)]
     dents = np.array([[dent(body, random) for _ in range(3)] for _ in points], np.float32)[None]
     presses = Presses(points, {"bonded": dents, "slide": dents})

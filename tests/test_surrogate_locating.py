@@ -24,6 +24,9 @@ FEW = Causes(
     levels=(0.6, 0.3),
     swellings=(0.04, 0.02, -0.02),
     tumour_swellings=(0.2, -0.1),
+    oedema=(0.1,),
+    reach=(8e-3, 16e-3),
+    reaches=(1, 1),
 )
 
 

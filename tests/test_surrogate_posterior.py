@@ -11,7 +11,7 @@ from sim.geometry.locate import Located
 from surrogate.locating.causes import DRAINAGE, SWELLING, TOOL, TUMOUR_SWELLING
 from surrogate.locating.evidence import SHIFT, SIGMA, SLIPPED, TURN, of_motions
 from surrogate.locating.posterior import COARSENED, MIXED, SeenPrior, conditioned, seen_prior
-from surrogate.locating.prior import NOWHERE, RIGIDS, SETS, WITH_PLACE, Prior
+from surrogate.locating.prior import BESIDE, NOWHERE, RIGIDS, SETS, WITH_PLACE, Prior
 from surrogate.locating.whitened import whitened
 
 POINTS = 30
@@ -21,7 +21,7 @@ POINTS = 30
 def prior():
     """Smooth random motions of a box as shapes of every cause in three skulls, and of tools on two places."""
     random, box = np.random.default_rng(0), make_box()
-    labels = [(kind, skull, NOWHERE) for kind in (DRAINAGE, SWELLING, TUMOUR_SWELLING) for skull in range(3)]
+    labels = [(kind, skull, NOWHERE) for kind in BESIDE for skull in range(3)]
     labels += [(TOOL, skull, place) for skull in range(2) for place in (NOWHERE, 0, 1)]
     kind, skull, place = np.repeat(np.array(labels), 3, axis=0).T
     wave = random.normal(scale=60.0, size=(len(kind), 3))

@@ -12,7 +12,7 @@ from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.geometry.locate import Located
 
-from .causes import DRAINAGE, SWELLING, TOOL
+from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL
 from .ensemble import Ensemble, surface_size
 from .evidence import SIGMA, Evidence, of_motions
 from .observation import Observation
@@ -30,10 +30,10 @@ TRIALS, NEAREST = 960, 120
 # What makes a cloud unlike all named points, in logarithms; and how much more than others that of the extent counts.
 UNLIKE, EXTENT = 1e3, 4.0
 # What moves the brain in a trial.
-ALONE = (TOOL, DRAINAGE, SWELLING)
+ALONE = (TOOL, DRAINAGE, SWELLING, OEDEMA)
 # Points of a trial, the share of the open cortex that they lie on, how much softer its tissue is than the ensemble's,
 # and errors as shares of the usual. Rigid errors along each axis [m], and how often there is none.
-POINTS, COVER, SOFTER, ERRORS = (20, 300), (0.1, 1.0), (0.7, 2.0), (0.05, 1.0)
+POINTS, COVER, SOFTER, ERRORS = (20, 400), (0.1, 1.0), (0.7, 2.0), (0.05, 1.0)
 SHIFTS, UNSHIFTED = (0.05e-3, 3e-3), 0.25
 # Of motion over error, so that its logarithm is finite.
 LITTLE = 1e-3
@@ -116,7 +116,7 @@ def likeness(evidence: Evidence) -> np.ndarray:
     ratio = max(seen / np.hypot(np.median(evidence.sigma), evidence.shift), LITTLE)
     extent = np.sqrt(((at - at.mean(axis=0)) ** 2).sum(axis=1).mean())
     logs = np.log([ratio, count, extent]) * [1.0, 1.0, EXTENT]
-    return np.append(logs, UNLIKE * (len(evidence) < 2 * count))
+    return np.append(logs, UNLIKE * (not evidence.named))
 
 
 def _trial(

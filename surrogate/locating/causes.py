@@ -16,9 +16,9 @@ from sim.material import Material, Ogden
 from ..data.tool_loads import draw
 from .regions import Region, beside
 
-KINDS = ("tool", "drainage", "swelling", "tumour swelling")
+KINDS = ("tool", "drainage", "swelling", "tumour swelling", "oedema")
 """The causes of an ensemble, by name."""
-TOOL, DRAINAGE, SWELLING, TUMOUR_SWELLING = range(len(KINDS))
+TOOL, DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA = range(len(KINDS))
 # Swelling is one rising wave, and another that does nothing.
 RISE = Wave(0.25, 0.0)
 
@@ -45,8 +45,12 @@ class Causes:
         Shares of the fluid that are left, one after the other, in each drainage.
     cone
         Greatest angle [rad] between gravity and the open cortex's inward axis: surgeons turn the opening up.
-    swellings, tumour_swellings
-        Changes of the brain's volume in each group, and of the tumour's alone.
+    swellings, tumour_swellings, oedema
+        Changes of volume in each group: of the brain's, of the tumour's alone, and of the brain's round the tumour.
+    reach
+        Least and greatest distance [m] from the tumour that oedema has, log-uniform.
+    reaches
+        Such distances in one group; of a skull that lets go, as of tools.
     regions
         Those whose stiffness is known: it is no draw.
     """
@@ -61,6 +65,9 @@ class Causes:
     cone: float = np.radians(60.0)
     swellings: tuple[float, ...] = (0.06, 0.04, 0.02, -0.02, -0.04)
     tumour_swellings: tuple[float, ...] = (0.2, -0.15)
+    oedema: tuple[float, ...] = (0.2, -0.1)
+    reach: tuple[float, float] = (8e-3, 40e-3)
+    reaches: tuple[int, int] = (2, 1)
     regions: tuple[Region, ...] = ()
 
 
@@ -94,6 +101,8 @@ class Group:
         Of the brain; tumour stiffness over the brain's; -m of Ogden's law, by which both stiffen.
     regions
         Others whose stiffness is known.
+    reach
+        How far [m] from the tumour oedema reaches, in turn.
     """
 
     number: int
@@ -102,6 +111,7 @@ class Group:
     ratio: float
     exponent: float
     regions: tuple[Region, ...] = ()
+    reach: tuple[float, ...] = ()
 
     def effects(self, swelling: tuple[float, ...], regions: tuple[int, ...] | None = None) -> tuple[Effect, ...]:
         """What its finite elements are made of, if these regions (None: all) swell by at most such shares."""
@@ -118,15 +128,18 @@ class Group:
 def groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Group, ...]:
     """Groups with each skull and each Poisson's ratio; skulls only where the anatomy has one.
 
-    Each skull has soft and stiff tumours, and tissue that stiffens little and much: a group in every part of the range.
+    Each skull has soft and stiff tumours, tissue that stiffens little and much, and oedema that reaches near and far:
+    a group in every part of each range.
     """
     made: list[Group] = []
     for number, skull in enumerate(SKULLS if anatomy.slide_normal.any() else ()):
         some = [poisson for poisson in causes.poisson if skull != LETS_GO or poisson <= causes.poisson_let_go]
         random = np.random.default_rng([seed, number])
         ratio, exponent = (_all_over(random, len(some), limits) for limits in (causes.stiffness, causes.exponent))
-        drawn = enumerate(zip(some, ratio, exponent, strict=True))
-        made += [Group(len(made) + n, skull, *each, causes.regions) for n, each in drawn]
+        count = causes.reaches[skull == LETS_GO]
+        reach = np.reshape(_all_over(random, count * len(some), causes.reach), (len(some), count)).tolist()
+        for *tissue, distances in zip(some, ratio, exponent, reach, strict=True):
+            made.append(Group(len(made), skull, *tissue, causes.regions, tuple(distances)))
     return tuple(made)
 
 

@@ -42,7 +42,7 @@ class Equations:
         block, rows = self.table[..., chosen[:, None], chosen], self.table[..., chosen[:, None], kept]
         solved = np.linalg.inv(block) @ rows
         table = self.table[..., left[:, None], kept] - rows[..., : len(left)].swapaxes(-1, -2) @ solved
-        shape = (*block.shape[:-1], *self.place.shape[-3:-2], -1)
+        shape = (*block.shape[:-1], self.place.shape[-3], self.place.shape[-1])
         here, there = (each[..., len(left) :].reshape(shape).swapaxes(-3, -2) for each in (rows, solved))
         place = self.place - here[..., :-1].swapaxes(-1, -2) @ there
         gain = (rows[..., -1] * solved[..., -1]).sum(axis=-1)

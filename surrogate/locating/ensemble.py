@@ -19,6 +19,7 @@ from sim.geometry.tetmesh import digest_of
 from ..model.npz_archive import kept_arrays
 from .causes import (
     DRAINAGE,
+    OEDEMA,
     SWELLING,
     TOOL,
     TUMOUR_SWELLING,
@@ -30,6 +31,7 @@ from .causes import (
     pushes,
     swellings,
 )  # fmt: skip
+from .oedema import round_tumour
 
 # Thousandths of the motion: far below what is seen.
 ACCURACY = Accuracy(tolerance=3e-3)
@@ -121,6 +123,12 @@ def members(
         local.deform(swellings(anatomy, causes.tumour_swellings)),
     ]
     kind = [TOOL, SWELLING, TUMOUR_SWELLING]
+    for reach in group.reach:
+        body, marked = round_tumour(anatomy, reach)
+        answers.append(
+            Fem(body, group.effects(causes.oedema, marked), ACCURACY, device).deform(swellings(body, causes.oedema))
+        )
+        kind.append(OEDEMA)
     last: Deformation | None = None
     for loads in drainages(group, anatomy, seed, causes):
         last = fem.deform(loads, start=last)

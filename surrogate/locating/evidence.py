@@ -112,6 +112,11 @@ class Evidence:
         return out
 
     @property
+    def named(self) -> bool:
+        """Whether points have names: each gives three rows then, and one of a cloud. So do tips."""
+        return len(self) >= 2 * len(np.unique(self.point))
+
+    @property
     def copies(self) -> int:
         """3 where rows are of motions along three axes, point after point; else 1."""
         threefold = len(self) % 3 == 0 and np.array_equal(self.axis, np.tile(np.eye(3), (len(self) // 3, 1)))

@@ -22,7 +22,7 @@ from .locator import Locator
 from .prior import NOWHERE, Prior
 from .regions import Region, check_regions
 
-FORMAT = "sulcus locator 4"
+FORMAT = "sulcus locator 5"
 LABELS = ("kind", "skull", "place")
 ARRAYS = ("shape", *LABELS, "centre")
 

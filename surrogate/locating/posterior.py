@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri, logsumexp
 
-from .causes import TOOL
+from .causes import OEDEMA, TOOL
 from .elimination import Equations
 from .evidence import SHIFT, SLIPPED, Evidence, triangular_inverse
 from .prior import RIGIDS, SETS, WITH_PLACE, Hypothesis, Prior
@@ -119,6 +119,8 @@ class SeenPrior:
         As `Prior.odds`.
     slip
         As `Evidence.slip`.
+    named
+        Whether points have names. The errors of a cloud look like oedema, which is not among its causes.
     """
 
     prior: Prior
@@ -126,6 +128,7 @@ class SeenPrior:
     rows: Whitened
     odds: np.ndarray
     slip: float = SLIPPED / SHIFT
+    named: bool = True
 
     @property
     def slipped(self) -> float:
@@ -174,6 +177,8 @@ class SeenPrior:
             found[some] = found[some[:-1]].eliminated(some[-1])
         evidence = np.full((*found[()].evidence.shape, len(SETS), len(self.odds)), -np.inf)
         for number, some in enumerate(SETS):
+            if OEDEMA in some and not self.named:
+                continue
             evidence[..., number, 0] = found[some].evidence
             if some in WITH_PLACE:
                 evidence[..., number, 1:] = found[some].with_places
@@ -219,7 +224,7 @@ def seen_prior(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> 
     seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
     # A motion and a rigid error may cancel, so that little is seen of either; and noise hides what is smaller.
     scale = 1e3 * max(float(np.hypot(seen, np.sqrt(3.0) * evidence.shift)), float(np.median(evidence.sigma)))
-    return SeenPrior(prior, scale, whitened(prior, evidence, seen), prior.odds(tips), evidence.slip)
+    return SeenPrior(prior, scale, whitened(prior, evidence, seen), prior.odds(tips), evidence.slip, evidence.named)
 
 
 def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS, free: bool = False) -> Posterior:

@@ -16,27 +16,31 @@ from sim.anatomy import Anatomy
 from sim.effects import SKULLS
 from sim.errors import InputError
 
-from .causes import DRAINAGE, SWELLING, TOOL, TUMOUR_SWELLING
+from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, TUMOUR_SWELLING
 from .ensemble import Ensemble, surface_size
 from .presses import Presses, spaced
 
 # Shapes of each kind in each skull, at most; the least share of the variance that one of them has.
-MOST = {DRAINAGE: 12, SWELLING: 12, TUMOUR_SWELLING: 4, TOOL: 40}
+MOST = {DRAINAGE: 12, SWELLING: 12, TUMOUR_SWELLING: 4, OEDEMA: 8, TOOL: 40}
 SMALLEST_SHARE = 1e-6
 # Places that one tool may press on, shapes of each, and how far [m] its forces reach round it.
 PLACES, PLACE_SHAPES, REACH = 30, 6, 6e-3
 # Sizes as shares of the seen motion: of what takes part; of a tumour's swelling where a brain swells; of forces all
 # over the cortex, which make good what the other shapes lack.
-SIZE = {DRAINAGE: 1.0, SWELLING: 1.0, TUMOUR_SWELLING: 0.3, TOOL: 0.15}
+SIZE = {DRAINAGE: 1.0, SWELLING: 1.0, TUMOUR_SWELLING: 0.3, OEDEMA: 1.0, TOOL: 0.15}
 # The rigid error, as shares of what an observation states: a brain that sinks looks much like one. The last is that of
 # a registration that slipped, which nobody states.
 RIGIDS = (0.1, 1.0, np.inf)
 # A skull that lets go holds what tools press against it, as one does in which the brain slides.
 PRESSED = {"bonded": "bonded", "slide": "slide", "contact": "slide"}
-# What may take part beside tools.
-SETS = ((), (DRAINAGE,), (SWELLING,), (DRAINAGE, SWELLING), (DRAINAGE, SWELLING, TUMOUR_SWELLING))
+# Causes beside tools, and which of them may take part.
+BESIDE = (DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA)
+SETS = (
+    (), (DRAINAGE,), (SWELLING,), (OEDEMA,), (DRAINAGE, SWELLING), (SWELLING, OEDEMA),
+    (DRAINAGE, SWELLING, TUMOUR_SWELLING),
+)  # fmt: skip
 # With one of these a tool may press on one place.
-WITH_PLACE = SETS[:4]
+WITH_PLACE = SETS[:6]
 NOWHERE = -1
 # A tip that touches presses on a place so near [m] as a standard deviation, and so seldom on none.
 TOUCHED, UNTOUCHED = 4e-3, 0.05
@@ -180,7 +184,7 @@ class Prior:
 
     def _in_skull(self, number: int) -> tuple[dict[int, np.ndarray], np.ndarray]:
         """Rows by kind in a skull, of tools those all over the cortex; and (p, q), those of a tool on each place."""
-        rows = {kind: np.flatnonzero((self.kind == kind) & (self.skull == number)) for kind in SETS[-1]}
+        rows = {kind: np.flatnonzero((self.kind == kind) & (self.skull == number)) for kind in BESIDE}
         pressed = (self.kind == TOOL) & (self.skull == list(SKULLS).index(PRESSED[list(SKULLS)[number]]))
         places = [np.flatnonzero(pressed & (self.place == place)) for place in range(self.place.max() + 1)]
         return rows | {TOOL: np.flatnonzero(pressed & (self.place == NOWHERE))}, np.array(places)
@@ -203,7 +207,7 @@ class Prior:
         """What may take part in each skull, in tables."""
         found, places = zip(*map(self._in_skull, range(len(SKULLS))), strict=True)
         rows, size, kinds = [], [], []
-        for kind in (TOOL, *SETS[-1]):
+        for kind in (TOOL, *BESIDE):
             most = max(len(own[kind]) for own in found)
             rows.append([np.pad(own[kind], (0, most - len(own[kind]))) for own in found])
             size.append([np.where(np.arange(most) < len(own[kind]), SIZE[kind], 0.0) for own in found])
@@ -215,7 +219,7 @@ def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = 
     """The prior of an ensemble, or of some of its members (N,) bool, and of forces on the open cortex."""
     anatomy, parts = ensemble.anatomy, []
     chosen = np.ones(len(ensemble.kind), bool) if members is None else members
-    for kind, skull in product((DRAINAGE, SWELLING, TUMOUR_SWELLING), range(len(SKULLS))):
+    for kind, skull in product(BESIDE, range(len(SKULLS))):
         some = np.flatnonzero(chosen & (ensemble.kind == kind) & (ensemble.skull == skull))
         if len(some):
             shape = principal(unit(anatomy, ensemble.motion[some]) / np.float32(np.sqrt(len(some))), MOST[kind])
