@@ -29,9 +29,9 @@ FAMILIES = {
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
-def episode(request, box, tmp_path_factory):
+def episode(request, small_box, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
-    write_anatomy(folder / "box.vtu", box)
+    write_anatomy(folder / "box.vtu", small_box)
     (folder / "plan.toml").write_text(PLAN.format(family=request.param, numbers=FAMILIES[request.param]))
     plan = load_plan(str(folder / "plan.toml"))
     assert not make_body(folder, plan, 1, 0, "cpu").failed
