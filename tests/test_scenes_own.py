@@ -13,7 +13,7 @@ from scenes.cli import main
 from scenes.play.deformers import Theatre
 from scenes.play.stage import TOOL
 from scenes.script.scene import find_scene
-from sim.bodies.meshfile import read_anatomy
+from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.errors import InputError
 from sim.runtime.user_script import run_script
 from sim.tools import distances_to
@@ -62,9 +62,10 @@ def test_a_command_plays_it(folder, monkeypatch, capsys, words):
         assert (reported["scenes"][0] if words[0] == "check" else reported)["scene"] == "nod"
 
 
-def test_what_its_effects_cost_is_measured(folder, monkeypatch, capsys):
+def test_what_its_effects_cost_is_measured(folder, small_box, monkeypatch, capsys):
     monkeypatch.chdir(folder)
-    assert main(["effects", "my_scene.py", "--every", "1", "--anatomy", "box.vtu", "--device", "cpu", "--json"]) == 0
+    write_anatomy(folder / "small.vtu", small_box)
+    assert main(["effects", "my_scene.py", "--every", "1", "--anatomy", "small.vtu", "--device", "cpu", "--json"]) == 0
     reported = json.loads(capsys.readouterr().out)
     assert reported["scene"] == "nod" and "ToolForce" in {row["effect"] for row in reported["effects"]}
 

@@ -17,13 +17,13 @@ from surrogate.training.train import LEARNERS
 def folder(tmp_path_factory, small_box):
     path = tmp_path_factory.mktemp("commands")
     write_anatomy(path / "box.vtu", small_box)
-    assert main(["simulate", str(path / "box.vtu"), "--out", str(path / "data.h5"), "--count", "150"]) == 0
+    assert main(["simulate", str(path / "box.vtu"), "--out", str(path / "data.h5"), "--count", "100"]) == 0
     return path
 
 
 def test_data_say_where_they_come_from(folder, small_box):
     data = read_dataset(folder / "data.h5")
-    assert data.good.all() and len(data.loads) == 150 and data.anatomy.digest == small_box.digest
+    assert data.good.all() and len(data.loads) == 100 and data.anatomy.digest == small_box.digest
     assert data.residual.max() <= 1e-4 and data.iterations.min() >= 1
     for name in (
         "anatomy",
@@ -64,7 +64,7 @@ def test_training_prints_every_figure_and_writes_every_model(folder, small_box, 
     assert rows["linear"]["mean_percent"] < 16.0 and rows["series"]["mean_percent"] < rows["linear"]["mean_percent"]
     assert report["winner"] == min(rows.values(), key=lambda row: row["mean_mm"])["name"]
     assert report["discs"] >= 6 and report["share_of_patch"] >= 0.15
-    assert report["training_loads"] + report["held_out"] + report["calibrated"] == 150
+    assert report["training_loads"] + report["held_out"] + report["calibrated"] == 100
     assert report["nominal_refused"] == pytest.approx(0.10, abs=0.005)
     solves = {name: row["solves"] for name, row in rows.items()}
     assert {count["loads"] for count in solves.values()} == {report["training_loads"]}
@@ -76,7 +76,7 @@ def test_training_prints_every_figure_and_writes_every_model(folder, small_box, 
 
 
 def test_the_same_command_again_solves_nothing(folder, capsys):
-    command = ["simulate", str(folder / "box.vtu"), "--out", str(folder / "data.h5"), "--count", "150", "--json"]
+    command = ["simulate", str(folder / "box.vtu"), "--out", str(folder / "data.h5"), "--count", "100", "--json"]
     before = (folder / "data.h5").read_bytes()
     assert main(command) == 0
     said = json.loads(capsys.readouterr().out)

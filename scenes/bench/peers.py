@@ -127,8 +127,8 @@ class Row:
 
     @property
     def first(self) -> float:
-        """Median seconds from a mesh to its first answer; NaN if none came to the tolerance."""
-        return float(np.median(self.firsts)) if self.answers and self.answers[0].good else np.nan
+        """Median seconds from a mesh to its first answer; NaN if none was measured or none came to the tolerance."""
+        return float(np.median(self.firsts)) if self.firsts and self.answers[0].good else np.nan
 
     @property
     def further(self) -> float:
@@ -180,7 +180,7 @@ def compare(
     """A row for each engine, ours first; `done` is called after every answer.
 
     Every engine is started once to warm up, so that it compiles its code and reads its files. It is then started
-    `starts` times for the first answer. The last of these processes goes on with the further loads.
+    `starts` times, which may be none, for the first answer. The last process goes on with the further loads.
     """
     rows = [Row(engine.label, engine.setting, case.tolerance, missing=engine.missing) for engine in engines]
     here = [number for number, row in enumerate(rows) if not row.missing]
