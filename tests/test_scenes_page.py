@@ -244,6 +244,7 @@ def test_a_verdict_is_the_error_in_millimetres(theatre):
     assert "error against FEM: mean 0.200, largest 0.200 mm; tip to tumour " in said
     tip = whole.drawn(3, whole.touch(3), loads, answer, 0.0).distance
     assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
+    assert " by FEM, without the error of the tumour (" in said
     assert verdict_words(found, stale=True, waits="").startswith('<p class="stale">of an earlier load: ')
 
 
@@ -269,12 +270,19 @@ def test_the_page_reads_what_the_frame_holds(theatre):
     """Distance, motion, force and milliseconds, and whose error is how large, each as a person reads it."""
     player = theatre.player("linear", short())
     seconds = {"deform": 12.3e-3, "render": 4.5e-3, "overlay": 0.7e-3}
-    known = {"distance": 12.34e-3, "distance_error": 2.46e-3, "moved": 1.234e-3, "seconds": seconds}
+    known = {
+        "distance": 12.34e-3,
+        "distance_error": 2.46e-3,
+        "moved": 1.234e-3,
+        "model_error": 11e-6,
+        "seconds": seconds,
+    }
     frame = replace(player.draw(3, 0.1, Touch(force=0.25)), **known)
     said = report(frame, player.stage, "linear", "", (), 7)
     for line in (
         ">tip to tumour 12.3&nbsp;mm<",
-        "<p>frame 3 of 6; 0.10 s; force 0.25 N; tumour moved 1.23 mm; ",
+        "<p>frame 3 of 6; 0.10 s; force 0.25 N; tumour moved 1.23 mm (error of the model 0.02 mm, "
+        "error of the tumour not known); ",
         "; tip to tumour within 2.5 mm of the model&#x27;s finite elements (95 %)</p>",
         "<p>Error of the tumour: not known.",
         "milliseconds: answer 12.3, camera picture 4.5, overlay 0.7<",
@@ -291,5 +299,8 @@ def test_the_page_reads_what_the_frame_holds(theatre):
     assert f"<p>Error of the tumour: {where} 1.2 mm from where it is; without observation 4.7 mm.</p>" in seen
     for said, off in ((prior, "4.7"), (seen, "1.2")):
         assert f"tip to tumour 12.3&nbsp;±&nbsp;{off}&nbsp;mm<" in said
-    doubted = replace(frame, tumour_error=known[0], doubt="why")
+    surely = report(replace(frame, moved_error=5.31e-3, model_error=None), player.stage, "fem", "", (), 7)
+    assert "; tumour moved 1.23 mm (error of the tumour 5.4 mm); " in surely
+    doubted = replace(frame, tumour_error=known[0], doubt="why", model_error=None)
+    assert "(error of the answer not known)" in report(doubted, player.stage, "linear", "", (), 7)
     assert "tip to tumour 12.3&nbsp;mm<" in report(doubted, player.stage, "linear", "", (), 7)

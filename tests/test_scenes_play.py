@@ -249,6 +249,8 @@ def test_the_label_tells_source_time_and_motion(play, monkeypatch):
     labelled(frame, "linear")
     assert said[:2] == [f"linear: tumour moved {1e3 * frame.moved:.2f} mm", f"t 1.70 s, {frame.acts}"]
     assert said[-1] == frame.deformation.source
+    labelled(replace(frame, moved=1.33e-3, moved_error=5.31e-3), "linear")
+    assert "linear: tumour moved 1.33 +- 5.4 mm" in said
 
 
 def test_regions_of_a_tissue_of_their_own_are_named_in_short():

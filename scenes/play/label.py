@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ar.overlay.hud import HEAD, ROW, panel
+from ar.overlay.hud import HEAD, ROW, bound_words, panel
 
 from .load_text import shortened
 from .player import Frame
@@ -22,11 +22,16 @@ def label_lines(frame: Frame, name: str) -> list[str]:
     moment = f"t {frame.time:.2f} s{', ' if frame.acts else ''}{frame.acts}"
     rest = [*doubt, moment, "ms: " + ", ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in spent)]
     if found is None:
-        return [f"{name}: tumour moved {1e3 * frame.moved:.2f} mm", *rest, source]
+        return [f"{name}: tumour moved {_within(frame.moved, frame.moved_error)}", *rest, source]
     moved = [f"truth: tumour moved {1e3 * found.truly:.2f} mm"]
-    moved += [] if found.location is None else [f"estimate: tumour moved {1e3 * found.moved:.2f} mm"]
+    moved += [] if found.location is None else [f"estimate: tumour moved {_within(found.moved, frame.moved_error)}"]
     lines = [] if frame.named else [f"lines: {LINES}"]
     return [*moved, *rest, f"truth: {source}", f"estimate: {found.source}", *lines]
+
+
+def _within(length: float, error: float | None) -> str:
+    """A length and the tumour's error of it [m] in millimetres; where that is not known the picture's head says so."""
+    return f"{1e3 * length:.2f} {'mm' if error is None else f'+- {bound_words(error, 1)}'}"
 
 
 def labelled(frame: Frame, name: str) -> np.ndarray:

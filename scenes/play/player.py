@@ -85,6 +85,8 @@ class Frame:
         Whether the tip is in the tumour: the distance is then to the surface round it.
     moved
         Mean distance of the tumour's predicted surface from where the scan has it [m]; by an estimate, its middle's.
+    moved_error
+        How far that may be from the tumour's in the patient [m], with a probability of 95 %; None where nobody knows.
     model_error
         In 95 of 100 loads no point of the tumour is farther [m] from where the model's finite elements have it. None of
         these themselves, and where nobody knows.
@@ -120,6 +122,7 @@ class Frame:
     distance_error: float | None
     inside: bool
     moved: float
+    moved_error: float | None
     model_error: float | None
     tumour_error: TumourError
     doubt: str
@@ -256,7 +259,7 @@ class Player:
             over.named,
             None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
             gauge is not None and gauge.inside,
-            motion if moved is None else moved[0],
+            *((motion, None) if moved is None else moved),
             promised, error, doubt, acting(loads, deformation, self.site.anatomy.mesh.nodes), tuple(head), remark, took,
             estimate,
         )  # fmt: skip

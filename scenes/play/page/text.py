@@ -211,7 +211,7 @@ def report(
     """What was answered: the distance first, then how far to trust it, what acts, the verdict and the table."""
     left = stage.at(frame.loads).left
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
-    facts += [f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' by the estimate'}"]
+    facts += [moved_words(frame)]
     if frame.distance_error is not None and frame.distance_error < np.inf:
         facts += [
             f"tip to tumour within {hud.bound_words(frame.distance_error, 1)} of the model's finite elements (95 %)"
@@ -229,6 +229,18 @@ def report(
     spent = {"deform": "answer", "render": "camera picture", "overlay": "overlay"}
     took = ", ".join(f"{spent.get(stage, stage)} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
     return "".join([*parts, verdict, table(rows), f'<p class="dim">milliseconds: {took}</p>'])
+
+
+def moved_words(frame: Frame) -> str:
+    """How far the tumour moved, and what that is off by: of the model, and of the tumour in the patient."""
+    said = f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' by the estimate'}"
+    if frame.moved_error is not None:
+        off = f"error of the tumour {hud.bound_words(frame.moved_error, 1)}"
+    else:
+        off = f"error of the {'answer' if frame.doubt else 'tumour'} not known"
+    if frame.model_error is not None and frame.estimate is None:
+        off = f"error of the model {hud.bound_words(frame.model_error, 2)}, {off}"
+    return f"{said} ({off})"
 
 
 def estimated(found: Estimate) -> list[str]:

@@ -67,7 +67,7 @@ def verdict_words(judged: Judged | None, stale: bool, waits: str, own: str = OWN
     if judged.mean is not None and judged.largest is not None:
         said = f"error against FEM: mean {1e3 * judged.mean:.3f}, largest {1e3 * judged.largest:.3f} mm"
     tip = "" if judged.distance is None else f"tip to tumour {millimetres(judged.distance)}, "
-    tail = f"{tip}tumour moved {1e3 * judged.motion:.2f} mm by FEM"
+    tail = f"{tip}tumour moved {1e3 * judged.motion:.2f} mm by FEM, without the error of the tumour"
     tail += f" (frame {judged.number}, FEM {1e3 * judged.seconds:.0f} ms"
     tail += ")" if judged.good else ", which did not reach its tolerance: do not rely on it)"
     if stale:
