@@ -18,7 +18,7 @@ from scenes.cli import main
 from scenes.play.deformers import AtRest
 from scenes.play.overlay.filming import Taking, Trouble, mounted, registered, shots_of
 from scenes.play.player import Player
-from scenes.script.calibration_file import write_calibration
+from scenes.script.calibration_file import read_intrinsic_covariance, write_calibration
 from scenes.script.film_truth import read_truth
 from scenes.script.reference_place import USUAL, VIEW
 from scenes.script.registration_file import read_registration
@@ -163,6 +163,7 @@ def test_a_film_and_all_that_belongs_to_it_are_written(tmp_path, capsys):
     assert [read_stamp(each.grey) for each in pictures] == pytest.approx(truth.times, abs=1e-4)
     assert pictures[0].colour is not None and pictures[0].colour.shape == (600, 800, 3)
     assert read_registration(out / "registration.json").covariance.max() == 0.0
+    assert not read_intrinsic_covariance(out / "camera.yaml").any()  # what drew the film is exactly known
     assert read_tool(out / "tool.json").shape == Ball(7e-3)
     rows = list(csv.DictReader((out / "truth.csv").read_text().splitlines()))
     middle = 1e3 * (stage.tumour_at_rest.vertices + truth.displacement[2]).mean(axis=0)

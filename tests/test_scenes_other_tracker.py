@@ -26,7 +26,8 @@ from scenes.play.overlay.picture import head_lines
 from scenes.play.overlay.plausible import buried
 from scenes.play.overlay.run import timed
 from scenes.play.overlay.tool_motion import ToolMotion
-from scenes.script.calibration_file import read_calibration, read_intrinsic_covariance
+from scenes.play.overlay.words import overlay_error
+from scenes.script.calibration_file import read_calibration, read_intrinsic_covariance, write_exactly_known
 from scenes.script.film_truth import read_truth
 from scenes.script.hand_eye_file import read_hand_eye
 from scenes.script.pose_file import TrackedRow, read_stream, write_poses
@@ -373,6 +374,10 @@ def test_a_calibration_s_error_is_in_the_band_as_far_as_the_reference_does_not_t
     assert known.band > known.parts["camera"] > 1e-4 and "camera" not in bare.parts
     assert head_lines(bare)[-1].startswith("error by tissue, camera and segmentation: not known")
     assert head_lines(known)[-1].startswith("error by tissue and segmentation: not known")
+    write_exactly_known(tmp_path / "k.json", follower.calibration)
+    exact = replace(follower, intrinsic=read_intrinsic_covariance(tmp_path / "k.yaml")).step(first.grey, 0.0)
+    assert exact.parts["camera"] == 0.0 and exact.band == pytest.approx(bare.band)
+    assert "The camera is stated to be exactly known." in overlay_error(exact)
     (tmp_path / "k.json").write_text(json.dumps(stored | {"covariance": [[1.0]]}))
     with pytest.raises(InputError, match="none of 9 x 9"):
         read_intrinsic_covariance(tmp_path / "k.yaml")

@@ -22,6 +22,11 @@ SMALLEST_ANGLE, UNSURE = np.radians(12.0), 0.02
 TILT = "Tilt the board by 20 to 45 degrees to all sides, near and far, and also in the picture's corners."
 
 
+def values_of(calibration: Calibration) -> np.ndarray:
+    """A calibration's values (9,) of `PARAMETERS`."""
+    return np.array([*calibration.focal, *calibration.principal, *calibration.lens.coefficients[:5]])
+
+
 @dataclass(frozen=True, eq=False)
 class Intrinsics:
     """A calibrated camera.
@@ -50,7 +55,7 @@ class Intrinsics:
     @property
     def values(self) -> np.ndarray:
         """(9,) of `PARAMETERS`."""
-        return np.array([*self.calibration.focal, *self.calibration.principal, *self.calibration.lens.coefficients[:5]])
+        return values_of(self.calibration)
 
     @property
     def deviations(self) -> np.ndarray:

@@ -74,7 +74,7 @@ def _camera(args: argparse.Namespace) -> int:
     from ar.tracking.targets import calibration_board
 
     from ..script.board_pictures import seen_views
-    from ..script.calibration_file import SUFFIXES, write_calibration
+    from ..script.calibration_file import SUFFIXES, intrinsics_header, write_calibration
 
     if not args.out:
         raise InputError("give --out K.yaml for the camera.")
@@ -91,14 +91,14 @@ def _camera(args: argparse.Namespace) -> int:
     except ValueError as error:
         raise InputError(f"{args.pictures}: {error}") from error
     report = {
-        "format": "sulcus intrinsics 1",
+        **intrinsics_header(found.calibration, found.covariance),
+        "rms_px": found.rms,
         "pictures": str(args.pictures),
         "looked_at": seen.looked_at,
         "seen": len(seen.views),
         "used": found.used,
         "left_out": found.left_out,
         "covered": found.covered,
-        **_camera_figures(found),
     }
     write_calibration(out, found.calibration)
     _write_json(table, report)
@@ -117,20 +117,6 @@ def _camera(args: argparse.Namespace) -> int:
         )
     print(f"written: {out}, with its covariance in {table}")
     return 0
-
-
-def _camera_figures(found) -> dict:
-    from ar.tracking.intrinsics import PARAMETERS
-
-    return {
-        "rms_px": found.rms,
-        "image_width": found.calibration.width,
-        "image_height": found.calibration.height,
-        "parameters": PARAMETERS,
-        "values": found.values.tolist(),
-        "standard_deviations": found.deviations.tolist(),
-        "covariance": found.covariance.tolist(),
-    }
 
 
 def _write_json(path: Path, report: dict) -> None:

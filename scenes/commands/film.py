@@ -34,6 +34,7 @@ SIGNED = "film"
 # What is written, and how it is recognised.
 FILES = {
     "camera.yaml": "a camera of `sulcus film`",
+    "camera.json": "a covariance of `sulcus calibrate`",
     "registration.json": "a registration of `sulcus register`",
     "tool.json": "a tool of `sulcus film`",
     "truth.npz": "what is true of a film of `sulcus film`",
@@ -46,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", help="a built-in scene with a tool, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument(
         "--out", required=True, type=Path, metavar="DIR",
-        help="folder for film.mp4, camera.yaml, registration.json, tool.json, truth.npz and truth.csv",
+        help="folder for film.mp4, camera.yaml and .json, registration.json, tool.json, truth.npz and truth.csv",
     )  # fmt: skip
     parser.add_argument("--every", type=int, default=1, help="film one frame in so many (default %(default)s)")
     parser.add_argument("--seconds", type=float, help="film only so much of the scene [s]")
@@ -92,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         What cannot be read, written or filmed; numbers that are out of range.
     """
     from ..play.overlay.filming import Taking, Trouble, mounted, registered, shots_of
-    from ..script.calibration_file import write_calibration
+    from ..script.calibration_file import write_calibration, write_exactly_known
     from ..script.film_truth import Truth, write_table, write_truth
     from ..script.registration_file import write_registration
     from ..script.tracked_tool import write_tool
@@ -121,6 +122,7 @@ def run(args: argparse.Namespace) -> int:
     shots: list[Shot] = []
     film = _write_film(args, shots_of(player, mounts, taking, args.every), shots, player)
     write_calibration(paths["camera.yaml"], replace(calibration, name=f"sulcus film: {scene.name}"))
+    write_exactly_known(paths["camera.json"], calibration)
     write_registration(paths["registration.json"], registered(player.site, mounts, shift, turn, args.seed))
     write_tool(paths["tool.json"], mounts.tool)
     truth = Truth(

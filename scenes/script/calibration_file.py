@@ -63,6 +63,33 @@ def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
         return 0.5 * (covariance + covariance.T)
 
 
+def intrinsics_header(calibration: Calibration, covariance: np.ndarray) -> dict[str, object]:
+    """What a K.json beside a calibration says: its values (9,) and their covariance (9, 9), 0 where they are exact."""
+    from ar.tracking.intrinsics import PARAMETERS, values_of
+
+    return {
+        "format": f"{INTRINSICS} 1",
+        "image_width": calibration.width,
+        "image_height": calibration.height,
+        "parameters": PARAMETERS,
+        "values": values_of(calibration).tolist(),
+        "standard_deviations": np.sqrt(np.diag(covariance)).tolist(),
+        "covariance": covariance.tolist(),
+    }
+
+
+def write_exactly_known(path: str | Path, calibration: Calibration) -> None:
+    """Write the K.json of a camera that is exactly known, as that of a rendered film: it appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be written.
+    """
+    with written_whole(path_of(path), ".json") as partial:
+        partial.write_text(json.dumps(intrinsics_header(calibration, np.zeros((9, 9)))) + "\n", encoding="utf-8")
+
+
 def write_calibration(path: str | Path, calibration: Calibration, form: Literal["opencv", "ros"] = "opencv") -> None:
     """Write a calibration as OpenCV's YAML or ROS's, .yaml or .yml; it appears whole or not at all.
 

@@ -74,8 +74,10 @@ def overlay_error(known: Known) -> str:
     if not known.relied or known.band is None:
         return "<p>Error of the overlay: not known.</p>"
     stated = [f"{name} {bound_words(length, 2)}" for name, length in known.parts.items() if length > 0.0]
-    none = ", ".join(name for name, length in known.parts.items() if not length > 0.0)
-    camera = "" if "camera" in known.parts else " What the camera's calibration adds is not known."
+    none = ", ".join(name for name, length in known.parts.items() if not length > 0.0 and name != "camera")
+    off = known.parts.get("camera")
+    camera = " What the camera's calibration adds is not known." if off is None else ""
+    camera = " The camera is stated to be exactly known." if off == 0.0 else camera
     parts = ", ".join([*stated, *([f"none stated of {none}"] if none else [])])
     return (
         f"<p>Error of the overlay: 95 of 100 times the tumour is within {bound_words(known.band, 1)} of where it is "
