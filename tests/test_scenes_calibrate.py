@@ -79,7 +79,9 @@ def test_pictures_that_are_no_views_of_the_board_are_refused(folder, pictures, t
     assert "none.mp4: no such file. Give a video" in refused([tmp_path / "none.mp4", *out], capsys)
     assert "holds no pictures. Give a folder" in refused([tmp_path, *out], capsys)
     (tmp_path / "text.mp4").write_text("no film")
-    assert "text.mp4: is no video that can be read. Give" in refused([tmp_path / "text.mp4", *out], capsys)
+    assert "text.mp4: is no video that can be read, as its bytes are not a video's: give" in refused(
+        [tmp_path / "text.mp4", *out], capsys
+    )
     assert "640 x 480 pixels, but 1280 x 960 was stated" in refused([folder, *out, "--size", "1280x960"], capsys)
     assert "--size '640' is no size" in refused([folder, *out, "--size", "640"], capsys)
     some = tmp_path / "some"

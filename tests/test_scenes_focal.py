@@ -1,6 +1,9 @@
 """A film that was taken by another camera, or at another zoom, is refused."""
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ from ar.tracking.focal_fit import focal_fit
 from ar.tracking.targets import tool_cube
 from scenes.cli import main
 from scenes.script.calibration_file import read_calibration, write_calibration
-from scenes.script.film_camera import demand_focal_length
+from scenes.script.film_camera import demand_film
 
 CUBE = tool_cube()
 
@@ -45,7 +48,8 @@ def test_a_focal_length_is_found_by_the_relief_of_a_target():
 
 
 @pytest.mark.parametrize(("factor", "way"), [(1.15, "13% shorter"), (0.85, "18% longer")])
-def test_a_film_of_another_zoom_is_refused_by_what_looks_at_it(factor, way, tmp_path, capsys):
+def test_a_film_of_another_zoom_is_refused_before_it_is_followed(factor, way, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("scenes.script.followed.followed", lambda *given: pytest.fail("the whole film is followed"))
     calibration = read_calibration(FILM / "camera.yaml")
     path = tmp_path / "camera.yaml"
     write_calibration(path, replace(calibration, focal=tuple(factor * each for each in calibration.focal)))
@@ -54,8 +58,37 @@ def test_a_film_of_another_zoom_is_refused_by_what_looks_at_it(factor, way, tmp_
         words += ["--registration", str(FILM / "registration.json")] if words[0] == "overlay" else []
         assert main(words) == 2
         said = capsys.readouterr().err
-        assert f"seen with focal lengths that are {way}" in said and "calibrate this one" in said
+        assert said.splitlines()[-1].startswith(f"sulcus {words[0]}: {FILM / 'film.mp4'}: its markers are seen with ")
+        assert f"focal lengths that are {way}" in said and f"than {path} states" in said
+        assert "calibrate this one" in said
     assert list(tmp_path.iterdir()) == [path]
-    demand_focal_length(FILM / "film.mp4", 30.0, calibration, "the film's own")
+    demand_film(FILM / "film.mp4", 30.0, calibration, "the film's own")
     nearly = replace(calibration, focal=tuple(1.02 * each for each in calibration.focal))
-    demand_focal_length(FILM / "film.mp4", 30.0, nearly, "two per cent off")
+    demand_film(FILM / "film.mp4", 30.0, nearly, "two per cent off")
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"", "it is empty"),
+        (b"no video", "its bytes are not a video's"),
+        ((FILM / "film.mp4").read_bytes()[:2000], "it is cut off or damaged"),
+    ],
+)
+def test_what_is_no_video_is_one_sentence_with_its_reason(content, why, tmp_path, capsys):
+    (tmp_path / "short.mp4").write_bytes(content)
+    given = [str(tmp_path / "short.mp4"), "--camera", str(FILM / "camera.yaml")]
+    assert main(["track", *given, "--out", str(tmp_path / "poses.csv")]) == 2
+    assert capsys.readouterr().err == (
+        f"sulcus track: {tmp_path}/short.mp4: is no video that can be read, as {why}: give a video, or a folder of PNG "
+        "or JPEG pictures.\n"
+    )
+
+
+def test_libraries_print_nothing_of_what_is_no_video(tmp_path):
+    """In a process that has opened none: FFmpeg asks once how much it says."""
+    (tmp_path / "short.mp4").write_text("no video")
+    code = "import sys; from pathlib import Path; from ar.tracking.pictures import rate_of; rate_of(Path(sys.argv[1]))"
+    words = [sys.executable, "-c", code, str(tmp_path / "short.mp4")]
+    done = subprocess.run(words, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True)
+    assert done.stdout == done.stderr == ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 # Of a video that does not say how long it is, one frame in so many.
 STEP = 5
 GIVE = "Give a video, or a folder of PNG or JPEG pictures."
+# What videos begin with: MP4 and MOV (after four bytes), AVI, Matroska and WebM.
+BEGINNINGS = (b"ftyp", b"RIFF", b"\x1aE\xdf\xa3")
 TOO_LARGE = "has more pixels than a camera gives. Write it smaller."
 
 
@@ -89,7 +92,7 @@ def length_of(path: Path) -> int:
     """
     if path.is_dir():
         return len(_files(path))
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    video = _opened(path)
     try:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     finally:
@@ -132,11 +135,14 @@ def _in_video(path: Path, step: int | None, colour: bool = False, first: int = 0
     """One in `step` frames of a video from the `first` on; None: so many that there are `MOST_PICTURES`."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file. {GIVE}")
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    video = _opened(path)
     try:
         width, height = (int(video.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if not video.isOpened() or min(width, height) < 1:
-            raise ValueError(f"{path}: is no video that can be read. {GIVE}")
+            raise ValueError(
+                f"{path}: is no video that can be read, as {_flaw(path)}: give a video, or a folder of PNG or JPEG "
+                "pictures."
+            )
         _demand_size(path, width, height)
         # What a file says of its length may be wrong: it ends where it ends.
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -155,6 +161,26 @@ def _in_video(path: Path, step: int | None, colour: bool = False, first: int = 0
         video.release()
 
 
+def _opened(path: Path) -> cv2.VideoCapture:
+    """A video; what cannot be read is said by a sentence, and not by FFmpeg and OpenCV on the console."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read at the first video of a process
+    logging = cv2.utils.logging  # type: ignore[attr-defined]
+    before = logging.setLogLevel(logging.LOG_LEVEL_ERROR)
+    try:
+        return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    finally:
+        logging.setLogLevel(before)
+
+
+def _flaw(path: Path) -> str:
+    """Why a file is no video, as its first bytes have it."""
+    with path.open("rb") as file:
+        first = file.read(8)
+    if not first:
+        return "it is empty"
+    return "it is cut off or damaged" if any(each in first for each in BEGINNINGS) else "its bytes are not a video's"
+
+
 def _spread(count: int) -> list[int]:
     """At most `MOST_PICTURES` of so many numbers, evenly."""
     return np.unique(np.linspace(0, count - 1, min(count, MOST_PICTURES)).round().astype(int)).tolist()
@@ -169,7 +195,7 @@ def rate_of(path: Path) -> float | None:
     """Pictures a second of a video, as it says itself; None of a folder, and where it does not say."""
     if not path.is_file():
         return None
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    video = _opened(path)
     try:
         rate = float(video.get(cv2.CAP_PROP_FPS))
         return rate if 0.0 < rate < np.inf else None

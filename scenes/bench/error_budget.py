@@ -104,6 +104,7 @@ class Filmed:
     def believed(self) -> tuple[Calibration, ...]:
         """Calibrations as they may have been found; to make one takes far longer than to use it."""
         scale = np.sqrt(np.diag(self.covariance))
+        scale[scale == 0.0] = 1.0  # what is exactly known
         values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
         steps = np.random.default_rng(0).standard_normal((CALIBRATIONS, 9)) * np.sqrt(values.clip(0.0))
         return tuple(changed(self.calibration, step) for step in scale * (steps @ vectors.T))

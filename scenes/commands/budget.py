@@ -187,7 +187,7 @@ def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
     with read_as(path, "a covariance of intrinsics", wanted):
         stored = json.loads(path.read_text(encoding="utf-8"))
         covariance, values = np.array(stored["covariance"], float), np.array(stored["values"], float)
-        if covariance.shape != (9, 9) or not np.isfinite(covariance).all() or not (np.diag(covariance) > 0.0).all():
+        if covariance.shape != (9, 9) or not np.isfinite(covariance).all() or not (np.diag(covariance) >= 0.0).all():
             raise InputError(f"its covariance is none of nine parameters. {wanted}")
         if not np.allclose(values[:4], [*calibration.focal, *calibration.principal], rtol=1e-3):
             raise InputError(f"is of another camera, or of another size of its pictures, than --camera. {wanted}")

@@ -201,23 +201,6 @@ def _film_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path
     return claimed(path, path.suffix, "a film of `sulcus render`", force, inputs)
 
 
-def _demand_film(args: argparse.Namespace, calibration: Calibration) -> None:
-    """Refuse what is no film, or one of another camera, before anything that takes long is read."""
-    from ar.tracking.pictures import GIVE, film_of
-    from ar.tracking.track import demand_picture
-
-    from ..script.film_camera import demand_focal_length
-
-    try:
-        first = next(iter(film_of(Path(args.pictures), args.rate)), None)
-        if first is None:
-            raise InputError(f"{args.pictures}: holds no picture. {GIVE}")
-        demand_picture(first.grey, calibration.width, calibration.height)
-        demand_focal_length(Path(args.pictures), args.rate, calibration, args.camera)
-    except ValueError as error:
-        raise InputError(str(error)) from error
-
-
 def _parts(args: argparse.Namespace, film: bool) -> Parts:
     """Read what the pictures are looked at with; what is quickly read comes first."""
     from ar.overlay.composite import load_kernels
@@ -229,6 +212,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     from ..play.overlay.picture import Painter
     from ..play.overlay.tool_motion import ToolMotion
     from ..script.calibration_file import read_calibration, read_intrinsic_covariance
+    from ..script.film_camera import demand_film
     from ..script.registration_file import other_mesh, read_registration
     from ..script.tracked_tool import read_tool
 
@@ -242,7 +226,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     if intrinsic is None:
         print(f"sulcus overlay: {UNSTATED.format(Path(args.camera).with_suffix('.json'))}", file=sys.stderr)
     if film:
-        _demand_film(args, calibration)
+        demand_film(Path(args.pictures), args.rate, calibration, args.camera)
     tool = None if args.tool is None else read_tool(args.tool)
     elsewhere = elsewhere_of(args, calibration)
     theatre = open_theatre(args.anatomy, args.model, args.device)

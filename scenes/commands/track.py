@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from ar.tracking.targets import TIP
 
     from ..script.calibration_file import read_calibration
-    from ..script.film_camera import demand_focal_length
+    from ..script.film_camera import demand_film
     from ..script.followed import followed
     from ..script.pose_file import write_poses
 
@@ -64,10 +64,11 @@ def run(args: argparse.Namespace) -> int:
     tip = np.array([0.0, 0.0, -TIP]) if args.tip is None else 1e-3 * np.array(args.tip)
     if not np.isfinite(tip).all():
         raise InputError("--tip has a number that is not finite: give three numbers in millimetres.")
-    calibration, begun = read_calibration(args.camera), time.perf_counter()
+    calibration = read_calibration(args.camera)
+    demand_film(args.pictures, args.rate, calibration, args.camera)
+    begun = time.perf_counter()
     rows = list(followed(args.pictures, calibration, args.body, args.frame, args.rate))
     seconds = time.perf_counter() - begun
-    demand_focal_length(args.pictures, args.rate, calibration, args.camera)
     write_poses(out, rows, tip)
     good = sum(row.pose is not None for row in rows)
     middle = 1e3 * float(np.median([row.seconds for row in rows]))
