@@ -110,6 +110,8 @@ def test_a_calibration_is_as_sure_as_one_of_pictures_and_wrong_ones_cost_more(fi
     deviations = np.sqrt(np.diag(filmed.covariance))
     assert (deviations[:4] > 0.05).all() and (deviations[:4] < 3.0).all()
     assert changed(USUAL, np.arange(9.0)).focal == (1400.0, 1401.0)
+    exact = replace(filmed, covariance=np.zeros((9, 9)))  # as of a film of `sulcus film`
+    assert np.abs(errors_of(exact, TECHNICAL[:1], 20).worst).max() < 1e-9
     worse = errors_of(replace(filmed, covariance=100.0 * filmed.covariance), TECHNICAL[:1], 50)
     assert np.median(worse.worst) > 5.0 * np.median(errors_of(filmed, TECHNICAL[:1], 50).worst)
 
@@ -167,5 +169,8 @@ def test_the_command_names_every_part_and_refuses_bad_input(box, tmp_path, capsy
     ):
         assert main([*words, *more]) == 2
         assert why in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["budget", "--help"])
+    assert "palpate and retract take over 4 minutes" in " ".join(capsys.readouterr().out.split())
     assert main(["budget", "sag", *words[2:]]) == 2
     assert "finds its tumour by what is seen" in capsys.readouterr().err

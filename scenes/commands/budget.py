@@ -43,7 +43,11 @@ are below. "technical" is what camera, tracking, times and model are off by; "cl
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
+    parser.add_argument(
+        "scene",
+        help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py; palpate and retract take over 4 minutes on two "
+        "cores",
+    )
     add_bodies(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
@@ -96,7 +100,6 @@ def run(args: argparse.Namespace) -> int:
     from ..play.stage import Stage
     from ..script.reference_place import reference_beside
     from ..script.registration_file import other_mesh, read_registration
-    from ..script.scene import demand_scene
 
     at_least("--draws", args.draws, FEWEST)
     at_least("--samples", args.samples, FEWEST_SAMPLES)
@@ -109,8 +112,7 @@ def run(args: argparse.Namespace) -> int:
     ):
         if not 0.0 <= value < 1e4:
             raise InputError(f"{name} {value:g}: give a number that is not below 0.")
-    demand_scene(args.scene)
-    theatre = open_theatre(args.anatomy, args.model, args.device)
+    theatre = open_theatre(args.anatomy, args.model, args.device, [args.scene])
     scene = _seen(args, theatre)
     calibration, site = scene.viewpoint.calibration, theatre.site
     assert calibration is not None

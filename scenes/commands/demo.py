@@ -87,14 +87,11 @@ def theatre_asked(args: argparse.Namespace, *scenes: str) -> Theatre:
     Raises
     ------
     InputError
-        As `demand_scene`, before anything is read, and as `open_theatre`; a limit of guarded models not above 0.
+        As `open_theatre`; a limit of guarded models not above 0.
     """
     from ..play.deformers import open_theatre
-    from ..script.scene import demand_scene
 
-    for name in scenes:
-        demand_scene(name)
-    theatre = open_theatre(args.anatomy, args.model, args.device)
+    theatre = open_theatre(args.anatomy, args.model, args.device, scenes)
     if args.guard_mm is None:
         return theatre
     if not 0.0 < args.guard_mm < float("inf"):

@@ -34,11 +34,9 @@ def run(args: argparse.Namespace) -> int:
 
     from ..play.deformers import open_theatre
     from ..play.effect_ablation import rows
-    from ..script.scene import demand_scene
 
     at_least("--every", args.every, 1)
-    demand_scene(args.scene)
-    theatre = open_theatre(args.anatomy, device=args.device)
+    theatre = open_theatre(args.anatomy, device=args.device, scenes=[args.scene])
     scene = scene_asked(args, args.scene, theatre)
     table = sys.stderr if args.json else sys.stdout
     who = theatre.described("fem", scene)

@@ -66,16 +66,14 @@ def run(args: argparse.Namespace) -> int:
     from ..bench.uncertainty import causes, coverage, ensemble, nominal, skulls_of, tissue_of, tumour_of, uncertainty
     from ..play.deformers import open_theatre
     from ..script.priors import drawn, drawn_from
-    from ..script.scene import SCENES, demand_scene
+    from ..script.scene import SCENES
     from ..script.shipped_files import template_path
     from ..script.uncertainty import read_uncertainties, uncertainty_path, write_uncertainties
 
     at_least("--draws", args.draws, FEWEST)
     at_least("--twins", args.twins, 0)
     names = args.scenes or SCENES
-    for name in names:
-        demand_scene(name)
-    theatre = open_theatre(args.anatomy, args.model, args.device)
+    theatre = open_theatre(args.anatomy, args.model, args.device, names)
     scenes = [scene_asked(args, name, theatre) for name in names]
     out = args.out or uncertainty_path(args.anatomy or template_path())
     # Before hours are spent: tissue must be one that is drawn. A file that is there is read, and scenes are added.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,7 +31,7 @@ from surrogate.model.learned import Learned
 from surrogate.model.left_out import LIMIT
 from surrogate.model.store import load
 
-from ..script.scene import Scene
+from ..script.scene import Scene, demand_scene
 from ..script.shipped_files import template_path
 from ..script.sight import Sight, StereoSight
 from ..script.site import Site, site_of
@@ -261,14 +261,21 @@ def model_path(anatomy: Path) -> Path:
     return anatomy.with_suffix(".model.npz")
 
 
-def open_theatre(anatomy: Path | None = None, model: Path | None = None, device: str = "auto") -> Theatre:
+def open_theatre(
+    anatomy: Path | None = None, model: Path | None = None, device: str = "auto", scenes: Sequence[str] = ()
+) -> Theatre:
     """Read an anatomy (default: the template that ships) with what lies beside it: scan, models, uncertainties.
+
+    `scenes` are names of those that will play there.
 
     Raises
     ------
     InputError
-        Files that are missing, unreadable, or do not belong together; a device that is not there.
+        As `demand_scene`, before anything is read. Files that are missing, unreadable, or do not belong together; a
+        device that is not there.
     """
+    for name in scenes:
+        demand_scene(name)
     # Learnt models alone would not notice, and the finite elements behind them fail too late.
     find_device(device, LIVE.precision)
     path = template_path() if anatomy is None else Path(anatomy)
