@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from ar.optics.camera import look_at
-from ar.overlay.hud import BREAK, FINE, FONT, bearings, folded, lay, marked, millimetres, panel, towards
+from ar.overlay.hud import BREAK, FINE, FONT, NEAR, bearings, folded, lay, marked, millimetres, panel, towards
 from ar.overlay.places import ASIDE, CLEAR, PAD, STEP, free_place
+from ar.overlay.refind import found_at
 
 
 @pytest.mark.parametrize(
@@ -175,3 +176,14 @@ def test_a_panel_leaves_out_its_last_lines_rather_than_hide_what_must_be_seen():
         changed = (panel(colour, lines, sights=sights) != colour).any(axis=2)
         assert changed.sum() > 1000 and not changed[hidden > 0].any()
     assert (panel(colour, lines[:2], sights=[hidden]) != colour).any(axis=2).sum() < changed.sum()
+
+
+def test_words_cover_thin_lines_rather_than_stand_far_from_their_wish():
+    """As a number does rings: without that it went far below the line that it belongs to."""
+    rows = {}
+    for name, thin in (("far", None), ("near", True)):
+        colour, taken = np.zeros((300, 400, 3), np.uint8), np.zeros((300, 400), np.uint8)
+        taken[:200, ::20] = 1
+        lay(colour, taken, ["8.7 +- 8.0 mm"], (150, 60), thin=None if thin is None else taken > 0)
+        _, rows[name], _, _ = found_at(colour, "8.7 +- 8.0 mm", FINE)
+    assert rows["near"] < 60 + NEAR < 200 < rows["far"]

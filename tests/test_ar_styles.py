@@ -17,7 +17,7 @@ from ar.overlay.legend import SHEET, Names
 from ar.overlay.measured import Measure
 from ar.overlay.outlines import ink_of, key_of, silhouette
 from ar.overlay.refind import found_at, of_ink, outline_gap, stands
-from ar.overlay.rings import RING, RINGS, draw_rings
+from ar.overlay.rings import RING, RINGS, draw_rings, lines_of
 from ar.overlay.styles import STYLES, Opening
 from ar.overlay.window import DARK, SHUT, Roles
 from ar.rendering.layer import Layer
@@ -301,6 +301,15 @@ def test_a_ring_s_caption_stands_apart_from_the_number_beside_the_tip():
     assert number is not None and caption is not None
     left, top, right, foot = number
     assert caption[1] > foot + ROW or caption[3] < top - ROW or caption[0] > right + ROW or caption[2] < left - ROW
+
+
+def test_rings_may_be_covered_and_their_numbers_may_not():
+    drawn = np.zeros((80, 120, 4), np.uint8)
+    distance = np.repeat(np.linspace(0.0, 8e-3, 120, dtype=np.float32)[None], 80, axis=0)
+    assert draw_rings(drawn, distance, np.ones((80, 120), bool), [5e-3]) == ["5"]
+    number = cv2.erode((drawn[..., 3] > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    there = lines_of(drawn[..., 3] > 0)
+    assert number.any() and not there[number].any() and there[8:20].any() and there[60:72].any()
 
 
 def test_a_cut_leaves_the_foot_to_its_words():

@@ -21,6 +21,7 @@ from .legend import Entry, Names, legend, place_sheet
 from .measured import Measure
 from .outlines import blank, box_around, dash, ink_of, joined, key_of, outlines, pieces
 from .places import CLEAR, PAD
+from .rings import lines_of
 from .styles import STYLES, Opening, Style
 from .traces import BEFORE, DOTTED, Trace, draw_before, draw_trace
 from .window import DARK, FRONT, SHUT, Lines, Roles, overlaid
@@ -167,7 +168,8 @@ def composite(
     surfaces += [trace.layer.vertices for trace in traces]
     box = box_around(camera, np.concatenate([*surfaces, measure.reached]))
     around = box if gauge is None else joined(box, box_around(camera, np.stack([gauge.tip, gauge.nearest])))
-    taken, faint, ground = np.zeros(shape, np.uint8), np.zeros(shape, bool), None
+    taken, ground = np.zeros(shape, np.uint8), None
+    faint, thin = np.zeros(shape, bool), np.zeros(shape, bool)
     if around is None:
         out = picture.colour.copy()
     else:
@@ -190,7 +192,10 @@ def composite(
             above = blank(part)
         if gauge is not None and above is not None:
             draw_line(above, part, gauge)
+        bare = under[..., 3] == 0
         measure.draw(under, under if above is None else above, around)
+        if style == "rings":
+            thin[around] = lines_of(bare & (under[..., 3] > 0))
         lines = Lines(ink_of(hidden.colour), not doubt, under, above)
         out, taken[around] = overlaid(picture.drawn, around, part, hidden, found, roles, style, lines)
     drawn, lined = Overlaid(out, taken), taken.copy()
@@ -210,7 +215,7 @@ def composite(
     apart = np.zeros_like(taken)
     if gauge is not None:
         before_it = taken.copy()
-        write_gauge(out, taken, camera, gauge, front, lined)
+        write_gauge(out, taken, camera, gauge, front, lined, thin)
         # What explains the style is no explanation of the number.
         apart = cv2.dilate(taken & ~before_it, np.ones((2 * APART + 1,) * 2, np.uint8))
     if ground is not None and around is not None:

@@ -69,7 +69,13 @@ def draw_line(sheet: np.ndarray, camera: Camera, gauge: Gauge) -> None:
 
 
 def write_gauge(
-    colour: np.ndarray, taken: np.ndarray, camera: Camera, gauge: Gauge, covered: np.ndarray, lines: np.ndarray
+    colour: np.ndarray,
+    taken: np.ndarray,
+    camera: Camera,
+    gauge: Gauge,
+    covered: np.ndarray,
+    lines: np.ndarray,
+    thin: np.ndarray,
 ) -> None:
     """Write the gauge's number beside the tip, in place; nothing when neither end of its line has a pixel.
 
@@ -77,8 +83,8 @@ def write_gauge(
 
     Parameters
     ----------
-    colour, taken, lines
-        As `lay` takes them; the latter as its `lines_there`.
+    colour, taken, lines, thin
+        As `lay` takes them; the third as its `lines_there`.
     covered
         (H, W) uint8: above 0 where tools are, which the number leaves in sight if it can.
     """
@@ -87,4 +93,4 @@ def write_gauge(
     if len(seen):
         column, row = np.clip(seen[0], -1e4, 1e4).round().astype(int).tolist()
         wish = column + BESIDE, row + BESIDE
-        lay(colour, taken, [str(gauge)], wish, GAUGE, needed=True, sights=covered, lines_there=lines)
+        lay(colour, taken, [str(gauge)], wish, GAUGE, needed=True, sights=covered, lines_there=lines, thin=thin)

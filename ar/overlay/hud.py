@@ -19,6 +19,8 @@ WHITE = (244, 244, 240)
 # Scale of the lines at the foot of a picture, from one's baseline to the next [pixel], and the share of the picture's
 # width that they may have.
 FINE, ROW, NARROW = 0.45, 18, 0.25
+# Words that may cover thin lines do so rather than stand farther than this from their wish [pixel].
+NEAR = 48
 # Shares of the picture's width that a panel's lines may have, the first for which there is room, if need be in smaller
 # letters.
 PANEL_WIDTHS, SMALLER = (0.9, 0.5, 0.36, 0.27, 0.2), 0.85
@@ -78,6 +80,7 @@ def lay(
     needed: bool = False,
     sights: np.ndarray | None = None,
     lines_there: np.ndarray | None = None,
+    thin: np.ndarray | None = None,
 ) -> None:
     """Write lines of ASCII text at the free place nearest to a wish, and take that place; both arrays change in place.
 
@@ -94,6 +97,8 @@ def lay(
         space.
     lines_there
         (H, W) uint8: above 0 where no words but lines are, which words that are `needed` may cover.
+    thin
+        (H, W) bool: lines that words cover rather than stand farther than `NEAR` from their wish.
     """
     if not lines:
         return
@@ -102,6 +107,9 @@ def lay(
     size = max(width for (width, _), _ in sizes), above + below + ROW * (len(lines) - 1)
     place = None if sights is None else free_place(taken | sights, size, wish)
     place = place or free_place(taken, size, wish)
+    if thin is not None and (place is None or np.hypot(place[0] - wish[0], place[1] - wish[1]) > NEAR):
+        shut = taken * ~thin
+        place = free_place(shut if sights is None else shut | sights, size, wish) or place
     if place is None and needed and lines_there is not None:
         place = free_place(taken & (1 - lines_there), size, wish)
     if place is None and needed:

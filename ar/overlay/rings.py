@@ -19,6 +19,8 @@ RING = (232.0, 228.0, 204.0)
 SHORTEST, OFF = 24, 3
 # The largest gap in a ring for its number, on both sides of the number [pixel].
 ROOM = 3
+# No line is so thick, and every number is [pixel].
+THICK = 9
 # A piece of so many pixels has a number of its own.
 LONG = 80
 
@@ -60,6 +62,12 @@ def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels
                 for line in lines
             )
     return list(rings)
+
+
+def lines_of(drawn: np.ndarray) -> np.ndarray:
+    """Rings (h, w) without their numbers, of what is `drawn` (h, w) of both, bool."""
+    numbers = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_OPEN, np.ones((THICK,) * 2, np.uint8))
+    return drawn & (numbers == 0)
 
 
 def _write_on(sheet: np.ndarray, line: np.ndarray, text: str, shut: np.ndarray, written: np.ndarray) -> bool:
