@@ -96,7 +96,7 @@ def test_each_state_is_said_with_both_errors(page, number, state, words):
         assert re.search(r'"number">tip to tumour \d+\.\d&nbsp;±&nbsp;\d\.\d&nbsp;mm<', said)
         assert "within 0.2 mm of where it is drawn" in said and "none stated of" in said
         assert "What the camera's calibration adds is not known." in said
-        assert "reference seen; tool seen; tumour moved 0.5&nbsp;±&nbsp;0.1&nbsp;mm" in said
+        assert "reference seen; tool seen; tumour moved 0.5&nbsp;±&nbsp;0.1&nbsp;mm (error of model and tool)" in said
     else:
         assert "tip to tumour: not known" in said and "Error of the overlay: not known" in said
         sample = page.history.samples[-1]

@@ -49,7 +49,7 @@ def _words(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str:
             return f"resection: {steps} step{'' if steps == 1 else 's'} done"
         case Touching() | Retracted() if answer.reaction.shape[1]:  # some learnt models do not know it
             bound = answer.reaction_bound[0, 0]
-            within = f" within {bound:.2f} N" if answer.outcome[0].good and np.isfinite(bound) else ""
+            within = f" within {bound:.2f} N (model)" if answer.outcome[0].good and np.isfinite(bound) else ""
             return f"the tool reads {np.linalg.norm(answer.reaction[0, -1, :3]):.2f} N{within}"
         case _:
             return ""

@@ -55,7 +55,7 @@ def report(shown: Shown, gauge: Gauge | None, tooled: bool, place: str) -> str:
     tool = "seen" if known.T_scan_tool is not None else "not seen" if placed else "not placed without the reference"
     facts = [place, f"reference {'seen' if placed else 'not seen'}", *([f"tool {tool}"] if tooled else [])]
     if known.motion.known and known.relied:
-        facts.append(f"tumour moved {unbroken(known.motion.moved, known.motion.error)}")
+        facts.append(f"tumour moved {unbroken(known.motion.moved, known.motion.error)} (error of model and tool)")
     took = f"looked at and drawn in {1e3 * shown.seconds:.0f} ms"
     if shown.latency is not None:
         took += f"; shown {1e3 * shown.latency:.0f} ms after it was taken"
