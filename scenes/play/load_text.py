@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 
+from ar.overlay.hud import rounded_up
 from sim.deformation import Deformation, Outcome
 from sim.loads import Cause, Loads, Posture, Pushed, Resected, Retracted, Touching
 
@@ -48,8 +49,9 @@ def _words(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str:
             steps = round(float(cause.done[0]))
             return f"resection: {steps} step{'' if steps == 1 else 's'} done"
         case Touching() | Retracted() if answer.reaction.shape[1]:  # some learnt models do not know it
-            bound = answer.reaction_bound[0, 0]
-            within = f" within {bound:.2f} N (model)" if answer.outcome[0].good and np.isfinite(bound) else ""
+            bound = float(answer.reaction_bound[0, 0])
+            known = answer.outcome[0].good and np.isfinite(bound)
+            within = f" within {rounded_up(bound, 2):.2f} N (model)" if known else ""
             return f"the tool reads {np.linalg.norm(answer.reaction[0, -1, :3]):.2f} N{within}"
         case _:
             return ""
