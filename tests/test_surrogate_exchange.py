@@ -50,7 +50,7 @@ def models(block, tmp_path_factory):
     path = tmp_path_factory.mktemp("exchange") / "data.h5"
     fem = Fem(block, (*pushed_effects(block, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
     provenance = {"tissue": tissue_to_json(TISSUE), "element": "p1"}
-    simulate(path, fem, draw("palpation", block, 200, 3), provenance)
+    simulate(path, fem, draw("palpation", block, 100, 3), provenance)
     data = read_dataset(path)
     fit = Ann.fit
     with pytest.MonkeyPatch.context() as patched:
