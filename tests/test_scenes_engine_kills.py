@@ -24,7 +24,7 @@ from scenes.episodes.workers import own_workers
 from tiny_work import Trouble, played
 
 if __name__ == "__main__":
-    with own_workers(["cpu"] * 2, {"distributed.scheduler.allowed-failures": 1000}, 1000) as workers:
+    with own_workers(["cpu"] * 3, {"distributed.scheduler.allowed-failures": 1000}, 1000) as workers:
         played(Path(sys.argv[1]), workers, int(sys.argv[2]), Trouble(seconds=0.2))
 """
 

@@ -71,7 +71,9 @@ def test_the_commands_run_where_there_is_no_checkout(programs, sulcus, tmp_path)
     where = ran(programs / "python", "-c", "import sim, scenes; print(sim.__file__, scenes.__file__)", cwd=tmp_path)
     assert all(Path(path).is_relative_to(programs.parent) for path in where.split())
     assert sulcus("--version").startswith("sulcus ")
-    assert "pass" in sulcus("check", "press", "--every", 60, "--device", "cpu")  # plays, draws and judges
+    assert "press" in sulcus("scenes")
+    sulcus("render", "press", "--every", 60, "--out", "frames")
+    assert "pass" in sulcus("check", "press", "--every", 60, "--device", "cpu")
     assert "http://" in sulcus("demo", "--device", "cpu", "--seconds", 1, "--port", free_port())
     made = "import gymnasium; made = gymnasium.make('scenes.gym:sulcus/Palpate-v0', device='cpu')"
     assert "(24,)" in ran(
