@@ -37,7 +37,7 @@ class Demo:
         self.solve.join()
         print("all closed", flush=True)
 
-theatre = Names(models={"linear": Names(left_out=None)}, learned_tissue=None, anatomy=Names(mesh=None),
+theatre = Names(models={"linear": Names(bound=1e-4, left_out=None)}, learned_tissue=None, anatomy=Names(mesh=None),
                 best=lambda scene: "linear", usual=lambda scene: "linear",
                 knowing=lambda scene: True, refusals=lambda scene: {}, described=lambda name, scene: name)
 sys.modules["ar.overlay.composite"] = Names(load_kernels=lambda: None)

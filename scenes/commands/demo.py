@@ -157,9 +157,12 @@ def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> s
             why = next(iter(theatre.refusals(scene).values()), none)
             print(f"sulcus {args.command}: finite elements play {scene.name}, no learned model: {why}", file=sys.stderr)
         best = theatre.best(scene)
-        stated = theatre.models[best].left_out if best in theatre.models else None
-        if args.deformer is None and stated is not None and not stated.enough:
-            print(f"sulcus {args.command}: on left-out cortex {best} is {stated}", file=sys.stderr)
+        if args.deformer is None and best in theatre.models:
+            from surrogate.model.guarded import off_by
+
+            stated = off_by(theatre.models[best])
+            if stated.weak:
+                print(f"sulcus {args.command}: on left-out cortex {best} is {stated.judged}", file=sys.stderr)
         return args.deformer or theatre.usual(scene)
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")

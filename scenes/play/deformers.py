@@ -26,7 +26,7 @@ from surrogate.locating.locator import Locator
 from surrogate.locating.locator_files import load_locator, locator_path
 from surrogate.locating.regions import differing
 from surrogate.model.applicability import refusal
-from surrogate.model.guarded import Guarded
+from surrogate.model.guarded import Guarded, off_by
 from surrogate.model.learned import Learned
 from surrogate.model.left_out import LIMIT
 from surrogate.model.store import load
@@ -162,8 +162,7 @@ class Theatre:
         A model of tissue that relaxes plays alone, with its bound: see `_guardable`.
         """
         name = self.best(scene)
-        stated = self.models[name].left_out if name in self.models else None
-        return name if stated is None or stated.enough or not self._guardable(scene) else GUARDED
+        return GUARDED if self._guardable(scene) and off_by(self.models[name]).weak else name
 
     def _guardable(self, scene: Scene) -> bool:
         """Whether finite elements can stand behind the best model.

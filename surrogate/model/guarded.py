@@ -12,7 +12,7 @@ from sim.errors import InputError
 from sim.loads import Loads
 
 from .learned import Learned
-from .left_out import LIMIT, handed_over
+from .left_out import LIMIT, OffBy, handed_over
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +78,11 @@ class Guarded:
         """(B,) bool: which of the model's answers are not good enough."""
         bound = np.where(np.isnan(predicted.bound[0]), self.model.bound, predicted.bound[0])
         return handed_over(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
+
+
+def off_by(model: Learned) -> OffBy:
+    """What a model states of its errors on cortex left out of a training."""
+    return OffBy(model.bound, model.left_out)
 
 
 def model_of(deformer: Deformer) -> Learned | None:
