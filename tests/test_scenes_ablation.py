@@ -156,7 +156,7 @@ class TestScenes:
     def test_pictures_and_a_sheet(self, anatomy, tmp_path, capsys):
         out = tmp_path / "new" / "sheet"
         assert main(["scenes", "press", "brain_shift", "--anatomy", anatomy, "--device", "cpu", "--out", str(out)]) == 0
-        assert "ms a frame by linear; the tumour moves" in capsys.readouterr().out
+        assert "ms a frame by guarded; the tumour moves" in capsys.readouterr().out
         assert sorted(path.name for path in out.iterdir()) == ["brain_shift.png", "press.png", "sheet.png"]
         whole, one = (cv2.imread(str(out / name)) for name in ("sheet.png", "press.png"))
         assert one.shape == (360, 480, 3) and whole.shape == (360, 1440, 3)

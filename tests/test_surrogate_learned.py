@@ -19,7 +19,7 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.disc_split import APART
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.evaluation.coverage import coverage
+from surrogate.evaluation.coverage import coverage, covered, held_by
 from surrogate.evaluation.score import errors
 from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
@@ -185,7 +185,7 @@ def test_how_bounds_hold_in_the_discs_left_out_is_reported_of_a_model_that_knows
         assert (stated.mean, stated.solved) == pytest.approx((share.mean(), solved.mean())) and solved.any()
         assert stated.guarded == pytest.approx((share * (1.0 - solved)).mean())
         found, held = trained.left_out[name], np.concatenate(held, axis=1)
-        assert found.loads == held.shape[1] == split.test.sum() and found.held == pytest.approx(held.mean(axis=1))
+        assert found.loads == held.shape[1] == split.test.sum() and found.held == (held[0].mean(), None)
     assert scored.left_out == {}
 
 
@@ -242,6 +242,10 @@ def test_a_judge_counts_each_level_by_its_own_bound(trained, fresh, box):
     assert found.extrapolated == answer.outcome.count(Outcome.EXTRAPOLATED) and found.loads == len(fresh)
     weakest = np.argsort(np.linalg.norm(fresh.of(Pushed).force, axis=1))
     assert found.tenths == tuple((weakest[k : k + 6] % 4 == 0).mean() for k in range(0, 60, 6))
+    some = covered(np.ones(20), np.full(20, 3e-3), np.array([np.full(20, 4e-3), np.full(20, np.inf)]), 0)
+    assert some.held == (1.0, None) and "100.0 % at 95 %, nothing is promised at 99 %;" in str(some)
+    half = np.where(np.arange(20) < 10, 2e-3, np.inf)  # what promises nothing does not hold, either
+    assert held_by(np.full(20, 3e-3), half[None]) == (0.0,)
 
 
 def test_the_model_alone_in_numpy_answers_as_the_deformer_does(model, box, fresh):

@@ -172,7 +172,7 @@ def test_how_its_bound_holds_in_the_discs_left_out_is_reported_of_a_model_that_k
         held.append(seen(here).error <= bounded.distance(good.rows(here)).bound)
     found = trained.distance_left_out["linear"]
     held = np.concatenate(held, axis=1)
-    assert found.loads == held.shape[1] == split.test.sum() and found.held == pytest.approx(held.mean(axis=1))
+    assert found.loads == held.shape[1] == split.test.sum() and found.held == (held[0].mean(), None)
 
 
 @pytest.mark.parametrize("count", [600, APART * ENOUGH])

@@ -289,9 +289,9 @@ def uncertainty(
     mark, failed = mark_of(scene, theatre.site, theatre.element_of(scene)), len(draws) - len(sound)
     named = {name: tuple(row[name] for row in by_name) for name in by_name[0]}
     share = float(np.mean(held[1:] or held))
-    return Uncertainty(
-        scene.name, mark, len(draws), failed, share, still.times, worst, middle, moved, named, folded=folded
-    )
+    numbers = sum(column.shape[1] for column in causes(kept, scene).values())
+    found = (scene.name, mark, len(draws), failed, share, still.times, worst, middle, moved, named)
+    return Uncertainty(*found, folded=folded, numbers=numbers)
 
 
 def off_by(motion: np.ndarray, field: np.ndarray, meshes: np.ndarray) -> np.ndarray:

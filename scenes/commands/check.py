@@ -85,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
             "model_error_mm": _mm(promised),
             "tumour_error_mm": _mm(error.bound),
             "largest_part": error.largest,
+            "tumour_error_is_a_guess": error.guess,
             "objections": against,
             "tumour_error_unobserved_mm": _mm(error.prior),
         }

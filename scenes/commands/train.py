@@ -128,8 +128,9 @@ def _calibration(trained: Trained) -> str:
 
 def _stated(model: Learned) -> dict[str, object]:
     """What a model says of itself, beside its score."""
-    known = model.left_out
-    return {"bound_mm": 1e3 * model.bound, "discs": None if known is None else asdict(known), "weak": off_by(model).weak}
+    known = off_by(model)
+    discs = None if known.left_out is None else asdict(known.left_out)
+    return {"bound_mm": 1e3 * known.bound, "discs": discs, "weak": known.weak}
 
 
 def _for_machines(trained: Trained, out: str, failed: int, preset: str) -> str:

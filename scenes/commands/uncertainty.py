@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve an ensemble of each scene, and keep what it says."""
-    from ..bench.uncertainty import causes, coverage, ensemble, nominal, skulls_of, tissue_of, tumour_of, uncertainty
+    from ..bench.uncertainty import coverage, ensemble, nominal, skulls_of, tissue_of, tumour_of, uncertainty
     from ..play.deformers import open_theatre
     from ..script.priors import drawn, drawn_from
     from ..script.scene import SCENES
@@ -101,8 +101,7 @@ def run(args: argparse.Namespace) -> int:
         write_uncertainties(out, [found])
         tried = bar(ensemble(theatre, scene, twins), total=len(twins))
         held = coverage(scene, still, found, twins, tried, args.seed + 1) if twins else None
-        fitted_numbers = sum(column.shape[1] for column in causes(draws, scene).values())
-        rows.append(_flat(theatre, scene, found, held) | {"fitted_numbers": fitted_numbers})
+        rows.append(_flat(theatre, scene, found, held))
         print("\n".join(_lines(rows[-1])), file=lines, flush=True)
     if args.json:
         print(json_line({"seed": args.seed, "out": str(out), "scenes": rows}))
@@ -126,6 +125,7 @@ def _flat(theatre: Theatre, scene: Scene, found: Uncertainty, twins: float | Non
         "model_mm": None if promised is None else 1e3 * promised, "tumour_mm": 1e3 * (error.bound or 0.0),
         "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment], "largest_part": error.largest,
         "draws": found.draws, "failed": found.failed, "frames": found.frames, "folded": found.folded,
+        "fitted_numbers": found.numbers, "few": found.few, "guess": found.guess,
         "held": found.held, "held_twins": twins,
         "parts_mm": ranked,
     }  # fmt: skip
@@ -139,7 +139,7 @@ def _lines(row: dict[str, Any]) -> Sequence[str]:
         f"{row['middle_mm']:.1f} mm. Root mean square of each part [mm]:"
     )
     lines += [f"    {name:<20} {size:6.3f}" for name, size in row["parts_mm"].items()]
-    if row["draws"] - row["failed"] < 2 * row["fitted_numbers"]:
+    if row["few"]:
         lines.append(
             f"  these parts are guesses: {row['fitted_numbers']} numbers are fitted to {row['draws'] - row['failed']} "
             f"draws. Give --draws {2 * row['fitted_numbers']} or more"

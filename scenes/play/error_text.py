@@ -45,13 +45,13 @@ def tumour_words(error: TumourError, brief: bool = False) -> str:
     """What the tumour is off by, against where it is in the patient."""
     if error.bound is None:
         return "tumour: not known" if brief else NOT_KNOWN_WORDS
-    within = f"tumour: within {bound_words(error.bound, 1)}"
+    within, guess = f"tumour: within {bound_words(error.bound, 1)}", ", a guess" if error.guess else ""
     if brief:
-        return within
+        return within if error.observed is not None else f"{within}{guess}"
     said = f"{within} of where it is (95 %)"
     if error.observed is None:
-        return f"{said}, above all {error.largest}"
-    return said if error.prior is None else f"{said}; without observation {bound_words(error.prior, 1)}"
+        return f"{said}{guess or f', above all {error.largest}'}"
+    return said if error.prior is None else f"{said}; without observation {bound_words(error.prior, 1)}{guess}"
 
 
 def worst(errors: Sequence[TumourError]) -> TumourError:

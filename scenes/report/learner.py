@@ -109,10 +109,10 @@ def coverage_of(study: Study, spec: Learner, outside: Loads, truth: np.ndarray) 
         return {}
     trained = train(study.dataset, [spec.name], expansion=study.expansion)
     model, found = trained.models[spec.name], trained.left_out.get(spec.name)
-    covered = {} if found is None else {"discs": found.held[0]}
+    held = {} if found is None else {"discs": found.held[0]}
     if model.bounds is not None and len(outside) >= TENTHS:
-        covered["beyond"] = coverage(model, outside, truth).held[0]
-    return covered
+        held["beyond"] = coverage(model, outside, truth).held[0]
+    return {name: share for name, share in held.items() if share is not None}
 
 
 def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]:

@@ -44,12 +44,15 @@ class TumourError:
         The same with what is observed of the brain [m]; None where nothing is.
     moved
         The part of `prior` by which its motion since the scan may be off: that without registration and segmentation.
+    guess
+        Whether `prior` is a guess, as `Uncertainty.guess` says.
     """
 
     prior: float | None
     largest: str = ""
     observed: float | None = None
     moved: float | None = None
+    guess: bool = False
 
     @property
     def bound(self) -> float | None:
@@ -85,6 +88,8 @@ class Uncertainty:
     folded
         In how many draws tetrahedra lie inside out, as under a tool on soft tumour: no tissue moves so. 0, too, in
         files that do not say it.
+    numbers
+        How many numbers the parts are fitted to the draws by; 0 in files that do not say it.
     """
 
     scene: str
@@ -99,6 +104,17 @@ class Uncertainty:
     parts: Mapping[str, tuple[float, ...]]
     frames: int = 0
     folded: int = 0
+    numbers: int = 0
+
+    @property
+    def few(self) -> bool:
+        """Whether fewer than two draws were solved for each number that was fitted to them."""
+        return self.draws - self.failed < 2 * self.numbers
+
+    @property
+    def guess(self) -> bool:
+        """Whether this is no more than a guess: of few draws, or of a load beyond the tissue's law."""
+        return self.few or self.folded > 0
 
     def at(self, time: float, surrogate: float = 0.0) -> TumourError:
         """The error at a time [s], where a trained model adds its own bound [m]."""
@@ -106,7 +122,8 @@ class Uncertainty:
         parts[SURROGATE] = surrogate / DEVIATIONS
         worst = float(np.hypot(self.read(self.worst, time), surrogate))
         moved = DEVIATIONS * float(np.linalg.norm([size for name, size in parts.items() if name not in AT_REST]))
-        return TumourError(worst, max(parts, key=lambda name: parts[name]), moved=min(moved, worst))
+        largest = max(parts, key=lambda name: parts[name])
+        return TumourError(worst, largest, moved=min(moved, worst), guess=self.guess)
 
     def read(self, values: tuple[float, ...], time: float) -> float:
         """One of the lists at a time [s], between its entries in proportion."""
@@ -159,8 +176,8 @@ def _read(row: dict) -> Uncertainty:
         if len(values) != len(lists["times"]) or not np.isfinite(values).all():
             raise InputError(f"{name} are not {len(lists['times'])} finite numbers.")
     counts = int(row["draws"]), int(row["failed"]), float(row["held"])
-    frames, folded = (int(row.get(name, 0)) for name in ("frames", "folded"))
-    return Uncertainty(str(row["scene"]), str(row["mark"]), *counts, **lists, parts=parts, frames=frames, folded=folded)
+    later = {name: int(row.get(name, 0)) for name in ("frames", "folded", "numbers")}
+    return Uncertainty(str(row["scene"]), str(row["mark"]), *counts, **lists, parts=parts, **later)
 
 
 def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:

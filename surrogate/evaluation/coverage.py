@@ -15,6 +15,8 @@ from ..model.conformal import LEVELS
 from ..model.learned import Learned
 
 TENTHS = 10
+Held = tuple[float | None, ...]
+"""For each of `conformal.LEVELS`, the share of loads within their bounds; None where bounds promise nothing."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +28,9 @@ class Coverage:
     loads
         n.
     held
-        Shares of the loads whose error lies below the bound, for `conformal.LEVELS`. The error is the largest at the
-        tumour, or that of the distance from tip to tumour.
+        Shares of the loads whose error lies below the bound, for `conformal.LEVELS`; None where too few loads
+        calibrated to promise anything. The error is the largest at the tumour, or that of the distance from tip to
+        tumour.
     tenths
         The same for the first level, by tenths of the force, from weak to strong.
     bound_mm, error_mm
@@ -37,19 +40,16 @@ class Coverage:
     """
 
     loads: int
-    held: tuple[float, float]
+    held: Held
     tenths: tuple[float, ...]
     bound_mm: float
     error_mm: float
     extrapolated: int
 
     def __str__(self) -> str:
-        held = ", ".join(
-            f"{100 * share:.1f} % at {100 * level:g} %" for share, level in zip(self.held, LEVELS, strict=True)
-        )
         tenths = " ".join(f"{100 * share:.0f}" for share in self.tenths)
         return (
-            f"{held}; by tenths of force {tenths}; median bound {self.bound_mm:.4f} mm, median error "
+            f"{held_words(self.held)}; by tenths of force {tenths}; median bound {self.bound_mm:.4f} mm, median error "
             f"{self.error_mm:.4f} mm; {self.extrapolated} loads outside the training range"
         )
 
@@ -91,14 +91,31 @@ def _demand_tenths(loads: Loads) -> None:
         raise InputError(f"{len(loads)} loads have no tenths: simulate at least {TENTHS}.")
 
 
+def held_by(error: np.ndarray, bound: np.ndarray) -> Held:
+    """Shares of errors (B,) within bounds (levels, B) of the same unit; infinite ones promise nothing."""
+    promised = ~np.isposinf(bound)
+    return tuple(
+        float((error <= row)[some].mean()) if some.any() else None for row, some in zip(bound, promised, strict=True)
+    )
+
+
+def held_words(held: Held) -> str:
+    """How often bounds held, in words."""
+    shares = zip(held, LEVELS, strict=True)
+    return ", ".join(
+        f"nothing is promised at {100 * level:g} %" if share is None else f"{100 * share:.1f} % at {100 * level:g} %"
+        for share, level in shares
+    )
+
+
 def covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolated: int) -> Coverage:
     """How often errors (B,) [m] lie below bounds (2, B) [m], under forces (B,) [N]; so many loads lie outside."""
-    held = error <= bound
+    held = error <= bound[0]
     by_force = np.array_split(np.argsort(force, kind="stable"), TENTHS)
     return Coverage(
         len(error),
-        (float(held[0].mean()), float(held[1].mean())),
-        tuple(float(held[0][rows].mean()) for rows in by_force),
+        held_by(error, bound),
+        tuple(float(held[rows].mean()) for rows in by_force),
         1e3 * float(np.median(bound[0])),
         1e3 * float(np.median(error)),
         extrapolated,

@@ -9,8 +9,8 @@ import numpy as np
 from sim.errors import InputError
 from sim.loads import Loads
 
-from ..model.conformal import LEVELS
 from ..model.learned import Learned
+from .coverage import Held, held_by, held_words
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class ForceScore:
     mean_percent, p95_percent
         Of each error divided by its load's force [%].
     held
-        Shares of the loads whose error lies below the bound, for `conformal.LEVELS`; None where none is promised.
+        Shares of the loads whose error lies below the bound, as in `Coverage`; None where none is promised.
     bound
         Median of the bound at the first level [N]; None as above.
     """
@@ -38,15 +38,13 @@ class ForceScore:
     mean: float
     mean_percent: float
     p95_percent: float
-    held: tuple[float, float] | None = None
+    held: Held | None = None
     bound: float | None = None
 
     def __str__(self) -> str:
         promised = "no bounds"
         if self.held is not None and self.bound is not None:
-            shares = zip(self.held, LEVELS, strict=True)
-            held = ", ".join(f"{100 * share:.1f} % at {100 * level:g} %" for share, level in shares)
-            promised = f"bounds held for {held}; median bound {self.bound:.4f} N"
+            promised = f"bounds held for {held_words(self.held)}; median bound {self.bound:.4f} N"
         return (
             f"mean error {self.mean:.4f} N of {self.force:.3f} N, {self.mean_percent:.2f} % of each load's force, "
             f"p95 {self.p95_percent:.2f} %; {promised}"
@@ -81,7 +79,7 @@ def force_score(error: np.ndarray, truth: np.ndarray, bound: np.ndarray | None =
         float(error[some].mean()),
         float(share.mean()),
         float(np.percentile(share, 95.0)),
-        tuple((error[some] <= bound[:, some]).mean(axis=1).tolist()) if bound is not None else None,
+        held_by(error[some], bound[:, some]) if bound is not None else None,
         float(np.median(bound[0, some])) if bound is not None else None,
     )
 

@@ -200,9 +200,11 @@ def tumour_trust(error: TumourError) -> str:
         )
     within = hud.bound_words(error.bound, 1)
     said = f"Error of the tumour: 95 of 100 times no point of it is more than {within} from where it is"
+    guess = ": a guess, of few draws or a load beyond the law of the tissue" if error.guess else ""
     if error.observed is None:
-        return f"<p>{said}; the largest part is {escape(error.largest)}.</p>"
-    return f"<p>{said}{'' if error.prior is None else f'; without observation {hud.bound_words(error.prior, 1)}'}.</p>"
+        return f"<p>{said}{guess or f'; the largest part is {escape(error.largest)}'}.</p>"
+    without = "" if error.prior is None else f"; without observation {hud.bound_words(error.prior, 1)}{guess}"
+    return f"<p>{said}{without}.</p>"
 
 
 def report(

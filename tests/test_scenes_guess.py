@@ -1,0 +1,31 @@
+"""An ensemble of few draws, or of loads beyond the tissue's law, is called a guess wherever its figure is shown."""
+
+import pytest
+
+from scenes.play.error_text import error_lines, tumour_words
+from scenes.script.uncertainty import TumourError, Uncertainty
+
+LISTS = {"times": (0.0, 1.0), "worst": (2e-3, 4e-3), "middle": (1e-3, 1e-3), "moved": (1e-3, 1e-3)}
+PARTS = {"E": (0.0, 3e-3), "registration": (2e-3, 2e-3)}
+
+
+@pytest.mark.parametrize(
+    ("counts", "guess"),
+    [
+        ({}, False),  # older files say neither
+        ({"numbers": 4}, False),
+        ({"numbers": 5}, True),
+        ({"folded": 1}, True),
+    ],
+)
+def test_what_few_draws_or_folded_tissue_say_is_a_guess(counts, guess):
+    found = Uncertainty("press", "mark", 9, 1, 0.95, **LISTS, parts=PARTS, **counts)
+    assert found.guess == found.at(0.5).guess == guess and found.few == (counts.get("numbers") == 5)
+
+
+def test_a_guess_is_called_so_and_blames_no_part():
+    alone, seen = TumourError(4.11e-3, "E", guess=True), TumourError(4.11e-3, "E", 1e-3, guess=True)
+    assert error_lines(None, alone, False)[-1] == "tumour: within 4.2 mm of where it is (95 %), a guess"
+    assert tumour_words(seen).endswith("within 1.0 mm of where it is (95 %); without observation 4.2 mm, a guess")
+    assert tumour_words(alone, brief=True) == "tumour: within 4.2 mm, a guess"
+    assert tumour_words(seen, brief=True) == "tumour: within 1.0 mm"
