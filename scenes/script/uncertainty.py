@@ -176,8 +176,9 @@ def _read(row: dict) -> Uncertainty:
         if len(values) != len(lists["times"]) or not np.isfinite(values).all():
             raise InputError(f"{name} are not {len(lists['times'])} finite numbers.")
     counts = int(row["draws"]), int(row["failed"]), float(row["held"])
-    later = {name: int(row.get(name, 0)) for name in ("frames", "folded", "numbers")}
-    return Uncertainty(str(row["scene"]), str(row["mark"]), *counts, **lists, parts=parts, **later)
+    frames, folded, numbers = (int(row.get(name, 0)) for name in ("frames", "folded", "numbers"))
+    of, mark = str(row["scene"]), str(row["mark"])
+    return Uncertainty(of, mark, *counts, **lists, parts=parts, frames=frames, folded=folded, numbers=numbers)
 
 
 def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:
