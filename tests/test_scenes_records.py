@@ -242,7 +242,19 @@ class TestEpisode:
 class TestRender:
     def test_frames_and_film(self, brief, anatomy, tmp_path, capsys):
         frames, film = tmp_path / "a" / "frames", tmp_path / "film.mp4"
-        words = ["render", "press", "--anatomy", str(anatomy), "--out", str(frames), "--every", "2", "--json"]
+        words = [
+            "render",
+            "press",
+            "--deformer",
+            "linear",
+            "--anatomy",
+            str(anatomy),
+            "--out",
+            str(frames),
+            "--every",
+            "2",
+            "--json",
+        ]
         assert main([*words, "--film", str(film)]) == 0
         report = json.loads(capsys.readouterr().out)
         assert report["frames"] == 4 and report["not_good"] == 0 and report["deformer"] == "linear"
@@ -257,7 +269,19 @@ class TestRender:
         assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "film.mp4"]
 
     def test_plain_frames_have_no_panel(self, brief, anatomy, theatre, tmp_path, capsys):
-        words = ["render", "press", "--anatomy", str(anatomy), "--every", "3", "--plain", "--out", str(tmp_path)]
+        words = [
+            "render",
+            "press",
+            "--deformer",
+            "linear",
+            "--anatomy",
+            str(anatomy),
+            "--every",
+            "3",
+            "--plain",
+            "--out",
+            str(tmp_path),
+        ]
         assert main(words) == 0
         assert "3 frames by linear" in capsys.readouterr().out
         shown = [frame.shown for frame in player(theatre, short(), "linear").frames(every=3)]
@@ -267,7 +291,7 @@ class TestRender:
     def test_doubtful_answers_are_reported_by_the_exit_code(self, anatomy, tmp_path, monkeypatch, capsys):
         strong = replace(short(), path=press(0.8, rise=0.1, hold=0.0))
         monkeypatch.setattr("scenes.script.scene.find_scene", lambda name: strong)
-        words = ["render", "press", "--anatomy", str(anatomy), "--out", str(tmp_path), "--json"]
+        words = ["render", "press", "--deformer", "linear", "--anatomy", str(anatomy), "--out", str(tmp_path), "--json"]
         assert main(words) == 1
         assert 2 <= json.loads(capsys.readouterr().out)["not_good"] <= 5
 
