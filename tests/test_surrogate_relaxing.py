@@ -32,7 +32,7 @@ from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import draw_poses
 from surrogate.evaluation.score import errors
 from surrogate.model.applicability import refusal
-from surrogate.model.guarded import Guarded
+from surrogate.model.guarded import Guarded, judged
 from surrogate.model.learned import Learned
 from surrogate.model.relaxation import MEMORY, Relaxed, followed
 from surrogate.model.store import load, save
@@ -233,6 +233,7 @@ def test_it_plays_alone_frame_by_frame(model: Learned, box: Anatomy) -> None:
     theatre = Theatre(box, None, {"contact": model}, "cpu")
     scene = replace(scene, element="p1")
     assert theatre.names(scene) == ("contact", "fem") and theatre.usual(scene) == "contact"
+    assert judged(replace(model, bound=1e-3)).endswith("enough: it plays alone nevertheless, as its tissue relaxes")
     with pytest.raises(InputError, match="its tissue relaxes, so that finite elements would have to answer"):
         theatre.deformer(GUARDED, scene)
     with pytest.raises(InputError, match="would need every frame before"):

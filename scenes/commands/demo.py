@@ -158,11 +158,11 @@ def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> s
             print(f"sulcus {args.command}: finite elements play {scene.name}, no learned model: {why}", file=sys.stderr)
         best = theatre.best(scene)
         if args.deformer is None and best in theatre.models:
-            from surrogate.model.guarded import off_by
+            from surrogate.model.guarded import judged, off_by
 
-            stated = off_by(theatre.models[best])
-            if stated.weak:
-                print(f"sulcus {args.command}: on left-out cortex {best} is {stated.judged}", file=sys.stderr)
+            model = theatre.models[best]
+            if off_by(model).weak:
+                print(f"sulcus {args.command}: on left-out cortex {best} is {judged(model)}", file=sys.stderr)
         return args.deformer or theatre.usual(scene)
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")

@@ -18,7 +18,7 @@ from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.disc_split import APART
 from surrogate.data.tool_loads import refused_share, refused_words
 from surrogate.evaluation.score import table, winner
-from surrogate.model.guarded import off_by
+from surrogate.model.guarded import judged, off_by
 from surrogate.model.learned import Learned
 from surrogate.model.store import save
 from surrogate.training.expansion import EXPANDED, Expansion
@@ -106,7 +106,7 @@ def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
             "error at the tumour's vertices on the held-out loads, against the finite elements on the same mesh:",
             table(trained.scores, 1e3 * trained.motion),
             f"worst vertex of 95 in 100 held-out loads within [mm]: {bounds}; scenes play that of the least",
-            *(f"on those discs {name} is {off_by(model).judged}" for name, model in trained.models.items()),
+            *(f"on those discs {name} is {judged(model)}" for name, model in trained.models.items()),
             *(f"on those discs bounds of {name} held for {found}" for name, found in trained.left_out.items()),
             *(
                 f"on those discs, bounds of the distance from tip to tumour by {name} held for {found}"

@@ -85,6 +85,13 @@ def off_by(model: Learned) -> OffBy:
     return OffBy(model.bound, model.left_out)
 
 
+def judged(model: Learned) -> str:
+    """How far off that is, in words, and who plays scenes for it: see `Guarded`."""
+    stated = off_by(model)
+    guarded = "it plays alone nevertheless, as its tissue relaxes" if model.series else "scenes play it guarded"
+    return f"{model.left_out or stated}: {guarded if stated.weak else 'it may answer alone'}"
+
+
 def model_of(deformer: Deformer) -> Learned | None:
     """The model that a deformer is, or asks first; None of finite elements."""
     if isinstance(deformer, Guarded):

@@ -50,7 +50,7 @@ class LeftOut:
             f"with finite elements behind it for {100 * self.solved:.0f} % of the loads, those that it may have over "
             f"{1e3 * self.limit:g} mm off, {100 * self.guarded:.2f} %"
         )
-        return f"{100 * self.mean:.2f} % of the motion off alone, {behind}: {_verdict(self.enough)}"
+        return f"{100 * self.mean:.2f} % of the motion off alone, {behind}"
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,6 @@ class OffBy:
     def weak(self) -> bool:
         """Whether that is too much to answer alone; where it is not known in the mean, of the worst vertex."""
         return not (self.bound <= LIMIT if self.left_out is None else self.left_out.enough)
-
-    @property
-    def judged(self) -> str:
-        """In words, and whether it may answer alone."""
-        return f"{self}: {_verdict(not self.weak)}" if self.left_out is None else str(self.left_out)
 
     def __str__(self) -> str:
         """In words."""
@@ -109,10 +104,6 @@ def left_out_of(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, out
         if _enough(left, _p999(np.where(solved[:, None], 0.0, distance))):
             break
     return LeftOut(float(share.mean()), left, _p999(distance), float(solved.mean()), limit)
-
-
-def _verdict(enough: bool) -> str:
-    return "it may answer alone" if enough else "scenes play it guarded, unless its tissue relaxes"
 
 
 def _p999(distance: np.ndarray) -> float | None:
