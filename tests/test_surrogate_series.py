@@ -23,6 +23,7 @@ from surrogate.regressors.force_series import ORDERS, SPANS, Series, forms
 from surrogate.regressors.left_out_tables import filled
 from surrogate.training.examples import Examples
 from surrogate.training.expansion import ADDED, COARSE, EXPANDED, Expansion
+from surrogate.training.kept_rows import KeptRows
 from surrogate.training.tabulate_series import radii_between, tabulated, with_middles
 from surrogate.training.train import learners_for, train
 
@@ -90,7 +91,7 @@ def every_motion(fem, nodes):
     return fem.reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
 
 
-def test_the_table_is_the_finite_elements_series(box, patch):
+def test_the_table_is_the_finite_elements_series(box, patch, tmp_path):
     fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", batch=200, element="p1")
     nodes = box.tumour_nodes
     loads = pushes(patch, 30, 3, (7e-3, 7e-3))
@@ -101,6 +102,18 @@ def test_the_table_is_the_finite_elements_series(box, patch):
     table = tabulated(fem, places, radii, reading, lambda done, total: heard.append((done, total)))
     series = Series(patch.points, triangles, radii, table)
     assert heard[-1] == (len(places), len(places))
+    # Stopped at its second step, it goes on there, and comes to the same.
+    kept = KeptRows(tmp_path / "rows", "a table")
+
+    def stop(done, total):
+        if done > step:
+            raise KeyboardInterrupt
+
+    step, last = heard[0][0], []
+    with pytest.raises(KeyboardInterrupt):
+        tabulated(fem, places, radii, reading, stop, kept)
+    again = tabulated(fem, places, radii, reading, lambda done, total: last.append(done), kept)
+    assert np.array_equal(again, table) and last == [done for done, _ in heard[2:]]
     size, _ = directions(loads)
     predicted = series.predict(tool_features(patch, loads)) * size[:, None]
     wanted = exact.sum(axis=1)

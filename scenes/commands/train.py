@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sim.errors import InputError
+from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.device import device_names
 from sim.runtime.timing import stage
 from surrogate.data.dataset import Dataset, read_dataset
@@ -57,11 +58,15 @@ def run(args: argparse.Namespace) -> int:
     shown = "{l_bar}{bar}| {n_fmt}/{total_fmt} learners [{elapsed}{postfix}]"
     with tqdm(total=len(learners), bar_format=shown, disable=args.json, file=sys.stderr) as bar:
         expansion = Expansion(
-            data, device, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places")
+            data,
+            device,
+            lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"),
+            begun=unfinished_path(out),
         )
         trained = train(data, learners, lambda learner: bar.update(), most=args.most, expansion=expansion)
     with stage("save"):
         save(out, trained.models)
+        unfinished_path(out).unlink(missing_ok=True)
     failed = int(np.sum(~data.good))
     preset = "" if data.tool is not None else data.provenance.get("preset", "")
     show = _for_machines if args.json else _for_people

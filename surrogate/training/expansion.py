@@ -14,6 +14,7 @@ from sim.accuracy import REFERENCE
 from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
+from sim.geometry.tetmesh import digest_of
 from sim.loads import Pushed
 from sim.minimisers.second_order import second_order
 from sim.runtime.atomic_files import written_whole
@@ -33,6 +34,7 @@ from ..regressors.left_out_tables import filled
 from ..regressors.rigid_contact import Contact
 from .condense_contact import condensed, side_by_side
 from .examples import Examples, left_by
+from .kept_rows import KeptRows
 from .tabulate_series import in_one_disc, radii_between, tabulated, with_middles
 
 # Share of the responses that a learner's basis may lose, and its most modes; the same of what the series adds to the
@@ -73,6 +75,8 @@ class Expansion:
         Of force components, for which the second order is had: so many take minutes, and 60 MB of a model.
     batch
         Most load cases that are solved together; None: as many as fit now, on a card that is nobody else's.
+    begun
+        Where the table's rows are kept while it is made, so that a stopped run goes on; the caller removes it.
     """
 
     data: Dataset
@@ -81,6 +85,7 @@ class Expansion:
     kept: Path | None = None
     most_pairs: int = 150_000
     batch: int | None = None
+    begun: Path | None = None
 
     @cached_property
     def patch(self) -> Patch:
@@ -264,8 +269,10 @@ class Expansion:
         others = np.setdiff1d(np.arange(count), few)
         table[few] = np.concatenate([part @ basis.modes.T for part, basis in zip(parts, bases, strict=True)], axis=-1)
         if len(others):
+            what = digest_of(whole.modes, self.places, self.radii)
+            kept = None if self.begun is None else KeptRows(self.begun, what)
             table[others] = tabulated(
-                fem, self.places[others], self.radii, reading, lambda n, _: self.progress(n + len(few), count)
+                fem, self.places[others], self.radii, reading, lambda n, _: self.progress(n + len(few), count), kept
             )
         return bases, table
 
