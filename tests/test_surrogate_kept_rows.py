@@ -19,7 +19,7 @@ def restored(kept):
 def kept(tmp_path):
     """Four rows, in two steps."""
     made = KeptRows(tmp_path / "rows", "one table")
-    assert restored(made) == 0
+    assert not made.some and restored(made) == 0 and not made.some
     made.add(0, TABLE[:3])
     made.add(3, TABLE[3:4])
     return made
@@ -28,7 +28,7 @@ def kept(tmp_path):
 def test_what_was_made_is_there_and_goes_on(kept):
     assert restored(kept) == 4
     kept.add(4, TABLE[4:])
-    assert restored(kept) == 6
+    assert restored(kept) == 6 and kept.some and not KeptRows(kept.path, "two tables").some
 
 
 def test_rows_after_a_torn_or_a_wrong_one_are_made_anew(kept):

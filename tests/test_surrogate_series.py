@@ -185,6 +185,16 @@ def test_two_orders_of_the_tumour_are_exact_wherever_a_tool_presses(expansion, b
         np.testing.assert_allclose(more, np.tile(few, (3, 1, 1)), rtol=1e-4, atol=1e-6)
 
 
+def test_a_run_that_went_on_has_the_same_table_and_states_no_seconds(tmp_path):
+    small = make_box(cells=(8, 8, 4), spacing=8e-3, tumour=12e-3, depth=20e-3, opening=22e-3)
+    data = simulated(tmp_path / "data.h5", small, 100)
+    whole, later = (Expansion(data, "cpu", begun=tmp_path / "rows", most_pairs=0) for _ in range(2))
+    assert whole.tabulated.seconds > 0.0 and np.isnan(later.tabulated.seconds)
+    assert np.array_equal(whole.tabulated.table, later.tabulated.table)
+    took = [train(data, ["series"], expansion=each).scores[0].solves.seconds for each in (whole, later)]
+    assert took[0] > 0.0 and took[1] is None
+
+
 def test_of_too_many_pairs_the_second_order_is_interpolated(data, trained):
     known = Expansion(data, "cpu", most_pairs=100)
     assert [len(parts) for parts in known.exact] == [1, 1]

@@ -20,7 +20,8 @@ class SolveCounts:
     inside
         Those of them inside the discs left out that are of the tumour.
     seconds
-        Of all these solves, on the machine that made them; None where the data do not state it.
+        Of all these solves, on the machine that made them; None where the data do not state it, and where a stopped run
+        went on.
     """
 
     loads: int

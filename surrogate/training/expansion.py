@@ -227,9 +227,9 @@ class Expansion:
                 return Tabulated(bases, file["table"], pairs, pair_basis, float(file["seconds"]))
         begun = time.perf_counter()
         fem = self.fem()
-        bases, table = self._tabulate(fem)
+        bases, table, anew = self._tabulate(fem)
         pairs, pair_basis = self._paired(fem, bases[0])
-        found = Tabulated(bases, table, pairs, pair_basis, time.perf_counter() - begun)
+        found = Tabulated(bases, table, pairs, pair_basis, time.perf_counter() - begun if anew else np.nan)
         if self.kept is not None:
             arrays = {f"modes{k}": basis.modes for k, basis in enumerate(bases)}
             arrays |= {"table": table, "pairs": pairs.pairs, "second": pairs.table, "second_modes": pair_basis.modes}
@@ -249,8 +249,11 @@ class Expansion:
         turn = reduce(basis.nodes, table, SECOND, len(basis.modes)).modes
         return Pairs(pairs, table @ turn.T), Basis(basis.nodes, turn @ basis.modes)
 
-    def _tabulate(self, fem: Fem) -> tuple[list[Basis], np.ndarray]:
-        """Every motion at a few places, the bases that these span, and what is at all places as their coefficients."""
+    def _tabulate(self, fem: Fem) -> tuple[list[Basis], np.ndarray, bool]:
+        """Every motion at a few places, the bases that these span, and what is at all places as their coefficients.
+
+        Last whether all of it was made now.
+        """
         count = len(self.places)
         few = np.sort(spread(self.places, FEW))
         every, motions = np.concatenate(self._known), []
@@ -268,13 +271,15 @@ class Expansion:
         table = np.empty((count, *parts[0].shape[1:3], reading.count), np.float32)
         others = np.setdiff1d(np.arange(count), few)
         table[few] = np.concatenate([part @ basis.modes.T for part, basis in zip(parts, bases, strict=True)], axis=-1)
+        anew = True
         if len(others):
             what = digest_of(whole.modes, self.places, self.radii)
             kept = None if self.begun is None else KeptRows(self.begun, what)
+            anew = kept is None or not kept.some
             table[others] = tabulated(
                 fem, self.places[others], self.radii, reading, lambda n, _: self.progress(n + len(few), count), kept
             )
-        return bases, table
+        return bases, table, anew
 
     @cached_property
     def _known(self) -> list[np.ndarray]:
@@ -318,7 +323,7 @@ class Tabulated:
     pairs, pair_basis
         The tumour's second order, for pairs of nodal forces.
     seconds
-        [s].
+        [s]; NaN where a stopped run went on.
     """
 
     bases: list[Basis]

@@ -30,6 +30,13 @@ class KeptRows:
     path: Path
     what: str
 
+    @property
+    def some(self) -> bool:
+        """Whether rows of this table are there."""
+        with suppress(OSError), self.path.open("rb") as file:
+            return file.read(len(self._head)) == self._head and len(file.read(1)) > 0
+        return False
+
     def restore(self, table: np.ndarray) -> int:
         """Fill the first rows of a table (P, ...) with those that are kept; how many."""
         head, size, count = self._head, table[0].nbytes, 0

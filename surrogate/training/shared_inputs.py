@@ -61,7 +61,8 @@ class SharedInputs:
         if name in EXPANDED:
             places = int((~self._left_out(known.places)).sum())
             series = places * len(known.radii) * TERMS
-            seconds.append(known.tabulated.seconds * places / len(known.places))
+            took = known.tabulated.seconds * places / len(known.places)
+            seconds.append(took if np.isfinite(took) else None)
         total = None if None in seconds else float(sum(filter(None, seconds)))
         return SolveCounts(loads, units, series, inside, total)
 
