@@ -8,7 +8,7 @@ from conftest import make_box
 from scipy.stats import multivariate_normal
 
 from sim.geometry.locate import Located
-from surrogate.locating.causes import DRAINAGE, SWELLING, TOOL, TUMOUR_SWELLING
+from surrogate.locating.causes import SWELLING, TOOL
 from surrogate.locating.evidence import SHIFT, SIGMA, SLIPPED, TURN, of_motions
 from surrogate.locating.posterior import COARSENED, MIXED, SeenPrior, conditioned, seen_prior
 from surrogate.locating.prior import BESIDE, NOWHERE, RIGIDS, SETS, WITH_PLACE, Prior
