@@ -12,10 +12,12 @@ from theatres import knowing_nothing
 from scenes.cli import main
 from sim.bodies.meshfile import read_mesh, write_anatomy
 from sim.effects import Elasticity
+from sim.errors import InputError
 from sim.material import Material
 from surrogate.data.stated_tissue import stating
 from surrogate.locating.causes import KINDS
 from surrogate.locating.locator_files import load_locator, save_locator
+from surrogate.locating.observation import MOST, Observation, looked_at, placed
 from surrogate.locating.regions import Region
 from surrogate.model.store import save
 
@@ -151,6 +153,8 @@ def test_people_read_sentences(files, capsys, words):
         ("x,y,z\n1,2\n", "row 2 is '1,2', not 3 numbers"),
         ("x,y,z\n1,2,three\n", "row 2 is '1,2,three'"),
         ("x,y,z\n1,2,nan\n", "row 2 has a number that is not finite"),
+        ("\nx,y,z\n\n1,2,1e200\n", "row 4 has a number that is not finite, or above 1e+09"),
+        ("x,y,z\n\n", "has a header and no rows"),
         ("x,y,z\n1,2,3\n", "1 points say too little"),
         ("x;y;z\n1;2;3\n", "with commas between"),
         ("x,y,z\n" + "40,30,20\n" * 20, "1 places a millimetre apart say too little"),
@@ -166,6 +170,59 @@ def test_bad_files_are_one_sentence_and_write_nothing(files, tmp_path, capsys, t
     assert main(["locate", str(folder / "box.vtu"), str(path), "--out", str(tmp_path / "out.vtu")]) == 2
     said = capsys.readouterr().err.strip().splitlines()
     assert reason in said[-1] and list(tmp_path.iterdir()) == [path]
+
+
+def seen_dent(body, truth, count):
+    """Points (n, 3) [m] all over the open cortex, and their motions by a dent."""
+    random = np.random.default_rng(3)
+    triangles = body.open_surface[random.integers(len(body.open_surface), size=count)]
+    share = random.dirichlet(np.ones(3), count)
+    return (np.einsum("nc,nci->ni", share, field[triangles]) for field in (body.mesh.nodes, truth))
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_of_very_many_points_some_are_looked_at(files, body, named):
+    """They say the same alone, and others cost nothing; those that are off are counted among them."""
+    folder, truth = files
+    locator = load_locator(folder / "box.locator.npz", body)
+    rest, motion = seen_dent(body, truth, 20_000)
+    some, now = looked_at(len(rest)), rest + motion
+    assert len(some) == MOST and some[0] == 0 and some[-1] == len(rest) - 1
+    rest[some[7]] = now[some[7]] = now[some[7]] + [0.0, 0.0, 0.05]
+    alone = locator.locate(Observation(now[some], rest[some] if named else None))
+    found = locator.locate(Observation(now, rest if named else None))
+    assert found.centroid == pytest.approx(alone.centroid) and found.p95 == pytest.approx(alone.p95)
+    assert some[7] in found.outliers and found.outliers.tolist() == some[alone.outliers].tolist()
+
+
+def test_half_a_cloud_of_another_place_is_refused(files, body):
+    """No cortex moves by 40 mm: such points are left out, rather than explained by a registration."""
+    folder, truth = files
+    rest, motion = seen_dent(body, truth, 60)
+    now = rest + motion
+    now[::2] += [0.0, 0.0, 0.04]
+    with pytest.raises(InputError, match="30 of 60 points lie off the open cortex"):
+        load_locator(folder / "box.locator.npz", body).locate(Observation(now))
+
+
+def test_points_of_which_each_has_two_motions_are_refused(files, body):
+    folder, truth = files
+    rest, motion = seen_dent(body, truth, 60)
+    twice = Observation(np.concatenate([rest + 3.0 * motion, rest - 3.0 * motion]), np.tile(rest, (2, 1)))
+    with pytest.raises(InputError, match="of 120 points fewer than 4 agree"):
+        load_locator(folder / "box.locator.npz", body).locate(twice)
+
+
+def test_an_observation_of_nothing_or_from_beyond_is_refused(body):
+    rest = body.mesh.nodes[np.unique(body.open_surface)]
+    for now, match in ((np.zeros((0, 3)), "0 points say too little"), (rest * 1e200, "not finite, or beyond")):
+        with pytest.raises(InputError, match=match):
+            placed(body, Observation(now))
+
+
+def test_a_folder_is_no_file_of_points(files, tmp_path, capsys):
+    assert main(["locate", str(files[0] / "box.vtu"), str(tmp_path)]) == 2
+    assert "is a folder. Give a CSV file with the header x,y,z" in capsys.readouterr().err
 
 
 def test_what_cannot_be_placed_does_not_wait_for_a_locator(tmp_path, capsys, body):

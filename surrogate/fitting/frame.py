@@ -13,7 +13,7 @@ from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
 from sim.geometry.closest_point import closest
 
-from ..locating.observation import FARTHEST_TIP, Observation, placed
+from ..locating.observation import FAR_NOW, Observation, placed
 
 RADIUS = 6e-3
 """Of the disc on which a tool presses, if nothing else is known [m]."""
@@ -90,7 +90,7 @@ def _check(anatomy: Anatomy, tool: Tool) -> None:
     if not np.isfinite(numbers).all():
         raise InputError("a tool has a number that is not finite: leave it out.")
     away = float(np.linalg.norm(foot(anatomy, tool) - tool.tip))
-    if away > FARTHEST_TIP:
+    if away > FAR_NOW:
         raise InputError(
             f"a tool lies {1e3 * away:.0f} mm off the open cortex, so that it cannot press on it: give millimetres, "
             "RAS, or leave it out."

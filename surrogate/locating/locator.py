@@ -16,7 +16,7 @@ from sim.runtime.threads import one_thread
 from .calibration import covering_factor, was_tried
 from .cause_shares import CauseShare, cause_shares, drawn_shares
 from .causes import KINDS
-from .observation import MOST, Observation
+from .observation import Observation, looked_at
 from .posterior import Posterior
 from .prior import Prior
 from .regions import Region
@@ -249,13 +249,13 @@ class Locator:
 
     def _located(self, observation: Observation) -> Location:
         begun, prior, count = time.perf_counter(), self.prior, len(observation.now)
-        found, named = settled(prior, observation)
+        found, near = settled(prior, observation)
         slipped = not observation.checked and _may_have_slipped(prior.anatomy, found)
         if slipped:
-            found, named = settled(prior, observation, free=True)
-        off = np.setdiff1d(np.arange(count), named) if observation.rest is not None else np.zeros(0, int)
-        outliers = np.union1d(off, found.outliers[found.outliers < count])
-        _demand_explained(found, len(outliers), count if observation.rest is not None else min(count, MOST))
+            found, near = settled(prior, observation, free=True)
+        some = looked_at(count)
+        outliers = np.union1d(np.setdiff1d(some, near), found.outliers[found.outliers < count])
+        _demand_explained(found, len(outliers), len(some))
         found = replace(found, factor=covering_factor(self.tried, found.evidence))
         return Location(
             prior,

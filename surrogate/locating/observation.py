@@ -21,11 +21,12 @@ from .evidence import SHIFT, SIGMA, Evidence, of_motions
 FEWEST = 6
 # Spread of points across a line, as a share of that along it: less is a line.
 THIN = 0.05
-# How far [m] half of the points may lie off the surface they are said to be of, and how far any may. Half of a cloud
-# may be farther off: it lies where the surface is now, and drained brains sink by more than a centimetre.
-NEAR, FAR, NEAR_NOW = 6e-3, 12e-3, 18e-3
-# Farther than this no tip touches the cortex [m], however it has moved; points nearer than that are one place [m].
-FARTHEST_TIP, ONE_PLACE = 30e-3, 1e-3
+# How far [m] half of the points may lie off the surface they are said to be of, and how far any may.
+NEAR, FAR = 6e-3, 12e-3
+# The same of a cloud and of tips: they lie where the surface is now, and drained brains sink by over a centimetre.
+NEAR_NOW, FAR_NOW = 18e-3, 30e-3
+# Points nearer than this are one place [m]; farther away than that nothing is [m].
+ONE_PLACE, FARTHEST = 1e-3, 1e6
 # Motions [m] beyond which no brain goes, and rigid errors that no tracker has.
 LONGEST_MOTION, FARTHEST_OFF = 0.025, 0.02
 # Smaller errors of a point [m] no tracker has: they are metres in a file of millimetres. Less is no motion at all [m].
@@ -45,7 +46,7 @@ FRAMES = (((1.0, 1.0, 1.0), ""), ((-1.0, -1.0, 1.0), "if x and y were turned: th
 # So many times as wide as the open cortex, or as narrow, points have other units.
 SPANS = 6.0
 MOST = 400
-"""Points of a cloud that are looked at, spread over it: more tell no more."""
+"""Points that are looked at, spread over those that are given: more tell no more, as neighbours share errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,58 +89,67 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
     Raises
     ------
     InputError
-        Numbers that are not finite, too few points, points on a line, a sigma that is smaller than any tracker's, or
-        sigmas that say nothing. A rigid error beyond any tracker's, motions beyond any brain's or too small to be
-        seen. Points that lie off the brain's surface, with the likely reason: units, LPS for RAS, another anatomy.
+        Numbers that are not finite or beyond any place, too few points, points on a line, a sigma that is smaller than
+        any tracker's, or sigmas that say nothing. A rigid error beyond any tracker's, motions beyond any brain's or too
+        small to be seen. Points that lie off the brain's surface, with the likely reason: units, LPS for RAS, another
+        anatomy.
     """
     _check(observation)
-    where, near = (observation.now, NEAR_NOW) if observation.rest is None else (observation.rest, NEAR)
+    some = looked_at(len(observation.now))
+    if observation.rest is None:
+        where, near, far = observation.now[some], NEAR_NOW, FAR_NOW
+    else:
+        where, near, far = observation.rest[some], NEAR, FAR
     off = _off_surface(anatomy, where)
     if _mostly_off(off, near):
         raise InputError(_elsewhere(anatomy, where, float(np.median(off)), near))
-    _demand_spread(where)
+    _demand_spread(where[off <= far])
     if observation.rest is not None:
-        _demand_motions(np.linalg.norm(observation.now - observation.rest, axis=1))
+        _demand_motions(np.linalg.norm(observation.now - observation.rest, axis=1)[some])
     for number, away in enumerate(_off_surface(anatomy, observation.tips), start=1):
-        if away > FARTHEST_TIP:
+        if away > FAR_NOW:
             raise InputError(
                 f"tip {number} lies {1e3 * away:.0f} mm off the open cortex, so that it cannot touch it: give "
                 "millimetres, RAS, or leave it out."
             )
-    named = np.flatnonzero(off <= FAR) if observation.rest is not None else np.zeros(0, int)
-    return placed_anew(anatomy, observation, named, np.zeros_like(anatomy.mesh.nodes), lambda at: np.zeros_like(at))
+    here = np.zeros_like(anatomy.mesh.nodes)
+    return placed_anew(anatomy, observation, some[off <= far], here, lambda at: np.zeros_like(at))
+
+
+def looked_at(count: int) -> np.ndarray:
+    """Numbers (k,) of those of `count` points that are looked at: all, or `MOST` that are spread over them."""
+    return np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
 
 
 def placed_anew(
     anatomy: Anatomy,
     observation: Observation,
-    named: np.ndarray,
+    near: np.ndarray,
     motion: np.ndarray,
     bias: Callable[[np.ndarray], np.ndarray],
 ) -> Evidence:
     """The observation as evidence where the body is believed to have moved by `motion` (V, 3) [m].
 
-    Of points with a place at rest only those `named` (k,) by number count. Points without one, and tips, are those of
-    the surface that are nearest to them; they tell of its motion along its normal. `bias` gives the rigid error
-    (n, 3) [m] that is believed in at places (n, 3). Tips are numbered after the points.
+    Of points only those count that are `near` (k,) the cortex, by number. Points without a place at rest, and tips, are
+    those of the surface that are nearest to them; they tell of its motion along its normal. `bias` gives the rigid
+    error (n, 3) [m] that is believed in at places (n, 3). Tips are numbered after the points.
     """
     parts, count = [], len(observation.now)
     cloud, number = observation.tips, count + np.arange(len(observation.tips))
     sigma = np.full(len(observation.tips), SIGMA)
     if observation.rest is not None:
-        here = observation.rest[named]
+        here = observation.rest[near]
         moved = of_motions(
             locate(anatomy.mesh, here),
             here,
-            observation.now[named] - here,
-            observation.sigmas[named],
+            observation.now[near] - here,
+            observation.sigmas[near],
             observation.rigid,
         )
-        parts.append(replace(moved, point=named[moved.point]))
+        parts.append(replace(moved, point=near[moved.point]))
     else:
-        some = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
-        cloud, number = np.concatenate([observation.now[some], cloud]), np.concatenate([some, number])
-        sigma = np.concatenate([observation.sigmas[some], sigma])
+        cloud, number = np.concatenate([observation.now[near], cloud]), np.concatenate([near, number])
+        sigma = np.concatenate([observation.sigmas[near], sigma])
     if len(cloud):
         along = _along_normals(anatomy, cloud, sigma, number, motion, bias)
         parts.append(replace(along, shift=observation.rigid))
@@ -190,8 +200,12 @@ def _check(observation: Observation) -> None:
     if sigma.shape != (count,):
         raise InputError(f"{count} points have a sigma of shape {sigma.shape}: give one number for each point.")
     for name, array in {**arrays, "sigma": sigma}.items():
-        if not np.isfinite(array).all():
-            raise InputError(f"`{name}` has a value that is not finite: leave such points out.")
+        if not (np.abs(array) < FARTHEST).all():
+            raise InputError(
+                f"`{name}` has a value that is not finite, or beyond {FARTHEST:,.0f} m: leave such points out."
+            )
+    if count < FEWEST:
+        raise InputError(f"{count} points say too little: give at least {FEWEST}, spread over the open cortex.")
     if not (sigma > 0.0).all():
         raise InputError("a sigma is not positive: give each point the standard deviation of its error [mm].")
     if sigma.min() < LEAST_SIGMA:
@@ -209,8 +223,6 @@ def _check(observation: Observation) -> None:
             f"a rigid error of {1e3 * observation.rigid:g} mm is none that a tracker has: give its standard deviation "
             f"along each axis, from 0 to {1e3 * FARTHEST_OFF:g} mm."
         )
-    if count < FEWEST:
-        raise InputError(f"{count} points say too little: give at least {FEWEST}, spread over the open cortex.")
 
 
 def _demand_motions(length: np.ndarray) -> None:

@@ -13,8 +13,8 @@ from sim.runtime.outside_files import path_of, read_as
 from .observation import Observation
 
 PLACE, MOTION, SIGMA = ("x", "y", "z"), ("dx", "dy", "dz"), "sigma"
-# Rows and characters of a line, beyond which a file is no list of points.
-MOST_ROWS, LONGEST_LINE = 1_000_000, 1000
+# Rows, characters of a line, and numbers beyond which a file is no list of points.
+MOST_ROWS, LONGEST_LINE, LARGEST = 1_000_000, 1000, 1e9
 
 
 def read_observation(path: str | Path, tips: str | Path | None = None) -> Observation:
@@ -25,8 +25,8 @@ def read_observation(path: str | Path, tips: str | Path | None = None) -> Observ
     Raises
     ------
     InputError
-        A file that is missing or no such table, columns that are missing, unknown or named twice, cells that are no
-        finite numbers.
+        A file that is missing or no such table, columns that are missing, unknown or named twice, no rows, cells that
+        are no finite numbers or too large ones.
     """
     columns = read_columns(path, {(*PLACE, *MOTION), (*PLACE, *MOTION, SIGMA), PLACE, (*PLACE, SIGMA)})
     touched = np.zeros((0, 3)) if tips is None else _points(read_columns(tips, {PLACE}), PLACE)
@@ -55,29 +55,34 @@ def read_columns(
         As `read_observation`.
     """
     path = path_of(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
     known = " or ".join(",".join(names) for names in sorted(allowed))
-    with read_as(path, "a table of points", f"Give a CSV file with the header {known}."):
+    remedy = f"Give a CSV file with the header {known}."
+    if not path.is_file():
+        raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {remedy}")
+    with read_as(path, "a table of points", remedy):
         text = path.read_text(encoding="utf-8-sig")
     lines = text.splitlines()
     if len(lines) > MOST_ROWS or any(len(line) > LONGEST_LINE for line in lines):
         raise InputError(f"{path}: has more than {MOST_ROWS:,} rows, or longer ones than a list of points has.")
-    rows = [row for row in csv.reader(lines) if row]
+    reader = csv.reader(lines)
+    rows = [(reader.line_num, row) for row in reader if row]
     if not rows:
         raise InputError(f"{path}: is empty: give a table with the header {known}.")
-    header = tuple(cell.strip().lower() for cell in rows[0])
+    first = rows.pop(0)[1]
+    header = tuple(cell.strip().lower() for cell in first)
     wanted = set().union(*allowed).intersection(header) if others else set(header)
     if wanted not in map(set, allowed) or len(set(header)) < len(header):
         raise InputError(
-            f"{path}: its first line is {','.join(rows[0])[:80]!r}: give the header {known}, with commas between."
+            f"{path}: its first line is {','.join(first)[:80]!r}: give the header {known}, with commas between."
         )
+    if not rows:
+        raise InputError(f"{path}: has a header and no rows: give a row for each point.")
     names = [name for name in header if name in wanted]
-    values = np.empty((len(rows) - 1, len(names)))
-    for number, row in enumerate(rows[1:], start=2):
+    values = np.empty((len(rows), len(names)))
+    for value, (number, row) in zip(values, rows, strict=True):
         try:
             cells = [cell for name, cell in zip(header, row, strict=True) if name in wanted]
-            values[number - 2] = [
+            value[:] = [
                 float(cell) if cell.strip() or name not in empty else np.nan
                 for name, cell in zip(names, cells, strict=True)
             ]
@@ -85,6 +90,6 @@ def read_columns(
             raise InputError(
                 f"{path}: row {number} is {','.join(row)[:80]!r}, not {len(header)} numbers: mend or remove it."
             ) from error
-        if not np.isfinite(values[number - 2][[bool(cell.strip()) for cell in cells]]).all():
-            raise InputError(f"{path}: row {number} has a number that is not finite: remove it.")
+        if not (np.abs(value[[bool(cell.strip()) for cell in cells]]) < LARGEST).all():
+            raise InputError(f"{path}: row {number} has a number that is not finite, or above {LARGEST:g}: remove it.")
     return dict(zip(names, values.T, strict=True))

@@ -15,6 +15,8 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri, logsumexp
 
+from sim.errors import InputError
+
 from .causes import OEDEMA, TOOL
 from .elimination import Equations
 from .evidence import SHIFT, SLIPPED, Evidence, triangular_inverse
@@ -231,6 +233,11 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS, fr
     """Condition a prior on evidence, without points that no other supports. Tips (k, 3) [m] touch the cortex.
 
     The rigid error is as large as is stated, or `free`: then it may be that of a registration that slipped.
+
+    Raises
+    ------
+    InputError
+        Points of which hardly any agree.
     """
     kept, point = np.ones(len(evidence), bool), evidence.point
     while True:
@@ -242,6 +249,11 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS, fr
         if excess.max() <= 1.0 or len(excess) <= FEWEST:
             break
         kept &= ~np.isin(point, np.unique(some.point)[excess >= max(1.0, 0.5 * excess.max())])
+        if len(np.unique(point[kept])) < FEWEST:
+            raise InputError(
+                f"of {len(np.unique(point))} points fewer than {FEWEST} agree on a motion: check that each has its own "
+                "motion. If they are less sure, raise sigma."
+            )
     unknown = np.zeros(len(prior.kind) + 6)
     for answer in answers:
         unknown[answer.rows] += answer.share * answer.mean

@@ -17,7 +17,7 @@ ROUNDS, STEADY = 6, 0.2e-3
 
 
 def settled(prior: Prior, observation: Observation, free: bool = False) -> tuple[Posterior, np.ndarray]:
-    """What an observation leaves of a prior, and the numbers (k,) of its named points that were looked at.
+    """What an observation leaves of a prior, and the numbers (k,) of its points that are near the cortex.
 
     The rigid error may be `free`, as in `conditioned`.
 
@@ -28,15 +28,15 @@ def settled(prior: Prior, observation: Observation, free: bool = False) -> tuple
     """
     anatomy, tips, count = prior.anatomy, observation.tips, len(observation.now)
     evidence = placed(anatomy, observation)
-    named = np.unique(evidence.point[evidence.point < count])
+    near = np.unique(evidence.point[evidence.point < count])
     found = conditioned(prior, evidence, tips, free)
     if observation.rest is None or len(tips):
         cortex, motion = np.unique(anatomy.open_surface), np.zeros_like(anatomy.mesh.nodes)
         for _ in range(ROUNDS):
             motion[cortex] = np.tensordot(found.weight, prior.at(cortex), 1)
-            evidence = placed_anew(anatomy, observation, named, motion, found.bias_at)
+            evidence = placed_anew(anatomy, observation, near, motion, found.bias_at)
             supported = np.delete(np.arange(len(tips)), found.outliers[found.outliers >= count] - count)
             before, found = found, conditioned(prior, evidence, tips[supported], free)
             if np.linalg.norm((found.weight - before.weight) @ prior.middle) < STEADY:
                 break
-    return found, named
+    return found, near
