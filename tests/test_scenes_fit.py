@@ -59,9 +59,16 @@ def test_the_command_writes_what_it_says(body, folder, monkeypatch, capsys):
     tissue = load_tissue(folder / "box.tissue.json", body.digest)
     assert said["frames"] == tissue.frames == 2 and said["ratio"]["median"] == pytest.approx(tissue.ratio[1])
     assert sum(said["skull"].values()) == pytest.approx(1.0) and said["young_pa"] is None
-    assert "Young's modulus" in said["not_known"]
-    assert main(words) == 0  # its own file is replaced
-    assert "times as stiff as the brain" in capsys.readouterr().out
+    assert "Young's modulus" in said["not_known"] and said["outliers"] == [[], []]
+    rows = (folder / "2.csv").read_text().splitlines()
+    rows[4] = ",".join([*rows[4].split(",")[:3], "9,9,-15"])
+    (folder / "3.csv").write_text("\n".join(rows))
+    assert main([*words[:-1], str(folder / "3.csv"), "--json"]) == 0  # its own file is replaced
+    assert json.loads(capsys.readouterr().out)["outliers"] == [[], [3]]
+    assert main([*words[:-1], str(folder / "3.csv")]) == 0
+    said = capsys.readouterr().out
+    assert "Frame 2: Left out, off the open cortex or without support by other points: rows 5 of the file." in said
+    assert "times as stiff as the brain" in said
 
 
 def test_bad_input_is_one_sentence(folder, capsys):

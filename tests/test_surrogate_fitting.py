@@ -4,16 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from locators import in_a_skull, locator_of
+from locators import dent, in_a_skull, locator_of
 
 from scenes.script.priors import drawn_from
 from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
+from surrogate.fitting import fit
 from surrogate.fitting.fit import probability_of, weighed
 from surrogate.fitting.frame import Frame, Tool, check_frames, foot
 from surrogate.fitting.responses import POISSONS, RATIOS, drained_loads, force_loads, responses
 from surrogate.fitting.stiffness import young_moduli
+from surrogate.fitting.support import unsupported
 from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
 from surrogate.fitting.tissue_files import load_tissue, save_tissue
 from surrogate.fitting.tool_table import read_tools
@@ -137,6 +139,27 @@ def test_a_file_keeps_the_tissue_and_refuses_others(tmp_path):
     path.write_text(path.read_text().replace("[[[", "[[[-", 1))
     with pytest.raises(InputError, match="no probabilities"):
         load_tissue(path, "abc")
+
+
+def test_points_that_no_other_supports_are_left_out(body, locator, monkeypatch):
+    """They are those that `locate` leaves out, and nothing is fitted to them; more than a third is refused."""
+    clean = frame_of(body, dent(body, np.random.default_rng(1)))
+    clean = replace(clean, observation=replace(clean.observation, sigma=np.full(60, 3e-4)))
+    wild = np.where(np.isin(np.arange(60), (5, 17))[:, None], [0.0, 0.01, -0.012], 0.0)
+    frames = [clean, replace(clean, observation=replace(clean.observation, now=clean.observation.now + wild))]
+    left_out = unsupported(locator, frames)
+    assert [each.tolist() for each in left_out] == [[], [5, 17]]
+    fitted_to = []
+    monkeypatch.setattr(fit, "responses", lambda *_: None)
+    monkeypatch.setattr(fit, "fitted", lambda locator, frames, *_: fitted_to.extend(frames))
+    fit.fit_tissue(locator, frames)
+    assert fitted_to[0] is clean and np.array_equal(
+        fitted_to[1].observation.rest, np.delete(clean.observation.rest, (5, 17), axis=0)
+    )
+    assert len(fitted_to[1].observation.now) == len(fitted_to[1].observation.sigma) == 58
+    torn = replace(clean.observation, now=clean.observation.now + np.where(np.arange(60)[:, None] % 2, 0.012, 0.0))
+    with pytest.raises(InputError, match=r"frame 2: .* of 60 points"):
+        unsupported(locator, [clean, replace(clean, observation=torn)])
 
 
 def test_bad_frames_are_refused(body):

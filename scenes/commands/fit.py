@@ -13,6 +13,7 @@ from sim.errors import InputError
 from sim.material import BRAIN
 
 from .json_line import json_line
+from .locate import rows_left_out
 from .locator import REGIONS, located_by
 from .outputs import add_force, claimed
 from .tissue_options import add_region_argument, regions_of
@@ -65,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
     from sim.runtime.device import find_device
     from surrogate.fitting.fit import fit_tissue
     from surrogate.fitting.frame import check_frames
+    from surrogate.fitting.support import unsupported
     from surrogate.fitting.tissue_files import save_tissue, tissue_path
 
     out = claimed(args.out or tissue_path(args.anatomy), ".json", KIND, args.force, [args.anatomy, *args.frames])
@@ -75,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
     if TUMOUR_LABEL in regions_of(args.region, BRAIN, anatomy.mesh):
         raise InputError("--region tumour: its stiffness is what `sulcus fit` finds. Give other regions alone.")
     locator = located_by(args, anatomy, small=True)
+    left_out = unsupported(locator, frames)
     with tqdm(file=sys.stderr) as bar:
 
         def progress(stage: str, done: int, total: int) -> None:
@@ -83,7 +86,11 @@ def run(args: argparse.Namespace) -> int:
 
         tissue = fit_tissue(locator, frames, args.device, Path(args.anatomy).with_suffix(".fit.parts"), progress)
     save_tissue(out, tissue)
-    print(json_line(_numbers(tissue, out)) if args.json else "\n".join(sentences(tissue, out)))
+    if args.json:
+        print(json_line({**_numbers(tissue, out), "outliers": [each.tolist() for each in left_out]}))
+    else:
+        said = [f"Frame {n}: {rows_left_out(each)}" for n, each in enumerate(left_out, start=1) if len(each)]
+        print("\n".join([*said, *sentences(tissue, out)]))
     return 0
 
 

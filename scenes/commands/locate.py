@@ -153,8 +153,11 @@ def _warnings(found: Location) -> list[str]:
     if found.slipped:
         said.append("If it was checked, say so by --registration-checked.")
     if len(found.outliers):
-        rows = ", ".join(str(number + 2) for number in found.outliers[:20]) + (
-            " ..." if len(found.outliers) > 20 else ""
-        )
-        said.append(f"Left out, off the open cortex or without support by other points: rows {rows} of the file.")
+        said.append(rows_left_out(found.outliers))
     return said + [f"Left out, as the points do not support it: tip {number + 1}." for number in found.tips_left_out]
+
+
+def rows_left_out(numbers: np.ndarray) -> str:
+    """Which rows of a file were left out, by the numbers (k,) of their points from 0."""
+    rows = ", ".join(str(number + 2) for number in numbers[:20]) + (" ..." if len(numbers) > 20 else "")
+    return f"Left out, off the open cortex or without support by other points: rows {rows} of the file."

@@ -18,6 +18,7 @@ from ..locating.regions import Region
 from .frame import Frame, check_frames, foot
 from .responses import POISSONS, RATIOS, Responses, drained_loads, force_loads, responses
 from .stiffness import young_moduli
+from .support import unsupported, without
 from .tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
 from .weighing import of_drained, of_pressed
 
@@ -31,16 +32,17 @@ def fit_tissue(
 ) -> FittedTissue:
     """What is known of the tissue of a locator's anatomy, from some frames of it.
 
-    Finite elements that a `folder` keeps are read. `progress` hears a stage, how many of its parts are done, and of
-    how many.
+    Points that no other supports are left out. Finite elements that a `folder` keeps are read. `progress` hears a
+    stage, how many of its parts are done, and of how many.
 
     Raises
     ------
     InputError
-        As `check_frames`.
+        As `check_frames` and `unsupported`.
     """
     anatomy = locator.anatomy
     check_frames(anatomy, frames)
+    frames = without(frames, unsupported(locator, frames))
     drained, pressed, regions = None, None, beside_tumour(locator)
     if any(not frame.tools for frame in frames):
         drained = responses(
