@@ -103,7 +103,7 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
     off = _off_surface(anatomy, where)
     if _mostly_off(off, near):
         raise InputError(_elsewhere(anatomy, where, float(np.median(off)), near))
-    _demand_spread(where[off <= far])
+    _demand_spread(where, off <= far)
     if observation.rest is not None:
         _demand_motions(np.linalg.norm(observation.now - observation.rest, axis=1)[some])
     for number, away in enumerate(_off_surface(anatomy, observation.tips), start=1):
@@ -242,14 +242,15 @@ def _demand_motions(length: np.ndarray) -> None:
         )
 
 
-def _demand_spread(where: np.ndarray) -> None:
-    """Raise InputError where points (n, 3) [m] are of few places, or of a line."""
+def _demand_spread(where: np.ndarray, near: np.ndarray) -> None:
+    """Raise InputError where points (n, 3) [m] are of few places, or those that are `near` (n,) of a line."""
     places = len(np.unique(np.round(where / ONE_PLACE), axis=0))
     if places < FEWEST:
         raise InputError(
             f"{places} places a millimetre apart say too little: give {FEWEST} at least, spread over the open cortex."
         )
-    along, across, _ = np.linalg.svd(where - where.mean(axis=0), compute_uv=False)
+    some = where[near]
+    along, across, _ = np.linalg.svd(some - some.mean(axis=0), compute_uv=False)
     if not across > THIN * along:
         raise InputError("the points lie on a line: spread them over the open cortex.")
 
