@@ -29,6 +29,8 @@ RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
 TRIALS, NEAREST = 960, 120
 # What makes a cloud unlike all named points, in logarithms; and how much more than others that of the extent counts.
 UNLIKE, EXTENT = 1e3, 4.0
+# By how much an observation may lie beyond all trials, in these logarithms: the most points are looked at that may be.
+MARGIN = 0.05
 # What moves the brain in a trial.
 ALONE = (TOOL, DRAINAGE, SWELLING, OEDEMA)
 # Points of a trial, the share of the open cortex that they lie on, how much softer its tissue is than the ensemble's,
@@ -100,7 +102,7 @@ def was_tried(tried: np.ndarray, evidence: Evidence) -> bool:
     own = likeness(evidence)
     alike = tried[tried[:, -2] == own[-1], :-1]
     within = len(alike) and (own >= alike.min(axis=0)).all()
-    return bool(within and (own[[0, 1, 3]] <= alike[:, [0, 1, 3]].max(axis=0)).all())
+    return bool(within and (own[[0, 1, 3]] <= alike[:, [0, 1, 3]].max(axis=0) + MARGIN).all())
 
 
 def likeness(evidence: Evidence) -> np.ndarray:

@@ -138,8 +138,9 @@ def groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Gro
         ratio, exponent = (_all_over(random, len(some), limits) for limits in (causes.stiffness, causes.exponent))
         count = causes.reaches[skull == LETS_GO]
         reach = np.reshape(_all_over(random, count * len(some), causes.reach), (len(some), count)).tolist()
-        for *tissue, distances in zip(some, ratio, exponent, reach, strict=True):
-            made.append(Group(len(made), skull, *tissue, causes.regions, tuple(distances)))
+        for poisson, own_ratio, own_exponent, distances in zip(some, ratio, exponent, reach, strict=True):
+            group = Group(len(made), skull, poisson, own_ratio, own_exponent, causes.regions, tuple(distances))
+            made.append(group)
     return tuple(made)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sim.anatomy import BRAIN_LABEL, PART_LABELS, Anatomy
 
@@ -17,7 +17,7 @@ def round_tumour(anatomy: Anatomy, reach: float) -> tuple[Anatomy, tuple[int, ..
     is where laws name no region but those of the anatomy.
     """
     mesh = anatomy.mesh
-    tumour = cKDTree(mesh.nodes[anatomy.tumour_nodes])
+    tumour = KDTree(mesh.nodes[anatomy.tumour_nodes])
     away, _ = tumour.query(mesh.nodes[mesh.tets].mean(axis=1))
     own = int(mesh.region.max()) + 1
     region = np.where((mesh.region == BRAIN_LABEL) & (away < reach), own, mesh.region)
