@@ -18,16 +18,9 @@ from surrogate.locating.prior import NOWHERE, PLACES, middle_of
 from surrogate.locating.setup import make_locator
 
 FEW = Causes(
-    poisson=(0.45, 0.485),
-    tools=(8, 3),
-    drainages=3,
-    levels=(0.6, 0.3),
-    swellings=(0.04, 0.02, -0.02),
-    tumour_swellings=(0.2, -0.1),
-    oedema=(0.1,),
-    reach=(8e-3, 16e-3),
-    reaches=(1, 1),
-)
+    poisson=(0.45, 0.485), tools=(8, 3), drainages=3, levels=(0.6, 0.3), swellings=(0.04, 0.02, -0.02),
+    tumour_swellings=(0.2, -0.1), oedema=(0.1,), reach=(8e-3, 16e-3), reaches=(1, 1),
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
