@@ -28,9 +28,7 @@ FEW = Causes(
     levels=(0.4,),
     swellings=(0.04, -0.02),
     tumour_swellings=(0.2,),
-    oedema=(0.1,),
-    reach=(8e-3, 16e-3),
-    reaches=(1, 1),
+    reaches=(0, 0),  # no oedema
 )
 
 
