@@ -29,7 +29,7 @@ RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
 TRIALS, NEAREST = 960, 120
 # What makes a cloud unlike all named points, in logarithms; and how much more than others that of the extent counts.
 UNLIKE, EXTENT = 1e3, 4.0
-# By how much an observation may lie beyond all trials, in these logarithms: the most points are looked at that may be.
+# An observation may lie so far beyond all trials, in these logarithms: 400 points, the most that are looked at, do.
 MARGIN = 0.05
 # What moves the brain in a trial.
 ALONE = (TOOL, DRAINAGE, SWELLING, OEDEMA)

@@ -122,7 +122,7 @@ class SeenPrior:
     slip
         As `Evidence.slip`.
     named
-        Whether points have names. The errors of a cloud look like oedema, which is not among its causes.
+        Whether points have names. Oedema is not among the causes of a cloud: its errors look like it.
     """
 
     prior: Prior
