@@ -18,7 +18,7 @@ from sim.effects import SKULLS
 from sim.errors import InputError
 from surrogate.locating.calibration import seen_patch
 from surrogate.locating.cause_shares import cause_shares
-from surrogate.locating.causes import DRAINAGE, KINDS
+from surrogate.locating.causes import DRAINAGE, KINDS, OEDEMA, SWELLING
 from surrogate.locating.locator_files import load_locator, locator_path
 from surrogate.locating.observation import Observation
 from surrogate.locating.prior import middle_of
@@ -173,3 +173,13 @@ def test_points_on_a_few_millimetres_were_not_tried(locator, sunk):
         now = rest + evidence.value.reshape(-1, 3)
         for seen in (Observation(now, rest), Observation(now)):
             assert locator.locate(seen).calibrated == known, cover
+
+
+@pytest.mark.parametrize("kind", [SWELLING, OEDEMA])
+def test_what_swells_may_be_oedema_and_that_is_said(locator, sunk, kind):
+    prior, body = locator.prior, locator.anatomy
+    motion = np.zeros_like(body.mesh.nodes)
+    motion[prior.nodes] = prior.shape[np.flatnonzero((prior.kind == kind) & (prior.skull == 0))[0]]
+    motion *= 5e-3 / np.sqrt((motion[np.unique(body.open_surface)] ** 2).sum(axis=1).mean())
+    swollen, drained = (locator.locate(observed(body, one, NAMED, (0, 0))).warnings for one in (motion, sunk))
+    assert any("oedema" in said for said in swollen) and not any("oedema" in said for said in drained)

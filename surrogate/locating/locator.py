@@ -30,6 +30,12 @@ MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
 DOUBTFUL = -2.0
 # A rigid error alone that explains such a share, and is so many times as large as stated, is named.
 RIGID, WIDE = 0.9, 2.0
+# What is said where swelling has a greater share than this.
+SWELLS = 0.5
+OEDEMA_WORDS = (
+    "The brain swells or shrinks, by what was seen. If that is oedema round the tumour alone, the tumour moves about "
+    "half as far, and ellipsoids often miss it: look for it in the scan."
+)
 # Normal numbers by which a radius is found that holds 95 in 100.
 DRAWS = 4000
 
@@ -175,7 +181,7 @@ class Location:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What else must be known of the answer, in sentences: `doubt`, and a registration that would look alike."""
+        """What else must be known of the answer, in sentences: what would look alike, and `doubt`."""
         evidence, alike = self.posterior.evidence, self.posterior.slipped >= DOUBTFUL
         share = self.rigid_alone.share
         named = not (self.slipped or self.checked) and evidence.beyond > WIDE and (alike or share > RIGID)
@@ -184,7 +190,8 @@ class Location:
             f"{self._rigid_words} would explain {share:.0%}, with a brain at rest.{apart} If it may be off so far, say "
             "so by --rigid."
         )
-        return tuple(said for said in (rigid if named else "", self.doubt) if said)
+        swells = self.causes["swelling"] + self.causes["oedema"] > SWELLS
+        return tuple(said for said in (rigid if named else "", OEDEMA_WORDS if swells else "", self.doubt) if said)
 
     @property
     def _rigid_words(self) -> str:
