@@ -239,15 +239,14 @@ class TestEpisode:
             assert moved < 3e-5 and file.attrs["deformer"] == "fem"
 
 
+RENDER = ("render", "press", "--deformer", "linear", "--anatomy")
+
+
 class TestRender:
     def test_frames_and_film(self, brief, anatomy, tmp_path, capsys):
         frames, film = tmp_path / "a" / "frames", tmp_path / "film.mp4"
         words = [
-            "render",
-            "press",
-            "--deformer",
-            "linear",
-            "--anatomy",
+            *RENDER,
             str(anatomy),
             "--out",
             str(frames),
@@ -270,11 +269,7 @@ class TestRender:
 
     def test_plain_frames_have_no_panel(self, brief, anatomy, theatre, tmp_path, capsys):
         words = [
-            "render",
-            "press",
-            "--deformer",
-            "linear",
-            "--anatomy",
+            *RENDER,
             str(anatomy),
             "--every",
             "3",

@@ -84,7 +84,8 @@ def run(args: argparse.Namespace) -> int:
             bar.total, bar.n = total, done
             bar.set_description(stage)
 
-        tissue = fit_tissue(locator, frames, args.device, Path(args.anatomy).with_suffix(".fit.parts"), progress)
+        parts = Path(args.anatomy).with_suffix(".fit.parts")
+        tissue = fit_tissue(locator, frames, args.device, parts, progress, left_out)
     save_tissue(out, tissue)
     if args.json:
         print(json_line({**_numbers(tissue, out), "outliers": [each.tolist() for each in left_out]}))

@@ -29,11 +29,12 @@ def fit_tissue(
     device: str = "auto",
     folder: Path | None = None,
     progress: Callable[[str, int, int], object] = lambda stage, done, total: None,
+    left_out: Sequence[np.ndarray] | None = None,
 ) -> FittedTissue:
     """What is known of the tissue of a locator's anatomy, from some frames of it.
 
-    Points that no other supports are left out. Finite elements that a `folder` keeps are read. `progress` hears a
-    stage, how many of its parts are done, and of how many.
+    Points that no other supports are left out: `left_out`, or what is found now. Finite elements that a `folder` keeps
+    are read. `progress` hears a stage, how many of its parts are done, and of how many.
 
     Raises
     ------
@@ -42,7 +43,7 @@ def fit_tissue(
     """
     anatomy = locator.anatomy
     check_frames(anatomy, frames)
-    frames = without(frames, unsupported(locator, frames))
+    frames = without(frames, unsupported(locator, frames) if left_out is None else left_out)
     drained, pressed, regions = None, None, beside_tumour(locator)
     if any(not frame.tools for frame in frames):
         drained = responses(

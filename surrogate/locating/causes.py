@@ -139,8 +139,7 @@ def groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Gro
         count = causes.reaches[skull == LETS_GO]
         reach = np.reshape(_all_over(random, count * len(some), causes.reach), (len(some), count)).tolist()
         for poisson, own_ratio, own_exponent, distances in zip(some, ratio, exponent, reach, strict=True):
-            group = Group(len(made), skull, poisson, own_ratio, own_exponent, causes.regions, tuple(distances))
-            made.append(group)
+            made.append(Group(len(made), skull, poisson, own_ratio, own_exponent, causes.regions, tuple(distances)))
     return tuple(made)
 
 

@@ -116,18 +116,15 @@ def members(
     """Motions (n, V, 3) float32 [m] and kinds (n,) of one group: those that converged and move the open cortex."""
     fem = Fem(anatomy, group.effects(causes.swellings), ACCURACY, device)
     tumour = tuple(np.unique(anatomy.mesh.region[anatomy.in_tumour]).tolist())
-    local = Fem(anatomy, group.effects(causes.tumour_swellings, tumour), ACCURACY, device)
     answers = [
         fem.deform(pushes(group, anatomy, seed, causes)),
         fem.deform(swellings(anatomy, causes.swellings)),
-        local.deform(swellings(anatomy, causes.tumour_swellings)),
+        _swollen(anatomy, group, causes.tumour_swellings, tumour, device),
     ]
     kind = [TOOL, SWELLING, TUMOUR_SWELLING]
     for reach in group.reach:
         body, marked = round_tumour(anatomy, reach)
-        answers.append(
-            Fem(body, group.effects(causes.oedema, marked), ACCURACY, device).deform(swellings(body, causes.oedema))
-        )
+        answers.append(_swollen(body, group, causes.oedema, marked, device))
         kind.append(OEDEMA)
     last: Deformation | None = None
     for loads in drainages(group, anatomy, seed, causes):
@@ -141,6 +138,13 @@ def members(
     if not good.any():
         raise InputError(f"no motion of group {group.number} ({group.skull}, nu {group.poisson:g}) converged.")
     return motion[good].astype(np.float32), kind[good]
+
+
+def _swollen(
+    anatomy: Anatomy, group: Group, shares: tuple[float, ...], regions: tuple[int, ...], device: str
+) -> Deformation:
+    """Answers of a body of which some regions change their volume by such shares."""
+    return Fem(anatomy, group.effects(shares, regions), ACCURACY, device).deform(swellings(anatomy, shares))
 
 
 def surface_size(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:

@@ -174,16 +174,15 @@ class SeenPrior:
         """
         # Tools all over the cortex and the rigid error take part in all hypotheses, and a set extends an earlier one.
         rigid = self._equations().eliminated(TOOL).varied(RIGID, np.minimum(RIGIDS, self.slip)).eliminated(RIGID)
-        found: dict[tuple[int, ...], Equations] = {(): rigid}
-        for some in SETS[1:]:
-            found[some] = found[some[:-1]].eliminated(some[-1])
-        evidence = np.full((*found[()].evidence.shape, len(SETS), len(self.odds)), -np.inf)
+        found: dict[tuple[int, ...], Equations] = {}
+        evidence = np.full((*rigid.evidence.shape, len(SETS), len(self.odds)), -np.inf)
         for number, some in enumerate(SETS):
             if OEDEMA in some and not self.named:
                 continue
-            evidence[..., number, 0] = found[some].evidence
+            here = found[some] = found[some[:-1]].eliminated(some[-1]) if some else rigid
+            evidence[..., number, 0] = here.evidence
             if some in WITH_PLACE:
-                evidence[..., number, 1:] = found[some].with_places
+                evidence[..., number, 1:] = here.with_places
         return self.odds + evidence.swapaxes(1, 2).reshape(-1, len(self.odds)) / COARSENED
 
     def _equations(self) -> Equations:
