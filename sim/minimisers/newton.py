@@ -14,6 +14,7 @@ from ..accuracy import Accuracy
 from ..deformation import Outcome
 from ..discretisation.problem import Problem
 from ..runtime.columns import combined, gathered, norms, scattered
+from ..runtime.device import Device
 from .line_search import search
 from .newton_cg import Descent
 from .residual import relative
@@ -31,11 +32,14 @@ class Newton:
         A residual that was not lowered by a tenth in so many iterations is held against round-off.
     round_off
         What the last digit of every displacement does to the residual, times this, is round-off.
+    stress_free
+        Where every term's force at every node is below so many times the same, a body is free of stress.
     """
 
     largest_forcing: float = 0.25
     patience: int = 4
     round_off: float = 4.0
+    stress_free: float = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +88,9 @@ def find_equilibrium(
             outcome[live[failed]] = Outcome.STALLED
             outcome[live[drowned]] = Outcome.ROUND_OFF
             failed |= drowned
+            if drowned.any():
+                relaxed = drowned & is_stress_free(problem, u, settings.stress_free)
+                share, done = np.where(relaxed, 0.0, share), done | relaxed
         outcome[live[done]] = Outcome.CONVERGED
         outcome[live[bad]] = Outcome.NOT_FINITE
         iterations[live], residual[live] = step, np.where(bad, np.inf, share)
@@ -118,8 +125,35 @@ def round_off(problem: Problem, u: wp.array, g: wp.array) -> np.ndarray:
 
     Below this no residual falls: the displacements that it would take are not among the type's numbers.
     """
-    device, values = problem.device, u.numpy()
-    sign = np.random.default_rng(0).choice([-1.0, 1.0], (len(values), 1))
-    near = problem.gradient(device.array(values * (1.0 + sign * np.finfo(device.precision).eps)))
+    device = problem.device
+    near = problem.gradient(_nearest(device, u))
     problem.constraint.project(near)
     return norms(device, combined(device, near, -1.0, g, near))
+
+
+def is_stress_free(problem: Problem, u: wp.array, factor: float) -> np.ndarray:
+    """Return the columns (b,) bool in which the forces of each term at each node are round-off at u (3N, b).
+
+    Round-off is `factor` times what the last digit of every displacement does there, or at the median node: a sliver's
+    nodes do not speak for the others.
+    """
+
+    def at_nodes(force: wp.array) -> np.ndarray:
+        return np.linalg.norm(force.numpy().reshape(-1, 3, u.shape[1]), axis=1)
+
+    change = wp.empty_like(u)
+    combined(problem.device, problem.gradient(_nearest(problem.device, u)), -1.0, problem.gradient(u), change)
+    noise = at_nodes(change)
+    out = np.ones(u.shape[1], bool)
+    for term in problem.terms:
+        own = wp.zeros_like(u)
+        term.add_gradient(u, own)
+        out &= (at_nodes(own) <= factor * np.maximum(noise, np.median(noise, axis=0))).all(axis=0)
+    return out
+
+
+def _nearest(device: Device, u: wp.array) -> wp.array:
+    """Displacements u (3N, b) with the last digit of each changed, up or down at random."""
+    values = u.numpy()
+    sign = np.random.default_rng(0).choice([-1.0, 1.0], (len(values), 1))
+    return device.array(values * (1.0 + sign * np.finfo(device.precision).eps))
