@@ -39,7 +39,8 @@ def test_the_bench_measures_what_it_says(brain, capsys):
     assert main(["bench", "skull", *words]) == 0
     bonded, slide = json.loads(capsys.readouterr().out)["rows"]
     assert (bonded["skull"], slide["skull"], bonded["failed"]) == ("bonded", "slide", 0)
-    assert abs(slide["motion"] / bonded["motion"] - 1.0) > 0.02 and bonded["leaked"] == 0.0 < slide["leaked"] < 1e-5
+    assert abs(slide["motion"] / bonded["motion"] - 1.0) > 0.02
+    assert bonded["leaked"] == 0.0 and 0.01 < slide["leaked"] < 0.5
     assert 0.0 < bonded["bond"] < 3.0 and slide["bond"] is None
     tissue = Material("neo-hookean", 3000.0, 0.49)
     answer = Fem(anatomy, pushed_effects(anatomy, tissue), TRAIN, "cpu").deform(draw("palpation", anatomy, 2, 0))

@@ -1,13 +1,15 @@
-"""How much tissue passes the closed skull: none does in a head."""
+"""Volume of tissue that passes the closed skull: zero in a head."""
 
 from functools import cache
 
 import numpy as np
 import warp as wp
+from scipy.spatial import KDTree
 
 from ..anatomy import Anatomy
 from ..discretisation.element import quadratic_shapes
 from ..discretisation.space import Discretisation
+from ..geometry.surface import areas
 from ..runtime.device import Device, forward_kernel
 
 # Points (6, 3), barycentric, and weights (6,) on a triangle: exact to degree 4 (Dunavant 1985, Table I).
@@ -16,14 +18,13 @@ POINTS = np.array([np.roll([1.0 - 2.0 * x, x, x], turn) for x in (_A, _B) for tu
 WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 
-def surface_vectors(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The integral (N, 3) [m^2] of N_i n over outward triangles (S, 3) or, quadratic and perhaps curved, (S, 6).
+def facet_vectors(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The integrals (S, n, 3) [m^2] of N_i n over outward triangles (S, n): n = 3 or, quadratic and perhaps curved, 6.
 
-    With N_i a shape function of nodes (N, 3) [m] and n the outward normal it is the integral of grad N_i over the body.
-    The sum of its products with displacements is the volume that the surface sweeps. Source: Engelman, Sani, Gresho
-    1982, Int. J. Numer. Methods Fluids 2:225-238.
+    With N_i the shape function of node i (nodes (N, 3) [m]) and n the outward normal. The sum of products with the
+    nodes' displacements is the volume that the triangle sweeps.
     """
-    out = np.zeros_like(nodes)
+    out = np.zeros((*triangles.shape, 3))
     for at, weight in zip(POINTS, WEIGHTS, strict=True):
         shape, slope = at, np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
         if triangles.shape[1] == 6:  # corners, then the middles of the edges between corners 0 and 1, 1 and 2, 2 and 0
@@ -32,31 +33,42 @@ def surface_vectors(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
             middles = 4.0 * (at[i, None] * slope[j] + at[j, None] * slope[i])
             slope = np.vstack([(4.0 * at - 1.0)[:, None] * slope, middles])
         tangents = np.einsum("ski,kd->sdi", nodes[triangles], slope)
-        normal = 0.5 * weight * np.cross(tangents[:, 0], tangents[:, 1])
-        for k, share in enumerate(shape):
-            np.add.at(out, triangles[:, k], share * normal)
+        out += shape[:, None] * (0.5 * weight * np.cross(tangents[:, 0], tangents[:, 1]))[:, None]
+    return out
+
+
+def surface_vectors(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The integral (N, 3) [m^2] of N_i n over the whole surface, as `facet_vectors`: of grad N_i over the body.
+
+    Engelman, Sani, Gresho 1982, "The implementation of normal and/or tangential boundary conditions in finite element
+    codes for incompressible fluid flow", Int. J. Numer. Methods Fluids 2:225-238.
+    """
+    out = np.zeros_like(nodes)
+    np.add.at(out, triangles, facet_vectors(nodes, triangles))
     return out
 
 
 @cache
 def kernel_of(device: Device) -> wp.Kernel:
-    """The kernel of a device's scalar type, over (surface node, column)."""
+    """Kernel of a device's scalar type, over (patch, column)."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
     def sweep(
         u: wp.array2d(dtype=scalar),
+        first: wp.array(dtype=wp.int32),
         nodes: wp.array(dtype=wp.int32),
         vector: wp.array(dtype=wp.vec3d),
         covered: wp.array(dtype=wp.int32),
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """v = a_i . u_i; out_0 += max(v, 0) where a skull covers node i, out_1 += |v| where none does."""
+        """v = sum a_i . u_i of a patch; out_0 += max(v, 0) where a skull covers it, out_1 += |v| where none does."""
         s, c = wp.tid()
         v = wp.float64(0.0)
-        for k in range(3):
-            v += vector[s][k] * wp.float64(u[3 * nodes[s] + k, c])
+        for i in range(first[s], first[s + 1]):
+            for k in range(3):
+                v += vector[i][k] * wp.float64(u[3 * nodes[i] + k, c])
         if covered[s] == 0:
             wp.atomic_add(out, 1, c, wp.abs(v))
         elif v > wp.float64(0.0):
@@ -66,22 +78,40 @@ def kernel_of(device: Device) -> wp.Kernel:
 
 
 class Leak:
-    """The volume that passes out through the closed skull, as a share of what the opening takes in and gives out."""
+    """The volume that passes out through the closed skull, as a share of what the opening takes in and gives out.
 
-    def __init__(self, anatomy: Anatomy, space: Discretisation, device: Device):
-        vectors = surface_vectors(space.nodes, space.surface)
-        nodes = np.flatnonzero(vectors.any(axis=1))
-        normal = space.sliding(anatomy.slide_normal, anatomy.held)
-        covered = (normal != 0.0).any(axis=1) | space.held(anatomy.held).all(axis=1)
+    The flux through each covered facet is averaged over those within `around` [m], the size of a palpating tool. Sums
+    over the facets of one node would not do: nodes that slide along the mean normal of their facets make these zero by
+    construction, whatever passes each facet.
+    """
+
+    def __init__(self, anatomy: Anatomy, space: Discretisation, device: Device, around: float = 7e-3):
+        solid = (anatomy.slide_normal != 0.0).any(axis=1) | anatomy.held.all(axis=1)
+        covered = solid[space.mesh.surface].all(axis=1)
+        vectors = facet_vectors(space.nodes, space.surface)
+        corners = space.nodes[space.surface[:, :3]]
+        near = KDTree(corners.mean(axis=1)).query_ball_point(corners.mean(axis=1), around)
+        size = areas(corners)
+        patches = [
+            np.array([row]) if not covered[row] else np.array(some)[covered[some]] for row, some in enumerate(near)
+        ]
+        row, other = np.repeat(np.arange(len(size)), [len(patch) for patch in patches]), np.concatenate(patches)
+        mean = size[row] / np.bincount(row, size[other])[row]
+        key = (row[:, None] * space.count + space.surface[other]).ravel()
+        key, place = np.unique(key, return_inverse=True)
+        lent = (mean[:, None, None] * vectors[other]).reshape(-1, 3)
+        total = np.column_stack([np.bincount(place, lent[:, k]) for k in range(3)])
         self._device = device
-        self._nodes = device.array(nodes, wp.int32)
-        self._vectors = device.array(vectors[nodes], wp.vec3d)
-        self._covered = device.array(covered[nodes].astype(np.int32), wp.int32)
+        self._arrays = [
+            device.array(np.searchsorted(key, space.count * np.arange(len(size) + 1)), wp.int32),
+            device.array(key % space.count, wp.int32),
+            device.array(total, wp.vec3d),
+            device.array(covered.astype(np.int32), wp.int32),
+        ]
 
     def share(self, u: wp.array) -> np.ndarray:
         """Of u (3N, B) [m] on the device: (B,), zero where nothing passes, NaN of what passes where nothing is open."""
         out = wp.zeros((2, u.shape[1]), dtype=wp.float64, device=self._device.name)
-        inputs = [u, self._nodes, self._vectors, self._covered]
-        self._device.launch(kernel_of(self._device), (len(self._nodes), u.shape[1]), inputs, [out])
+        self._device.launch(kernel_of(self._device), (len(self._arrays[3]), u.shape[1]), [u, *self._arrays], [out])
         passed, swept = out.numpy()
         return np.divide(passed, swept, out=np.where(passed > 0.0, np.nan, 0.0), where=swept > 0.0)
