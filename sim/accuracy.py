@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Real
 from typing import Literal
 
@@ -24,7 +24,8 @@ class Accuracy:
         Converged: free gradient <= tolerance x the largest 2-norm among the terms' own gradients and the
         reaction at constrained nodes.
     outer
-        Most Newton steps for one load, and for each of its load steps.
+        Most Newton steps for one load, and for each of its load steps. All load steps and strides of tools together
+        take at most outer x (1 + steps).
     inner
         Most conjugate-gradient iterations in one Newton step.
     precision
@@ -34,6 +35,8 @@ class Accuracy:
     evaluations
         Most evaluations of the whole body's forces before Newton, which local solvers and L-BFGS share; 0: Newton
         alone. None: as many as are worth it on the device. Few `outer` steps are Newton's alone, whatever this says.
+    any_strain
+        Report equilibria with inverted tetrahedra, or strained beyond what was measured on brain, as converged.
 
     Raises
     ------
@@ -47,6 +50,7 @@ class Accuracy:
     precision: Precision = "float64"
     steps: int = 24
     evaluations: int | None = None
+    any_strain: bool = field(default=False, repr=False)  # what was recorded of the others stays comparable
 
     def __post_init__(self) -> None:
         if self.precision not in tuple(FLOOR):  # which need not be hashable

@@ -14,6 +14,11 @@ from .arguments import all_finite, as_array, numbers, whole_numbers
 from .errors import InputError
 from .loads import Loads
 
+ROWS = ("reached", "inverted", "leaked", "bond", "strained")
+"""Fields (B,) of a `Deformation` that not every deformer knows."""
+COLUMNS = ("bound", "reaction_bound", "stretch")
+"""Fields (2, B) of a `Deformation` that not every deformer knows."""
+
 
 class Outcome(Enum):
     """How an answer came about; the value is the sentence that a user reads."""
@@ -27,6 +32,9 @@ class Outcome(Enum):
         "stopped because the residual is at the round-off of its number type; float64 or a coarser tolerance goes on"
     )
     PIERCED = "stopped because a tool came to be inside the tissue, where it has no surface to press on"
+    ON_BONE = "a tool overlaps surface that is fixed or covered by the skull: it stands on bone"
+    INVERTED = "in equilibrium, but tetrahedra are inverted, as in no tissue: the load is too strong for this mesh"
+    OVERSTRAINED = "in equilibrium, but more than 1 ml is strained beyond what was measured on brain: do not rely on it"
     NOT_FINITE = "stopped because a number overflowed"
     GUESSED = "a first guess: nothing was solved"
     PREDICTED = "predicted by a trained model inside its training range"
@@ -95,6 +103,10 @@ class Deformation:
         NaN from one that promises nothing.
     reaction_bound
         (2, B) [N]: the same of the force of each tool in `reaction`.
+    stretch
+        (2, B): the smallest and the largest principal stretch of the tissue. NaN from a deformer that does not know.
+    strained
+        (B,) [m^3]: the volume whose stretch leaves the range measured on brain, 0.5 to 1.5. NaN as `stretch`.
     source
         Who answered, in words: finite elements of which kind and tissue, or what learned from them.
     """
@@ -115,13 +127,13 @@ class Deformation:
     bond: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     bound: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     reaction_bound: np.ndarray = field(default_factory=lambda: np.array(np.nan))
+    stretch: np.ndarray = field(default_factory=lambda: np.array(np.nan))
+    strained: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     source: str = ""
 
     def __post_init__(self) -> None:
         count = len(self.displacement)
-        shapes = {name: (count,) for name in ("reached", "inverted", "leaked", "bond")}
-        shapes |= {"bound": (2, count), "reaction_bound": (2, count)}
-        for name, shape in shapes.items():
+        for name, shape in [*((name, (count,)) for name in ROWS), *((name, (2, count)) for name in COLUMNS)]:
             given = getattr(self, name)
             if given.shape != shape:
                 object.__setattr__(self, name, np.broadcast_to(given, shape))
@@ -141,12 +153,8 @@ class Deformation:
             residual=self.residual[index],
             time=self.time[index],
             reaction=self.reaction[index],
-            reached=self.reached[index],
-            inverted=self.inverted[index],
-            leaked=self.leaked[index],
-            bond=self.bond[index],
-            bound=self.bound[:, index],
-            reaction_bound=self.reaction_bound[:, index],
+            **{name: getattr(self, name)[index] for name in ROWS},
+            **{name: getattr(self, name)[:, index] for name in COLUMNS},
             memory={name: value[index] for name, value in self.memory.items()},
             warm={name: value[index] for name, value in self.warm.items()},
         )
@@ -195,12 +203,8 @@ def joined(parts: Sequence[Deformation]) -> Deformation:
         memory=shared("memory"),
         warm=shared("warm"),
         cost=Cost({stage: sum(part.cost.seconds[stage] for part in parts) for stage in stages}),
-        reached=stacked("reached"),
-        inverted=stacked("inverted"),
-        leaked=stacked("leaked"),
-        bond=stacked("bond"),
-        bound=np.concatenate([part.bound for part in parts], axis=1),
-        reaction_bound=np.concatenate([part.reaction_bound for part in parts], axis=1),
+        **{name: stacked(name) for name in ROWS},
+        **{name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in COLUMNS},
         source=parts[0].source,
     )
 

@@ -17,14 +17,13 @@ from .anatomy import Anatomy
 from .arguments import at_least, vertex_numbers
 from .compile import check_causes, compile_problem
 from .deformation import Cost, Deformation, check_start, joined
-from .diagnostics.bond_traction import Bond
-from .diagnostics.skull_leak import Leak
+from .diagnostics.deformed_tissue import Diagnostics
 from .discretisation.footprint import Skin
 from .discretisation.inverted_elements import Inversion
 from .discretisation.problem import Problem
 from .discretisation.space import discretise
 from .discretisation.term import Cases
-from .effects import Bonded, Effect, Elasticity
+from .effects import Effect, Elasticity
 from .errors import InputError
 from .linalg.preconditioner import choose_preconditioner
 from .linalg.rest_solver import Resting
@@ -111,9 +110,7 @@ class Fem:
         parts = local_solvers(plan, problem, preconditioner, self.effects, self.space)
         if problem.device.on_cuda:
             parts[0]()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
-        self._leak = Leak(anatomy, self.space, problem.device)
-        bonded = (effect for effect in self.effects if isinstance(effect, Bonded))
-        self._bond = next((Bond(effect, anatomy, self.space, problem.device) for effect in bonded), None)
+        self._diagnostics = Diagnostics(anatomy, self.space, self.effects, problem.device, accuracy.any_strain)
         inversion = Inversion(self.space, problem.device, problem.bounded)
         self.strategy = Strategy(problem, preconditioner, inversion, accuracy, plan, *parts)
         """What solves a load: the plan's solvers, one after the other."""
@@ -198,7 +195,7 @@ class Fem:
         """Who answers frame after frame on CUDA. The CPU waits for nothing that this would spare it."""
         if not self.plan.frames:
             return None
-        return frame_sequence(self.strategy, self.space, self._skin, self.lock, self.description)
+        return frame_sequence(self.strategy, self.space, self._skin, self._diagnostics, self.lock, self.description)
 
     def _vertices(self, at: np.ndarray) -> np.ndarray:
         return vertex_numbers("at", at, len(self._anatomy.mesh.nodes))
@@ -345,7 +342,7 @@ class Fem:
         self.problem.begin(replace(cases, share=found.gone, anew=found.anew))
         memory = dict(self.problem.end(found.u))
         displaced = cases.loads.of(Displaced) is not None
-        held = self.problem.gradient(found.u) if displaced or self._bond else None
+        held = self.problem.gradient(found.u) if displaced or self._diagnostics.needs_forces else None
         on_footprint = self.problem.constraint.force_on_footprint(held) if displaced else None
         touching = [term.reaction(found.u) for term in self.problem.barriers]
         reaction = np.concatenate([self._reaction(cases.loads, on_footprint), *touching], axis=1)
@@ -356,10 +353,11 @@ class Fem:
             memory[MIDDLES] = whole[:, len(nodes) :] - self.space.interpolated(displacement)[:, len(nodes) :]
         else:
             displacement = unstacked(self.problem.device, found.u, nodes)
+        fields = self._diagnostics.fields(found.u, held)
         return Deformation(
             displacement=displacement,
             nodes=nodes,
-            outcome=tuple(found.outcome),
+            outcome=tuple(self._diagnostics.outcomes(found.outcome, found.inverted, fields["strained"])),
             iterations=found.iterations,
             residual=found.residual,
             time=cases.loads.times,
@@ -369,8 +367,7 @@ class Fem:
             cost=Cost({**seconds, "reactions": time.perf_counter() - solved}),
             reached=found.reached,
             inverted=found.inverted,
-            leaked=self._leak.share(found.u),
-            bond=self._bond.share(held) if self._bond else np.array(np.nan),
+            **fields,
             source=self.description,
         )
 

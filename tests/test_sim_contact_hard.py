@@ -70,9 +70,7 @@ HARD = {
     ),
     "half off the edge": Hard(((at(0.0, 0.03, HEIGHT - 4e-3),),)),
     "half off the corner": Hard(((at(0.0, 0.0, HEIGHT - 4e-3),),)),
-    "deeper than the body is thick": Hard(
-        ((at(0.03, 0.03, HEIGHT - 0.035),),), ends=frozenset({Outcome.PIERCED, Outcome.BUDGET, Outcome.STALLED})
-    ),
+    "deeper than the body is thick": Hard(((at(0.03, 0.03, HEIGHT - 0.035),),), ends=frozenset({Outcome.ON_BONE})),
     "swallowed whole": Hard(((at(0.03, 0.03, HEIGHT - 6e-3),),), (Ball(2e-3),)),
     "turned by half a turn about its shaft": Hard(
         ((at(0.03, 0.03, HEIGHT - 2e-3),), (at(0.03, 0.03, HEIGHT - 2e-3, turn=(0.0, 0.0, 180.0)),)),
@@ -80,7 +78,7 @@ HARD = {
     ),
     "thin blade": Hard(((at(0.03, 0.03, HEIGHT - 1e-3),),), (Spatula(0.012, 0.02, 2.5e-4),)),
     "tip far smaller than an element": Hard(((at(0.033, 0.031, HEIGHT - 4e-4),),), (Ball(5e-4),)),
-    "far inside at once": Hard(((at(0.03, 0.03, 0.01),),)),
+    "far inside at once": Hard(((at(0.03, 0.03, 0.01),),), ends=frozenset({Outcome.OVERSTRAINED})),
     "a touch of no depth": Hard(((at(0.03, 0.03, HEIGHT),), (at(0.03, 0.03, HEIGHT),))),
     "gap wider than the body": Hard(
         ((DOWN,),), accuracy=Accuracy(1e-4, outer=3), gap=0.2, ends=CONVERGED | {Outcome.BUDGET, Outcome.STALLED}

@@ -12,6 +12,7 @@ from sim.accuracy import FLOOR, Accuracy
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import UNITS, MeshFile, read_mesh, write_mesh
 from sim.deformation import Deformation, guess
+from sim.diagnostics.stretch import LEAST, MOST
 from sim.effects import SKULLS, Effect, Held, NodalForce
 from sim.errors import InputError
 from sim.fem import Fem
@@ -34,6 +35,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_tissue_arguments(parser, whole=True)
     add_element_argument(parser, "p1, the file's linear tetrahedra as every other program takes them")
     parser.add_argument("--tolerance", type=float, default=1e-6, help="relative residual (default %(default)g)")
+    parser.add_argument(
+        "--any-strain",
+        action="store_true",
+        help="accept inverted tetrahedra, and strains beyond those that were measured on brain tissue",
+    )
     parser.add_argument(
         "--precision",
         default="float64",
@@ -59,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     Then the equilibrium under the largest share of the load that has one is written, or the last state where none has.
     """
     out = claimed(args.out, ".vtu", "a result of `sulcus solve`", args.force, [args.mesh])
-    accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision)
+    accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision, any_strain=args.any_strain)
     file = read_mesh(args.mesh, args.unit)
     tissue = elasticity_of(args, file.mesh)
     anatomy, loads, notes = problem_of(file, args.mesh, UNITS[args.unit])
@@ -82,8 +88,15 @@ def run(args: argparse.Namespace) -> int:
     if reached < 1.0:
         what = f"in equilibrium under {reached:.1%} of the load" if reached else "the last state, in no equilibrium"
         print(f"{args.mesh}: {outcome.value}; what is written is {what}", file=sys.stderr)
-    if inverted:  # an equilibrium of every law but `neo-hookean` may lie there: converged, and no tissue
-        print(f"{args.mesh}: {inverted} tetrahedra are inside out: the load is beyond the law's range", file=sys.stderr)
+    least, most = deformation.stretch[:, 0]
+    if inverted:
+        print(f"{args.mesh}: {inverted} tetrahedra are inverted: the load is too strong for this mesh", file=sys.stderr)
+    if least < LEAST or most > MOST:
+        print(
+            f"{args.mesh}: stretches are {least:.2g} to {most:.2g}; {1e6 * deformation.strained[0]:.2g} ml leave the "
+            f"range of {LEAST} to {MOST} that was measured on brain tissue",
+            file=sys.stderr,
+        )
     report = {
         "outcome": outcome.name.lower(),
         "message": outcome.value,
@@ -96,6 +109,8 @@ def run(args: argparse.Namespace) -> int:
         "nodes": fem.space.count,
         "seconds": round(seconds, 4),
         "inverted_tetrahedra": inverted,
+        "stretch": [round(float(least), 4), round(float(most), 4)],
+        "strained_ml": round(1e6 * float(deformation.strained[0]), 4),
         "leaked": float(deformation.leaked[0]),
         "bond": float(deformation.bond[0]),
         "largest_displacement_mm": round(1e3 * float(np.linalg.norm(deformation.displacement[0], axis=1).max()), 6),

@@ -22,6 +22,9 @@ OWN_TISSUES, OWN = re.compile(r"; region \d.*?(?=\)(?:;|$))"), re.compile(r"(?:(
 DOUBTS = {
     Outcome.EXTRAPOLATED: "outside what the model learned: do not rely on it",
     Outcome.PIERCED: "the tool came to be inside the tissue: do not rely on it",
+    Outcome.ON_BONE: "the tool stands on bone: do not rely on it",
+    Outcome.INVERTED: "the mesh is inverted under this load: do not rely on it",
+    Outcome.OVERSTRAINED: "strained beyond measured tissue: do not rely on it",
     Outcome.GUESSED: "nothing was solved: do not rely on it",
 }
 

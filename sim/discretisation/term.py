@@ -232,6 +232,10 @@ class Barrier(Term, Protocol):
         """In which columns (b,) a tool is inside the body at u (3N, b) [m], where it may touch none of its surface."""
         ...
 
+    def overlaps(self, u: wp.array) -> np.ndarray:
+        """Columns (2, b) bool in which a tool contains touchable surface at u (3N, b) [m], or undeformed bone."""
+        ...
+
     def widen(self, times: float) -> None:
         """Until the next batch begins the gap is so many times as wide."""
         ...

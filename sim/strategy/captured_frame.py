@@ -209,6 +209,11 @@ class Frame:
         return self._workspace.state
 
     @property
+    def u(self) -> wp.array:
+        """Displacements (3N, 1) [m] of the last answer."""
+        return self._workspace.columns["u"]
+
+    @property
     def before(self) -> State:
         """What the last answer started from."""
         return self._before

@@ -15,6 +15,7 @@ from weakref import ref
 import numpy as np
 
 from ..deformation import Cost, Deformation, Outcome
+from ..diagnostics.deformed_tissue import Diagnostics
 from ..discretisation.footprint import Skin
 from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
@@ -78,13 +79,24 @@ class FrameSequence:
         What the frame solves, and who counts its tetrahedra.
     frame
         Where that is done.
+    diagnostics
+        Marks equilibria that are not of tissue.
     lock
         Held by who asks for an answer.
     source
         What the answers call their solver.
     """
 
-    def __init__(self, problem: Problem, inversion: Inversion, frame: Frame, lock: RLock, source: str):
+    def __init__(
+        self,
+        problem: Problem,
+        inversion: Inversion,
+        frame: Frame,
+        diagnostics: Diagnostics,
+        lock: RLock,
+        source: str,
+    ):
+        self._diagnostics = diagnostics
         self._problem, self._inversion, self._frame, self._lock = problem, inversion, frame, lock
         self._source = source
         self._nodes = np.arange(problem.rows // 3)
@@ -122,10 +134,12 @@ class FrameSequence:
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
         displacement = found[HEAD:].reshape(1, -1, 3).copy()
         displacement.setflags(write=False)  # as a start, the device's own stands in for it
+        inverted, fields = found[INVERTED : INVERTED + 1].astype(int), self._diagnostics.strains(self._frame.u)
+        outcome = self._diagnostics.outcomes(np.array([Outcome.CONVERGED]), inverted, fields["strained"])
         answer = Deformation(
             displacement=displacement,
             nodes=self._nodes,
-            outcome=(Outcome.CONVERGED,),
+            outcome=tuple(outcome),
             iterations=found[STEPS : STEPS + 1].astype(int),
             residual=found[RESIDUAL : RESIDUAL + 1].copy(),
             time=loads.times,
@@ -133,7 +147,9 @@ class FrameSequence:
             warm=warm,
             cost=Cost({"equilibrium": time.perf_counter() - clock}),
             reached=np.ones(1),
-            inverted=found[INVERTED : INVERTED + 1].astype(int),
+            inverted=inverted,
+            stretch=fields["stretch"],
+            strained=fields["strained"],
             source=self._source,
         )
         self._last, self._here = ref(answer), ref(warm)
@@ -170,12 +186,14 @@ class FrameSequence:
         self._there = self._here
 
 
-def frame_sequence(strategy: Strategy, space: Discretisation, skin: Skin, lock: RLock, source: str) -> FrameSequence:
+def frame_sequence(
+    strategy: Strategy, space: Discretisation, skin: Skin, diagnostics: Diagnostics, lock: RLock, source: str
+) -> FrameSequence:
     """By the solvers of a plan that follows frames, on the tissue under a skin."""
     problem, preconditioner, inversion = strategy.problem, strategy.preconditioner, strategy.inversion
     part = strained_part(problem, preconditioner, space) if strategy.plan.strained else None
     frame = Frame(problem, preconditioner, inversion, skin, strategy.accuracy.tolerance, part)
-    return FrameSequence(problem, inversion, frame, lock, source)
+    return FrameSequence(problem, inversion, frame, diagnostics, lock, source)
 
 
 def _gone() -> None:

@@ -139,6 +139,7 @@ class Strategy:
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
+        on_bone = self._overlaps(device.zeros(problem.rows, count))[1]
         if not guesses:
             answer, astray = self._whole(cases), np.zeros(count, bool)
         else:
@@ -158,11 +159,12 @@ class Strategy:
                 problem.begin(some)
                 answer.put(again, self._whole(some), device)
         answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
-        anew, lost = astray.copy(), np.flatnonzero(self._lost(answer))
+        anew, lost = astray.copy(), np.flatnonzero(self._lost(answer) & ~on_bone)
         if len(lost):
             found = self._in_steps(cases.rows(lost), answer, lost)
             anew[lost] |= found.reached > answer.reached[lost]
             answer.put(lost, found, device)
+        answer.outcome[on_bone] = Outcome.ON_BONE
         return replace(answer, gone=answer.reached, anew=anew) if problem.barriers else answer
 
     def _acts(self, count: int) -> np.ndarray:
@@ -177,6 +179,11 @@ class Strategy:
         if not acts.all():
             acts = np.logical_or.reduce([acts, *(term.buried(rest) for term in self.problem.barriers)])
         return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
+
+    def _overlaps(self, u: wp.array) -> np.ndarray:
+        """Columns (2, b) bool of the batch that has begun in which a tool overlaps surface at u (3N, b), or bone."""
+        none = np.zeros((2, u.shape[1]), bool)
+        return np.logical_or.reduce([none, *(term.overlaps(u) for term in self.problem.barriers)])
 
     def _rested(self, start: wp.array) -> wp.array:
         """Start (3N, b) [m], or rest where nothing acts there: in float32 no descent would end in letting go."""
@@ -365,13 +372,15 @@ class Strategy:
         reached, iterations, residual = np.zeros(count), np.zeros(count, int), np.full(count, np.inf)
         outcome = np.full(count, Outcome.BUDGET, object)
         lets = outer = self.accuracy.outer
+        budget = outer * (1 + self.accuracy.steps)
         if not problem.barriers:
             lets, outer = self.stepping.aimed, min(self.stepping.most, outer)
         while left >= 0:
             strides = [term.stride(aimed(cases, reached), u) for term in problem.barriers]
             longest = np.minimum.reduce([np.ones(count), *strides])
             step = np.minimum(step, longest)
-            live = np.flatnonzero((reached < 1.0) & (step >= self.stepping.least * np.minimum(1.0, 4.0 * longest)))
+            live = (reached < 1.0) & (step >= self.stepping.least * np.minimum(1.0, 4.0 * longest))
+            live = np.flatnonzero(live & (iterations < budget))
             if len(live) == 0 or spent > self.stepping.patience * self.accuracy.inner * done:
                 break
             aim = np.minimum(reached[live] + step[live], 1.0)
@@ -391,7 +400,8 @@ class Strategy:
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
         if problem.barriers and len(short) < count:
             problem.begin(aimed(cases, np.ones(count)))
-            pierced = np.logical_or.reduce([term.buried(u) for term in problem.barriers]) & (reached == 1.0)
+            inside = [self._overlaps(u)[0], *(term.buried(u) for term in problem.barriers)]
+            pierced = np.logical_or.reduce(inside) & (reached == 1.0)
             outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0
         if len(short):
             problem.begin(cases.rows(short))

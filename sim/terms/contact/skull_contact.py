@@ -289,6 +289,10 @@ class Skull:
         """The skull is never inside what it holds."""
         return np.zeros(u.shape[1], bool)
 
+    def overlaps(self, u: wp.array) -> np.ndarray:
+        """The skull is no tool."""
+        return np.zeros((2, u.shape[1]), bool)
+
     def widen(self, times: float) -> None:
         """The barrier as many times as wide, and as much softer; the bone steps back by as much."""
         self._wall.times = times

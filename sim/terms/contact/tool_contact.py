@@ -13,7 +13,7 @@ from ...discretisation.space import Discretisation
 from ...discretisation.term import Cases
 from ...effects import Retraction, ToolContact
 from ...errors import InputError
-from ...geometry.surface import areas, edge_lengths
+from ...geometry.surface import areas, edge_lengths, vertex_normals
 from ...loads import Retracted, Touching
 from ...runtime.device import Device
 from ...tools import Tool, cores_of
@@ -43,6 +43,8 @@ class Contact:
         (N, 3) [m] at rest; (S, 3) or (S, 6), what may be touched of the surface.
     whole
         (W, 3) corners of the whole surface, outwards.
+    bone
+        (K, 3) or (K, 6), the surface where it is fixed or covered by the skull: no tool can be there.
     gap
         Distance [m] at which tissue begins to feel a tool; it is never touched quite.
     shear
@@ -63,6 +65,7 @@ class Contact:
         nodes: np.ndarray,
         triangles: np.ndarray,
         whole: np.ndarray,
+        bone: np.ndarray,
         gap: float,
         shear: float,
         device: Device,
@@ -76,15 +79,9 @@ class Contact:
         self._triangles, self._closed = triangles, device.array(whole, wp.int32)
         self._shapes, self._way, self._device, self._touch = tools, way, device, touch
         self._kernels = kernels_of(device, triangles.shape[1])
-        corners = nodes[triangles[:, :3]]
-        longest = touch.stretch * edge_lengths(corners).max(axis=1)
         fine = np.sqrt(2.0 * min(core.radius for core in cores) * touch.sag * gap) / FARTHEST
-        self._surface = Surface()
-        self._surface.rest = device.array(nodes, wp.vec3d)
-        self._surface.table = device.array(triangles, wp.int32)
-        pieces = np.ceil(longest / fine).astype(np.int32)
-        self._surface.pieces, self._rows = device.array(pieces, wp.int32), int(pieces.max())
-        self._surface.area = device.array(areas(corners), wp.float64)
+        self._surface, self._rows = _sampled(nodes, triangles, fine / touch.stretch, device)
+        self._bone, _ = _sampled(nodes, bone, fine, device)
         self._cores = [
             device.array(np.array([core.centre for core in cores]), wp.vec3d),
             device.array(np.array([core.half for core in cores]), wp.vec3d),
@@ -122,6 +119,18 @@ class Contact:
             for corners, pose in zip(self._corners, self._pose[:, self._owner].swapaxes(0, 1), strict=True)
         ]
         return any_enclosed(self._device, np.concatenate(points, axis=1), self._surface.rest, self._closed, u)
+
+    def overlaps(self, u: wp.array) -> np.ndarray:
+        """As `Barrier.overlaps`: deeper than the gap."""
+        if self._pose is None:
+            return np.zeros((2, u.shape[1]), bool)
+        dim, found = (len(self._owner), u.shape[1]), []
+        for moved, surface in ((u, self._surface), (wp.zeros_like(u), self._bone)):
+            out = wp.zeros(dim, dtype=wp.float64, device=self._device.name)
+            inputs = [moved, surface, self._tools]
+            self._device.launch(self._kernels.nearest, (len(surface.table), u.shape[1]), inputs, [out])
+            found.append((out.numpy() < -self._asked - self._sag).any(axis=0))
+        return np.stack(found)
 
     def widen(self, times: float) -> None:
         """The barrier as many times as wide, and as much softer."""
@@ -188,7 +197,17 @@ class Contact:
         nodes, own = self._nodes[self.touchable], np.searchsorted(self.touchable, self._triangles)
         corners, exact = own[:, :3], replace(self._device, precision="float64")
         term = Contact(
-            self.name, self._shapes, self._way, nodes, own, corners, self._asked, self._shear, exact, self._touch
+            self.name,
+            self._shapes,
+            self._way,
+            nodes,
+            own,
+            corners,
+            own[:0],
+            self._asked,
+            self._shear,
+            exact,
+            self._touch,
         )
         return term, Reduced(term, len(nodes), own.shape[1], exact)
 
@@ -282,11 +301,12 @@ def contact_of(
     triangles = space.surface[anatomy.bare]
     if not len(triangles):
         raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is held or slides.")
-    points, reach = space.nodes[np.unique(triangles)], _reach(space.nodes, triangles)
+    touchable, reach = np.unique(triangles), _reach(space.nodes, triangles)
+    points, normals = space.nodes[touchable], vertex_normals(space.nodes, triangles[:, :3])[touchable]
 
     @lru_cache(touch.kept)
     def came_from(number: int, pose: bytes) -> np.ndarray:
-        return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, reach, touch.march)
+        return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, normals, reach, touch.march)
 
     def clear(pose: np.ndarray) -> np.ndarray:
         """Where tools (B, tools, 4, 4) came from."""
@@ -313,7 +333,21 @@ def contact_of(
         return Way(_begun(last, cases.anew, lambda pose: pose, laid), held)
 
     whole = space.surface[:, :3]
-    return Contact(name, tools, way, space.nodes, triangles, whole, effect.gap, shear, device, touch)
+    solid = np.logical_or(anatomy.held.all(axis=1), anatomy.slide_normal.any(axis=1))
+    bone = space.surface[solid[whole].all(axis=1)]
+    return Contact(name, tools, way, space.nodes, triangles, whole, bone, effect.gap, shear, device, touch)
+
+
+def _sampled(nodes: np.ndarray, triangles: np.ndarray, fine: float, device: Device) -> tuple[Surface, int]:
+    """Surface triangles with sample points at most `fine` [m] apart, and the most rows of points in a triangle."""
+    corners = nodes[triangles[:, :3]]
+    pieces = np.ceil(edge_lengths(corners).max(axis=1) / fine).astype(np.int32)
+    out = Surface()
+    out.rest = device.array(nodes, wp.vec3d)
+    out.table = device.array(triangles, wp.int32)
+    out.pieces = device.array(pieces, wp.int32)
+    out.area = device.array(areas(corners), wp.float64)
+    return out, int(pieces.max(initial=0))
 
 
 def _begun(

@@ -22,6 +22,7 @@ class Kernels:
     add_reaction: wp.Kernel
     bound_step: wp.Kernel
     clearance: wp.Kernel
+    nearest: wp.Kernel
 
 
 @cache
@@ -225,6 +226,24 @@ def kernels_of(device: Device, size: int) -> Kernels:
         for k in range(tools.radius.shape[0]):
             wp.atomic_min(out, k, c, least_distance(seen(at, tools, k, c), stretch, tools.half[k], tools.radius[k]))
 
+    @forward_kernel(module="unique")
+    def nearest(
+        u: wp.array2d(dtype=scalar),
+        surface: Surface,
+        tools: Tools,
+        # outputs
+        out: wp.array2d(dtype=wp.float64),
+    ):
+        """Least signed distance from the points of the surface to each core, where it is negative."""
+        s, c = wp.tid()
+        at, n = nodes_of(surface, u, s, c), surface.pieces[s]
+        for k in range(tools.radius.shape[0]):
+            own, half, radius = seen(at, tools, k, c), tools.half[k], tools.radius[k]
+            if is_near(own, wp.float64(0.0), half, radius):
+                for i in range(n):
+                    for j in range(2 * (n - i) - 1):
+                        wp.atomic_min(out, k, c, touch_of(shape_of(i, j, n) * own, half, radius).distance)
+
     return Kernels(
-        add_energy, add_gradient, add_curvature, add_diagonal, add_matrix, add_reaction, bound_step, clearance
+        add_energy, add_gradient, add_curvature, add_diagonal, add_matrix, add_reaction, bound_step, clearance, nearest
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,24 +78,54 @@ class Way:
 
 
 def approach(
-    tool: Tool, pose: np.ndarray, points: np.ndarray, reach: np.ndarray, march: int = Touch.march
+    tool: Tool,
+    pose: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    reach: np.ndarray,
+    march: int = Touch.march,
 ) -> np.ndarray:
-    """Where a tool at `pose` (4, 4) came from along its shaft: just clear of a surface with vertices `points` (n, 3).
+    """Pose (4, 4) just clear of a surface from which a tool comes straight to `pose` (4, 4).
 
-    `reach` (n,) [m] is how far the surface goes on round each vertex. A tool that is clear where it is came from there.
-    It is followed through the air in `march` steps at most.
+    Along its shaft, or along the surface's outward normal where that way is less than half as long: an instrument that
+    lies flat in tissue was not pushed in from the side. A tool that is clear at `pose` comes from there. The surface
+    has vertices `points` (n, 3) [m] with unit `normals` (n, 3) and extends `reach` (n,) [m] round each vertex. The tool
+    is followed through the air in `march` steps at most.
     """
-    out, shaft = pose.copy(), pose[:3, 2]
-    local = (points - pose[:3, 3]) @ pose[:3, :3]
-    back, room = max(_above(core, local, reach) for core in cores_of(tool)), 0.0
+    cores, R = cores_of(tool), pose[:3, :3]
+    along_shaft = _cleared(tool, pose, R, cores, points, reach, march)
+    touched = distances_to(tool, pose, points) < reach
+    outward = normals[touched].sum(axis=0)
+    if not outward.any():
+        return along_shaft
+    T = Rotation.align_vectors(outward[None], np.array([[0.0, 0.0, 1.0]]))[0].as_matrix()
+    balls = [Core(T.T @ R @ core.centre, np.zeros(3), core.radius + float(np.linalg.norm(core.half))) for core in cores]
+    along_normal = _cleared(tool, pose, T, balls, points, reach, march)
+    shaft, normal = (np.linalg.norm(start[:3, 3] - pose[:3, 3]) for start in (along_shaft, along_normal))
+    return along_normal if 2.0 * normal < shaft else along_shaft
+
+
+def _cleared(
+    tool: Tool,
+    pose: np.ndarray,
+    R: np.ndarray,
+    cores: Sequence[Core],
+    points: np.ndarray,
+    reach: np.ndarray,
+    march: int,
+) -> np.ndarray:
+    """As `approach`, along the third column of R (3, 3); `cores`, in its axes from the tool's origin, contain it."""
+    out, local = pose.copy(), (points - pose[:3, 3]) @ R
+    back, room = max(_above(core, local, reach) for core in cores), 0.0
     for _ in range(march):
         back = max(0.0, back - room)
-        out[:3, 3] = pose[:3, 3] + back * shaft
+        out[:3, 3] = pose[:3, 3] + back * R[:, 2]
         room = max(0.0, float((distances_to(tool, out, points) - reach).min()))
     return out
 
 
 def _above(core: Core, local: np.ndarray, reach: np.ndarray) -> float:
-    """How high [m] above the tool's origin the surface goes, at most, where a core on its way down meets it."""
+    """How far [m] a core must go up its axis z to be above all of a surface that it meets on its way down."""
     aside = (np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
-    return max(0.0, float((local[:, 2] + reach)[aside <= core.radius + reach].max(initial=0.0)))
+    highest = (local[:, 2] + reach)[aside <= core.radius + reach].max(initial=-np.inf)
+    return max(0.0, float(highest - (core.centre[2] - core.half[2] - core.radius)))

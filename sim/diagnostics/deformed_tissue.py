@@ -1,0 +1,53 @@
+"""Fields of a `Deformation` that say whether its tissue is one: leak, bond, stretch, and the outcomes that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import warp as wp
+
+from ..anatomy import Anatomy
+from ..deformation import Outcome
+from ..discretisation.space import Discretisation
+from ..effects import Bonded, Effect
+from ..runtime.device import Device
+from .bond_traction import Bond
+from .skull_leak import Leak
+from .stretch import Stretch
+
+
+class Diagnostics:
+    """Measures the deformations of an anatomy under some effects."""
+
+    def __init__(
+        self, anatomy: Anatomy, space: Discretisation, effects: Iterable[Effect], device: Device, any_strain: bool
+    ):
+        self._leak, self._stretch, self._any_strain = Leak(anatomy, space, device), Stretch(space, device), any_strain
+        bonded = (effect for effect in effects if isinstance(effect, Bonded))
+        self._bond = next((Bond(effect, anatomy, space, device) for effect in bonded), None)
+
+    @property
+    def needs_forces(self) -> bool:
+        """Return True if `fields` needs the forces of fixed nodes."""
+        return self._bond is not None
+
+    def fields(self, u: wp.array, force: wp.array | None) -> dict[str, np.ndarray]:
+        """Fields `leaked`, `bond`, `stretch` and `strained` at u (3N, B) [m] with internal forces (3N, B) [N]."""
+        bond = self._bond.share(force) if self._bond and force is not None else np.array(np.nan)
+        return {"leaked": self._leak.share(u), "bond": bond, **self.strains(u)}
+
+    def strains(self, u: wp.array) -> dict[str, np.ndarray]:
+        """Fields `stretch` and `strained` at u (3N, B) [m]."""
+        return self._stretch.measure(u)
+
+    def outcomes(self, outcome: np.ndarray, inverted: np.ndarray, strained: np.ndarray) -> np.ndarray:
+        """Outcomes (B,), with those equilibria marked that are not of tissue, unless any strain will do.
+
+        inverted (B,) counts tetrahedra; strained (B,) [m^3] as in `Deformation`.
+        """
+        good = np.array([one.good and not self._any_strain for one in outcome], bool)
+        out = outcome.copy()
+        out[good & self._stretch.exceeds(strained)] = Outcome.OVERSTRAINED
+        out[good & (inverted > 0)] = Outcome.INVERTED
+        return out
