@@ -1,19 +1,26 @@
 """What a live link says on its console, and how often it sends the same STATUS."""
 
 import asyncio
+import re
 import socket
+import threading
 import time
+from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
-from films import FILM, follower_of
-from links import HOST, NAMES, linked, peers, played
+from films import FILM, follower_of, truth_of
+from links import HOST, NAMES, corners_of, in_mm, linked, peers, played
 from theatres import template_theatre
 
 from scenes.link.console import limited, printed
+from scenes.link.frame import stamp_of
 from scenes.link.messages import transform
 from scenes.script.registration_file import read_registration
 from scenes.script.scene import find_scene
+
+BEGUN = stamp_of(time.time())
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +68,57 @@ def test_changes_are_noted_once_and_a_status_is_not_repeated_ten_times_a_second(
     played(scene())
     for each in ("cannot be reached", "the identity", "no StylusTipToReference yet", "comes"):
         assert sum(each in line for line in lines) == 1, (each, lines)
+
+
+def test_link_slow_solver_reports_each_second_and_empties(follower):
+    """No answer to a pose older than `stale` is shown, and no STATUS is late, while one solution takes 2 s."""
+    registration = read_registration(FILM / "registration.json")
+    poses = registration.T_patient_scan @ truth_of(follower.motion.stage).T_scan_tool
+    beside = in_mm(poses[10] @ np.linalg.inv(follower.tool.T_cube_tool))
+    slow, stale, sent = threading.Event(), 0.3, {}
+
+    class Slow:
+        def deform(self, loads, start=None, at=None):
+            time.sleep(1.0 if slow.is_set() else 0.0)  # a pose takes two
+            return follower.motion.deformer.deform(loads)
+
+    async def track(tracker):
+        for number in count():
+            sent[BEGUN + number] = time.monotonic()
+            tracker.send("TRANSFORM", NAMES.tool, transform(beside), BEGUN + number)
+            await asyncio.sleep(0.03)
+
+    async def scene():
+        motion = replace(follower.motion, deformer=Slow())
+        link = linked(replace(follower, motion=motion), registration, stale=stale)
+        async with link as port, peers(port, 2) as (tracker, viewer):
+            slow.set()
+            moving = asyncio.create_task(track(tracker))
+            while "no solution yet, computing for 1 s" not in await viewer.said("Sulcus"):
+                pass
+            slow.clear()
+            await viewer.next("TRANSFORM", "TumourToRas")
+            slow.set()
+            begun = heard = time.monotonic()
+            words, ages = set(), [0.0]
+            while (now := time.monotonic()) < begun + 4.0:
+                header, body = await viewer.next()
+                if header.name == "TumourNow":
+                    ages.append(now - sent[header.stamp] if len(corners_of(body)) else 0.0)
+                    emptied.append(now - begun) if not len(corners_of(body)) else None
+                if header.name == "Sulcus":
+                    words.add(re.sub(r"[\d.]+", "", body[30:-1].decode()))
+                    assert now - heard < 1.3
+                    heard = now
+            assert max(ages) < stale + 0.1 and emptied[0] < stale + 0.3
+            assert any("stale, the answer is" in each for each in words)
+            slow.clear()
+            while not len(corners_of((await viewer.next("POLYDATA", "TumourNow"))[1])):
+                pass
+            moving.cancel()
+
+    emptied = []
+    played(scene())
 
 
 def test_a_console_gets_no_storm_and_nothing_that_a_terminal_obeys(capsys):

@@ -235,6 +235,20 @@ def test_the_command_serves_this_machine_alone_and_ends_at_a_signal():
     assert process.returncode == 0 and "Traceback" not in error, error
 
 
+@pytest.mark.parametrize(("delay", "said"), [(0.0, ""), (0.1, "--stale 0.3 is too short for solutions that take 0.2")])
+def test_link_command_measures_one_solution(follower, monkeypatch, capsys, delay, said):
+    class Slow:
+        def deform(self, loads, start=None, at=None):
+            time.sleep(delay)
+            return follower.motion.deformer.deform(loads)
+
+    monkeypatch.setattr("scenes.commands.link.mover", lambda *words: (Slow(), "a slow one"))
+    words = ["--tool", FILM / "tool.json", "--port", "0", "--device", "cpu", "--seconds", "0.1"]
+    assert main(["link", str(template_path()), *map(str, words)]) == 0
+    out, error = capsys.readouterr()
+    assert "one solution takes" in out and said in error and ("too short" in error) == bool(said)
+
+
 @pytest.mark.parametrize(
     ("words", "why"),
     [

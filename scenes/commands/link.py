@@ -231,6 +231,15 @@ def opened(args: argparse.Namespace) -> Session:
     names = Names(args.tool_name, args.reference_name, args.camera_name, args.registration_name)
     print(f"{args.anatomy.name}; {tool.shape}; motion by {who}", flush=True)
     answering = Answering(ToolMotion(stage, deformer), tool, tracking, registration)
+    seconds = 0.0 if deformer is None else answering.measure()
+    if deformer is not None:
+        print(f"one solution takes {seconds:.2g} s on this machine", flush=True)
+    if 2.0 * seconds > args.stale:
+        print(
+            f"sulcus link: --stale {args.stale:g} is too short for solutions that take {seconds:.2g} s: give --stale "
+            f"{np.ceil(3.0 * seconds):.0f}, or a model of the tool's poses",
+            file=sys.stderr,
+        )
     heard = Heard(names, args.stale)
     return Session(answering, Outgoing(stage, registration is not None), heard, eye, args.clients, limited(printed))
 

@@ -1,4 +1,4 @@
-"""The loop of a live link: the newest pose is answered in a thread of its own, and what is old is said to be so."""
+"""The loop of a live link: the newest pose is solved in a thread, and a task of its own reports what is old."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Eye:
 class Session:
     """A live link: hears poses, has them answered, and publishes the answers.
 
-    All but `_answered` and what is drawn belongs to the event loop's thread.
+    All but `_computed` and what is drawn belongs to the event loop's thread.
 
     Parameters
     ----------
@@ -129,11 +129,14 @@ class Session:
         self._answers, self._speaks, self._heard, self._eye = answers, speaks, heard, eye
         self._others: dict[str, None] = {}
         self._places: Places | None = None
-        self._known: Known | None = None
+        self._states: set[State] = set()
+        self._loop = asyncio.get_running_loop()
+        self._solved = self._shown = answers.answer(heard, self._loop.time(), clock.time())
+        # Arrival of the pose that was solved last, and start of the solution that is being computed [s].
+        self._arrived = self._begun = np.inf
         self._posed, self._pictured = asyncio.Event(), asyncio.Event()
         self._picture: Picture | None = None
         self._ended = asyncio.Event()
-        self._loop = asyncio.get_running_loop()
 
     def end(self) -> None:
         """Say to all clients that it is over, and end `serve`; from any thread."""
@@ -181,57 +184,72 @@ class Session:
 
     async def _work(self, seconds: float) -> None:
         self.clients.publish("scan", (self._speaks.scan(0),))
+        self._show(self._solved, self._speaks.messages(self._solved))
         with ThreadPoolExecutor(1, "answer") as answering, ThreadPoolExecutor(1, "draw") as drawing:
-            work = [self._answering(answering), *([] if self._eye is None else [self._drawing(self._eye, drawing)])]
+            work = [self._reporting(), self._answering(answering)]
+            work += [] if self._eye is None else [self._drawing(self._eye, drawing)]
             tasks = [asyncio.create_task(each) for each in work]
             ended = asyncio.create_task(self._ended.wait())
             limit = seconds if np.isfinite(seconds) else None
             done, _ = await asyncio.wait((*tasks, ended), timeout=limit, return_when=asyncio.FIRST_COMPLETED)
+            for task in (*tasks, ended):
+                task.cancel()
             over = framed("STATUS", "Sulcus", status(Code.SHUTDOWN, "the server ends"), stamp_of(clock.time()))
             self.clients.publish("status", (over,))
             await self.clients.close()
-            for task in (*tasks, ended):
-                task.cancel()
             for task in done:
                 task.result()  # what went wrong is raised
 
     async def _answering(self, thread: ThreadPoolExecutor) -> None:
-        """Answer the newest pose, again and again; say what is not known."""
-        said: object = None
-        beat, states, answer = 0.0, set[State](), None
+        """Compute the solution of the newest pose, again and again."""
         while True:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(TICK):
-                    await self._posed.wait()
-            fresh = self._posed.is_set()
+            await self._posed.wait()
             self._posed.clear()
-            if fresh or answer is None or self._gone():
-                answer, messages = await self._loop.run_in_executor(thread, self._answered, self._heard, self._places)
-                self._known = answer.known
-                self.clients.publish("answer", messages)
-            known = answer.known
-            if known.state not in states:
-                states.add(known.state)
-                self._note(f"the tumour is {_found(known)}")
+            heard, places, self._begun = self._heard, self._places, self._loop.time()
+            body = heard.beside(heard.names.tool, self._begun)
+            answer, messages = await self._loop.run_in_executor(thread, self._computed, heard, places, self._begun)
+            self._solved, self._begun = answer, np.inf
+            self._arrived = np.inf if isinstance(body, str) else body.arrived
+            current = self._current(self._loop.time())
+            # A pose may have grown old while its solution was computed.
+            self._show(current, messages if current is answer else self._speaks.messages(current, places))
+
+    async def _reporting(self) -> None:
+        """Publish, every tick and whatever the solver does, that a pose or its solution is too old, and a STATUS."""
+        said: object = None
+        beat = 0.0
+        while True:
             now, kinds = self._loop.time(), frozenset(self.clients.refused)
+            if (answer := self._current(now)) is not self._shown:
+                self._show(answer, self._speaks.messages(answer, self._places))
+            known = answer.known
             # A number that grows is no news.
             saying = known.state, re.sub(r"[\d.]+", "", known.words), kinds, tuple(self._others)
             if saying != said or now - beat >= BEAT:
                 said, beat = saying, now
                 self.clients.publish("status", (self._speaks.status(answer, self._refused_words(known)),))
+            await asyncio.sleep(TICK)
 
-    def _gone(self) -> bool:
-        """Whether the tool's pose is not known now."""
-        return isinstance(self._heard.beside(self._heard.names.tool, self._loop.time()), str)
+    def _current(self, now: float) -> Answer:
+        """Return the last solution, or the reason why none holds at a time [s]; the solver is not called."""
+        if isinstance(self._heard.beside(self._heard.names.tool, now), str):
+            return self._answers.answer(self._heard, now, clock.time(), self._shown.known)
+        answer, waited = late(self._solved, now - self._arrived, self._heard.stale), now - self._begun
+        if answer is self._solved and answer.known.state in (State.NO_TOOL, State.STALE) and waited > BEAT:
+            return replace(answer, known=replace(answer.known, words=f"no solution yet, computing for {waited:.0f} s"))
+        return answer
 
-    def _answered(self, heard: Heard, places: Places | None) -> tuple[Answer, tuple[bytes, ...]]:
-        """An answer and its messages, in the thread that answers."""
-        now = self._loop.time()
-        answer = self._answers.answer(heard, now, clock.time(), self._known)
-        body = heard.beside(heard.names.tool, now)
-        if not isinstance(body, str):
-            answer = late(answer, self._loop.time() - body.arrived, heard.stale)
+    def _computed(self, heard: Heard, places: Places | None, now: float) -> tuple[Answer, tuple[bytes, ...]]:
+        """Compute an answer and its messages, in the solver's thread."""
+        answer = self._answers.answer(heard, now, clock.time(), self._shown.known)
         return answer, self._speaks.messages(answer, places)
+
+    def _show(self, answer: Answer, messages: tuple[bytes, ...]) -> None:
+        self._shown = answer
+        if answer.known.state not in self._states:
+            self._states.add(answer.known.state)
+            self._note(f"the tumour is {_found(answer.known)}")
+        self.clients.publish("answer", messages)
 
     def _refused_words(self, known: Known) -> str:
         """What was refused so far, and which other transforms there are where the wanted one does not come."""
@@ -246,11 +264,11 @@ class Session:
         while True:
             await self._pictured.wait()
             self._pictured.clear()
-            if self._picture is None or self._known is None:
+            if self._picture is None:
                 continue
             (colour, stamp), heard = self._picture, self._heard
             camera = self._answers.camera(heard, self._loop.time(), stamp)
-            drawn = await self._loop.run_in_executor(thread, eye.painted, colour, self._known, camera)
+            drawn = await self._loop.run_in_executor(thread, eye.painted, colour, self._shown.known, camera)
             self.clients.publish("picture", (framed("IMAGE", "Overlay", image(drawn), stamp),))
 
     def _longest(self, kind: str) -> int:
