@@ -165,6 +165,32 @@ def test_two_bodies_are_found_from_two_files(tmp_path, capsys):
     assert "still.csv: 0 motions turn the bodies" in refused(["--hand-eye", one, still], capsys)
 
 
+@pytest.mark.parametrize(
+    ("column", "cells", "pose"),
+    [
+        ("Status", ("OK", "MISSING", "OUT_OF_VIEW"), None),
+        ("ToolToTrackerTransformStatus", ("ok", "INVALID", "ok"), None),
+        ("valid", ("1", "0", "False"), None),
+        ("state", ("good", "", "Partially Out of Volume"), None),
+        ("status", ("OK", "MISSING", "OK"), "nan,nan,nan,nan,nan,nan,nan"),
+        ("note", ("a", "b", "c"), "nan,nan,nan,nan,nan,nan,nan"),
+        ("note", ("a", "b", "c"), "0,0,0,0,0,0,0"),
+        ("note", ("a", "b", "c"), "0,0,0,0,0,0,1"),
+    ],
+)
+def test_pose_rows_not_seen_are_dropped_and_counted(tmp_path, column, cells, pose):
+    path, good = tmp_path / "poses.csv", "1,2,3,0,0,0,1"
+    rows = [f"{row},{good if row != 1 or pose is None else pose},{cell}" for row, cell in enumerate(cells)]
+    path.write_text("\n".join([f"{HEAD},{column}", *rows]))
+    unseen = len({"MISSING", "INVALID", "0", ""}.intersection(cells) or {pose}) + len(
+        {"OUT_OF_VIEW", "False", "Partially Out of Volume"}.intersection(cells)
+    )
+    with pytest.warns(UserWarning, match=f"{unseen} rows are not seen by the tracker"):
+        assert len(read_poses(path)[0]) == 3 - unseen
+    path.write_text(f"{HEAD}\n0,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,1\n")
+    assert len(read_poses(path)[0]) == 2  # the tracker's own frame
+
+
 def test_poses_are_read_in_metres_and_wrong_ones_are_refused(tmp_path):
     path = write_poses(tmp_path / "poses.csv", turned(3), [[0.1, 0.2, 0.3]] * 3)
     times, found = read_poses(path)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +24,11 @@ TIP, TIP_DEVIATION = ("tip_x_mm", "tip_y_mm", "tip_z_mm"), "tip_off_mm"
 COVARIANCE = tuple(f"cov_{row}{column}" for row in range(6) for column in range(row, 6))
 LAST = ("corners", "residual_px", "ms", "frame")
 CAMERA = "camera: x right, y down, z forward"
+# Columns in which a tracker says that it saw the body, and what they hold then.
+STATUS = "state", "valid", "visible", "tracked", "seen"
+SEEN = "ok", "good", "seen", "valid", "visible", "tracked", "tracking", "true", "yes", "1", "1.0"
+# Number of kinds of unseen rows that a warning names.
+MOST_WORDS = 3
 # By how much a quaternion's length may differ from 1, and a place be from the origin [m].
 ROUNDED, FARTHEST = 0.01, 100.0
 # Of the covariance: from metres and radians to millimetres and radians.
@@ -32,8 +40,9 @@ USUAL = 0.25e-3, float(np.radians(0.1))
 def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,) [s] and poses (n, 4, 4) [m] of a file with the columns time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw.
 
-    A pose leads from the body to the tracker: x_tracker = T x_body. Further columns are passed over, and so are rows
-    without a pose.
+    A pose leads from the body to the tracker: x_tracker = T x_body. Rows without a pose are passed over, and with a
+    warning rows in which the tracker did not see the body: their status is not OK, or they are all zeros or the
+    identity. Other further columns are ignored.
 
     Raises
     ------
@@ -72,7 +81,20 @@ def read_stream(path: str | Path) -> PoseStream:
 def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times (n,), poses (n, 4, 4) and covariances (n, 6, 6) of all rows; without a pose they are NaN."""
     with_errors = (TIME, *PLACE, *TURN, *COVARIANCE)
-    columns = read_columns(path, {with_errors[:8], with_errors}, with_errors[1:], others=True)
+    unseen = Counter[str]()
+    columns = read_columns(path, {with_errors[:8], with_errors}, with_errors[1:], partial(_is_unseen, unseen=unseen))
+    pose = np.column_stack([columns[name] for name in (*PLACE, *TURN)])
+    zeros, same = ((np.abs(pose) == each).all(axis=1) for each in (np.zeros(7), np.eye(7)[6]))
+    # A body that is the identity in every row is the frame of the other one.
+    for rows, what in ((zeros, "zeros"), (same & ~same[~np.isnan(pose[:, 0])].all(), "the identity")):
+        unseen.update({what: np.count_nonzero(rows)})
+        for name in with_errors[1:8]:
+            columns[name][rows] = np.nan
+    if unseen.total():
+        counted = ", ".join(f"{count} {what}" for what, count in unseen.most_common(MOST_WORDS) if count)
+        warnings.warn(
+            f"{path}: {unseen.total()} rows are not seen by the tracker and not used: {counted}", stacklevel=1
+        )
     blank = np.isnan([columns[name] for name in (*PLACE, *TURN)])
     odd = np.flatnonzero(blank.any(axis=0) & ~blank.all(axis=0))
     if len(odd):
@@ -95,6 +117,16 @@ def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     poses[kept, :3, :3] = Rotation.from_quat(turns[kept]).as_matrix()
     poses[kept, :3, 3] = places[kept]
     return columns[TIME], poses, _covariances(columns, len(turns))
+
+
+def _is_unseen(cells: Mapping[str, str], unseen: Counter[str]) -> bool:
+    """Return True if a row (cells by column) has a pose that the tracker did not see, and count it by its reason."""
+    pose = {cells[name].strip().casefold() for name in (*PLACE, *TURN)}
+    status = {name: cell.strip() for name, cell in cells.items() if name in STATUS or name.endswith("status")}
+    why = [f"{name} {cell[:20]!r}" for name, cell in status.items() if cell.casefold() not in SEEN]
+    why += ["nan"] if pose == {"nan"} else []
+    unseen.update(why[:1] if pose != {""} else [])
+    return bool(why)
 
 
 def _covariances(columns: dict[str, np.ndarray], count: int) -> np.ndarray:

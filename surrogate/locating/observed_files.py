@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -43,11 +44,15 @@ def _points(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarra
 
 
 def read_columns(
-    path: str | Path, allowed: set[tuple[str, ...]], empty: tuple[str, ...] = (), others: bool = False
+    path: str | Path,
+    allowed: set[tuple[str, ...]],
+    empty: tuple[str, ...] = (),
+    blank: Callable[[Mapping[str, str]], bool] | None = None,
 ) -> dict[str, np.ndarray]:
     """Columns of a table by name, whose header is one of those allowed; in some columns cells may be `empty`: NaN.
 
-    With `others`, further columns are passed over, whatever they hold.
+    With `blank`, further columns are allowed. It is given all cells of a row by column; where it returns True, the
+    `empty` columns of that row are NaN.
 
     Raises
     ------
@@ -70,7 +75,7 @@ def read_columns(
         raise InputError(f"{path}: is empty: give a table with the header {known}.")
     first = rows.pop(0)[1]
     header = tuple(cell.strip().lower() for cell in first)
-    wanted = set().union(*allowed).intersection(header) if others else set(header)
+    wanted = set(header) if blank is None else set().union(*allowed).intersection(header)
     if wanted not in map(set, allowed) or len(set(header)) < len(header):
         raise InputError(
             f"{path}: its first line is {','.join(first)[:80]!r}: give the header {known}, with commas between."
@@ -81,15 +86,16 @@ def read_columns(
     values = np.empty((len(rows), len(names)))
     for value, (number, row) in zip(values, rows, strict=True):
         try:
-            cells = [cell for name, cell in zip(header, row, strict=True) if name in wanted]
+            cells = dict(zip(header, row, strict=True))
+            gone = blank is not None and blank(cells)
             value[:] = [
-                float(cell) if cell.strip() or name not in empty else np.nan
-                for name, cell in zip(names, cells, strict=True)
+                np.nan if name in empty and (gone or not cells[name].strip()) else float(cells[name]) for name in names
             ]
         except ValueError as error:
             raise InputError(
                 f"{path}: row {number} is {','.join(row)[:80]!r}, not {len(header)} numbers: mend or remove it."
             ) from error
-        if not (np.abs(value[[bool(cell.strip()) for cell in cells]]) < LARGEST).all():
+        given = [name not in empty or not gone and bool(cells[name].strip()) for name in names]
+        if not (np.abs(value[given]) < LARGEST).all():
             raise InputError(f"{path}: row {number} has a number that is not finite, or above {LARGEST:g}: remove it.")
     return dict(zip(names, values.T, strict=True))
