@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenes.link.frame import HEADER, BadMessageError, content_of, framed, read_header, stamp_of, time_of
+from scenes.link.frame import HEADER, BadMessageError, content_of, framed, metadata_of, read_header, stamp_of, time_of
 from scenes.link.heard import Heard, Names, rigid
 from scenes.link.messages import (
     Code,
@@ -113,6 +113,21 @@ def test_the_checksum_is_that_of_the_catalogue():
     assert read_header(framed("STRING", "A", b"123456789", 0)[:58]).checksum == 0x6C40DF5F0B497347
 
 
+def messaged(value, value_size=None, count=1):
+    """Header and body of a message of version 2 with one pair of metadata."""
+    index = struct.pack(">HHHI", count, 3, 3, len(value) if value_size is None else value_size)
+    body = struct.pack(">HHII", 12, len(index), 3 + len(value), 0) + b"content" + index + b"key" + value.encode()
+    raw = b"\0\2" + framed("STRING", "A", body, 0)[2:]
+    return read_header(raw[: HEADER.size]), body
+
+
+def test_metadata_stands_behind_the_content():
+    header, body = messaged("OK\0")
+    assert content_of(header, body) == b"content" and metadata_of(header, body) == {"key": "OK"}
+    assert metadata_of(*messaged("", count=1)) == {"key": ""}
+    assert metadata_of(read_header(framed("STRING", "A", b"", 0)[:58]), b"") == {}
+
+
 def body_of(raw):
     return content_of(read_header(raw[:58]), raw[58:])
 
@@ -125,6 +140,8 @@ def body_of(raw):
         (lambda: body_of(framed("STRING", "A", b"abc", 0)[:-1] + b"d"), "wrong checksum"),
         (lambda: body_of(b"\0\2" + framed("STRING", "A", b"abc", 0)[2:]), "too short for an extended"),
         (lambda: body_of(b"\0\2" + framed("STRING", "A", b"\0\xff" + bytes(14), 0)[2:]), "extended header names"),
+        (lambda: metadata_of(*messaged("a", value_size=9)), "other sizes than its index"),
+        (lambda: metadata_of(*messaged("a", count=2)), "other sizes than its index"),
         (lambda: read_transform(bytes(44)), "wrong size: 44 bytes in place of 48"),
         (lambda: read_position(bytes(28)), "quaternion"),
         (lambda: read_points(bytes(135)), "wrong size"),
@@ -176,6 +193,7 @@ def test_a_body_is_known_while_its_transforms_are_new():
     assert heard.beside(names.tool, 1.4) == "no new StylusTipToReference for 0.4 s"
     for T, stamp, sender, why in (
         (np.eye(4), STAMP + 9, 0, "identity"),
+        (np.diag([0.0, 0.0, 0.0, 1.0]), STAMP + 9, 0, "zeros, which trackers send"),
         (matrix(), STAMP, 0, "the same time stamp"),
         (matrix(), STAMP - 9, 0, "before the last"),
         (matrix(), STAMP + 9, 1, "another client"),

@@ -149,6 +149,28 @@ def test_the_c_library_sends_what_is_read(built, follower, registration):
     played(scene((HOST, other), lambda port: (server, other, 30)))
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("Status", "MISSING"), ("TransformStatus", "OUT_OF_VIEW"), ("StylusToTrackerTransformStatus", "")],
+)
+def test_link_tool_not_seen_by_tracker_is_counted(follower, registration, beside, key, value):
+    names = Names(tool="StylusTipToReferenceOfSpine")  # a message carries 20 bytes of it
+
+    async def scene():
+        async with linked(follower, registration, names=names) as port, peers(port) as (tracker,):
+            for number, word in enumerate((value, value, "OK")):
+                if word == "OK":
+                    while "2 not seen by its tracker" not in (words := await tracker.said("Sulcus")):
+                        pass
+                    assert f"no {names.tool} yet" in words
+                message = pyigtl.TransformMessage(beside, timestamp=1e9 + number, device_name=names.tool)
+                message.header_version, message.metadata = 2, {"FrameNumber": "7", key: word}
+                tracker.writer.write(message.pack())
+            await tracker.next("TRANSFORM", "TumourToRas")
+
+    played(scene())
+
+
 def test_pyigtl_sends_and_hears(follower, registration, beside):
     async def scene():
         async with linked(follower, registration) as port:
@@ -254,6 +276,9 @@ def test_link_command_measures_one_solution(follower, monkeypatch, capsys, delay
     [
         (["--port", "70000"], "--port 70000"),
         (["--stale", "0"], "--stale 0"),
+        (["--tool-name", "N\u00e4del"], "--tool-name 'N\u00e4del': must be of printable"),
+        (["--camera-name", " "], "--camera-name ' '"),
+        (["--tool-name", "StylusTipToReferenceA", "--camera-name", "StylusTipToReferenceB"], "their first 20"),
         (["--tracking-mm", "-1"], "--tracking-mm -1"),
         (["--client", ":18944"], "--client :18944"),
         *((["--client", host], f"--client {host}: port 18944 of this machine") for host in SELF),

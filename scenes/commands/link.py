@@ -22,10 +22,12 @@ from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument
 from .tracked_scene import mover, tracked_scene
 
 if TYPE_CHECKING:
+    from ..link.heard import Names
     from ..link.session import Session
     from ..play.deformers import Theatre
     from ..script.tracked_tool import TrackedTool
 
+NAMES = "--tool-name", "--reference-name", "--camera-name", "--registration-name"
 PORT = 18944
 """That of OpenIGTLink."""
 # So long a signal waits for clients to hear that the server ends [s].
@@ -97,6 +99,12 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--tracking-mm {args.tracking_mm:g}: give millimetres, 0 to 100.")
     if not 0 <= args.port < 1 << 16:
         raise InputError(f"--port {args.port}: give a port from 0 to 65535.")
+    names = names_of(args)
+    for option, name in zip(NAMES, (names.tool, names.reference, names.camera, names.registration), strict=True):
+        if not (name.strip() and name.isascii() and name.isprintable()):
+            raise InputError(f"{option} {name!r}: must be of printable ASCII characters.")
+    if len(names.by_wire) < len(NAMES):
+        raise InputError(f"{', '.join(NAMES)}: must differ in their first 20 characters, which messages carry.")
     if args.host not in ("127.0.0.1", "localhost", "::1"):
         said = "OpenIGTLink asks for no password: whoever reaches this address may move the tumour that all see"
         print(f"sulcus link: {said}", file=sys.stderr)
@@ -107,6 +115,13 @@ def run(args: argparse.Namespace) -> int:
             f"another one, as --port {args.port % 65535 + 1}, or give --client the port of the other server."
         )
     return until_ended(partial(_linked, args, source))
+
+
+def names_of(args: argparse.Namespace) -> Names:
+    """Names of the transforms that are received."""
+    from ..link.heard import Names
+
+    return Names(args.tool_name, args.reference_name, args.camera_name, args.registration_name)
 
 
 def address_of(text: str) -> tuple[str, int]:
@@ -196,7 +211,7 @@ def opened(args: argparse.Namespace) -> Session:
 
     from ..link.answer import Answering
     from ..link.console import limited, printed
-    from ..link.heard import Heard, Names
+    from ..link.heard import Heard
     from ..link.outgoing import Outgoing
     from ..link.session import Eye, Session
     from ..play.deformers import open_theatre
@@ -228,7 +243,6 @@ def opened(args: argparse.Namespace) -> Session:
         device = find_device(args.device, LIVE.precision).name
         load_kernels(device)
         eye = Eye(calibration, Painter(stage, tool, device=device), tracking)
-    names = Names(args.tool_name, args.reference_name, args.camera_name, args.registration_name)
     print(f"{args.anatomy.name}; {tool.shape}; motion by {who}", flush=True)
     answering = Answering(ToolMotion(stage, deformer), tool, tracking, registration)
     seconds = 0.0 if deformer is None else answering.measure()
@@ -240,7 +254,7 @@ def opened(args: argparse.Namespace) -> Session:
             f"{np.ceil(3.0 * seconds):.0f}, or a model of the tool's poses",
             file=sys.stderr,
         )
-    heard = Heard(names, args.stale)
+    heard = Heard(names_of(args), args.stale)
     return Session(answering, Outgoing(stage, registration is not None), heard, eye, args.clients, limited(printed))
 
 

@@ -6,10 +6,10 @@ import asyncio
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 
-from .frame import HEADER, WRONG_CHECKSUM, BadMessageError, Header, content_of, framed, read_header
+from .frame import HEADER, WRONG_CHECKSUM, BadMessageError, Header, content_of, framed, metadata_of, read_header
 from .messages import Code, status
 
 REFUSED = "SulcusRefused"
@@ -218,7 +218,8 @@ class Clients:
             return
         body = await reader.readexactly(header.size)
         try:
-            self._receive(client.number, header, content_of(header, body))
+            content = content_of(header, body)
+            self._receive(client.number, replace(header, metadata=metadata_of(header, body)), content)
         except BadMessageError as error:
             code = Code.CHECKSUM if str(error) == WRONG_CHECKSUM else Code.CONFIGURATION
             # What stands after a colon differs from message to message.

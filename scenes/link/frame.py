@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from sim.errors import InputError
 
@@ -16,6 +17,8 @@ HEADER = struct.Struct(">H12s20sQQQ")
 """Version, type, device name, time stamp, size of the body, checksum: 58 bytes, all numbers big-endian."""
 # Sizes of the extended header, of the index of metadata and of metadata, and the message's number: of version 2 on.
 EXTENDED = struct.Struct(">HHII")
+INDEXED = struct.Struct(">HHI")
+"""Of one pair of metadata: size of its key, encoding and size of its value."""
 VERSIONS = (1, 2)
 # A time stamp counts 2^-32 s since 1970.
 TICKS = 1 << 32
@@ -43,6 +46,8 @@ class Header:
         Of its body, in bytes.
     checksum
         CRC-64 of the body (ECMA-182, from 0).
+    metadata
+        By key, once the body was read.
     """
 
     version: int
@@ -51,6 +56,7 @@ class Header:
     stamp: int
     size: int
     checksum: int
+    metadata: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_header(raw: bytes) -> Header:
@@ -87,6 +93,31 @@ def content_of(header: Header, body: bytes) -> bytes:
     if not EXTENDED.size <= start <= end:
         raise BadMessageError("its extended header names other sizes than the message has")
     return body[start:end]
+
+
+def metadata_of(header: Header, body: bytes) -> dict[str, str]:
+    """Metadata of a message whose content was read, by key; those of version 1 have none.
+
+    Raises
+    ------
+    BadMessageError
+        Metadata of other sizes than its index names.
+    """
+    _, index, size, _ = EXTENDED.unpack_from(body) if header.version > 1 else (0, 0, 0, 0)
+    if not index:
+        return {}
+    table, text = body[len(body) - index - size : len(body) - size], body[len(body) - size :]
+    count = int.from_bytes(table[:2])
+    rows = list(INDEXED.iter_unpack(table[2:])) if len(table) == 2 + count * INDEXED.size else []
+    if len(rows) != count or sum(key + value for key, _, value in rows) != size:
+        raise BadMessageError("its metadata has other sizes than its index names")
+    found, at = {}, 0
+    for key, _, value in rows:
+        words = text[at : at + key], text[at + key : at + key + value]
+        key_text, value_text = (each.decode("utf-8", "replace").strip("\0 ") for each in words)
+        found[key_text] = value_text
+        at += key + value
+    return found
 
 
 def framed(kind: str, name: str, body: bytes, stamp: int) -> bytes:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .frame import TICKS, BadMessageError
+from .frame import NAME_BYTES, TICKS, BadMessageError
 
 # By how much axes may differ from length 1 and right angles: matrices come in single precision.
 SQUARE = 2e-3
@@ -33,10 +34,10 @@ class Names:
     camera: str = "CameraToReference"
     registration: str = "ReferenceToRas"
 
-    @property
-    def all(self) -> tuple[str, ...]:
-        """Every one."""
-        return self.tool, self.reference, self.camera, self.registration
+    @cached_property
+    def by_wire(self) -> dict[str, str]:
+        """Every one, by the bytes of it that a message carries."""
+        return {name[:NAME_BYTES].strip(): name for name in (self.tool, self.reference, self.camera, self.registration)}
 
     def by_tracker(self, name: str) -> bool:
         """Whether a body's transform ends in the tracker's frame."""
@@ -82,6 +83,8 @@ class Heard:
             A matrix that is no rigid motion, or one that says that nothing is seen; a time that does not go on;
             another client that sends the same transform.
         """
+        if not matrix[:3, :3].any():
+            raise BadMessageError("zeros, which trackers send of what they do not see")
         T = rigid(matrix)
         if name != self.names.registration and np.array_equal(matrix, np.eye(4)):
             raise BadMessageError("the identity, which trackers send of what they do not see")
@@ -120,6 +123,19 @@ class Heard:
         reference = self.sent[self.names.reference]
         arrived = min(body.arrived, reference.arrived)
         return replace(body, T=np.linalg.inv(reference.T) @ body.T, arrived=arrived)
+
+
+def check_status(metadata: Mapping[str, str]) -> None:
+    """Reject a transform that its tracker says is not that of a body it sees: any status that is not OK.
+
+    Raises
+    ------
+    BadMessageError
+        A status, as of 3D Slicer and PLUS, that is not OK.
+    """
+    for key, value in metadata.items():
+        if key.casefold().endswith("status") and value.casefold() != "ok":
+            raise BadMessageError(f"not seen by its tracker: {key} {value[:20]}")
 
 
 def rigid(matrix: np.ndarray) -> np.ndarray:

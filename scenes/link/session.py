@@ -21,7 +21,7 @@ from .answer import Answer, Seen, bounded, late
 from .clients import Clients
 from .console import address_words
 from .frame import BadMessageError, Header, framed, stamp_of
-from .heard import Heard
+from .heard import Heard, check_status
 from .messages import IMAGE, POINT, Code, image, read_image, read_points, read_position, read_transform, status
 from .outgoing import MOST_PLACES, STRANGE, Places
 
@@ -303,13 +303,15 @@ class Session:
 
     def _hear_transform(self, number: int, header: Header, content: bytes) -> None:
         names = self._heard.names
-        if header.name not in names.all:
+        name = names.by_wire.get(header.name)
+        if name is None:
             if header.name and len(self._others) < MOST_OTHERS:
                 self._others[header.name] = None
             return
+        check_status(header.metadata)
         matrix = (read_transform if header.kind == "TRANSFORM" else read_position)(content)
-        self._heard = self._heard.hearing(header.name, matrix, header.stamp, self._loop.time(), number)
-        if header.name in (names.tool, names.registration):
+        self._heard = self._heard.hearing(name, matrix, header.stamp, self._loop.time(), number)
+        if name in (names.tool, names.registration):
             self._posed.set()
 
 

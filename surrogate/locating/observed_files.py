@@ -95,7 +95,7 @@ def read_columns(
             raise InputError(
                 f"{path}: row {number} is {','.join(row)[:80]!r}, not {len(header)} numbers: mend or remove it."
             ) from error
-        given = [name not in empty or not gone and bool(cells[name].strip()) for name in names]
+        given = [name not in empty or (not gone and bool(cells[name].strip())) for name in names]
         if not (np.abs(value[given]) < LARGEST).all():
             raise InputError(f"{path}: row {number} has a number that is not finite, or above {LARGEST:g}: remove it.")
     return dict(zip(names, values.T, strict=True))
