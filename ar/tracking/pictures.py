@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from itertools import islice
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from ..optics.calibration import LARGEST_SIDE
 MOST_PICTURES = 300
 # Pixels of a picture, and bytes of its file.
 MOST_PIXELS, MOST_BYTES = 64_000_000, 256_000_000
+NUMBER = re.compile(r"([0-9]+)")
 SUFFIXES = (".png", ".jpg", ".jpeg")
 # Of a video that does not say how long it is, one frame in so many.
 STEP = 5
@@ -65,7 +68,10 @@ def pictures_of(path: Path) -> Iterator[Named]:
 
 
 def film_of(path: Path, rate: float, colour: bool = False, first: int = 0) -> Iterator[Named]:
-    """Every picture from the `first` on of a video, or of a folder in the order of names, with its time [s].
+    """Every picture from the `first` on of a video, or of a folder, with its time [s].
+
+    The order in a folder is that of the numbers in the names. Pixels are those that are stored: neither a video's
+    metadata nor EXIF turns them.
 
     Of a folder `rate` is how many there are in a second; a video says its own times. `colour` asks for that, too.
 
@@ -106,10 +112,38 @@ def in_colour(name: str, colour: np.ndarray, time: float) -> Named:
 
 
 def _files(folder: Path) -> list[Path]:
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
-    if not files:
+    alphabetical = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    if not alphabetical:
         raise ValueError(f"{folder}: holds no pictures. Give a folder of PNG or JPEG pictures.")
+    # A hyphen is a minus sign where the same words also stand before a number without it.
+    plain = {before for path in alphabetical for before, _ in _numbers(path)[:-1]}
+    files = sorted(alphabetical, key=lambda path: [_signed(each, plain) for each in _numbers(path)])
+    if files != alphabetical:
+        first = next(index for index, path in enumerate(files) if path != alphabetical[index])
+        _notice(
+            f"{folder}: is read in the order of the numbers in its names, not alphabetically: picture {first + 1} is "
+            f"{files[first].name}, not {alphabetical[first].name}"
+        )
     return files
+
+
+def _numbers(path: Path) -> list[tuple[str, str]]:
+    """The numbers in a file's name, each behind the words before it; words at the end have the number -1."""
+    *pairs, end = NUMBER.split(f"/{path.stem.casefold()}")
+    return [*zip(pairs[::2], pairs[1::2], strict=True), (end, "-1")]
+
+
+def _signed(numbered: tuple[str, str], plain: set[str]) -> tuple[str, int]:
+    words, number = numbered
+    if words.endswith("-") and words[:-1] in plain:
+        return words[:-1], -int(number)
+    return words, int(number)
+
+
+@cache
+def _notice(text: str) -> None:
+    """Warn once of each thing."""
+    warnings.warn(text, stacklevel=1)
 
 
 def _read(path: Path, kind: str = "L") -> np.ndarray:
@@ -144,6 +178,8 @@ def _in_video(path: Path, step: int | None, colour: bool = False, first: int = 0
                 "pictures."
             )
         _demand_size(path, width, height)
+        if turn := int(video.get(cv2.CAP_PROP_ORIENTATION_META)):
+            _notice(f"{path}: its metadata turns it by {turn} degrees: pixels are used as stored, as by calibrations")
         # What a file says of its length may be wrong: it ends where it ends.
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         every = step or (-(-count // MOST_PICTURES) if count > 0 else STEP)
@@ -167,7 +203,9 @@ def _opened(path: Path) -> cv2.VideoCapture:
     logging = cv2.utils.logging  # type: ignore[attr-defined]
     before = logging.setLogLevel(logging.LOG_LEVEL_ERROR)
     try:
-        return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0.0)  # The calibration belongs to pixels as they are stored.
+        return video
     finally:
         logging.setLogLevel(before)
 

@@ -40,9 +40,9 @@ USUAL = 0.25e-3, float(np.radians(0.1))
 def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,) [s] and poses (n, 4, 4) [m] of a file with the columns time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw.
 
-    A pose leads from the body to the tracker: x_tracker = T x_body. Rows without a pose are passed over, and with a
-    warning rows in which the tracker did not see the body: their status is not OK, or they are all zeros or the
-    identity. Other further columns are ignored.
+    A pose leads from the body to the tracker: x_tracker = T x_body. Rows without a pose are passed over. So
+    are rows in which the tracker did not see the body, with a warning: a status that is not OK, zeros or the identity.
+    Other columns are ignored.
 
     Raises
     ------
