@@ -27,7 +27,7 @@ PROTOCOL = [f"viser-v{viser.__version__}"]
 class Page(Browser):
     """A page that notes what it is sent."""
 
-    def __init__(self, host="127.0.0.1", port=None, **limits):
+    def __init__(self, host="127.0.0.1", port=None, origins=(), **limits):
         self.heard = []
         super().__init__(
             [],
@@ -42,6 +42,7 @@ class Page(Browser):
             port=free_port() if port is None else port,
             size=(64, 48),
             limits=guard.Limits(**limits),
+            origins=origins,
         )
 
     @property

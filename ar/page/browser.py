@@ -55,10 +55,12 @@ class Browser:
         size: tuple[int, int] = (640, 480),
         signs: Sequence[Sign] = (),
         limits: Limits = LIMITS,
+        origins: tuple[str, ...] = (),
     ) -> None:
         """Start the server; where `port` is taken, the next free one serves, see `address`.
 
         `words` is HTML under the picture, `size` the picture's width and height [pixel] until the first arrives.
+        `origins` are further addresses of the page, of a proxy or another port, as `ar.page.guard.origin_of` has them.
 
         Raises
         ------
@@ -70,8 +72,8 @@ class Browser:
             A viser that serves otherwise than `ar.page.guard` knows.
         """
         check_address(host, port)
-        self.limits = limits
-        self.server, self.token = open_server(host, port, title, limits)
+        self.limits, self.origins = limits, origins
+        self.server, self.token = open_server(host, port, title, limits, origins)
         dress(self.server, viewpoint, signs)
         gui = self.server.gui
         gui.add_html(style(size[0] / size[1]))
@@ -152,6 +154,11 @@ class Browser:
         host = self.server.get_host()
         name = "localhost" if host in EVERYWHERE else bracketed(host)
         return f"http://{name}:{self.server.get_port()}" + (f"/?token={self.token}" if self.token else "")
+
+    @property
+    def addresses(self) -> list[str]:
+        """Further addresses of the page, with the token."""
+        return [f"{origin}/?token={self.token}" for origin in self.origins]
 
     @property
     def visitors(self) -> int:

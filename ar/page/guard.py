@@ -10,6 +10,7 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import logging
+import re
 import secrets
 import socket
 import threading
@@ -32,6 +33,8 @@ from .messages import LARGEST, MessageError, checked
 # The guard stands on how this release line of viser serves: another is refused.
 KNOWN = "1.1."
 # Another page must not frame this one to have it clicked, nor learn its address.
+PORTS = {"http": 80, "https": 443}
+NAME = re.compile(r"[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?")
 HEADERS = {"Content-Security-Policy": "frame-ancestors 'self'", "Referrer-Policy": "no-referrer"}
 
 
@@ -67,14 +70,18 @@ class UnguardedError(RuntimeError):
 
 @dataclass(frozen=True)
 class Door:
-    """Who may come in: `host` as the page is bound to, `token` (None: whoever is on this machine)."""
+    """Who may come in: `host` as the page is bound to, `token` (None: whoever is on this machine).
+
+    `origins` are further addresses of the page, by a proxy or another port, as `origin_of` writes them.
+    """
 
     host: str
     token: str | None
+    origins: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, host: str) -> Door:
-        """A door with a fresh token, unless only this machine reaches the host.
+    def of(cls, host: str, origins: tuple[str, ...] = ()) -> Door:
+        """A door with a fresh token, unless only this machine reaches the host and no proxy leads there.
 
         Raises
         ------
@@ -83,7 +90,7 @@ class Door:
         """
         addresses = [entry[4][0] for entry in socket.getaddrinfo(host, None)]
         near = all(ipaddress.ip_address(str(address).split("%")[0]).is_loopback for address in addresses)
-        return cls(host, None if near else secrets.token_urlsafe(24))
+        return cls(host, None if near and not origins else secrets.token_urlsafe(24), origins)
 
     def refusal(self, request: Request, address: str, port: int) -> str | None:
         """Why a request that reached this machine at an address and a port is refused; None where it is not."""
@@ -93,14 +100,25 @@ class Door:
         places = {f"{name}:{port}".lower() for name in names}
         if port == 80:  # browsers leave it out
             places |= {name.lower() for name in names}
+        allowed = {f"http://{place}" for place in places} | set(self.origins)
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        if len(hosts) != 1 or hosts[0].lower() not in places:
-            return f"This page is not served under that host name. Open it as it was printed, at port {port}.\n"
-        if origins and (len(origins) > 1 or origins[0].lower() not in {f"http://{place}" for place in places}):
+        if len(hosts) != 1 or hosts[0].lower() not in places.union(*map(hosts_of, self.origins)):
+            return (
+                f"This page is not served under that host name. Open it as it was printed, at port {port}, or start it "
+                "with --address and the address that your browser shows.\n"
+            )
+        if origins and (len(origins) > 1 or origins[0].lower() not in allowed):
             return "Another page may not use this one.\n"
         if self.token is not None and not any(map(self.is_token, self.tokens(request, port))):
             return "This page asks for a token: open the address that was printed, with its ?token=...\n"
         return None
+
+    def is_encrypted(self, request: Request) -> bool:
+        """Return True if a request came by an address of https alone."""
+        schemes = [
+            each.split(":")[0] for each in self.origins if request.headers.get("Host", "").lower() in hosts_of(each)
+        ]
+        return set(schemes) == {"https"}
 
     def is_token(self, text: str) -> bool:
         """Whether a text is the token; the time that it takes does not tell how much of it is right."""
@@ -193,7 +211,9 @@ class Controls:
         return self.server.gui._command_handle_from_uuid.get(identifier)
 
 
-def open_server(host: str, port: int, title: str, limits: Limits = LIMITS) -> tuple[viser.ViserServer, str | None]:
+def open_server(
+    host: str, port: int, title: str, limits: Limits = LIMITS, origins: tuple[str, ...] = ()
+) -> tuple[viser.ViserServer, str | None]:
     """Serve a page; returns viser's server and the token that the page's address must carry, if any.
 
     Raises
@@ -203,7 +223,7 @@ def open_server(host: str, port: int, title: str, limits: Limits = LIMITS) -> tu
     """
     if not viser.__version__.startswith(KNOWN):
         raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {KNOWN}*.")
-    door, controls = Door.of(host), Controls()
+    door, controls = Door.of(host, origins), Controls()
     with guarding(door, controls, limits) as opened:
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     try:
@@ -264,8 +284,36 @@ def answer(
         response.headers.update(HEADERS)
         if door.token is not None:
             secret = f"{cookie(port)}={door.token}; HttpOnly; SameSite=Strict; Path=/"
-            response.headers["Set-Cookie"] = secret
+            response.headers["Set-Cookie"] = secret + "; Secure" * door.is_encrypted(request)
     return response
+
+
+def origin_of(address: str) -> str:
+    """Write an address of a page as browsers do: scheme and name in lower case, no port that its scheme implies.
+
+    Raises
+    ------
+    ValueError
+        A text that is no address, or has a path, a user or a query.
+    """
+    try:
+        parts = urlsplit(address)
+        scheme, name, port = parts.scheme.lower(), parts.hostname or "", parts.port
+        rebuilt = f"{bracketed(name)}{'' if port is None else f':{port}'}"
+        if ":" in name:
+            ipaddress.IPv6Address(name)
+    except ValueError:
+        scheme, name, port, rebuilt = "", "", None, ""
+    plain_name = ":" in name or bool(NAME.fullmatch(name))
+    if scheme not in PORTS or not plain_name or port == 0 or address.lower().rstrip("/") != f"{scheme}://{rebuilt}":
+        raise ValueError(f"{address!r}: must be https://NAME or https://NAME:PORT, without a path.")
+    return f"{scheme}://{bracketed(name)}" + ("" if port in (None, PORTS[scheme]) else f":{port}")
+
+
+def hosts_of(origin: str) -> set[str]:
+    """Names that a request by an address carries as its host, with and without the port that the scheme implies."""
+    scheme, _, place = origin.partition("://")
+    return {place} if place.rpartition(":")[2].isdecimal() else {place, f"{place}:{PORTS[scheme]}"}
 
 
 def bracketed(host: str) -> str:

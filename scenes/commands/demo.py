@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
+from .address_option import add_address, addresses_of, say_addresses
 from .camera_options import add_camera, filmed
 from .style_option import add_style
 from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
@@ -187,6 +188,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="address to serve on (default %(default)s); one that other machines reach asks visitors for a token",
     )
     parser.add_argument("--port", type=int, default=8080, help="port, or the next free one (default %(default)s)")
+    add_address(parser)
     parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after so long (default: never)")
 
 
@@ -201,6 +203,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{args.scene} is no scene. For a film or a camera of your own: {own}")
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
+    addresses_of(args)
     find_device(args.device, LIVE.precision)
     # One thread for all kernels of the first picture: each that compiles reads Warp's headers first, for two seconds.
     kernels = ThreadPoolExecutor(1, "kernels")
@@ -231,13 +234,12 @@ def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitSta
     name = deformer_name(args, theatre, scene)
     anatomy = "the average of 152 healthy adults (ICBM 152)" if args.anatomy is None else args.anatomy.name
     try:
-        demo = Demo(theatre, scene, name, args.host, args.port, anatomy, asked, args.style)
+        demo = Demo(theatre, scene, name, args.host, args.port, anatomy, asked, args.style, addresses_of(args))
     except UnguardedError as error:
         raise InputError(str(error)) from error
     closing.callback(demo.close)
     print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)
-    if demo.browser.token is not None:
-        print("others than this machine reach the page by its name or address in place of localhost, with this token")
+    say_addresses(demo.browser)
     print(f"{scene.name} by {theatre.described(name, scene)}")
     demo.busy.on("compiling; the next start finds it done")
     if name != "fem":

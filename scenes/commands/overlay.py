@@ -17,6 +17,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
+from .address_option import add_address, addresses_of, say_addresses
 from .demo import add_bodies
 from .interrupt import until_ended
 from .json_line import json_line
@@ -75,6 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--page", action="store_true", help="show the film on a page in the browser; a camera has one always"
     )
     parser.add_argument("--port", type=int, default=8080, help="of the page, or the next free (default %(default)s)")
+    add_address(parser)
     parser.add_argument("--seconds", type=float, default=np.inf, help="end the page after so long (default: never)")
     add_poses(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
@@ -142,6 +144,7 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
     given = [name for name, value in (films | {"--live": args.live or None}).items() if value is not None]
     if given:
         raise InputError(f"{', '.join(given)}: for films without a page. Leave it out here.")
+    addresses_of(args)
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
     table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, [args.camera])
@@ -180,9 +183,10 @@ def _film_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> l
 def _page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name: str, frames: int = 0) -> OverlayPage:
     from ..play.overlay.page import OverlayPage
 
-    page = OverlayPage(parts.follower, parts.painter, name, parts.who, HOST, args.port, frames)
+    page = OverlayPage(parts.follower, parts.painter, name, parts.who, HOST, args.port, frames, addresses_of(args))
     closing.callback(page.close)
     print(f"sulcus: open {page.browser.address} (Ctrl-C ends); motion by {parts.who}", flush=True)
+    say_addresses(page.browser)
     return page
 
 

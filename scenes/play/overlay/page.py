@@ -54,6 +54,8 @@ class OverlayPage:
         Where it is served.
     frames
         How many pictures the film has; 0: it is a camera.
+    origins
+        Further addresses of the page, as `ar.page.browser.Browser` takes them.
     """
 
     follower: Follower
@@ -63,6 +65,7 @@ class OverlayPage:
     host: str = "127.0.0.1"
     port: int = 8080
     frames: int = 0
+    origins: tuple[str, ...] = ()
     browser: Browser = field(init=False)
     busy: Busy = field(init=False)
     history: History = field(init=False)
@@ -105,6 +108,7 @@ class OverlayPage:
             self.port,
             (calibration.width, calibration.height),
             signs_of(stage.site),
+            origins=self.origins,
         )
         self.busy = Busy(lambda line: self.browser.status(escape(line)))
 

@@ -66,6 +66,7 @@ class Demo:
         anatomy: str = "the default",
         find: Callable[[str], Scene] = find_scene,
         style: Style = "window",
+        origins: tuple[str, ...] = (),
     ) -> None:
         """Open the page; `anatomy` is whose brain, in words, and `find` makes the scenes that visitors choose."""
         self.theatre, self.anatomy, self.first, self.find = theatre, anatomy, scene, find
@@ -75,7 +76,14 @@ class Demo:
         size, site = (scene.viewpoint.width, scene.viewpoint.height), theatre.site
         parts = self._parts(deformer)
         self.browser = Browser(
-            parts[0], viewpoint_of(site), *parts[1:], host=host, port=port, size=size, signs=signs_of(site)
+            parts[0],
+            viewpoint_of(site),
+            *parts[1:],
+            host=host,
+            port=port,
+            size=size,
+            signs=signs_of(site),
+            origins=origins,
         )
         self.busy = Busy(lambda line: self.browser.status(escape(line)))
         self.dismissed: list[Referee] = []
