@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from sim.errors import InputError
+from sim.runtime.kernel_cache import ensure_writable_cache
 from sim.runtime.user_script import run_script
 
 from .commands.bench import BENCHES
@@ -85,6 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     warnings.formatwarning = lambda message, *rest: f"sulcus {args.command}: {message}\n"
     try:
+        ensure_writable_cache()
         for path in getattr(args, "plugin", ()):
             run_script(path)
         return importlib.import_module(f"scenes.commands.{args.command}").run(args)

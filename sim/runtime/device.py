@@ -12,6 +12,7 @@ import warp as wp
 
 from ..accuracy import Precision
 from ..errors import InputError
+from .kernel_cache import ensure_writable_cache
 
 forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
 """`wp.kernel` without adjoint, which nobody asks for, and launched as wide as the work, which saves registers."""
@@ -141,6 +142,8 @@ def device_names(words: str) -> tuple[str, ...]:
 def _present() -> list[str]:
     if wp.config.log_level == wp.LOG_INFO:  # its start-up notes would stand among a command's own lines
         wp.config.log_level = wp.LOG_ERROR
+    if wp.config.kernel_cache_dir is None:
+        ensure_writable_cache()
     wp.init()
     return [device.alias for device in wp.get_devices()]
 

@@ -1,0 +1,83 @@
+"""Folder that Warp compiles kernels into: a private temporary one where the user's cannot be written."""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+import warnings
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryFile, gettempdir, mkdtemp
+
+from ..errors import InputError
+
+VARIABLE = "WARP_CACHE_PATH"
+NAME = "sulcus-kernels"
+REMEDY = f"Set {VARIABLE} to a folder that can be written."
+
+
+def ensure_writable_cache() -> None:
+    """Set `WARP_CACHE_PATH` to a private temporary folder, with a warning, where Warp's own choice cannot be written.
+
+    Processes that are started later inherit it. Warp reads it when it is first used.
+
+    Raises
+    ------
+    InputError
+        No temporary folder can be written either.
+    """
+    usual = _usual_folder()
+    if _is_writable(usual):
+        return
+    try:
+        folder = _private_folder()
+    except OSError as error:
+        raise InputError(f"{usual}: kernels cannot be compiled there, nor in a temporary folder. {REMEDY}") from error
+    os.environ[VARIABLE] = str(folder)
+    warnings.warn(f"{usual} cannot be written: kernels are compiled into {folder}. {REMEDY}", stacklevel=1)
+
+
+def _usual_folder() -> Path:
+    """The folder that Warp chooses by itself."""
+    number = version("warp-lang")
+    if chosen := os.environ.get(VARIABLE):
+        return Path(chosen).absolute() / number
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", "~")).expanduser() / "NVIDIA" / "warp" / "Cache" / number
+    if sys.platform == "darwin":
+        return Path(os.path.expanduser("~/Library/Caches")) / "warp" / number
+    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "warp" / number
+
+
+def _is_writable(folder: Path) -> bool:
+    """Return True if a file can be written in a folder, which is made; a home that is not known is none."""
+    try:
+        if not folder.is_absolute():
+            return False
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder) as file:
+            file.write(b"0")
+    except OSError:
+        return False
+    return True
+
+
+def _private_folder() -> Path:
+    """A folder that this user alone can read and write: the same one in later runs, unless another user took its name.
+
+    Raises
+    ------
+    OSError
+        No folder can be made.
+    """
+    own = os.getuid() if hasattr(os, "getuid") else 0
+    folder = Path(gettempdir()) / f"{NAME}-{own}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    found = folder.lstat()
+    private = sys.platform == "win32" or (found.st_uid == own and stat.S_IMODE(found.st_mode) == 0o700)
+    if stat.S_ISDIR(found.st_mode) and private and _is_writable(folder):
+        return folder
+    return Path(mkdtemp(prefix=f"{NAME}-"))
