@@ -7,8 +7,11 @@ import subprocess
 import sys
 from contextlib import ExitStack
 from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import pytest
+from distributed import Client, Scheduler, Security, SpecCluster
 from tiny_work import Made, Trouble, body_path, held, played, tiny_run, tried
 
 from scenes.episodes.engine import Tally, still_missing
@@ -99,23 +102,45 @@ def test_each_process_has_a_card_of_its_own_and_is_replaced_if_it_fails(undistur
     assert broken not in [line[1] for line in lines[first + 1 :]] and fresh != broken and second > first
 
 
+def test_scheduler_rejects_clients_without_its_keys(workers):
+    address = workers.client.scheduler.address
+    served = workers.client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.http_server.port)
+    assert address.startswith("tls://")
+    for security in (Security(), Security.temporary()):
+        plain = address if security.tls_ca_file else address.replace("tls", "tcp")
+        with pytest.raises((OSError, TypeError)):
+            Client(plain, security=security, timeout=2.0, set_as_default=False)
+    ports = [int(each.rpartition(":")[2]) for each in workers.client.scheduler_info(n_workers=-1)["workers"]]
+    for port in ports:
+        with pytest.raises(OSError):
+            Client(f"tcp://127.0.0.1:{port}", timeout=1.0, set_as_default=False)
+    for page in ("/", "/status", "/info/main/workers.html", "/json/counts.json", "/metrics"):
+        with pytest.raises(HTTPError, match="404"):
+            urlopen(f"http://127.0.0.1:{served}{page}", timeout=5.0)
+
+
 def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path):
     address = "tcp://127.0.0.1:9"
     with pytest.raises(InputError, match=f"--scheduler {address}: no Dask scheduler answers"):
         scheduled_workers(address, "cpu", patience=0.5).__enter__()
     counts, added = [], []
-    with ExitStack() as closing, own_workers(["cpu"]) as own:
-        address = own.client.scheduler.address
+    with ExitStack() as closing:
+        own = closing.enter_context(SpecCluster({}, {"cls": Scheduler, "options": {"host": "127.0.0.1", "port": 0}}))
+        address = own.scheduler_address
         command = [sys.executable, "-m", "dask", "worker", address, "--nthreads", "1", "--host", "127.0.0.1"]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
+        def add():
+            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+            added.append(closing.enter_context(subprocess.Popen(command, env=environment, cwd=tmp_path, **quiet)))
+            closing.callback(added[-1].terminate)
+
         def heard(kind, outcome, count):
-            if not added:
-                quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-                added.append(closing.enter_context(subprocess.Popen(command, env=environment, cwd=tmp_path, **quiet)))
-                closing.callback(added[0].terminate)
+            if len(added) < 2:
+                add()
             counts.append(count)
 
+        add()
         with scheduled_workers(address, "auto") as workers:
             assert workers.device == "cpu"
             folder = tmp_path / "more"
@@ -124,7 +149,7 @@ def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path
         assert {name: held(folder)[name] for name in undisturbed} == undisturbed
 
         def ending(kind, outcome, count):
-            own.client.cluster.close()
+            own.close()
 
         folder = tmp_path / "ended"
         ended = pytest.raises(InputError, match="scheduler ended")

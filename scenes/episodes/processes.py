@@ -17,7 +17,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from dask import config
-from distributed import Worker
+from distributed import Security, Worker
 
 from sim.errors import InputError
 from sim.runtime.processes import VISIBLE, card_of, end_with_parent, uninterrupted
@@ -38,7 +38,9 @@ class _Started:
 
 
 @contextmanager
-def started_processes(address: str, devices: Sequence[str], starts: int) -> Iterator[Callable[[], None]]:
+def started_processes(
+    address: str, security: Security, devices: Sequence[str], starts: int
+) -> Iterator[Callable[[], None]]:
     """Workers of the scheduler at an address, one for each device, killed at the end; gives what tends them.
 
     Whoever calls that now and then has those started again that ended.
@@ -49,7 +51,7 @@ def started_processes(address: str, devices: Sequence[str], starts: int) -> Iter
         When they are tended: one that has ended `starts` times in a row without having been connected.
     """
     shown = [_card(name) for name in devices]
-    crew = [_start(address, card, 1) for card in shown]
+    crew = [_start(address, security, card, 1) for card in shown]
 
     def tend() -> None:
         for place, one in enumerate(crew):
@@ -62,7 +64,7 @@ def started_processes(address: str, devices: Sequence[str], starts: int) -> Iter
                     f"(exit code {one.process.exitcode}). Give fewer --workers, or look for want of memory."
                 )
             _close(one)
-            crew[place] = _start(address, shown[place], times)
+            crew[place] = _start(address, security, shown[place], times)
 
     try:
         yield tend
@@ -86,10 +88,10 @@ def _card(device: str) -> str | None:
     return card_of(number or "0") if kind == "cuda" else None
 
 
-def _start(address: str, card: str | None, times: int) -> _Started:
+def _start(address: str, security: Security, card: str | None, times: int) -> _Started:
     context = get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_serve, args=(address, card, theirs), name="worker", daemon=True)
+    process = context.Process(target=_serve, args=(address, security, card, theirs), name="worker", daemon=True)
     more = ALONE if card is None else {**ALONE, VISIBLE: card}
     with _environment(more), uninterrupted():
         process.start()
@@ -109,17 +111,19 @@ def _close(one: _Started) -> None:
     one.said.close()
 
 
-def _serve(address: str, card: str | None, connected: Any) -> None:
+def _serve(address: str, security: Security, card: str | None, connected: Any) -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
     quiet_dask()
-    with config.set({"distributed.worker.profile.enabled": False}):  # it holds on to what a task has closed
-        asyncio.run(_work(address, card, connected))
+    # A profile holds on to what a task has closed, and what is served by HTTP asks for no keys.
+    with config.set({"distributed.worker.profile.enabled": False, "distributed.worker.http.routes": []}):
+        asyncio.run(_work(address, security, card, connected))
 
 
-async def _work(address: str, card: str | None, connected: Any) -> None:
+async def _work(address: str, security: Security, card: str | None, connected: Any) -> None:
     resources = None if card is None else {CARD: 1.0}
     # Without a limit: a worker that is paused near its share of memory never goes on, as its memory is not Dask's.
-    async with Worker(address, nthreads=1, host=HERE, memory_limit=0, resources=resources) as worker:
+    settings = {"nthreads": 1, "host": HERE, "memory_limit": 0, "resources": resources, "dashboard": False}
+    async with Worker(address, security=security, **settings) as worker:
         connected.send_bytes(b"yes")
         await worker.finished()
 

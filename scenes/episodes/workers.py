@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 
+import cryptography  # noqa: F401  `Security.temporary` needs it
 from dask import config
-from distributed import Client, Scheduler, SpecCluster
+from distributed import Client, Scheduler, Security, SpecCluster
 
 from sim.errors import InputError
 
@@ -19,6 +20,7 @@ MOST_DEATHS = 20
 SETTINGS = {
     "distributed.scheduler.allowed-failures": MOST_DEATHS,
     "distributed.scheduler.worker-ttl": None,  # clocks jump, as after sleep; who ends is seen by its process
+    "distributed.scheduler.http.routes": [],  # what they serve asks for no keys
 }
 PATIENCE = 10.0
 """How long a scheduler may take to answer [s]."""
@@ -74,7 +76,9 @@ def own_workers(
 ) -> Iterator[Workers]:
     """Processes of this machine, one for each name in `devices`, each with the card that its name has.
 
-    They are spawned, started again when they end, and killed when the block ends or this process does.
+    They are spawned, started again when they end, and killed when the block ends or this process does. A scheduler and
+    its workers run what any client sends them: keys that exist in the memory of these processes alone (TLS) keep other
+    users of the machine out.
 
     Parameters
     ----------
@@ -88,11 +92,14 @@ def own_workers(
     device = devices[0].split(":")[0]
     with _environment(), config.set({**SETTINGS, **(settings or {})}):
         quiet_dask()
-        scheduler = {"cls": Scheduler, "options": {"host": HERE, "port": 0, "dashboard_address": f"{HERE}:0"}}
+        security = Security.temporary()
+        options = {"host": HERE, "port": 0, "protocol": "tls://", "security": security}
+        options |= {"dashboard": False, "dashboard_address": f"{HERE}:0"}
+        scheduler = {"cls": Scheduler, "options": options}
         with (
-            closing(SpecCluster({}, scheduler, name=f"sulcus-{os.getpid()}")) as cluster,
+            closing(SpecCluster({}, scheduler, security=security, name=f"sulcus-{os.getpid()}")) as cluster,
             Client(cluster, set_as_default=False) as client,
-            started_processes(cluster.scheduler_address, devices, starts) as tend,
+            started_processes(cluster.scheduler_address, security, devices, starts) as tend,
         ):
             yield Workers(client, device, f"{len(devices)} process{'es' * (len(devices) > 1)} on {device}", tend)
 
