@@ -3,6 +3,7 @@
 import re
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -208,7 +209,7 @@ def test_visitors_take_over_scrub_and_switch(running):
     assert wait_for(lambda: "force 0.31 N" in report(demo) and page.inputs["tool"].value == HAND)
     visitor.set(page.inputs["direction right [deg]"], 20.0)
     visitor.set(page.inputs["place up [mm]"], -5.0)
-    assert wait_for(lambda: demo.wish.touch == Touch(0.0, -5e-3, 0.31, (np.radians(20.0), 0.0), 2e-3))
+    assert wait_for(lambda: demo.wish.touch == Touch(0.0, -5e-3, 0.31, (np.radians(20.0), 0.0)))
     visitor.set(page.inputs["deformer"], "fem")
     assert wait_for(lambda: "|finite elements|: solved to its tolerance" in report(demo))
     assert wait_for(lambda: "finite elements' own answer" in report(demo))
@@ -222,6 +223,36 @@ def test_visitors_take_over_scrub_and_switch(running):
     assert f"force {demo.stage.scene.path(number / 60).force:.2f} N" in report(demo)
     time.sleep(0.3)
     assert f"frame {number} of 120" in report(demo)
+
+
+def test_hand_starts_where_the_script_has_the_tool(demo, monkeypatch):
+    """By a slider and by the menu; the sliders follow the script."""
+    demo.wish.set(plays=False, number=100)
+    path = demo.stage.scene.path
+
+    def moved(time):
+        return replace(path(time), x=3e-3, y=-2e-3, force=0.25, tilt=(0.1, -0.05))
+
+    monkeypatch.setitem(vars(demo.stage.scene), "path", moved)
+    visitor, inputs = Visitor(demo.browser, 1200), demo.browser.inputs
+    labels = ("force [N]", "place right [mm]", "place up [mm]", "direction right [deg]", "direction up [deg]")
+
+    def shown():
+        return [inputs[label].value for label in labels]
+
+    assert wait_for(lambda: demo.run(0.2) and shown() == [0.25, 3.0, -2.0, 5.73, -2.86])
+    visitor.set(inputs["tool"], HAND)
+    assert wait_for(lambda: demo.wish.tool == HAND) and demo.wish.touch == moved(0.0)
+    visitor.set(inputs["force [N]"], 0.1)
+    assert wait_for(lambda: demo.wish.touch.force == 0.1)
+    demo.run(0.2)
+    assert shown()[0] == 0.1
+    visitor.set(inputs["tool"], SCRIPT)
+    assert wait_for(lambda: demo.run(0.2) and demo.wish.tool == SCRIPT and shown()[0] == 0.25)
+    visitor.set(inputs["place up [mm]"], 1.0)
+    assert wait_for(lambda: demo.wish.tool == HAND)
+    assert demo.wish.touch == replace(moved(0.0), y=1e-3)
+    visitor.wire.close()
 
 
 def test_the_menu_says_who_has_the_tool(demo):
@@ -325,13 +356,14 @@ def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
 def test_the_scene_changes_without_a_new_server(demo):
     page, address = demo.browser, demo.browser.address
     assert demo.run(0.3) >= 1 and "tool" in page.meshes
-    demo.wish.set(scene="brain_shift", plays=False)
+    demo.wish.set(scene="brain_shift", plays=False, deformer="fem")
     assert wait_for(lambda: demo.run(0.5) and "gravity pulls" in report(demo))
     assert demo.stage.scene.name == "brain_shift" and "tool" not in page.meshes and "force [N]" not in page.inputs
     assert "fluid drains" in page.words.content and page.address == address
     demo.wish.set(scene="press")
     assert wait_for(lambda: demo.run(0.5) and "force 0." in report(demo))
     assert demo.stage.scene is demo.first and page.inputs["scene"].value == "press"
+    assert demo.wish.deformer == demo.theatre.usual(demo.first) != "fem"  # its own, not that of the scene before
 
 
 def test_a_scene_that_this_body_cannot_play_is_said_and_the_old_one_goes_on(demo):

@@ -1,8 +1,11 @@
 """An ensemble of few draws, or of loads beyond the tissue's law, is called a guess wherever its figure is shown."""
 
+from dataclasses import replace
+
 import pytest
 
 from scenes.play.error_text import error_lines, tumour_words
+from scenes.play.page.text import tumour_trust
 from scenes.script.uncertainty import TumourError, Uncertainty
 
 LISTS = {"times": (0.0, 1.0), "worst": (2e-3, 4e-3), "middle": (1e-3, 1e-3), "moved": (1e-3, 1e-3)}
@@ -27,5 +30,9 @@ def test_a_guess_is_called_so_and_blames_no_part():
     alone, seen = TumourError(4.11e-3, "E", guess=True), TumourError(4.11e-3, "E", 1e-3, guess=True)
     assert error_lines(None, alone, False)[-1] == "tumour: within 4.2 mm of where it is (95 %), a guess"
     assert tumour_words(seen).endswith("within 1.0 mm of where it is (95 %); without observation 4.2 mm, a guess")
+    for error in (alone, seen):
+        named = replace(error, registration=1.56e-3)
+        for words in (tumour_words(named), tumour_trust(named)):
+            assert "registration 1.6 mm per axis (SD)" in words
     assert tumour_words(alone, brief=True) == "tumour: within 4.2 mm, a guess"
     assert tumour_words(seen, brief=True) == "tumour: within 1.0 mm"

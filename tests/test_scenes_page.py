@@ -19,7 +19,7 @@ from scenes.play.player import Player
 from scenes.play.stage import Stage
 from scenes.play.waiting_notice import NOTICED, Busy
 from scenes.script.scene import find_scene
-from scenes.script.tool_paths import Touch
+from scenes.script.tool_paths import Touch, press
 from scenes.script.uncertainty import TumourError
 from sim.accuracy import LIVE
 from sim.deformation import Outcome, guess
@@ -67,6 +67,14 @@ class TestTrust:
     def test_a_bound_is_not_reported_too_small(self, bound, words):
         bounded = replace(answer(Outcome.PREDICTED), bound=np.full((2, 1), bound))
         assert f"is more than {words} from where its finite elements have it" in trust(bounded, "svr")
+
+    def test_undeformed_brain_has_no_motion_and_no_error_of_it(self, theatre):
+        scene = small(path=press(0.2), duration=1.0)
+        player = Player(theatre.stage(scene), theatre.deformer("linear", scene))
+        frames = [player.draw(0, time, player.scene.path(time)) for time in (0.0, 0.9)]
+        said = [report(frame, player.stage, "linear", "", (), 2) for frame in frames]
+        assert "tumour moved" not in said[0] and "Nothing moves the tumour" in said[0]
+        assert "tumour moved" in said[1] and "Nothing moves" not in said[1]
 
     def test_where_nothing_moves_nothing_is_promised(self):
         still = answer(Outcome.PREDICTED)

@@ -268,10 +268,16 @@ class Browser:
         # There, no visitor leaves meanwhile.
         self.note("lines", lambda: self.server.get_event_loop().call_soon_threadsafe(send))
 
-    def put(self, label: str, value: float | str) -> None:
-        """Set a control without calling its `changed`, as when a script moves the tool."""
+    def put(self, label: str, value: float | str, wanted: Callable[[], bool] | None = None) -> None:
+        """Set a control without calling its `changed`, as when a script moves the tool.
+
+        A slider stays within its ends. With `wanted` another value alone is set, if that returns True on the thread
+        that hears the visitors.
+        """
         control = self.controls.handles[label]
-        self.note(f"control {label}", lambda: self.controls.assign(control, value))
+        if isinstance(control, viser.GuiSliderHandle) and not isinstance(value, str):
+            value = min(max(value, control.min), control.max)
+        self.note(f"control {label}", lambda: self.controls.assign(control, value, wanted))
 
     def write(self, label: str, words: str) -> None:
         """Put other words, HTML, into a note; without any it is not shown."""

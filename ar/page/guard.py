@@ -28,6 +28,7 @@ from viser import _messages
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from .client_page import own_document
 from .messages import LARGEST, MessageError, checked
 
 # The guard stands on how this release line of viser serves: another is refused.
@@ -282,6 +283,10 @@ def answer(
         response = connection.respond(HTTPStatus.NOT_FOUND, "There is no such file.\n")
     if response is not None:
         response.headers.update(HEADERS)
+        if response.headers.get("Content-Type", "").startswith("text/html"):
+            response.body = own_document(bytes(response.body), response.headers.get("Content-Encoding") == "gzip")
+            del response.headers["Content-Length"]
+            response.headers["Content-Length"] = str(len(response.body))
         if door.token is not None:
             secret = f"{cookie(port)}={door.token}; HttpOnly; SameSite=Strict; Path=/"
             response.headers["Set-Cookie"] = secret + "; Secure" * door.is_encrypted(request)

@@ -41,12 +41,17 @@ class Inputs:
             command.remove()
         self.handles, self.kept, self.notes, self.commands = {}, {}, {}, []
 
-    def assign(self, control: viser.GuiInputHandle, value: float | str) -> None:
-        """Set a control on the thread that hears the visitors: another could overwrite what is not yet read."""
+    def assign(
+        self, control: viser.GuiInputHandle, value: float | str, wanted: Callable[[], bool] | None = None
+    ) -> None:
+        """Set a control on the thread that hears the visitors: another could overwrite what is not yet read.
+
+        With `wanted` it is set to another value alone, and if that returns True there.
+        """
 
         def put() -> None:
             # The page may have been filled anew meanwhile.
-            if id(control) in self.kept:
+            if id(control) in self.kept and (wanted is None or (control.value != value and wanted())):
                 self.kept[id(control)] = value
                 control.value = value
 

@@ -8,6 +8,7 @@ leaves the rules aside and shows picture and controls in one docked panel.
 from __future__ import annotations
 
 from .aside import ASIDE, HELP, TABS
+from .client_page import WITHOUT
 from .sight import HISTORY, PICTURE, SAID, SLICES
 
 PAGE, STATUS = "sulcus", "sulcus-status"
@@ -63,6 +64,9 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
   overflow: auto; padding: 0.2rem; box-sizing: border-box }
 #ASIDE > input:nth-of-type(2):checked ~ .shown:nth-of-type(1),
 #ASIDE > input:nth-of-type(3):checked ~ .shown:nth-of-type(2) { display: block }
+:root.WITHOUT #ASIDE:has(> input:nth-of-type(1):checked)::after { width: 100%;
+  content: "3-D view: not available, as this browser has no WebGL"; padding: 1rem; text-align: center; color: #ddd }
+:root.WITHOUT canvas { visibility: hidden }
 #ASIDE p { margin: 0; font-size: 0.72rem; opacity: 0.75; line-height: 1.25 }
 #SLICES img { display: block; width: 100%; max-width: calc(3 * (var(--low) - 3.9rem)); margin: 0 auto }
 #HISTORY svg { display: block; width: 100%; height: calc(var(--low) - 2rem) }
@@ -130,6 +134,7 @@ def style(aspect: float) -> str:
     """An element of rules for a picture of width / height `aspect`."""
     rules = RULES
     for name, value in (
+        ("WITHOUT", WITHOUT),
         ("#PICTURE", f"#{PICTURE}"),
         ("PANEL", PANEL),
         ("VIEW", VIEW),

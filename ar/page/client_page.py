@@ -1,0 +1,69 @@
+"""The document that a browser loads first: viser's own, with this page's title and icon, and usable without WebGL.
+
+Viser's client reads what the server sends only while it draws. Where a browser has no WebGL, drawing into nothing takes
+its place: image, controls and tabs work, and the 3-D view alone says that it cannot be shown.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+from functools import lru_cache
+from urllib.parse import quote
+
+TITLE = "sulcus"
+ICON = (
+    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' rx='7' fill='#141414'/>"
+    "<circle cx='16' cy='16' r='9' fill='#1f6f3a' stroke='#37e36b' stroke-width='3'/>"
+    "<path d='M4 10 Q16 3 28 10' fill='none' stroke='#eee' stroke-width='2' stroke-dasharray='2 2'/></svg>"
+)
+WITHOUT = "sulcus-without-webgl"
+"""Class of the document's element in a browser without WebGL."""
+# Constants of WebGL are their own names here: what is asked about by a name is answered by that name.
+SCRIPT = """
+(() => {
+  const given = HTMLCanvasElement.prototype.getContext;
+  const four = ['SCISSOR_BOX', 'VIEWPORT', 'COLOR_CLEAR_VALUE', 'BLEND_COLOR'];
+  const texts = {VERSION: 'WebGL 2.0', SHADING_LANGUAGE_VERSION: 'WebGL GLSL ES 3.00'};
+  const answers = {
+    getParameter: name => texts[name] ?? (four.includes(name) ? [0, 0, 1, 1] : 16),
+    getProgramParameter: (program, name) => String(name).startsWith('ACTIVE') ? 0 : true,
+    getShaderParameter: () => true,
+    getShaderPrecisionFormat: () => ({precision: 23, rangeMin: 127, rangeMax: 127}),
+    getContextAttributes: () => ({alpha: true, depth: true, stencil: false, antialias: true}),
+    getProgramInfoLog: () => '', getShaderInfoLog: () => '', getSupportedExtensions: () => [],
+    getExtension: () => null, getUniformLocation: () => null, getAttribLocation: () => -1,
+    isContextLost: () => false, getError: () => 0, checkFramebufferStatus: () => 'FRAMEBUFFER_COMPLETE',
+    clientWaitSync: () => 'CONDITION_SATISFIED', getSyncParameter: () => 'SIGNALED',
+  };
+  const nothing = canvas => new Proxy({canvas, drawingBufferWidth: 1, drawingBufferHeight: 1}, {
+    get(target, name) {
+      if (name in target) return target[name];
+      if (typeof name !== 'string') return undefined;
+      if (/^[A-Z0-9_]+$/.test(name)) return name;
+      return answers[name] ?? (name.startsWith('create') ? () => ({}) : () => undefined);
+    },
+  });
+  HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+    const found = given.call(this, kind, ...more);
+    if (found || !/webgl/.test(kind)) return found;
+    document.documentElement.classList.add('WITHOUT');
+    return this.sulcusNothing ??= nothing(this);
+  };
+})();
+"""
+
+
+@lru_cache(maxsize=4)
+def own_document(document: bytes, is_zipped: bool) -> bytes:
+    """Viser's document with this page's title, icon and script."""
+    text = (gzip.decompress(document) if is_zipped else document).decode()
+    icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON)}" />'
+    script = f"<script>{SCRIPT.replace('WITHOUT', WITHOUT)}</script>"
+    for pattern, own in (
+        (r"<title>[^<]*</title>", f"<title>{TITLE}</title>"),
+        (r'<link\s+rel="icon"[^>]*>', icon),
+        (r"<head>", f"<head>{script}"),
+    ):
+        text = re.sub(pattern, lambda _, own=own: own, text, count=1)
+    return gzip.compress(text.encode()) if is_zipped else text.encode()
