@@ -3,7 +3,6 @@
 import re
 import threading
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -223,36 +222,6 @@ def test_visitors_take_over_scrub_and_switch(running):
     assert f"force {demo.stage.scene.path(number / 60).force:.2f} N" in report(demo)
     time.sleep(0.3)
     assert f"frame {number} of 120" in report(demo)
-
-
-def test_hand_starts_where_the_script_has_the_tool(demo, monkeypatch):
-    """By a slider and by the menu; the sliders follow the script."""
-    demo.wish.set(plays=False, number=100)
-    path = demo.stage.scene.path
-
-    def moved(time):
-        return replace(path(time), x=3e-3, y=-2e-3, force=0.25, tilt=(0.1, -0.05))
-
-    monkeypatch.setitem(vars(demo.stage.scene), "path", moved)
-    visitor, inputs = Visitor(demo.browser, 1200), demo.browser.inputs
-    labels = ("force [N]", "place right [mm]", "place up [mm]", "direction right [deg]", "direction up [deg]")
-
-    def shown():
-        return [inputs[label].value for label in labels]
-
-    assert wait_for(lambda: demo.run(0.2) and shown() == [0.25, 3.0, -2.0, 5.73, -2.86])
-    visitor.set(inputs["tool"], HAND)
-    assert wait_for(lambda: demo.wish.tool == HAND) and demo.wish.touch == moved(0.0)
-    visitor.set(inputs["force [N]"], 0.1)
-    assert wait_for(lambda: demo.wish.touch.force == 0.1)
-    demo.run(0.2)
-    assert shown()[0] == 0.1
-    visitor.set(inputs["tool"], SCRIPT)
-    assert wait_for(lambda: demo.run(0.2) and demo.wish.tool == SCRIPT and shown()[0] == 0.25)
-    visitor.set(inputs["place up [mm]"], 1.0)
-    assert wait_for(lambda: demo.wish.tool == HAND)
-    assert demo.wish.touch == replace(moved(0.0), y=1e-3)
-    visitor.wire.close()
 
 
 def test_the_menu_says_who_has_the_tool(demo):

@@ -32,7 +32,7 @@ def test_a_guess_is_called_so_and_blames_no_part():
     assert tumour_words(seen).endswith("within 1.0 mm of where it is (95 %); without observation 4.2 mm, a guess")
     for error in (alone, seen):
         named = replace(error, registration=1.56e-3)
-        for words in (tumour_words(named), tumour_trust(named)):
-            assert "registration 1.6 mm per axis (SD)" in words
+        for words in (error_lines(None, named, False)[-1], tumour_trust(named)):
+            assert "registration 1.6 mm" in words
     assert tumour_words(alone, brief=True) == "tumour: within 4.2 mm, a guess"
     assert tumour_words(seen, brief=True) == "tumour: within 1.0 mm"

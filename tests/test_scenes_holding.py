@@ -1,6 +1,7 @@
 """Visitors who share a page: what one of them asks ends it for nobody, and each reads who has the tool."""
 
 import threading
+from dataclasses import replace
 
 import pytest
 from theatres import Silent, small, theatre_of
@@ -9,6 +10,7 @@ from visitor import Visitor, free_port, wait_for
 from scenes.play.deformers import Theatre
 from scenes.play.page.demo import READING, SCRIPT, Demo
 from scenes.play.page.referee import Referee
+from scenes.play.page.requests import HAND
 from scenes.play.player import Player
 from scenes.play.tool_holder import holding
 from scenes.script.tool_paths import press
@@ -132,3 +134,33 @@ def test_each_visitor_reads_who_has_the_tool(running):
     one.set(page.inputs["tool"], SCRIPT)
     assert wait_for(lambda: read() == ["the script moves the tool"])
     one.wire.close()
+
+
+def test_hand_starts_where_the_script_has_the_tool(demo, monkeypatch):
+    """By a slider and by the menu; the sliders follow the script."""
+    demo.wish.set(plays=False, number=100)
+    path = demo.stage.scene.path
+
+    def moved(time):
+        return replace(path(time), x=3e-3, y=-2e-3, force=0.25, tilt=(0.1, -0.05))
+
+    monkeypatch.setitem(vars(demo.stage.scene), "path", moved)
+    visitor, inputs = Visitor(demo.browser, 1200), demo.browser.inputs
+    labels = ("force [N]", "place right [mm]", "place up [mm]", "direction right [deg]", "direction up [deg]")
+
+    def shown():
+        return [inputs[label].value for label in labels]
+
+    assert wait_for(lambda: demo.run(0.2) and shown() == [0.25, 3.0, -2.0, 5.73, -2.86])
+    visitor.set(inputs["tool"], HAND)
+    assert wait_for(lambda: demo.wish.tool == HAND) and demo.wish.touch == moved(0.0)
+    visitor.set(inputs["force [N]"], 0.1)
+    assert wait_for(lambda: demo.wish.touch.force == 0.1)
+    demo.run(0.2)
+    assert shown()[0] == 0.1
+    visitor.set(inputs["tool"], SCRIPT)
+    assert wait_for(lambda: demo.run(0.2) and demo.wish.tool == SCRIPT and shown()[0] == 0.25)
+    visitor.set(inputs["place up [mm]"], 1.0)
+    assert wait_for(lambda: demo.wish.tool == HAND)
+    assert demo.wish.touch == replace(moved(0.0), y=1e-3)
+    visitor.wire.close()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ar.overlay.hud import bound_words
 
-from ..script.uncertainty import TumourError
+from ..script.uncertainty import REGISTRATION, TumourError
 
 NOT_KNOWN_WORDS = "error of the tumour: not known"
 
@@ -49,8 +49,12 @@ def tumour_words(error: TumourError, brief: bool = False) -> str:
     if brief:
         return within if error.observed is not None else f"{within}{guess}"
     said = f"{within} of where it is (95 %)"
+    of = error.registration_words
     if error.observed is None:
-        return f"{said}{guess or f', above all {error.largest}'}"
+        if of and not guess and error.largest == REGISTRATION:
+            return f"{said}, {of}"
+        return f"{said}{guess or f', above all {error.largest}'}{f'; {of}' * bool(of)}"
+    said += f", {of}" * bool(of)
     return said if error.prior is None else f"{said}; without observation {bound_words(error.prior, 1)}{guess}"
 
 

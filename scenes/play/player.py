@@ -51,6 +51,8 @@ IN_BONE = "the bone is where this push needs the tool: do not rely on it"
 CARRIED, BLOCKED = 0.5e-3, 2e-3
 # A picture of fewer pixels in width has its lines of errors in few words.
 FEW = 480
+# Displacement below which a brain is undeformed [m].
+STILL = 1e-6
 STAGES = ("deform", "render", "overlay")
 """What the time of a frame is spent on."""
 
@@ -233,7 +235,7 @@ class Player:
         traces = () if estimate is None else traces_of(estimate, stage.truth(positions))
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
         motion = float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean())
-        if estimate is None and error.moved is not None:
+        if estimate is None and error.moved is not None and not is_undeformed(deformation):
             moved = motion, error.moved
         band = 0.0 if estimate is not None else error.bound or 0.0
         trained = answering(self.deformer, deformation) is not None
@@ -284,7 +286,11 @@ class Player:
         time = float(loads.times[0])
         scripted = self.uncertainty is not None and touch == self.scene.path(time)
         error = self.uncertainty.at(time, promised) if self.uncertainty is not None and scripted else NOT_KNOWN
-        return error if estimate is None else replace(error, observed=estimate.worst)
+        return (
+            error
+            if estimate is None
+            else replace(error, observed=estimate.worst, registration=estimate.observation.rigid)
+        )
 
     def frames(self, every: int = 1, together: int = 1) -> Iterator[Frame]:
         """The frames of the scene, or every so many of them.
@@ -335,6 +341,11 @@ class Player:
         tip = tip - lifted(touch.force) * inward
         pose = tool.pose(tip, inward, self.site.right)
         return HeldTool(tip, pose, beyond)
+
+
+def is_undeformed(deformation: Deformation) -> bool:
+    """Return True if nothing moves by more than a micrometre: there is no motion whose error could be given."""
+    return bool(np.abs(deformation.displacement).max(initial=0.0) < STILL)
 
 
 def _believed(positions: np.ndarray, estimate: Estimate | None) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
 
-from .priors import PRIORS, REGISTRATION, SEGMENTATION
+from .priors import OF_REGISTRATION, PRIORS, REGISTRATION, SEGMENTATION
 from .scene import Scene
 from .site import Site
 
@@ -46,6 +46,8 @@ class TumourError:
         The part of `prior` by which its motion since the scan may be off: that without registration and segmentation.
     guess
         Whether `prior` is a guess, as `Uncertainty.guess` says.
+    registration
+        Standard deviation along each axis [m] of the registration that the bound is of; None: not available.
     """
 
     prior: float | None
@@ -53,6 +55,14 @@ class TumourError:
     observed: float | None = None
     moved: float | None = None
     guess: bool = False
+    registration: float | None = field(default=None, compare=False)
+
+    @property
+    def registration_words(self) -> str:
+        """The registration's standard deviation along each axis, or nothing: bounds of scenes differ by it."""
+        if self.registration is None or self.bound is None:
+            return ""
+        return f"registration {1e3 * self.registration:.1f} mm"
 
     @property
     def bound(self) -> float | None:
@@ -123,7 +133,8 @@ class Uncertainty:
         worst = float(np.hypot(self.read(self.worst, time), surrogate))
         moved = DEVIATIONS * float(np.linalg.norm([size for name, size in parts.items() if name not in AT_REST]))
         largest = max(parts, key=lambda name: parts[name])
-        return TumourError(worst, largest, moved=min(moved, worst), guess=self.guess)
+        registration = OF_REGISTRATION.range[1]
+        return TumourError(worst, largest, moved=min(moved, worst), guess=self.guess, registration=registration)
 
     def read(self, values: tuple[float, ...], time: float) -> float:
         """One of the lists at a time [s], between its entries in proportion."""

@@ -16,7 +16,7 @@ from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, R
 from ...script.camera_paths import PATHS
 from ...script.scene import SCENES, Scene
 from ...script.site import Site
-from ...script.tool_paths import AIR
+from ...script.tool_paths import AIR, Touch
 from .beside import TIP, TUMOUR_MIDDLE
 from .requests import HAND, SCRIPT, Wish
 from .text import effect_words
@@ -135,13 +135,28 @@ def hand(
     return [Choice("tool", (SCRIPT, HAND), SCRIPT, give, hint=HANDS), strength(scene, wish, take), *places, *tilts]
 
 
+def slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
+    """Values of the tool's sliders at a touch, by their labels."""
+    strong = {"depth [mm]": 1e3 * touch.depth} if scene.posed else {"force [N]": touch.force}
+    places = {"place right [mm]": 1e3 * touch.x, "place up [mm]": 1e3 * touch.y}
+    tilts = {f"direction {way} [deg]": np.degrees(tilt) for way, tilt in zip(("right", "up"), touch.tilt, strict=True)}
+    return {label: round(float(value), 2) for label, value in (strong | places | tilts).items()}
+
+
 def strength(scene: Scene, wish: Wish, take: Callable[..., None]) -> Slider:
     """How hard the hand pushes, or how deep it goes."""
     touch = wish.touch
     if scene.posed:
-        low, now = -1e3 * AIR, 1e3 * touch.depth
+        low = -1e3 * AIR
+        now = min(max(1e3 * touch.depth, low), MOST_DEPTH)
         hint = "how far the tool is beyond where it just touches; negative: in the air"
         return Slider("depth [mm]", low, MOST_DEPTH, 0.1, now, lambda value: take(depth=1e-3 * value), hint=hint)
     return Slider(
-        "force [N]", 0.0, MOST_FORCE, 0.01, touch.force, lambda value: take(force=value), hint="how hard it pushes"
+        "force [N]",
+        0.0,
+        MOST_FORCE,
+        0.01,
+        min(touch.force, MOST_FORCE),
+        lambda value: take(force=value),
+        hint="how hard it pushes",
     )

@@ -27,7 +27,7 @@ from ..tool_holder import holding
 from ..waiting_notice import Busy
 from .beside import lines_of, sample_of, slices_of
 from .cast import Cast
-from .controls import PLAN, clocked, controls
+from .controls import PLAN, clocked, controls, slider_values
 from .moment import Moment
 from .referee import Referee, Truth
 from .requests import HAND, SCRIPT, Wish
@@ -49,8 +49,6 @@ WAITS = "The finite elements are working on this load."
 RESTS = '<p class="stale">The body at rest, as in the scan. The first answer is on its way.</p>'
 # How long a page that plays shows why a frame is left out [s].
 READING = 2.0
-FIRST = Touch(force=0.15, depth=2e-3)
-"""What a hand holds that takes the tool."""
 
 
 class Demo:
@@ -169,7 +167,7 @@ class Demo:
         self.history = History(lines_of(scene))
         # The frame that is shown.
         self.reached: int | None = None
-        self.wish = Wish(deformer, FIRST, scene.name, clocked=clocked(scene, self.theatre.site))
+        self.wish = Wish(deformer, scene.path(0.0), scene.name, clocked=clocked(scene, self.theatre.site))
 
     def _change(self, name: str) -> None:
         """Play another scene; where this body has none of that name, stay, and say why."""
@@ -177,8 +175,7 @@ class Demo:
         self.busy.on(f"preparing the scene {name}")
         try:
             scene = self.first if name == self.first.name else self.find(name)
-            known = self.theatre.names(scene)
-            deformer = self.wish.deformer if self.wish.deformer in known else self.theatre.usual(scene)
+            deformer = self.theatre.usual(scene)
             self._cast(scene, deformer)
             self.wish.set(style=old[2].style, path=old[2].path, through=old[2].through)
             parts = self._parts(deformer)
@@ -265,6 +262,14 @@ class Demo:
         now.picture = pictured(frame)
         move_bodies(self.browser, frame, player)
         self._beside(frame, player)
+        if touch is None:
+            self._show_touch(hand, lambda: self.wish.tool == SCRIPT)
+
+    def _show_touch(self, touch: Touch, wanted: Callable[[], bool]) -> None:
+        """Set the tool's sliders to a touch, so that a hand that takes the tool starts there."""
+        if self.stage.scene.tool is not None:
+            for label, value in slider_values(self.stage.scene, touch).items():
+                self.browser.put(label, value, wanted)
 
     def _restyle(self, now: Moment) -> None:
         """Draw the same answer in another way."""
@@ -354,15 +359,26 @@ class Demo:
 
     def _give(self, tool: str, **wishes: int) -> None:
         """The menu, or the frame slider, gave the tool away; the menu says so after whatever is on its way to it."""
+        if tool == HAND:
+            self._start_hand()
         self.wish.set(tool=tool, holder=self._visitor() if tool == HAND else None, **wishes)
         if self.stage.scene.tool is not None:
             self.browser.put("tool", tool)
 
     def _take(self, **values: float) -> None:
         """A slider was moved: the tool is in the visitor's hand."""
+        self._start_hand()
         self.wish.set(holder=self._visitor())
         self.wish.hand(**values)
+        self._show_touch(self.wish.touch, lambda: True)
         self.browser.put("tool", HAND)
+
+    def _start_hand(self) -> None:
+        """Where the script has the tool, a hand takes it as it is in the frame that is shown."""
+        if self.wish.tool == SCRIPT:
+            number = self.wish.number if self.reached is None else self.reached
+            scene = self.stage.scene
+            self.wish.set(touch=scene.path(float(scene.times[number])))
 
     def _visitor(self) -> int | None:
         """Who set what is heard now."""

@@ -18,7 +18,7 @@ from ...script.tool_paths import Touch
 from ...script.uncertainty import TumourError
 from ..deformers import GUARDED, Theatre
 from ..observer import ELLIPSOID_COLOUR, Estimate
-from ..player import Frame
+from ..player import Frame, is_undeformed
 from ..stage import TRUTH_COLOUR, TUMOUR_COLOUR, Stage
 from .tally import Row
 
@@ -174,7 +174,7 @@ def trust(answer: Deformation, name: str) -> str:
     if not outcome.good:
         return f'<p>{who}</p><p class="warn">Do not rely on this answer: {escape(outcome.value)}.</p>'
     how = "inside the range that it was trained on" if outcome is Outcome.PREDICTED else "solved to its tolerance"
-    if not answer.displacement.any():
+    if is_undeformed(answer):
         return f"<p>{who}: {how}. Nothing moves the tumour.</p>"
     bound = float(answer.bound[0, 0])
     if not np.isfinite(bound):
@@ -201,6 +201,8 @@ def tumour_trust(error: TumourError) -> str:
     within = hud.bound_words(error.bound, 1)
     said = f"Error of the tumour: 95 of 100 times no point of it is more than {within} from where it is"
     guess = ": a guess, of few draws or a load beyond the law of the tissue" if error.guess else ""
+    if error.registration_words:
+        said += f" ({error.registration_words} along each axis, as a standard deviation)"
     if error.observed is None:
         return f"<p>{said}{guess or f'; the largest part is {escape(error.largest)}'}.</p>"
     without = "" if error.prior is None else f"; without observation {hud.bound_words(error.prior, 1)}{guess}"
@@ -213,7 +215,8 @@ def report(
     """What was answered: the distance first, then how far to trust it, what acts, the verdict and the table."""
     left = stage.at(frame.loads).left
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
-    facts += [moved_words(frame)]
+    if frame.estimate is not None or not is_undeformed(frame.deformation):
+        facts += [moved_words(frame)]
     if frame.distance_error is not None and frame.distance_error < np.inf:
         facts += [
             f"tip to tumour within {hud.bound_words(frame.distance_error, 1)} of the model's finite elements (95 %)"
