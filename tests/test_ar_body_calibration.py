@@ -110,6 +110,21 @@ def test_motions_that_determine_nothing_are_refused():
         hand_eye(about, about @ X)
 
 
+@pytest.mark.parametrize(("tilt", "is_parallel"), [(1.9, True), (2.2, False)])
+def test_hand_eye_axes_within_8_degrees_are_rejected(tilt, is_parallel):
+    """Turns about the z axis, tilted to both sides: the axes of motions scatter just below and just above 8 degrees."""
+    X, rng = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12]), np.random.default_rng(1)
+    axes = [Rotation.from_euler("x", side * tilt, degrees=True).apply([0.0, 0.0, 1.0]) for side in (-1.0, 1.0)]
+    turns = [0.0 * axes[0], *(angle * axis for angle in np.linspace(0.5, 2.0, 8) for axis in axes)]
+    first = np.array([rigid(turn, 0.1 * rng.normal(size=3)) for turn in turns])
+    second = np.linalg.inv(X) @ first @ X
+    if not is_parallel:
+        np.testing.assert_allclose(hand_eye(first, second).X, X, atol=1e-9)
+        return
+    with pytest.raises(ValueError, match=r"are parallel, to [67]\.\d degrees"):
+        hand_eye(first, second)
+
+
 def test_many_poses_are_thinned():
     X = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12])
     found = hand_eye(*bodies(X, count=1000))

@@ -199,6 +199,24 @@ def test_nothing_is_followed_into_another_picture(geometry, view):
     assert len(which) == len(there) < 3
 
 
+def test_point_that_leads_back_elsewhere_is_dropped(geometry, view, monkeypatch):
+    """As where a texture repeats: each point is found, and every other one leads back 5 pixels from its start."""
+    pixels = grid(geometry.size)
+    ends = []
+
+    def matched(one, other, start, guess, **settings):
+        ends.append(start if not ends else start + [[0.0 if row % 2 else 5.0, 0.0] for row in range(len(start))])
+        return (
+            (start if len(ends) == 1 else guess + (ends[1] - start)).astype(np.float32),
+            np.ones((len(start), 1)),
+            None,
+        )
+
+    monkeypatch.setattr("cv2.calcOpticalFlowPyrLK", matched)
+    which, _ = followed(view, replace(view, hidden=np.zeros_like(view.hidden)), pixels)
+    assert len(ends) == 2 and len(which) == len(ends[0]) // 2
+
+
 def test_a_motion_unlike_its_neighbours_has_no_support():
     random = np.random.default_rng(0)
     places, motions = random.uniform(0.0, 0.02, (60, 3)), 1e-4 * random.standard_normal((60, 3)) + 3e-3
