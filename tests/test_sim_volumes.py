@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sim.bodies.head_masks import Sources, head_masks
-from sim.bodies.label_map import read_labels
 from sim.bodies.label_volume import masked_subject, volume_subject
 from sim.bodies.subject import MeshPlan, Part, make_anatomy
 from sim.bodies.volume import read_volume
@@ -304,89 +303,3 @@ def test_oedema_and_ventricles_become_regions(tmp_path):
         masked_subject(masks, regions=("necrosis",))
     with pytest.raises(InputError, match="label 3 is named by --tumour and by --oedema"):
         head_masks(Sources(path, (1,), (3,), parts={"oedema": (3,)}))
-
-
-class TestConventions:
-    def brats(self, folder, enhancing):
-        affine, places = grid()
-        labels = np.where(np.linalg.norm(places - TUMOUR, axis=-1) < 18.0, 2, 0)
-        core = np.linalg.norm(places - TUMOUR, axis=-1)
-        labels[core < 12.0], labels[core < 6.0] = enhancing, 1
-        nifti(folder / "t1.nii", (head(places) > 0).astype(np.float32), affine)
-        return nifti(folder / "seg.nii", labels.astype(np.uint8), affine)
-
-    @pytest.mark.parametrize("enhancing", [3, 4])
-    def test_brats(self, tmp_path, enhancing):
-        path = self.brats(tmp_path, enhancing)
-        masks = head_masks(Sources(path, convention="brats", mask=tmp_path / "t1.nii"))
-        assert masked_subject(masks).tumour_volume == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.05)
-        assert {name: int(mask.sum()) for name, mask in masks.parts.items()} == {
-            "necrosis": (read_labels(path).layers == 1).sum(), "oedema": (read_labels(path).layers == 2).sum()
-        }  # fmt: skip
-        with pytest.raises(InputError, match="labels of brats do not mark the brain"):
-            head_masks(Sources(path, convention="brats"))
-
-    def test_a_cavity_is_no_tumour(self, tmp_path):
-        affine, places = grid()
-        labels = head(places, brain=0)
-        labels[10:14, 10:14, 10:14] = 4
-        nifti(tmp_path / "seg.nii", labels, affine)
-        nifti(tmp_path / "t1.nii", head(places), affine)
-        with pytest.raises(InputError, match="label 4 is the cavity of a resection"):
-            head_masks(Sources(tmp_path / "seg.nii", convention="brats", mask=tmp_path / "t1.nii"))
-        masks = head_masks(Sources(tmp_path / "seg.nii", tumour=(3,), convention="brats", mask=tmp_path / "t1.nii"))
-        assert masks.tumour.sum() == (labels == 3).sum()
-
-    def aseg(self, folder, name="aseg.mgz", mirrored=False):
-        """White matter and cortex by halves, a ventricle on the left, and fluid around."""
-        affine, places = grid(AXES["oblique"])
-        whole = head(places, tumour=1)
-        size = np.linalg.norm((places - MIDDLE) / [46.0, 55.0, 42.0], axis=-1)
-        right = (places[..., 0] > MIDDLE[0]) ^ mirrored
-        labels = np.where(whole == 0, np.where(size < 1.1, 24, 0), np.where(size > 0.8, 3, 2))
-        labels[right & (whole > 0)] += 39
-        labels[np.linalg.norm(places - MIDDLE + [15.0, 0.0, 0.0], axis=-1) < 8.0] = 4
-        small, near = grid(edge=2.0, count=16, middle=TUMOUR)
-        nifti(folder / "tumour.nii", (head(near) == 3).astype(np.int16), small)
-        return mgz(folder / name, labels.astype(np.int32), affine)
-
-    @pytest.mark.parametrize("name", ["freesurfer", "synthseg"])
-    def test_freesurfer(self, tmp_path, name):
-        path = self.aseg(tmp_path)
-        masks = head_masks(Sources(path, convention=name, tumour_in=tmp_path / "tumour.nii"))
-        subject = masked_subject(masks)
-        assert masks.parts["ventricles"].any() and subject.notes == ()
-        low, high = 1e3 * subject.cortex.min(axis=0), 1e3 * subject.cortex.max(axis=0)
-        np.testing.assert_allclose([low, high], MIDDLE + np.outer([-1, 1], [46.0, 55.0, 42.0]), atol=EDGE)
-
-    def test_left_on_the_right_is_refused(self, tmp_path):
-        path = self.aseg(tmp_path, mirrored=True)
-        with pytest.raises(InputError, match=r"left half lie \d+ mm to the right of .* Its affine is mirrored, or"):
-            head_masks(Sources(path, convention="freesurfer", tumour_in=tmp_path / "tumour.nii"))
-
-    def test_labels_of_another_program_are_refused(self, tmp_path):
-        aseg, brats, tumour = self.aseg(tmp_path), self.brats(tmp_path, 4), tmp_path / "tumour.nii"
-        for sources, reason in (
-            (
-                Sources(aseg, convention="brats", mask=tmp_path / "t1.nii"),
-                "it has 24, 41, 42 beside. It looks like free",
-            ),
-            (
-                Sources(aseg, convention="fsl", tumour_in=tumour),
-                "it has 4, 24, 41, 42 beside. It looks like freesurfer or",
-            ),
-            (Sources(brats, convention="freesurfer", tumour_in=tumour), "it lacks 41. It looks like brats"),
-            (Sources(brats, convention="fsl", tumour_in=tumour), "it lacks 3. It looks like brats"),
-        ):
-            with pytest.raises(InputError, match=re.escape(reason)):
-                head_masks(sources)
-
-    def test_fsl_with_a_tumour_of_a_number_of_ones_own(self, tmp_path):
-        affine, places = grid()
-        labels = head(places, brain=2, tumour=9)
-        labels[(labels == 2) & (places[..., 2] > MIDDLE[2])] = 3
-        path = nifti(tmp_path / "a.nii", labels, affine)
-        masks = head_masks(Sources(path, tumour=(9,), convention="fsl"))
-        assert masks.brain.sum() == np.isin(labels, (2, 3)).sum() and masks.tumour.sum() == (labels == 9).sum()
-        with pytest.raises(InputError, match="no labels are called 'spm': choose one of brats, freesurfer"):
-            head_masks(Sources(path, convention="spm"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 from ..errors import InputError
@@ -32,8 +32,10 @@ class Convention:
         Whether a file has no other labels than these.
     mask
         Whether the brain lies in another file.
-    clash
-        Labels that, together, have another meaning, and what that is in words.
+    apart
+        Labels that no file has together.
+    deepest
+        Labels that lie farthest inside.
     """
 
     name: str
@@ -49,7 +51,8 @@ class Convention:
     right: tuple[int, ...] = ()
     only: bool = False
     mask: bool = False
-    clash: tuple[tuple[int, ...], str] = ((), "")
+    apart: tuple[int, ...] = ()
+    deepest: tuple[int, ...] = ()
 
     @property
     def known(self) -> frozenset[int]:
@@ -59,7 +62,7 @@ class Convention:
     def fits(self, present: Collection[int]) -> bool:
         """Whether a file with these labels may be of the convention."""
         labels = set(present) - {0}
-        if self.tumour and not labels & set(self.tumour):
+        if (self.tumour and not labels & set(self.tumour)) or (self.apart and labels >= set(self.apart)):
             return False
         return set(self.needed) <= labels and (not self.only or labels <= self.known)
 
@@ -101,7 +104,43 @@ BRATS = Convention(
     oedema=(2,),
     only=True,
     mask=True,
-    clash=((3, 4), "in BraTS 2024 label 4 is the cavity of a resection and 3 enhances"),
+    apart=(3, 4),
+)
+TUMOURS = (
+    replace(
+        BRATS,
+        name="nnunet",
+        source="nnU-Net's BraTS models, and the Medical Segmentation Decathlon: 1 oedema, 2 necrotic core, 3 enhancing "
+        "tumour",
+        tumour=(2, 3),
+        necrosis=(2,),
+        oedema=(1,),
+        apart=(),
+    ),
+    replace(
+        BRATS,
+        name="brats2015",
+        source="BraTS until 2016: 1 necrosis, 2 oedema, 3 non-enhancing and 4 enhancing tumour",
+        apart=(),
+    ),
+    replace(
+        BRATS,
+        name="brats-post",
+        source="BraTS after treatment, since 2024: 1 non-enhancing core, 2 oedema, 3 enhancing tumour, 4 cavity of a "
+        "resection",
+        tumour=(1, 3),
+        csf=(4,),
+        apart=(),
+    ),
+    replace(
+        BRATS,
+        name="brats-ped",
+        source="BraTS of children, since 2024: 1 enhancing tumour, 2 non-enhancing tumour, 3 cyst, 4 oedema",
+        tumour=(1, 2, 3),
+        necrosis=(),
+        oedema=(4,),
+        apart=(),
+    ),
 )
 FSL = Convention(
     "fsl",
@@ -110,6 +149,7 @@ FSL = Convention(
     needed=(2, 3),
     csf=(1,),
     only=True,
+    deepest=(3,),
 )
 CONVENTIONS = {
     one.name: one
@@ -118,39 +158,54 @@ CONVENTIONS = {
         FREESURFER,
         replace(FREESURFER, name="synthseg", source="SynthSeg, with or without parcels of the cortex"),
         FSL,
+        *TUMOURS,
     )
 }
 """By their names. FSL FIRST, and SynthSeg, have the numbers of FreeSurfer."""
 
 
-def demand_fits(path: object, convention: Convention, present: Collection[int], own: Collection[int] = ()) -> None:
-    """Refuse a file whose labels `present` are not those of a convention, but for a user's `own` ones.
+def demand_fits(
+    path: object,
+    convention: Convention,
+    present: Collection[int],
+    own: Collection[int] = (),
+    against: Callable[[Convention], str] = lambda _: "",
+) -> None:
+    """Reject a file whose labels `present` are not those of a convention, but for a user's `own` ones.
+
+    `against` says why a convention whose numbers fit is not that of the file; empty: it may be.
 
     Raises
     ------
     InputError
-        Naming what is missing or not known, and the convention that would fit.
+        Naming what is missing, not known or contradicted, and the conventions that would fit.
     """
     labels = set(present) - {0} - set(own)
-    numbers, meaning = convention.clash
-    if numbers and convention.fits(labels) and labels >= set(numbers) and not own:
-        said = " and ".join(map(str, numbers))
-        raise InputError(
-            f"{path}: has the labels {said}, and {meaning}: name those of the core yourself, for instance --tumour 1,3."
-        )
-    if convention.fits(labels) or (own and set(convention.needed) <= labels):
-        return
     missing = [label for label in convention.needed if label not in labels]
-    wanted = [label for label in convention.tumour if label not in own]
-    if missing:
-        why = f"lacks {_listed(missing)}"
+    kin = convention.fits(labels) or (own and not missing)
+    if kin:
+        why = against(convention)
+        if not why:
+            return
+    elif missing:
+        why = f"it lacks {_listed(missing)}"
     elif convention.only and not labels <= convention.known:
-        why = f"has {_listed(sorted(labels - convention.known))} beside"
+        why = f"it has {_listed(sorted(labels - convention.known))} beside"
+    elif convention.apart and labels >= set(convention.apart):
+        why = f"it has {' and '.join(map(str, convention.apart))} together"
     else:
-        why = f"has none of {_listed(wanted)}"
-    others = [one.name for one in CONVENTIONS.values() if one is not convention and one.fits(labels)]
-    remedy = f"It looks like {' or '.join(others)}" if others else "Name its labels: --brain 1,2 --tumour 3"
-    raise InputError(f"{path}: is not labelled as {convention.name} ({convention.source}): it {why}. {remedy}.")
+        why = f"it has none of {_listed([label for label in convention.tumour if label not in own])}"
+    others: dict[object, str] = {}
+    for one in CONVENTIONS.values():
+        if kin and bool(one.tumour) != bool(convention.tumour):
+            continue
+        if one is not convention and one.fits(labels) and not against(one):
+            meant = [labels.intersection(of) for of in (one.tumour, one.oedema, one.necrosis)]
+            others.setdefault(str(meant) if one.tumour else one.name, one.name)
+    looks = f"It looks like {' or '.join(others.values())}" if others else "Name its labels: --brain 1,2 --tumour 3"
+    core = ",".join(str(label) for label in convention.tumour if label in present)
+    sure = f"; if it is not, name the core: --tumour {core}" if others and core else ""
+    raise InputError(f"{path}: is not labelled as {convention.name} ({convention.source}): {why}. {looks}{sure}.")
 
 
 def _listed(labels: list[int]) -> str:

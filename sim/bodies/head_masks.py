@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 from .conventions import CONVENTIONS, Convention, demand_fits
+from .label_contacts import against, contacts_of, contradiction
 from .label_map import Label, LabelMap, Mask, listed, on_border, read_labels, widened
 from .one_space import in_one_space
 from .placement import side_of
@@ -127,6 +128,8 @@ def head_masks(sources: Sources) -> HeadMasks:
     notes = whole.notes + tuple(f"{one.path}: {note}" for one in others.values() for note in one.notes)
     if convention is None and not sources.mask and not sources.tumour_in:
         notes += _unnamed(whole, (*brain, *tumour, *(label for labels in named.values() for label in labels)))
+    if not sources.tumour_in:
+        notes += _doubtful(whole, tumour, sources.parts)
     if sources.mask:
         notes += _outside(marked, affine)
     if either:
@@ -154,6 +157,17 @@ def _unnamed(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
     found = {(layer, value) for layer, present in enumerate(whole.present) for value in present}
     left = [names.get(place, place[1]) for place in sorted(found - set(whole.places(named)))]
     return (f"neither brain nor tumour: what is labelled {listed(left)}",) if left else ()
+
+
+def _doubtful(whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tuple[Label, ...]]) -> tuple[str, ...]:
+    """A note on labels of one's own that the anatomy contradicts."""
+    if whole.layers.shape[-1] > 1 or not {NECROSIS, "oedema"}.intersection(parts):
+        return ()
+    own = {name: tuple(value for _, value in whole.places(labels)) for name, labels in parts.items()}
+    core, necrosis = tuple(value for _, value in whole.places(tumour)), own.get(NECROSIS, ())
+    meant = Convention("own", "", tumour=core + necrosis, necrosis=necrosis, oedema=own.get("oedema", ()))
+    found = contradiction(contacts_of(whole), meant)
+    return (f"{found.reason}: see that the labels mean this",) if found else ()
 
 
 def _side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
@@ -196,7 +210,10 @@ def _meant(
         necrosis = sources.parts.get(NECROSIS, ())
         parts = tuple(label for name, labels in sources.parts.items() if name != NECROSIS for label in labels)
         given = brain + parts + (() if sources.tumour_in else tumour + necrosis)
-        demand_fits(sources.labels, convention, whole.labels, {value for _, value in whole.places(given)})
+        named = {value for _, value in whole.places(given)}
+        checked = convention.deepest or (convention.tumour and not sources.tumour and not sources.parts)
+        doubts = (against(whole, convention),) if checked else ()
+        demand_fits(sources.labels, convention, whole.labels, named, *doubts)
         _demand_sides(whole, convention)
         if not brain and not sources.mask:
             brain = _there(convention.brain, whole)
@@ -230,7 +247,11 @@ def _others(sources: Sources, tumour: Sequence[Label]) -> dict[str, Mask]:
     if sources.tumour_in:
         second, necrosis = read_labels(sources.tumour_in), sources.parts.get(NECROSIS, ())
         whole = second.mask((*tumour, *necrosis) if tumour else ())
-        others["tumour"] = Mask(Path(sources.tumour_in), whole, second.affine, second.notes)
+        several = not tumour and len(second.labels) > 1
+        said = listed(sorted(second.labels))
+        all_of = f"its labels {said} are all taken for tumour: name those of the core by --tumour"
+        notes = (*second.notes, all_of) if several else second.notes
+        others["tumour"] = Mask(Path(sources.tumour_in), whole, second.affine, notes)
         if necrosis:
             others[NECROSIS] = Mask(Path(sources.tumour_in), second.mask(necrosis), second.affine)
     return others
