@@ -18,6 +18,7 @@ from ..geometry.tetmesh import MeshWarning, TetMesh, oriented
 from ..runtime.atomic_files import written_whole
 from ..runtime.file_limits import MESH_BYTES, MeshBytes, at_most
 from ..runtime.outside_files import path_of, read_as
+from .given_cells import demand_one_body, demand_tetrahedra, merged, pieces_note, regions_of
 from .mesh_references import demand_own
 from .vtu_size import demand_small
 
@@ -42,15 +43,17 @@ class MeshFile:
 
 
 def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES) -> MeshFile:
-    """Read tetrahedra with cell data `region` (absent: one region 0).
+    """Read tetrahedra with cell data `region`, or else with the groups of a mesher (absent: one region 0).
 
-    Quadratic ones (`tetra10`) are taken as they are, curved edges too. Cells that are not tetrahedra are dropped and
-    tetrahedra of negative orientation are turned, each with a note. `limits` bound what a file may inflate to.
+    Quadratic ones (`tetra10`) are taken as they are, curved edges too. Points, lines and surfaces are dropped, nodes
+    that coincide are merged and tetrahedra of negative orientation are turned, each with a note. `limits` bound what a
+    file may inflate to.
 
     Raises
     ------
     InputError
-        A file that is missing or unreadable, without tetrahedra or with both kinds, or with data that does not fit.
+        A file that is missing or unreadable, without tetrahedra, with both kinds or with other volume cells, or with
+        data that does not fit. Tetrahedra that are listed twice, or overlap.
     """
     import meshio  # an optional reader: machines that only train have none
 
@@ -83,26 +86,24 @@ def _taken(path: Path, raw: meshio.Mesh, metre: float) -> MeshFile:
         raise InputError(
             f"{path}: holds {' and '.join(sorted(found))}, which do not conform: mesh it with one of them."
         )
+    demand_tetrahedra(raw, found)
     blocks = [number for number, block in enumerate(raw.cells) if block.type in found]
     notes = []
     dropped = sorted({f"{len(block.data)} {block.type}" for block in raw.cells if block.type not in found})
     if dropped:
         notes.append(f"dropped cells that are not tetrahedra: {', '.join(dropped)}")
-    table = np.concatenate([raw.cells[number].data for number in blocks])
-    region = np.zeros(len(table), np.int32)
-    if "region" in raw.cell_data:
-        stored = np.concatenate([raw.cell_data["region"][number] for number in blocks])
-        with np.errstate(invalid="ignore"):  # what is no number, or too large for one, does not come back
-            region = stored.astype(np.int32)
-        if stored.ndim != 1 or not np.array_equal(stored, region):
-            raise InputError(f"{path}: cell data `region` must be one whole number for each tetrahedron.")
-    table, turned = oriented(raw.points, table)
+    region, said = regions_of(raw, blocks)
+    table, turned = oriented(raw.points, np.concatenate([raw.cells[number].data for number in blocks]))
+    data = {name: np.asarray(field) for name, field in raw.point_data.items()}
+    points, table, data, gone = merged(np.asarray(raw.points, np.float64), table, data)
+    if gone:
+        notes.append(f"merged {gone} nodes with others at the same place: results are numbered without them")
     tets, middles = np.split(table, [4], axis=1)
-    nodes = np.asarray(raw.points, np.float64) * metre
-    mesh = TetMesh(nodes, tets, region, middles if middles.size else None)
+    mesh = TetMesh(points * metre, tets, region, middles if middles.size else None)
+    demand_one_body(points, tets)
     if turned:
         notes.append(f"turned {turned} tetrahedra of negative orientation")
-    return MeshFile(mesh, {name: np.asarray(field) for name, field in raw.point_data.items()}, tuple(notes))
+    return MeshFile(mesh, data, (*notes, *said, *pieces_note(mesh)))
 
 
 def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray], space: str = "") -> None:

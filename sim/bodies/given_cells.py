@@ -1,0 +1,208 @@
+"""Cells of a mesh file: one body of tetrahedra that meet at their nodes and do not overlap, and its regions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from ..anatomy import REGION_NAMES, region_words
+from ..errors import InputError
+from ..geometry.tetmesh import FACES, TetMesh
+
+# Beginnings of meshio's names of volume cells.
+VOLUMES = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron", "VTK_LAGRANGE_TETRA", "VTK_LAGRANGE_HEXA",
+           "VTK_LAGRANGE_WEDGE", "VTK_LAGRANGE_PYRAMID")  # fmt: skip
+# Nodes closer than this share of the body's size are one.
+COINCIDENT = 1e-9
+# Smallest barycentric coordinate of a point that lies inside a tetrahedron, not on its border.
+INSIDE = 1e-3
+# Nodes and middles of tetrahedra that are looked for in other ones: an overlap of a thousandth of the volume shows.
+PROBES = 2**13
+SPELT = {"tumor": "tumour", "edema": "oedema", "ventricle": "ventricles", **{name: name for name in REGION_NAMES}}
+"""Names of regions in other spellings."""
+
+
+def demand_tetrahedra(raw: Any, read: set[str]) -> None:
+    """Reject a mesh with volume cells of other types than those that are `read`.
+
+    Raises
+    ------
+    InputError
+        Naming the types.
+    """
+    others = {block.type for block in raw.cells if block.type.startswith(VOLUMES)} - read
+    if others and read:
+        counts = ", ".join(f"{sum(len(b.data) for b in raw.cells if b.type == one)} {one}" for one in sorted(others))
+        raise InputError(f"a part of its volume is {counts}: all of it must be tetrahedra. Split or mesh it so.")
+
+
+def merged(
+    points: np.ndarray, table: np.ndarray, data: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], int]:
+    """Points (V, 3), cells (T, n) and point data with one node in place of each group that coincides; how many went.
+
+    Raises
+    ------
+    InputError
+        Nodes that coincide and have different data.
+    """
+    used = np.unique(table)
+    whole = used[0] >= 0 and used[-1] < len(points)  # other numbers are rejected with the mesh
+    size = np.ptp(points[used], axis=0).max() if whole else 0.0
+    pairs = KDTree(points[used]).query_pairs(COINCIDENT * size, output_type="ndarray") if whole else used[:0]
+    if not len(pairs):
+        return points, table, dict(data), 0
+    first = np.arange(len(points))
+    np.minimum.at(first, used[pairs.max(axis=1)], used[pairs.min(axis=1)])
+    while (first != first[first]).any():
+        first = first[first]
+    for name, field in data.items():
+        if not np.array_equal(field, field[first]):
+            raise InputError(f"nodes that coincide have different `{name}`: give them one value, or merge them.")
+    left = first == np.arange(len(points))
+    return points[left], (np.cumsum(left) - 1)[first[table]], {k: v[left] for k, v in data.items()}, int((~left).sum())
+
+
+def demand_one_body(points: np.ndarray, tets: np.ndarray) -> None:
+    """Reject tetrahedra (T, 4) of positive orientation that are listed twice, or that overlap.
+
+    Raises
+    ------
+    InputError
+        Saying how many.
+    """
+    faces = tets[:, FACES].reshape(-1, 3)
+    turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    sides = np.take_along_axis(faces, turn, axis=1).astype(np.int64) @ [len(points) ** 2, len(points), 1]
+    folded = len(faces) - len(np.unique(sides))  # two tetrahedra on one side of a face
+    twice = len(tets) - len(np.unique(np.sort(tets, axis=1), axis=0)) if folded else 0
+    if twice:
+        raise InputError(f"{twice} tetrahedra are listed twice: list each once.")
+    inside = folded or _inside_others(points, tets)
+    if inside:
+        raise InputError(
+            f"its tetrahedra overlap, at {inside} {'faces' if folded else 'nodes or middles'}: each place must lie in "
+            "one. Cut the bodies out of each other, and mesh them together."
+        )
+
+
+def pieces_note(mesh: TetMesh) -> tuple[str, ...]:
+    """A note on a mesh in pieces that share no node; none where it is one."""
+    links = mesh.tets[:, [0, 0, 0]].ravel(), mesh.tets[:, 1:].ravel()
+    graph = coo_array((np.ones(len(links[0])), links), shape=(len(mesh.nodes),) * 2)
+    piece = connected_components(graph, directed=False)[1]
+    used = np.unique(mesh.tets)
+    count = len(np.unique(piece[used]))
+    if count == 1:
+        return ()
+    first = piece[used] == piece[used[0]]
+    near = KDTree(mesh.nodes[used[first]]).query(mesh.nodes[used[~first]])[0].min()
+    return (
+        f"it is in {count} pieces that share no node, {1e3 * near:.3g} mm apart: nothing holds them together. Where "
+        "they touch, mesh them together, with common nodes at their interface",
+    )
+
+
+def _inside_others(points: np.ndarray, tets: np.ndarray) -> int:
+    """Count nodes and middles of tetrahedra (T, 4), `PROBES` of them at most, that lie inside of another one."""
+    corners = points[tets]
+    middle = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    probes = np.concatenate([middle, points[np.unique(tets)]])
+    chosen = np.linspace(0, len(probes) - 1, min(PROBES, len(probes))).astype(int)
+    near = KDTree(probes[chosen]).query_ball_point(middle, reach)
+    which = np.repeat(np.arange(len(tets)), [len(one) for one in near])
+    probe = chosen[np.concatenate(near).astype(int)]
+    edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+    inner = np.einsum("nij,nj->ni", np.linalg.inv(edges)[which], probes[probe] - corners[which, 0])
+    least = np.minimum(inner.min(axis=1), 1.0 - inner.sum(axis=1))
+    return len(np.unique(probe[(least > INSIDE) & (probe != which)]))
+
+
+def regions_of(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Region (T,) of each tetrahedron in some blocks of cells, and a note where it is not cell data `region`.
+
+    Without such data it is the one array of whole numbers that varies, or the sets of cells.
+
+    Raises
+    ------
+    InputError
+        `region` that is not one whole number for each, several arrays that differ, or sets that overlap.
+    """
+    if "region" in raw.cell_data:
+        region = _whole(np.concatenate([raw.cell_data["region"][number] for number in blocks]))
+        if region is None:
+            raise InputError("cell data `region` must be one whole number for each tetrahedron.")
+        return region, ()
+    stored = {name: _whole(np.concatenate([on[number] for number in blocks])) for name, on in raw.cell_data.items()}
+    varied = {name: one for name, one in stored.items() if one is not None and 1 < len(np.unique(one)) < len(one)}
+    if "gmsh:physical" in varied:
+        varied.pop("gmsh:geometrical", None)  # the entities that the groups are made of
+    groups = {name: np.atleast_1d(value) for name, value in raw.field_data.items()}
+    names = {int(v[0]): name for name, v in groups.items() if v.dtype.kind in "iu" and v.size == 2 and v[1] == 3}
+    names |= {number: ", ".join(said) for number, said in getattr(raw, "cell_tags", {}).items()}
+    if not varied:
+        return _from_sets(raw, blocks)
+    name, region = next(iter(varied.items()))
+    if any(not np.array_equal(region, other) for other in varied.values()):
+        said = ", ".join(f"`{one}`" for one in varied)
+        raise InputError(f"its cell data {said} may each be its regions: call the right one `region`.")
+    return _named(region, names, f"cell data `{name}`")
+
+
+def _whole(values: np.ndarray) -> np.ndarray | None:
+    """Values (T,) as whole numbers; None where they are none."""
+    if values.ndim != 1 or values.dtype.kind not in "biuf":
+        return None
+    with np.errstate(invalid="ignore"):  # what is no number, or too large for one, does not come back
+        whole = values.astype(np.int32)
+    return whole if np.array_equal(values, whole) else None
+
+
+def _from_sets(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Regions by the file's named sets of cells; one region 0 where no set parts the body."""
+    marked, total = {}, sum(len(raw.cells[number].data) for number in blocks)
+    for name, on in raw.cell_sets.items():
+        masks = [np.zeros(len(raw.cells[number].data), bool) for number in blocks]
+        for mask, number in zip(masks, blocks, strict=True):
+            if on[number] is not None:
+                mask[np.asarray(on[number], int)] = True
+        mask = np.concatenate(masks)
+        if not name.startswith("gmsh:") and 0 < mask.sum() < total:
+            marked[name] = mask
+    if not marked:
+        return np.zeros(total, np.int32), ()
+    if np.sum([*marked.values()], axis=0).max() > 1:
+        raise InputError(f"its sets of cells {', '.join(marked)} overlap: store cell data `region` in their place.")
+    region = np.select([*marked.values()], range(1, len(marked) + 1), 0).astype(np.int32)
+    return _named(region, dict(enumerate(marked, 1)), "its sets of cells", free=True)
+
+
+def _named(
+    region: np.ndarray, names: Mapping[int, str], said: str, free: bool = False
+) -> tuple[np.ndarray, tuple[str]]:
+    """Regions whose numbers are those of their groups' `names`, and a note; numbers that are not the file's are `free`.
+
+    Raises
+    ------
+    InputError
+        Names of which some are of regions, and others not, where the numbers contradict them.
+    """
+    known = {number: SPELT.get(names.get(number, "").strip().lower()) for number in np.unique(region).tolist()}
+    wrong = [number for number, name in known.items() if name and REGION_NAMES[name] != number]
+    if wrong or (free and any(known.values())):
+        number = {old: REGION_NAMES[name] for old, name in known.items() if name}
+        spare = iter(new for new in range(1, 2**16) if new not in REGION_NAMES.values())
+        kept = {old for old in known if old not in number and old not in REGION_NAMES.values() and not free}
+        number |= {old: old if old in kept or old == 0 else next(spare) for old in known if old not in number}
+        region = np.array([number[old] for old in known], np.int32)[np.searchsorted([*known], region)]
+        names = {number[old]: names.get(old, f"group {old}") for old in known}
+    parts = (
+        region_words(one) + (f" from {names[one]}" if names.get(one) else "") for one in np.unique(region).tolist()
+    )
+    return region, (f"regions are those of {said}: {', '.join(parts)}",)
