@@ -189,3 +189,24 @@ def test_the_camera_of_a_calibration_is_opencvs():
     wanted = cv2.projectPoints(points, np.zeros(3), np.zeros(3), SOME.K, SOME.lens.coefficients[:5])[0]
     assert np.allclose(camera.project(points)[0], wanted.reshape(-1, 2), atol=1e-9)
     assert repr(SOME) == repr(parsed(ros_text(SOME)))
+
+
+MATRIX = "camera_matrix:\n  cols: 3\n  data:\n{}  rows: 3\n"
+PLAIN = "image_width: 640\nimage_height: 480\ncamera_name: {}\n{}distortion_model: plumb_bob\n{}"
+NUMBERS = [500.0, 0, 320.0, 0, 5e2, 240.0, 0, 0, 1]
+LENS = "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0.1, -0.2, 0.0, 0.0, 0.0]\n"
+
+
+@pytest.mark.parametrize("inset", ["  ", "    "])
+@pytest.mark.parametrize("name", ["720p", "4k_cam", "2024-01-02", "left: 1", "12", '"quoted"'])
+def test_calibration_of_ros_with_plain_names_and_lists_is_read(name, inset):
+    lists = MATRIX.format("".join(f"{inset}- {number}\n" for number in NUMBERS))
+    for start in ("", "\ufeff", "%YAML:1.0\n---\n", "stamp: 12:30:01\nnote: 3rd\n"):
+        found = parsed(start + PLAIN.format(name, lists, LENS))
+        assert found.name == name.strip('"') and found.focal == (500.0, 500.0) and found.lens.k1 == 0.1
+
+
+def test_calibration_of_zeros_is_not_calibrated():
+    lists = MATRIX.format("  - 0.0\n" * 9)
+    with pytest.raises(ValueError, match="a camera that is not calibrated: calibrate it first"):
+        parsed(PLAIN.format("cam", lists, LENS))

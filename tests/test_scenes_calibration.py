@@ -33,7 +33,7 @@ def test_files_that_are_none_are_refused(tmp_path):
     with pytest.raises(InputError, match="names no file"):
         read_calibration(3)  # type: ignore[arg-type]
     for content, reason in (
-        (b"\xff\xfe\x00\x01", "it is damaged, or of another kind. Give YAML"),
+        (b"\xff\xfe\x00\x01", "it is no text in UTF-8. Give YAML"),
         (b"", r"wrong\.yaml: image_width is missing. Give YAML"),
         (b"#" * (4 * LONGEST_TEXT + 10), r"wrong\.yaml: it has more than"),
         (b"camera_matrix: [" + b"[" * 20000, r"wrong\.yaml: its lists are nested too deeply"),

@@ -139,3 +139,10 @@ def test_cells_that_are_no_one_body_are_rejected(tmp_path: Path, changes: dict, 
     path = write(tmp_path / "bad.vtu", **changes)
     with pytest.raises(InputError, match=sentence):
         read_mesh(path)
+
+
+def test_vtu_packed_with_lz4_says_so(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.vtu")
+    path.write_bytes(path.read_bytes().replace(b"vtkZLibDataCompressor", b"vtkLZ4DataCompressor"))
+    with pytest.raises(InputError, match="its arrays are packed by vtkLZ4DataCompressor, and vtkZLib"):
+        read_mesh(path)

@@ -239,13 +239,6 @@ def test_files_that_are_no_volumes(tmp_path):
         assert name in str(caught.value)
 
 
-def test_a_volume_without_orientation_is_taken_as_it_lies_and_says_so(tmp_path):
-    _, places = grid(AFFINES["thick slices"])
-    labels = np.where(ball(places), 3, ellipsoid(places)).astype(np.int16)
-    nibabel.save(nibabel.Nifti1Image(labels, None), tmp_path / "l.nii")
-    assert any("neither sform nor qform" in note for note in volume_subject(tmp_path / "l.nii", (1,), (3,)).notes)
-
-
 @pytest.mark.parametrize(("apart", "said"), [(0.5, False), (30.0, True)])
 def test_forms_that_disagree_are_said_and_the_sform_is_taken(tmp_path, apart, said):
     affine, places = grid(AFFINES["oblique and negative"])

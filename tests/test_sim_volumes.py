@@ -208,6 +208,17 @@ def test_segments_are_called_by_their_names(tmp_path):
         volume_subject(path, ("Whole brain", "tumour"), ("Tumour",))
 
 
+def test_segments_of_one_name_are_told_apart_by_numbers(tmp_path):
+    affine, places = grid()
+    named = segments(("Brain", 0, 1), ("Tumou\u0301r", 0, 4), ("Tumo\u00far", 0, 3))
+    labels = head(places)
+    labels[(labels == 3) & (places[..., 0] > TUMOUR[0])] = 4
+    path = nrrd(tmp_path / "a.seg.nrrd", labels, affine, more=named)
+    with pytest.raises(InputError, match="several segments are called tumo\u00far: give its number, of 3, 4"):
+        volume_subject(path, ("Brain",), ("tumo\u00far",))  # composed or not, they are one name
+    assert volume_subject(path, ("Brain",), (3, 4)).notes == ()
+
+
 class TestSeveralFiles:
     @pytest.fixture
     def files(self, tmp_path):

@@ -18,6 +18,17 @@ DEEPEST = 4
 MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
 # Coefficients that OpenCV takes; those after the eighth are of thin prisms and tilted sensors.
 COUNTS = (4, 5, 8, 12, 14)
+KEYS = (
+    "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model", "distortion_coefficients",
+    "rectification_matrix", "projection_matrix", "fisheye_model", READOUT,
+)  # fmt: skip
+"""Keys of a calibration that are read."""
+BLOCK_LIST = re.compile(r"^(( *)data: *)\n((?:\2 *- *[-+.\w]+ *\n)+)", re.MULTILINE)
+ITEM = re.compile(r"^ *- *([-+.\w]+)", re.MULTILINE)
+"""A list of numbers, one on a line, and one of them."""
+NAME_LINE = re.compile(r"^(camera_name:[ \t]+)([^\s\"'\[{][^\n\"#]*?)[ \t]*$", re.MULTILINE)
+OTHER_LINE = re.compile(rf"^(?!(?:{'|'.join(KEYS)})\b)\w+:[ \t]+[^\s\[{{|>&!][^\n]*\n", re.MULTILINE)
+"""A name without quotes, and a value on one line whose key is not read."""
 WANTED = (
     "Give YAML with image_width, image_height, camera_matrix and distortion_coefficients, as OpenCV or ROS writes it."
 )
@@ -46,6 +57,8 @@ def parsed(text: str) -> Calibration:
     if "fisheye_model" in keys and not (root.getNode("fisheye_model").isInt() and not _int(root, "fisheye_model")):
         raise ValueError("the camera was calibrated as a fisheye: calibrate it without CALIB_FISHEYE.")
     K = _matrix(root, "camera_matrix", (3, 3))
+    if not K.any():
+        raise ValueError("camera_matrix is all 0, as of a camera that is not calibrated: calibrate it first.")
     if K[0, 1] or K[1, 0] or not np.array_equal(K[2], [0.0, 0.0, 1.0]):
         raise ValueError("camera_matrix must be (fx 0 cx; 0 fy cy; 0 0 1): calibrate without skew.")
     for key, shape in (("rectification_matrix", (3, 3)), ("projection_matrix", (3, 4))):
@@ -67,12 +80,19 @@ def _opened(text: str) -> cv2.FileStorage:
     deep = np.cumsum([(sign in "[{") - (sign in "]}") for sign in text])
     if deep.max(initial=0) > DEEPEST or re.search(r"^[ \t]*(?:[^\n]*:)?(?:[ \t]*-[ \t]){2}", text, re.MULTILINE):
         raise ValueError(f"its lists are nested too deeply. {WANTED}")
+    text = _needed(text)
     if not text.startswith("%YAML"):
         text = "%YAML:1.0\n---\n" + re.sub(r"\A\s*---[ \t]*\n", "", text)
     try:
         return cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     except (cv2.error, SystemError) as error:  # the second is how a failing constructor shows
         raise ValueError(f"it is no YAML that OpenCV reads: set lists in brackets, or indent them. {WANTED}") from error
+
+
+def _needed(text: str) -> str:
+    """The text as OpenCV's parser takes it: lists in brackets, names in quotes, and no key that is not read."""
+    text = BLOCK_LIST.sub(lambda found: f"{found[1]}[{', '.join(ITEM.findall(found[3]))}]\n", text)
+    return OTHER_LINE.sub("", NAME_LINE.sub(r'\1"\2"', text))
 
 
 def _int(root: cv2.FileNode, key: str) -> int:
@@ -132,12 +152,10 @@ def _readout(root: cv2.FileNode, keys: list[str]) -> float:
 
 
 def _name(root: cv2.FileNode, keys: list[str]) -> str:
-    """The camera's name; a number is one too."""
+    """The camera's name."""
     if "camera_name" not in keys:
         return ""
     node = root.getNode("camera_name")
-    if node.isInt():
-        return str(_int(root, "camera_name"))
     if not node.isString():
         raise ValueError("camera_name must be text: put it into quotes.")
     return node.string()

@@ -132,7 +132,7 @@ def _given(args: argparse.Namespace) -> dict[str, float | str]:
 
 def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
     if args.labels is None:
-        for name in ("brain", "tumour", "convention", "tumour_in", *PART_LABELS, *SEPTA, "regions"):
+        for name in ("brain", "tumour", "convention", "tumour_in", "axes", *PART_LABELS, *SEPTA, "regions"):
             if getattr(args, name):
                 option = name.replace("_", "-")
                 raise InputError(

@@ -187,7 +187,7 @@ def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
         raise InputError("--intrinsics belongs to a camera: give it by --camera.")
     wanted = "Give the K.json that `sulcus calibrate` wrote beside the camera."
     with read_as(path, "a covariance of intrinsics", wanted):
-        stored = json.loads(path.read_text(encoding="utf-8"))
+        stored = json.loads(path.read_text(encoding="utf-8-sig"))
         covariance, values = np.array(stored["covariance"], float), np.array(stored["values"], float)
         if covariance.shape != (9, 9) or not np.isfinite(covariance).all() or not (np.diag(covariance) >= 0.0).all():
             raise InputError(f"its covariance is none of nine parameters. {wanted}")

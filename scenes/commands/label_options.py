@@ -34,6 +34,7 @@ def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None
     parser.add_argument(
         "--tumour-in", type=Path, metavar="FILE", help="the file in which the tumour is marked, on a grid of its own"
     )
+    add_axes(parser)
     for name, number in PART_LABELS.items():
         counts = "tumour" if name == "necrosis" else "brain"
         parser.add_argument(
@@ -52,6 +53,14 @@ def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None
     )  # fmt: skip
 
 
+def add_axes(parser: argparse._ActionsContainer) -> None:
+    """Declare --axes, of NIfTI files that do not state their orientation."""
+    parser.add_argument(
+        "--axes", default="", metavar="RAS",
+        help="directions of the axes of NIfTI files with neither sform nor qform, such as RAS or LPS",
+    )  # fmt: skip
+
+
 def labels(text: str) -> tuple[Label, ...]:
     """Numbers and names with commas between them, for argparse."""
     found = tuple(int(part) if part.strip().isdecimal() else part.strip() for part in text.split(","))
@@ -63,7 +72,14 @@ def labels(text: str) -> tuple[Label, ...]:
 def sources_of(args: argparse.Namespace) -> Sources:
     """The files and labels that the options name."""
     return Sources(
-        args.labels, args.brain or (), args.tumour or (), args.convention, args.mask, args.tumour_in, _parts(args)
+        args.labels,
+        args.brain or (),
+        args.tumour or (),
+        args.convention,
+        args.mask,
+        args.tumour_in,
+        _parts(args),
+        args.axes,
     )
 
 
@@ -87,5 +103,6 @@ def label_words(args: argparse.Namespace) -> list[str]:
         "--tumour-in": args.tumour_in,
         **{f"--{name}": ",".join(map(str, found)) for name, found in _parts(args).items()},
         "--regions": ",".join(args.regions) or None,
+        "--axes": args.axes or None,
     }
     return [f"{name}={value}" for name, value in given.items() if value is not None]

@@ -14,6 +14,7 @@ from sim.errors import InputError
 
 from .demo import add_trajectory, scene_asked
 from .json_line import json_line
+from .label_options import add_axes
 from .outputs import add_force
 from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
 
@@ -52,6 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--image", type=Path, nargs="+", action="extend", default=[], metavar="T1.nii.gz",
         help="images of the patient, in the space of the labels that the anatomy was made from",
     )  # fmt: skip
+    add_axes(parser)
     parser.add_argument(
         "--labels", type=Path, nargs="+", action="extend", default=[], metavar="LABELS.nii.gz",
         help="label maps, likewise: no label is mixed with another",
@@ -99,7 +101,9 @@ def run(args: argparse.Namespace) -> int:
     out = claimed_warp(args.out, args.force)
     theatre = open_theatre(args.anatomy, None, args.device)
     scene = None if args.located else scene_of(args, theatre)
-    pictures = [read_picture(path, theatre.anatomy, path in args.labels) for path in (*args.image, *args.labels)]
+    pictures = [
+        read_picture(path, theatre.anatomy, path in args.labels, args.axes) for path in (*args.image, *args.labels)
+    ]
     for picture in pictures:
         for warning in picture.warnings:
             print(f"{picture.path}: {warning}", file=sys.stderr)

@@ -184,7 +184,7 @@ def load_plan(name: str) -> Plan:
     with read_as(path, "a plan", "A plan is text in UTF-8."):
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"is longer than a plan may be, {MOST_BYTES:,} bytes. Leave out what is no plan.")
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     plan = plan_from(text, path.stem, path.parent)
     return replace(plan, own={each: digest_beside(plan, each) for each in _own_anatomies(plan.contents)})
 

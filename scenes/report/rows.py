@@ -164,7 +164,7 @@ FORMER_NAMES = {"teacher": "own_fem", "taught": "loads"}
 def _kept(path: Path, digest: str) -> Row | None:
     """The row in a file, if it is there, whole, and of the same inputs."""
     try:
-        stored = json.loads(path.read_text())
+        stored = json.loads(path.read_text(encoding="utf-8-sig"))
         row = {FORMER_NAMES.get(name, name): value for name, value in stored["row"].items()}
         return msgspec.convert(row, Row) if stored["digest"] == digest else None
     except (OSError, ValueError, LookupError, TypeError):

@@ -35,7 +35,7 @@ def read_calibration(path: str | Path) -> Calibration:
         if path.exists() and not path.is_file():
             raise InputError(f"is no file. {WANTED}")
         with path.open("rb") as file:
-            text = file.read(4 * LONGEST_TEXT + 1).decode("utf-8")
+            text = file.read(4 * LONGEST_TEXT + 1).decode("utf-8-sig")
         try:
             return parsed(text)
         except ValueError as error:
@@ -54,7 +54,7 @@ def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
     if not beside.is_file() or beside.stat().st_size > LONGEST_TEXT:
         return None
     with read_as(beside, "a covariance of `sulcus calibrate`", "Remove it, or calibrate the camera anew."):
-        stored = json.loads(beside.read_text(encoding="utf-8"))
+        stored = json.loads(beside.read_text(encoding="utf-8-sig"))
         if not isinstance(stored, dict) or not str(stored.get("format", "")).startswith(INTRINSICS):
             return None
         covariance = np.array(stored["covariance"], float)

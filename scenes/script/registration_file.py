@@ -42,7 +42,7 @@ def read_registration(path: str | Path) -> Registration:
     with read_as(path, "a registration", WANTED):
         if path.stat().st_size > LARGEST:
             raise InputError(f"is larger than a registration. {WANTED}")
-        stored = json.loads(path.read_text(encoding="utf-8"))
+        stored = json.loads(path.read_text(encoding="utf-8-sig"))
         if stored.get("format") != FORMAT:
             raise InputError(f"its format is not {FORMAT!r}. {WANTED}")
         T, covariance, centre = (

@@ -173,7 +173,7 @@ def read_uncertainties(path: Path) -> dict[str, Uncertainty]:
     if not path.is_file():
         return {}
     with read_as(path, "uncertainties", "Delete it, and make it anew by `sulcus uncertainty`."):
-        stored = json.loads(path.read_text())
+        stored = json.loads(path.read_text(encoding="utf-8-sig"))
         if stored.get("format") != FORMAT:
             raise InputError(f"its format is not {FORMAT!r}: delete it, and make it anew by `sulcus uncertainty`.")
         return {name: _read(row) for name, row in stored["scenes"].items()}

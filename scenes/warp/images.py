@@ -11,7 +11,10 @@ from nibabel.arrayproxy import ArrayProxy
 from scipy import ndimage
 
 from sim.anatomy import Anatomy
+from sim.bodies.label_map import are_whole
+from sim.bodies.nifti import load_nifti
 from sim.bodies.volume import READERS, Volume, read_volume
+from sim.bodies.voxels import Voxels
 from sim.errors import InputError
 from sim.fields.grid import Grid
 from sim.fields.warp_fields import WarpFields
@@ -53,7 +56,7 @@ class Warped:
     gone: int
 
 
-def read_picture(path: Path, anatomy: Anatomy, labels: bool) -> Picture:
+def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> Picture:
     """Read an image, or a label map, that shows the brain of an anatomy.
 
     Raises
@@ -61,10 +64,10 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool) -> Picture:
     InputError
         As `read_volume`; an image that shows none of this brain; labels that are not whole numbers.
     """
-    volume = read_volume(path, finite=False)
+    volume = read_volume(path, Voxels(axes=axes), finite=False)
     image = _as_nifti(path, volume)
     values = volume.values
-    if labels and not np.array_equal(values, np.rint(values)):
+    if labels and not are_whole(values):
         raise InputError(f"{path}: holds values that are not whole, so it is no label map. Give it by --image.")
     if shown(volume.affine, values.shape, anatomy) == 0.0:
         low, high = (1e3 * end for end in (anatomy.mesh.nodes.min(axis=0), anatomy.mesh.nodes.max(axis=0)))
@@ -78,9 +81,8 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool) -> Picture:
 
 def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
     """The image as its NIfTI file has it; of another format, the same values in the same place, whole ones whole."""
-    image = nibabel.load(path) if path.name.lower().endswith((".nii", ".nii.gz")) else None
-    if isinstance(image, nibabel.Nifti1Image):
-        return image
+    if path.name.lower().endswith((".nii", ".nii.gz")):
+        return load_nifti(path)
     values = np.nan_to_num(volume.values)
     with np.errstate(invalid="ignore"):
         whole = [kind for kind in WHOLE if np.array_equal(values, values.astype(kind))]

@@ -16,7 +16,7 @@ from .label_map import Label, LabelMap, Mask, listed, on_border, read_labels, wi
 from .one_space import in_one_space
 from .placement import side_of
 from .volume import read_volume
-from .voxels import Grid
+from .voxels import OF_BRAINS, Grid, Voxels
 
 # Share of what is labelled that may lie outside of a mask without a word.
 OUTSIDE = 0.01
@@ -45,6 +45,8 @@ class Sources:
     parts
         Labels of other tissues by name of `PART_LABELS` or `SEPTA`, in place of the convention's. Necrosis counts as
         tumour, and all else as brain.
+    axes
+        Directions of the axes of NIfTI files that state none, such as RAS.
     """
 
     labels: Path
@@ -54,6 +56,12 @@ class Sources:
     mask: Path | None = None
     tumour_in: Path | None = None
     parts: Mapping[str, tuple[Label, ...]] = field(default_factory=dict)
+    axes: str = ""
+
+    @property
+    def voxels(self) -> Voxels:
+        """Voxels that the files may have."""
+        return Voxels(axes=self.axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +80,8 @@ class HeadMasks:
         Voxels of the brain on the border of a file that has a grid of its own.
     grids
         Of the files that were read.
+    voxels
+        Voxels that a scan of the head may have.
     parts
         Other tissues by name, as `Sources.parts`, or as a convention tells them.
     affine
@@ -89,6 +99,7 @@ class HeadMasks:
     cut: int = 0
     parts: dict[str, np.ndarray] = field(default_factory=dict)
     grids: tuple[Grid, ...] = ()
+    voxels: Voxels = OF_BRAINS
 
 
 def head_masks(sources: Sources) -> HeadMasks:
@@ -103,7 +114,7 @@ def head_masks(sources: Sources) -> HeadMasks:
     """
     convention = _convention(sources)
     _demand_named(sources, convention)
-    whole = read_labels(sources.labels)
+    whole = read_labels(sources.labels, sources.voxels)
     brain, tumour = _meant(whole, sources, convention)
     marked = {} if sources.mask else {"brain": whole.mask(brain)}
     marked |= {} if sources.tumour_in else {"tumour": whole.mask(tumour)}
@@ -148,6 +159,7 @@ def head_masks(sources: Sources) -> HeadMasks:
             Grid(Path(sources.labels), whole.layers.shape[:3], whole.affine),
             *(one.grid for name, one in others.items() if name != NECROSIS),
         ),
+        sources.voxels,
     )
 
 
@@ -242,10 +254,10 @@ def _others(sources: Sources, tumour: Sequence[Label]) -> dict[str, Mask]:
     """What other files mark."""
     others = {}
     if sources.mask:
-        volume = read_volume(sources.mask)
+        volume = read_volume(sources.mask, sources.voxels)
         others["brain"] = Mask(Path(sources.mask), volume.values != 0, volume.affine, volume.notes)
     if sources.tumour_in:
-        second, necrosis = read_labels(sources.tumour_in), sources.parts.get(NECROSIS, ())
+        second, necrosis = read_labels(sources.tumour_in, sources.voxels), sources.parts.get(NECROSIS, ())
         whole = second.mask((*tumour, *necrosis) if tumour else ())
         several = not tumour and len(second.labels) > 1
         said = listed(sorted(second.labels))

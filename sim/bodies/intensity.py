@@ -13,6 +13,7 @@ from ..errors import InputError
 from ..geometry.tetmesh import TetMesh
 from ..runtime.atomic_files import written_whole
 from .volume import read_volume
+from .voxels import OF_BRAINS, Voxels
 
 HEADER = 348  # bytes of NIfTI
 # Grey values that differ by less than this share of them are one.
@@ -142,7 +143,7 @@ def is_sidecar(path: str | Path) -> bool:
         return SIGNED in file.read(HEADER)
 
 
-def read_intensity(path: str | Path) -> Intensity:
+def read_intensity(path: str | Path, voxels: Voxels = OF_BRAINS) -> Intensity:
     """Read a volume of grey values: what `write_intensity` wrote, or a patient's scan.
 
     Raises
@@ -150,5 +151,5 @@ def read_intensity(path: str | Path) -> Intensity:
     InputError
         A file that is missing, unreadable, or not a volume. Voxels without a number are kept.
     """
-    volume = read_volume(path, finite=False)
+    volume = read_volume(path, voxels, finite=False)
     return Intensity(volume.values, volume.affine)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +14,10 @@ from scipy import ndimage
 from ..errors import InputError
 from ..runtime.file_limits import MOST_VOXELS
 from .volume import read_volume
-from .voxels import Grid, Segment
+from .voxels import OF_BRAINS, Grid, Segment, Voxels
+
+# Difference of a label from a whole number that a slope of the file or a resampling leaves.
+ROUND_OFF = 1e-3
 
 Label = int | str
 """A number, or what the file calls it."""
@@ -84,16 +88,27 @@ class LabelMap:
             raise InputError(f"{self.path}: {wrong}. Choose from {self._choice()}.")
         for label, at in zip(labels, found, strict=True):
             if len(at) > 1:
-                names = ", ".join(sorted(one.name for one in self.segments if (one.layer, one.value) in at))
-                raise InputError(f"{self.path}: several segments have the label {label}: name one of {names}.")
+                raise InputError(f"{self.path}: several segments {self._several(label, at)}.")
         return [at[0] for at in found]
 
     def _place(self, label: Label) -> list[tuple[int, int]]:
         if isinstance(label, int):
             return [(layer, label) for layer, present in enumerate(self.present) if label in present]
-        alike = [one for one in self.segments if one.name == label]
-        alike = alike or [one for one in self.segments if one.name.casefold() == label.casefold()]
+        composed = {one: unicodedata.normalize("NFC", one.name) for one in self.segments}
+        wanted = unicodedata.normalize("NFC", label)
+        alike = [one for one, name in composed.items() if name == wanted]
+        alike = alike or [one for one, name in composed.items() if name.casefold() == wanted.casefold()]
         return [(one.layer, one.value) for one in alike if one.value in self.present[one.layer]]
+
+    def _several(self, label: Label, at: list[tuple[int, int]]) -> str:
+        """Words about segments at some places that one label means, and what to give in its place."""
+        if isinstance(label, int):
+            names = ", ".join(sorted(one.name for one in self.segments if (one.layer, one.value) in at))
+            return f"have the label {label}: name one of {names}"
+        numbers = sorted(value for _, value in at)
+        clear = all(len(self._place(number)) == 1 for number in numbers)
+        remedy = f"give its number, of {', '.join(map(str, numbers))}" if clear else "rename all but one in 3D Slicer"
+        return f"are called {label}: {remedy}"
 
     def _choice(self) -> str:
         if self.segments:
@@ -101,25 +116,32 @@ class LabelMap:
         return listed(sorted(self.labels))
 
 
-def read_labels(path: str | Path) -> LabelMap:
-    """The label map in a file.
+def read_labels(path: str | Path, voxels: Voxels = OF_BRAINS) -> LabelMap:
+    """The label map in a file; values within 1e-3 of whole numbers are rounded, with a note.
 
     Raises
     ------
     InputError
         What `read_volume` refuses; values that are not whole, or all 0.
     """
-    volume = read_volume(path, layered=True)
-    values = volume.values
+    volume = read_volume(path, voxels, layered=True)
+    values, notes = volume.values, volume.notes
     if values.dtype.kind == "f":
         whole = np.rint(values)
-        if not np.array_equal(values, whole) or np.abs(whole).max() > 2**31 - 1:
+        if not are_whole(values) or np.abs(whole).max() > 2**31 - 1:
             raise InputError(f"{path}: holds fractions, so it is no label volume. Give whole-number labels.")
+        if not np.array_equal(values, whole):
+            notes = (*notes, f"its labels are rounded by up to {np.abs(values - whole).max():.1g}")
         values = whole.astype(np.int32)
     if not values.any():
         raise InputError(f"{path}: is empty, every voxel is 0. Export the labels again.")
     layers = values if values.ndim == 4 else values[..., None]
-    return LabelMap(Path(path), layers, volume.affine, volume.notes, volume.segments)
+    return LabelMap(Path(path), layers, volume.affine, notes, volume.segments)
+
+
+def are_whole(values: np.ndarray) -> bool:
+    """Return True if all values are whole numbers but for round-off of a scale."""
+    return bool((np.abs(values - np.rint(values)) <= ROUND_OFF).all())
 
 
 def listed(labels: Sequence[Label]) -> str:

@@ -91,7 +91,7 @@ def masked_subject(
             known = ", ".join(one for one in PART_LABELS if one in masks.parts) or "none"
             own = f", or name its labels by --{name}" if name in PART_LABELS else ""
             raise InputError(f"{masks.name}: marks no {name}, so it is no region. Choose from {known}{own}.")
-    intensity = None if t1 is None else read_intensity(t1)
+    intensity = None if t1 is None else read_intensity(t1, masks.voxels)
     if t1 is not None and intensity is not None:
         scan = Grid(path_of(t1), intensity.values.shape, intensity.affine)
         demand_scan_of(Mask(Path(masks.name), masks.brain, masks.affine), scan, masks.grids)

@@ -63,7 +63,7 @@ def read_markup(path: str | Path) -> Markup:
     with read_as(path, "markups of 3D Slicer", REMEDY):
         if path.stat().st_size > LARGEST:
             raise InputError(f"{path}: is too large for markups. {REMEDY}")
-        text = path.read_bytes().decode("utf-8")
+        text = path.read_bytes().decode("utf-8-sig")
         kind, system, placed = _fcsv(text) if path.name.lower().endswith(".fcsv") else _json(text)
         if system not in SIGNS:
             said = f"its coordinate system is {system!r}" if system else "it does not state its coordinate system"

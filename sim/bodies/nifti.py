@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,9 +10,10 @@ import numpy as np
 
 from ..errors import InputError
 from ..runtime.file_limits import MOST_VOXELS
-from .voxels import PIECE, REMEDY, SURPLUS, Volume, Voxels
+from .voxels import PIECE, REMEDY, SURPLUS, Volume, Voxels, held, opened
 
 if TYPE_CHECKING:
+    from nibabel.fileholders import FileHolder
     from nibabel.freesurfer.mghformat import MGHImage
     from nibabel.nifti1 import Nifti1Image
 
@@ -29,13 +29,9 @@ def read_nifti(path: Path, voxels: Voxels) -> Volume:
         Another file, one that ends before its voxels do or that declares too many, a slope that is no number. nibabel's
         own exceptions of a damaged one.
     """
-    import nibabel
-
-    image = nibabel.load(path)
-    if not isinstance(image, nibabel.Nifti1Image):
-        raise InputError(f"{path}: is no NIfTI volume in one file. {REMEDY}")
-    with image.file_map["image"].get_prepare_fileobj("rb") as file:
-        header = type(image.header).from_fileobj(file)  # the image's own has forgotten them
+    image = load_nifti(path)
+    with opened(path) as file:
+        header = type(image.header).from_fileobj(file, check=False)  # the image's own has forgotten slope and size
     slope, shift = float(header["scl_slope"]), float(header["scl_inter"])
     _demand_few(path, image.shape)
     if not math.isfinite(slope) or not math.isfinite(shift):
@@ -44,9 +40,40 @@ def read_nifti(path: Path, voxels: Voxels) -> Volume:
             "again."
         )
     needed = int(header["vox_offset"]) + math.prod(image.shape) * header.get_data_dtype().itemsize
-    _demand_held(path, needed, path.name.lower().endswith(".gz"))
+    _demand_held(path, needed)
     metre = METRES.get(str(image.header.get_xyzt_units()[0]), 1e-3)
-    return Volume(np.asanyarray(image.dataobj), _affine(image, metre), _assumed(image, metre, voxels.same_place))
+    affine, notes = _placed(path, image, metre, voxels)
+    size = np.asarray(header["pixdim"], np.float64)[1:4]
+    if image.header["sform_code"] == 0 and not (size > 0.0).all():
+        raise InputError(f"{path}: its voxel size is {size} (pixdim): every edge must be above 0.")
+    return Volume(np.asanyarray(image.dataobj), affine, notes)
+
+
+def load_nifti(path: Path) -> Nifti1Image:
+    """The image of a NIfTI file of one part, packed or not, whatever its name says.
+
+    Raises
+    ------
+    InputError
+        Another file. nibabel's own exceptions of a damaged one.
+    """
+    import nibabel
+    from nibabel.imageglobals import LoggingOutputSuppressor
+
+    with opened(path) as file:
+        start = file.read(348)
+    two = start[4:8] in (b"n+2\0", b"ni2\0")
+    if not two and start[344:348] != b"n+1\0":
+        raise InputError(f"{path}: is no NIfTI volume in one file. {REMEDY}")
+    with LoggingOutputSuppressor():  # remarks on fields that are repaired
+        return (nibabel.Nifti2Image if two else nibabel.Nifti1Image).from_file_map({"image": _holder(path)})
+
+
+def _holder(path: Path) -> FileHolder:
+    from nibabel.fileholders import FileHolder
+
+    given = held(path)
+    return FileHolder(given) if isinstance(given, str) else FileHolder(fileobj=given)
 
 
 def read_mgh(path: Path, voxels: Voxels) -> Volume:
@@ -60,14 +87,13 @@ def read_mgh(path: Path, voxels: Voxels) -> Volume:
     """
     import nibabel
 
-    image = nibabel.MGHImage.from_filename(path)
+    image = nibabel.MGHImage.from_file_map({"image": _holder(path)})
     header = image.header
     shape = tuple(map(int, image.shape))
     _demand_few(path, shape)
     needed = header.get_data_offset() + math.prod(shape) * header.get_data_bytespervox()
-    packed = path.name.lower().endswith(".mgz")
-    _demand_held(path, needed, packed)
-    with gzip.open(path) if packed else path.open("rb") as file:
+    _demand_held(path, needed)
+    with opened(path) as file:
         flag = file.read(30)[28:]  # nibabel's own header has an orientation always
     if flag != b"\x00\x01":
         raise InputError(
@@ -90,10 +116,10 @@ def _demand_few(path: Path, shape: tuple[int, ...]) -> None:
         raise InputError(f"{path}: has {voxels:.3g} voxels, and {MOST_VOXELS:.3g} are the most. Resample it.")
 
 
-def _demand_held(path: Path, needed: int, packed: bool) -> None:
+def _demand_held(path: Path, needed: int) -> None:
     """Refuse a file that has fewer bytes than it declares: no memory is taken before."""
     held = 0
-    with gzip.open(path) if packed else path.open("rb") as file:
+    with opened(path) as file:
         while piece := file.read(PIECE):  # to its end, where gzip has its checksum
             held += len(piece)
             if held > needed + SURPLUS:
@@ -102,19 +128,44 @@ def _demand_held(path: Path, needed: int, packed: bool) -> None:
         raise InputError(f"{path}: ends after {held:,} of {needed:,} bytes. Copy or export it again.")
 
 
-def _assumed(image: Nifti1Image, metre: float, same: float) -> tuple[str, ...]:
-    """What had to be assumed about the place of an image whose affine is in units of `metre` [m]."""
+def _placed(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Affine (4, 4) to metres (RAS) of an image whose affine is in units of `metre` [m], and a note on a doubt.
+
+    Raises
+    ------
+    InputError
+        An image that does not state its orientation, unless `voxels` do; axes that are none.
+    """
     sform = image.get_sform(coded=True)[0]
     try:
         qform = image.get_qform(coded=True)[0]
     except ValueError:  # no rotation is stored there; where the sform is good, nibabel does not look at it
         qform = None
     if sform is None and qform is None:
-        return ("has neither sform nor qform: its axes are taken to point right, anterior and superior",)
+        return _turned(path, image, metre, voxels.axes), ()
     if sform is None or qform is None:
-        return ()
+        return _affine(image, metre), ()
     corners = np.stack([*np.ndindex(2, 2, 2)]) * (np.array(image.shape[:3]) - 1)
     apart = metre * np.linalg.norm(corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3], axis=1).max()
-    if apart <= same:
-        return ()
-    return (f"its sform and qform place it up to {apart * 1e3:.3g} mm apart: the sform is taken",)
+    note = f"its sform and qform place it up to {apart * 1e3:.3g} mm apart: the sform is taken"
+    if np.linalg.det(sform[:3, :3]) * np.linalg.det(qform[:3, :3]) < 0.0:
+        note = "its sform and qform mirror each other: left and right are swapped in one of them. The sform is taken"
+    return _affine(image, metre), (note,) if apart > voxels.same_place else ()
+
+
+def _turned(path: Path, image: Nifti1Image, metre: float, axes: str) -> np.ndarray:
+    """Affine (4, 4) to metres of a volume about its middle, whose axes point as the letters `axes` say."""
+    if not axes:
+        raise InputError(
+            f"{path}: has neither sform nor qform, so nobody knows where left is. Export it with its orientation, or "
+            "state where its axes point, such as --axes RAS or --axes LPS."
+        )
+    rows = [next((row for row, ends in enumerate(("LR", "PA", "IS")) if letter in ends), 3) for letter in axes.upper()]
+    if sorted(rows) != [0, 1, 2]:
+        raise InputError(f"axes {axes!r} are no directions: give three letters such as RAS or LPS.")
+    affine = np.eye(4)
+    affine[:3, :3] = 0.0
+    for axis, (row, letter) in enumerate(zip(rows, axes.upper(), strict=True)):
+        affine[row, axis] = metre * float(image.header.get_zooms()[axis]) * (1.0 if letter in "RAS" else -1.0)
+    affine[:3, 3] = -0.5 * affine[:3, :3] @ (np.array(image.shape[:3]) - 1)
+    return affine

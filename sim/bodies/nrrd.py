@@ -79,7 +79,7 @@ def read_nrrd(path: Path, voxels: Voxels) -> Volume:
 
 def _header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]:
     """Fields by their names in lower case, and keys of the writer's own; the file is then at its voxels."""
-    if not re.fullmatch(rb"NRRD000[1-5]\s*", file.readline(LONGEST)):
+    if not re.fullmatch(rb"(\xef\xbb\xbf)?NRRD000[1-5]\s*", file.readline(LONGEST)):
         raise InputError(f"{path}: does not begin as an NRRD file does. {REMEDY}")
     fields, keys = {}, {}
     for _ in range(MOST_LINES):

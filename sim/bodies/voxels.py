@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import lzma
+from collections.abc import Callable
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +20,8 @@ LPS = np.array([-1.0, -1.0, 1.0])
 """What makes RAS of LPS, and the other way."""
 # What lies behind the voxels and is read for the checksum after them [bytes], and what is read at once.
 SURPLUS, PIECE = 2**24, 2**20
+# Bytes of a file whose name does not say how it is packed: it is unpacked in memory.
+MOST_UNPACKED = 2**31
 
 
 @dataclass(frozen=True)
@@ -26,11 +34,14 @@ class Voxels:
         [m] Edges: no scanner of a brain resolves less, and larger voxels do not show its surface.
     same_place
         [m] An sform and a qform that place a voxel less far apart differ by round-off.
+    axes
+        Directions of the axes of a NIfTI file that states none, such as RAS or LPS; empty: it is rejected.
     """
 
     finest: float = 1e-5
     coarsest: float = 6e-3
     same_place: float = 1e-3
+    axes: str = ""
 
 
 OF_BRAINS = Voxels()
@@ -75,6 +86,35 @@ class Grid:
     path: Path
     shape: tuple[int, ...]
     affine: np.ndarray
+
+
+def opened(path: Path) -> Any:
+    """A file opened at its first byte, unpacked as its content says, whatever it is called.
+
+    Raises
+    ------
+    InputError
+        An archive of several files.
+    """
+    return _opener(path)(path, "rb")
+
+
+def held(path: Path) -> str | BytesIO:
+    """What nibabel opens a file by: its name where that says how the content is packed, else its unpacked bytes."""
+    named = gzip.open if path.name.lower().endswith(("gz", "mgz")) else open
+    if _opener(path) is named:
+        return str(path)
+    with opened(path) as file:
+        return BytesIO(file.read(MOST_UNPACKED))
+
+
+def _opener(path: Path) -> Callable[..., Any]:
+    with path.open("rb") as file:
+        start = file.read(4)
+    if start == b"PK\3\4":
+        raise InputError(f"{path}: is a ZIP archive: unpack it, and give the file in it.")
+    packers = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zX": lzma.open}
+    return next((opener for magic, opener in packers.items() if start.startswith(magic)), open)
 
 
 def checked(path: Path, volume: Volume, voxels: Voxels, finite: bool, layered: bool) -> Volume:

@@ -53,6 +53,10 @@ def demand_small(path: Path, most: int) -> bool:
         raise InputError(f"its header_type is {headed!r}. Write it anew with {' or '.join(WORDS)}.")
     opener = OPENERS.get(root.get("compressor", ""))
     if opener is None:
+        if root.get("compressor"):
+            raise InputError(
+                f"its arrays are packed by {root.get('compressor')}, and {', '.join(OPENERS)} are read. Write it so."
+            )
         return False
     word = np.dtype(WORDS[headed]).newbyteorder(">" if root.get("byte_order") == "BigEndian" else "<")
     raw = behind is not None

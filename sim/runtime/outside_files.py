@@ -70,6 +70,8 @@ def _reason(error: BaseException) -> str:
             return "its text is nested too deeply"
         case OSError(errno=int(number)) if number > 0:
             return os.strerror(number)[0].lower() + os.strerror(number)[1:]
+        case UnicodeDecodeError():
+            return "it is no text in UTF-8"
         case EOFError():
             return "it ends too early"
         case OSError() if found := CUT_OFF.search(str(error)):

@@ -43,7 +43,7 @@ def load_tissue(path: str | Path, digest: str) -> FittedTissue:
         A file that is missing, none of this version, damaged, or of another anatomy.
     """
     with read_as(path, "fitted tissue", "Make it anew by `sulcus fit`."):
-        stored = json.loads(Path(path).read_text())
+        stored = json.loads(Path(path).read_text(encoding="utf-8-sig"))
         if stored["format"] != FORMAT or stored["skull"] != list(SKULLS):
             raise InputError(f"{path}: is no fitted tissue of this version: make it anew by `sulcus fit`.")
         if stored["anatomy"] != digest:

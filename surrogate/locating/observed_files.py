@@ -43,6 +43,10 @@ def _points(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarra
     return 1e-3 * np.column_stack([columns[name] for name in names])
 
 
+NAMES = ("label", "name", "id")
+"""Columns that name a point, and that are passed over."""
+
+
 def read_columns(
     path: str | Path,
     allowed: set[tuple[str, ...]],
@@ -75,7 +79,7 @@ def read_columns(
         raise InputError(f"{path}: is empty: give a table with the header {known}.")
     first = rows.pop(0)[1]
     header = tuple(cell.strip().lower() for cell in first)
-    wanted = set(header) if blank is None else set().union(*allowed).intersection(header)
+    wanted = set(header).difference(NAMES) if blank is None else set().union(*allowed).intersection(header)
     if wanted not in map(set, allowed) or len(set(header)) < len(header):
         raise InputError(
             f"{path}: its first line is {','.join(first)[:80]!r}: give the header {known}, with commas between."
