@@ -12,6 +12,7 @@ from sim.bodies.markups import read_markup
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.placement import within_outline
 from sim.errors import InputError
+from surrogate.locating.observed_files import read_observation
 
 RADIUS = 55.0  # [mm] of the brain of `ball`, round the origin
 
@@ -42,6 +43,16 @@ def curve(count=9, wide=30.0, high=18.0, over=(0.0, 0.0, 1.0)):
 def test_coordinates_are_of_the_system_that_is_stated_or_else_of_slicers(tmp_path, system):
     found = read_markup(markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0], [1.0, 2.0, 3.0]], "Line", system))
     np.testing.assert_allclose(found.points, [[0.01, 0.02, 0.03], [0.001, 0.002, 0.003]])
+
+
+def test_markup_and_table_that_begin_with_a_mark_are_read(tmp_path):
+    """Editors of Windows begin UTF-8 with a byte order mark; a table may name its points."""
+    path = markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0]])
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    table = tmp_path / "p.csv"
+    table.write_bytes(b"\xef\xbb\xbflabel,x,y,z\nF-1,10,20,30\n")
+    for points in (read_markup(path).points, read_observation(table).now):
+        np.testing.assert_allclose(points, [[0.01, 0.02, 0.03]])
 
 
 def fcsv(path, system, *rows, end="\n"):

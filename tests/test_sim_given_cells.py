@@ -146,3 +146,40 @@ def test_vtu_packed_with_lz4_says_so(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"vtkZLibDataCompressor", b"vtkLZ4DataCompressor"))
     with pytest.raises(InputError, match="its arrays are packed by vtkLZ4DataCompressor, and vtkZLib"):
         read_mesh(path)
+
+
+GMSH_41 = """$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$Entities
+0 0 0 2
+1 0 0 0 1 1 1 1 1 0
+2 0 0 0 1 1 1 {} 0
+$EndEntities
+$Nodes
+1 5 1 5
+3 1 0 5
+1\n2\n3\n4\n5
+0 0 0
+0.1 0 0
+0 0.1 0
+0 0 0.1
+0 0 -0.1
+$EndNodes
+$Elements
+2 2 1 2
+3 1 4 1
+1 1 2 3 4
+3 2 4 1
+2 1 3 2 5
+$EndElements
+"""
+
+
+def test_gmsh_groups_of_some_volumes_only_are_rejected(tmp_path: Path) -> None:
+    path = tmp_path / "a.msh"
+    path.write_text(GMSH_41.format("1 2"))
+    assert read_mesh(path).mesh.region.tolist() == [1, 2]
+    path.write_text(GMSH_41.format("0"))
+    with pytest.raises(InputError, match="its `gmsh:physical` is given of some cells only: put every volume into a"):
+        read_mesh(path)

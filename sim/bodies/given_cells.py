@@ -17,6 +17,8 @@ from ..geometry.tetmesh import FACES, TetMesh
 # Beginnings of meshio's names of volume cells.
 VOLUMES = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron", "VTK_LAGRANGE_TETRA", "VTK_LAGRANGE_HEXA",
            "VTK_LAGRANGE_WEDGE", "VTK_LAGRANGE_PYRAMID")  # fmt: skip
+# Cells of which each may be a region; of more cells, a number for each is an index.
+FEW = 8
 # Nodes closer than this share of the body's size are one.
 COINCIDENT = 1e-9
 # Smallest barycentric coordinate of a point that lies inside a tetrahedron, not on its border.
@@ -140,7 +142,7 @@ def regions_of(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]
             raise InputError("cell data `region` must be one whole number for each tetrahedron.")
         return region, ()
     stored = {name: _whole(np.concatenate([on[number] for number in blocks])) for name, on in raw.cell_data.items()}
-    varied = {name: one for name, one in stored.items() if one is not None and 1 < len(np.unique(one)) < len(one)}
+    varied = {name: one for name, one in stored.items() if one is not None and _parts(one)}
     if "gmsh:physical" in varied:
         varied.pop("gmsh:geometrical", None)  # the entities that the groups are made of
     groups = {name: np.atleast_1d(value) for name, value in raw.field_data.items()}
@@ -153,6 +155,12 @@ def regions_of(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]
         said = ", ".join(f"`{one}`" for one in varied)
         raise InputError(f"its cell data {said} may each be its regions: call the right one `region`.")
     return _named(region, names, f"cell data `{name}`")
+
+
+def _parts(values: np.ndarray) -> bool:
+    """Return True if whole numbers (T,) part the cells, and do not number them."""
+    count = len(np.unique(values))
+    return count > 1 and (count < len(values) or count <= FEW)
 
 
 def _whole(values: np.ndarray) -> np.ndarray | None:

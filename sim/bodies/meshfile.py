@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext, redirect_stderr, redirect_stdout
@@ -70,7 +71,15 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
         with warnings.catch_warnings(), nullcontext() if counted else at_most(limits.largest):
             warnings.simplefilter("ignore")
             demand_own(path, limits)
-            raw = meshio.read(path)
+            try:
+                raw = meshio.read(path)
+            except ValueError as error:
+                found = re.match(r"Incompatible cell data '([^']+)'", str(error))
+                if found is None:
+                    raise
+                raise InputError(
+                    f"its `{found[1]}` is given of some cells only: put every volume into a group, and save it again."
+                ) from error
     with read_as(path, "a mesh", remedy):
         return _taken(path, raw, UNITS[unit])
 

@@ -14,6 +14,8 @@ from sim.runtime.outside_files import path_of, read_as
 from .observation import Observation
 
 PLACE, MOTION, SIGMA = ("x", "y", "z"), ("dx", "dy", "dz"), "sigma"
+NAMES = ("label", "name", "id")
+"""Columns that name a point, and that are passed over."""
 # Rows, characters of a line, and numbers beyond which a file is no list of points.
 MOST_ROWS, LONGEST_LINE, LARGEST = 1_000_000, 1000, 1e9
 
@@ -41,10 +43,6 @@ def read_observation(path: str | Path, tips: str | Path | None = None) -> Observ
 def _points(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
     """Columns [mm] as points (n, 3) [m]."""
     return 1e-3 * np.column_stack([columns[name] for name in names])
-
-
-NAMES = ("label", "name", "id")
-"""Columns that name a point, and that are passed over."""
 
 
 def read_columns(
