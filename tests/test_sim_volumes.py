@@ -208,7 +208,7 @@ def test_segments_are_called_by_their_names(tmp_path):
         volume_subject(path, ("Whole brain", "tumour"), ("Tumour",))
 
 
-def test_segments_of_one_name_are_told_apart_by_numbers(tmp_path):
+def test_segments_of_one_name_need_numbers(tmp_path):
     affine, places = grid()
     named = segments(("Brain", 0, 1), ("Tumou\u0301r", 0, 4), ("Tumo\u00far", 0, 3))
     labels = head(places)
