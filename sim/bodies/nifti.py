@@ -63,6 +63,8 @@ def load_nifti(path: Path) -> Nifti1Image:
     with opened(path) as file:
         start = file.read(348)
     two = start[4:8] in (b"n+2\0", b"ni2\0")
+    if not two and 348 not in (int.from_bytes(start[:4], "little"), int.from_bytes(start[:4], "big")):
+        raise ValueError("no header of NIfTI")
     if not two and start[344:348] != b"n+1\0":
         raise InputError(f"{path}: is no NIfTI volume in one file. {REMEDY}")
     with LoggingOutputSuppressor():  # remarks on fields that are repaired
