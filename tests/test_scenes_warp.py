@@ -1,5 +1,6 @@
 """A warp as others read it: SimpleITK, pynrrd, slicerio and trimesh; and what is refused."""
 
+import hashlib
 import json
 import struct
 from xml.etree import ElementTree
@@ -233,6 +234,7 @@ def test_markups_and_figures(out):
     assert [point["label"] for point in markup["controlPoints"]][:2] == ["tumour, in the scan", "tumour, now"]
     report = json.loads((out / "warp.json").read_text())
     assert set(report["files"]) | {"warp.json"} == {path.name for path in out.iterdir()}
+    assert report["sha256"] == {one: hashlib.sha256((out / one).read_bytes()).hexdigest() for one in report["files"]}
     text = (out / "README.txt").read_text()
     assert "Not a medical device" in text and "RAS" in text and "nothing folds" in text
 

@@ -1,6 +1,10 @@
 """What `sulcus warp` is asked for: loads, moments of scenes, images as they come; what it refuses, and how."""
 
+import inspect
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import nibabel
@@ -12,7 +16,9 @@ from scenes.cli import main
 from scenes.warp.images import read_picture, warped_values, write_warped
 from scenes.warp.output_folder import FORMAT, own_files, written_warp
 from sim.bodies.meshfile import write_anatomy, write_mesh
+from sim.errors import InputError
 from sim.fields.warp_fields import warp_fields
+from sim.runtime.atomic_files import partial_path
 
 
 def dimple(nodes, depth=4e-3):
@@ -282,11 +288,59 @@ def test_a_list_of_files_that_names_others_is_not_believed(tmp_path):
         listed = {"format": FORMAT, "files": ["README.txt", name]}
         (folder / "warp.json").write_text(json.dumps(listed))
         assert own_files(folder) == set()
-        with written_warp(folder) as place:
+        with written_warp(folder, force=True) as place:
             (place / "README.txt").write_text("new")
         assert other.read_text() == "mine"
     (folder / "warp.json").write_text(json.dumps({"format": FORMAT, "files": ["README.txt", "old.stl"]}))
     (folder / "old.stl").write_text("old")
-    with written_warp(folder) as place:
+    with written_warp(folder, force=True) as place:
         (place / "warp.json").write_text("{}")
     assert [path.name for path in folder.iterdir()] == ["warp.json"]
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from scenes.warp.output_folder import written_warp
+left, replace = int(sys.argv[2]), Path.replace
+def dying(path, target):
+    global left
+    left -= 1
+    return os._exit(9) if left < 0 else replace(path, target)
+Path.replace = dying
+with written_warp(Path(sys.argv[1])) as place:
+    write(place, "new")
+"""
+NAMES = ("README.txt", "a.stl", "warp.json")
+
+
+def write(place, text):
+    for name in NAMES:
+        (place / name).write_text(json.dumps({"format": FORMAT, "files": NAMES[:2]}) if name == "warp.json" else text)
+
+
+@pytest.mark.parametrize("renames", range(len(NAMES) + 1))
+def test_warp_killed_between_renames_never_seems_whole(renames, tmp_path):
+    folder = tmp_path / "a[b]"
+    with written_warp(folder) as place:
+        write(place, "old")
+        (place / "gone.stl").write_text("old")
+        (place / "warp.json").write_text(json.dumps({"format": FORMAT, "files": [*NAMES, "gone.stl"]}))
+    code = f"import json\nFORMAT, NAMES = {FORMAT!r}, {NAMES}\n{inspect.getsource(write)}{KILLED}"
+    done = subprocess.run([sys.executable, "-c", code, folder, str(renames)], check=False)
+    assert done.returncode == 9
+    texts = {(folder / name).read_text() for name in NAMES[:2] if (folder / name).exists()}
+    assert not (folder / "warp.json").exists() or texts == {"old"}
+    with written_warp(folder) as place:  # all of it is known to be a warp's, so that nothing asks for --force
+        write(place, "newest")
+    assert {path.name for path in folder.iterdir()} == set(NAMES) and (folder / "a.stl").read_text() == "newest"
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_warp_while_another_run_writes_is_rejected(tmp_path):
+    folder = tmp_path / "out"
+    other = partial_path(folder).with_name(partial_path(folder).name.replace(str(os.getpid()), str(os.getppid())))
+    other.mkdir()
+    with pytest.raises(InputError, match=r"another `sulcus warp` is writing"), written_warp(folder):
+        pytest.fail("entered")
+    assert list(tmp_path.iterdir()) == [other]

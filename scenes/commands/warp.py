@@ -92,31 +92,31 @@ def run(args: argparse.Namespace) -> int:
     from ..script.shipped_files import template_path
     from ..warp.export import Asked, write_warp
     from ..warp.images import read_picture
-    from ..warp.output_folder import claimed_warp
+    from ..warp.output_folder import written_warp
     from ..warp.spacing import steps_of
 
     demand_options(args)
     if args.scene is not None:
         demand_scene(args.scene)
-    out = claimed_warp(args.out, args.force)
-    theatre = open_theatre(args.anatomy, None, args.device)
-    scene = None if args.located else scene_of(args, theatre)
-    pictures = [
-        read_picture(path, theatre.anatomy, path in args.labels, args.axes) for path in (*args.image, *args.labels)
-    ]
-    for picture in pictures:
-        for warning in picture.warnings:
-            print(f"{picture.path}: {warning}", file=sys.stderr)
-    moment, sequence = moments(args, theatre, scene)
-    source = (args.anatomy or template_path()).name
-    spacing = None if args.spacing is None else 1e-3 * args.spacing
-    total = steps_of(spacing) + 2 + len(pictures) + bool(sequence)
-    with tqdm(total=total, unit="part", desc="fields, files", file=sys.stderr) as bar:
-        asked = Asked(spacing, args.interpolation, source, bar.update)
-        report = write_warp(out, moment, pictures, asked, sequence)
+    with written_warp(args.out, args.force) as place:
+        theatre = open_theatre(args.anatomy, None, args.device)
+        scene = None if args.located else scene_of(args, theatre)
+        pictures = [
+            read_picture(path, theatre.anatomy, path in args.labels, args.axes) for path in (*args.image, *args.labels)
+        ]
+        for picture in pictures:
+            for warning in picture.warnings:
+                print(f"{picture.path}: {warning}", file=sys.stderr)
+        moment, sequence = moments(args, theatre, scene)
+        source = (args.anatomy or template_path()).name
+        spacing = None if args.spacing is None else 1e-3 * args.spacing
+        total = steps_of(spacing) + 2 + len(pictures) + bool(sequence)
+        with tqdm(total=total, unit="part", desc="fields, files", file=sys.stderr) as bar:
+            asked = Asked(spacing, args.interpolation, source, bar.update)
+            report = write_warp(place, moment, pictures, asked, sequence)
     for warning in report["warnings"]:
         print(f"sulcus warp: {warning}", file=sys.stderr)
-    print(json_line({**report, "out": str(out)}) if args.json else sentences(report, out))
+    print(json_line({**report, "out": str(args.out)}) if args.json else sentences(report, args.out))
     wrong = "" if report["converged"] else "the answer did not converge"
     if report["fields_fold"]:
         wrong = "space folds, see README.txt"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from .markups import write_markups
 from .meshes import mesh_of, write_glb, write_stl, write_vtp
 from .moment import Moment
 from .nrrd_files import write_field_nrrd, write_field_sequence
-from .output_folder import FORMAT, LISTED, written_warp
+from .output_folder import FORMAT, LISTED
 from .places import Folded, Places, folds_of, places_of
 from .readme import page
 from .segmentation import write_segmentation
@@ -54,41 +55,48 @@ class Asked:
 
 
 def write_warp(
-    folder: Path, moment: Moment, pictures: Sequence[Picture], asked: Asked, sequence: Sequence[tuple[float, Moment]]
+    place: Path, moment: Moment, pictures: Sequence[Picture], asked: Asked, sequence: Sequence[tuple[float, Moment]]
 ) -> dict[str, Any]:
-    """Write a moment as files of other programs, and moments of a `sequence` with their times [s]; return the figures.
+    """Write a moment into the folder that `written_warp` yields, and moments of a `sequence` with their times [s].
+
+    Returns the figures.
 
     Raises
     ------
     InputError
-        As `written_warp` and `fields_of`; a sequence that is too long.
+        As `fields_of`; a sequence that is too long.
     """
     begun = process_time()
     fields = fields_of(moment, asked.spacing, asked.step)
     seconds = process_time() - begun
-    with written_warp(folder) as place:
-        write_field_nifti(place / "field_resampling.nii.gz", fields.grid, fields.backward)
-        write_field_nrrd(place / "field_modeling.nrrd", fields.grid, fields.forward, "modeling")
+    write_field_nifti(place / "field_resampling.nii.gz", fields.grid, fields.backward)
+    write_field_nrrd(place / "field_modeling.nrrd", fields.grid, fields.forward, "modeling")
+    asked.step(1)
+    if sequence:
+        _write_sequence(place / "field_sequence.seq.nrrd", sequence)
         asked.step(1)
-        if sequence:
-            _write_sequence(place / "field_sequence.seq.nrrd", sequence)
-            asked.step(1)
-        warped = []
-        for picture in pictures:
-            warped.append(write_warped(place, picture, fields, asked.order))
-            asked.step(1)
-        _write_surfaces(place, moment)
-        places = places_of(moment)
-        _write_points(place, moment, places.marks)
+    warped = []
+    for picture in pictures:
+        warped.append(write_warped(place, picture, fields, asked.order))
         asked.step(1)
-        report = figures(moment, fields, places, warped, len(sequence))
-        report["fields_cpu_s"] = round(seconds, 1)
-        report["anatomy"] = {"file": asked.source, "digest": moment.anatomy.digest}
-        (place / "README.txt").write_text(page(report, warped))
-        files = sorted(path.name for path in place.iterdir())
-        report = {"format": FORMAT, "files": files, "spaces": spaces(files), **report}
-        (place / LISTED).write_text(json.dumps(report, indent=1) + "\n")
+    _write_surfaces(place, moment)
+    places = places_of(moment)
+    _write_points(place, moment, places.marks)
+    asked.step(1)
+    report = figures(moment, fields, places, warped, len(sequence))
+    report["fields_cpu_s"] = round(seconds, 1)
+    report["anatomy"] = {"file": asked.source, "digest": moment.anatomy.digest}
+    (place / "README.txt").write_text(page(report, warped))
+    files = sorted(path.name for path in place.iterdir())
+    sums = {name: _sha256(place / name) for name in files}
+    report = {"format": FORMAT, "files": files, "spaces": spaces(files), "sha256": sums, **report}
+    (place / LISTED).write_text(json.dumps(report, indent=1) + "\n")
     return report
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _write_surfaces(place: Path, moment: Moment) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import platform
 import re
@@ -236,7 +237,7 @@ def partial_path(path: Path) -> Path:
 def partials_of(path: Path) -> list[Path]:
     """The hidden names under which any process of any machine writes `path`, or has left it unfinished."""
     form = _partial_form(path.name)
-    return sorted(left for left in path.parent.glob(f".sulcus-*-{path.name}") if form.fullmatch(left.name))
+    return sorted(left for left in path.parent.glob(f".sulcus-*-{glob.escape(path.name)}") if form.fullmatch(left.name))
 
 
 def _partial_form(name: str | None) -> re.Pattern[str]:
