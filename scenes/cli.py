@@ -9,11 +9,11 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
-from importlib.metadata import version
 
 from sim.errors import InputError
 from sim.runtime.kernel_cache import ensure_writable_cache
 from sim.runtime.user_script import run_script
+from sim.runtime.versions import version_of
 
 from .commands.bench import BENCHES
 from .commands.guidance import guidance
@@ -111,7 +111,7 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
         description=__doc__,
         epilog="First steps: `sulcus demo`, then `sulcus patient --help`. Research only; not a medical device.",
     )
-    parser.add_argument("--version", action="version", version=f"sulcus {version('sulcus')}")
+    parser.add_argument("--version", action="version", version=f"sulcus {version_of('sulcus')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in COMMANDS.items():
         command = commands.add_parser(

@@ -54,7 +54,9 @@ def by_formula(body, loads, *_):
 def test_the_command_writes_what_it_says(body, folder, monkeypatch, capsys):
     monkeypatch.setattr(fit, "responses", by_formula)
     words = ["fit", str(folder / "box.vtu"), str(folder / "1.csv"), str(folder / "2.csv")]
+    (folder / "box.fit.parts").mkdir()
     assert main([*words, "--json"]) == 0
+    assert not (folder / "box.fit.parts").exists()  # what it kept in case it is stopped
     said = json.loads(capsys.readouterr().out)
     tissue = load_tissue(folder / "box.tissue.json", body.digest)
     assert said["frames"] == tissue.frames == 2 and said["ratio"]["median"] == pytest.approx(tissue.ratio[1])

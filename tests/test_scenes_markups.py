@@ -111,6 +111,7 @@ def test_what_lies_within_an_outline_is_on_its_side_of_the_head():
         ({"system": "IJK"}, "its coordinate system is 'IJK': LPS and RAS are known"),
         ({"coordinateUnits": ["m", "m", "m"]}, "and mm are read"),
         ({"points": [[0.0, np.nan, 0.0]]}, "coordinates are no numbers"),
+        ({"points": [[0.0, 1e308, 0.0]]}, "more than 10 m away: coordinates are in mm"),
         ({"points": []}, "has 0 points that are placed"),
         ({"controlPoints": 3}, "cannot be read as markups"),
     ],

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import bz2
 import resource
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
@@ -111,3 +113,27 @@ def test_lengths_are_of_the_unit_that_is_said(tmp_path: Path, unit: str, millime
     found = read_volume(volume(tmp_path / "a.nii", (edge, edge, edge), unit, 3.0 / millimetres))
     np.testing.assert_allclose(np.diag(found.affine)[:3], 1e-3, rtol=1e-6)
     assert "up to 3 mm apart" in " ".join(found.notes)
+
+
+@pytest.mark.parametrize("kind", ["uchar", "double"])
+def test_bzip2_nrrd_of_a_few_bytes_is_rejected_unread(tmp_path, kind):
+    """Few bytes may hold half a billion zeros: the sizes of header and file are compared before any is read."""
+    header = f"""NRRD0004
+type: {kind}
+dimension: 3
+space: right-anterior-superior
+sizes: 1024 1024 512
+space directions: (1,0,0) (0,1,0) (0,0,1)
+space origin: (0,0,0)
+endian: little
+encoding: bzip2
+
+"""
+    (tmp_path / "b.nrrd").write_bytes(header.encode() + 100 * bz2.compress(bytes(2**20)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="is too short for its"):
+            read_volume(tmp_path / "b.nrrd")
+        assert tracemalloc.get_traced_memory()[1] < 2**22
+    finally:
+        tracemalloc.stop()

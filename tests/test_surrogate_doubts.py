@@ -160,8 +160,22 @@ def test_a_locator_of_trials_without_the_size_of_patches_is_refused(locator, tmp
     header = json.loads(str(arrays["header"])) | {"format": "sulcus locator 3"}
     path = tmp_path / "old.npz"
     np.savez(path, **arrays | {"header": np.array(json.dumps(header)), "tried": arrays["tried"][:, 1:]})
-    with pytest.raises(InputError, match="is no locator of this version: move it away, and `sulcus locate` makes it"):
+    with pytest.raises(InputError, match=r"is no locator of this version\. Move it away, and `sulcus locate` makes it"):
         load_locator(path, locator.anatomy)
+
+
+@pytest.mark.parametrize("name", ["header", "tried", "shape", "kind", "place", "centre", "nodes"])
+def test_locator_of_another_content_than_sealed_is_rejected(locator, tmp_path, name):
+    with np.load(locator_path(template_path())) as file:
+        arrays = {name: file[name] for name in file.files}
+    if name == "header":
+        region = {"name": "tumour", "ratio": 3.0}
+        arrays["header"] = np.array(json.dumps(json.loads(str(arrays["header"])) | {"regions": [], "more": region}))
+    else:
+        arrays[name] = np.concatenate([arrays[name][1:], arrays[name][:1]]) if name != "shape" else 10.0 * arrays[name]
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(InputError, match=r"a\.npz: .* not have the digest that it states.* Move it away"):
+        load_locator(tmp_path / "a.npz", locator.anatomy)
 
 
 def test_points_on_a_few_millimetres_were_not_tried(locator, sunk):

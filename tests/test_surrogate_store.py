@@ -1,24 +1,36 @@
 """Model files from outside: bounded, believed only where a training could have made them, and refused in sentences."""
 
 import json
+import re
 import tracemalloc
 import zipfile
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from scenes.commands.companion_files import stated as stated_beside
+from scenes.commands.outputs import model_header, recognised
+from scenes.script.film_truth import read_truth
 from sim.errors import InputError
+from sim.geometry.tetmesh import digest_of
 from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import Basis
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
+from surrogate.model import kept_arrays
 from surrogate.model.conformal import GROWTH, Bound
+from surrogate.model.kept_arrays import kept_path
 from surrogate.model.learned import Part
 from surrogate.model.npz_archive import Archive
 from surrogate.model.store import load, save
 from surrogate.model.training_range import Outside
 from surrogate.training.train import train
+
+HOUSE = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +152,60 @@ def rewritten(stored, path, change):
     return path
 
 
+@pytest.mark.parametrize("change", [lambda array: 10.0 * array, lambda array: array[::-1], lambda array: array[:, :3]])
+def test_model_with_another_array_than_named_is_rejected(stored, models, box, tmp_path, change):
+    with np.load(stored) as file:
+        arrays = {name: file[name] for name in file.files}
+    modes = digest_of(models["svr"].parts[0].basis.modes)
+    np.savez(tmp_path / "model.npz", **arrays | {modes: change(arrays[modes])})
+    with pytest.raises(InputError, match=rf"its array '{modes}' has another digest: it is damaged\. Make one with"):
+        load(tmp_path / "model.npz", box)
+
+
+READERS = {
+    "header": model_header,
+    "recognised": lambda path: recognised(path, "a model of `sulcus train`"),
+    "truth": lambda path: read_truth(path, "digest", 3, 2**20),
+    "stated": stated_beside,
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_npz_that_inflates_beyond_its_limit_is_not_read(name, tmp_path):
+    """40 MB in 40 kB, in the header and in an array."""
+    many, header = np.zeros(5_000_000), np.array(json.dumps({"format": "sulcus film 1", "anatomy": "digest"}))
+    arrays = dict.fromkeys(("times", "displacement", "T_camera_scan", "T_scan_tool"), many)
+    if name != "truth":
+        header = np.array(" " * 10_000_000)
+    np.savez_compressed(tmp_path / "a.npz", header=header, **arrays)
+    tracemalloc.start()
+    try:
+        with suppress(InputError):
+            assert not READERS[name](tmp_path / "a.npz")
+        assert tracemalloc.get_traced_memory()[1] < 2**21
+    finally:
+        tracemalloc.stop()
+
+
+def test_kept_path_states_version_device_and_the_rest(tmp_path, monkeypatch):
+    first = kept_path(tmp_path, "a-", "cpu", "digest", "smoothed")
+    assert first == kept_path(tmp_path, "a-", "cpu", "digest", "smoothed") and kept_path(None, "a-", "cpu") is None
+    others = [kept_path(tmp_path, "a-", "cpu", "digest", "p2")]
+    monkeypatch.setattr(kept_arrays, "version_of", lambda name: "9.9")
+    others.append(kept_path(tmp_path, "a-", "cpu", "digest", "smoothed"))
+    monkeypatch.setattr(kept_arrays, "find_device", lambda name, precision: SimpleNamespace(on_cuda=True))
+    others.append(kept_path(tmp_path, "a-", "cuda", "digest", "smoothed"))
+    assert len({first, *others}) == 4
+
+
+def test_archives_are_opened_by_the_reader_with_limits_alone():
+    """The only others read what the same process wrote."""
+    allowed = {"npz_archive.py", "engine_process.py", "peers.py"}
+    paths = [path for room in ("sim", "surrogate", "ar", "scenes") for path in (HOUSE / room).rglob("*.py")]
+    found = {path.name for path in paths if re.search(r"np\.load\(|ZipFile\(|torch\.load\(", path.read_text())}
+    assert found == allowed
+
+
 def test_a_file_says_its_space(stored):
     assert json.loads(str(np.load(stored)["header"]))["space"] == "RAS [m]"
 
@@ -253,7 +319,7 @@ def test_arrays_that_are_larger_than_a_model_may_be_are_refused(tmp_path):
     np.savez_compressed(tmp_path / "m.npz", few=np.zeros(10), many=np.zeros(1000))
     with (tmp_path / "m.npz").open("rb") as raw:
         for most, name, count in ((1000, "few", 10), (8200, "many", 1000)):  # less than both with their heads
-            archive = Archive(raw, most)
+            archive = Archive(raw, largest=most)
             assert len(archive.arrays([name])[name]) == count
             with pytest.raises(InputError, match="MB are the most"):
                 archive.arrays(["few", "many"])

@@ -7,7 +7,6 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +15,7 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
+from sim.runtime.versions import version_of
 
 from .child_process import HOUSE, Ended, run_to_end
 from .figure_readings import number_at
@@ -32,7 +32,7 @@ def version_here() -> str:
     """The version of sulcus with a digest of its code, which changes while the version stays."""
     paths = sorted(path for room in ("ar", "scenes", "sim", "surrogate") for path in (HOUSE / room).rglob("*.py"))
     code = b"\0".join(path.relative_to(HOUSE).as_posix().encode() + b"\0" + path.read_bytes() for path in paths)
-    return f"{version('sulcus')} (code {digest_of(np.frombuffer(code, np.uint8))})"
+    return f"{version_of('sulcus')} (code {digest_of(np.frombuffer(code, np.uint8))})"
 
 
 @dataclass(frozen=True)

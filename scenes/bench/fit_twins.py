@@ -12,13 +12,13 @@ from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.bodies.fluid_level import fluid_level
 from sim.bodies.open_cortex import open_cortex
+from sim.discretisation.space import recommended
 from sim.effects import Effect, Elasticity, Gravity, Held, ToolForce
 from sim.fem import Fem
 from sim.geometry.locate import locate
-from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Posture, Pushed
 from surrogate.data.tool_loads import draw as drawn_loads
-from surrogate.model.npz_archive import kept_arrays
+from surrogate.model.kept_arrays import kept_arrays, kept_path
 
 from .locate_twins import LEFT, PROBABLE, RATIO, SKULLS, STIFFNESS, TILT, check_same, ogden
 
@@ -152,8 +152,8 @@ def patients(
 
 def _kept(finer: Anatomy, loads: Loads, patient: Patient, device: str, folder: Path | None) -> np.ndarray:
     """Motions (frames, V, 3) [m] of a patient's own mesh, from the folder if they are there; (0, V, 3): none."""
-    stated = digest_of(np.frombuffer(repr((finer.digest, patient)).encode(), np.uint8))
-    path = None if folder is None else folder / f"patient-{patient.number:04d}-{stated}.npz"
+    stated = finer.digest, recommended(finer.mesh), patient, ACCURACY
+    path = kept_path(folder, f"patient-{patient.number:04d}-", device, *stated)
 
     def solved() -> dict[str, np.ndarray]:
         answer = Fem(finer, effects_of(patient), ACCURACY, device).deform(loads)

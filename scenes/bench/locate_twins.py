@@ -17,11 +17,10 @@ from sim.elements import RECOMMENDED
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.locate import locate
-from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Posture, Pushed
 from sim.material import MATERIALS, Ogden
 from surrogate.data.tool_loads import draw as drawn_loads
-from surrogate.model.npz_archive import kept_arrays
+from surrogate.model.kept_arrays import kept_arrays, kept_path
 
 CAUSES = ("tool", "drainage", "swelling", "drainage and tool")
 """What moves twins, one after the other: each takes part in a quarter of them, or in half."""
@@ -188,8 +187,7 @@ def check_same(body: Anatomy, finer: Anatomy) -> None:
 
 def _kept(anatomy: Anatomy, draw: Draw, device: str, element: str, folder: Path | None) -> np.ndarray | None:
     """The motion of a twin's own mesh, from the folder if it is there, of the same draw."""
-    stated = digest_of(np.frombuffer(repr((anatomy.digest, draw, element)).encode(), np.uint8))
-    path = None if folder is None else folder / f"twin-{draw.number:04d}-{stated}.npz"
+    path = kept_path(folder, f"twin-{draw.number:04d}-", device, anatomy.digest, element, draw)
 
     def made() -> dict[str, np.ndarray]:
         found = solved(anatomy, draw, device, element)

@@ -7,7 +7,6 @@ import platform
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import date
-from importlib.metadata import version
 
 import numpy as np
 import warp as wp
@@ -16,6 +15,7 @@ from sim.accuracy import LIVE, TRAIN
 from sim.fem import Fem
 from sim.resected_fem import Operated
 from sim.runtime.device import find_device
+from sim.runtime.versions import version_of
 from surrogate.data.tool_loads import draw
 
 from ..play.deformers import Theatre
@@ -109,7 +109,7 @@ def machine(device: str) -> str:
             names += [line.split(":")[1].strip() for line in file if line.startswith("model name")][:1]
     except OSError:
         names.append(platform.processor())
-    versions = ", ".join(f"{name} {version(name)}" for name in ("sulcus", "warp-lang", "torch", "numpy"))
+    versions = ", ".join(f"{name} {version_of(name)}" for name in ("sulcus", "warp-lang", "torch", "numpy"))
     return (
         f"{' / '.join(names)}, {os.cpu_count()} cores; Python {platform.python_version()}, {versions}; {date.today()}"
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from sim.errors import InputError
 from sim.runtime.atomic_files import unfinished_path
 
-from .outputs import HEAD, model_header
+from .outputs import head_of, model_header
 
 # What of a data set must stay as it was for a run to go on with it.
 KEPT = ("anatomy", "effects", "tissue", "element", "accuracy", "preset", "seed", "shape")
@@ -26,7 +26,7 @@ def stated(path: Path) -> dict[str, str]:
         if h5py.is_hdf5(path):
             with h5py.File(path, "r") as file:
                 return {name: str(value) for name, value in file.attrs.items()}
-        head = path.read_bytes()[:HEAD].decode("latin-1")  # the journal of an unfinished run: its first record is JSON
+        head = head_of(path).decode("latin-1")  # the journal of an unfinished run: its first record is JSON
         return {name: str(value) for name, value in json.JSONDecoder().raw_decode(head[head.index("{") :])[0].items()}
     except (OSError, ValueError, LookupError, AttributeError, zipfile.BadZipFile):
         return {}

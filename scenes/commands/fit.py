@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -87,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
         parts = Path(args.anatomy).with_suffix(".fit.parts")
         tissue = fit_tissue(locator, frames, args.device, parts, progress, left_out)
     save_tissue(out, tissue)
+    shutil.rmtree(parts, ignore_errors=True)
     if args.json:
         print(json_line({**_numbers(tissue, out), "outliers": [each.tolist() for each in left_out]}))
     else:

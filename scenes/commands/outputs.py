@@ -114,8 +114,7 @@ def _without_trace(path: Path) -> Iterator[None]:
 
 def _names(path: Path) -> set[bytes]:
     """Names of the arrays of a `.vtu` file; none of any other file."""
-    content = path.read_bytes()
-    return set(re.findall(rb'Name="([^"]*)"', content)) if b"<VTKFile" in content[:HEAD] else set()
+    return set(re.findall(rb'Name="([^"]*)"', path.read_bytes())) if b"<VTKFile" in head_of(path) else set()
 
 
 def _is_solution(path: Path) -> bool:
@@ -153,14 +152,20 @@ def model_header(path: Path) -> dict:
     OSError, ValueError, LookupError, zipfile.BadZipFile
         A file that is none.
     """
-    import numpy as np
+    from surrogate.model.npz_archive import Archive
 
-    with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-        return dict(json.loads(str(file["header"])))
+    with path.open("rb") as raw:
+        return dict(json.loads(Archive(raw).text("header")))
+
+
+def head_of(path: Path) -> bytes:
+    """The first bytes of a file; no more are read."""
+    with path.open("rb") as file:
+        return file.read(HEAD)
 
 
 def _begins(words: bytes) -> Callable[[Path], bool]:
-    return lambda path: words in path.read_bytes()[:HEAD]
+    return lambda path: words in head_of(path)
 
 
 def _is_picture(path: Path) -> bool:

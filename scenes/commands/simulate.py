@@ -7,7 +7,6 @@ import json
 import sys
 from contextlib import ExitStack
 from functools import partial
-from importlib.metadata import version
 
 import h5py
 import numpy as np
@@ -25,6 +24,7 @@ from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.device import device_names
 from sim.runtime.memory import Budget
 from sim.runtime.timing import stage
+from sim.runtime.versions import version_of
 from sim.tools import Ball, BuiltIn, Capsule, Spatula
 from surrogate.data.crew import Asked, solving
 from surrogate.data.dataset import read_outcomes
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
             "seed": str(args.seed),
             **({} if tool is None else {"shape": repr(tool)}),
             **({"history": HISTORY} if tool is not None and tissue.prony else {}),
-            **{f"{name} version": version(name) for name in ("sulcus", "warp-lang", "numpy")},
+            **{f"{name} version": version_of(name) for name in ("sulcus", "warp-lang", "numpy")},
         }
         if args.force:
             remove_data(out, {**provenance, "anatomy": anatomy.digest})

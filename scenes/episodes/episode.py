@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from hashlib import sha256
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from sim.fem import Fem
 from sim.loads import Loads, Posture, Pushed, Resected, Retracted, Touching
 from sim.resected_fem import Operated
 from sim.runtime.atomic_files import demand_space, written_stream
+from sim.runtime.versions import version_of
 from surrogate.data.stated_tissue import stating
 from surrogate.model.guarded import model_of
 from surrogate.model.learned import Learned
@@ -351,7 +351,7 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, r
             "height": camera.height,
             "depth_scale_m": DEPTH_SCALE,
             "segmentation": ", ".join(f"{label} {name}" for label, name in NAMES.items()) + ", 0 nothing",
-            "sulcus_version": version("sulcus"),
+            "sulcus_version": version_of("sulcus"),
             "solved_every": recording.solved_every or 1,
             **recording.stated,
         }

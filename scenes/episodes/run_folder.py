@@ -13,11 +13,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import remove_left_overs, why, written_whole
+from sim.runtime.versions import version_of
 
 FORMAT = "sulcus run 1"
 PLAN, RUN, FAILED, BODIES, RATES = "plan.toml", "run.json", "failed", "bodies", "rates"
@@ -60,7 +60,7 @@ class Failure:
 @cache
 def versions_here() -> Mapping[str, str]:
     """The versions of this process's packages."""
-    return {name: version(name) for name in PARTS}
+    return {name: version_of(name) for name in PARTS}
 
 
 def episode_name(number: int) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Pushed
 from sim.runtime.device import find_device
+from sim.runtime.versions import version_of
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.disc_split import Split, leave_discs_out
@@ -154,5 +154,6 @@ class Study:
     def digest(self) -> str:
         """Hash of what every answer here depends on."""
         data = self.dataset
-        stated = repr((sorted(data.provenance.items()), self.loads, self.beyond, self.fine, version("sulcus")))
+        on = "cuda" if self.on_card else "cpu"
+        stated = repr((sorted(data.provenance.items()), self.loads, self.beyond, self.fine, on, version_of("sulcus")))
         return digest_of(np.frombuffer(stated.encode(), np.uint8), data.good, *vars(self.pushed).values())

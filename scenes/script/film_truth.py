@@ -11,7 +11,9 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
+from sim.runtime.file_limits import LARGEST_FILM
 from sim.runtime.outside_files import path_of, read_as
+from surrogate.model.npz_archive import Archive
 
 FORMAT = "sulcus film 1"
 WANTED = "Give the truth.npz that `sulcus film` wrote."
@@ -60,8 +62,8 @@ def write_truth(path: Path, truth: Truth) -> None:
         )
 
 
-def read_truth(path: str | Path, anatomy: str, vertices: int) -> Truth:
-    """The truth in a file, of a body with this digest and so many vertices on its tumour's surface.
+def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LARGEST_FILM) -> Truth:
+    """The truth in a file, of a body with this digest and so many vertices on its tumour's surface; `largest` [bytes] of its arrays.
 
     Raises
     ------
@@ -69,14 +71,15 @@ def read_truth(path: str | Path, anatomy: str, vertices: int) -> Truth:
         A file that is missing or no such truth, or of another body.
     """
     path = path_of(path)
-    with read_as(path, "what is true of a film", WANTED), np.load(path, allow_pickle=False) as file:
-        header = json.loads(str(file["header"]))
+    with read_as(path, "what is true of a film", WANTED), path.open("rb") as raw:
+        archive = Archive(raw, WANTED, largest)
+        header = json.loads(archive.text("header"))
         if header["format"] != FORMAT:
             raise InputError(f"its format is not {FORMAT!r}. {WANTED}")
         if header["anatomy"] != anatomy:
             raise InputError("is of another anatomy: give the one that was filmed, by --anatomy.")
-        times, moved = np.array(file["times"], float), np.array(file["displacement"], float)
-        cameras, tools = (np.array(file[name], float) for name in COLUMNS)
+        arrays = archive.arrays(("times", "displacement", *COLUMNS))
+        times, moved, cameras, tools = (arrays[name].astype(float) for name in ("times", "displacement", *COLUMNS))
     count = len(times)
     shapes = (times.shape, cameras.shape, tools.shape, moved.shape)
     if not count or shapes != ((count,), (count, 4, 4), (count, 4, 4), (count, vertices, 3)):

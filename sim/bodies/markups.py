@@ -12,6 +12,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from ..errors import InputError
+from ..runtime.file_limits import FARTHEST
 from ..runtime.outside_files import path_of, read_as
 
 SIGNS = {"LPS": (-1.0, -1.0, 1.0), "RAS": (1.0, 1.0, 1.0)}
@@ -73,6 +74,8 @@ def read_markup(path: str | Path) -> Markup:
         points = np.array(placed, np.float64).reshape(-1, 3)
         if not np.isfinite(points).all():
             raise InputError(f"{path}: has points whose coordinates are no numbers. {REMEDY}")
+        if np.abs(points).max() > 1e3 * FARTHEST:
+            raise InputError(f"{path}: has points more than {FARTHEST:g} m away: coordinates are in mm. {REMEDY}")
         return Markup(path, kind, 1e-3 * points * SIGNS[system])
 
 

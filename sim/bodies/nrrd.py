@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 
 from ..errors import InputError
-from ..runtime.file_limits import INFLATION, MOST_VOXELS
+from ..runtime.file_limits import INFLATION, LITTLE, MOST_VOXELS
 from .voxels import PIECE, REMEDY, SURPLUS, Segment, Volume, Voxels
 
 SIGNS = {
@@ -144,14 +144,15 @@ def _voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) 
         raise InputError(f"{path}: skips a part of itself before its voxels. {ONE_FILE}")
     coding = _field(path, fields, "encoding").lower()
     if coding in ("gzip", "gz"):
-        stream, most = gzip.GzipFile(fileobj=file), INFLATION
+        stream = gzip.GzipFile(fileobj=file)
     elif coding in ("bzip2", "bz2"):
-        stream, most = bz2.BZ2File(file), 2**20
+        stream = bz2.BZ2File(file)
     elif coding == "raw":
-        stream, most = file, 1
+        stream = file
     else:
         raise InputError(f"{path}: its voxels are coded as {coding!r}: raw, gzip and bzip2 are read. Save it so.")
-    if needed > most * path.stat().st_size:
+    size = path.stat().st_size
+    if needed > (size if stream is file else max(LITTLE * (coding[0] == "b"), INFLATION * size)):
         raise InputError(f"{path}: is too short for its {needed:,} bytes of voxels. Copy or save it again.")
     held = bytearray()
     while len(held) < needed + SURPLUS and (piece := stream.read(PIECE)):  # to the end, where gzip has its checksum

@@ -11,13 +11,19 @@ from ..errors import InputError
 
 # Deflate, the packing of .npz, .nii.gz, .vtu and HDF5, makes at most 1,032 bytes of one: more is declared, not stored.
 INFLATION = 1032
+# Bytes that a small file of bzip2 may inflate to, whose packing has no limit: 512 x 512 x 512 voxels of 16 bits.
+LITTLE = 2**28
 # One array [bytes]: quadratic tetrahedra (10 numbers of 8 bytes) of the finest brain meshes in use, 10 million, take
 # 0.8 GB.
 LARGEST_ARRAY = 2 * 1024**3
 # All arrays of a model file, inflated [bytes]: the shipped one, of five learners, has 0.04 GB.
 LARGEST_MODEL = 2 * 1024**3
+# What is true of a film, inflated [bytes]: an hour at 25 images a second of a tumour of 500 vertices has 0.5 GB.
+LARGEST_FILM = 2**29
 # Text that heads a model file [bytes]: the shipped one has 0.02 MB.
 LARGEST_HEADER = 16 * 1024**2
+# Coordinates of what lies in or near a head [m].
+FARTHEST = 10.0
 # Voxels of one volume: a head of 200 mm at 0.25 mm has as many.
 MOST_VOXELS = 2**29
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import TypeVar
 
@@ -22,6 +21,7 @@ from sim.runtime.atomic_files import check_output, demand_space, unfinished_path
 from sim.runtime.outside_files import read_as
 from sim.runtime.processes import LostError
 from sim.runtime.timing import listened, stage
+from sim.runtime.versions import version_of
 
 from .answer_rows import CHECKSUM, checksums, row_type
 from .array_meanings import TITLE, explain
@@ -244,7 +244,7 @@ def _write(path: Path, work: Work, stated: Mapping[str, str], journal: Journal) 
             "tool": _tool(work.loads, stated),
             "compression": "none: packed, displacements are a sixth smaller",
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            "sulcus version": version("sulcus"),
+            "sulcus version": version_of("sulcus"),
         }
         write_provenance(file, {**facts, **stated})
         write_embedded(file, work.anatomy)

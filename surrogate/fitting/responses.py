@@ -13,6 +13,7 @@ from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.bodies.fluid_level import fluid_level
 from sim.bodies.open_cortex import open_cortex
+from sim.discretisation.space import recommended
 from sim.effects import SKULLS, Gravity, Held, ToolForce
 from sim.fem import Fem
 from sim.geometry.tetmesh import digest_of
@@ -21,7 +22,7 @@ from sim.loads import Loads, Posture, Pushed
 from ..locating.causes import SPREAD, SUPINE, USUAL, directions, linear
 from ..locating.locator import telling_nodes
 from ..locating.regions import Region, beside
-from ..model.npz_archive import kept_arrays
+from ..model.kept_arrays import kept_arrays, kept_path
 
 RATIOS = np.geomspace(0.4, 3.2, 4)
 """Stiffness of the tumour over the brain's, in the tissues that are solved."""
@@ -106,9 +107,9 @@ def _kept(
     folder: Path | None,
 ) -> np.ndarray:
     """Motions (loads, n, 3) [m] of one tissue, from the folder if they are there."""
-    numbers = [array.tobytes() for cause in loads.causes for array in vars(cause).values()]
-    stated = digest_of(np.frombuffer(b"".join([repr((anatomy.digest, tissue, ACCURACY)).encode(), *numbers]), np.uint8))
-    path = None if folder is None else folder / f"{stated}.npz"
+    numbers = [array for cause in loads.causes for array in vars(cause).values()]
+    stated = anatomy.digest, recommended(anatomy.mesh), tissue, ACCURACY, digest_of(*numbers)
+    path = kept_path(folder, "", device, *stated)
     skull, poisson, ratio, regions = tissue
     effects = (beside(linear, poisson, ratio, regions), Held(), SKULLS[skull], ToolForce(), Gravity())
 

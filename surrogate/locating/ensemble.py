@@ -11,12 +11,12 @@ import numpy as np
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation
+from sim.discretisation.space import recommended
 from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.geometry.tetmesh import digest_of
 
-from ..model.npz_archive import kept_arrays
+from ..model.kept_arrays import kept_arrays, kept_path
 from .causes import (
     DRAINAGE,
     OEDEMA,
@@ -98,8 +98,8 @@ def _kept(
     anatomy: Anatomy, group: Group, seed: int, device: str, causes: Causes, folder: Path | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The motions and kinds of a group, from the folder if they are there, of the same draw."""
-    stated = digest_of(np.frombuffer(repr((anatomy.digest, group, seed, causes, ACCURACY)).encode(), np.uint8))
-    path = None if folder is None else folder / f"{group.number:03d}-{stated}.npz"
+    stated = anatomy.digest, recommended(anatomy.mesh), group, seed, causes, ACCURACY
+    path = kept_path(folder, f"{group.number:03d}-", device, *stated)
     names = "motion", "kind"
     arrays = kept_arrays(
         path,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,16 @@ from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
+from sim.runtime.versions import version_of
 
-from ..model.npz_archive import Archive
+from ..model.npz_archive import Archive, seal_of
 from .causes import KINDS
 from .locator import Locator
 from .prior import NOWHERE, Prior
 from .regions import Region, check_regions
 
-FORMAT = "sulcus locator 5"
+FORMAT = "sulcus locator 6"
+REMEDY = "Move it away, and `sulcus locate` makes it anew."
 LABELS = ("kind", "skull", "place")
 ARRAYS = ("shape", *LABELS, "centre")
 
@@ -42,12 +43,13 @@ def save_locator(path: str | Path, locator: Locator) -> None:
     """
     prior = locator.prior
     header = {
-        "format": FORMAT, "anatomy": prior.anatomy.digest, "version": version("sulcus"), "kinds": KINDS,
+        "format": FORMAT, "anatomy": prior.anatomy.digest, "version": version_of("sulcus"), "kinds": KINDS,
         "whole": prior.nodes is None, "space": "RAS [m]", "regions": [asdict(one) for one in locator.regions],
     }  # fmt: skip
-    arrays = {name: getattr(prior, name) for name in _names(header)}
+    arrays = {name: getattr(prior, name) for name in _names(header)} | {"tried": locator.tried}
+    header["seal"] = seal_of(header, arrays)
     with written_whole(path, ".npz") as unfinished:
-        np.savez(unfinished, header=np.array(json.dumps(header)), tried=locator.tried, **arrays)  # pyright: ignore[reportArgumentType]
+        np.savez(unfinished, header=np.array(json.dumps(header)), **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
@@ -59,18 +61,18 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
         A file that is missing, no locator of this version, damaged, or of another anatomy.
     """
     with (
-        read_as(path, "a locator", "Give one that `save_locator` wrote, or none: `sulcus locate` makes it."),
+        read_as(path, "a locator", REMEDY),
         Path(path).open("rb") as raw,
     ):
-        archive = Archive(raw)
+        archive = Archive(raw, REMEDY)
         header = json.loads(archive.text("header"))
         if header["format"] != FORMAT or tuple(header["kinds"]) != KINDS:
-            raise InputError(f"{path}: is no locator of this version: move it away, and `sulcus locate` makes it anew.")
+            raise InputError(f"{path}: is no locator of this version. {REMEDY}")
         if header["anatomy"] != anatomy.digest:
             raise InputError(f"{path}: was made for another anatomy: give that one, or another locator.")
         regions = tuple(Region(**one) for one in header.get("regions", ()))
         check_regions(regions, anatomy)
-        arrays = archive.arrays([*_names(header), "tried"])
+        arrays = archive.sealed(header, [*_names(header), "tried"])
         _check(path, anatomy, arrays)
         tried = arrays.pop("tried")
         return Locator(Prior(anatomy, **arrays), tried, regions)
@@ -93,6 +95,4 @@ def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) ->
     for name, (low, high) in zip(LABELS, limits, strict=True):
         fits = fits and arrays[name].dtype.kind == "i" and arrays[name].min() >= low and arrays[name].max() < high
     if not fits or not all(np.isfinite(arrays[name]).all() for name in ("shape", "centre", "tried")):
-        raise InputError(
-            f"{path}: has arrays that do not fit the anatomy: move it away, and `sulcus locate` makes it anew."
-        )
+        raise InputError(f"{path}: has arrays that do not fit the anatomy. {REMEDY}")

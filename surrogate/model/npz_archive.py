@@ -2,60 +2,38 @@
 
 from __future__ import annotations
 
+import json
 import math
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
-from typing import BinaryIO, cast
+from collections.abc import Iterable, Mapping
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from numpy.lib import format as npy
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
+from sim.geometry.tetmesh import digest_of
 from sim.runtime.file_limits import LARGEST_HEADER, LARGEST_MODEL
-from sim.runtime.outside_files import read_as
 
 # Of an array's own header.
 LONGEST = 10_000
 
 
-def kept_arrays(
-    path: Path | None,
-    kind: str,
-    names: Iterable[str],
-    make: Callable[[], Mapping[str, np.ndarray]],
-    check: Callable[[Mapping[str, np.ndarray]], object] = lambda arrays: None,
-) -> Mapping[str, np.ndarray]:
-    """Arrays of some names from a file, if it is there; else they are made, and kept there. No path: only made.
-
-    `kind` is what the file holds, with its article; `check` refuses arrays that were read.
-
-    Raises
-    ------
-    InputError
-        A file that cannot be read, or that the check refuses.
-    """
-    if path is not None and path.exists():
-        with read_as(path, kind, "Delete it: it is made anew."), path.open("rb") as raw:
-            found = Archive(raw).arrays(names)
-            check(found)
-            return found
-    made = make()
-    if path is not None:
-        with written_whole(path, ".npz") as unfinished:
-            np.savez(unfinished, **made)  # pyright: ignore[reportArgumentType]
-    return made
+def seal_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+    """Digest of a file's header, but for its own `seal`, and of all its arrays."""
+    names = sorted(arrays)
+    stated = json.dumps([names, {name: value for name, value in header.items() if name != "seal"}], sort_keys=True)
+    return digest_of(np.frombuffer(stated.encode(), np.uint8), *(arrays[name] for name in names))
 
 
 class Archive:
     """The arrays of an open `.npz` file, of at most `largest` bytes together.
 
-    Reading the wrong kind of file raises what `zipfile` and NumPy raise.
+    Every message ends with a `remedy`. Reading the wrong kind of file raises what `zipfile` and NumPy raise.
     """
 
-    def __init__(self, file: BinaryIO, largest: int = LARGEST_MODEL) -> None:
-        self._zip, self._largest = zipfile.ZipFile(file), largest
+    def __init__(self, file: BinaryIO, remedy: str = "", largest: int = LARGEST_MODEL) -> None:
+        self._zip, self._remedy, self._largest = zipfile.ZipFile(file), remedy, largest
 
     def text(self, name: str) -> str:
         """An array of one text.
@@ -80,17 +58,45 @@ class Archive:
         self._demand(wanted, self._largest)
         return {name: self._array(name) for name in wanted}
 
+    def addressed(self, digests: Iterable[str]) -> dict[str, np.ndarray]:
+        """Arrays that are stored under the digest of their content.
+
+        Raises
+        ------
+        InputError
+            As `arrays`; one whose content has another digest.
+        """
+        found = self.arrays(digests)
+        for name, array in found.items():
+            if digest_of(array) != name:
+                raise self._damaged(f"its array {name!r} has another digest")
+        return found
+
+    def sealed(self, header: Mapping[str, Any], names: Iterable[str]) -> dict[str, np.ndarray]:
+        """Arrays by name that belong to a header with a `seal`.
+
+        Raises
+        ------
+        InputError
+            As `arrays`; header or arrays that are not those of the seal.
+        """
+        found = self.arrays(names)
+        if seal_of(header, found) != header["seal"]:
+            raise self._damaged("its header and arrays do not have the digest that it states")
+        return found
+
+    def _damaged(self, reason: str) -> InputError:
+        return InputError(f"{reason}: it is damaged. {self._remedy}".rstrip())
+
     def _demand(self, names: list[str], most: int) -> None:
         held = {info.filename: info for info in self._zip.infolist()}
         missing = [name for name in names if f"{name}.npy" not in held]
         if missing:
-            raise InputError(f"lacks the array {missing[0]!r}: it is damaged. Make one with `sulcus train`.")
+            raise self._damaged(f"lacks the array {missing[0]!r}")
         size = sum(held[f"{name}.npy"].file_size for name in names)
         if size > most:
-            raise InputError(
-                f"has arrays of {size / 1e6:,.0f} MB, and {most / 1e6:,.0f} MB are the most: it is no model of this "
-                "version. Make one with `sulcus train`."
-            )
+            reason = f"has arrays of {size / 1e6:,.0f} MB: {most / 1e6:,.0f} MB are the most that are read."
+            raise InputError(f"{reason} {self._remedy}".rstrip())
 
     def _array(self, name: str) -> np.ndarray:
         info = self._zip.getinfo(f"{name}.npy")
@@ -100,8 +106,6 @@ class Archive:
             read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
             shape, _, kind = read(member, max_header_size=LONGEST)
             if kind.hasobject or math.prod(shape) * kind.itemsize > info.file_size:
-                raise InputError(
-                    f"its array {name!r} is not what it says: it is damaged. Make one with `sulcus train`."
-                )
+                raise self._damaged(f"its array {name!r} is not what it says")
         with self._zip.open(info) as member:
             return cast(np.ndarray, npy.read_array(member, allow_pickle=False, max_header_size=LONGEST))

@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import path_of, read_as
+from sim.runtime.versions import version_of
 from sim.tools import stated_tool
 
 from ..data.encode import Basis
@@ -44,6 +44,7 @@ from .training_range import Envelope
 from .vetting import demand_finite, demand_sound
 
 FORMAT = "sulcus model 2"
+REMEDY = "Make one with `sulcus train`."
 REGRESSORS: dict[str, type[Regressor]] = {
     "linear": Linear,
     "pcr": Pcr,
@@ -87,7 +88,7 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
         "format": FORMAT,
         "anatomy": digests.pop(),
         "space": "RAS [m]",
-        "versions": {name: version(name) for name in ("sulcus", "numpy")},
+        "versions": {name: version_of(name) for name in ("sulcus", "numpy")},
         "models": {name: _described(model, put) for name, model in models.items()},
     }
     with written_whole(path, ".npz") as partial:
@@ -106,8 +107,8 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
     path = path_of(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; make a model with `sulcus train`.")
-    with read_as(path, "a model", "Make one with `sulcus train`."), path.open("rb") as raw:
-        archive = Archive(raw)
+    with read_as(path, "a model", REMEDY), path.open("rb") as raw:
+        archive = Archive(raw, REMEDY)
         header = json.loads(archive.text("header"))
         if header["format"] != FORMAT:
             raise InputError(f"{path}: has the format {str(header['format'])[:40]!r}, not {FORMAT!r}: train it anew.")
@@ -116,7 +117,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
                 f"{path}: was trained on the anatomy {str(header['anatomy'])[:40]}, but this one is {anatomy.digest}: "
                 "use the mesh that it was made for, or run `sulcus simulate` and `sulcus train` for this one."
             )
-        arrays = archive.arrays(_keys(header["models"].values()))
+        arrays = archive.addressed(_keys(header["models"].values()))
         models = {name: _rebuilt(description, arrays, anatomy) for name, description in header["models"].items()}
         for name, model in models.items():
             demand_sound(name, model)
@@ -155,8 +156,8 @@ def learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
 def _described_in(path: str | Path) -> Iterator[dict[str, Any]]:
     """The header of a model file; whatever fails in the block is said of the file."""
     path = path_of(path)
-    with read_as(path, "a model", "Make one with `sulcus train`."), path.open("rb") as raw:
-        yield json.loads(Archive(raw).text("header"))
+    with read_as(path, "a model", REMEDY), path.open("rb") as raw:
+        yield json.loads(Archive(raw, REMEDY).text("header"))
 
 
 def _left_out(description: dict[str, Any]) -> LeftOut | None:

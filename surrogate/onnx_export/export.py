@@ -6,7 +6,6 @@ The graph is what the model's own formulas do with wires in place of arrays: no 
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +14,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.loads import Pushed
 from sim.runtime.atomic_files import written_whole
+from sim.runtime.versions import version_of
 
 from ..data.cortex_patch import open_patch
 from ..data.encode import rooted, shared_out, tool_features
@@ -102,7 +102,7 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
     sheet.output(excess > 0.0, Port("extrapolated", np.bool_, ("B",), "outside: do not rely on it"))
     sheet.output(sheet.constant(nodes), Port("nodes", np.int64, nodes.shape, "of the mesh"))
     sheet.output(sheet.constant(rest), Port("rest", np.float32, rest.shape, "where the vertices `nodes` lie [m], RAS"))
-    return sheet.model(name, TEXT, version("sulcus"), _notes(name, model))
+    return sheet.model(name, TEXT, version_of("sulcus"), _notes(name, model))
 
 
 def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False) -> None:

@@ -19,6 +19,7 @@ from sim.loads import Pushed
 from sim.minimisers.second_order import second_order
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
+from sim.runtime.versions import version_of
 
 from ..data.cortex_patch import Patch, open_patch
 from ..data.dataset import Dataset
@@ -26,7 +27,9 @@ from ..data.encode import Basis, nodal_shares, reduce
 from ..data.stated_tissue import stated_tissue
 from ..data.tool_loads import spread
 from ..model.applicability import trained_skull
+from ..model.kept_arrays import REMADE
 from ..model.learned import Part, only_pushed
+from ..model.npz_archive import Archive
 from ..regressors.compliance_table import Linear
 from ..regressors.force_pairs import Pairs
 from ..regressors.force_series import FACTORS, SPANS, Series
@@ -217,11 +220,12 @@ class Expansion:
         """
         if self.kept is not None and self.kept.exists():
             with (
-                read_as(self.kept, "a table of the series", "Delete it: it is made anew."),
+                read_as(self.kept, "a table of the series", REMADE),
                 self.kept.open("rb") as raw,
-                np.load(raw) as file,
             ):
-                bases = [Basis(nodes, file[f"modes{k}"]) for k, nodes in enumerate(self._known)]
+                modes = [f"modes{k}" for k in range(len(self._known))]
+                file = Archive(raw, REMADE).arrays([*modes, "pairs", "second", "second_modes", "table", "seconds"])
+                bases = [Basis(nodes, file[name]) for name, nodes in zip(modes, self._known, strict=True)]
                 pairs = Pairs(file["pairs"], file["second"])
                 pair_basis = Basis(self.tumour, file["second_modes"])
                 return Tabulated(bases, file["table"], pairs, pair_basis, float(file["seconds"]))
@@ -273,7 +277,7 @@ class Expansion:
         table[few] = np.concatenate([part @ basis.modes.T for part, basis in zip(parts, bases, strict=True)], axis=-1)
         anew = True
         if len(others):
-            what = digest_of(whole.modes, self.places, self.radii)
+            what = f"{version_of('sulcus')} {digest_of(whole.modes, self.places, self.radii)}"
             kept = None if self.begun is None else KeptRows(self.begun, what)
             anew = kept is None or not kept.some
             table[others] = tabulated(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import h5py
 import numpy as np
 
 from sim.runtime.atomic_files import Stream, demand_space, written_stream
+from sim.runtime.versions import version_of
 
 from ..reading.contents import Contents
 from ..reading.open_files import opened
@@ -103,6 +103,6 @@ def environment(episodes: Sequence[Contents], rates: Sequence[float]) -> dict[st
     return {
         "env_name": "sulcus",
         "type": GYM,
-        "env_version": version("sulcus"),
+        "env_version": version_of("sulcus"),
         "env_kwargs": {"families": families, "frames_per_second": sorted(set(rates))},
     }

@@ -1,0 +1,23 @@
+"""Versions of installed packages, and the name under which package indexes know this one."""
+
+from __future__ import annotations
+
+import tomllib
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+DISTRIBUTION = "sulcus-ar"
+"""The `name` in pyproject.toml: another project owns `sulcus` on the Python Package Index."""
+
+
+@cache
+def version_of(package: str) -> str:
+    """Version of a package; "sulcus" is this one, which may be a checkout that is not installed."""
+    if package != "sulcus":
+        return version(package)
+    try:
+        return version(DISTRIBUTION)
+    except PackageNotFoundError:
+        project = Path(__file__).parents[2] / "pyproject.toml"
+        return tomllib.loads(project.read_text(encoding="utf-8"))["project"]["version"]
