@@ -166,6 +166,18 @@ def test_a_cut_shows_the_surface_the_section_and_nothing_in_the_air():
     assert of_ink(inset, EMPTY)[:8].mean() > 0.8 and not of_ink(inset, EMPTY)[-60:-20].any()
 
 
+@pytest.mark.parametrize("error", [2e-3, 6e-3])
+def test_cut_draws_its_broken_line_at_the_error(error):
+    at, ink = tumour(), key_of(ink_of(GREEN))
+    plane = plane_through(CAMERA, at.vertices.mean(axis=0), None)
+    places = plane.coordinates(np.array([[-0.03, 0.0, 0.0], [0.03, 0.0, 0.0]])), np.zeros(2, int)
+    with_line, without = (section(CAMERA, at, plane, places, (240, 180), ink, error=each) for each in (error, None))
+    inside = np.argwhere(of_ink(without, ink))
+    scale = np.ptp(inside[:, 1]) / 0.024
+    away = np.linalg.norm(np.argwhere((with_line != without).any(axis=2)) - inside.mean(axis=0), axis=1) / scale
+    assert len(away) > 40 and np.median(away) == pytest.approx(0.012 + error, abs=0.4e-3)
+
+
 def test_distances_are_signed_and_end():
     surface = tumour((0.0, 0.0, 0.0), 0.01)
     turned = replace(surface, triangles=surface.triangles[:, ::-1])

@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from ar.tracking.registration import Registration
 from scenes.bench.error_budget import (
     CLINICAL,
     LATENCY,
@@ -75,7 +77,44 @@ def test_latency_costs_what_the_camera_moves_meanwhile(filmed):
     found = errors_of(moving, [LATENCY], 20)
     np.testing.assert_allclose(found.across, 0.02 * SPEED, rtol=0.05)
     assert errors_of(replace(moving, latency=0.0), [LATENCY], 20).worst.max() < 1e-12
-    assert errors_of(replace(filmed, latency=0.02), [LATENCY], 20).worst.max() == pytest.approx(0.0, abs=1e-3)
+    assert errors_of(replace(filmed, latency=0.02), [LATENCY], 20).worst.max() < 1e-12  # nothing moves
+
+
+def test_latency_costs_what_the_tumour_moves_meanwhile(filmed):
+    sunk = replace(filmed, velocity=np.tile(SPEED * filmed.site.axis, (60, 1)), latency=0.02, clock=0.0)
+    found = errors_of(sunk, [LATENCY], 20)
+    for each in (found.middle, found.worst):
+        assert each == pytest.approx(0.02 * SPEED, rel=0.02)
+    hasty = errors_of(replace(sunk, latency=0.0, clock=0.01), [LATENCY], COUNT)  # of either sign
+    assert np.sqrt(np.mean(hasty.middle**2)) == pytest.approx(0.01 * SPEED, rel=0.1)
+    assert errors_of(sunk, [SHUTTER], 20).worst.max() < 1e-12
+
+
+def test_coverage_of_patients_with_other_bodies_is_low(filmed):
+    """Bodies that differ six times as much, that is, not those from which the band comes."""
+    alike, others = (
+        budgeted(filmed, 100, twins=replace(filmed, bodies=k * filmed.bodies), progress=lambda names: ()).held
+        for k in (1.0, 6.0)
+    )
+    assert alike is not None and others is not None and alike[0] > 0.9 and others[0] < 0.8
+    assert others[1] is not None and 0.0 < others[1] < 0.1
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_registration_errs_along_the_axes_of_the_reference(filmed, axis):
+    """The reference is turned by 90 degrees in the scan: about an axis through the tumour a turn moves no middle."""
+    T, middle = filmed.T_scan_patient.copy(), (filmed.rest + filmed.field).mean(axis=0)
+    T[:3, :3] = Rotation.from_euler("xyz", [90.0, 0.0, 90.0], degrees=True).as_matrix() @ T[:3, :3]
+    turn, shift = np.full(6, 1e-16), np.full(6, 1e-16)
+    turn[3 + axis], shift[axis] = 0.02**2, 1e-3**2
+    toward = VIEW.camera(filmed.site).T_camera_world[2, :3]
+    for apart, size in ((T[:3, axis], 0.0), (T[:3, (axis + 1) % 3], 0.02)):
+        registered = Registration(np.linalg.inv(T), np.diag(turn), middle - 0.05 * apart, 1e-3, 6)
+        found = errors_of(replace(filmed, T_scan_patient=T, registration=registered), [REGISTRATION], COUNT)
+        assert np.sqrt(np.mean(found.middle**2)) == pytest.approx(0.05 * size, rel=0.1, abs=2e-6)
+    registered = Registration(np.linalg.inv(T), np.diag(shift), middle, 1e-3, 6)
+    found = errors_of(replace(filmed, T_scan_patient=T, registration=registered), [REGISTRATION], COUNT)
+    assert np.std(found.along) == pytest.approx(1e-3 * abs(toward @ T[:3, axis]), rel=0.15, abs=2e-6)
 
 
 def test_a_rolling_shutter_costs_what_the_camera_moves_between_the_rows_of_reference_and_tumour(filmed):

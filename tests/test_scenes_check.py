@@ -143,6 +143,12 @@ class TestThePictureItself:
         sentences, figures = self.pixels(play, frames, truth, wrong)
         assert about(sentences, "outline") and figures.drawn > 2.0
 
+    def test_with_the_answer_a_millimetre_away_it_fails(self, play, frames, truth):
+        """Picture and answer agree, and both differ from the finite elements."""
+        away = shifted(frames[2], 1e-3 * play.site.right)
+        sentences, figures = self.pixels(play, frames, truth, drawn(play, away, play.positions(away.deformation)))
+        assert about(sentences, "outline") and figures.drawn > 2.0
+
     def test_of_an_earlier_frame_it_fails(self, play, frames, truth):
         late = replace(frames[2], shown=frames[1].shown)
         assert about(self.pixels(play, frames, truth, late)[0], "does not say")

@@ -7,13 +7,14 @@ import h5py
 import numpy as np
 import pytest
 from conftest import make_box
+from scipy.spatial.transform import Rotation
 
 from scenes.episodes.checksums import broken
 from scenes.episodes.families import FAMILIES, Motions
 from scenes.episodes.make import body_of, body_path, episode_path, make_body, make_episode
 from scenes.episodes.plan import load_plan, plan_from, shipped
 from scenes.episodes.scripted import drawn_episode
-from scenes.episodes.sensing import noisy
+from scenes.episodes.sensing import noisy, sensed
 from scenes.play.deformers import open_theatre
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
@@ -217,3 +218,14 @@ def test_noise_has_its_deviation_and_no_mean():
         assert abs(added.mean()) < 0.02 * deviation
     dark = noisy(np.zeros_like(grey), 40.0, np.random.default_rng(3))
     assert np.mean(dark == 0) == pytest.approx(0.5, abs=0.02)
+
+
+def test_sensed_poses_err_by_the_stated_degrees_and_millimetres():
+    columns = {name: np.tile(np.eye(4), (4000, 1, 1)) for name in ("T_world_tool", "T_camera_world")}
+    noise = {"tool_mm": 0.5, "tool_deg": 0.3, "camera_mm": 2.0, "camera_deg": 1.5}
+    found = sensed(columns | {"force": np.zeros((4000, 3))}, noise | {"force_n": 0.02}, 0, 0)
+    for name, whose in (("T_world_tool_tracked", "tool"), ("T_camera_world_tracked", "camera")):
+        turns = np.degrees(Rotation.from_matrix(found[name][:, :3, :3]).as_rotvec())
+        assert turns.std(axis=0) == pytest.approx(noise[f"{whose}_deg"], rel=0.05)
+        assert 1e3 * found[name][:, :3, 3].std(axis=0) == pytest.approx(noise[f"{whose}_mm"], rel=0.05)
+    assert found["force_read"].std(axis=0) == pytest.approx(0.02, rel=0.05)

@@ -67,7 +67,9 @@ def folder(tmp_path_factory, box):
     """An anatomy, its displacement, images on four grids with a label map each, and the warp of all."""
     folder = tmp_path_factory.mktemp("warp")
     write_anatomy(folder / "box.vtu", box)
-    covariance = np.tile([4e-6, 1e-6, 1e-6, 0.0, 0.0, 0.0], (len(box.mesh.nodes), 1))
+    # 1e-6 I + 3e-6 u u' with u along (1, 2, 3): xx, yy, zz, xy, yz, xz; its largest eigenvalue is 4e-6.
+    covariance = 1e-6 * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) + 3e-6 / 14.0 * np.array([1, 4, 9, 2, 6, 3])
+    covariance = np.tile(covariance, (len(box.mesh.nodes), 1))
     deviation = np.full(len(box.mesh.nodes), 6e-6**0.5)
     data = {"displacement": bump(box.mesh.nodes), "deviation": deviation, "covariance": covariance}
     write_mesh(folder / "located.vtu", box.mesh, data)

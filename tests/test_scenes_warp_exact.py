@@ -39,12 +39,16 @@ def fields(kinked):
 def test_the_error_of_each_part_is_that_of_the_worse_field(kinked, fields):
     places = places_of(kinked)
     errors = places.errors(fields)
-    off = replace(fields, backward=fields.backward + np.float32(1e-3))
     assert 0.05e-3 < errors[places.tumour].max() < 1e-3 and errors[places.cortex].max() < 1e-6
-    # Beside the grid there is no field.
-    held = fields.grid.index(places.rest[places.cortex])
-    inside = ((held > 0.0) & (held < np.array(fields.grid.shape) - 1)).all(axis=1)
-    assert np.allclose(places.errors(off)[places.cortex][inside], 3**0.5 * 1e-3, rtol=1e-3)
+    # No field reaches beyond the grid.
+    index = fields.grid.index(places.rest)
+    inside = ((index > 0.0) & (index < np.array(fields.grid.shape) - 1)).all(axis=1)
+    exact = inside & (errors < 1e-6)
+    assert exact.sum() > 20 and not inside[places.cortex].any()
+    for name in ("forward", "backward"):
+        off = replace(fields, **{name: getattr(fields, name) + np.float32(1e-3)})
+        assert np.allclose(places.errors(off)[exact], 3**0.5 * 1e-3, rtol=1e-3)
+        assert np.allclose(places.errors(off)[places.cortex], errors[places.cortex])
     assert places.tumour.sum() > 4 * (kinked.anatomy.mesh.region == 2).sum()
 
 

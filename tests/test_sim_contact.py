@@ -146,3 +146,22 @@ def test_a_tool_of_two_cores_is_two_tools_that_move_as_one() -> None:
 def test_a_tool_of_no_shape_is_a_sentence(cores: tuple[Core, ...], words: str) -> None:
     with pytest.raises(InputError, match=words):
         ToolContact((type("Shapeless", (), {"cores": cores})(),))
+
+
+BLADE = Spatula(0.012, 0.026, 1.5e-3)
+
+
+@pytest.mark.parametrize(
+    ("tool", "ends"),
+    [
+        (BLADE, [[0.006, 0, 1.5e-3], [0, 0.013, 1.5e-3], [0, 0, 0], [0, 0, 3e-3], [0.004, -0.01, 0]]),
+        (Capsule(3e-3, 0.02), [[0, 0, 0], [0, 0, 0.026], [3e-3, 0, 3e-3], [0, -3e-3, 0.02]]),
+        (Ball(7e-3), [[0, 0, 0], [0, 0, 0.014], [0, 7e-3, 7e-3]]),
+    ],
+)
+def test_tool_surface_lies_where_its_sizes_say(tool, ends):
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0.1, -0.2, 0.3]
+    signs = np.array([[x, y, 1.0] for x in (-1, 1) for y in (-1, 1)])
+    points = (np.array(ends)[:, None] * signs).reshape(-1, 3)
+    assert distances_to(tool, turn, points @ turn[:3, :3].T + turn[:3, 3]) == pytest.approx(0.0, abs=1e-12)

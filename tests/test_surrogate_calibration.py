@@ -8,6 +8,7 @@ from conftest import make_box
 from scipy.stats import chi2
 
 from sim.errors import InputError
+from surrogate.locating import calibration
 from surrogate.locating.calibration import (
     NEAREST,
     covering_factor,
@@ -97,6 +98,30 @@ def test_whole_groups_are_left_out_one_of_each_skull(body):
     assert turn.tolist() == [0, 0, 1, 1, 2, 0, 1, 1, -1, -1]
     with pytest.raises(InputError, match="several Poisson's ratios"):
         trials(some_members(body, [0, 0, 1], [0, 0, 1]), None)
+
+
+def test_trial_prior_lacks_the_group_of_the_trial(body, monkeypatch):
+    """A spy sees which members each prior has, and which member each trial is made of."""
+    random, group = np.random.default_rng(0), np.repeat(np.arange(6), 4)
+    motion = random.normal(scale=2e-3, size=(24, *body.mesh.nodes.shape)).astype(np.float32)
+    ensemble = Ensemble(body, motion, np.tile([0, 1], 12), group // 2, group)
+    known, made = [], []
+    monkeypatch.setattr(calibration, "prior_of", lambda ensemble, presses, mask: known.append(mask))
+
+    def middle(anatomy, moved):
+        made.append((known[-1], moved[0]))
+        return middle_of(anatomy, moved)
+
+    def unsettled(prior, observation):
+        raise InputError("no trial")
+
+    monkeypatch.setattr(calibration, "middle_of", middle)
+    monkeypatch.setattr(calibration, "settled", unsettled)
+    assert not len(trials(ensemble, None, count=40)) and len(made) == 40
+    assert [sorted(set(group[~mask])) for mask in known] == [[0, 2, 4], [1, 3, 5]]
+    for mask, moved in made:
+        share = np.linalg.lstsq(motion.reshape(24, -1).T.astype(float), moved.ravel(), rcond=None)[0]
+        assert not mask[np.abs(share) > 1e-6].any() and np.abs(share).max() > 0.5
 
 
 @pytest.mark.parametrize("times", [0.5, 1.0, 4.0])

@@ -196,6 +196,15 @@ def test_gross_errors_are_left_out_and_named(prior):
     assert off < 2.0 * without + 0.3e-3
 
 
+@pytest.mark.parametrize(("deviations", "left_out"), [(2.3, []), (4.2, [7])])
+def test_point_is_left_out_once_one_in_ten_thousand_is_so_far(prior, deviations, left_out):
+    """The root of chi-square of three numbers is 4.6 at 1e-4, and 7.9 at 1e-12; half of the error is predictable."""
+    still = seen(prior, np.zeros(prior.anatomy.mesh.nodes.shape))
+    far = np.where(still.point == 7, deviations * still.sigma / np.sqrt(3.0), 0.0)
+    found = conditioned(prior, replace(still, value=still.value + far))
+    assert found.outliers.tolist() == left_out
+
+
 def test_points_with_one_row_are_left_out_too(prior):
     """Motions along one axis only, as those of a cloud."""
     _, evidence = drawn(prior, np.random.default_rng(6))

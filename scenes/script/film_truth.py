@@ -63,7 +63,9 @@ def write_truth(path: Path, truth: Truth) -> None:
 
 
 def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LARGEST_FILM) -> Truth:
-    """The truth in a file, of a body with this digest and so many vertices on its tumour's surface; `largest` [bytes] of its arrays.
+    """The truth in a file, of a body with this digest and number of `vertices` on its tumour's surface.
+
+    Its arrays inflate to at most `largest` bytes.
 
     Raises
     ------

@@ -1,0 +1,32 @@
+"""Comparisons in tests compare something."""
+
+import numpy as np
+import pytest
+
+EMPTY, SOME = np.zeros((0, 3)), np.ones(2)
+COMPARISONS = {
+    "allclose": lambda: np.allclose(EMPTY, 1.0),
+    "array_equal": lambda: np.array_equal(EMPTY, EMPTY.copy()),
+    "assert_allclose": lambda: np.testing.assert_allclose(EMPTY, 1.0),
+    "assert_array_equal": lambda: np.testing.assert_array_equal(EMPTY, 1.0),
+    "assert_array_less": lambda: np.testing.assert_array_less(EMPTY, 1.0),
+    "a number": lambda: pytest.approx(1.0) == EMPTY,
+    "an array": lambda: pytest.approx(EMPTY) == EMPTY,
+}
+
+
+@pytest.mark.parametrize("name", COMPARISONS)
+def test_comparison_of_nothing_fails(name):
+    with pytest.raises(AssertionError, match="array without elements"):
+        COMPARISONS[name]()
+
+
+@pytest.mark.empty
+@pytest.mark.parametrize("name", COMPARISONS)
+def test_comparison_of_nothing_in_marked_test_passes(name):
+    COMPARISONS[name]()
+
+
+def test_comparison_with_written_empty_list_passes():
+    np.testing.assert_array_equal(EMPTY[:, 0], [])
+    assert not np.array_equal(EMPTY, SOME) and pytest.approx(SOME) == SOME and pytest.approx([]) == []
