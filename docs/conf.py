@@ -1,8 +1,9 @@
 """How Sphinx builds the pages: `make docs`. Nothing is fetched, neither here nor in the browser."""
 
 import sys
-from importlib.metadata import version as version_of
 from pathlib import Path
+
+from sim.runtime.versions import version_of
 
 sys.path.insert(0, str(Path(__file__).parent / "extensions"))
 

@@ -1,7 +1,7 @@
 """Three policies press on the cortex over the tumour: random, scripted, and one that is trained here in seconds.
 
 The trained one is linear in what a robot observes, and has four weights. The cross-entropy method finds them: policies
-are drawn, the best are kept, and the next are drawn about those. It needs `pip install "sulcus[gym]"`.
+are drawn, the best are kept, and the next are drawn about those. It needs `pip install -e '.[gym]'`.
 """
 
 import gymnasium

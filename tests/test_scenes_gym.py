@@ -78,7 +78,7 @@ def test_without_gymnasium_there_is_a_remedy_and_nothing_else_needs_it():
         "try:\n    import scenes.gym\nexcept sim.InputError as error:\n    print(error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert 'pip install "sulcus[gym]"' in done.stdout
+    assert "pip install -e '.[gym]'" in done.stdout
 
 
 @pytest.mark.parametrize("observation", ["states", "rgbd"])

@@ -95,7 +95,7 @@ def test_every_answer_is_judged_by_one_routine(case, judge, tmp_path):
     for row in (wrong, failing, dying):
         assert not any(answer.good for answer in row.answers)
         assert np.isnan([row.first, row.further, row.first_ratio, row.ratio]).all()
-    assert "pip install" in absent.missing and not absent.answers
+    assert "pip install -e" in absent.missing and not absent.answers
     assert "checkout" in elsewhere.missing
 
 

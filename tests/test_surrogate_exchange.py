@@ -220,4 +220,4 @@ def test_what_cannot_be_exported_is_a_sentence(folder, models, capsys, monkeypat
         onnx_model("ann", replace(models["ann"], parts=(strange,)))
     monkeypatch.setitem(sys.modules, "onnx", None)
     assert main(["export", model, "--out", out]) == 2
-    assert "pip install onnx" in capsys.readouterr().err and not (folder / "model.onnx").exists()
+    assert "pip install -e '.[onnx]'" in capsys.readouterr().err and not (folder / "model.onnx").exists()

@@ -15,7 +15,7 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
-from sim.runtime.versions import version_of
+from sim.runtime.versions import install_hint, version_of
 
 from .child_process import HOUSE, Ended, run_to_end
 from .figure_readings import number_at
@@ -92,7 +92,7 @@ def entry_of(figure: Figure, run: Run, before: Entry | None, heard: Callable[[st
 
 def _not_installed(figure: Figure) -> str:
     gone = [name for name in figure.modules if find_spec(name) is None]
-    return f"{', '.join(gone)} not installed: pip install -e '.[peers]'" if gone else ""
+    return f"{', '.join(gone)} not installed. {install_hint('peers')}" if gone else ""
 
 
 def _same(before: Entry, now: Entry) -> bool:

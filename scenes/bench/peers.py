@@ -23,6 +23,7 @@ from sim.discretisation.footprint import footprint_weights
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Pushed
 from sim.material import Material
+from sim.runtime.versions import install_hint
 from surrogate.data.tool_loads import draw
 
 from .child_process import HOUSE, package_environment
@@ -60,7 +61,7 @@ class Engine:
         if script.suffix == ".py" and not script.exists():
             return f"{script.name} is not here: run it in a checkout of the repository"
         if any(find_spec(module) is None for module in self.modules):
-            return "not installed: pip install -e '.[peers]'"
+            return f"not installed. {install_hint('peers')}"
         return ""
 
     @property

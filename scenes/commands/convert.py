@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sim.errors import InputError
+from sim.runtime.versions import install_hint
 
 from .json_line import json_line
 from .outputs import add_force, claimed
@@ -94,7 +95,7 @@ def folder_writer(name: str) -> Callable[..., dict[str, Any]]:
         try:
             from ..episodes.exports.lerobot import write_lerobot
         except ImportError as error:
-            raise InputError("--to lerobot: needs pyarrow. Install it: pip install 'sulcus[exports]'.") from error
+            raise InputError(f"--to lerobot: needs pyarrow. {install_hint('exports')}") from error
         return write_lerobot
     if name == "folder":
         from ..episodes.exports.plain_folder import write_folder

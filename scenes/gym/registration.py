@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from sim.errors import InputError
+from sim.runtime.versions import install_hint
 
 NAMESPACE = "sulcus"
 NAMES = ("Palpate", "Retract", "Debulk")
@@ -21,7 +22,7 @@ def register_environments() -> None:
     try:
         from gymnasium.envs.registration import register, registry
     except ImportError as error:
-        raise InputError('these environments need Gymnasium. Install it: pip install "sulcus[gym]".') from error
+        raise InputError(f"these environments need Gymnasium. {install_hint('gym')}") from error
     for name in NAMES:
         known = f"{NAMESPACE}/{name}-v0"
         if known not in registry:

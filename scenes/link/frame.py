@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from sim.errors import InputError
+from sim.runtime.versions import install_hint
 
 try:
     from fastcrc import crc64
 except ImportError as error:
-    raise InputError("OpenIGTLink's checksums need fastcrc. Install it: pip install 'sulcus[link]'.") from error
+    raise InputError(f"OpenIGTLink's checksums need fastcrc. {install_hint('link')}") from error
 
 HEADER = struct.Struct(">H12s20sQQQ")
 """Version, type, device name, time stamp, size of the body, checksum: 58 bytes, all numbers big-endian."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
+from ..runtime.versions import install_hint
 from .enclosed_voxels import enclosed
 from .fif import read_surface
 from .head_masks import HeadMasks
@@ -23,7 +24,7 @@ INNER_SKULL = Path("data", "fsaverage", "fsaverage-inner_skull-bem.fif")
 """Where the wheel of mne has it."""
 VOXEL = 1e-3
 """[m] The skull is put onto voxels of this edge."""
-REMEDY = 'Install it: pip install "sulcus[anatomies]".'
+REMEDY = install_hint("anatomies")
 
 
 def masked_head(mask: Path, t1: Path | None = None, volume: float | None = None) -> Healthy:

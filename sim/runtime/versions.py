@@ -11,6 +11,11 @@ DISTRIBUTION = "sulcus-ar"
 """The `name` in pyproject.toml: another project owns `sulcus` on the Python Package Index."""
 
 
+def install_hint(extra: str) -> str:
+    """Sentence that says how to install an extra of this package: from its checkout, as no index has it."""
+    return f"Install it in the checkout: pip install -e '.[{extra}]'."
+
+
 @cache
 def version_of(package: str) -> str:
     """Version of a package; "sulcus" is this one, which may be a checkout that is not installed."""

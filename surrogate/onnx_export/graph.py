@@ -9,6 +9,7 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from sim.errors import InputError
+from sim.runtime.versions import install_hint
 
 from ..array_functions import columns_in_use, halved, product_of, squared_distances, taken
 
@@ -200,7 +201,7 @@ class Sheet:
         try:
             from onnx import helper, numpy_helper
         except ImportError as error:
-            raise InputError("the package onnx is not installed: pip install onnx.") from error
+            raise InputError(f"the package onnx is not installed. {install_hint('onnx')}") from error
 
         def described(ports: list[Port]) -> list:
             kinds = [KINDS[np.dtype(port.kind)] for port in ports]
