@@ -1,6 +1,10 @@
-"""The name under which the package is installed, and names that comments and docstrings point to."""
+"""Names that point elsewhere: of the installed package, of code in docstrings and comments, of cited works."""
 
+import ast
+import builtins
+import io
 import re
+import tokenize
 import tomllib
 from pathlib import Path
 
@@ -64,3 +68,71 @@ def test_version_of_checkout_that_is_not_installed_is_the_projects(monkeypatch):
     assert version_of.__wrapped__("sulcus") == PROJECT["version"]
     with pytest.raises(versions.PackageNotFoundError):
         version_of.__wrapped__("numpy")
+
+
+FOREIGN = {
+    "onnx",
+    "TensorProto",
+    "trainbr",
+    "fitrsvm",
+    "eig3",
+    "DataLoader",
+    "PATH",
+    "cov_00",
+    "cov_55",
+    "python",
+    "_in_row",
+}
+"""Names of other programs, and parts of names."""
+
+
+def texts_and_names():
+    """Docstrings and comments of the packages with their places, and every name and word of their code."""
+    said, known = [], {*dir(builtins), *FOREIGN}
+    for path in [
+        path for room in ("sim", "surrogate", "ar", "scenes") for path in sorted((HOUSE / room).rglob("*.py"))
+    ]:
+        text, docs = path.read_text(), set()
+        tree = ast.parse(text)
+        known |= {path.stem, *path.relative_to(HOUSE).parts[:-1]}
+        for node in ast.walk(tree):
+            names = [getattr(node, kind, None) for kind in ("id", "attr", "arg", "name", "asname", "module")]
+            known |= {part for name in names if isinstance(name, str) for part in name.split(".")}
+            if (
+                isinstance(node, ast.Expr)
+                and isinstance(node.value, ast.Constant)
+                and isinstance(node.value.value, str)
+            ):
+                docs.add(node.value)
+                said.append((f"{path.relative_to(HOUSE)}:{node.lineno}", node.value.value))
+        strings = (node for node in ast.walk(tree) if isinstance(node, ast.Constant) and node not in docs)
+        known |= {word for node in strings if isinstance(node.value, str) for word in re.findall(r"\w+", node.value)}
+        tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+        said += [
+            (f"{path.relative_to(HOUSE)}:{one.start[0]}", one.string) for one in tokens if one.type == tokenize.COMMENT
+        ]
+    return said, known
+
+
+def test_names_in_backticks_exist():
+    said, known = texts_and_names()
+    found = [(place, name) for place, text in said for name in re.findall(r"(?<!`)`([A-Za-z_][\w.]*)`(?!`)", text)]
+    assert len(found) > 1000
+    assert not [(place, name) for place, name in found if not set(filter(None, name.split("."))) <= known]
+
+
+def test_cited_titles_are_those_that_were_compared_with_their_sources():
+    """A new citation, or one that a rename has changed, is compared with its source, then listed."""
+    listed = set((HOUSE / "tests/data/citations.txt").read_text().splitlines())
+    paths = [
+        path for room in ("sim", "surrogate", "ar", "scenes", "docs", "examples") for path in (HOUSE / room).rglob("*")
+    ]
+    found = set()
+    for path in [*paths, HOUSE / "README.md"]:
+        if path.suffix in {".py", ".md"} and "generated" not in path.parts:
+            text = re.sub(r"\"\n\s+f?\"", "", path.read_text())
+            text = re.sub(r"\s+#?\s*", " ", text)
+            cited = re.findall(r"[A-Za-zéöü.],? \(?((?:1[89]|20)\d\d)\)?,? \"([^\"]{6,200})\"", text)
+            found |= {f"{year} {title}" for year, title in cited}
+    assert len(found) > 60
+    assert found == listed, sorted(found ^ listed)

@@ -21,7 +21,7 @@ RATE = 15.0
 
 @dataclass
 class Recording:
-    """Pictures as `page_sight.coded` writes them, each with the time [s] when it came."""
+    """Pictures as `coded` writes them, each with the time [s] when it came."""
 
     began: float
     taken: list[tuple[float, str]] = field(default_factory=list)
@@ -73,6 +73,6 @@ def played(taken: Sequence[tuple[float, str]], ended: float, rate: float) -> Ite
 
 
 def decoded(code: str) -> np.ndarray:
-    """The picture (H, W, 3) uint8 of an address that `page_sight.coded` wrote."""
+    """The picture (H, W, 3) uint8 of an address that `coded` wrote."""
     written = np.frombuffer(base64.b64decode(code.partition(",")[2]), np.uint8)
     return cv2.cvtColor(cv2.imdecode(written, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)  # type: ignore[arg-type]

@@ -1,6 +1,6 @@
 """Equilibrium of soft tissue and hard tools, which touch it in few nodes: a model of the one, the other as it is.
 
-A proximal quasi-Newton method (Lee, Sun, Saunders 2014, "ContactDescent Newton-type methods for minimizing composite
+A proximal quasi-Newton method (Lee, Sun, Saunders 2014, "Proximal Newton-type methods for minimizing composite
 functions", SIAM J. Optim. 24:1420-1443). Each step minimises
 
     s'(u) x + x . B x / 2 + c(u + x),

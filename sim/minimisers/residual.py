@@ -16,7 +16,7 @@ from .lbfgs_kernels import FREE, OWN, PAIRS, SUMS, WHOLE, kernels_of
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """What is out of balance: the free gradient g (3N, b) [N] on the device, and its `sums` (SUMS, b) of steering.
+    """What is out of balance: the free gradient g (3N, b) [N] on the device, and the `sums` (SUMS, b) that steer.
 
     Square norms own (b last) of the gradients of the terms that are not constant. `part` (3N, b) is zero between.
     """

@@ -293,8 +293,8 @@ def _bearing(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
     Most places bear a force as before. Those that would pull are let go. Those that are entered then are taken up
     again, until neither is left. Where that does not end soon it is a nonnegative least-squares problem. (Portugal,
-    Judice, Vicente 1994, "Block pivoting and interior-point algorithms for linear least squares problems with
-    nonnegative variables", Math. Comput. 63:625-643.)
+    Judice, Vicente 1994, "A comparison of block pivoting and interior-point algorithms for linear least squares
+    problems with nonnegative variables", Math. Comput. 63:625-643.)
     """
     count = len(gain)
     if not count:
