@@ -9,7 +9,7 @@ PAGES := tests/test_ar_browser.py tests/test_scenes_demo.py tests/test_scenes_ov
 QUICK := house sim_reference sim_material sim_physics sim_plan sim_warm sim_loads sim_term sim_given sim_meshfile sim_solve \
 	sim_readme surrogate_bound surrogate_store ar_camera ar_raster ar_overlay scenes_tissue scenes_output
 
-.PHONY: demo quick test docs lint template locator bench-check clean
+.PHONY: demo quick test test-gpu docs lint template locator bench-check clean
 
 demo: $(STAMP)
 	$(VENV)/bin/sulcus demo
@@ -19,8 +19,12 @@ quick: $(STAMP)
 
 test: $(STAMP)
 	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile \
-		--no-loadscope-reorder --durations 15 $(PAGES:%=--ignore=%)
-	$(VENV)/bin/python -m pytest $(PAGES)
+		--no-loadscope-reorder --durations 15 -rs $(PAGES:%=--ignore=%)
+	$(VENV)/bin/python -m pytest -rs $(PAGES)
+
+# Those that need a graphics card alone.
+test-gpu: $(STAMP)
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -rs -m gpu
 
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .

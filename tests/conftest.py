@@ -15,7 +15,7 @@ from sim.geometry.tetmesh import TetMesh, oriented
 from sim.loads import Nodal, Pushed
 from surrogate.regressors.ann import Ann
 
-pytest_plugins = ["empty_comparisons"]
+pytest_plugins = ["empty_comparisons", "expected_skips"]
 # Files that take longest on two cores, with a few long tests each: begun last, they would leave a core idle at the end.
 LONGEST = (
     "engine_kills", "commands", "check", "locating", "effects", "play", "docs", "wheel", "examples", "series", "sight",

@@ -1,7 +1,10 @@
-"""Comparisons in tests compare something."""
+"""Comparisons in tests compare something, and tests are skipped for known reasons alone."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from expected_skips import as_failed
 
 EMPTY, SOME = np.zeros((0, 3)), np.ones(2)
 COMPARISONS = {
@@ -30,3 +33,12 @@ def test_comparison_of_nothing_in_marked_test_passes(name):
 def test_comparison_with_written_empty_list_passes():
     np.testing.assert_array_equal(EMPTY[:, 0], [])
     assert not np.array_equal(EMPTY, SOME) and pytest.approx(SOME) == SOME and pytest.approx([]) == []
+
+
+@pytest.mark.parametrize(
+    ("reason", "outcome"),
+    [("no CUDA device here", "skipped"), ("needs SULCUS_PVPYTHON, ParaView's pvpython", "skipped"), ("slow", "failed")],
+)
+def test_skip_for_unlisted_reason_fails(reason, outcome):
+    report = SimpleNamespace(skipped=True, outcome="skipped", longrepr=("test_a.py", 1, f"Skipped: {reason}"))
+    assert as_failed(report).outcome == outcome

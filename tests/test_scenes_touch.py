@@ -128,7 +128,8 @@ class TestPalpate:
             nodes = anatomy.tumour_nodes
             theirs = expected.at(nodes).displacement
             assert frame.deformation.at(nodes).displacement == pytest.approx(theirs, abs=1e-5)
-            assert frame.deformation.reaction == pytest.approx(expected.reaction, abs=2e-3)
+            if force is not None:
+                assert frame.deformation.reaction == pytest.approx(expected.reaction, abs=2e-3)
         assert 2 < by_model < len(frames) - 2
         batch = play.deformer.deform(stacked([frame.loads for frame in frames]), at=nodes)
         for row, (frame, solved) in enumerate(zip(frames, palpated, strict=True)):
