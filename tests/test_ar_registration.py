@@ -134,6 +134,9 @@ def test_a_file_gives_back_what_was_written_and_damage_is_named(tmp_path):
     for change, words in (
         ({"T_patient_scan_mm": mirrored.tolist()}, "no rigid motion"),
         ({"covariance": (-np.eye(6)).tolist()}, "no covariance"),
+        ({"covariance": (1e300 * np.eye(6)).tolist()}, "no covariance"),
+        ({"centre_mm": [0.0, 1e308, 0.0]}, "not within 10 m: numbers are in millimetres"),
+        ({"T_patient_scan_mm": (np.eye(4) + np.outer(np.eye(4)[0], [0, 0, 0, 1e308])).tolist()}, "not within 10 m"),
         ({"centre_mm": [0, 0]}, "other shapes"),
         ({"format": "mine"}, "format is not"),
     ):

@@ -12,6 +12,7 @@ from ar.tracking.rigid import is_rigid
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
+from sim.runtime.file_limits import FARTHEST
 from sim.runtime.outside_files import path_of, read_as
 
 FORMAT = "sulcus registration 1"
@@ -54,8 +55,8 @@ def read_registration(path: str | Path) -> Registration:
         if not is_rigid(T, RIGID):
             raise InputError("T_patient_scan_mm is no rigid motion: rows of a rotation, and a shift in millimetres.")
         _demand_covariance(covariance)
-        if not np.isfinite(centre).all():
-            raise InputError("its centre is not finite.")
+        if not (np.abs([*T[:3, 3], *centre]) <= FARTHEST).all():
+            raise InputError(f"its shift or its centre is not within {FARTHEST:g} m: numbers are in millimetres.")
         counts = int(stored["pairs"]), int(stored["surface"])
         scanned = _scanned(stored["scanned"]) if "scanned" in stored else None
         return Registration(T, covariance, centre, 1e-3 * float(stored["rms_mm"]), *counts, scanned)
@@ -63,7 +64,7 @@ def read_registration(path: str | Path) -> Registration:
 
 def _scanned(stored: dict) -> Scanned:
     bounds, target = 1e-3 * np.array(stored["bounds_mm"], float), 1e-3 * np.array(stored["tumour_mm"], float)
-    if bounds.shape != (2, 3) or target.shape != (3,) or not (np.isfinite(bounds).all() and np.isfinite(target).all()):
+    if bounds.shape != (2, 3) or target.shape != (3,) or not (np.abs([*bounds, target]) <= FARTHEST).all():
         raise InputError("what it was made for has other numbers than bounds 2 x 3 and a tumour's middle of 3.")
     return Scanned(str(stored["anatomy"]), bounds, target)
 
@@ -103,7 +104,7 @@ def other_mesh(registration: Registration, anatomy: Anatomy, path: str | Path) -
 
 
 def _demand_covariance(covariance: np.ndarray) -> None:
-    finite = np.isfinite(covariance).all()
+    finite = (np.abs(covariance) <= FARTHEST**2).all()
     values = np.linalg.eigvalsh(covariance) if finite else np.array([-1.0])
     if not finite or not np.allclose(covariance, covariance.T) or values[0] < -ROUNDING * max(values[-1], 0.0):
         raise InputError("covariance is no covariance: it is symmetric, finite, and nowhere negative.")
