@@ -100,6 +100,22 @@ def test_coverage_of_patients_with_other_bodies_is_low(filmed):
     assert others[1] is not None and 0.0 < others[1] < 0.1
 
 
+def test_worst_error_is_that_of_the_farthest_point(filmed):
+    bodies = np.tile(filmed.field, (100, 1, 1))
+    bodies[:, 7] += 3e-3 * filmed.site.right
+    found = errors_of(replace(filmed, bodies=bodies, meshes=np.zeros(100)), [PARAMETERS], 10)
+    assert found.worst == pytest.approx(3e-3, rel=0.02) and found.middle == pytest.approx(3e-3 / 60, rel=0.05)
+
+
+def test_deviation_of_coverage_counts_bodies_and_not_samples(filmed):
+    """Of two bodies one is always covered, the other never: the deviation of a ratio of two clusters."""
+    bodies = np.stack([filmed.field, filmed.field + 0.1 * filmed.site.right])
+    share, deviation = budgeted(
+        filmed, 60, twins=replace(filmed, bodies=bodies, meshes=np.zeros(2)), progress=lambda names: ()
+    ).held
+    assert 0.3 < share < 0.7 and deviation == pytest.approx(2.0 * share * (1.0 - share))
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_registration_errs_along_the_axes_of_the_reference(filmed, axis):
     """The reference is turned by 90 degrees in the scan: about an axis through the tumour a turn moves no middle."""

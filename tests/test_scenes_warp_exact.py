@@ -49,6 +49,7 @@ def test_the_error_of_each_part_is_that_of_the_worse_field(kinked, fields):
         off = replace(fields, **{name: getattr(fields, name) + np.float32(1e-3)})
         assert np.allclose(places.errors(off)[exact], 3**0.5 * 1e-3, rtol=1e-3)
         assert np.allclose(places.errors(off)[places.cortex], errors[places.cortex])
+    assert places.cortex.sum() == len(np.unique(kinked.anatomy.open_surface)) + 3 * len(kinked.anatomy.open_surface)
     assert places.tumour.sum() > 4 * (kinked.anatomy.mesh.region == 2).sum()
 
 
@@ -96,6 +97,20 @@ def test_a_spacing_follows_from_the_landmarks_error_too(dented):
     assert places.errors(fields)[places.tumour].max() < ENOUGH / 10.0
     finer = finer_spacing(dented, fields)
     assert finer is not None and finer < 1.5e-3
+
+
+def test_folds_are_found_however_slight_and_the_largest_comes_first(small_box):
+    """Two inner vertices go through a face of theirs: one of them hardly."""
+    mesh, moved = small_box.mesh, np.zeros_like(small_box.mesh.nodes)
+    inner = np.setdiff1d(np.arange(len(mesh.nodes)), mesh.surface)
+    first, last = inner[0], inner[-1]
+    for vertex, times in ((first, 1.0001), (last, 2.0)):
+        tet = mesh.tets[(mesh.tets == vertex).any(axis=1)][0]
+        moved[vertex] = times * (mesh.nodes[tet[tet != vertex]].mean(axis=0) - mesh.nodes[vertex])
+    moment = moment_of(small_box, moved)
+    folds = folds_of(moment, warp_fields(small_box, moved, 2e-3))
+    assert len(folds) == 2 and folds[0].volume >= folds[1].volume and folds[0].tetrahedra > folds[1].tetrahedra
+    assert all(fold.off > 0.1e-3 for fold in folds)
 
 
 def test_a_spacing_of_too_many_nodes_is_refused(small_box):
