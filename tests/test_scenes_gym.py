@@ -17,7 +17,7 @@ from scenes.gym.hertz import Hertz
 from scenes.gym.observation import FELT, TRACKED
 from scenes.gym.pressed_model import PressedModel
 from scenes.gym.registration import NAMES, register_environments
-from scenes.gym.reward import ENDED, OVER_LIMIT, STEP, Judged, earned
+from scenes.gym.reward import ENDED, FAR, OVER_LIMIT, SHARE, STEP, Judged, earned
 from scenes.gym.scripted import scripted
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT, TASKS
@@ -190,6 +190,9 @@ def test_a_reward_is_a_difference_of_potentials_and_its_limits():
     assert earned(near, near, False, False) == pytest.approx(-STEP)
     assert earned(near, replace(near, load=1.1), False, False) == pytest.approx(-STEP - OVER_LIMIT)
     assert earned(near, near, False, True) == pytest.approx(ENDED - STEP)
+    assert earned(near, replace(near, cut=2), False, False) == pytest.approx(2.0 * SHARE - STEP)
+    lost, farther = Judged(FAR, 1.0, 0, 0.5), Judged(2.0 * FAR, 5.0, 0, 0.5)  # beyond, all count alike
+    assert earned(farther, lost, False, False) == pytest.approx(-STEP) != earned(lost, near, False, False)
 
 
 def test_the_model_has_the_force_of_the_finite_elements():
