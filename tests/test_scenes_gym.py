@@ -171,19 +171,6 @@ def test_the_scripted_policy_palpates_and_pushing_on_ends_at_the_limit():
         environment.unwrapped.step(DOWN)
 
 
-@pytest.mark.parametrize(("limit", "share"), [(0.5, "pressure"), (2.0, "force")])
-def test_load_is_the_share_of_the_limit_reached_first(limit, share):
-    environment = made().unwrapped
-    task = replace(PALPATE, pressure=limit * PALPATE.pressure)
-    environment.episode.setting = replace(environment.episode.setting, task=task)
-    environment.reset(seed=3)
-    terminated = False
-    while not terminated:
-        *_, terminated, _, truth = environment.step(DOWN)
-    shares = {"force": np.linalg.norm(truth["force"]) / task.force, "pressure": truth["pressure"] / task.pressure}
-    assert truth["load"] == pytest.approx(shares[share]) and shares[share] > 1.25 > 1.2 * min(shares.values())
-
-
 def test_a_reward_is_a_difference_of_potentials_and_its_limits():
     near, far = Judged(0.002, 0.1, 0, 0.5), Judged(0.012, 0.6, 0, 0.5)
     assert earned(far, near, False, False) == pytest.approx(1.0 + 0.5 - STEP)

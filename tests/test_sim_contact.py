@@ -18,7 +18,7 @@ from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.material import Material
 from sim.runtime.user_script import run_script
-from sim.tools import Ball, Capsule, Core, Spatula, Tool, distances_to
+from sim.tools import Ball, Capsule, Core, Spatula, Tool, distances_to, foremost
 
 SOFT = Material("neo-hookean", 3000.0, 0.45)
 SIDE, HEIGHT = 0.08, 0.04
@@ -165,3 +165,17 @@ def test_tool_surface_lies_where_its_sizes_say(tool, ends):
     signs = np.array([[x, y, 1.0] for x in (-1, 1) for y in (-1, 1)])
     points = (np.array(ends)[:, None] * signs).reshape(-1, 3)
     assert distances_to(tool, turn, points @ turn[:3, :3].T + turn[:3, 3]) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("tool", "direction", "point"),
+    [
+        (BLADE, [1e-9, 1.0, 0.0], [0.0, 0.013, 1.5e-3]),  # the middle of an edge
+        (BLADE, [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]),  # and of a face
+        (BLADE, [0.6, -0.8, 0.0], [0.0045 + 0.6 * 1.5e-3, -0.0115 - 0.8 * 1.5e-3, 1.5e-3]),
+        (Capsule(3e-3, 0.02), [1.0, 0.0, 0.0], [3e-3, 0.0, 0.013]),
+        (Ball(7e-3), [0.0, 0.0, 1.0], [0.0, 0.0, 0.014]),
+    ],
+)
+def test_foremost_point_lies_on_the_tool_in_the_direction(tool, direction, point):
+    assert foremost(tool, np.eye(4)[None], np.array(direction))[0] == pytest.approx(point, abs=1e-10)

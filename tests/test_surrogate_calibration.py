@@ -42,6 +42,9 @@ def test_points_lie_on_a_patch_of_the_open_cortex_and_move_with_it(body, evidenc
     assert np.ptp(places[:, 2]) == pytest.approx(0.0, abs=1e-12) and places[0, 2] == pytest.approx(on[:, 2].max())
     whole = seen_patch(body, np.zeros_like(body.mesh.nodes), np.random.default_rng(0), 400, 1.0).at
     assert np.ptp(places[:, :2], axis=0).max() < 0.95 * np.ptp(whole[:, :2], axis=0).max()
+    triangles = np.unique(np.sort(evidence.place.vertices[:, :3], axis=1), axis=0)
+    share = len(triangles) / len(body.open_surface)  # all of one size
+    assert 0.3 < share <= 0.5
     moved = np.einsum("mc,mci->mi", evidence.place.weights, body.mesh.nodes[evidence.place.vertices])
     assert moved == pytest.approx(evidence.at)
 
@@ -105,7 +108,7 @@ def test_trial_prior_lacks_the_group_of_the_trial(body, monkeypatch):
     random, group = np.random.default_rng(0), np.repeat(np.arange(6), 4)
     motion = random.normal(scale=2e-3, size=(24, *body.mesh.nodes.shape)).astype(np.float32)
     ensemble = Ensemble(body, motion, np.tile([0, 1], 12), group // 2, group)
-    known, made = [], []
+    known, made, clouds = [], [], []
     monkeypatch.setattr(calibration, "prior_of", lambda ensemble, presses, mask: known.append(mask))
 
     def middle(anatomy, moved):
@@ -113,11 +116,12 @@ def test_trial_prior_lacks_the_group_of_the_trial(body, monkeypatch):
         return middle_of(anatomy, moved)
 
     def unsettled(prior, observation):
+        clouds.append(observation.rest is None)
         raise InputError("no trial")
 
     monkeypatch.setattr(calibration, "middle_of", middle)
     monkeypatch.setattr(calibration, "settled", unsettled)
-    assert not len(trials(ensemble, None, count=40)) and len(made) == 40
+    assert not len(trials(ensemble, None, count=40)) and len(made) == 40 and clouds == 20 * [True, False]
     assert [sorted(set(group[~mask])) for mask in known] == [[0, 2, 4], [1, 3, 5]]
     for mask, moved in made:
         share = np.linalg.lstsq(motion.reshape(24, -1).T.astype(float), moved.ravel(), rcond=None)[0]
