@@ -24,8 +24,7 @@ class Accuracy:
         Converged: free gradient <= tolerance x the largest 2-norm among the terms' own gradients and the
         reaction at constrained nodes.
     outer
-        Most Newton steps for one load, and for each of its load steps. All load steps and strides of tools together
-        take at most outer x (1 + steps).
+        Most Newton steps for one load, and for each of its load steps; all together at most outer x (1 + steps).
     inner
         Most conjugate-gradient iterations in one Newton step.
     precision
@@ -51,6 +50,11 @@ class Accuracy:
     steps: int = 24
     evaluations: int | None = None
     any_strain: bool = field(default=False, repr=False)  # what was recorded of the others stays comparable
+
+    @property
+    def most(self) -> int:
+        """Most Newton steps for one load, all load steps and strides of tools together."""
+        return self.outer * (1 + self.steps)
 
     def __post_init__(self) -> None:
         if self.precision not in tuple(FLOOR):  # which need not be hashable

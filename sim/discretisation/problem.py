@@ -76,6 +76,11 @@ class Problem:
         """Whether the stiffness depends on the step in time."""
         return any(isinstance(term, Paced) for term in self.terms)
 
+    def overlaps(self, u: wp.array) -> np.ndarray:
+        """Columns (2, b) bool as `Barrier.overlaps` of any barrier."""
+        none = np.zeros((2, u.shape[1]), bool)
+        return np.logical_or.reduce([none, *(term.overlaps(u) for term in self.barriers)])
+
     def begin(self, cases: Cases) -> None:
         """Take a batch of load cases."""
         imposed = self.impose(cases.loads)

@@ -139,7 +139,7 @@ class Strategy:
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
-        on_bone = self._overlaps(device.zeros(problem.rows, count))[1]
+        on_bone = problem.overlaps(device.zeros(problem.rows, count))[1]
         if not guesses:
             answer, astray = self._whole(cases), np.zeros(count, bool)
         else:
@@ -159,13 +159,13 @@ class Strategy:
                 problem.begin(some)
                 answer.put(again, self._whole(some), device)
         answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
-        anew, lost = astray.copy(), np.flatnonzero(self._lost(answer) & ~on_bone)
+        lost = np.flatnonzero(self._lost(answer) & ~on_bone)
         if len(lost):
             found = self._in_steps(cases.rows(lost), answer, lost)
-            anew[lost] |= found.reached > answer.reached[lost]
+            astray[lost] |= found.reached > answer.reached[lost]
             answer.put(lost, found, device)
         answer.outcome[on_bone] = Outcome.ON_BONE
-        return replace(answer, gone=answer.reached, anew=anew) if problem.barriers else answer
+        return replace(answer, gone=answer.reached, anew=astray) if problem.barriers else answer
 
     def _acts(self, count: int) -> np.ndarray:
         """Which cases (b,) of the batch that has begun any force or imposed motion acts on at rest."""
@@ -179,11 +179,6 @@ class Strategy:
         if not acts.all():
             acts = np.logical_or.reduce([acts, *(term.buried(rest) for term in self.problem.barriers)])
         return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
-
-    def _overlaps(self, u: wp.array) -> np.ndarray:
-        """Columns (2, b) bool of the batch that has begun in which a tool overlaps surface at u (3N, b), or bone."""
-        none = np.zeros((2, u.shape[1]), bool)
-        return np.logical_or.reduce([none, *(term.overlaps(u) for term in self.problem.barriers)])
 
     def _rested(self, start: wp.array) -> wp.array:
         """Start (3N, b) [m], or rest where nothing acts there: in float32 no descent would end in letting go."""
@@ -225,12 +220,8 @@ class Strategy:
             learnt = None
         if Step.LBFGS not in self.plan.steps(count, imposed):
             return self._thorough(start, self.accuracy.outer)
-        descents: list[tuple[BatchElimination | Alone | Lbfgs, Mapping[str, np.ndarray] | None]] = [
-            (self.lbfgs, learnt)
-        ]
         near = self.local(count)
-        if near is not None:
-            descents = [(near, cases.warm), (self.lbfgs, None)]
+        descents = [(self.lbfgs, learnt)] if near is None else [(near, cases.warm), (self.lbfgs, None)]
         index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
         answer = Answer(
             wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
@@ -344,9 +335,8 @@ class Strategy:
         acting = np.flatnonzero(self._acts(count))
         if len(acting) == count:
             return self._by_steps(cases, start, moved, 1.0, most)
-        at_rest, none = device.zeros(*start.shape), np.zeros(count, int)
-        every = np.full(count, Outcome.CONVERGED, object)
-        answer = Answer(at_rest, every, none, np.zeros(count), np.ones(count), none.copy(), 0)
+        none, every = np.zeros(count, int), np.full(count, Outcome.CONVERGED, object)
+        answer = Answer(device.zeros(*start.shape), every, none, np.zeros(count), np.ones(count), none.copy(), 0)
         if len(acting):
             part = gathered(device, start, acting)
             answer.put(acting, self._by_steps(cases.rows(acting), part, moved, 1.0, most), device)
@@ -371,16 +361,14 @@ class Strategy:
         u, step, left, spent, done = wp.clone(start), np.full(count, first), most, 0, 1
         reached, iterations, residual = np.zeros(count), np.zeros(count, int), np.full(count, np.inf)
         outcome = np.full(count, Outcome.BUDGET, object)
-        lets = outer = self.accuracy.outer
-        budget = outer * (1 + self.accuracy.steps)
-        if not problem.barriers:
-            lets, outer = self.stepping.aimed, min(self.stepping.most, outer)
+        outer = self.accuracy.outer
+        lets, outer = (outer, outer) if problem.barriers else (self.stepping.aimed, min(self.stepping.most, outer))
         while left >= 0:
             strides = [term.stride(aimed(cases, reached), u) for term in problem.barriers]
             longest = np.minimum.reduce([np.ones(count), *strides])
             step = np.minimum(step, longest)
-            live = (reached < 1.0) & (step >= self.stepping.least * np.minimum(1.0, 4.0 * longest))
-            live = np.flatnonzero(live & (iterations < budget))
+            long_enough = step >= self.stepping.least * np.minimum(1.0, 4.0 * longest)
+            live = np.flatnonzero((reached < 1.0) & long_enough & (iterations < self.accuracy.most))
             if len(live) == 0 or spent > self.stepping.patience * self.accuracy.inner * done:
                 break
             aim = np.minimum(reached[live] + step[live], 1.0)
@@ -400,8 +388,8 @@ class Strategy:
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
         if problem.barriers and len(short) < count:
             problem.begin(aimed(cases, np.ones(count)))
-            inside = [self._overlaps(u)[0], *(term.buried(u) for term in problem.barriers)]
-            pierced = np.logical_or.reduce(inside) & (reached == 1.0)
+            buried = np.logical_or.reduce([term.buried(u) for term in problem.barriers])
+            pierced = (problem.overlaps(u)[0] | buried) & (reached == 1.0)
             outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0
         if len(short):
             problem.begin(cases.rows(short))

@@ -87,10 +87,10 @@ def approach(
 ) -> np.ndarray:
     """Pose (4, 4) just clear of a surface from which a tool comes straight to `pose` (4, 4).
 
-    Along its shaft, or along the surface's outward normal where that way is less than half as long: an instrument that
-    lies flat in tissue was not pushed in from the side. A tool that is clear at `pose` comes from there. The surface
-    has vertices `points` (n, 3) [m] with unit `normals` (n, 3) and extends `reach` (n,) [m] round each vertex. The tool
-    is followed through the air in `march` steps at most.
+    The way is along its shaft, or along the surface's outward normal where that is less than half as long. An
+    instrument that lies flat in tissue was not pushed in from the side. A tool that is clear at `pose` comes from
+    there. The surface has vertices `points` (n, 3) [m] with unit `normals` (n, 3) and extends `reach` (n,) [m] round
+    each vertex. The tool is followed through the air in `march` steps at most.
     """
     cores, R = cores_of(tool), pose[:3, :3]
     along_shaft = _cleared(tool, pose, R, cores, points, reach, march)
