@@ -34,8 +34,8 @@ class Accuracy:
     evaluations
         Most evaluations of the whole body's forces before Newton, which local solvers and L-BFGS share; 0: Newton
         alone. None: as many as are worth it on the device. Few `outer` steps are Newton's alone, whatever this says.
-    any_strain
-        Report equilibria with inverted tetrahedra, or strained beyond what was measured on brain, as converged.
+    limit_strain
+        Report equilibria with inverted tetrahedra, or strained beyond what was measured on brain, as not good.
 
     Raises
     ------
@@ -49,7 +49,7 @@ class Accuracy:
     precision: Precision = "float64"
     steps: int = 24
     evaluations: int | None = None
-    any_strain: bool = field(default=False, repr=False)  # what was recorded of the others stays comparable
+    limit_strain: bool = field(default=False, repr=False)  # what was recorded of the others stays comparable
 
     @property
     def most(self) -> int:

@@ -36,6 +36,7 @@ from .runtime.device import find_device
 from .runtime.exclusive import alone
 from .runtime.memory import check_fits, fitting_batch, free_bytes
 from .runtime.threads import one_thread
+from .strategy.bone import solve_off_bone
 from .strategy.extrapolation import moved_on, pushes_of, way_of
 from .strategy.frame_sequence import FrameSequence, frame_sequence
 from .strategy.newton_correction import step_from
@@ -110,7 +111,7 @@ class Fem:
         parts = local_solvers(plan, problem, preconditioner, self.effects, self.space)
         if problem.device.on_cuda:
             parts[0]()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
-        self._diagnostics = Diagnostics(anatomy, self.space, self.effects, problem.device, accuracy.any_strain)
+        self._diagnostics = Diagnostics(anatomy, self.space, self.effects, problem.device, accuracy.limit_strain)
         inversion = Inversion(self.space, problem.device, problem.bounded)
         self.strategy = Strategy(problem, preconditioner, inversion, accuracy, plan, *parts)
         """What solves a load: the plan's solvers, one after the other."""
@@ -324,7 +325,7 @@ class Fem:
     ) -> Deformation:
         clock = time.perf_counter()
         guesses = () if last is None else (moved_on(cases.loads, last, cases.warm), last)
-        found = strategy.solve(cases, guesses)
+        found = solve_off_bone(strategy, cases, guesses)
         seconds = {"equilibrium": time.perf_counter() - clock}
         way = way_of(pushes_of(cases.loads), last, cases.warm) if len(cases.loads) <= CARRIED else {}
         return self._answered(cases, found, way, at, seconds)

@@ -78,7 +78,9 @@ HARD = {
     ),
     "thin blade": Hard(((at(0.03, 0.03, HEIGHT - 1e-3),),), (Spatula(0.012, 0.02, 2.5e-4),)),
     "tip far smaller than an element": Hard(((at(0.033, 0.031, HEIGHT - 4e-4),),), (Ball(5e-4),)),
-    "far inside at once": Hard(((at(0.03, 0.03, 0.01),),), ends=frozenset({Outcome.OVERSTRAINED})),
+    "far inside at once": Hard(
+        ((at(0.03, 0.03, 0.01),),), accuracy=Accuracy(1e-4, limit_strain=True), ends=frozenset({Outcome.OVERSTRAINED})
+    ),
     "a touch of no depth": Hard(((at(0.03, 0.03, HEIGHT),), (at(0.03, 0.03, HEIGHT),))),
     "gap wider than the body": Hard(
         ((DOWN,),), accuracy=Accuracy(1e-4, outer=3), gap=0.2, ends=CONVERGED | {Outcome.BUDGET, Outcome.STALLED}

@@ -32,7 +32,7 @@ from sim.runtime.device import find_device
 from sim.runtime.memory import check_fits, host_bytes
 
 TOLERANCE = 1e-7
-ACCURACY = Accuracy(tolerance=TOLERANCE, any_strain=True)
+ACCURACY = Accuracy(tolerance=TOLERANCE)
 CONVERGED = {Outcome.CONVERGED, Outcome.CONVERGED_ANEW, Outcome.CONVERGED_IN_STEPS}
 STOPPED = {Outcome.BUDGET, Outcome.STALLED, Outcome.ROUND_OFF}
 ANEW = frozenset({Outcome.CONVERGED_ANEW})
@@ -264,7 +264,7 @@ def test_an_overload_says_how_far_it_got() -> None:
         BLOCK,
         soft("neo-hookean"),
         100.0 * pressed(),
-        accuracy=Accuracy(TOLERANCE, outer=6, steps=6, any_strain=True),
+        accuracy=Accuracy(TOLERANCE, outer=6, steps=6),
     )
     found = case.solve()
     assert found.outcome[0] in STOPPED

@@ -21,9 +21,13 @@ class Diagnostics:
     """Measures the deformations of an anatomy under some effects."""
 
     def __init__(
-        self, anatomy: Anatomy, space: Discretisation, effects: Iterable[Effect], device: Device, any_strain: bool
+        self, anatomy: Anatomy, space: Discretisation, effects: Iterable[Effect], device: Device, limit_strain: bool
     ):
-        self._leak, self._stretch, self._any_strain = Leak(anatomy, space, device), Stretch(space, device), any_strain
+        self._leak, self._stretch, self._limit_strain = (
+            Leak(anatomy, space, device),
+            Stretch(space, device),
+            limit_strain,
+        )
         bonded = (effect for effect in effects if isinstance(effect, Bonded))
         self._bond = next((Bond(effect, anatomy, space, device) for effect in bonded), None)
 
@@ -42,11 +46,11 @@ class Diagnostics:
         return self._stretch.measure(u)
 
     def outcomes(self, outcome: np.ndarray, inverted: np.ndarray, strained: np.ndarray) -> np.ndarray:
-        """Outcomes (B,), with those equilibria marked that are not of tissue, unless any strain will do.
+        """Outcomes (B,), with those equilibria marked that are not of tissue, if strains are limited.
 
         inverted (B,) counts tetrahedra; strained (B,) [m^3] as in `Deformation`.
         """
-        good = np.array([one.good and not self._any_strain for one in outcome], bool)
+        good = np.array([one.good and self._limit_strain for one in outcome], bool)
         out = outcome.copy()
         out[good & self._stretch.exceeds(strained)] = Outcome.OVERSTRAINED
         out[good & (inverted > 0)] = Outcome.INVERTED

@@ -139,7 +139,6 @@ class Strategy:
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
-        on_bone = problem.overlaps(device.zeros(problem.rows, count))[1]
         if not guesses:
             answer, astray = self._whole(cases), np.zeros(count, bool)
         else:
@@ -159,12 +158,11 @@ class Strategy:
                 problem.begin(some)
                 answer.put(again, self._whole(some), device)
         answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
-        lost = np.flatnonzero(self._lost(answer) & ~on_bone)
+        lost = np.flatnonzero(self._lost(answer))
         if len(lost):
             found = self._in_steps(cases.rows(lost), answer, lost)
             astray[lost] |= found.reached > answer.reached[lost]
             answer.put(lost, found, device)
-        answer.outcome[on_bone] = Outcome.ON_BONE
         return replace(answer, gone=answer.reached, anew=astray) if problem.barriers else answer
 
     def _acts(self, count: int) -> np.ndarray:

@@ -1,0 +1,36 @@
+"""Tools that stand on bone: nothing is solved for them, the body stays as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..deformation import Outcome
+from ..discretisation.term import Cases
+from .strategy import Answer, Strategy
+from .time_steps import Still
+
+
+def solve_off_bone(strategy: Strategy | Still, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
+    """Solve as `Strategy.solve` the cases whose tools overlap no bone; the others stay at the last of their guesses.
+
+    Against bone no tissue gives way: a solution would be that of the barrier's stiffness, and take long.
+    """
+    problem, device, count = strategy.problem, strategy.problem.device, len(cases.loads)
+    if isinstance(strategy, Still) or not problem.barriers:
+        return strategy.solve(cases, guesses)
+    problem.begin(cases)
+    on_bone = problem.overlaps(device.zeros(problem.rows, count))[1]
+    if not on_bone.any():
+        return strategy.solve(cases, guesses)
+    u = device.array(guesses[-1]) if guesses else device.zeros(problem.rows, count)
+    none, outcome = np.zeros(count, int), np.full(count, Outcome.ON_BONE, object)
+    answer = Answer(u, outcome, none, np.full(count, np.inf), np.zeros(count), strategy.inversion.count(u), 0)
+    anew, clear = np.zeros(count, bool), np.flatnonzero(~on_bone)
+    if len(clear):
+        found = strategy.solve(cases.rows(clear), [guess[:, clear] for guess in guesses])
+        answer.put(clear, found, device)
+        anew[clear] = found.anew
+    return replace(answer, gone=answer.reached, anew=anew)
