@@ -16,7 +16,7 @@ from types import SimpleNamespace as Names
 
 class Demo:
     def __init__(self, *words):
-        self.browser = Names(address="here", token=None)
+        self.browser = Names(address="here", addresses=(), token=None)
         self.busy, self.cast = Names(on=len), Names(predicted=lambda *asked: None)
         self.solve = threading.Thread(target=time.sleep, args=(100.0,), daemon=True)
         self.solve.start()

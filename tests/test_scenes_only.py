@@ -38,7 +38,7 @@ TOOLS = cost(
     "contact.barrier contact.enclosure contact.reduced contact.tool_blocks contact.tool_contact contact.tool_functions "
     "contact.tool_kernels contact.tool_path",
     "contact.enclosure:add_angle contact.tool_kernels:add_gradient contact.tool_kernels:add_reaction "
-    "contact.tool_kernels:clearance",
+    "contact.tool_kernels:clearance contact.tool_kernels:nearest",
     "Contact Functions Reduced Touch",
 )
 # A new effect adds one line.
