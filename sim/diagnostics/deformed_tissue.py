@@ -23,11 +23,8 @@ class Diagnostics:
     def __init__(
         self, anatomy: Anatomy, space: Discretisation, effects: Iterable[Effect], device: Device, limit_strain: bool
     ):
-        self._leak, self._stretch, self._limit_strain = (
-            Leak(anatomy, space, device),
-            Stretch(space, device),
-            limit_strain,
-        )
+        self._leak, self._stretch = Leak(anatomy, space, device), Stretch(space, device)
+        self._limit_strain = limit_strain
         bonded = (effect for effect in effects if isinstance(effect, Bonded))
         self._bond = next((Bond(effect, anatomy, space, device) for effect in bonded), None)
 

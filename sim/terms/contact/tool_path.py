@@ -114,7 +114,7 @@ def _cleared(
     reach: np.ndarray,
     march: int,
 ) -> np.ndarray:
-    """As `approach`, along the third column of R (3, 3); `cores`, in its axes from the tool's origin, contain it."""
+    """Pose as of `approach`, along the third column of R (3, 3); `cores` in the axes of R contain the tool."""
     out, local = pose.copy(), (points - pose[:3, 3]) @ R
     back, room = max(_above(core, local, reach) for core in cores), 0.0
     for _ in range(march):
