@@ -21,8 +21,8 @@ meant = False
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item):
-    """Read the mark of a test."""
+def pytest_runtest_protocol(item):
+    """Read the mark of a test, for its fixtures too."""
     global meant
     meant = item.get_closest_marker("empty") is not None
     return (yield)
