@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from numbers import Real
 from typing import Literal
 
@@ -49,7 +49,7 @@ class Accuracy:
     precision: Precision = "float64"
     steps: int = 24
     evaluations: int | None = None
-    limit_strain: bool = field(default=False, repr=False)  # what was recorded of the others stays comparable
+    limit_strain: bool = True
 
     @property
     def most(self) -> int:

@@ -34,7 +34,7 @@ class Outcome(Enum):
     PIERCED = "stopped because a tool came to be inside the tissue, where it has no surface to press on"
     ON_BONE = "a tool overlaps surface that is fixed or covered by the skull: it stands on bone"
     INVERTED = "in equilibrium, but tetrahedra are inverted, as in no tissue: the load is too strong for this mesh"
-    OVERSTRAINED = "in equilibrium, but more than 1 ml is strained beyond what was measured on brain: do not rely on it"
+    OVERSTRAINED = "in equilibrium, but more than 1 ml is strained beyond what was measured on brain"
     NOT_FINITE = "stopped because a number overflowed"
     GUESSED = "a first guess: nothing was solved"
     PREDICTED = "predicted by a trained model inside its training range"

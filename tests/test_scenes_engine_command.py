@@ -90,7 +90,9 @@ def test_a_signal_ends_all_processes_at_once_and_leaves_what_can_go_on(number, t
         error = client.communicate(timeout=20)[1]
     finally:
         client.kill()
-    assert client.returncode == 130 and "the same command goes on in" in error and "Traceback" not in error
+    # Python ends itself by SIGINT where the interrupt met a string that was executed: shells say 130 of both.
+    assert client.returncode in (130, -signal.SIGINT), error
+    assert "the same command goes on in" in error and "Traceback" not in error, error
     assert (folder / "run.json").exists() and not list(folder.glob("episode_*"))
 
 

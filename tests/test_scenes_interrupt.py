@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+import time
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -94,7 +95,6 @@ def test_what_goes_wrong_is_reported_and_handlers_are_given_back():
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_that_a_finaliser_swallows_is_not_lost(number):
     class Signalling:
@@ -108,4 +108,7 @@ def test_an_interrupt_that_a_finaliser_swallows_is_not_lost(number):
         went_on = True
         stop_if_asked()
     assert went_on
+    with pytest.raises(KeyboardInterrupt), terminated_as_interrupted():  # and if nobody asks, repeated
+        Signalling()
+        time.sleep(20.0)
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before

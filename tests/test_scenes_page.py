@@ -9,6 +9,7 @@ from theatres import short, sinking, small, theatre_of
 
 from ar.page.parts import Choice, Fold, Slider
 from scenes.play.deformers import GUARDED, plan_of
+from scenes.play.load_text import doubt_of
 from scenes.play.page.beside import TIP, TUMOUR_MIDDLE, lines_of, sample_of, slices_of
 from scenes.play.page.controls import clocked, controls
 from scenes.play.page.referee import Truth
@@ -84,7 +85,7 @@ class TestTrust:
 
 
 class TestVerdict:
-    JUDGED = Judged(28, 0.35, True, 1e-3, 1e-4, 2e-4)
+    JUDGED = Judged(28, 0.35, "", 1e-3, 1e-4, 2e-4)
 
     def test_of_the_present_load_it_stands_plainly(self):
         said = verdict_words(self.JUDGED, False, "waits")
@@ -95,7 +96,9 @@ class TestVerdict:
         assert said.startswith('<p class="stale">of an earlier load') and "frame 28" in said and "waits" in said
 
     def test_an_answer_short_of_its_tolerance_is_not_relied_on(self):
-        said = [verdict_words(replace(self.JUDGED, good=good), False, "waits") for good in (True, False)]
+        said = [
+            verdict_words(replace(self.JUDGED, doubt=doubt), False, "waits") for doubt in ("", doubt_of(Outcome.BUDGET))
+        ]
         assert ["do not rely on it" in each for each in said] == [False, True]
 
     def test_before_any_it_says_what_is_waited_for(self):

@@ -79,7 +79,7 @@ def stated(scene, theatre, worst=(2e-3, 4e-3), **values):
     flat = (1e-3, 1e-3)
     lists = {"times": (0.0, scene.duration), "worst": worst, "middle": flat, "moved": flat}
     return Uncertainty(
-        scene.name, mark, 8, 0, 0.95, **(lists | values), parts={"E": (0.0, 3e-3), "registration": (2e-3, 2e-3)}
+        scene.name, mark, 8, 0, **(lists | values), parts={"E": (0.0, 3e-3), "registration": (2e-3, 2e-3)}
     )
 
 
@@ -176,10 +176,15 @@ class TestEnsemble:
 
         draws, twins = drawn(300, 0), drawn(300, 1)
         found = uncertainty(theatre, scene, still, draws, answers(draws))
-        assert 0.93 < coverage(scene, still, found, twins, answers(twins), 1) < 0.97
-        assert 0.93 < found.held < 0.97
+        tested = coverage(scene, still, found, twins, answers(twins), 1)
+        assert tested.patients == 300 and 0.93 < tested.covered < 0.97
+        few = [coverage(scene, still, found, drawn(20, seed), answers(drawn(20, seed)), seed) for seed in range(2, 22)]
+        scatter = np.std([one.covered for one in few])
+        assert 0.5 * scatter < np.mean([one.deviation for one in few]) < 3.0 * scatter
         tight = replace(found, worst=tuple(0.7 * one for one in found.worst))
-        assert coverage(scene, still, tight, twins, answers(twins), 1) < 0.85
+        assert coverage(scene, still, tight, twins, answers(twins), 1).covered < 0.85
+        with pytest.raises(InputError, match="1 of 300 synthetic patients"):
+            coverage(scene, still, found, twins, [*answers(twins)[:1], *[None] * 299], 1)
 
     def test_draws_without_equilibrium_are_counted_and_too_many_refused(self, theatre):
         field = np.ones((9, 3))
@@ -359,11 +364,11 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
     said = capsys.readouterr()
     (row,) = json.loads(said.out)["scenes"]
     assert "these parts are guesses: 8 numbers are fitted to 8 draws" in said.err and row["fitted_numbers"] == 8
-    assert (
-        row["scene"] == "brief" and row["draws"] == 8 and 0.0 <= row["held_twins"] <= 1.0 and 0.5 < row["held"] <= 1.0
-    )
+    assert row["scene"] == "brief" and row["draws"] == 8 and row["patients"] == 2 and 0.5 < row["covered"] <= 1.0
+    assert "on 2 synthetic patients that are not among them" in said.err and 0.0 <= row["covered_deviation"] < 0.5
     assert row["tumour_mm"] > 4.0 > row["model_mm"] and row["largest_part"] == "registration"
     stored = read_uncertainties(uncertainty_path(body))["brief"]
+    assert stored.covered == pytest.approx(row["covered"], abs=1e-6)
     assert main(["check", *words, "--deformer", "fem", "--every", "3", "--json"]) == 0
     (checked,) = json.loads(capsys.readouterr().out)["scenes"]
     assert checked["model_error_mm"] is None

@@ -263,9 +263,9 @@ def stubborn() -> tuple[Anatomy, Loads]:
 def test_load_steps_rescue_what_newton_fails_on() -> None:
     anatomy, asked = stubborn()
     effects = Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held()
-    patient = Fem(anatomy, effects, Accuracy(1e-8), "cpu", element="p1").deform(asked)
+    patient = Fem(anatomy, effects, Accuracy(1e-8, limit_strain=False), "cpu", element="p1").deform(asked)
     assert patient.outcome == (Outcome.CONVERGED,)
-    few = Accuracy(1e-8, outer=int(patient.iterations[0]) - 2)
+    few = Accuracy(1e-8, outer=int(patient.iterations[0]) - 2, limit_strain=False)
     hasty = Fem(anatomy, effects, few, "cpu", element="p1").deform(asked)
     assert hasty.outcome == (Outcome.CONVERGED_IN_STEPS,)
     assert hasty.outcome[0].good
@@ -280,7 +280,7 @@ def test_a_rescue_leaves_the_other_rows_alone() -> None:
     value = asked.of(Prescribed)
     assert value is not None
     three = Loads((Prescribed(value.displacement * np.array([0.01, 1.0, 0.02])[:, None, None]),))
-    body = Fem(anatomy, effects, Accuracy(1e-8, outer=8), "cpu", element="p1")
+    body = Fem(anatomy, effects, Accuracy(1e-8, outer=8, limit_strain=False), "cpu", element="p1")
     found = body.deform(three)
     assert found.outcome[0] is found.outcome[2] is Outcome.CONVERGED
     assert found.outcome[1] is Outcome.CONVERGED_IN_STEPS
@@ -347,11 +347,15 @@ def test_numbers_that_overflow_are_an_outcome_not_an_answer() -> None:
 @pytest.mark.parametrize("law", ["corotational", "neo-hookean", "stable-neo-hookean"])
 def test_brutal_loads_converge(law: str) -> None:
     """10 N on a 10 cm box of 3 kPa: strains of several hundred per cent."""
-    effects, accuracy = [Elasticity(Material(law, 3000.0, 0.45)), Held(), NodalForce()], Accuracy(1e-6)
-    body = Fem(ANATOMY, effects, accuracy, "cpu", element="p1")
+    effects = [Elasticity(Material(law, 3000.0, 0.45)), Held(), NodalForce()]
     force = top_forces(MESH, np.array([[3.0, 2.0, -9.0], [0.0, 0.0, 10.0], [10.0, 0.0, 0.0]]))
-    found = body.deform(Loads((Nodal(force),)))
-    assert all(outcome.good for outcome in found.outcome)
+    limited, free = (
+        Fem(ANATOMY, effects, Accuracy(1e-6, limit_strain=limit), "cpu", element="p1").deform(Loads((Nodal(force),)))
+        for limit in (True, False)
+    )
+    assert all(outcome.good for outcome in free.outcome)
+    assert {Outcome.OVERSTRAINED, Outcome.INVERTED} & set(limited.outcome)
+    np.testing.assert_array_equal(limited.displacement, free.displacement)
 
 
 @pytest.mark.parametrize("poisson", [0.0, 0.49, 0.499, -0.4])

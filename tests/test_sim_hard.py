@@ -36,7 +36,8 @@ ACCURACY = Accuracy(tolerance=TOLERANCE)
 CONVERGED = {Outcome.CONVERGED, Outcome.CONVERGED_ANEW, Outcome.CONVERGED_IN_STEPS}
 STOPPED = {Outcome.BUDGET, Outcome.STALLED, Outcome.ROUND_OFF}
 ANEW = frozenset({Outcome.CONVERGED_ANEW})
-ANYHOW = frozenset(CONVERGED | STOPPED)
+BEYOND = {Outcome.OVERSTRAINED, Outcome.INVERTED}
+ANYHOW = frozenset(CONVERGED | STOPPED | BEYOND)
 PUSH = np.array([0.03, 0.02, -0.25])
 BLOCK = box((3, 3, 5), 0.1, distortion=0.15)
 SOFT = Material("stable-neo-hookean", 3000.0, 0.45)
@@ -215,7 +216,7 @@ def test_it_ends_as_it_must(name: str) -> None:
     outcome, u = found.outcome[0], found.displacement[0]
     assert outcome in case.ends, f"{case.wrong_elsewhere}: {outcome.value}"
     assert np.isfinite(u).all()
-    if outcome.good:
+    if outcome.good or outcome in BEYOND:
         assert found.reached[0] == 1.0
         assert case.residual(u) <= 1.01 * TOLERANCE
     else:

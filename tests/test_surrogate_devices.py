@@ -189,7 +189,7 @@ def test_ctrl_c_ends_all_processes_and_the_same_command_goes_on(tmp_path, box_fi
         out, error = run.communicate(timeout=30)
     finally:
         run.kill()
-    assert run.returncode == 130 and out == ""
+    assert run.returncode in (130, -signal.SIGINT) and out == ""
     assert error.strip().splitlines()[-1] == f"stopped; the same command goes on from {tmp_path / 'a.h5'}.partial"
     assert "Traceback" not in error and "Interrupt" not in error
     assert all(map(gone, children))

@@ -43,7 +43,8 @@ from ..script.tool_paths import Path, Touch
 from ..script.uncertainty import LEVEL, Uncertainty, mark_of
 
 # Thousandths of the motion, as in a locator's ensemble.
-ACCURACY = Accuracy(tolerance=3e-3)
+# Draws with inverted tetrahedra are counted, and not left out.
+ACCURACY = Accuracy(tolerance=3e-3, limit_strain=False)
 # Moments of a scene that are solved; a scene cannot be known where fewer draws than this share have an answer.
 MOMENTS, LEAST = 5, 0.8
 # A moment that is not reached at once is in so many steps.
@@ -277,20 +278,18 @@ def uncertainty(
     folded = sum(answer is not None and answer.inverted > 0 for answer in answers)
     kept, shifts = [draw for draw, _ in sound], rigid(SHIFTS, seed)
     meshes = mesh_errors(scene, kept)
-    rows, held = [], []
+    rows = []
     for moment, (field, normals) in enumerate(zip(still.fields, still.normals, strict=True)):
         motion = np.stack([answer[moment] for _, answer in sound])
         worst, middle = distances(off_by(motion, field, meshes), normals, *shifts)
-        held.append(left_out(worst))
         bounds = [float(np.quantile(one, LEVEL)) for one in (worst, middle)]
         moved = float(np.linalg.norm(field, axis=1).mean())
         rows.append((*bounds, moved, parts(motion, field, kept, scene)))
     worst, middle, moved, by_name = zip(*rows, strict=True)
     mark, failed = mark_of(scene, theatre.site, theatre.element_of(scene)), len(draws) - len(sound)
     named = {name: tuple(row[name] for row in by_name) for name in by_name[0]}
-    share = float(np.mean(held[1:] or held))
     numbers = sum(column.shape[1] for column in causes(kept, scene).values())
-    found = (scene.name, mark, len(draws), failed, share, still.times, worst, middle, moved, named)
+    found = (scene.name, mark, len(draws), failed, still.times, worst, middle, moved, named)
     return Uncertainty(*found, folded=folded, numbers=numbers)
 
 
@@ -311,12 +310,6 @@ def distances(
     worst = np.stack([np.linalg.norm(one + aside, axis=2).max(axis=1) for one in off])
     middle = np.stack([np.linalg.norm((one + aside).mean(axis=1), axis=1) for one in off])
     return worst, middle
-
-
-def left_out(worst: np.ndarray) -> float:
-    """Share of distances (draws, shifts) of each draw that are within the bound that all other draws give."""
-    bounds = [np.quantile(np.delete(worst, row, axis=0), LEVEL) for row in range(len(worst))]
-    return float((worst <= np.array(bounds)[:, None]).mean())
 
 
 def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw], scene: Scene) -> dict[str, float]:
@@ -358,16 +351,28 @@ def size(field: np.ndarray) -> float:
 
 def coverage(
     scene: Scene, still: Motions, stated: Uncertainty, draws: Sequence[Draw], answers: Iterable[Answer], seed: int
-) -> float:
-    """The share of twins whose worst point lies within the stated bound, over all moments but the first.
+) -> Uncertainty:
+    """The uncertainty with its coverage on synthetic patients: other draws, with other errors of registration.
 
-    Twins are other draws, with other errors of registration and segmentation.
+    Raises
+    ------
+    InputError
+        Fewer than two of them have an equilibrium.
     """
     sound = sound_of(draws, answers)
-    kept, held = [draw for draw, _ in sound], []
+    if len(sound) < 2:
+        raise InputError(
+            f"{len(sound)} of {len(draws)} synthetic patients of the scene {scene.name} have an equilibrium: too few."
+        )
+    kept, inside = [draw for draw, _ in sound], []
+    shift, wide = rigid(SHIFTS * len(sound), seed)  # of each patient their own
+    each = list(zip(shift.reshape(len(sound), SHIFTS, 3), wide.reshape(len(sound), SHIFTS), strict=True))
     for moment in range(1, len(still.times)):
         motion = np.stack([answer[moment] for _, answer in sound])
         off = off_by(motion, still.fields[moment], mesh_errors(scene, kept))
-        worst, _ = distances(off, still.normals[moment], *rigid(SHIFTS, seed))
-        held.append(worst <= stated.worst[moment])
-    return float(np.mean(held))
+        normals = still.normals[moment]
+        worst = [distances(one[None], normals, *errors)[0][0] for one, errors in zip(off, each, strict=True)]
+        inside.append(np.array(worst) <= stated.worst[moment])
+    shares = np.mean(inside, axis=(0, 2))  # errors of one patient depend on each other
+    deviation = float(shares.std(ddof=1) / np.sqrt(len(shares)))
+    return replace(stated, patients=len(shares), covered=float(shares.mean()), deviation=deviation)

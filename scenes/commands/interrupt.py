@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
@@ -72,14 +73,18 @@ def until_ended(work: Callable[[ExitStack], int]) -> int:
 def terminated_as_interrupted() -> Iterator[Callable[[], None]]:
     """Do at SIGTERM what Ctrl-C does: clean up, and end what was started.
 
-    Python drops an error that a finaliser raises, and so an interrupt that comes while one runs. Long work therefore
-    calls what this gives, now and then: it raises KeyboardInterrupt if a signal came.
+    Python drops an error that a finaliser raises: a signal that comes while one runs is repeated after it. Long work
+    also calls the function that is yielded, now and then: it raises KeyboardInterrupt if a signal came.
     """
-    came = threading.Event()
+    came, over = threading.Event(), threading.Event()
 
     def hear(number: int, frame: FrameType | None) -> None:
         came.set()
-        raise KeyboardInterrupt
+        if not _finalises(frame):
+            raise KeyboardInterrupt
+        again = threading.Timer(POLL, lambda: over.is_set() or signal.pthread_kill(main, number))
+        again.daemon = True
+        again.start()
 
     def stop_if_asked() -> None:
         if came.is_set():
@@ -88,12 +93,23 @@ def terminated_as_interrupted() -> Iterator[Callable[[], None]]:
     if threading.current_thread() is not threading.main_thread():
         yield stop_if_asked
         return
+    main = threading.get_ident()
     before = {number: signal.signal(number, hear) for number in CODES}
     try:
         yield stop_if_asked
     finally:
+        over.set()
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _finalises(frame: FrameType | None) -> bool:
+    """Return True if a frame runs within a finaliser, or within what a garbage collection calls."""
+    while frame is not None:
+        if frame.f_code.co_name in ("__del__", "_gc_callback") or frame.f_code.co_filename == weakref.__file__:
+            return True
+        frame = frame.f_back
+    return False
 
 
 def leave(number: int, frame: FrameType | None) -> None:

@@ -37,7 +37,7 @@ from surrogate.data.tool_poses import draw_poses, tool_of
 from ..script.shipped_files import template_path
 from .companion_files import batch_begun, remove_data
 from .devices_option import add_devices
-from .interrupt import INTERRUPTED
+from .interrupt import INTERRUPTED, terminated_as_interrupted
 from .outputs import add_force, claimed
 from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, elasticity_of, tissue_of
 
@@ -111,6 +111,7 @@ def run(args: argparse.Namespace) -> int:
     devices = device_names(args.device)
     batch = batch_begun(out) if args.batch is None else args.batch
     with ExitStack() as closing:
+        stop_if_asked = closing.enter_context(terminated_as_interrupted())
         with stage("set-up"):
             wanted = Asked(anatomy, effects, accuracy, args.element, batch, len(loads))
             solver = closing.enter_context(solving(wanted, devices, partial(print, file=sys.stderr)))
@@ -131,6 +132,7 @@ def run(args: argparse.Namespace) -> int:
         bar = closing.enter_context(tqdm(unit="load", disable=args.json, file=sys.stderr))
 
         def progress(done: int, total: int) -> None:
+            stop_if_asked()
             bar.total = total
             bar.update(done - bar.n)
 
@@ -211,4 +213,6 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Solved) -
     if not args.poses and refused_words(args.preset):
         print(refused_words(args.preset))
     if failed:
-        print(f"{failed} cases did not converge; they stay in the file, marked, and are not trained on.")
+        print(
+            f"{failed} answers are not reliable (their outcomes say why); they stay in the file and are not trained on."
+        )

@@ -83,8 +83,6 @@ class Uncertainty:
         Its name, and what tells it from others of that name, see `mark_of`.
     draws, failed
         Bodies that were solved, and those of which no equilibrium was found: these are left out.
-    held
-        Share of draws, each with many errors of registration and segmentation, that lie within what all others say.
     times
         [s].
     worst, middle
@@ -100,13 +98,17 @@ class Uncertainty:
         files that do not say it.
     numbers
         How many numbers the parts are fitted to the draws by; 0 in files that do not say it.
+    patients
+        Number of synthetic patients, none of them among the draws, on which the bound was tested.
+    covered, deviation
+        Share of their errors that the bound covered, over all moments but the first, and the share's standard deviation
+        from the number of patients; None: not tested.
     """
 
     scene: str
     mark: str
     draws: int
     failed: int
-    held: float
     times: tuple[float, ...]
     worst: tuple[float, ...]
     middle: tuple[float, ...]
@@ -115,6 +117,9 @@ class Uncertainty:
     frames: int = 0
     folded: int = 0
     numbers: int = 0
+    patients: int = 0
+    covered: float | None = None
+    deviation: float | None = None
 
     @property
     def few(self) -> bool:
@@ -186,10 +191,12 @@ def _read(row: dict) -> Uncertainty:
     for name, values in (lists | parts).items():
         if len(values) != len(lists["times"]) or not np.isfinite(values).all():
             raise InputError(f"{name} are not {len(lists['times'])} finite numbers.")
-    counts = int(row["draws"]), int(row["failed"]), float(row["held"])
-    frames, folded, numbers = (int(row.get(name, 0)) for name in ("frames", "folded", "numbers"))
-    of, mark = str(row["scene"]), str(row["mark"])
-    return Uncertainty(of, mark, *counts, **lists, parts=parts, frames=frames, folded=folded, numbers=numbers)
+    counts = {name: int(row.get(name, 0)) for name in ("frames", "folded", "numbers", "patients")}
+    shares = {name: None if row.get(name) is None else float(row[name]) for name in ("covered", "deviation")}
+    if not all(share is None or 0.0 <= share <= 1.0 for share in shares.values()):
+        raise InputError("covered and deviation are not shares from 0 to 1.")
+    of, mark, draws, failed = str(row["scene"]), str(row["mark"]), int(row["draws"]), int(row["failed"])
+    return Uncertainty(of, mark, draws, failed, **lists, parts=parts, **counts, **shares)
 
 
 def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:

@@ -12,6 +12,7 @@ from ..runtime.device import Device, forward_kernel
 # Shen, Yang 2013, "A comprehensive experimental study on material properties of human brain tissue", J. Biomech.
 # 46:2795-2801.
 LEAST, MOST = 0.5, 1.5
+ROUND_OFF = 1e-4  # a stretch of 1.5 in single precision is within the range
 # Volume beyond that range from which a deformation is not reliable [m^3], and as a share of a small body. Tools strain
 # a little tissue beyond it at their rims: in surgical loads up to 0.6 ml, under the hardest spatulas 2.5 ml.
 VOLUME, SHARE = 1e-6, 0.1
@@ -21,7 +22,7 @@ VOLUME, SHARE = 1e-6, 0.1
 def kernel_of(device: Device) -> wp.Kernel:
     """Kernel over (element, column)."""
     scalar, vec, mat = device.scalar, device.vector, device.matrix
-    low, high = wp.constant(wp.float64(LEAST * LEAST)), wp.constant(wp.float64(MOST * MOST))
+    low, high = wp.constant(wp.float64((LEAST - ROUND_OFF) ** 2)), wp.constant(wp.float64((MOST + ROUND_OFF) ** 2))
 
     @forward_kernel(module="unique")
     def measure(

@@ -13,6 +13,7 @@ from sim.deformation import Deformation
 from sim.loads import Pushed
 
 from ...script.tool_paths import lifted
+from ..load_text import doubt_of
 from ..player import Player
 from ..tip_reading import measured
 from .referee import Truth
@@ -24,12 +25,13 @@ OWN, TRUTH = "this is the finite elements' own answer", "the truth is the finite
 class Judged:
     """How far off a deformer is where the finite elements have answered: mean and largest, and the motion [m].
 
-    mean and largest are None where the answer is the finite elements' own; distance is theirs from tip to tumour [m].
+    doubt: why the truth may not be relied on; mean and largest are None where the answer is the finite elements' own;
+    distance is theirs from tip to tumour [m].
     """
 
     number: int
     seconds: float
-    good: bool
+    doubt: str
     motion: float
     mean: float | None
     largest: float | None
@@ -53,7 +55,7 @@ def judge(truth: Truth, player: Player, own: bool, shown: Deformation | None = N
     lift = lifted(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
     gauge = measured(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
     distance = None if gauge is None else gauge.distance
-    return Judged(truth.number, truth.seconds, truth.deformation.outcome[0].good, motion, *off, distance)
+    return Judged(truth.number, truth.seconds, doubt_of(truth.deformation.outcome[0]), motion, *off, distance)
 
 
 def verdict_words(judged: Judged | None, stale: bool, waits: str, own: str = OWN) -> str:
@@ -69,7 +71,7 @@ def verdict_words(judged: Judged | None, stale: bool, waits: str, own: str = OWN
     tip = "" if judged.distance is None else f"tip to tumour {millimetres(judged.distance)}, "
     tail = f"{tip}tumour moved {1e3 * judged.motion:.2f} mm by FEM, without the error of the tumour"
     tail += f" (frame {judged.number}, FEM {1e3 * judged.seconds:.0f} ms"
-    tail += ")" if judged.good else ", which did not reach its tolerance: do not rely on it)"
+    tail += f", {judged.doubt})" if judged.doubt else ")"
     if stale:
         return f'<p class="stale">of an earlier load: {said}; {tail}. {escape(waits)}</p>'
     return f"<p>{said}; {tail}</p>"
