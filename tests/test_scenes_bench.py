@@ -8,7 +8,7 @@ import pytest
 from conftest import make_box
 from theatres import coarse_brain
 
-from scenes.bench import stages, stopwatch
+from scenes.bench import contact_mesh, stages, stopwatch
 from scenes.bench.elements import Press, Row, limits, rows
 from scenes.bench.robustness import SETS, Record, Trial, records, shares, tallies
 from scenes.cli import main
@@ -16,6 +16,7 @@ from sim.bodies.meshfile import write_anatomy
 from sim.bodies.refine import refined
 from sim.deformation import Outcome
 from sim.effects import Elasticity, Held, Slide, ToolForce
+from sim.material import Material
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +50,16 @@ def test_soft_tissue_locks_linear_elements_alone():
     assert share["p1"] < 0.5
     assert 0.8 < share["p2"] < 1.0
     assert 0.8 < share["smoothed"] < 1.05
+
+
+def test_contact_force_of_p2_depends_less_on_the_mesh_than_that_of_p1():
+    anatomy = make_box(cells=(5, 5, 3), spacing=8e-3, tumour=12e-3, opening=34e-3)
+    stiff, exact = contact_mesh.rows(anatomy, ["p1", "p2"], [2e-3], 8e-3, Material("neo-hookean", 3000.0, 0.45), "cpu")
+    assert stiff.along.shape == stiff.fine.shape == (5,) and stiff.depth == 2e-3
+    assert 0.0 < exact.share < stiff.share and exact.along.mean() < stiff.fine.mean() < stiff.along.mean()
+    assert 0.0 < exact.sideways.max() < stiff.sideways.max() < stiff.along.min() and stiff.scatter > exact.scatter
+    known = replace(stiff, along=np.array([1.1, 1.3]), fine=np.array([1.0, 1.0]))
+    assert known.share == pytest.approx(0.2) and known.scatter == pytest.approx(0.2 / 1.2)
 
 
 def test_the_limit_is_that_of_a_second_order_error():

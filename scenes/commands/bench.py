@@ -8,6 +8,7 @@ import importlib
 BENCHES = {
     "stages": "what each stage of a frame costs on this machine (also done without a word)",
     "elements": "how far each element is from the limit of fine meshes, and what it costs",
+    "contact": "what share of a contact force is the mesh's: a ball is moved over one cell",
     "skull": "how far the tumour moves under each skull, on meshes of several sizes, and what passes",
     "robust": "how many of thousands of random loads converge",
     "live": "what a frame of a moving tool takes, warm-started, and how far off it is",

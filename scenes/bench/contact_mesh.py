@@ -1,0 +1,109 @@
+"""The mesh's share of a contact force: a ball is moved over one cell of a mesh and of the mesh with halved edges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.accuracy import TRAIN
+from sim.anatomy import Anatomy
+from sim.bodies.refine import refined
+from sim.discretisation.footprint import nearest_on
+from sim.effects import ToolContact, ToolForce, pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Touching
+from sim.material import Tissue
+from sim.tools import Ball
+
+# Places of the ball along one long edge of the surface, as shares of its length.
+PLACES = np.linspace(0.0, 1.0, 5)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Forces on a ball [N] over the places; NaN where the answer is not good.
+
+    Parameters
+    ----------
+    element, depth
+        Finite element, and how deep the ball stands in the surface at rest [m].
+    along
+        (places,) component along the surface's normal.
+    sideways
+        (places,) length of the rest.
+    fine
+        (places,) the component along the normal on the mesh with halved edges.
+    """
+
+    element: str
+    depth: float
+    along: np.ndarray
+    sideways: np.ndarray
+    fine: np.ndarray
+
+    @property
+    def share(self) -> float:
+        """Mean excess of the force over that on the mesh with halved edges, as a share of the latter."""
+        return float(np.mean(self.along / self.fine - 1.0))
+
+    @property
+    def scatter(self) -> float:
+        """Range of the force over the places, as a share of its mean."""
+        return float(np.ptp(self.along) / self.along.mean())
+
+
+def rows(
+    anatomy: Anatomy, elements: Sequence[str], depths: Sequence[float], radius: float, tissue: Tissue, device: str
+) -> Iterator[Row]:
+    """One row for each element and depth [m] of a ball of a radius [m].
+
+    Raises
+    ------
+    InputError
+        An anatomy without tumour or open cortex.
+    """
+    normal, places = _line(anatomy)
+    T = np.zeros((len(places), 1, 4, 4))
+    T[..., :3, :3], T[..., 3, 3] = _axes(normal), 1.0
+    fine = refined(anatomy)
+    for element in elements:
+        solvers = [_solver(body, element, radius, tissue, device) for body in (anatomy, fine)]
+        for depth in depths:
+            T[:, 0, :3, 3] = places - depth * normal
+            forces = []
+            for fem in solvers:
+                found = fem.deform(Loads((Touching(T.copy()),)))
+                good = np.array([outcome.good for outcome in found.outcome])
+                forces.append(np.where(good[:, None], found.reaction[:, 0, :3], np.nan))
+            along, finer = (np.abs(force @ normal) for force in forces)
+            sideways = np.sqrt(np.maximum((forces[0] ** 2).sum(axis=1) - along**2, 0.0))
+            yield Row(element, depth, along, sideways, finer)
+
+
+def _line(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
+    """The outward normal (3,) over the tumour, and places (p, 3) [m] along the open triangle's longest edge there."""
+    if not len(anatomy.tumour_nodes) or not len(anatomy.open_surface):
+        raise InputError("the anatomy has no tumour, or no open cortex above it: make one with `sulcus anatomy`.")
+    nodes = anatomy.mesh.nodes
+    centre = nodes[anatomy.tumour_nodes].mean(axis=0)
+    point = nearest_on(nodes[anatomy.open_surface], centre)
+    corners = nodes[anatomy.open_surface]
+    a, b, c = corners[np.linalg.norm(corners.mean(axis=1) - point, axis=1).argmin()]
+    normal = np.cross(b - a, c - a)
+    start, end = max(((a, b), (b, c), (c, a)), key=lambda edge: float(np.linalg.norm(edge[1] - edge[0])))
+    return normal / np.linalg.norm(normal), start + PLACES[:, None] * (end - start)
+
+
+def _axes(normal: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) whose third axis is a unit normal."""
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(normal, first), normal])
+
+
+def _solver(anatomy: Anatomy, element: str, radius: float, tissue: Tissue, device: str) -> Fem:
+    passive = (effect for effect in pushed_effects(anatomy, tissue) if not isinstance(effect, ToolForce))
+    return Fem(anatomy, [*passive, ToolContact((Ball(radius),))], TRAIN, device, element=element)

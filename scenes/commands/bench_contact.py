@@ -1,0 +1,49 @@
+"""`sulcus bench contact`: the mesh's share of a contact force."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from sim.bodies.meshfile import read_anatomy
+from sim.elements import ELEMENTS, RECOMMENDED
+
+from ..script.shipped_files import template_path
+from .tissue_options import add_tissue_arguments, tissue_of
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument("--elements", nargs="+", default=[RECOMMENDED], choices=ELEMENTS, help=f"({RECOMMENDED})")
+    parser.add_argument("--depths", nargs="+", type=float, default=[1.0, 3.0], help="of the ball [mm] (1 3)")
+    parser.add_argument("--ball", type=float, default=6.0, help="its radius [mm] (default %(default)g)")
+    add_tissue_arguments(parser)
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, row by row; 1 if an answer is not good."""
+    from ..bench.contact_mesh import rows
+    from ..bench.stages import machine
+
+    table, where = sys.stderr if args.json else sys.stdout, machine(args.device)
+    anatomy, found = read_anatomy(args.anatomy or template_path()), []
+    names = ("element", "depth [mm]", "force [mN]", "over halved edges", "range over a cell", "sideways, most")
+    print(f"{where}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}", file=table)
+    depths = [depth / 1e3 for depth in args.depths]
+    for row in rows(anatomy, args.elements, depths, args.ball / 1e3, tissue_of(args), args.device):
+        force = f"{row.element} | {1e3 * row.depth:g} | {1e3 * row.along.mean():.1f}"
+        shares = f"{row.share:+.1%} | {row.scatter:.1%} | {(row.sideways / row.along).max():.1%}"
+        print(f"| {force} | {shares} |", file=table, flush=True)
+        found.append(row)
+    if args.json:
+        lists = [{name: np.asarray(value).tolist() for name, value in asdict(row).items()} for row in found]
+        print(json.dumps({"machine": where, "rows": lists}))
+    return 0 if all(np.isfinite(row.along + row.fine).all() for row in found) else 1
