@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import get_lapack_funcs
 from scipy.special import chdtri, logsumexp
 
 from sim.errors import InputError
 
 from .causes import OEDEMA, TOOL
-from .elimination import Equations
+from .elimination import Equations, with_places
 from .evidence import SHIFT, SLIPPED, Evidence, triangular_inverse
 from .prior import RIGIDS, SETS, WITH_PLACE, Hypothesis, Prior
 from .whitened import Whitened, whitened
@@ -32,19 +33,39 @@ COARSENED = 2.0
 RIGID = -1
 # So many of the most probable hypotheses make a mixture.
 MIXED = 24
+potrs, trtrs = get_lapack_funcs(("potrs", "trtrs"), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What one hypothesis says: share, its probability; rows (k,) of the unknowns, mean (k,), and back (k, k).
+    """What one hypothesis says of k unknowns.
 
-    The covariance is back^T back.
+    Parameters
+    ----------
+    share
+        Its probability.
+    rows, mean
+        (k,) of the unknowns.
+    size
+        (k,): their prior standard deviations.
+    lower
+        (k, k): Cholesky factor of the precision of the unknowns, each over `size`.
     """
 
     share: float
     rows: np.ndarray
     mean: np.ndarray
-    back: np.ndarray
+    size: np.ndarray
+    lower: np.ndarray
+
+    def root(self, columns: np.ndarray) -> np.ndarray:
+        """Multiply columns (k, n) by R (k, k), of which the covariance is R^T R."""
+        return trtrs(self.lower.T, self.size[:, None] * columns, trans=1)[0]
+
+    @cached_property
+    def back(self) -> np.ndarray:
+        """R (k, k) itself."""
+        return self.size * triangular_inverse(self.lower)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,12 +115,11 @@ class Posterior:
 
     def covariance(self, shape: np.ndarray) -> np.ndarray:
         """Covariances (q, 3, 3) [m^2] of motions that shapes (r, q, 3) [m] make."""
-        flat = shape.reshape(len(shape), -1)
-        mean, found = self.weight @ flat, np.zeros((shape.shape[1], 3, 3))
+        flat = np.pad(shape.reshape(len(shape), -1), ((0, 6), (0, 0)))  # a rigid error moves no tissue
+        mean, found = self.unknown @ flat, np.zeros((shape.shape[1], 3, 3))
         for answer in self.answers:
-            chosen = answer.rows < len(flat)
-            part = flat[answer.rows[chosen]]
-            off = np.concatenate([answer.back[:, chosen] @ part, [answer.mean[chosen] @ part - mean]])
+            part = flat[answer.rows]
+            off = np.concatenate([answer.root(part), [answer.mean @ part - mean]])
             off = off.reshape(len(off), -1, 3).transpose(1, 2, 0)
             found += answer.share * off @ off.transpose(0, 2, 1)
         return self.factor * found
@@ -175,14 +195,16 @@ class SeenPrior:
         # Tools all over the cortex and the rigid error take part in all hypotheses, and a set extends an earlier one.
         rigid = self._equations().eliminated(TOOL).varied(RIGID, np.minimum(RIGIDS, self.slip)).eliminated(RIGID)
         found: dict[tuple[int, ...], Equations] = {}
+        extended = {some[:-1] for some in SETS}
         evidence = np.full((*rigid.evidence.shape, len(SETS), len(self.odds)), -np.inf)
         for number, some in enumerate(SETS):
             if OEDEMA in some and not self.named:
                 continue
-            here = found[some] = found[some[:-1]].eliminated(some[-1]) if some else rigid
+            last = some not in extended
+            here = found[some] = found[some[:-1]].eliminated(some[-1], last) if some else rigid
             evidence[..., number, 0] = here.evidence
-            if some in WITH_PLACE:
-                evidence[..., number, 1:] = here.with_places
+        pressed = [number for number, some in enumerate(SETS) if some in WITH_PLACE and some in found]
+        evidence[..., pressed, 1:] = np.moveaxis(with_places([found[SETS[number]] for number in pressed]), 0, -2)
         return self.odds + evidence.swapaxes(1, 2).reshape(-1, len(self.odds)) / COARSENED
 
     def _equations(self) -> Equations:
@@ -213,11 +235,11 @@ class SeenPrior:
         size = np.full(len(own), self.scale)
         size[: len(hypothesis.rows)] *= hypothesis.size
         size[len(hypothesis.rows) : len(own) - len(place)] = min(hypothesis.rigid, self.slip)
-        # The inverse of the Cholesky factor of the precision of unknowns, each over its prior standard deviation.
         inner = self.rows.products[own[:, None], own] * size * size[:, None]
         inner[np.diag_indices(len(own))] += 1.0
-        back = size * triangular_inverse(np.linalg.cholesky(inner))
-        return Answer(share, own, back.T @ (back @ self.rows.products[-1, own]), back)
+        lower = np.linalg.cholesky(inner)
+        mean = size * potrs(lower.T, size * self.rows.products[-1, own])[0]
+        return Answer(share, own, mean, size, lower)
 
 
 def seen_prior(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> SeenPrior:
@@ -264,8 +286,8 @@ def _oddness(rows: Whitened, answer: Answer, point: np.ndarray) -> np.ndarray:
     """Square Mahalanobis distance of each point (n,) from what all others predict of it, by one hypothesis."""
     data = len(rows.products) - 1
     precise = rows.precise(np.append(answer.rows, data))
-    known = precise[:, :-1] @ answer.back.T
-    gain = precise[:, -1] - known @ (answer.back @ rows.products[data, answer.rows])
+    known = answer.root(precise[:, :-1].T).T
+    gain = precise[:, -1] - precise[:, :-1] @ answer.mean
     number = np.unique(point, return_inverse=True)[1]
     order, count = np.argsort(number, kind="stable"), np.bincount(number)
     found, first = np.empty(len(count)), np.cumsum(count) - count

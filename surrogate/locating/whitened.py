@@ -51,7 +51,7 @@ class Whitened:
     @cached_property
     def products(self) -> np.ndarray:
         """(r + 7, r + 7): of the rows of unknowns, and of what is seen as the last, with each other."""
-        count, tall = self._shapes, len(self.weights) > len(self.shape)
+        count, tall = self._shapes, len(self.weights) > 2 * len(self.shape)
         few = np.linalg.qr(self.weights, mode="r") if tall else self.weights
         rows = (few @ self.shape).reshape(-1, count)
         across = self.weights.T @ self.rest.reshape(len(self.weights), -1)
