@@ -166,6 +166,8 @@ def test_figures_of_a_row_are_those_by_hand():
     assert (found.held, found.milliseconds) == (50.0, pytest.approx(20.0)) and (found.twins, found.refused) == (2, 0)
     with_refused = row(PointsSeen(30, 20, 1), "it", [exact, half, refused])
     assert with_refused.removed == pytest.approx(100.0 * (1.0 - 13.0 / 30.0)) and with_refused.held == 50.0
+    warned = row(PointsSeen(30, 20, 1), "it", [replace(half, warned=True), half, replace(half, doubted=True)])
+    assert (warned.warned, warned.doubted) == (1, 1)
     assert with_refused.refused == 1 and with_refused.milliseconds == pytest.approx(20.0)
     alone = row(PointsSeen(30, 20, 1), "it", [refused])
     assert (alone.held, alone.milliseconds, alone.removed) == (None, None, pytest.approx(0.0))
@@ -224,6 +226,13 @@ def test_every_twin_is_seen_on_points_of_its_own(locator, body):
     slipped = observed(body, some[0].motion, PointsSeen(30, 50, 0, slip=8e-3), (0, 0)).now - seen[0].now
     assert slipped == pytest.approx(np.tile(slipped[0], (30, 1))) and np.linalg.norm(slipped[0]) == pytest.approx(8e-3)
     assert slipped[0] @ open_cortex(body).axis == pytest.approx(0.0, abs=1e-9)
+    wrong = [observed(body, some[0].motion, PointsSeen(30, 50, 0, wrong=True), (0, seed)) for seed in range(8)]
+    right = [observed(body, some[0].motion, PointsSeen(30, 50, 0), (0, seed)) for seed in range(8)]
+    moved = np.stack([one.now - other.now for one, other in zip(wrong, right, strict=True)])
+    shifts = np.ptp(moved, axis=1).max(axis=1) < 1e-12
+    assert 0 < shifts.sum() < 8
+    assert all(2e-3 <= np.linalg.norm(each[0]) <= 5e-3 for each in moved[shifts])
+    assert all(np.linalg.norm(each, axis=1).max() <= np.radians(4.0) * 0.1 for each in moved[~shifts])
     with pytest.raises(InputError, match="level 3"):
         list(rows(some, sights_of([30], [50], [3]), spy, locator))
     with pytest.raises(InputError, match="no twin"):

@@ -18,7 +18,7 @@ from sim.effects import SKULLS
 from sim.errors import InputError
 from surrogate.locating.calibration import seen_patch
 from surrogate.locating.cause_shares import cause_shares
-from surrogate.locating.causes import DRAINAGE, KINDS, OEDEMA, SWELLING
+from surrogate.locating.causes import DRAINAGE, KINDS, OEDEMA, SWELLING, TOOL
 from surrogate.locating.locator_files import load_locator, locator_path
 from surrogate.locating.observation import Observation
 from surrogate.locating.prior import middle_of
@@ -99,6 +99,30 @@ def test_a_shift_along_the_axis_is_answered_as_sinking_and_said_to_look_alike(lo
     assert not found.slipped and found.calibrated and not found.doubt
     (said,) = found.warnings
     assert "with a brain at rest. The two cannot be distinguished. If it may be off so far" in said
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("skull", range(3))
+def test_locate_true_motion_warns_of_no_registration(locator, skull, seed):
+    """Drained, with a dent of the last shape of a tool; most of it looks like a shift of all points."""
+    prior, body = locator.prior, locator.anatomy
+    random, motion = np.random.default_rng([skull, seed]), np.zeros_like(body.mesh.nodes)
+    for kind, size in ((DRAINAGE, 4.0), (SWELLING, 1.0), (TOOL, 1.0)):
+        some = prior.shape[(prior.kind == kind) & (prior.skull == (skull if kind else skull % 2))][:3]
+        motion[prior.nodes] += size * np.tensordot(random.standard_normal(len(some)), some, 1)
+    found = locator.locate(replace(observed(body, motion, NAMED, (0, seed)), rigid=0.8e-3))
+    assert not found.is_registration_suspect and not any("registration" in said for said in found.warnings)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("sight", [NAMED, CLOUD])
+def test_locate_shifted_registration_warns(locator, sight, seed):
+    """Nothing moved but the registration, by 7 mm along the axis and across it."""
+    body, axis = locator.anatomy, open_cortex(locator.anatomy).axis
+    seen = observed(body, np.zeros_like(body.mesh.nodes), sight, (0, seed))
+    shift = 5e-3 * axis + sideways(body, 5e-3)
+    found = locator.locate(replace(seen, now=seen.now + shift, rigid=0.8e-3))
+    assert found.is_registration_suspect and any("registration" in said for said in found.warnings)
 
 
 @pytest.mark.parametrize("sight", [NAMED, CLOUD])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -31,13 +32,16 @@ EXACT = 5e-5
 WHITE, SMOOTH, LENGTH, TURN = 0.3e-3, 0.5e-3, 15e-3, float(np.radians(0.5))
 TRANSLATIONS = (0.0, 1e-3, 2e-3)
 """Of the rigid error, at each level of noise [m]; at level 0 there is no error at all."""
+# Least and greatest error of a wrong registration: a translation [m], or a rotation [rad] about the brain's middle.
+WRONG_BY = (2e-3, 5e-3), (float(np.radians(2.0)), float(np.radians(4.0)))
 
 
 @dataclass(frozen=True)
 class PointsSeen:
     """What is seen: so many points, on a round share `cover` [%] of the open cortex, at a level of noise.
 
-    Points without names are a cloud. A registration that slips displaces all by `slip` [m], along the open cortex.
+    Points without names are a cloud. A registration that slips displaces all by `slip` [m], along the open cortex. One
+    that is `wrong` displaces or rotates all, as `misplaced` does.
     """
 
     points: int
@@ -45,6 +49,7 @@ class PointsSeen:
     noise: int
     named: bool = True
     slip: float = 0.0
+    wrong: bool = False
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,8 @@ class Estimate:
         Whether the observation was refused: the tumour is then believed where the scan shows it.
     doubted
         Whether it was said that the registration may have slipped.
+    warned
+        True if a warning names a wrong registration, one that may have slipped included.
     """
 
     error: np.ndarray
@@ -71,6 +78,7 @@ class Estimate:
     seconds: float | None
     refused: bool = False
     doubted: bool = False
+    warned: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,8 +95,8 @@ class Row:
         Share of the twins [%] whose centroid lies in the ellipsoid that is said to hold 95 %; None: none is stated.
     milliseconds
         Median of an estimate; None of the oracle, which is none.
-    twins, refused, doubted
-        How many there were, how many of them were refused, and of how many a slip was suspected.
+    twins, refused, doubted, warned
+        Numbers of twins, of refused observations, of suspected slips, and of warnings of a wrong registration.
     """
 
     points: int
@@ -103,6 +111,7 @@ class Row:
     twins: int
     refused: int
     doubted: int
+    warned: int
 
 
 def observed(body: Anatomy, motion: np.ndarray, sight: PointsSeen, seed: tuple[int, ...]) -> Observation:
@@ -115,12 +124,23 @@ def observed(body: Anatomy, motion: np.ndarray, sight: PointsSeen, seed: tuple[i
     rest, moved = evidence.at[::3], evidence.value.reshape(-1, 3)
     if sight.slip:
         moved = moved + sight.slip * _along(body, np.random.default_rng([*seed, sight.points, sight.cover, 3]))
-    known = rest if sight.named else None
-    if not sight.noise:
-        return Observation(rest + moved, known, np.full(len(rest), EXACT), rigid=0.0)
-    random = np.random.default_rng([*seed, sight.points, sight.cover, sight.noise])
-    translation = TRANSLATIONS[sight.noise]
-    return Observation(spoilt(rest, rest + moved, translation, random), known, rigid=translation / np.sqrt(3.0))
+    now, sigma, translation = rest + moved, np.full(len(rest), EXACT), TRANSLATIONS[sight.noise]
+    if sight.noise:
+        random = np.random.default_rng([*seed, sight.points, sight.cover, sight.noise])
+        now, sigma = spoilt(rest, now, translation, random), None
+    if sight.wrong:
+        now = misplaced(body, now, np.random.default_rng([*seed, sight.points, sight.cover, 4]))
+    return Observation(now, rest if sight.named else None, sigma, rigid=translation / np.sqrt(3.0))
+
+
+def misplaced(body: Anatomy, now: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Displace or rotate positions (n, 3) [m] at random, within `WRONG_BY`."""
+    way, rotates = random.standard_normal(3), random.uniform() < 0.5
+    error = random.uniform(*WRONG_BY[rotates]) * way / np.linalg.norm(way)
+    if not rotates:
+        return now + error
+    middle = body.mesh.nodes.mean(axis=0)
+    return middle + Rotation.from_rotvec(error).apply(now - middle)
 
 
 def _along(body: Anatomy, random: np.random.Generator) -> np.ndarray:
@@ -180,10 +200,10 @@ def rows(
 
 
 def sights_of(
-    points: Sequence[int], covers: Sequence[int], noises: Sequence[int], named: bool = True, slip: float = 0.0
+    points: Sequence[int], covers: Sequence[int], noises: Sequence[int], **others: Any
 ) -> tuple[PointsSeen, ...]:
-    """Every combination."""
-    return tuple(PointsSeen(*each, named, slip) for each in product(points, covers, noises))
+    """Every combination, with `others` of a `PointsSeen`."""
+    return tuple(PointsSeen(*each, **others) for each in product(points, covers, noises))
 
 
 def row(sight: PointsSeen, name: str, estimates: Sequence[Estimate]) -> Row:
@@ -202,6 +222,7 @@ def row(sight: PointsSeen, name: str, estimates: Sequence[Estimate]) -> Row:
         twins=len(estimates),
         refused=sum(each.refused for each in estimates),
         doubted=sum(each.doubted for each in estimates),
+        warned=sum(each.warned for each in estimates),
     )  # fmt: skip
 
 
@@ -212,10 +233,11 @@ def estimate(
     seconds: float | None,
     refused: bool = False,
     doubted: bool = False,
+    warned: bool = False,
 ) -> Estimate:
     """An estimate of the motion (q, 3) [m] of the tumour's vertices, beside the truth (q, 3) [m]."""
     error, motion = np.linalg.norm(found - true, axis=1), np.linalg.norm(true, axis=1)
-    return Estimate(error, motion, square, seconds, refused, doubted)
+    return Estimate(error, motion, square, seconds, refused, doubted, warned)
 
 
 def ours(locator: Locator, motion: np.ndarray, seen: Observation) -> Estimate:
@@ -228,7 +250,8 @@ def ours(locator: Locator, motion: np.ndarray, seen: Observation) -> Estimate:
         return estimate(np.zeros_like(true), true, None, None, refused=True)
     off = found.centroid - middle_of(body, motion[None])[0]
     square = float(off @ np.linalg.solve(found.centroid_covariance, off))
-    return estimate(found.at(body.tumour_nodes), true, square, found.seconds, doubted=found.slipped)
+    doubts = {"doubted": found.slipped, "warned": found.is_registration_suspect}
+    return estimate(found.at(body.tumour_nodes), true, square, found.seconds, **doubts)
 
 
 def _rivalling(body: Anatomy, twin: Twin, rival: Rival, seen: Observation) -> Estimate:

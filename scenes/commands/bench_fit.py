@@ -34,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, default=0, help="of the patients (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--locator", type=Path, metavar="FILE.npz", help="locator of the anatomy (default: a new one)")
     parser.add_argument("--folder", type=Path, help="keeps what was made, so that a stopped run goes on")
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
 

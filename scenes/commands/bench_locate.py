@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 HEADS = (
     "points", "cover [%]", "noise", "estimator", "removed [%]", "error: mean [mm]", "p95 [mm]", "in the 95 % ellipsoid",
-    "refused", "in doubt", "ms",
+    "refused", "in doubt", "warned", "ms",
 )  # fmt: skip
 
 # Farther no registration slips unnoticed [mm].
@@ -63,6 +63,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--slip", type=float, default=0.0, metavar="MM",
         help="all points are displaced so far along the open cortex, as by a registration that slipped (default 0)",
     )  # fmt: skip
+    parser.add_argument(
+        "--wrong-registration", action="store_true",
+        help="all points are displaced by 2 to 5 mm or rotated by 2 to 4 degrees, in a random direction",
+    )  # fmt: skip
+    parser.add_argument(
+        "--locator", type=Path, metavar="FILE.npz", help="locator of the anatomy (default: a new one, kept in --folder)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the twins and of what is seen (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument(
@@ -92,7 +99,8 @@ def run(args: argparse.Namespace) -> int:
     table = sys.stderr if args.json else sys.stdout
     where = f"{machine(args.device)}; truths of {len(finer.mesh.nodes)} nodes, {args.element}"
     print(f"{where}\n\n{len(some)} twins\n\n| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", file=table)
-    sights = sights_of(args.points, args.cover, args.noise, not args.clouds, 1e-3 * args.slip)
+    others = {"named": not args.clouds, "slip": 1e-3 * args.slip, "wrong": args.wrong_registration}
+    sights = sights_of(args.points, args.cover, args.noise, **others)
     made = []
     with bar("observations") as heard:
         for row in rows(some, sights, rivals(body), locator, args.seed, heard):
@@ -151,12 +159,12 @@ def finer_of(args: argparse.Namespace) -> Anatomy:
 
 
 def locator_of(args: argparse.Namespace, body: Anatomy) -> Locator:
-    """The locator that the folder keeps, or a new one."""
+    """Read the locator that is given, or the one that the folder keeps, or make a new one."""
     from surrogate.locating.locator_files import load_locator, save_locator
     from surrogate.locating.setup import make_locator
 
-    path = None if args.folder is None else args.folder / f"{body.digest}.locator.npz"
-    if path is not None and path.is_file():
+    path = args.locator or (args.folder and args.folder / f"{body.digest}.locator.npz")
+    if args.locator or (path and path.is_file()):
         return load_locator(path, body)
     parts = None if path is None else path.with_suffix(".parts")
     with bar("locator") as heard:
@@ -188,5 +196,6 @@ def _cells(row: Row) -> Iterable[str]:
     took = "" if row.milliseconds is None else f"{row.milliseconds:.3g}"
     return (
         f"{row.points}", f"{row.cover}", f"{row.noise}", row.estimator, f"{row.removed:.0f}", f"{row.mean:.2f}",
-        f"{row.p95:.2f}", held, f"{row.refused or ''}", f"{row.doubted or ''}", took,
+        f"{row.p95:.2f}", held, f"{row.refused or ''}", f"{row.doubted or ''}",
+        f"{row.warned or ''}", took,
     )  # fmt: skip

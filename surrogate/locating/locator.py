@@ -28,8 +28,11 @@ MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
 # The registration may have slipped where that makes what is seen so many times as probable, as a logarithm. On twins it
 # does so for one of 432 motions, and for all slips of 8 to 20 mm along the cortex (docs/locate.md).
 DOUBTFUL = -2.0
-# A rigid error alone that explains such a share, and is so many times as large as stated, is named.
-RIGID, WIDE = 0.9, 2.0
+# Least logarithm of a slip's probability over that of a motion for which a warning names the slip. True motions have
+# -7 in the median (docs/locate.md).
+ALIKE = -2.5
+# A rigid error is wide if it exceeds the reported one by this factor.
+WIDE = 2.0
 # What is said where swelling has a greater share than this.
 SWELLS = 0.5
 OEDEMA_WORDS = (
@@ -180,15 +183,18 @@ class Location:
         return ""
 
     @property
+    def is_registration_suspect(self) -> bool:
+        """Return True if a wrong registration explains the observation nearly as well as a motion does."""
+        found, checked = self.posterior, self.checked
+        return self.slipped or (not checked and found.evidence.beyond > WIDE and found.slipped >= ALIKE)
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What else must be known of the answer, in sentences: what would look alike, and `doubt`."""
-        evidence, alike = self.posterior.evidence, self.posterior.slipped >= DOUBTFUL
-        share = self.rigid_alone.share
-        named = not (self.slipped or self.checked) and evidence.beyond > WIDE and (alike or share > RIGID)
-        apart = " The two cannot be distinguished." if alike else ""
+        named = self.is_registration_suspect and not self.slipped
         rigid = (
-            f"{self._rigid_words} would explain {share:.0%}, with a brain at rest.{apart} If it may be off so far, say "
-            "so by --rigid."
+            f"{self._rigid_words} would explain {self.rigid_alone.share:.0%}, with a brain at rest. The two cannot be "
+            "distinguished. If it may be off so far, say so by --rigid."
         )
         swells = self.causes["swelling"] + self.causes["oedema"] > SWELLS
         return tuple(said for said in (rigid if named else "", OEDEMA_WORDS if swells else "", self.doubt) if said)
