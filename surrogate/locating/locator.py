@@ -144,7 +144,7 @@ class Location:
     @cached_property
     def within_errors(self) -> bool:
         """Whether nothing need have moved for what was seen: it is no more than errors that are stated."""
-        return within_errors(self.prior, self.posterior.evidence)
+        return within_errors(self.posterior)
 
     @cached_property
     def cause_shares(self) -> tuple[CauseShare, ...]:

@@ -87,6 +87,8 @@ class Posterior:
     slipped
         Logarithm of how many times more probable what is seen is, if the registration slipped, than if it did not: of
         the best hypothesis of each.
+    moving
+        As that of a `SeenPrior`.
     factor
         What covariances are larger by than the mixture's.
     """
@@ -97,6 +99,7 @@ class Posterior:
     surprise: float
     outliers: np.ndarray
     slipped: float
+    moving: float
     factor: float = 1.0
 
     @property
@@ -160,8 +163,11 @@ class SeenPrior:
 
     @property
     def moving(self) -> float:
-        """Logarithm of the mean evidence of motions under a registration that is no more off than is stated."""
-        logs = COARSENED * self.logs[~self._slips]
+        """Logarithm of the mean evidence of motions under a registration that is no more off than is stated.
+
+        Odds do not count: a tip tells of no motion.
+        """
+        logs = COARSENED * (self.logs - self.odds)[~self._slips]
         logs, rows = logs[np.isfinite(logs)], self.rows
         return float(logsumexp(logs) - np.log(len(logs)) - 0.5 * rows.products[-1, -1] + rows.whitening.logarithm)
 
@@ -236,7 +242,7 @@ class SeenPrior:
         size[: len(hypothesis.rows)] *= hypothesis.size
         size[len(hypothesis.rows) : len(own) - len(place)] = min(hypothesis.rigid, self.slip)
         inner = self.rows.products[own[:, None], own] * size * size[:, None]
-        inner[np.diag_indices(len(own))] += 1.0
+        inner.flat[:: len(own) + 1] += 1.0
         lower = np.linalg.cholesky(inner)
         mean = size * potrs(lower.T, size * self.rows.products[-1, own])[0]
         return Answer(share, own, mean, size, lower)
@@ -279,7 +285,7 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS, fr
     for answer in answers:
         unknown[answer.rows] += answer.share * answer.mean
     outliers = np.setdiff1d(point, some.point)
-    return Posterior(some, answers, unknown, float(odd.sum() / len(some)), outliers, seen.slipped)
+    return Posterior(some, answers, unknown, float(odd.sum() / len(some)), outliers, seen.slipped, seen.moving)
 
 
 def _oddness(rows: Whitened, answer: Answer, point: np.ndarray) -> np.ndarray:

@@ -5,15 +5,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import chdtrc
 
-from .evidence import Evidence
-from .posterior import seen_prior
-from .prior import Prior
+from .posterior import Posterior
 
 # So improbable by errors alone is what is seen where something moved, by each of three tests.
 MOVED = 0.005
 
 
-def within_errors(prior: Prior, evidence: Evidence) -> bool:
+def within_errors(posterior: Posterior) -> bool:
     """Whether what is seen is no more than its errors, the rigid one as large as is stated: nothing need have moved.
 
     Two tests are of its size: the square Mahalanobis distance has a part of what is rigid, by generalised least
@@ -21,6 +19,7 @@ def within_errors(prior: Prior, evidence: Evidence) -> bool:
     the prior make it, by their mean evidence, as errors alone do. By Markov's inequality errors alone exceed 1 / p with
     a probability of p at most. So a dent is seen that is no larger in all than errors might be.
     """
+    evidence = posterior.evidence
     whitening, scale = evidence.whitening(0.0), evidence.rigid_scale
     rigid, white = whitening.white(evidence.rigid * scale), whitening.white(evidence.value)
     precision, gain = rigid.T @ rigid, rigid.T @ white
@@ -31,4 +30,4 @@ def within_errors(prior: Prior, evidence: Evidence) -> bool:
     if min(chdtrc(6, together), chdtrc(len(white) - 6, rest)) <= MOVED:
         return False
     still = 0.5 * (gain @ np.linalg.solve(whole, gain) - np.linalg.slogdet(whole)[1] - white @ white)
-    return bool(seen_prior(prior, evidence).moving - still - whitening.logarithm < -np.log(MOVED))
+    return bool(posterior.moving - still - whitening.logarithm < -np.log(MOVED))

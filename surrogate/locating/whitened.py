@@ -40,7 +40,8 @@ class Whitened:
         shapes = columns < self._shapes
         found, back = np.empty((len(self.rest), len(columns))), self.whitening.back
         some = self.shape.reshape(-1, self._shapes)[:, columns[shapes]].reshape(len(self.shape), -1)
-        found[:, shapes] = (back(self.weights) @ some).reshape(len(found), -1)
+        root = self.whitening.root.T
+        found[:, shapes] = np.linalg.multi_dot([root, self.weights, some]).reshape(len(found), -1)
         found[:, ~shapes] = back(self.rest[:, columns[~shapes] - self._shapes])
         return found
 
