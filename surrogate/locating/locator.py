@@ -82,7 +82,7 @@ class Location:
         Whether covariances were tried on observations like this: named points or a cloud, so many, and motions so far
         above errors, from a registration that did not slip.
     seconds
-        What this took, set-up apart.
+        What this took, set-up and tables that all observations share apart.
     """
 
     prior: Prior
@@ -261,7 +261,9 @@ class Locator:
             return self._located(observation)
 
     def _located(self, observation: Observation) -> Location:
-        begun, prior, count = time.perf_counter(), self.prior, len(observation.now)
+        prior, count = self.prior, len(observation.now)
+        prior.prepare()
+        begun = time.perf_counter()
         found, near = settled(prior, observation)
         slipped = not observation.checked and _may_have_slipped(prior.anatomy, found)
         if slipped:

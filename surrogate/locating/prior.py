@@ -137,6 +137,10 @@ class Prior:
         some = np.unique(nodes)
         return replace(self, shape=self.at(some), nodes=some)
 
+    def prepare(self) -> None:
+        """Compute the tables that all observations share, unless they are there."""
+        _ = self.middle, self.hypotheses, self.together, self._by_vertex
+
     @cached_property
     def middle(self) -> np.ndarray:
         """(r, 3) [m]: how each shape moves the middle of the tumour's volume."""
