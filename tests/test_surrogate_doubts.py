@@ -134,13 +134,21 @@ def test_a_brain_that_sinks_is_not_taken_for_a_slip(locator, sunk, sight):
     assert not found.within_errors and sum(found.causes.values()) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_locate_cloud_rounding_changes_no_result(locator, sunk, seed):
+    """Over an edge of the surface two triangles are equally near, so that rounding selects one."""
+    seen = observed(locator.anatomy, sunk / 2.0, PointsSeen(300, 28, 2, named=False), (0, seed))
+    found, again = (locator.locate(replace(seen, now=seen.now * factor)).centroid for factor in (1.0, 1.0 + 4e-16))
+    assert again == pytest.approx(found, abs=1e-8)
+
+
 def test_a_cloud_that_sinks_has_drained_though_a_brain_that_shrinks_looks_alike(locator):
     """All of it by 5 mm, along the opening's axis."""
     body = locator.anatomy
     still = observed(body, np.zeros_like(body.mesh.nodes), PointsSeen(100, 90, 1, named=False), (0, 0))
     found = locator.locate(replace(still, now=still.now + 5e-3 * open_cortex(body).axis))
     largest = found.cause_shares[0]
-    assert largest.causes == KINDS[1:3] and largest.low > 0.8 and "not separable" in found.named_causes
+    assert largest.causes == KINDS[1:3] and largest.low > 0.7 and "not separable" in found.named_causes
     assert found.causes["drainage"] > found.causes["swelling"]
 
 

@@ -13,7 +13,7 @@ from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
 from sim.geometry.closest_point import closest
 from sim.geometry.locate import Located, locate
-from sim.geometry.surface import unit
+from sim.geometry.surface import unit, vertex_normals
 
 from ..array_functions import squared_distances
 from .evidence import SHIFT, SIGMA, Evidence, of_motions
@@ -168,9 +168,9 @@ def _along_normals(
     triangles, nodes = anatomy.open_surface, anatomy.mesh.nodes
     corners = (nodes + motion)[triangles]
     _, triangle, weights = closest(cloud - bias(cloud), corners)
-    a, b, c = np.moveaxis(corners[triangle], 1, 0)
-    normal = unit(np.cross(b - a, c - a))
     vertices = triangles[triangle]
+    # Over an edge two triangles are equally near: normals of vertices do not depend on the one that is found.
+    normal = unit(np.einsum("nc,nci->ni", weights, vertex_normals(nodes + motion, triangles)[vertices]))
     at = np.einsum("nc,nci->ni", weights, nodes[vertices])
     # A fourth vertex of no weight makes it a place of the mesh.
     place = Located(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(len(at))]))
