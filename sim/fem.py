@@ -73,6 +73,8 @@ class Fem:
         Loads come one at a time. On the CPU the first takes a second more, the others a third to two thirds as long.
     avoid
         Solvers that are not tried, as where one is measured or doubted. Newton-CG always is.
+    stiff_as
+        Another `Fem` of the same rest stiffness, as where only a change of volume differs: its factor is shared.
 
     Raises
     ------
@@ -90,6 +92,7 @@ class Fem:
         element: str | None = None,
         live: bool = False,
         avoid: Collection[Step] = (),
+        stiff_as: Fem | None = None,
     ):
         if not isinstance(anatomy, Anatomy):
             raise InputError(f"anatomy is {anatomy!r:.80}: give an Anatomy, such as read_anatomy(FILE.vtu) returns.")
@@ -104,7 +107,8 @@ class Fem:
         self.space = discretise(anatomy.mesh, element)
         self._skin = Skin(self.space.nodes, self.space.surface, find_device(device, accuracy.precision))
         problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
-        preconditioner = choose_preconditioner(problem, self.space, self._unsmoothed)
+        shared = stiff_as and stiff_as.strategy.preconditioner
+        preconditioner = shared or choose_preconditioner(problem, self.space, self._unsmoothed)
         if batch is None:
             batch = fitting_batch(problem.rows, problem.device, free_bytes(problem.device))
         plan = plan_for(problem, preconditioner, self.space, accuracy, at_least("batch", batch, 1), live, avoid)

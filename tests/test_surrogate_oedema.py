@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from locators import in_a_skull, locator_of
 
+from sim import fem
 from sim.anatomy import BRAIN_LABEL, PART_LABELS
-from surrogate.locating.causes import OEDEMA, SWELLING, Causes, groups
-from surrogate.locating.ensemble import members
+from surrogate.locating.causes import OEDEMA, SWELLING, Causes, groups, swellings
+from surrogate.locating.ensemble import ACCURACY, members
 from surrogate.locating.observation import Observation, placed
 from surrogate.locating.oedema import round_tumour
 from surrogate.locating.posterior import conditioned
@@ -53,6 +54,18 @@ def test_oedema_is_solved_and_bulges_over_the_tumour_more_than_a_brain_that_swel
     size = np.linalg.norm(motion[:, np.unique(body.open_surface)], axis=2)
     bulge = size.max(axis=1) / np.sqrt((size**2).mean(axis=1))
     assert bulge[kind == OEDEMA].min() > 1.05 * bulge[kind == SWELLING][0]
+
+
+def test_members_of_one_group_share_one_factor(body, monkeypatch):
+    """Only changes of volume differ; results agree with those of factors of their own within the tolerance."""
+    group, made, choose = groups(body, 0, FEW)[0], [], fem.choose_preconditioner
+    monkeypatch.setattr(fem, "choose_preconditioner", lambda *given: made.append(given) or choose(*given))
+    motion, kind = members(body, group, 0, "cpu", FEW)
+    assert len(made) == 1
+    marked, labels = round_tumour(body, group.reach[0])
+    apart = fem.Fem(marked, group.effects(FEW.oedema, labels), ACCURACY, "cpu").deform(swellings(marked, FEW.oedema))
+    largest = np.abs(apart.displacement).max()
+    assert motion[kind == OEDEMA][: len(apart)] == pytest.approx(apart.displacement, abs=1e-2 * largest)
 
 
 def test_a_cloud_is_not_taken_for_oedema(body):

@@ -119,12 +119,12 @@ def members(
     answers = [
         fem.deform(pushes(group, anatomy, seed, causes)),
         fem.deform(swellings(anatomy, causes.swellings)),
-        _swollen(anatomy, group, causes.tumour_swellings, tumour, device),
+        _swollen(anatomy, group, causes.tumour_swellings, tumour, device, fem),
     ]
     kind = [TOOL, SWELLING, TUMOUR_SWELLING]
     for reach in group.reach:
         body, marked = round_tumour(anatomy, reach)
-        answers.append(_swollen(body, group, causes.oedema, marked, device))
+        answers.append(_swollen(body, group, causes.oedema, marked, device, fem))
         kind.append(OEDEMA)
     last: Deformation | None = None
     for loads in drainages(group, anatomy, seed, causes):
@@ -141,10 +141,11 @@ def members(
 
 
 def _swollen(
-    anatomy: Anatomy, group: Group, shares: tuple[float, ...], regions: tuple[int, ...], device: str
+    anatomy: Anatomy, group: Group, shares: tuple[float, ...], regions: tuple[int, ...], device: str, fem: Fem
 ) -> Deformation:
-    """Answers of a body of which some regions change their volume by such shares."""
-    return Fem(anatomy, group.effects(shares, regions), ACCURACY, device).deform(swellings(anatomy, shares))
+    """Answers of a body of which some regions change their volume by such shares; it is as stiff as that of `fem`."""
+    swells = Fem(anatomy, group.effects(shares, regions), ACCURACY, device, stiff_as=fem)
+    return swells.deform(swellings(anatomy, shares))
 
 
 def surface_size(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
