@@ -19,8 +19,6 @@ from sim.loads import Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Rese
 from sim.minimisers.lbfgs import LEARNT
 from sim.resected_fem import finite_elements
 
-pytestmark = pytest.mark.empty  # nothing lost, no doubles, no rows: compared as such
-
 BODY = base_held(box((3, 3, 3), 0.1))
 EFFECTS = Elasticity(), Held(), ToolForce()
 POINT, FORCE = np.array([0.05, 0.05, 0.1]), np.array([0.0, 0.0, -0.2])
@@ -145,12 +143,14 @@ def test_what_is_no_load_is_refused(fem: Fem, cut: Any, loads: Any) -> None:
 def test_lists_of_vertices_will_do(fem: Fem, cut: Any) -> None:
     for body in (fem, cut):
         whole = body.deform(PUSH)
-        some_lists: list[Any] = [[5, 2], (5, 2), np.array([5, 2], np.uint8), [], [7, 7]]
+        some_lists: list[Any] = [[5, 2], (5, 2), np.array([5, 2], np.uint8), [7, 7]]
         for at in some_lists:
             some = body.deform(PUSH, at=at)
             np.testing.assert_array_equal(some.displacement, whole.displacement[:, np.array(at, int)])
             np.testing.assert_array_equal(whole.at(at).displacement, some.displacement)
             assert some.displacement.shape == (1, len(at), 3)
+        none: Any = []
+        assert body.deform(PUSH, at=none).displacement.shape == whole.at(none).displacement.shape == (1, 0, 3)
     with pytest.raises(InputError, match="does not know vertex 3"):
         fem.deform(PUSH, at=np.array([1])).at(np.array([3]))
     with pytest.raises(InputError, match="does not know vertex 3"):
