@@ -15,7 +15,7 @@ from scenes.warp.spacing import ENOUGH, FINEST, fields_of, finer_spacing
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.errors import InputError
-from sim.fields.warp_fields import warp_fields
+from sim.fields.warp_fields import warp_fields, warp_grid
 from sim.geometry.tetmesh import signed_volumes
 
 
@@ -142,3 +142,11 @@ def test_where_the_finite_elements_fold_the_fields_do_not_and_it_is_said(small_b
     assert report["folds"][0]["fields_off_mm"] == pytest.approx(1e3 * fold.off) and not report["fields_fold"]
     text = (tmp_path / "out" / "README.txt").read_text()
     assert "WARNING: the finite elements fold" in text and "they were unfolded" in text and "nothing folds" not in text
+
+
+def test_finer_spacing_wide_field_keeps_within_32_million_nodes(kinked):
+    wide = moment_of(kinked.anatomy, kinked.displacement + [40e-3, 0.0, 0.0])
+    finer = finer_spacing(wide, warp_fields(wide.anatomy, wide.displacement, 5e-3))
+    grids = (warp_grid(wide.anatomy, wide.displacement[None], spacing) for spacing in (finer, finer - 0.05e-3))
+    fits, too_many = (np.prod(grid.shape) for grid in grids)
+    assert fits <= 32e6 < too_many
