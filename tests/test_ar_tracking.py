@@ -15,7 +15,7 @@ from ar.tracking.detection import Corners, Detector
 from ar.tracking.drawn import drawn
 from ar.tracking.pose import Verdict, pose_of
 from ar.tracking.targets import BORDER, TIP, Target, calibration_board, patient_reference, tool_cube
-from ar.tracking.track import STALE, Tracker
+from ar.tracking.track import Tracker
 
 CUBE, PLATE = tool_cube(), patient_reference()
 K = np.array([[1000.0, 0.0, 410.0], [0.0, 1000.0, 295.0], [0.0, 0.0, 1.0]])
@@ -170,8 +170,9 @@ def test_the_last_pose_tells_two_apart_and_a_far_one_does_not() -> None:
     assert pose_of(CAMERA, PLATE, corners)[0] is Verdict.AMBIGUOUS
     near = T.copy()
     near[:3, :3] = Rotation.from_euler("x", 2.0, degrees=True).as_matrix() @ T[:3, :3]
-    verdict, pose = pose_of(CAMERA, PLATE, corners, near)
-    assert verdict is Verdict.GOOD and pose is not None and angle(pose.T_camera_target, T) < 5.0
+    for _ in range(10):  # in some the mirrored pose fits better
+        verdict, pose = pose_of(CAMERA, PLATE, seen_from_front(T, 0.2, rng), near)
+        assert verdict is Verdict.GOOD and pose is not None and angle(pose.T_camera_target, T) < 5.0
     far = flat((0.0, 0.0, 90.0), (0.0, 0.0, 1.0))
     assert pose_of(CAMERA, PLATE, corners, far) == (Verdict.AMBIGUOUS, None)
 
@@ -197,7 +198,7 @@ def test_a_target_is_followed_lost_and_found(scene: tuple[np.ndarray, dict[str, 
     there = tracker.track(jumped, again)
     assert there.verdicts["tool"] is Verdict.GOOD  # out of its window, so it was looked for everywhere
     nothing, state, lost = np.full((600, 800), 120, np.uint8), there, []
-    for _ in range(STALE + 2):
+    for _ in range(7):
         state = tracker.track(nothing, state)
         lost.append(state.verdicts["tool"])
         assert not state.poses

@@ -1,7 +1,9 @@
 """Parts of an overlay's error that are known exactly: registration, clock, and covariances that are turned."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from films import follower_of, truth_of
@@ -9,14 +11,19 @@ from links import in_mm
 from scipy.spatial.transform import Rotation
 from theatres import template_theatre
 
+from ar.optics.camera import Camera
+from ar.tracking.calibration_error import calibration_error
 from ar.tracking.clocks import Clock
 from ar.tracking.pose import Pose
 from ar.tracking.pose_stream import stream_of
 from ar.tracking.registration import Registration
+from ar.tracking.targets import patient_reference
+from ar.tracking.track import Tracked
 from scenes.link.answer import Answering
 from scenes.link.heard import Heard, Names
+from scenes.play.overlay.agreement import Agreement
 from scenes.play.overlay.elsewhere import Elsewhere
-from scenes.play.overlay.follower import tip_covariance
+from scenes.play.overlay.follower import PATIENT, tip_covariance
 from scenes.script.scene import find_scene
 from scenes.script.tracked_tool import TrackedTool
 from sim.tools import Ball
@@ -73,3 +80,66 @@ def test_tip_covariance_is_turned_into_the_scan(source):
         Pose(T_patient_cube, six(own if source == "tracking" else none), 0.0, 4),
     )
     np.testing.assert_allclose(found, np.outer(expected, expected), atol=1e-15)
+
+
+def shifted(x, z=0.0):
+    T = np.eye(4)
+    T[:3, 3] = x, 0.0, z
+    return T
+
+
+def test_pose_between_samples_weighs_their_covariances():
+    stream = stream_of(np.array([0.0, 0.04]), np.tile(np.eye(4), (2, 1, 1)), np.stack([np.eye(6), 4.0 * np.eye(6)]))
+    np.testing.assert_allclose(stream.at(0.01).covariance, (0.75**2 + 4.0 * 0.25**2) * np.eye(6), atol=1e-12)
+
+
+def test_agreement_keeps_the_last_30_places_that_are_known():
+    found, body = Agreement(), Pose(np.eye(4), np.zeros((6, 6)), 0.0, 4)
+    for number in range(80):
+        deviation = 3e-3 if number % 2 else 1e-3
+        found = found.seen("tool", Pose(shifted(1e-5 * number), deviation**2 * np.eye(6), 0.0, 4), body, None)
+    np.testing.assert_allclose(found.places["tool"][:, 0], 1e-5 * np.arange(20, 80, 2))
+
+
+def looking(motion, **given):
+    """What is known of pictures every 40 ms: `motion` is of the reference before the camera, from the film's first."""
+    follower = replace(follower_of(template_theatre().stage(find_scene("palpate"))), tool=None, **given)
+    first = truth_of(follower.motion.stage).T_camera_scan[0] @ np.linalg.inv(follower.registration.T_patient_scan)
+    seen = [Tracked(0, {}, {PATIENT: Pose(T @ first, np.zeros((6, 6)), 0.0, 4)}, {}) for T in motion]
+    vars(follower)["tracker"] = SimpleNamespace(track=lambda grey, before: seen[int(grey[0, 0])])
+    known = [None]
+    for number in range(len(motion)):
+        known.append(follower.step(np.full((1, 1), number, np.uint8), 0.04 * number, known[-1]))
+    return follower, known[1:]
+
+
+def test_pace_is_across_the_view_and_fades_in_seconds():
+    """10 mm along the view, then 10 mm across it, then nothing: each in 40 ms."""
+    _, known = looking([shifted(0.0), shifted(0.0, 0.01), shifted(0.01, 0.01), shifted(0.01, 0.01)])
+    assert [each.pace for each in known] == [None, *(pytest.approx(pace) for pace in (0.0, 0.25, 0.25 * 0.1**0.04))]
+
+
+def test_band_has_no_registration_error_along_the_view():
+    follower, (known,) = looking([np.eye(4)])
+    scan, view = follower.registration, known.camera.T_camera_world[:3]
+    sight = view @ [*follower.motion.stage.tumour_at_rest.vertices.mean(axis=0), 1.0]
+    sight = scan.T_patient_scan[:3, :3] @ view[:, :3].T @ sight
+    for error, expected in ((sight, 0.0), (np.cross(sight, PARTS), 2.4477e-3)):
+        own = six(1e-6 * np.outer(error, error) / (error @ error))
+        _, (known,) = looking([np.eye(4)], registration=replace(scan, covariance=own))
+        assert known.parts["registration"] == pytest.approx(expected, rel=1e-4, abs=1e-7)
+
+
+def test_calibration_error_is_what_the_pose_leaves_of_it():
+    """A focal length that is 0.2 % off: the pose is fitted again, and a place beside the target is seen elsewhere."""
+    T, corners, place = turned("x", 25.0), patient_reference().faces[0].corners, np.array([0.1, 0.05, 0.03])
+    T[:3, 3], own = (0.0, 0.02, 0.4), np.zeros((9, 9))
+    own[:2, :2] = 4.0
+    right, wrong = (np.array([[focal, 0.0, 400.0], [0.0, focal, 300.0], [0.0, 0.0, 1.0]]) for focal in (1e3, 1002.0))
+    turn, shift = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3].copy()
+    pixels = cv2.projectPoints(corners, turn, shift, right, None)[0]
+    again = cv2.solvePnP(corners, pixels, wrong, None, turn.copy(), shift.copy(), True)[1:]
+    seen = [cv2.projectPoints(place, *pose, K, None)[0] for pose, K in (((turn, shift), right), (again, wrong))]
+    expected = np.linalg.norm(seen[1] - seen[0]) / 1e3 * (T[:3, :3] @ place + T[:3, 3])[2]
+    found = calibration_error(Camera(right, np.eye(4), 800, 600), T, corners, place, own)
+    assert np.sqrt(np.trace(found)) == pytest.approx(expected, rel=0.1)

@@ -132,6 +132,9 @@ def test_clocks_are_compared_by_motion_with_an_error_that_holds():
         clock_by_motion(times[:3], places[:3], samples, others)
     with pytest.raises(ValueError, match="end before the pictures"):
         clock_by_motion(3.0 * times, places, samples, others)
+    some = np.abs(samples - 2.5) > 0.06
+    with pytest.raises(ValueError, match="gaps of more than 0.1 s"):
+        clock_by_motion(times, places, samples[some], others[some])
 
 
 @pytest.fixture(scope="module")
