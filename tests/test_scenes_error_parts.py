@@ -1,6 +1,6 @@
 """Parts of an overlay's error that are known exactly: registration, clock, and covariances that are turned."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import cv2
@@ -17,16 +17,23 @@ from ar.tracking.clocks import Clock
 from ar.tracking.pose import Pose
 from ar.tracking.pose_stream import stream_of
 from ar.tracking.registration import Registration
+from ar.tracking.rigid import moved_about
 from ar.tracking.targets import patient_reference
 from ar.tracking.track import Tracked
 from scenes.link.answer import Answering
 from scenes.link.heard import Heard, Names
 from scenes.play.overlay.agreement import Agreement
-from scenes.play.overlay.elsewhere import Elsewhere
-from scenes.play.overlay.follower import PATIENT, tip_covariance
+from scenes.play.overlay.elsewhere import Elsewhere, Eye
+from scenes.play.overlay.follower import PATIENT, Known, State, tip_covariance
+from scenes.play.overlay.rows import write_rows
+from scenes.play.overlay.run import Shown
+from scenes.play.overlay.tool_motion import UNBOUND, Motion, ToolMotion
+from scenes.play.overlay.truth import Off, off, summary
 from scenes.script.scene import find_scene
 from scenes.script.tracked_tool import TrackedTool
+from sim.loads import Touching
 from sim.tools import Ball
+from surrogate.model.learned import predicted
 
 PARTS = np.array([1e-3, 2e-3, 3e-3])
 
@@ -67,6 +74,19 @@ def test_tracker_clock_error_is_in_the_covariance(error, expected):
     assert np.abs(found.covariance[1:, 1:]).max() < 1e-12
 
 
+def test_hand_eye_error_is_that_of_a_camera_moved_by_it():
+    """A small shift and turn of the camera, in the axes of what carries it, along one direction of all six."""
+    times, step = np.zeros(1), 1e-4 * np.array([1.0, -2.0, 3.0, 5.0, -3.0, 2.0])
+    T, far = turned("zx", [30.0, 50.0]) @ shifted(0.3), stream_of(times, shifted(0.5, 0.8)[None], np.zeros((1, 6, 6)))
+    right, other = (
+        Elsewhere(far, far, eye=Eye(each, np.outer(step, step))) for each in (T, moved_about(T, np.zeros(3), step))
+    )
+    found, there = right.reference(0.0), other.reference(0.0).T_camera_target
+    turn = Rotation.from_matrix(there[:3, :3] @ found.T_camera_target[:3, :3].T).as_rotvec()
+    moved = np.append(there[:3, 3] - found.T_camera_target[:3, 3], turn)
+    np.testing.assert_allclose(found.covariance, np.outer(moved, moved), rtol=0.0, atol=2e-3 * (moved @ moved))
+
+
 @pytest.mark.parametrize("source", ["tracking", "tool", "registration"])
 def test_tip_covariance_is_turned_into_the_scan(source):
     """A quarter turn of the registration, another one of the cube; an error along (1, 2, 3) in its own frame."""
@@ -86,6 +106,79 @@ def shifted(x, z=0.0):
     T = np.eye(4)
     T[:3, 3] = x, 0.0, z
     return T
+
+
+@dataclass(frozen=True)
+class Sinking:
+    """A tumour that goes as deep as the tool, once that is below the opening's middle; it keeps every start."""
+
+    stage: object
+    starts: list = field(default_factory=list)
+
+    def deform(self, loads, start=None, at=None):
+        self.starts.append(start)
+        (cause,), site, nodes = loads.every(Touching), self.stage.site, self.stage.tumour_vertices
+        depth = np.maximum((cause.pose[:, 0, :3, 3] - site.origin) @ site.axis, 0.0)
+        moved = np.broadcast_to(depth[:, None, None] * site.axis, (len(depth), len(nodes), 3))
+        return predicted(moved, nodes, loads, [False] * len(depth), 0.0, np.full((2, len(depth)), np.nan), "")
+
+
+def test_tool_error_is_of_a_deeper_tool_and_each_start_the_last():
+    stage = template_theatre().stage(find_scene("palpate"))
+    sinking, pose = Sinking(stage), np.eye(4)
+    pose[:3, 3] = stage.site.origin
+    first = ToolMotion(stage, sinking).under(pose, np.diag([1e-6, 1e-8, 1e-8]))
+    assert first.moved == pytest.approx(0.0, abs=1e-9) and first.tool == pytest.approx(1.96e-3, rel=1e-3)
+    ToolMotion(stage, sinking).under(pose, 1e-6 * np.eye(3), first)
+    assert sinking.starts[0] is None and sinking.starts[2] is first.answer
+
+
+@pytest.mark.parametrize(("bound", "expected", "doubt"), [(3e-4, 3e-4, ""), (np.inf, 0.0, UNBOUND)])
+def test_model_error_without_a_bound_is_the_models_own(bound, expected, doubt, monkeypatch):
+    model = SimpleNamespace(bound=bound)
+    monkeypatch.setattr("scenes.play.overlay.tool_motion.answering", lambda deformer, answer: model)
+    stage = template_theatre().stage(find_scene("palpate"))
+    found = ToolMotion(stage, Sinking(stage)).under(np.eye(4), np.zeros((3, 3)))
+    assert (found.model, found.doubt) == (expected, doubt)
+
+
+def test_summary_counts_tumours_beyond_their_band_by_1_mm():
+    known = [SimpleNamespace(relied=row < 3, band=2e-3) for row in range(4)]
+    errors = [Off(1.0, 0.9, 1e-3, worst, worst <= 2e-3) for worst in (1.9e-3, 2.9e-3, 3.1e-3, 9e-3)]
+    found = summary(known, errors)
+    assert (found["pictures"], found["wrong"]) == (3, 1) and found["held_percent"] == pytest.approx(100.0 / 3.0)
+
+
+def test_rows_of_an_overlay_are_in_millimetres(tmp_path):
+    names = ("tracking", "camera", "registration", "tool", "model", "shutter")
+    parts = {name: 1e-3 * (number + 7) for number, name in enumerate(names)}
+    known = SimpleNamespace(
+        camera=0,
+        motion=Motion(np.zeros(0), True, 4e-3, 3e-3, 4e-3),
+        band=6e-3,
+        parts=parts,
+        time=1.0,
+        state=State.GOOD,
+        words="",
+    )
+    shown = Shown(known, np.zeros(0), 0.013, 1e-3 * np.arange(1, 4), 0.014)
+    write_rows(tmp_path / "rows.csv", [shown], [Off(15.0, 16.0, 17e-3, 18e-3, True)])
+    cells = (tmp_path / "rows.csv").read_text().splitlines()[1].split(",")
+    assert [float(cell) for cell in cells[2:16] + cells[17:21]] == pytest.approx([*range(1, 19)])
+
+
+def test_outline_error_is_the_same_both_ways():
+    """A drawn tumour that is a small piece of the true one, and a true one that is a small piece of the drawn one."""
+    stage = template_theatre().stage(find_scene("palpate"))
+    rest, calibration, truth = stage.tumour_at_rest.vertices, follower_of(stage).calibration, truth_of(stage)
+    small, outlines = rest[:1] + 0.2 * (rest - rest[:1]), []
+    for drawn, true in ((small, rest), (rest, small)):
+        motion = Motion(stage.anatomy.mesh.nodes.copy())
+        motion.positions[stage.tumour_vertices] = drawn
+        camera, moved = calibration.camera(truth.T_camera_scan[0]), np.tile(true - rest, (len(truth.times), 1, 1))
+        known = Known(truth.times[0], State.GOOD, "", Tracked(0, {}, {}, {}), motion, camera)
+        outlines.append(off(known, replace(truth, displacement=moved), calibration, stage).outline)
+    assert outlines[0] == pytest.approx(outlines[1]) and outlines[0] > 10.0
 
 
 def test_pose_between_samples_weighs_their_covariances():

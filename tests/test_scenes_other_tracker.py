@@ -95,6 +95,7 @@ def test_gaps_have_no_pose_and_the_last_one_goes_on_for_a_moment_only():
     assert stream.at(1.3) is not None and stream.at(1.31) is not None
     assert stream.at(1.3 - 5e-5) is not None and stream.at(1.29) is None  # files round times
     assert stream.age(1.2) == pytest.approx(1.2 - last) and LONGEST < 0.3
+    assert Elsewhere(stream, sampled(swung, times[:10])).age(2.5) == pytest.approx(2.5 - times[9])  # of the older one
     with pytest.raises(ValueError, match="pose 3 is not later"):
         stream_of(np.array([0.0, 2.0, 1.0]), np.tile(np.eye(4), (3, 1, 1)), np.tile(NONE, (3, 1, 1)))
 
@@ -133,7 +134,7 @@ def test_clocks_are_compared_by_motion_with_an_error_that_holds():
     with pytest.raises(ValueError, match="end before the pictures"):
         clock_by_motion(3.0 * times, places, samples, others)
     some = np.abs(samples - 2.5) > 0.06
-    with pytest.raises(ValueError, match="gaps of more than 0.1 s"):
+    with pytest.raises(ValueError, match="gaps of more than"):
         clock_by_motion(times, places, samples[some], others[some])
 
 
