@@ -60,6 +60,7 @@ def test_link_bound_of_registration_is_2_80_sigma(shift):
     heard = Heard(names, 1.0).hearing(names.tool, in_mm(given.T_patient_scan @ pose), 1, 0.0, 0)
     found = Answering(follower.motion, follower.tool, 5e-4, given).answer(heard, 0.0, 0.0)
     assert found.known.parts["registration"] == pytest.approx(2.7955e-3, rel=1e-4)
+    assert found.known.band == pytest.approx(np.hypot(2.7955e-3, found.known.motion.error), rel=1e-4)
 
 
 @pytest.mark.parametrize(("error", "expected"), [(0.0, 0.0), (0.01, 2e-3)])

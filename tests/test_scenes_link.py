@@ -13,6 +13,7 @@ from films import FILM, follower_of, truth_of
 from links import HOST, NAMES, Peer, corners_of, in_mm, linked, peers, played
 from theatres import template_theatre
 
+from ar.overlay.gauge import Gauge
 from scenes.link import clients as limits
 from scenes.link.answer import NOT_SEEN, Answer, late
 from scenes.link.clients import Clients
@@ -317,8 +318,8 @@ def test_places_inside_the_tumour_move_with_its_volume(stage):
 def test_an_answer_with_a_bound_is_stale_when_it_is_old(stage, state):
     known = Known(0.0, state, "words", NOT_SEEN, Motion(stage.anatomy.mesh.nodes), band=1e-3)
     assert late(Answer(NOW, known), 0.2, 0.3).known is known
-    old = late(Answer(NOW, known), 0.4, 0.3).known
-    assert old.state is State.STALE and old.band is None and "0.4 s old" in old.words
+    old = late(Answer(NOW, known, Gauge(np.zeros(3), np.ones(3))), 0.4, 0.3)
+    assert old.known.state is State.STALE and old.known.band is old.gauge is None and "0.4 s old" in old.known.words
 
 
 def motion_of(rest, nodes, displacement):

@@ -63,14 +63,17 @@ def test_a_picture_between_two_poses_has_a_pose_between_and_its_error_says_what_
 
 def test_where_no_two_poses_are_round_a_picture_the_newest_counts_with_how_far_the_camera_went():
     times = STEP * np.arange(12)
-    for heard, time, stamped in (
-        (heard_of(times), times[-1] + 0.2, True),
-        (heard_of(times[-2:]), times[-1] - 0.5 * STEP, True),
-        (heard_of(times, stamped=False), times[-1] + 0.02, False),
+    middle = camera(0.0) @ [*1e3 * TUMOUR, 1.0]
+    here, there = (np.linalg.inv(camera(time)) @ middle for time in times[-2:])
+    way = 1e-3 * np.linalg.norm(here - there)
+    for heard, time, stamped, apart in (
+        (heard_of(times), times[-1] + 0.2, True, 0.2),
+        (heard_of(times[-2:]), times[-1] - 0.5 * STEP, True, 0.5 * STEP),
+        (heard_of(times, stamped=False), times[-1] + 0.02, False, 0.02 - 5e-3),
     ):
         placed = at(heard, time, stamped=stamped)
-        newest = camera(times[-1])
-        assert np.allclose(placed.T[:3, :3], newest[:3, :3]) and placed.moved > 1e-4
+        assert np.allclose(placed.T[:3, :3], camera(times[-1])[:3, :3])
+        assert placed.moved == pytest.approx(way * apart / STEP, rel=1e-4)
     assert at(heard_of(times), times[-1] + 1.0) == "no {name} within 0.3 s of the picture's time"
     assert "alone" in at(heard_of(times[-1:]), times[-1])
 
