@@ -2,7 +2,6 @@
 
 import asyncio
 import socket
-import struct
 import time
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
@@ -154,14 +153,16 @@ def test_a_storm_of_clients_is_bounded_and_passes():
 def test_a_client_that_asks_is_sent_that_and_nothing_else():
     async def scene():
         async with served() as (clients, port), peers(port, 1) as (one,):
-            clients.publish("a", [framed("STRING", "A", string("s"), 0), framed("POLYDATA", "P", bytes(40), 0)])
+            surfaces = [framed("POLYDATA", name, bytes(40), stamp) for name, stamp in (("O", 1), ("P", 2), ("Q", 2))]
+            clients.publish("a", [framed("STRING", "A", string("s"), 0), *surfaces])
             for _ in range(2):
+                clients.publish("b", [framed("STRING", "B", string("s"), 0)])
                 one.send("GET_POLYDATA", "", b"")
                 assert (await one.next())[0].name == "P"
             one.send("GET_IMAGE", "", b"")
             assert "no IMAGE yet" in await one.said()
             one.send("STT_STRING", "", b"")
-            assert [(await one.next())[0].name for _ in range(2)] == ["A", "P"]
+            assert [(await one.next())[0].name for _ in range(5)] == ["A", "O", "P", "Q", "B"]
 
     played(scene())
 
@@ -312,6 +313,10 @@ def test_places_inside_the_tumour_move_with_its_volume(stage):
     body = outgoing.messages(Answer(NOW, moved), outgoing.placed(["a", "b", "c"], at))[-2]
     found = 1e-3 * read_points(body[HEADER.size :])[1]
     assert found == pytest.approx(at + 0.3 * (at - rest[stage.nodes].mean(axis=0)), abs=1e-6)
+    # Of a model that knows the tumour alone, a place on the cortex is not sent.
+    tumour = replace(moved, motion=motion_of(rest, anatomy.tumour_nodes, 0.0 * rest[anatomy.tumour_nodes]))
+    both = outgoing.placed(["a", "c"], np.vstack([at[:1], rest[anatomy.open_surface[:1, 0]]]))
+    assert read_points(outgoing.messages(Answer(NOW, tumour), both)[-2][HEADER.size :])[0] == ["a"]
 
 
 @pytest.mark.parametrize("state", [State.GOOD, State.UNSURE])
@@ -359,7 +364,7 @@ def test_places_on_the_tumour_move_with_it_and_a_million_points_are_passed_over(
             tracker.send("TRANSFORM", NAMES.tool, transform(beside[10]), NOW)
             while not len(body := (await tracker.next("POINT", "PointsNow"))[1]):
                 pass
-            found = np.array([struct.unpack(">3f", body[at + 100 : at + 112]) for at in (0, 136)])
-            assert found == pytest.approx(rest[:2] + 1e3 * truth.displacement[10, :2], abs=1e-2)
+            names, found = read_points(body)
+            assert names == ["a", "b"] and found == pytest.approx(rest[:2] + 1e3 * truth.displacement[10, :2], abs=1e-2)
 
     played(scene())
