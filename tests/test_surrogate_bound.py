@@ -1,5 +1,7 @@
 """Bounds: they hold as often as they say, class by class, and grow where nothing was promised."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,9 @@ def test_outside_it_grows(bound):
     features, force, _ = drawn(10, 3)
     inside, outside = (bound.of(features, force, lying(10, beyond=excess)) for excess in (0.0, 1.0))
     assert (outside > 2.0 * inside).all()
+    near = replace(bound, growth=np.array(500.0), near=np.array(1e-3))  # its first millimetre does not count
+    assert near.of(features, force, lying(10, 3e-3)) == pytest.approx(2.0 * inside)
+    assert near.of(features, force, lying(10, 0.9e-3)) == pytest.approx(inside)
 
 
 def far_and_near(growth, seed, near=400, far=300):
