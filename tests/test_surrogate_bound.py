@@ -8,7 +8,7 @@ import pytest
 from sim.loads import Pushed, push
 from surrogate.data.cortex_patch import open_patch
 from surrogate.model.conformal import LEVELS, MOST_GROWTH, USUAL_GROWTH, conformal, fitted_bound, fitted_growth
-from surrogate.model.training_range import Outside, envelope_of
+from surrogate.model.training_range import Envelope, Measured, Outside, envelope_of
 
 
 def lying(count, away=0.0, beyond=0.0):
@@ -145,3 +145,23 @@ def test_an_envelope_reaches_as_far_as_training_loads_lie_apart(box):
     assert (found.force, found.footprint) == ((0.1, 0.2), (5e-3, 6e-3))
     assert found.line_force == pytest.approx(0.2 / 6e-3)
     assert not found.holds(patch, held).any() and found.holds(patch, training).all()
+
+
+@pytest.mark.parametrize(
+    ("force", "angle", "overhang", "radius", "away", "beyond", "excess"),
+    [
+        (0.2, 0.3, 1e-3, 6e-3, 0.0, 0.0, 0.0),
+        (0.2, 0.7, 1e-3, 6e-3, 0.0, 0.2, 0.2),
+        (0.2, 0.3, 3e-3, 6e-3, 0.0, 1.0, 1.0),
+        (0.6, 0.3, 1e-3, 8e-3, 0.0, 1.0, 1.0),
+        (0.28, 0.3, 1e-3, 4e-3, 0.0, 0.4, 0.4),
+        (0.05, 0.3, 1e-3, 2e-3, 0.0, 1.0, 1.0),
+        (0.2, 0.3, 1e-3, 12e-3, 0.0, 0.5, 0.5),
+        (0.2, 0.3, 1e-3, 6e-3, 3e-3, 0.0, 2.0),
+    ],
+)
+def test_envelope_measures_how_far_a_load_is_outside(force, angle, overhang, radius, away, beyond, excess):
+    envelope = Envelope(np.zeros((1, 3)), 1e-3, 2e-3, 0.5, (0.1, 0.3), (4e-3, 8e-3), 50.0)
+    pushed = Pushed(np.array([[away, 0.0, 0.0]]), np.array([[0.0, 0.0, force]]), np.array([radius]))
+    found = envelope.outside(pushed, Measured(*(np.array([each]) for each in (force, angle, overhang))))
+    assert np.concatenate(found) == pytest.approx([away, beyond, excess], abs=1e-2)

@@ -1,6 +1,7 @@
 """Certificates: an estimate of a prediction's error that is its error, and which deformer a budget buys."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -87,6 +88,19 @@ def test_loads_that_two_steps_do_not_settle_are_not_sound(fem, loads, box):
     assert 4 < found.sound.sum() < 12 and (found.corrected.iterations == 2).any()
     assert (abs(effectivity - 1.0) < 0.2)[found.sound].all() and effectivity[~found.sound].max() > 2.0
     assert (found.after < found.before).all()
+
+
+def test_certificate_leaves_out_a_step_that_raises_the_residual(fem, loads, box):
+    hard, steps = loads.rows(np.arange(12)).scaled(6.0), []
+
+    def corrected(*given):
+        found, before, missing = fem.corrected(*given)
+        steps.append(replace(found, residual=found.residual + len(steps)))
+        return steps[-1], before, missing
+
+    known = fem.deform(hard).at(box.tumour_nodes)
+    found = certify(SimpleNamespace(anatomy=box, corrected=corrected), hard, known)
+    assert len(steps) == 3 and np.array_equal(found.corrected.displacement, steps[0].displacement)
 
 
 def test_one_load_alone_says_the_same_as_in_a_batch(box, loads, predicted, fem):
