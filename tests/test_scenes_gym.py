@@ -208,6 +208,8 @@ def test_many_answered_together_are_as_each_alone():
     together = replace(setting.answers, together=True).answer(asked)
     for one, each in zip(setting.answers.answer(asked), together, strict=True):
         assert np.allclose(one.force, each.force, atol=1e-4) and np.allclose(one.motion, each.motion, atol=1e-5)
+    unbound = replace(setting.answers, model=replace(setting.answers.model, bounds=None, bound=7e-4))
+    assert unbound.answer(asked[2:3])[0].error == 7e-4  # loads without a bound have the model's
 
 
 def test_the_tumour_sinks_and_is_cut_share_by_share(boxed):

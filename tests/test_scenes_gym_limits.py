@@ -1,15 +1,23 @@
 """Limits of Gymnasium's tasks: of force and pressure, and of where a tool may go."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from theatres import template_theatre
 
 import scenes.gym  # noqa: F401
-from scenes.gym.tasks import PALPATE
+from scenes.gym.cut_elements import CutElements
+from scenes.gym.setting import open_setting
+from scenes.gym.tasks import DEBULK, PALPATE
 from scenes.gym.tool_motion import HIGHEST, laid, moved
+from scenes.gym.touched import Asked
 from scenes.script.site import site_of
+from sim.bodies.meshfile import write_anatomy
+from sim.deformation import Outcome
 
 DOWN = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0], np.float32)
 
@@ -36,3 +44,30 @@ def test_tool_leans_and_sinks_no_farther_than_it_may(box):
     for way, depth in ((-1.0, 5e-3), (1.0, -HIGHEST)):
         found = moved(hand, site, tool, np.array([0.0, 0.0, way, 0.0, 0.0, 0.0]), 0.3, 5e-3)
         assert (found.place - site.origin) @ site.axis == pytest.approx(depth - tool.radius)
+
+
+def test_tool_turns_about_the_axes_of_the_open_cortex():
+    site, tool = template_theatre().site, PALPATE.tool
+    hand = laid(site, tool, site.origin)
+    for number, axis in enumerate((site.right, site.up, -site.axis)):
+        twist = 0.2 * np.eye(6)[3 + number]
+        found = moved(hand, site, tool, twist, 0.3, 5e-3)
+        np.testing.assert_allclose(found.turned, Rotation.from_rotvec(0.2 * axis).as_matrix() @ hand.turned, atol=1e-9)
+
+
+def test_cut_elements_are_reliable_where_both_levels_are(box, tmp_path):
+    """Half way between two levels of the fluid, of which the lower one finds no equilibrium."""
+    write_anatomy(tmp_path / "box.vtu", box)
+    setting, solved = open_setting(DEBULK, str(tmp_path / "box.vtu"), "auto", "cpu", (48, 36)), []
+
+    def deform(loads, start):
+        answer = setting.answers.fem.deform(loads, start)
+        solved.append(answer if not solved else replace(answer, outcome=(Outcome.BUDGET,)))
+        return solved[-1]
+
+    fem = SimpleNamespace(deform=deform, remains=setting.answers.fem.remains)
+    pose = DEBULK.tool.pose(setting.site.origin, setting.site.axis, setting.site.right)
+    for fluid, good in ((1.0, True), (0.95, False)):
+        answers = CutElements(setting.site, fem, setting.answers.ball)
+        assert answers.answer([Asked(pose, fluid=fluid, done=1)])[0].good == good
+        solved.clear()
