@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from surrogate.data.tool_loads import draw
+from surrogate.evaluation.force_score import force_score
 from surrogate.evaluation.score import score, spread, table, winner
 from surrogate.evaluation.solve_counts import SolveCounts
 
@@ -68,3 +69,10 @@ def test_of_few_loads_no_percentile_of_a_thousand_is_reported(pretender, box, fr
     assert said[2].split().count("-") == 3 and "not known from fewer than 1000 loads" in said[3]
     known = table([replace(row, p999_mm=0.25, p999_percent=2.5, worst_p999_mm=0.5)], 1.0).splitlines()
     assert len(known[2]) == len(said[2]) and "0.2500" in known[2] and "fewer" not in known[3]
+
+
+def test_force_score_leaves_out_tools_that_do_not_press():
+    truth = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0], [0.0, 4.0, 0.0]])
+    found = force_score(np.array([9.0, 0.2, 0.2]), truth, np.array([[0.1, 0.3, 0.1], [0.1, 0.5, 0.4]]))
+    assert (found.loads, found.force, found.held) == (2, 3.0, (0.5, 1.0))
+    assert (found.mean, found.mean_percent, found.bound) == pytest.approx((0.2, 7.5, 0.2))
