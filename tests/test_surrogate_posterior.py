@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 from sim.geometry.locate import Located
 from surrogate.locating.causes import SWELLING, TOOL
 from surrogate.locating.evidence import SHIFT, SIGMA, SLIPPED, TURN, of_motions
-from surrogate.locating.posterior import COARSENED, MIXED, SeenPrior, conditioned, seen_prior
+from surrogate.locating.posterior import COARSENED, MIXED, Posterior, SeenPrior, conditioned, seen_prior
 from surrogate.locating.prior import BESIDE, NOWHERE, RIGIDS, SETS, WITH_PLACE, Prior
 from surrogate.locating.whitened import whitened
 
@@ -64,6 +64,13 @@ def test_what_is_seen_of_shapes_is_their_motion_at_the_points(prior):
     evidence = seen(prior, np.zeros((len(prior.anatomy.mesh.nodes), 3)))
     found = np.hstack([prior.seen(*evidence.weights), evidence.rigid * evidence.rigid_scale])
     assert found == pytest.approx(seen_unknowns(prior, evidence), abs=1e-9)
+
+
+def test_rigid_error_at_places_is_what_their_rows_have_of_it(prior):
+    evidence = drawn(prior, np.random.default_rng(3))[1]
+    found = Posterior(evidence, [], np.arange(1.0, 7.0), 1.0, np.zeros(0, int), 0.0)
+    own = np.einsum("mi,mi->m", found.bias_at(evidence.at), evidence.axis)
+    assert own == pytest.approx(evidence.rigid @ found.rigid, abs=1e-12)
 
 
 def test_hypotheses_are_sets_of_causes_in_one_skull_with_and_without_a_tool(prior):
