@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import h5py
@@ -17,6 +18,7 @@ from tiny_episodes import HEIGHT, WIDTH, Wanted, write_episode
 from scenes import read_episodes, write_card
 from scenes.cli import main
 from scenes.episodes.exports.card import keep_card
+from scenes.episodes.exports.columns import rate_of
 from scenes.episodes.exports.datasheet import listed
 from scenes.episodes.exports.motion import poses_after, states, twists
 from scenes.episodes.exports.statistics import Spread
@@ -66,6 +68,17 @@ def test_statistics_of_parts_are_those_of_the_whole():
     for name, of in (("min", np.nanmin), ("max", np.nanmax), ("mean", np.nanmean), ("std", np.nanstd)):
         assert np.allclose(said[name], of(rows, axis=0))
     assert said["count"] == [20] and Spread.of(np.full((2, 1), np.nan)).said()["mean"] == [0.0]
+
+
+@pytest.mark.parametrize("off", [2e-3, 2e-4, 5e-5])
+def test_rate_of_frames_is_that_of_even_steps_to_100_us(off, tmp_path):
+    contents, time = SimpleNamespace(path=tmp_path / "e.h5"), 0.04 * np.arange(26)
+    time[10] += off
+    if off < 1e-4:
+        assert rate_of(contents, time) == 25.0
+        return
+    with pytest.raises(InputError, match="not evenly spaced"):
+        rate_of(contents, time)
 
 
 def test_lerobot_has_its_layout_and_the_pictures_own_bytes(lerobot, folder):

@@ -221,11 +221,14 @@ def test_noise_has_its_deviation_and_no_mean():
 
 
 def test_sensed_poses_err_by_the_stated_degrees_and_millimetres():
-    columns = {name: np.tile(np.eye(4), (4000, 1, 1)) for name in ("T_world_tool", "T_camera_world")}
+    true = np.eye(4)
+    true[:3, :3], true[:3, 3] = Rotation.from_rotvec([1.0, -0.5, 0.3]).as_matrix(), (0.4, -0.2, 0.3)
+    columns = {name: np.tile(true, (4000, 1, 1)) for name in ("T_world_tool", "T_camera_world")}
     noise = {"tool_mm": 0.5, "tool_deg": 0.3, "camera_mm": 2.0, "camera_deg": 1.5}
     found = sensed(columns | {"force": np.zeros((4000, 3))}, noise | {"force_n": 0.02}, 0, 0)
     for name, whose in (("T_world_tool_tracked", "tool"), ("T_camera_world_tracked", "camera")):
-        turns = np.degrees(Rotation.from_matrix(found[name][:, :3, :3]).as_rotvec())
+        off = np.linalg.inv(true) @ found[name]  # along and about its own axes
+        turns = np.degrees(Rotation.from_matrix(off[:, :3, :3]).as_rotvec())
         assert turns.std(axis=0) == pytest.approx(noise[f"{whose}_deg"], rel=0.05)
-        assert 1e3 * found[name][:, :3, 3].std(axis=0) == pytest.approx(noise[f"{whose}_mm"], rel=0.05)
+        assert 1e3 * off[:, :3, 3].std(axis=0) == pytest.approx(noise[f"{whose}_mm"], rel=0.05)
     assert found["force_read"].std(axis=0) == pytest.approx(0.02, rel=0.05)
