@@ -254,11 +254,12 @@ def test_what_is_observed_is_the_truth_with_its_noise():
 def test_an_aspirator_presses_on_healthy_tissue_by_hertz(boxed):
     setting = open_setting(DEBULK, boxed, "auto", "cpu", SIZE)
     site, ball = setting.site, Hertz(DEBULK.tool.radius, MATERIALS["drained"].tissue)
-    tip = site.origin + 0.012 * site.right + 1e-3 * site.axis  # beside the corridor, 1 mm deep in a flat top
-    (touched,) = setting.answers.answer([Asked(DEBULK.tool.pose(tip, site.axis, site.right), done=1)])
-    force = float(ball.force(np.array(1e-3)))
-    assert touched.force @ site.axis == pytest.approx(force, rel=1e-6)
-    assert touched.pressure == pytest.approx(1.5 * force / (np.pi * DEBULK.tool.radius * 1e-3))
+    for depth in (1e-3, DEBULK.tool.radius + 1e-3):  # its middle above a flat top, and below it
+        tip = site.origin + 0.012 * site.right + depth * site.axis  # beside the corridor
+        (touched,) = setting.answers.answer([Asked(DEBULK.tool.pose(tip, site.axis, site.right), done=1)])
+        force = float(ball.force(np.array(depth)))
+        assert touched.force @ site.axis == pytest.approx(force, rel=1e-6)
+        assert touched.pressure == pytest.approx(1.5 * force / (np.pi * DEBULK.tool.radius * depth))
     assert float(ball.deeper(np.array(force), ball.contact(np.array(force)))) == pytest.approx(0.0)
 
 

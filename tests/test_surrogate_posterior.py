@@ -10,6 +10,7 @@ from scipy.stats import multivariate_normal
 from sim.geometry.locate import Located
 from surrogate.locating.causes import SWELLING, TOOL
 from surrogate.locating.evidence import SHIFT, SIGMA, SLIPPED, TURN, of_motions
+from surrogate.locating.observation import Observation, placed_anew
 from surrogate.locating.posterior import COARSENED, MIXED, Posterior, SeenPrior, conditioned, seen_prior
 from surrogate.locating.prior import BESIDE, NOWHERE, RIGIDS, SETS, WITH_PLACE, Prior
 from surrogate.locating.whitened import whitened
@@ -71,6 +72,15 @@ def test_rigid_error_at_places_is_what_their_rows_have_of_it(prior):
     found = Posterior(evidence, [], np.arange(1.0, 7.0), 1.0, np.zeros(0, int), 0.0)
     own = np.einsum("mi,mi->m", found.bias_at(evidence.at), evidence.axis)
     assert own == pytest.approx(evidence.rigid @ found.rigid, abs=1e-12)
+
+
+def test_cloud_is_compared_without_its_rigid_error(prior):
+    body, shift = prior.anatomy, np.array([[4e-3, -2e-3, 0.0]])
+    open_nodes = body.mesh.nodes[np.unique(body.open_surface)]
+    rest = open_nodes[np.linalg.norm(open_nodes - open_nodes.mean(axis=0), axis=1) < 10e-3]
+    still, number = np.zeros_like(body.mesh.nodes), np.arange(len(rest))
+    found = placed_anew(body, Observation(rest + shift), number, still, lambda at: np.tile(shift, (len(at), 1)))
+    assert len(rest) > 3 and found.at == pytest.approx(rest, abs=1e-9)
 
 
 def test_hypotheses_are_sets_of_causes_in_one_skull_with_and_without_a_tool(prior):
