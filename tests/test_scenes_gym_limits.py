@@ -14,7 +14,7 @@ from scenes.gym.cut_elements import CutElements
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE
 from scenes.gym.tool_motion import HIGHEST, laid, moved
-from scenes.gym.touched import Asked
+from scenes.gym.touched import Asked, Touched
 from scenes.script.site import site_of
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome
@@ -33,6 +33,26 @@ def test_load_is_the_share_of_the_limit_reached_first(limit, share):
         *_, terminated, _, truth = environment.step(DOWN)
     shares = {"force": np.linalg.norm(truth["force"]) / task.force, "pressure": truth["pressure"] / task.pressure}
     assert truth["load"] == pytest.approx(shares[share]) and shares[share] > 1.25 > 1.2 * min(shares.values())
+
+
+@pytest.mark.parametrize(("shares", "ends"), [("110111", "success"), ("1x", "unreliable")])
+def test_episode_is_over_after_goals_in_a_row_or_a_bad_answer(shares, ends):
+    """Shares of the force that is asked for; x: of a solution that is not good."""
+    environment = gymnasium.make("sulcus/Palpate-v0", device="cpu", size=(48, 36)).unwrapped
+    nodes, seen = np.arange(len(environment.setting.site.anatomy.mesh.nodes)), iter(f"0{shares}")
+
+    def answer(asked):
+        share, goal = next(seen), environment.episode.drawn.goal
+        force = np.array([0.0, 0.0, goal.amount * (share != "0")])
+        return [Touched(np.zeros((len(nodes), 3)), nodes, force, 0.0, good=share != "x")]
+
+    task = replace(PALPATE, aside=1.0, held=3)
+    setting = replace(environment.setting, task=task, answers=SimpleNamespace(answer=answer))
+    environment.setting = environment.episode.setting = setting
+    environment.reset(seed=3)
+    over = [environment.step(0.0 * DOWN) for _ in shares]
+    assert [terminated for _, _, terminated, _, _ in over] == [False] * (len(shares) - 1) + [True]
+    assert over[-1][-1]["success"] == (ends == "success") != (over[-1][1] < -5.0)
 
 
 def test_tool_leans_and_sinks_no_farther_than_it_may(box):

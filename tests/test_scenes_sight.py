@@ -147,7 +147,8 @@ def test_the_checks_see_what_is_wrong_of_an_estimate(play, frames, truth):
     undrawn = plain.drawn(frame.number, frame.touch, frame.loads, frame.deformation, 0.1)
     assert "the drawn outline" in sentences(replace(undrawn, estimate=frame.estimate))
     astray = replace(frame.estimate, middle=frame.estimate.middle + 0.01)
-    assert "ellipsoid holds the tumour's middle in" in sentences(replace(frame, estimate=astray))
+    for wrong in (astray, replace(frame.estimate, location=None)):  # one that is refused has no ellipsoid
+        assert "ellipsoid holds the tumour's middle in" in sentences(replace(frame, estimate=wrong))
     silent = replace(frame, remark="estimate 9.9 mm off")
     assert "does not say its frame's number or" in sentences(silent)
     other = replace(frame, estimate=replace(frame.estimate, true=np.full(3, 1.0)))
