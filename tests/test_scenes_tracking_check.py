@@ -1,11 +1,13 @@
 """What `sulcus check` judges of lost, found and stale pictures fails where the code that it guards is perturbed."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from theatres import template_theatre
 
+from scenes.cli import main
 from scenes.play.overlay.drawn_film import drawn_film
 from scenes.play.overlay.follower import Follower, State
 from scenes.play.overlay.picture import Painter
@@ -102,3 +104,13 @@ def test_a_registration_that_is_off_by_two_millimetres_fails(film, parts):
 def test_what_never_comes_back_fails():
     never = TrackingFigures(1, 0, 0, np.inf, 0.0)
     assert never.row()["back"] is None and len(never.broken()) == 1
+
+
+def test_check_exit_status_is_1_where_tracking_alone_fails(film, parts, monkeypatch, capsys):
+    names = {"drawn_film.drawn_film": film, "tracking_checks.usual": parts}
+    names["tracking_checks.measure_tracking"] = TrackingFigures(16, 1, 0, 0.0, 0.0)
+    for name, found in names.items():
+        monkeypatch.setattr(f"scenes.play.overlay.{name}", lambda *given, found=found: found)
+    assert main(["check", "tracking", "--device", "cpu", "--json"]) == 1
+    said = json.loads(capsys.readouterr().out)
+    assert not said["passed"] and said["scenes"] == [] and len(said["tracking"]["broken"]) == 1
