@@ -35,7 +35,7 @@ def test_load_is_the_share_of_the_limit_reached_first(limit, share):
     assert truth["load"] == pytest.approx(shares[share]) and shares[share] > 1.25 > 1.2 * min(shares.values())
 
 
-@pytest.mark.parametrize(("shares", "ends"), [("110111", "success"), ("1x", "unreliable")])
+@pytest.mark.parametrize(("shares", "ends"), [("110111", "success"), ("1x", "unreliable"), ("11x", "unreliable")])
 def test_episode_is_over_after_goals_in_a_row_or_a_bad_answer(shares, ends):
     """Shares of the force that is asked for; x: of a solution that is not good."""
     environment = gymnasium.make("sulcus/Palpate-v0", device="cpu", size=(48, 36)).unwrapped

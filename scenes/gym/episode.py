@@ -130,7 +130,7 @@ class Episode:
         task, goal, self.shown = self.setting.task, self.drawn.goal, self.done
         target = self._target(touched)
         judged = self._judge(touched, target)
-        kept = judged.away <= task.aside and judged.off <= task.tolerance and judged.load <= 1.0
+        kept = touched.good and judged.away <= task.aside and judged.off <= task.tolerance and judged.load <= 1.0
         self.held = self.held + 1 if kept else 0
         success = self.held >= task.held
         if success and task.cuts:
