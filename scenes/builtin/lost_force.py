@@ -8,6 +8,7 @@ from sim.material import Material
 
 from ..script.scene import Bounds, Scene
 from ..script.sight import Sight
+from ..script.tool import Probe
 from ..script.tool_paths import press
 from ..script.viewpoint import Viewpoint
 
@@ -19,10 +20,11 @@ SCENE = Scene(
     "lost_force",
     __doc__ or "",
     press(force=0.35, rise=1.5, hold=0.5, at=(-0.004, 0.003)),
+    tool=Probe(radius=10e-3),  # under a smaller one tetrahedra are inverted
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Bonded(), ToolForce()),
     sight=Sight(),
     viewpoint=Viewpoint(fov=np.radians(13.0), width=800, height=600),
-    # The tumour moves little more than the rigid error: 46 % are removed, 36 of four frames, by other seeds 11 to 76.
+    # The tumour moves little more than the rigid error: in four frames 43 % of the motion is removed.
     bounds=Bounds(overlap=0.75, error=2e-3, removed=0.3),
 )

@@ -30,7 +30,7 @@ SCENE = Scene(
     "microscope",
     __doc__ or "",
     late,
-    tool=Probe(radius=4e-3),
+    tool=Probe(radius=7e-3),
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity(), ToolForce()),
     lying=drained(2.0, to=0.2),

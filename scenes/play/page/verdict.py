@@ -25,7 +25,7 @@ OWN, TRUTH = "this is the finite elements' own answer", "the truth is the finite
 class Judged:
     """How far off a deformer is where the finite elements have answered: mean and largest, and the motion [m].
 
-    doubt: why the truth may not be relied on; mean and largest are None where the answer is the finite elements' own;
+    doubt says why their answer may not be relied on. mean and largest are None where the answer shown is theirs.
     distance is theirs from tip to tumour [m].
     """
 
