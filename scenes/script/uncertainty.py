@@ -191,12 +191,15 @@ def _read(row: dict) -> Uncertainty:
     for name, values in (lists | parts).items():
         if len(values) != len(lists["times"]) or not np.isfinite(values).all():
             raise InputError(f"{name} are not {len(lists['times'])} finite numbers.")
-    counts = {name: int(row.get(name, 0)) for name in ("frames", "folded", "numbers", "patients")}
-    shares = {name: None if row.get(name) is None else float(row[name]) for name in ("covered", "deviation")}
-    if not all(share is None or 0.0 <= share <= 1.0 for share in shares.values()):
+    frames, folded, numbers, patients = (int(row.get(key, 0)) for key in ("frames", "folded", "numbers", "patients"))
+    covered, deviation = (None if row.get(name) is None else float(row[name]) for name in ("covered", "deviation"))
+    if not all(share is None or 0.0 <= share <= 1.0 for share in (covered, deviation)):
         raise InputError("covered and deviation are not shares from 0 to 1.")
-    of, mark, draws, failed = str(row["scene"]), str(row["mark"]), int(row["draws"]), int(row["failed"])
-    return Uncertainty(of, mark, draws, failed, **lists, parts=parts, **counts, **shares)
+    return Uncertainty(
+        scene=str(row["scene"]), mark=str(row["mark"]), draws=int(row["draws"]), failed=int(row["failed"]),
+        times=lists["times"], worst=lists["worst"], middle=lists["middle"], moved=lists["moved"], parts=parts,
+        frames=frames, folded=folded, numbers=numbers, patients=patients, covered=covered, deviation=deviation,
+    )  # fmt: skip
 
 
 def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:
