@@ -20,9 +20,17 @@ from .tissue_options import add_tissue_arguments, tissue_of
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
-    parser.add_argument("--elements", nargs="+", default=[RECOMMENDED], choices=ELEMENTS, help=f"({RECOMMENDED})")
-    parser.add_argument("--depths", nargs="+", type=float, default=[1.0, 3.0], help="of the ball [mm] (1 3)")
-    parser.add_argument("--ball", type=float, default=6.0, help="its radius [mm] (default %(default)g)")
+    parser.add_argument(
+        "--elements",
+        nargs="+",
+        default=[RECOMMENDED],
+        choices=ELEMENTS,
+        help=f"finite elements to measure (default: {RECOMMENDED})",
+    )
+    parser.add_argument(
+        "--depths", nargs="+", type=float, default=[1.0, 3.0], help="depths of the ball [mm] (default: 1 3)"
+    )
+    parser.add_argument("--ball", type=float, default=6.0, help="radius of the ball [mm] (default %(default)g)")
     add_tissue_arguments(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
