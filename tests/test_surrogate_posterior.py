@@ -69,7 +69,7 @@ def test_what_is_seen_of_shapes_is_their_motion_at_the_points(prior):
 
 def test_rigid_error_at_places_is_what_their_rows_have_of_it(prior):
     evidence = drawn(prior, np.random.default_rng(3))[1]
-    found = Posterior(evidence, [], np.arange(1.0, 7.0), 1.0, np.zeros(0, int), 0.0)
+    found = Posterior(evidence, [], np.arange(1.0, 7.0), 1.0, np.zeros(0, int), 0.0, 0.0)
     own = np.einsum("mi,mi->m", found.bias_at(evidence.at), evidence.axis)
     assert own == pytest.approx(evidence.rigid @ found.rigid, abs=1e-12)
 
