@@ -9,6 +9,7 @@ import pytest
 from scenes.cli import main
 from sim.bodies.meshfile import write_anatomy
 from surrogate.data.dataset import read_dataset
+from surrogate.data.tool_loads import BEYOND_TISSUE
 from surrogate.model.store import load, stated_errors
 from surrogate.training.train import LEARNERS
 
@@ -38,6 +39,15 @@ def test_data_say_where_they_come_from(folder, small_box):
     ):
         assert data.provenance[name]
     assert "law='neo-hookean'" in data.provenance["effects"] and "0.0001" in data.provenance["accuracy"]
+    assert "limit_strain=True" in data.provenance["accuracy"]
+
+
+def test_simulate_keeps_strained_answers_of_brutal_loads(folder, tmp_path):
+    """As of the published protocol, whose loads small bodies have no room for."""
+    out = tmp_path / "data.h5"
+    words = ["simulate", str(folder / "box.vtu"), "--preset", "brutal", "--count", "2", "--device", "cpu", "--json"]
+    assert main([*words, "--out", str(out)]) == 0 and BEYOND_TISSUE == ("seed", "brutal")
+    assert "limit_strain=False" in read_dataset(out).provenance["accuracy"]
 
 
 def test_displacements_are_those_of_the_finite_elements(folder, small_box):

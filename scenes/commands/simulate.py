@@ -31,7 +31,7 @@ from surrogate.data.dataset import read_outcomes
 from surrogate.data.holding import HISTORY, drawn_times
 from surrogate.data.simulate import Solved, simulate
 from surrogate.data.stated_tissue import stating
-from surrogate.data.tool_loads import PRESETS, draw, refused_share, refused_words
+from surrogate.data.tool_loads import BEYOND_TISSUE, PRESETS, draw, refused_share, refused_words
 from surrogate.data.tool_poses import draw_poses, tool_of
 
 from ..script.shipped_files import template_path
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
         tissue = tissue_of(args)
         tool, loads = _drawn(args, anatomy, tissue)
     precision = "float32" if args.tolerance >= 1e-4 else "float64"
-    accuracy = Accuracy(args.tolerance, precision=precision)
+    accuracy = Accuracy(args.tolerance, precision=precision, limit_strain=args.preset not in BEYOND_TISSUE)
     effects: tuple[Effect, ...] = (*pushed_effects(anatomy, elasticity, args.skull), NodalForce())
     if tool is not None:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))

@@ -72,6 +72,8 @@ TOOLS = {
 # No surgery: a trial of the solver. 1 N on 3 mm would be a flat punch 40 mm deep.
 BRUTAL = Tool("brutal", (3e-3, 10e-3), (0.02, 1.05), pressure=(0.0, np.inf), depth=np.inf, even=True)
 PRESETS = (*TOOLS, "mixed", "seed", BRUTAL.name)
+BEYOND_TISSUE = ("seed", BRUTAL.name)
+"""Presets whose loads strain tissue beyond what was measured on brain: their equilibria are kept all the same."""
 
 
 def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
