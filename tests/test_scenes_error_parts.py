@@ -196,7 +196,7 @@ def test_agreement_keeps_the_last_30_places_that_are_known():
 
 
 def looking(motion, **given):
-    """What is known of pictures every 40 ms: `motion` is of the reference before the camera, from the film's first."""
+    """Return what is known of pictures every 40 ms: `motion` moves the reference before the camera, from the first."""
     follower = replace(follower_of(template_theatre().stage(find_scene("palpate"))), tool=None, **given)
     first = truth_of(follower.motion.stage).T_camera_scan[0] @ np.linalg.inv(follower.registration.T_patient_scan)
     seen = [Tracked(0, {}, {PATIENT: Pose(T @ first, np.zeros((6, 6)), 0.0, 4)}, {}) for T in motion]

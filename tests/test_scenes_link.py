@@ -313,7 +313,7 @@ def test_places_inside_the_tumour_move_with_its_volume(stage):
     body = outgoing.messages(Answer(NOW, moved), outgoing.placed(["a", "b", "c"], at))[-2]
     found = 1e-3 * read_points(body[HEADER.size :])[1]
     assert found == pytest.approx(at + 0.3 * (at - rest[stage.nodes].mean(axis=0)), abs=1e-6)
-    # Of a model that knows the tumour alone, a place on the cortex is not sent.
+    # A place on the cortex is not sent for a model that knows the tumour alone.
     tumour = replace(moved, motion=motion_of(rest, anatomy.tumour_nodes, 0.0 * rest[anatomy.tumour_nodes]))
     both = outgoing.placed(["a", "c"], np.vstack([at[:1], rest[anatomy.open_surface[:1, 0]]]))
     assert read_points(outgoing.messages(Answer(NOW, tumour), both)[-2][HEADER.size :])[0] == ["a"]

@@ -55,7 +55,7 @@ def laid(tool: Tool, turn: tuple[float, float, float], x: float, top: float) -> 
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("skull", SKULLS)
 def test_contact_product_ends_outside_or_says_so(skull: str, element: str) -> None:
-    """Where an outcome is good no surface is inside a tool and no tetrahedron inverted; on bone it never is."""
+    """A good outcome has no surface inside a tool and no inverted tetrahedron; none is good on bone."""
     for (name, (tool, turn)), ratio, step in product(SHAPES.items(), (1.0, 10.0), (None, 0.02)):
         anatomy = block(ratio != 1.0)
         top = float(anatomy.mesh.nodes[:, 2].max())

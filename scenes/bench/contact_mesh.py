@@ -10,13 +10,14 @@ import numpy as np
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
 from sim.bodies.refine import refined
-from sim.discretisation.footprint import nearest_on
 from sim.effects import ToolContact, ToolForce, pushed_effects
-from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.material import Tissue
 from sim.tools import Ball
+from surrogate.data.tool_loads import axes_about
+
+from .elements import above_tumour
 
 # Places of the ball along one long edge of the surface, as shares of its length.
 PLACES = np.linspace(0.0, 1.0, 5)
@@ -67,7 +68,7 @@ def rows(
     """
     normal, places = _line(anatomy)
     T = np.zeros((len(places), 1, 4, 4))
-    T[..., :3, :3], T[..., 3, 3] = _axes(normal), 1.0
+    T[..., :3, :3], T[..., 3, 3] = axes_about(normal[None]), 1.0
     fine = refined(anatomy)
     for element in elements:
         solvers = [_solver(body, element, radius, tissue, device) for body in (anatomy, fine)]
@@ -85,23 +86,12 @@ def rows(
 
 def _line(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
     """The outward normal (3,) over the tumour, and places (p, 3) [m] along the open triangle's longest edge there."""
-    if not len(anatomy.tumour_nodes) or not len(anatomy.open_surface):
-        raise InputError("the anatomy has no tumour, or no open cortex above it: make one with `sulcus anatomy`.")
-    nodes = anatomy.mesh.nodes
-    centre = nodes[anatomy.tumour_nodes].mean(axis=0)
-    point = nearest_on(nodes[anatomy.open_surface], centre)
-    corners = nodes[anatomy.open_surface]
+    point, _ = above_tumour(anatomy)
+    corners = anatomy.mesh.nodes[anatomy.open_surface]
     a, b, c = corners[np.linalg.norm(corners.mean(axis=1) - point, axis=1).argmin()]
     normal = np.cross(b - a, c - a)
     start, end = max(((a, b), (b, c), (c, a)), key=lambda edge: float(np.linalg.norm(edge[1] - edge[0])))
     return normal / np.linalg.norm(normal), start + PLACES[:, None] * (end - start)
-
-
-def _axes(normal: np.ndarray) -> np.ndarray:
-    """Rotation (3, 3) whose third axis is a unit normal."""
-    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    first /= np.linalg.norm(first)
-    return np.column_stack([first, np.cross(normal, first), normal])
 
 
 def _solver(anatomy: Anatomy, element: str, radius: float, tissue: Tissue, device: str) -> Fem:

@@ -85,13 +85,24 @@ def limits(found: Sequence[Row]) -> dict[float, float]:
 
 def _loads(anatomy: Anatomy, press: Press) -> Loads:
     """A push towards the tumour's centre at the nearest point of the open cortex."""
+    point, centre = above_tumour(anatomy)
+    inward = (centre - point) / np.linalg.norm(centre - point)
+    return push(point, press.force * inward, press.footprint)
+
+
+def above_tumour(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
+    """Point (3,) [m] of the open cortex that is nearest to the tumour's centre, and that centre.
+
+    Raises
+    ------
+    InputError
+        An anatomy without tumour or open cortex.
+    """
     if not len(anatomy.tumour_nodes) or not len(anatomy.open_surface):
         raise InputError("the anatomy has no tumour, or no open cortex above it: make one with `sulcus anatomy`.")
     nodes = anatomy.mesh.nodes
     centre = nodes[anatomy.tumour_nodes].mean(axis=0)
-    point = nearest_on(nodes[anatomy.open_surface], centre)
-    inward = (centre - point) / np.linalg.norm(centre - point)
-    return push(point, press.force * inward, press.footprint)
+    return nearest_on(nodes[anatomy.open_surface], centre), centre
 
 
 def _measured(anatomy: Anatomy, element: str, poisson: float, press: Press, device: str) -> Row:

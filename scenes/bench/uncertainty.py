@@ -42,8 +42,7 @@ from ..script.scene import Scene
 from ..script.tool_paths import Path, Touch
 from ..script.uncertainty import LEVEL, Uncertainty, mark_of
 
-# Thousandths of the motion, as in a locator's ensemble.
-# Draws with inverted tetrahedra are counted, and not left out.
+# Thousandths of the motion, as in a locator's ensemble. Draws with inverted tetrahedra are counted, and not left out.
 ACCURACY = Accuracy(tolerance=3e-3, limit_strain=False)
 # Moments of a scene that are solved; a scene cannot be known where fewer draws than this share have an answer.
 MOMENTS, LEAST = 5, 0.8
@@ -364,12 +363,12 @@ def coverage(
         raise InputError(
             f"{len(sound)} of {len(draws)} synthetic patients of the scene {scene.name} have an equilibrium: too few."
         )
-    kept, inside = [draw for draw, _ in sound], []
+    meshes, inside = mesh_errors(scene, [draw for draw, _ in sound]), []
     shift, wide = rigid(SHIFTS * len(sound), seed)  # of each patient their own
     each = list(zip(shift.reshape(len(sound), SHIFTS, 3), wide.reshape(len(sound), SHIFTS), strict=True))
     for moment in range(1, len(still.times)):
         motion = np.stack([answer[moment] for _, answer in sound])
-        off = off_by(motion, still.fields[moment], mesh_errors(scene, kept))
+        off = off_by(motion, still.fields[moment], meshes)
         normals = still.normals[moment]
         worst = [distances(one[None], normals, *errors)[0][0] for one, errors in zip(off, each, strict=True)]
         inside.append(np.array(worst) <= stated.worst[moment])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +13,7 @@ from sim.bodies.meshfile import read_anatomy
 from sim.elements import ELEMENTS, RECOMMENDED
 
 from ..script.shipped_files import template_path
+from .json_line import json_line
 from .tissue_options import add_tissue_arguments, tissue_of
 
 
@@ -53,5 +53,5 @@ def run(args: argparse.Namespace) -> int:
         found.append(row)
     if args.json:
         lists = [{name: np.asarray(value).tolist() for name, value in asdict(row).items()} for row in found]
-        print(json.dumps({"machine": where, "rows": lists}))
+        print(json_line({"machine": where, "rows": lists}))
     return 0 if all(np.isfinite(row.along + row.fine).all() for row in found) else 1

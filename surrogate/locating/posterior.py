@@ -38,7 +38,7 @@ potrs, trtrs = get_lapack_funcs(("potrs", "trtrs"), dtype=np.float64)
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What one hypothesis says of k unknowns.
+    """Answer of one hypothesis about k unknowns.
 
     Parameters
     ----------
