@@ -126,9 +126,14 @@ class Chromium:
 
 
 def box_of(window: Chromium, element: str) -> np.ndarray:
-    """Left, top, right and bottom of an element, once it is there: a narrow window lays the panel out anew."""
+    """Left, top, right and bottom of an element, once it has a size and stays where it is: layout takes a while."""
     assert window.wait(element)
-    return np.array(window.value(BOX.format(element)))
+    box, last, until = np.array(window.value(BOX.format(element))), None, time.monotonic() + 20.0
+    while not np.array_equal(box, last) or not (box[2:] > box[:2]).all():
+        assert time.monotonic() < until, f"{element} does not come to rest: {box}"
+        time.sleep(0.1)
+        box, last = np.array(window.value(BOX.format(element))), box
+    return box
 
 
 def assert_fits(window: Chromium, size: tuple[int, int], lines: tuple[str, ...]) -> None:

@@ -72,6 +72,7 @@ def test_in_a_low_window_what_switches_physics_off_is_in_sight(demo, window):
     window.size(1280, 720)
     fold = "[...document.querySelectorAll('legend, span, div')].findLast(e => e.innerText?.startsWith('more: switch'))"
     window.value(f"document.getElementById('{TABS[0][1]}').click()")
+    assert window.wait(f"innerWidth == 1280 && {fold}?.offsetHeight > 0")
     view = box_of(window, "document.querySelector('canvas')")
     assert box_of(window, fold)[3] + 5 * 16 <= view[1]
 
