@@ -14,7 +14,7 @@ from test_sim_volumes import grid, head, nifti
 from theatres import short
 
 from scenes.cli import main
-from scenes.commands.placement_options import add_opening_arguments, trajectory_given
+from scenes.commands.placement_options import add_opening_arguments, opening_words, trajectory_given
 from scenes.play.deformers import Theatre
 from scenes.script.approach import Approach, approach_of
 from scenes.script.scene import PALPATION, find_scene
@@ -165,6 +165,8 @@ def test_a_patient_says_how_its_scenes_follow_it(site, tmp_path):
         for option in ("--opening-at", "--opening-over"):
             assert trajectory_given(parser.parse_args([option, str(path)])) == (path if found else None)
     assert trajectory_given(parser.parse_args([])) is None
+    words = ["--opening-at=1.0,2.0,3.0", "--fine-opening"]
+    assert opening_words(parser.parse_args(words)) == words and not opening_words(parser.parse_args([]))
 
 
 def test_no_trajectory_is_the_middle():

@@ -1,4 +1,4 @@
-"""A mesh twice as fine is the same body."""
+"""A finer mesh is the same body."""
 
 from dataclasses import replace
 
@@ -8,7 +8,10 @@ from boxes import box as block
 from boxes import hold
 
 from sim.bodies.refine import refined
+from sim.bodies.subject import MeshPlan, make_anatomy
+from sim.bodies.template import Tumour, template_subject
 from sim.errors import InputError
+from sim.geometry.surface import areas, edge_lengths
 from sim.geometry.tetmesh import TetMesh, row_keys
 
 
@@ -41,6 +44,32 @@ def test_what_holds_the_body_holds_it_still(box):
     # Free and not to be touched: on edges between an open and a held node.
     near = np.abs(np.linalg.norm(fine.mesh.nodes[surface[rim]], axis=1) - 25e-3)
     assert near.max() < 8e-3
+
+
+def test_refined_near_opening_halves_cells_there_and_nowhere_else(box):
+    fine = refined(box, near_opening=True)
+    mesh, count = fine.mesh, len(box.mesh.nodes)
+    np.testing.assert_array_equal(mesh.nodes[:count], box.mesh.nodes)
+    assert (mesh.volumes > 0.0).all() and np.isin(np.arange(len(mesh.nodes)), mesh.tets).all()
+    for label in np.unique(box.mesh.region):
+        whole = box.mesh.volumes[box.mesh.region == label].sum()
+        assert mesh.volumes[mesh.region == label].sum() == pytest.approx(whole, rel=1e-12)
+    assert len(fine.open_surface) == 4 * len(box.open_surface)
+    # Every inner face is of two tetrahedra, and the surface has the area and the closed shape that it had.
+    faces = np.sort(mesh.tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+    times = np.unique(row_keys(faces), return_counts=True)[1]
+    assert times.max() == 2 and (times == 1).sum() == len(mesh.surface)
+    assert areas(mesh.nodes[mesh.surface]).sum() == pytest.approx(areas(box.mesh.nodes[box.mesh.surface]).sum())
+    opened = box.mesh.nodes[np.unique(box.open_surface)]
+    far = np.linalg.norm(mesh.nodes[count:, None] - opened, axis=2).min(axis=1).max()
+    assert far < 2.5 * edge_lengths(box.mesh.nodes[box.open_surface]).mean()
+    assert 0 < len(mesh.nodes) - count < 0.5 * (len(refined(box).mesh.nodes) - count)
+
+
+def test_fine_opening_of_a_mesh_plan_is_refined():
+    subject = template_subject(Tumour())
+    plain, fine = (make_anatomy(subject, MeshPlan(2000, fine_opening=each)) for each in (False, True))
+    assert len(fine.open_surface) == 4 * len(plain.open_surface) and fine.digest != plain.digest
 
 
 def test_what_is_held_or_slides_is_not_open_even_where_a_tool_was_let(box):

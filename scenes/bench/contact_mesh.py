@@ -1,7 +1,8 @@
-"""The mesh's share of a contact force: a ball is moved over one cell of a mesh and of the mesh with halved edges."""
+"""The mesh's share of a contact force: a ball is moved over one cell of a mesh, and of a mesh half as coarse."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -36,7 +37,9 @@ class Row:
     sideways
         (places,) length of the rest.
     fine
-        (places,) the component along the normal on the mesh with halved edges.
+        (places,) the component along the normal on the mesh whose cells at the opening are halved.
+    seconds, fine_seconds
+        Duration of all places together on each mesh.
     """
 
     element: str
@@ -44,10 +47,12 @@ class Row:
     along: np.ndarray
     sideways: np.ndarray
     fine: np.ndarray
+    seconds: float
+    fine_seconds: float
 
     @property
     def share(self) -> float:
-        """Mean excess of the force over that on the mesh with halved edges, as a share of the latter."""
+        """Mean excess of the force over that on the finer mesh, as a share of the latter."""
         return float(np.mean(self.along / self.fine - 1.0))
 
     @property
@@ -69,19 +74,21 @@ def rows(
     normal, places = _line(anatomy)
     T = np.zeros((len(places), 1, 4, 4))
     T[..., :3, :3], T[..., 3, 3] = axes_about(normal[None]), 1.0
-    fine = refined(anatomy)
+    fine = refined(anatomy, near_opening=True)
     for element in elements:
         solvers = [_solver(body, element, radius, tissue, device) for body in (anatomy, fine)]
         for depth in depths:
             T[:, 0, :3, 3] = places - depth * normal
-            forces = []
+            forces, seconds = [], []
             for fem in solvers:
+                began = time.perf_counter()
                 found = fem.deform(Loads((Touching(T.copy()),)))
+                seconds.append(time.perf_counter() - began)
                 good = np.array([outcome.good for outcome in found.outcome])
                 forces.append(np.where(good[:, None], found.reaction[:, 0, :3], np.nan))
             along, finer = (np.abs(force @ normal) for force in forces)
             sideways = np.sqrt(np.maximum((forces[0] ** 2).sum(axis=1) - along**2, 0.0))
-            yield Row(element, depth, along, sideways, finer)
+            yield Row(element, depth, along, sideways, finer, *seconds)
 
 
 def _line(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:

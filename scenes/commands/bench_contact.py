@@ -43,13 +43,14 @@ def run(args: argparse.Namespace) -> int:
 
     table, where = sys.stderr if args.json else sys.stdout, machine(args.device)
     anatomy, found = read_anatomy(args.anatomy or template_path()), []
-    names = ("element", "depth [mm]", "force [mN]", "over halved edges", "range over a cell", "sideways, most")
+    names = ("element", "depth [mm]", "force [mN]", "over halved cells", "range over a cell", "sideways, most")
+    names = (*names, "seconds", "seconds, halved")
     print(f"{where}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}", file=table)
     depths = [depth / 1e3 for depth in args.depths]
     for row in rows(anatomy, args.elements, depths, args.ball / 1e3, tissue_of(args), args.device):
         force = f"{row.element} | {1e3 * row.depth:g} | {1e3 * row.along.mean():.1f}"
         shares = f"{row.share:+.1%} | {row.scatter:.1%} | {(row.sideways / row.along).max():.1%}"
-        print(f"| {force} | {shares} |", file=table, flush=True)
+        print(f"| {force} | {shares} | {row.seconds:.1f} | {row.fine_seconds:.1f} |", file=table, flush=True)
         found.append(row)
     if args.json:
         lists = [{name: np.asarray(value).tolist() for name, value in asdict(row).items()} for row in found]

@@ -19,7 +19,7 @@ ON_LINE = 2000
 
 
 def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare --opening-at and --opening-over, of which one may be given."""
+    """Declare --fine-opening, and --opening-at and --opening-over, of which one may be given."""
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
         "--opening-at", type=point_or_file, metavar="X,Y,Z|FILE.mrk.json",
@@ -30,6 +30,10 @@ def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
         "--opening-over", type=piece_point_or_file, metavar="PIECE|X,Y,Z|FILE.mrk.json",
         help="open the skull over a piece of the tumour, by its number (1, the default, is the largest), or over a "
         "point inside the brain [mm, RAS]. A file of 3D Slicer may hold the point, or a trajectory that ends there",
+    )  # fmt: skip
+    parser.add_argument(
+        "--fine-opening", action="store_true",
+        help="halve the cells at the open cortex, contact forces depend less on the mesh, at a cost in time",
     )  # fmt: skip
 
 
@@ -60,7 +64,7 @@ def opening_words(args: argparse.Namespace) -> list[str]:
         for name, value in given.items()
         if value is not None
     }
-    return [f"{name}={text}" for name, text in texts.items()]
+    return [f"{name}={text}" for name, text in texts.items()] + ["--fine-opening"] * args.fine_opening
 
 
 def trajectory_given(args: argparse.Namespace) -> Path | None:

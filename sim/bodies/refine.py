@@ -1,26 +1,60 @@
-"""The same body on a mesh twice as fine: what a mesh's own error is measured against."""
+"""The same body on a finer mesh: everywhere, or near the open cortex."""
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
+from scipy.spatial import KDTree
 
 from ..anatomy import Anatomy
 from ..discretisation.space import discretise
 from ..errors import InputError
-from ..geometry.tetmesh import TetMesh, oriented
+from ..geometry.surface import edge_lengths
+from ..geometry.tetmesh import QUADRATIC_EDGES, TetMesh, oriented
 
 # Nodes of a quadratic tetrahedron: four children keep a corner each; the octahedron between them is cut along one of
 # its three diagonals, round which its other four nodes stand in this order.
 CORNERS = np.array([[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3]])
 DIAGONALS = np.array([[4, 9], [5, 7], [6, 8]])
 ROUND = np.array([[6, 7, 8, 5], [4, 6, 9, 8], [4, 5, 9, 7]])
+MIDDLE = {frozenset(edge): 4 + k for k, edge in enumerate(QUADRATIC_EDGES.tolist())}
 
 
-def refined(anatomy: Anatomy) -> Anatomy:
-    """Every tetrahedron in eight, every edge halved; held and sliding nodes as quadratic elements would have them.
+def _patterns() -> dict[tuple[int, ...], list[list[int]]]:
+    """Children of a tetrahedron by which of its edges are halved: none, one, two opposite ones, or those of a face."""
+    found: dict[tuple[int, ...], list[list[int]]] = {(): [[0, 1, 2, 3]]}
+    for a, b in combinations(range(4), 2):
+        c, d = (k for k in range(4) if k not in (a, b))
+        one, other = MIDDLE[frozenset((a, b))], MIDDLE[frozenset((c, d))]
+        found[(one,)] = [[a, one, c, d], [one, b, c, d]]
+        found[tuple(sorted((one, other)))] = [[x, one, y, other] for x in (a, b) for y in (c, d)]
+    for a, b, c in combinations(range(4), 3):
+        ab, bc, ac = (MIDDLE[frozenset(edge)] for edge in ((a, b), (b, c), (a, c)))
+        d = 6 - a - b - c
+        found[tuple(sorted((ab, bc, ac)))] = [[a, ab, ac, d], [ab, b, bc, d], [ac, bc, c, d], [ab, bc, ac, d]]
+    return found
 
-    The octahedron inside is cut along its shortest diagonal: Bey 1995, "Tetrahedral grid refinement", Computing
-    55:355-378, cuts it along a fixed one.
+
+PATTERNS = _patterns()
+
+
+def _closed() -> np.ndarray:
+    """Smallest pattern (64, 6) bool that holds each set of halved edges; all six where no smaller one does."""
+    sets = (np.arange(64)[:, None] >> np.arange(6)) & 1 > 0
+    known = np.array([np.isin(np.arange(4, 10), one) for one in sorted(PATTERNS, key=len)] + [np.ones(6, bool)])
+    return known[(sets[:, None] <= known).all(axis=2).argmax(axis=1)]
+
+
+CLOSED = _closed()
+
+
+def refined(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
+    """Halve every edge, or those whose middle is within an edge's mean length of the open cortex.
+
+    The body's own nodes come first and stay. Held and sliding nodes are those of quadratic elements. A tetrahedron
+    becomes eight, and two or four at the edge of what is refined: red and green refinement, Bey 1995, "Tetrahedral
+    grid refinement", Computing 55:355-378. Bey's fixed diagonal of the octahedron inside is the shortest one here.
 
     Raises
     ------
@@ -31,18 +65,50 @@ def refined(anatomy: Anatomy) -> Anatomy:
     if mesh.middles is not None:
         raise InputError("a quadratic mesh is not refined: give the linear one.")
     space = discretise(mesh, "p2")
-    nodes, table = space.nodes, space.table
-    ends = nodes[table[:, DIAGONALS]]
+    nodes, table, count = space.nodes, space.table, len(mesh.nodes)
+    opening = space.surface[anatomy.craniotomy[mesh.surface].all(axis=1)]
+    halved = np.ones(space.count, bool)
+    if near_opening:
+        reach = edge_lengths(nodes[anatomy.open_surface]).mean()
+        halved[count:] = KDTree(nodes[np.unique(opening)]).query(nodes[count:])[0] <= reach
+    cut = _conforming(table, halved)
+    tets, parent = _children(nodes, table, cut)
+    held, normal = space.held(anatomy.held), space.sliding(anatomy.slide_normal, anatomy.held)
+    craniotomy = np.zeros(space.count, bool)
+    craniotomy[opening] = True
+    craniotomy[:count] = anatomy.craniotomy
+    free = ~held.any(axis=1) & (normal == 0.0).all(axis=1)
+    tets, _ = oriented(nodes, tets)
+    number = np.cumsum(halved) - 1
+    fine = TetMesh(nodes[halved], number[tets], mesh.region[parent])
+    return Anatomy(fine, held[halved], normal[halved], (craniotomy & free)[halved])
+
+
+def _conforming(table: np.ndarray, halved: np.ndarray) -> np.ndarray:
+    """Halved edges (T, 6) bool of each tetrahedron, a pattern in each; their middles are marked in `halved` (N,)."""
+    while True:
+        asked = halved[table[:, 4:]]
+        cut = CLOSED[asked @ (1 << np.arange(6))]
+        if (cut == asked).all():
+            return cut
+        halved[table[:, 4:][cut]] = True
+
+
+def _children(nodes: np.ndarray, table: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tetrahedra (C, 4) over the nodes, and which each is a part of (C,), in the parents' order."""
+    tets, parent = [], []
+    for pattern, parts in PATTERNS.items():
+        rows = np.flatnonzero((cut == np.isin(np.arange(4, 10), pattern)).all(axis=1))
+        tets.append(table[rows][:, parts].reshape(-1, 4))
+        parent.append(np.repeat(rows, len(parts)))
+    rows = np.flatnonzero(cut.all(axis=1))
+    whole = table[rows]
+    ends = nodes[whole[:, DIAGONALS]]
     shortest = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2).argmin(axis=1)
     around = ROUND[shortest]
     inner = [np.column_stack([DIAGONALS[shortest], around[:, k], around[:, (k + 1) % 4]]) for k in range(4)]
-    cut = np.stack([np.take_along_axis(table, one, axis=1) for one in inner], axis=1)
-    children = np.concatenate([table[:, CORNERS], cut], axis=1)
-    tets, _ = oriented(nodes, children.reshape(-1, 4))
-    held, normal = space.held(anatomy.held), space.sliding(anatomy.slide_normal, anatomy.held)
-    craniotomy = np.zeros(space.count, bool)
-    opening = space.surface[anatomy.craniotomy[mesh.surface].all(axis=1)]
-    craniotomy[opening] = True
-    craniotomy[: len(mesh.nodes)] = anatomy.craniotomy
-    free = ~held.any(axis=1) & (normal == 0.0).all(axis=1)
-    return Anatomy(TetMesh(nodes, tets, np.repeat(mesh.region, 8)), held, normal, craniotomy & free)
+    octahedron = np.stack([np.take_along_axis(whole, one, axis=1) for one in inner], axis=1)
+    tets.append(np.concatenate([whole[:, CORNERS], octahedron], axis=1).reshape(-1, 4))
+    parent.append(np.repeat(rows, 8))
+    order = np.argsort(np.concatenate(parent), kind="stable")
+    return np.concatenate(tets)[order], np.concatenate(parent)[order]

@@ -17,6 +17,7 @@ from .dural_septa import Septum
 from .intensity import Intensity
 from .mesher import Meshing, Solids, mesh_solids
 from .placement import Piece, Placement, within_outline
+from .refine import refined
 from .signed_distance import Field
 
 FEWEST_NODES, MOST_NODES = 2_000, 250_000
@@ -35,6 +36,8 @@ class MeshPlan:
         Wanted in the mesh.
     craniotomy
         [m] Diameter of the opening along the cortex.
+    fine_opening
+        Whether cells at the open cortex are halved, beyond the nodes wanted: contact forces depend less on the mesh.
     meshing
         How the mesh is searched for and smoothed.
     placement
@@ -48,6 +51,7 @@ class MeshPlan:
 
     nodes: int = 5300
     craniotomy: float = 0.050
+    fine_opening: bool = False
     meshing: Meshing = field(default_factory=Meshing)
     placement: Placement = field(default_factory=Placement)
 
@@ -129,7 +133,8 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
         subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening, subject.pieces
     )
     mesh = _with_parts(mesh_solids(solids, plan.nodes, plan.meshing), subject)
-    return bounded(mesh, subject.site, plan.craniotomy, plan.placement, subject.outline, subject.septa)
+    made = bounded(mesh, subject.site, plan.craniotomy, plan.placement, subject.outline, subject.septa)
+    return refined(made, near_opening=True) if plan.fine_opening else made
 
 
 def _with_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
