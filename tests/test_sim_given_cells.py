@@ -183,3 +183,19 @@ def test_gmsh_groups_of_some_volumes_only_are_rejected(tmp_path: Path) -> None:
     path.write_text(GMSH_41.format("0"))
     with pytest.raises(InputError, match="its `gmsh:physical` is given of some cells only: put every volume into a"):
         read_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$ParametricNodes\n1\n1 0 0 0 3 1\n$EndParametricNodes\n"
+         "$Elements\n1\n1 4 0 1 1 1 1\n$EndElements", r"parameters of the geometry: .*\(Mesh\.SaveParametric = 0"),
+        ("$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 1 1 1\n3 1 1 1\n1\n0 0 0 0 0 0\n$EndNodes",
+         "parameters of the geometry"),
+        ("$NOD\n1\n1 0 0 0\n$ENDNOD", "MSH 1, of which no mesh is read: save it as MSH 4.1"),
+    ],
+)  # fmt: skip
+def test_msh_of_an_unread_kind_states_the_remedy(tmp_path: Path, text: str, reason: str) -> None:
+    (tmp_path / "a.msh").write_text(text)
+    with pytest.raises(InputError, match=reason):
+        read_mesh(tmp_path / "a.msh")

@@ -3,6 +3,7 @@
 import bz2
 import gzip
 import lzma
+import struct
 import zipfile
 from contextlib import nullcontext
 
@@ -83,3 +84,17 @@ def test_header_without_voxel_size_says_so_without_a_log(tmp_path, capfd):
         with nullcontext() if reason is None else pytest.raises(InputError, match=reason):
             read_labels(tmp_path / "l.nii")
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("kind", [nibabel.Nifti1Image, nibabel.Nifti2Image])
+def test_overlong_quaternion_is_rounded_or_reported(tmp_path, kind):
+    turn = np.diag([1.0, -1.0, -1.0])
+    image = kind(np.ones((4, 4, 4), np.int16), None)
+    image.set_qform(np.block([[turn, np.zeros((3, 1))], [np.zeros(3), 1.0]]), 1)
+    place, number = (256, "<f") if kind is nibabel.Nifti1Image else (352, "<d")
+    for length, fits in ((1.0002, True), (1.2, False)):
+        raw = bytearray(image.to_bytes())
+        struct.pack_into(number, raw, place, length)
+        (tmp_path / "l.nii").write_bytes(raw)
+        with nullcontext() if fits else pytest.raises(InputError, match=r"quaternion of length 1\.2, .* must be 1"):
+            np.testing.assert_allclose(read_labels(tmp_path / "l.nii").affine[:3, :3], 1e-3 * turn)

@@ -30,9 +30,7 @@ def demand_own(path: Path, limits: MeshBytes) -> None:
     if suffix not in ENDINGS:
         given = suffix or "a name without ending"
         raise InputError(f"no mesh is read from {given}: give a tetrahedral mesh as {', '.join(ENDINGS)}.")
-    if suffix == ".inp":
-        _demand_no_include(path)
-    elif suffix in (".xdmf", ".xmf"):
+    if suffix in (".xdmf", ".xmf"):
         for other in _named(path):
             demand_stored(other, limits)
     elif h5py.is_hdf5(path):
@@ -96,10 +94,3 @@ def _named(path: Path) -> set[Path]:
         elif kind not in (None, "XML"):
             raise InputError(f"its numbers are of the format {kind}. Write them as HDF, or as XML.")
     return named
-
-
-def _demand_no_include(path: Path) -> None:
-    with path.open(errors="replace") as lines:
-        for line in lines:
-            if line.partition(",")[0].strip().replace("*", "").upper() == "INCLUDE":
-                raise InputError("it includes another file. Join the two to one.")

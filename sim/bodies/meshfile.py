@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import traceback
 import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext, redirect_stderr, redirect_stdout
@@ -19,6 +20,7 @@ from ..geometry.tetmesh import MeshWarning, TetMesh, oriented
 from ..runtime.atomic_files import written_whole
 from ..runtime.file_limits import MESH_BYTES, MeshBytes, at_most
 from ..runtime.outside_files import path_of, read_as
+from .abaqus import AbaqusMesh, read_abaqus
 from .given_cells import demand_one_body, demand_tetrahedra, merged, pieces_note, regions_of
 from .mesh_references import demand_own
 from .vtu_size import demand_small
@@ -29,6 +31,21 @@ if TYPE_CHECKING:
 UNITS = {"m": 1.0, "mm": 1e-3}
 # meshio's names of tetrahedra by their nodes; it brings every format's order of mid-edge nodes to VTK's.
 CELLS = {4: "tetra", 10: "tetra10"}
+
+REMEDY = "Convert it to .vtu or .msh."
+# Of meshio's reason in a message [characters].
+LONGEST = 200
+REASONS = {
+    r"Incompatible cell data '([^']+)'": (
+        "its `{}` is given of some cells only: put every volume into a group, and save it again."
+    ),
+    r"[Pp]arametric ?[Nn]odes": (
+        "its nodes have parameters of the geometry: save it without them (Mesh.SaveParametric = 0 in Gmsh)."
+    ),
+    r"\$NOD": "it is of MSH 1, of which no mesh is read: save it as MSH 4.1.",
+}
+"""Messages by a pattern in meshio's reason, or in the name of a section of an MSH file."""
+SECTIONS = b"$ParametricNodes", b"$NOD"
 
 # An anatomy's longest side [m]: a mouse's brain has 15 mm, a whole head 0.3 m.
 SMALLEST, LARGEST = 5e-3, 1.0
@@ -56,36 +73,53 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
         A file that is missing or unreadable, without tetrahedra, with both kinds or with other volume cells, or with
         data that does not fit. Tetrahedra that are listed twice, or overlap.
     """
-    import meshio  # an optional reader: machines that only train have none
-
     path = path_of(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file. Give a tetrahedral mesh, such as .vtu or .msh.")
     if unit not in UNITS:
         raise InputError(f"no unit is called {unit!r}: choose one of {', '.join(UNITS)}.")
-    remedy = "Convert it to .vtu or .msh."
-    # meshio prints what it stumbles over, and warns of arrays that it skips.
-    with read_as(path, "a mesh", remedy), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+    with read_as(path, "a mesh", REMEDY):
         most = limits.of(path.stat().st_size)
         counted = path.suffix.lower() == ".vtu" and demand_small(path, most)
         with warnings.catch_warnings(), nullcontext() if counted else at_most(limits.largest):
-            warnings.simplefilter("ignore")
+            warnings.simplefilter("ignore")  # meshio warns of arrays that it skips
             demand_own(path, limits)
-            try:
-                raw = meshio.read(path)
-            except ValueError as error:
-                found = re.match(r"Incompatible cell data '([^']+)'", str(error))
-                if found is None:
-                    raise
-                raise InputError(
-                    f"its `{found[1]}` is given of some cells only: put every volume into a group, and save it again."
-                ) from error
-    with read_as(path, "a mesh", remedy):
+            raw = read_abaqus(path) if path.suffix.lower() == ".inp" else _by_meshio(path)
+    with read_as(path, "a mesh", REMEDY):
         return _taken(path, raw, UNITS[unit])
 
 
-def _taken(path: Path, raw: meshio.Mesh, metre: float) -> MeshFile:
-    """What meshio read, with lengths in units of `metre` [m]."""
+def _by_meshio(path: Path) -> meshio.Mesh:
+    """Read a mesh of another format than Abaqus's.
+
+    Raises
+    ------
+    InputError
+        Passing on the reason that meshio gives itself. Its other exceptions show a damaged file.
+    """
+    import meshio  # an optional reader: machines that only train have none
+
+    printed = StringIO()  # meshio prints why it reads no file
+    try:
+        with redirect_stdout(printed), redirect_stderr(StringIO()):
+            return meshio.read(path)
+    except (Exception, SystemExit) as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        if (last.line or "").startswith("raise ") and "meshio" in Path(last.filename).parts:
+            printed.write(str(error))
+        said = " ".join(re.sub(r"[^!-~]", " ", printed.getvalue()).split()).rstrip(".")
+        if not said and path.suffix.lower() == ".msh":
+            with path.open("rb") as lines:
+                said = next((line.strip().decode() for line in lines if line.strip() in SECTIONS), "")
+        if not said:
+            raise
+        reason = f"meshio reports `{said[:LONGEST]}`. {REMEDY}"
+        known = ((re.search(words, said), reason) for words, reason in REASONS.items())
+        raise InputError(next((own.format(*found.groups()) for found, own in known if found), reason)) from error
+
+
+def _taken(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
+    """Mesh of a file that was read, with lengths in units of `metre` [m]."""
     kinds = {block.type for block in raw.cells}
     found = kinds.intersection(CELLS.values())
     if not found:

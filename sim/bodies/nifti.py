@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from nibabel.freesurfer.mghformat import MGHImage
     from nibabel.nifti1 import Nifti1Image
 
+# Share by which the square of a quaternion's length may exceed 1.
+ROUNDED = 1e-3
 METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}
 
 
@@ -55,7 +57,7 @@ def load_nifti(path: Path) -> Nifti1Image:
     Raises
     ------
     InputError
-        Another file. nibabel's own exceptions of a damaged one.
+        Another file, or a qform that is no rotation. nibabel's own exceptions of a damaged one.
     """
     import nibabel
     from nibabel.imageglobals import LoggingOutputSuppressor
@@ -67,8 +69,20 @@ def load_nifti(path: Path) -> Nifti1Image:
         raise ValueError("no header of NIfTI")
     if not two and start[344:348] != b"n+1\0":
         raise InputError(f"{path}: is no NIfTI volume in one file. {REMEDY}")
+    kind = nibabel.Nifti2Image if two else nibabel.Nifti1Image
+    with opened(path) as file:
+        header = kind.header_class.from_fileobj(file, check=False)
+    over = sum(float(header[f"quatern_{axis}"]) ** 2 for axis in "bcd") - 1.0
+    if over > ROUNDED and int(header["qform_code"]) > 0 >= int(header["sform_code"]):
+        raise InputError(
+            f"{path}: its qform has a quaternion of length {(over + 1.0) ** 0.5:.4g}, which is no rotation: the length "
+            "must be 1. Export it again, with its orientation."
+        )
+    if 0.0 < over <= ROUNDED:  # half a turn, as in the format's reference code; nibabel allows single round-off
+        rounded = type("Rounded", (kind.header_class,), {"quaternion_threshold": 2.0 * ROUNDED})
+        kind = type("RoundedImage", (kind,), {"header_class": rounded})
     with LoggingOutputSuppressor():  # remarks on fields that are repaired
-        return (nibabel.Nifti2Image if two else nibabel.Nifti1Image).from_file_map({"image": _holder(path)})
+        return kind.from_file_map({"image": _holder(path)})
 
 
 def _holder(path: Path) -> FileHolder:

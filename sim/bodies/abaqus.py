@@ -1,0 +1,137 @@
+"""Abaqus input files: nodes, elements and sets of elements, in as many blocks as the program wrote."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+
+SOLID = re.compile(r"[AD]?C3D(4|5|6|8|10|13|15|20|27)(?!\d)")
+# By their number of nodes.
+SOLIDS = {4: "tetra", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetra10", 13: "pyramid13", 15: "wedge15",
+          20: "hexahedron20", 27: "hexahedron27"}  # fmt: skip
+# Numbers of one element: its own, and those of its nodes.
+WIDTHS = {"tetra": 5, "tetra10": 11}
+# Keywords that make or move nodes and elements.
+GENERATORS = "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM"
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Elements of one type: nodes (n, k) of tetrahedra, and (n, 0) of others."""
+
+    type: str
+    data: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class AbaqusMesh:
+    """Contents of a file under the names of meshio's meshes; a set has its rows of each block."""
+
+    points: np.ndarray
+    cells: list[Block]
+    cell_sets: Mapping[str, list[np.ndarray]]
+    point_data: Mapping[str, Any] = field(default_factory=dict)
+    cell_data: Mapping[str, Any] = field(default_factory=dict)
+    field_data: Mapping[str, Any] = field(default_factory=dict)
+
+
+def read_abaqus(path: Path) -> AbaqusMesh:
+    """Read nodes, elements and sets of elements of all blocks of a file; names are in capitals.
+
+    Raises
+    ------
+    InputError
+        A file that refers to another, computes nodes by a rule, or uses a number for two nodes or for none.
+    """
+    index, points = dict[int, int](), list[list[float]]()
+    blocks, sets = list[tuple[str, np.ndarray]](), dict[str, list[np.ndarray]]()
+    apart = False  # nodes of an assembly that are in none of its instances: reference points
+    with path.open(encoding="utf-8-sig", errors="replace") as lines:
+        for keyword, options, rows in _sections(lines):
+            if keyword == "INCLUDE" or (keyword in ("NODE", "ELEMENT", "ELSET") and "INPUT" in options):
+                raise InputError("it includes another file. Join the two to one.")
+            if keyword in GENERATORS or (keyword == "NODE" and options.get("SYSTEM", "R") != "R"):
+                raise InputError(f"its *{keyword} computes coordinates or elements: save it with all of them listed.")
+            if keyword in ("ASSEMBLY", "INSTANCE", "END INSTANCE", "END ASSEMBLY"):
+                apart = keyword in ("ASSEMBLY", "END INSTANCE")
+            elif keyword == "NODE" and not apart:
+                _add_nodes(rows, index, points)
+            elif keyword == "ELEMENT" and rows:
+                blocks.append(_elements(options.get("TYPE", ""), rows))
+                if "ELSET" in options:
+                    sets.setdefault(options["ELSET"], []).append(blocks[-1][1][:, 0])
+            elif keyword == "ELSET" and "INTERNAL" not in options:
+                sets.setdefault(options["ELSET"], []).extend(_members(rows, "GENERATE" in options, sets))
+    try:
+        cells = [
+            Block(kind, np.array([[index[n] for n in row[1:]] for row in table.tolist()])) for kind, table in blocks
+        ]
+    except KeyError as error:
+        raise InputError(f"an element names node {error}, which no *NODE lists: list it there.") from error
+    known = {name: np.concatenate(numbers) for name, numbers in sets.items() if numbers}
+    within = {name: [np.flatnonzero(np.isin(table[:, 0], n)) for _, table in blocks] for name, n in known.items()}
+    return AbaqusMesh(np.array(points).reshape(-1, 3), cells, within)
+
+
+def _sections(lines: Iterable[str]) -> Iterator[tuple[str, dict[str, str], list[str]]]:
+    """Split lines into keywords, each with its parameters and data lines; comments and blank lines are dropped."""
+    head, rows = "", list[str]()
+    for line in chain(map(str.strip, lines), "*"):
+        if line.startswith("*") and not line.startswith("**"):
+            keyword, *options = (part.strip() for part in head.upper().split(","))
+            pairs = (option.partition("=") for option in options)
+            yield keyword, {name.strip(): value.strip(' "') for name, _, value in pairs}, rows
+            head, rows = line[1:], []
+        elif head.endswith(",") and not rows and line[:1].isalpha():
+            head += line  # its parameters continue
+        elif line and not line.startswith("**"):
+            rows.append(line)
+
+
+def _add_nodes(rows: list[str], index: dict[int, int], points: list[list[float]]) -> None:
+    """Append the nodes of a block: number, and up to three coordinates, 0 where they are blank."""
+    for row in rows:
+        number, *cells = (cell.strip() for cell in f"{row},,,".split(","))
+        place = [float(cell or 0.0) for cell in cells[:3]]
+        at = index.setdefault(int(number), len(points))
+        if at == len(points):
+            points.append(place)
+        elif points[at] != place:
+            raise InputError(
+                f"node {number} is listed at two places, as in a file of several parts: save it as one mesh, in which "
+                "each node has its own number."
+            )
+
+
+def _elements(name: str, rows: list[str]) -> tuple[str, np.ndarray]:
+    """Type and table (n, 1 + k) of a block's elements: number and nodes of tetrahedra, of others the number alone."""
+    if not name:
+        raise InputError("an *ELEMENT has no TYPE: state it, such as TYPE=C3D4.")
+    solid = SOLID.match(name)
+    kind = SOLIDS[int(solid[1])] if solid else name
+    if kind in WIDTHS:
+        return kind, np.array(_whole(rows), int).reshape(-1, WIDTHS[kind])
+    first = (row for row, before in zip(rows, ["", *rows], strict=False) if not before.endswith(","))
+    return kind, np.array([int(row.split(",")[0]) for row in first], int).reshape(-1, 1)
+
+
+def _members(rows: list[str], generate: bool, sets: Mapping[str, list[np.ndarray]]) -> list[np.ndarray]:
+    """Numbers of elements, listed or by first, last and step (`generate`), and those of sets that are named."""
+    if generate:
+        return [np.arange(first, last + 1, *step) for first, last, *step in (_whole([row]) for row in rows)]
+    cells = [cell.strip(' "') for row in rows for cell in row.split(",")]
+    named = [numbers for cell in cells for numbers in sets.get(cell.upper(), [])]
+    return [np.array([int(cell) for cell in cells if cell.isdecimal()], int), *named]
+
+
+def _whole(rows: list[str]) -> list[int]:
+    """Whole numbers in cells between commas, blank ones left out."""
+    return [int(cell) for row in rows for cell in row.split(",") if cell.strip()]
