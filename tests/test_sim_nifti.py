@@ -98,3 +98,11 @@ def test_overlong_quaternion_is_rounded_or_reported(tmp_path, kind):
         (tmp_path / "l.nii").write_bytes(raw)
         with nullcontext() if fits else pytest.raises(InputError, match=r"quaternion of length 1\.2, .* must be 1"):
             np.testing.assert_allclose(read_labels(tmp_path / "l.nii").affine[:3, :3], 1e-3 * turn)
+
+
+def test_values_of_an_unread_type_are_reported(tmp_path):
+    raw = bytearray(nibabel.Nifti1Image(np.ones((4, 4, 4), np.int16), np.eye(4)).to_bytes())
+    struct.pack_into("<hh", raw, 70, 1536, 128)
+    (tmp_path / "l.nii").write_bytes(raw)
+    with pytest.raises(InputError, match=r"nibabel reports `data code 1536 not supported`\. Give one"):
+        read_labels(tmp_path / "l.nii")

@@ -57,10 +57,12 @@ def load_nifti(path: Path) -> Nifti1Image:
     Raises
     ------
     InputError
-        Another file, or a qform that is no rotation. nibabel's own exceptions of a damaged one.
+        Another file, a qform that is no rotation, or a header that nibabel does not read. Its other exceptions of a
+        damaged one.
     """
     import nibabel
     from nibabel.imageglobals import LoggingOutputSuppressor
+    from nibabel.spatialimages import HeaderDataError
 
     with opened(path) as file:
         start = file.read(348)
@@ -81,8 +83,11 @@ def load_nifti(path: Path) -> Nifti1Image:
     if 0.0 < over <= ROUNDED:  # half a turn, as in the format's reference code; nibabel allows single round-off
         rounded = type("Rounded", (kind.header_class,), {"quaternion_threshold": 2.0 * ROUNDED})
         kind = type("RoundedImage", (kind,), {"header_class": rounded})
-    with LoggingOutputSuppressor():  # remarks on fields that are repaired
-        return kind.from_file_map({"image": _holder(path)})
+    try:
+        with LoggingOutputSuppressor():  # remarks on fields that are repaired
+            return kind.from_file_map({"image": _holder(path)})
+    except HeaderDataError as error:
+        raise InputError(f"{path}: nibabel reports `{error}`. {REMEDY}") from error
 
 
 def _holder(path: Path) -> FileHolder:
