@@ -154,7 +154,7 @@ def test_the_page_of_formats_lists_what_a_model_holds():
     held = {"tool" if name == "ball" else name for name in header["models"]["series-gp"]}  # this file is an older one
     assert {row.strip("`") for row in rows} == {"header", *held}
     (stated,) = re.findall(r"^\| `header` \| JSON: (.*)\|$", FORMATS, re.M)
-    assert set(re.findall(r"`(\w+)`", stated)) == {"space", *header}
+    assert set(re.findall(r"`(\w+)`", stated)) == {"space", "seal", *header}
     (stated,) = re.findall(r"^\| `envelope` \| (.*)\|$", FORMATS, re.M)
     assert set(re.findall(r"`(\w+)`", stated)) == set(header["models"]["series-gp"]["envelope"])
 

@@ -26,7 +26,7 @@ from surrogate.model.conformal import GROWTH, Bound
 from surrogate.model.kept_arrays import kept_path
 from surrogate.model.learned import Part
 from surrogate.model.npz_archive import Archive
-from surrogate.model.store import load, save
+from surrogate.model.store import learned_tissue, load, save, stated_errors
 from surrogate.model.training_range import Outside
 from surrogate.training.train import train
 
@@ -138,18 +138,30 @@ def test_what_no_model_refers_to_is_not_read(stored, box, tmp_path):
         tracemalloc.stop()
 
 
-def rewritten(stored, path, change):
-    """The file with another header, and its members as they were."""
+def rewritten(stored, path, change, seal=""):
+    """The file with another header, without its seal as older files, and its members as they were."""
     with zipfile.ZipFile(stored) as source, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as target:
         for name in source.namelist():
             raw = source.read(name)
             if name == "header.npy":
-                text = change(str(np.load(stored)["header"]))
+                text = change(re.sub(r', "seal": "\w+"', seal, str(np.load(stored)["header"])))
                 with target.open(name, "w") as member:
                     np.lib.format.write_array(member, np.array(text))
             else:
                 target.writestr(name, raw)
     return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [('"bound": 0.', '"bound": 1.'), ('"svr"', '"gp"'), ('"reach": ', '"reach": 1'), ('"space"', '"space2"')],
+)
+@pytest.mark.parametrize("read", [load, learned_tissue, lambda path, _: stated_errors(path)])
+def test_header_of_another_content_than_sealed_is_rejected(stored, box, tmp_path, read, old, new):
+    path = rewritten(stored, tmp_path / "model.npz", lambda text: text.replace(old, new), r"\g<0>")
+    with pytest.raises(InputError, match=r"do not have the digest that it states: it is damaged\. Make one with"):
+        read(path, box)
+    read(rewritten(stored, path, str), box)  # older files have no seal
 
 
 @pytest.mark.parametrize("change", [lambda array: 10.0 * array, lambda array: array[::-1], lambda array: array[:, :3]])

@@ -36,7 +36,7 @@ from ..regressors.svr import Svr
 from .conformal import GROWTH, Bound
 from .learned import Learned, Part
 from .left_out import LeftOut, OffBy
-from .npz_archive import Archive
+from .npz_archive import Archive, seal_of
 from .own_learners import find_own, name_of
 from .tip_distance import TipModel
 from .tool_force import ForceModel
@@ -91,6 +91,7 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
         "versions": {name: version_of(name) for name in ("sulcus", "numpy")},
         "models": {name: _described(model, put) for name, model in models.items()},
     }
+    header["seal"] = seal_of(header, {})  # of the arrays, their names are the digests
     with written_whole(path, ".npz") as partial:
         np.savez_compressed(partial, header=np.array(json.dumps(header)), **arrays)  # pyright: ignore[reportArgumentType]
 
@@ -109,7 +110,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
         raise InputError(f"{path}: no such file; make a model with `sulcus train`.")
     with read_as(path, "a model", REMEDY), path.open("rb") as raw:
         archive = Archive(raw, REMEDY)
-        header = json.loads(archive.text("header"))
+        header = _header(archive)
         if header["format"] != FORMAT:
             raise InputError(f"{path}: has the format {str(header['format'])[:40]!r}, not {FORMAT!r}: train it anew.")
         if header["anatomy"] != anatomy.digest:
@@ -157,7 +158,15 @@ def _described_in(path: str | Path) -> Iterator[dict[str, Any]]:
     """The header of a model file; whatever fails in the block is said of the file."""
     path = path_of(path)
     with read_as(path, "a model", REMEDY), path.open("rb") as raw:
-        yield json.loads(Archive(raw, REMEDY).text("header"))
+        yield _header(Archive(raw, REMEDY))
+
+
+def _header(archive: Archive) -> dict[str, Any]:
+    """Header of a model file; older files have no seal."""
+    header = json.loads(archive.text("header"))
+    if "seal" in header:
+        archive.sealed(header, ())
+    return header
 
 
 def _left_out(description: dict[str, Any]) -> LeftOut | None:
