@@ -122,7 +122,7 @@ def test_an_answer_is_that_of_the_normal_equations_and_its_evidence_that_of_the_
             size = np.concatenate([sight.scale * hypothesis.size, np.full(6, rigid), np.full(len(place), sight.scale)])
             some = unknown[answer.rows]
             spread = np.linalg.inv(some @ np.linalg.solve(noise, some.T) + np.diag(size**-2.0))
-            assert answer.back.T @ answer.back == pytest.approx(spread, rel=1e-4, abs=1e-8)
+            assert answer.root.T @ answer.root == pytest.approx(spread, rel=1e-4, abs=1e-8)
             mean = spread @ some @ np.linalg.solve(noise, evidence.value)
             assert answer.mean == pytest.approx(mean, rel=1e-4, abs=1e-6)
             logs.append(log)
@@ -176,7 +176,7 @@ def test_ellipsoids_hold_what_is_drawn(prior):
         answer = sight.answer(hypothesis, hypothesis.places[0], 1.0)
         scale = np.append(np.ones(len(prior.kind)), RIGID)
         off = answer.mean - (truth / scale)[answer.rows]
-        square.append(off @ np.linalg.solve(answer.back.T @ answer.back, off))
+        square.append(off @ np.linalg.solve(answer.root.T @ answer.root, off))
     degrees = len(answer.rows)
     assert np.mean(square) == pytest.approx(degrees, abs=4.0 * np.sqrt(2.0 * degrees / 200))
 
@@ -191,7 +191,7 @@ def test_a_mixture_lies_between_its_hypotheses(prior):
     spreads = np.zeros((len(answers), *2 * means.shape[1:]))
     for mean, spread, answer in zip(means, spreads, answers, strict=True):
         mean[answer.rows] = answer.mean
-        spread[np.ix_(answer.rows, answer.rows)] = answer.back.T @ answer.back
+        spread[np.ix_(answer.rows, answer.rows)] = answer.root.T @ answer.root
     share = np.array([answer.share for answer in answers])
     assert (np.diff(share) <= 0.0).all()
     mean = share @ means

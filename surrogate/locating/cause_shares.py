@@ -86,7 +86,7 @@ def drawn_shares(prior: Prior, posterior: Posterior) -> np.ndarray:
     for answer, end in zip(posterior.answers, ends, strict=True):
         rows = np.flatnonzero(answer.rows < len(prior.kind))
         kind = prior.kind[answer.rows[rows]]
-        weight = answer.mean[rows] + normal[begin:end, : len(answer.back)] @ answer.back[:, rows]
+        weight = answer.mean[rows] + normal[begin:end, : len(answer.root)] @ answer.root[:, rows]
         for number in np.unique(kind):
             own = rows[kind == number]
             shapes = answer.rows[own]

@@ -33,7 +33,7 @@ COARSENED = 2.0
 RIGID = -1
 # So many of the most probable hypotheses make a mixture.
 MIXED = 24
-potrs, trtrs = get_lapack_funcs(("potrs", "trtrs"), dtype=np.float64)
+(potrs,) = get_lapack_funcs(("potrs",), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +58,9 @@ class Answer:
     size: np.ndarray
     lower: np.ndarray
 
-    def root(self, columns: np.ndarray) -> np.ndarray:
-        """Multiply columns (k, n) by R (k, k), of which the covariance is R^T R."""
-        return trtrs(self.lower.T, self.size[:, None] * columns, trans=1)[0]
-
     @cached_property
-    def back(self) -> np.ndarray:
-        """R (k, k) itself."""
+    def root(self) -> np.ndarray:
+        """Factor R (k, k) of the covariance R^T R."""
         return self.size * triangular_inverse(self.lower)
 
 
@@ -122,7 +118,7 @@ class Posterior:
         mean, found = self.unknown @ flat, np.zeros((shape.shape[1], 3, 3))
         for answer in self.answers:
             part = flat[answer.rows]
-            off = np.concatenate([answer.root(part), [answer.mean @ part - mean]])
+            off = np.concatenate([answer.root @ part, [answer.mean @ part - mean]])
             off = off.reshape(len(off), -1, 3).transpose(1, 2, 0)
             found += answer.share * off @ off.transpose(0, 2, 1)
         return self.factor * found
@@ -292,7 +288,7 @@ def _oddness(rows: Whitened, answer: Answer, point: np.ndarray) -> np.ndarray:
     """Square Mahalanobis distance of each point (n,) from what all others predict of it, by one hypothesis."""
     data = len(rows.products) - 1
     precise = rows.precise(np.append(answer.rows, data))
-    known = answer.root(precise[:, :-1].T).T
+    known = precise[:, :-1] @ answer.root.T
     gain = precise[:, -1] - precise[:, :-1] @ answer.mean
     number = np.unique(point, return_inverse=True)[1]
     order, count = np.argsort(number, kind="stable"), np.bincount(number)
