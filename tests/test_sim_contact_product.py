@@ -20,22 +20,25 @@ from sim.loads import Loads, Touching
 from sim.material import Material
 from sim.tools import Ball, Capsule, Spatula, Tool, core_of, distances_to
 
-SIDE, DEPTH, GAP = 0.06, 2e-3, 1e-4
+SIDE, DEPTH, GAP = 0.06, 1.5e-3, 1e-4
 TURNED = (90.0, 0.0, 0.0)
 SHAPES: dict[str, tuple[Tool, tuple[float, float, float]]] = {
     "ball": (Ball(6e-3), (0.0, 0.0, 0.0)),
     "rod on its side": (Capsule(3e-3, 8e-3), TURNED),
-    "blade": (Spatula(0.012, 0.016, 1.5e-3), (0.0, 0.0, 0.0)),
-    "blade on its edge": (Spatula(0.012, 0.016, 1e-3), TURNED),
+    "blade": (Spatula(9e-3, 0.012, 1.5e-3), (0.0, 0.0, 0.0)),
+    "blade on its edge": (Spatula(9e-3, 0.012, 1e-3), TURNED),
 }
+TOOLS = tuple(tool for tool, _ in SHAPES.values())
 SKULLS: dict[str, Effect] = {"bonded": Bonded(), "slide": Slide(), "contact": SkullContact(GAP)}
-# Places of tools: within the opening, and 2 mm from the bone at x = 6 mm.
+# Places of tools: within the opening, and 2 mm from the bone at x = 6 mm. The tools of other cases stay in the air.
 CENTRE, EDGE = 0.03, 8e-3
+CASES = tuple(product(SHAPES, (CENTRE, EDGE)))
+AWAY = at(0.03, 0.012, 1.0)
 
 
 def block(ratio: bool) -> Anatomy:
     """A block on a fixed base whose top is open for 12 mm < x < 48 mm; with a tumour in its middle."""
-    mesh = box((10, 4, 3), SIDE)
+    mesh = box((10, 4, 2), SIDE)
     inner = np.abs(mesh.nodes[mesh.tets].mean(axis=1) - mesh.nodes.mean(axis=0)).max(axis=1) < 0.01
     mesh = TetMesh(mesh.nodes, mesh.tets, np.where(inner & ratio, TUMOUR_LABEL, BRAIN_LABEL))
     x, _, z = mesh.nodes.T
@@ -45,8 +48,9 @@ def block(ratio: bool) -> Anatomy:
     return Anatomy(mesh, np.repeat((z < 1e-9)[:, None], 3, axis=1), normal, opened)
 
 
-def laid(tool: Tool, turn: tuple[float, float, float], x: float, top: float) -> np.ndarray:
+def laid(shape: str, x: float, top: float) -> np.ndarray:
     """T_world_tool (4, 4) of a tool whose lowest point is `DEPTH` under the top at x."""
+    tool, turn = SHAPES[shape]
     core, pose = core_of(tool), at(x, 0.012, top - DEPTH, turn=turn)  # type: ignore[arg-type]
     pose[2, 3] -= (core.corners @ pose[:3, :3].T)[:, 2].min() - core.radius
     return pose
@@ -56,27 +60,27 @@ def laid(tool: Tool, turn: tuple[float, float, float], x: float, top: float) -> 
 @pytest.mark.parametrize("skull", SKULLS)
 def test_contact_product_ends_outside_or_says_so(skull: str, element: str) -> None:
     """A good outcome has no surface inside a tool and no inverted tetrahedron; none is good on bone."""
-    for (name, (tool, turn)), ratio, step in product(SHAPES.items(), (1.0, 10.0), (None, 0.02)):
+    for ratio, step in product((1.0, 10.0), (None, 0.02)):
         anatomy = block(ratio != 1.0)
+        soft, stiff = (Material("neo-hookean", 3000.0 * times, 0.45) for times in (1.0, ratio))
+        tissue = Elasticity(soft) if ratio == 1.0 else Elasticity(soft, {TUMOUR_LABEL: stiff})
+        effects = [tissue, Held(), SKULLS[skull], ToolContact(TOOLS, GAP), *([] if step is None else [Inertia()])]
         top = float(anatomy.mesh.nodes[:, 2].max())
-        tissue = Elasticity(
-            Material("neo-hookean", 3000.0, 0.45), {TUMOUR_LABEL: Material("neo-hookean", 3000.0 * ratio, 0.45)}
-        ) if ratio != 1.0 else Elasticity(Material("neo-hookean", 3000.0, 0.45))  # fmt: skip
-        effects = [tissue, Held(), SKULLS[skull], ToolContact((tool,), GAP), *([] if step is None else [Inertia()])]
+        poses = np.array([[laid(name, x, top) if name == shape else AWAY for name in SHAPES] for shape, x in CASES])
         fem = Fem(anatomy, effects, TRAIN, "cpu", element=element)
-        poses = np.stack([laid(tool, turn, x, top) for x in (CENTRE, EDGE)])
-        loads = Loads((Touching(poses[:, None]),), np.full(2, step or 0.0))
-        found = fem.deform(loads)
-        where = f"{name}, ratio {ratio}, step {step}"
-        assert np.isfinite(found.displacement).all() and np.isfinite(found.reaction).all(), where
+        found = fem.deform(Loads((Touching(poses),), np.full(len(CASES), step or 0.0)))
+        assert np.isfinite(found.displacement).all() and np.isfinite(found.reaction).all()
         bone = anatomy.mesh.surface[
             (anatomy.held.all(axis=1) | anatomy.slide_normal.any(axis=1))[anatomy.mesh.surface].all(axis=1)
         ]
         share = np.array([(i, j, 12 - i - j) for i in range(13) for j in range(13 - i)]) / 12.0
         solid = np.einsum("qc,scx->sqx", share, anatomy.mesh.nodes[bone]).reshape(-1, 3)
-        for row, pose in enumerate(poses):
-            if distances_to(tool, pose, solid).min() < -3.0 * GAP:
-                assert found.outcome[row] is Outcome.ON_BONE, where
+        for row, (shape, x) in enumerate(CASES):
+            where = f"{shape} at {x}, ratio {ratio}, step {step}: {found.outcome[row]}"
+            tool, pose = SHAPES[shape][0], laid(shape, x, top)
+            assert found.outcome[row].good == (x == CENTRE), where
+            assert (found.outcome[row] is Outcome.ON_BONE) == (x == EDGE), where
+            assert (distances_to(tool, pose, solid).min() < -3.0 * GAP) == (x == EDGE), where
             if found.outcome[row].good:
                 assert found.inverted[row] == 0, where
                 points = (
@@ -85,7 +89,5 @@ def test_contact_product_ends_outside_or_says_so(skull: str, element: str) -> No
                     else (anatomy.mesh.nodes + found.displacement[row])[anatomy.mesh.surface].reshape(-1, 3)
                 )
                 assert distances_to(tool, pose, points).min() > -(YIELDS + 0.5) * GAP, where
-                assert found.reaction[row, 0, 2] < 0.0, where
+                assert found.reaction[row, TOOLS.index(tool), 2] < 0.0, where
                 assert found.iterations[row] <= TRAIN.most, where
-        assert found.outcome[0].good, f"{where}: {found.outcome[0]}"
-        assert found.outcome[1] is Outcome.ON_BONE, where
