@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain, repeat
 
 import numpy as np
 import pytest
@@ -256,11 +258,11 @@ def test_block_jacobi_reaches_the_same_answer(device: Device) -> None:
     assert jacobi.linear_iterations > 2 * exact.linear_iterations
 
 
-class Contrary:
-    """A direction that leads uphill, in every column or only where positive curvature was not asked for."""
+class Scaled:
+    """A direction of Newton times the numbers (b,) that a function gives of the lengths taken (b,)."""
 
-    def __init__(self, problem: Problem, always: bool):
-        self.plain, self.always = NewtonCG(rest_solver(problem), 400), always
+    def __init__(self, problem: Problem, times: Callable[[np.ndarray], np.ndarray]):
+        self.plain, self.times = NewtonCG(rest_solver(problem), 400), times
 
     def begin(self) -> None:
         self.plain.begin()
@@ -272,8 +274,7 @@ class Contrary:
         self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, taken: np.ndarray
     ) -> Direction:
         found = self.plain.find(problem, u, g, gap, forcing, taken)
-        sign = np.where((taken == 0.0) & (not self.always), 1.0, -1.0)
-        return replace(found, d=problem.device.array(sign * found.d.numpy()))
+        return replace(found, d=problem.device.array(self.times(taken) * found.d.numpy()))
 
 
 def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, batch: Found) -> None:
@@ -281,7 +282,8 @@ def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, b
     rows = np.array([1, 2, 4])
     problem.begin(rows_of(cases_of(), rows))
     patient = Accuracy(tolerance=1e-7, outer=300)
-    found = equilibrium_of(problem, Contrary(problem, False), np.zeros((ROWS, 3)), patient)
+    uphill = Scaled(problem, lambda taken: np.where(taken == 0.0, 1.0, -1.0))
+    found = equilibrium_of(problem, uphill, np.zeros((ROWS, 3)), patient)
     assert all(outcome is Outcome.CONVERGED for outcome in found.outcome)
     assert found.iterations[2] > batch.iterations[4]
     np.testing.assert_allclose(found.u, batch.u[:, rows], atol=1e-6 * np.abs(batch.u).max())
@@ -289,9 +291,21 @@ def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, b
 
 def test_a_search_that_fails_twice_is_reported(problem: Problem) -> None:
     problem.begin(cases_of())
-    found = equilibrium_of(problem, Contrary(problem, True), np.zeros((ROWS, len(TOTAL))), TIGHT)
+    uphill = Scaled(problem, lambda taken: np.full(len(taken), -1.0))
+    found = equilibrium_of(problem, uphill, np.zeros((ROWS, len(TOTAL))), TIGHT)
     assert all(outcome is Outcome.STALLED for outcome in found.outcome)
     assert not found.u.any()
+
+
+@pytest.mark.parametrize(("tiny", "outcome"), [(12, Outcome.CONVERGED), (1000, Outcome.STALLED)])
+def test_steps_below_the_last_digit_end_stalled(problem: Problem, batch: Found, tiny: int, outcome: Outcome) -> None:
+    """Newton resumes after a few of them, and does not spend its budget on them."""
+    problem.begin(rows_of(cases_of(), np.array([4])))
+    sizes = chain(repeat(1e-20, tiny), repeat(1.0))
+    timid = Scaled(problem, lambda taken: np.full(len(taken), next(sizes)))
+    found = equilibrium_of(problem, timid, 0.9 * batch.u[:, [4]], TIGHT)
+    assert found.outcome[0] is outcome
+    assert found.iterations[0] <= 30
 
 
 def test_a_spent_budget_is_reported(problem: Problem) -> None:

@@ -29,7 +29,10 @@ class Newton:
     largest_forcing
         Inexact Newton: the linear residual is never larger than this share.
     patience
-        A residual that was not lowered by a tenth in so many iterations is held against round-off.
+        A residual that was not lowered by a tenth in this number of iterations is held against round-off.
+    still
+        A case stalls after this number of such iterations in a row whose steps are below the last digit of u. Fewer may
+        be a radius that a short step left small, and that doubles.
     round_off
         What the last digit of every displacement does to the residual, times this, is round-off.
     stress_free
@@ -38,6 +41,7 @@ class Newton:
 
     largest_forcing: float = 0.25
     patience: int = 4
+    still: int = 16
     round_off: float = 4.0
     stress_free: float = 100.0
 
@@ -67,7 +71,7 @@ def find_equilibrium(
     result, u, before, live = wp.clone(start), wp.clone(start), start, np.arange(count)
     gap, open_gap = problem.gap(u)
     taken, failed = np.ones(count), np.zeros(count, bool)
-    first, best, idle = np.zeros(count), np.full(count, np.inf), np.zeros(count, int)
+    first, best, (idle, still) = np.zeros(count), np.full(count, np.inf), np.zeros((2, count), int)
     last_digit = np.finfo(device.precision).eps
     linear_iterations = 0
     descent.begin()
@@ -83,7 +87,11 @@ def find_equilibrium(
         idle[live] = np.where(share <= 0.9 * best[live], 0, idle[live] + 1)
         best[live] = np.fmin(best[live], share)
         stuck = ~done & ~bad & (failed | (idle[live] >= settings.patience))
+        still[live] *= stuck
         if stuck.any():
+            moved = norms(device, combined(device, u, -1.0, before, wp.empty_like(u)))
+            still[live] += stuck & (moved <= last_digit * norms(device, u))
+            failed |= still[live] >= settings.still
             drowned = stuck & ~open_gap & (free <= settings.round_off * round_off(problem, u, g))
             outcome[live[failed]] = Outcome.STALLED
             outcome[live[drowned]] = Outcome.ROUND_OFF
