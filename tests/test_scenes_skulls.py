@@ -14,6 +14,7 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
+from sim.deformation import Outcome
 from sim.effects import Bonded, Slide, pushed_effects
 from sim.fem import Fem
 from sim.material import Material
@@ -67,6 +68,16 @@ def test_a_tear_that_does_not_come_to_rest_is_in_no_figure(brain, capsys, monkey
     monkeypatch.setattr("scenes.bench.skull_models.rows", lambda *words: iter([row]))
     assert main(["bench", "skull", path, "--loads", "1", "--device", "cpu", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["rows"] == [asdict(row) | {"motion": pytest.approx(np.nan, nan_ok=True)}]
+
+
+def test_skull_rows_under_strained_loads_count_them(brain):
+    _, anatomy = brain
+    loads = draw("palpation", anatomy, 3, 0).rows(slice(2, 3)).scaled(np.full(1, 4.0))
+    tissue = Material("neo-hookean", 3000.0, 0.45)
+    limited = Fem(anatomy, pushed_effects(anatomy, tissue), TRAIN, "cpu").deform(loads)
+    assert limited.outcome[0] in (Outcome.OVERSTRAINED, Outcome.INVERTED)
+    (row,) = rows([anatomy], ["bonded"], [0.45], loads, "cpu")
+    assert row.failed == 0 and row.bond == pytest.approx(limited.bond[0], rel=1e-3)
 
 
 @pytest.mark.parametrize(

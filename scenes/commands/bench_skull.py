@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         found.append(row)
         moved = f"{row.motion:.4f}" + (f" ({row.failed} not converged)" if row.failed else "")
         bond = "" if row.bond is None else f"{row.bond:.2f}"
-        leaked = "" if row.leaked is None else f"{row.leaked:.1g}"
+        leaked = "" if row.leaked is None else f"{row.leaked:.2g}"
         cells = (row.skull, f"{row.poisson:g}", row.vertices, moved, leaked, bond, f"{row.seconds:.2f}")
         print(f"| {' | '.join(map(str, cells))} |", file=table, flush=True)
     if args.json:
