@@ -129,6 +129,12 @@ def test_one_in_a_hundred_is_checked_and_every_solve_is_reported(box):
     assert (row.loads, row.checked, len(reported)) == (11, 4, 3)
 
 
+def test_strained_loads_that_converge_are_counted(box):
+    soft = replace(BRAIN, young=600.0)
+    (row,) = rows(Trial(box, (), "p1", "cpu", 12), soft, drawn(box, ["brutal"], 12), 1, lambda: None)
+    assert row.converged == row.loads == 12
+
+
 @pytest.mark.parametrize(
     ("more", "reason"),
     [

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim.accuracy import TRAIN, Accuracy
+from sim.accuracy import STRAINED, Accuracy
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.deformation import Deformation, guess
 from sim.discretisation.footprint import footprint_weights
@@ -62,7 +62,7 @@ class Study:
     anatomy: Anatomy
     loads: Loads
     body: Body
-    accuracy: Accuracy = TRAIN
+    accuracy: Accuracy = STRAINED
     device: str = "auto"
 
     def fem(self, body: Body) -> Fem:

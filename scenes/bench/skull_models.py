@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from sim.accuracy import TRAIN
+from sim.accuracy import STRAINED
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, joined
 from sim.effects import Bonded, pushed_effects
@@ -19,8 +19,6 @@ from sim.tearing import TEARING, Tearing, torn
 from .elements import tumour_motion
 from .stopwatch import timed
 
-# Skulls and meshes are compared under the same loads, strained or not.
-ACCURACY = replace(TRAIN, limit_strain=False)
 # A bond that lets go where it bears too much, and one that bears nothing: the skull presses only, without a gap.
 TORN = {"tearing": Bonded(), "pressing": Bonded(1e-6, 1e-6)}
 
@@ -89,9 +87,9 @@ def _answered(
     if skull in TORN:
         effects = [TORN[skull] if isinstance(one, Bonded) else one for one in pushed_effects(anatomy, tissue)]
         each = [loads.rows(np.array([row])) for row in range(len(loads))]
-        found = [timed(torn, anatomy, effects, load, ACCURACY, device, tearing=tearing) for load in each]
+        found = [timed(torn, anatomy, effects, load, STRAINED, device, tearing=tearing) for load in each]
         good = np.array([one.rested and one.answer.outcome[0].good for one, _ in found])
         return joined([one.answer for one, _ in found]), good, float(np.mean([seconds for _, seconds in found]))
-    fem = Fem(anatomy, pushed_effects(anatomy, tissue, skull), ACCURACY, device)
+    fem = Fem(anatomy, pushed_effects(anatomy, tissue, skull), STRAINED, device)
     answer, seconds = timed(fem.deform, loads)
     return answer, np.array([outcome.good for outcome in answer.outcome]), seconds / len(loads)

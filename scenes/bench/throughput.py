@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from sim.accuracy import REFERENCE, TRAIN
+from sim.accuracy import REFERENCE, STRAINED
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation
 from sim.effects import Effect, pushed_effects
@@ -162,8 +162,8 @@ def on_each(devices: Sequence[str], trial: Trial) -> Iterator[Asked]:
 
 def made(device: str, trial: Trial) -> Made:
     """A trial's finite elements on a device, in single precision."""
-    find_device(device, TRAIN.precision)  # starts Warp, off the clock
-    return Made(*timed(replace(trial, device=device).fem, TRAIN))
+    find_device(device, STRAINED.precision)  # starts Warp, off the clock
+    return Made(*timed(replace(trial, device=device).fem, STRAINED))
 
 
 def facts(made: Made, task: None) -> tuple[int, str, float]:
