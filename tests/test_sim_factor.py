@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -150,10 +151,25 @@ def test_a_front_touches_later_unknowns_alone() -> None:
 
 
 @pytest.mark.usefixtures("order")
+@pytest.mark.parametrize("later", [False, True])
+def test_entries_stored_on_one_side_have_the_same_fronts(later: bool) -> None:
+    stiffness, motions = system(sliding())
+    whole, node = sp.coo_array(motions.T @ stiffness @ motions), node_of(motions)
+    first, second = node[whole.row], node[whole.col]
+    kept = (np.random.default_rng(4).random((node.max() + 1,) * 2)[first, second] > 0.02) | (first == second)
+    kept |= (first < second) == later
+    left = sp.coo_array((whole.data[kept], (whole.row[kept], whole.col[kept])), whole.shape)
+    (order, parts), (same, others) = (fronts_of(sp.csc_array(one), node, 2) for one in (whole, left))
+    np.testing.assert_array_equal(order, same)
+    for front, other in zip(chain(*parts), chain(*others), strict=True):
+        np.testing.assert_array_equal(front.rows, other.rows)
+
+
+@pytest.mark.usefixtures("order")
 def test_dissection_leaves_little_fill() -> None:
     """A chain of a thousand nodes: an order that ignores the graph fills it."""
-    chain = sp.csr_array(sp.diags_array([np.ones(999), np.ones(999)], offsets=[-1, 1]).astype(np.int8))
-    assert sorted(dissection(chain)) == list(range(1000))
+    line = sp.csr_array(sp.diags_array([np.ones(999), np.ones(999)], offsets=[-1, 1]).astype(np.int8))
+    assert sorted(dissection(line)) == list(range(1000))
     matrix = sp.csc_array(sp.diags_array([-np.ones(999), np.full(1000, 3.0), -np.ones(999)], offsets=[-1, 0, 1]))
     _, parts = fronts_of(matrix, np.arange(1000))
     assert max(len(front.border) for part in parts for front in part) <= 4

@@ -64,6 +64,7 @@ def fronts_of(
     across = first != second
     links = np.ones(int(across.sum()), np.int8), (first[across], second[across])
     graph = sp.csr_array(sp.coo_array(links, shape=(len(number),) * 2))
+    graph += graph.T  # an entry may be zero by round-off, and not stored, on one side only
     order = dissection(graph, settings.leaf)
     groups = _groups(sp.csr_array(graph[order][:, order]), weight[order], settings)
     divided = _divided(groups, weight[order], parts, settings.most_above)
