@@ -1,6 +1,7 @@
 """The benches: what they measure is what they say, and an interrupted trial goes on."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -144,3 +145,17 @@ def test_random_loads_converge(anatomy):
     assert len(checked) == len(SETS)
     # What is left of round-off: single precision judges itself a little too well.
     assert max(checked) <= 1.1e-4
+
+
+def test_bench_contact_prints_what_its_columns_are(tmp_path, capsys):
+    path = tmp_path / "box.vtu"
+    write_anatomy(path, make_box(cells=(5, 5, 3), spacing=8e-3, tumour=12e-3, opening=34e-3))
+    words = ["bench", "contact", "--anatomy", str(path), "--device", "cpu", "--elements", "p1", "--ball", "8"]
+    assert main([*words, "--depths", "2"]) == 0
+    said = capsys.readouterr().out
+    head, row = (
+        re.findall(r"\|([^|]+)", line) for line in said.splitlines() if line.startswith("| ") and "--" not in line
+    )
+    assert len(head) == len(row) == 8 and all(f"\n{name.strip()}: " in said for name in head[3:7])
+    assert main([*words, "--depths", "2", "0"]) == 2
+    assert "--depths" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from boxes import box, top_forces
 from oracle import internal_forces
 
 from scenes.cli import main
+from sim.deformation import Outcome
 from sim.geometry.tetmesh import MeshWarning
 from sim.material import LAWS, Material
 
@@ -178,6 +180,23 @@ def test_no_force_at_all_is_rest(solve) -> None:
     assert run.code == 0
     assert run.report["iterations"] == 0
     assert not run.displacement.any()
+    assert run.report["notes"] == ["nothing moves: no force acts on a node that is free, and no motion is prescribed"]
+
+
+@pytest.mark.parametrize(("times", "torn"), [(0.1, False), (40.0, True)])
+def test_bond_beyond_its_strength_is_noted(solve, times: float, torn: bool) -> None:
+    side = np.where((MESH.nodes[:, 0] < 1e-9)[:, None] & ~BASE[:, None], [1.0, 0.0, 0.0], 0.0)
+    data = {"fixed": BASE.astype(int), "force": times * FORCE, "slide_normal": side}
+    run = solve(data, "--skull", "bonded", "--any-strain")
+    assert (run.report["bond"] > 1.0) == torn == ("the bond on the skull bears" in run.errors)
+    assert any("the bond" in note for note in run.report["notes"]) == torn
+
+
+def test_outcomes_are_all_on_the_page_of_checks() -> None:
+    page = (Path(__file__).parents[1] / "docs/verification.md").read_text()
+    rows = re.findall(r"^\| `([A-Z_]+)` \|", page, re.MULTILINE)
+    assert sorted(rows) == sorted(outcome.name for outcome in Outcome)
+    assert all(Outcome[name].good for name in rows[:4]) and not any(Outcome[name].good for name in rows[4:])
 
 
 def test_single_precision(solve) -> None:
@@ -241,7 +260,7 @@ def test_tetrahedra_that_end_inside_out_are_counted_and_printed(solve, depth: fl
     )
     assert run.code == (1 if inverted else 0)
     assert run.report["inverted_tetrahedra"] == inverted == (len(mesh.tets) if inverted else 0)
-    assert ("6 tetrahedra are inverted" in run.errors) == bool(inverted)
+    assert ("6 tetrahedra are inverted" in run.errors) == bool(inverted) == bool(run.report["notes"])
 
 
 GOOD = {"fixed": BASE.astype(int), "force": FORCE}

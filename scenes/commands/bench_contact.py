@@ -11,10 +11,18 @@ import numpy as np
 
 from sim.bodies.meshfile import read_anatomy
 from sim.elements import ELEMENTS, RECOMMENDED
+from sim.errors import InputError
 
 from ..script.shipped_files import template_path
 from .json_line import json_line
 from .tissue_options import add_tissue_arguments, tissue_of
+
+LEGEND = """
+over halved cells: excess over the force with the cells at the opening halved, as a share. That one is itself too
+  large by about a third of this.
+range over a cell: the largest force less the smallest over five places along one edge, as a share of the mean.
+sideways, most: the force across the surface's normal, as a share of that along it.
+seconds: of all places together, on the mesh as it is, and with halved cells."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,6 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if an answer is not good."""
     from ..bench.contact_mesh import rows
+
+    if min(*args.depths, args.ball) <= 0.0:
+        raise InputError("--depths and --ball are lengths in mm: give numbers above 0.")
     from ..bench.stages import machine
 
     table, where = sys.stderr if args.json else sys.stdout, machine(args.device)
@@ -52,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
         shares = f"{row.share:+.1%} | {row.scatter:.1%} | {(row.sideways / row.along).max():.1%}"
         print(f"| {force} | {shares} | {row.seconds:.1f} | {row.fine_seconds:.1f} |", file=table, flush=True)
         found.append(row)
+    print(LEGEND, file=table)
     if args.json:
         lists = [{name: np.asarray(value).tolist() for name, value in asdict(row).items()} for row in found]
         print(json_line({"machine": where, "rows": lists}))

@@ -85,18 +85,28 @@ def run(args: argparse.Namespace) -> int:
     seconds = time.perf_counter() - clock
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
     outcome, reached, inverted = deformation.outcome[0], float(deformation.reached[0]), int(deformation.inverted[0])
+    moved, bond, notes = (
+        float(np.linalg.norm(deformation.displacement[0], axis=1).max()),
+        float(deformation.bond[0]),
+        [],
+    )
     if reached < 1.0:
         what = f"in equilibrium under {reached:.1%} of the load" if reached else "the last state, in no equilibrium"
-        print(f"{args.mesh}: {outcome.value}; what is written is {what}", file=sys.stderr)
+        notes.append(f"{outcome.value}; what is written is {what}")
     least, most = deformation.stretch[:, 0]
     if inverted:
-        print(f"{args.mesh}: {inverted} tetrahedra are inverted: the load is too strong for this mesh", file=sys.stderr)
+        notes.append(f"{inverted} tetrahedra are inverted: the load is too strong for this mesh. Give a weaker one")
     if least < LEAST or most > MOST:
-        print(
-            f"{args.mesh}: stretches are {least:.2g} to {most:.2g}; {1e6 * deformation.strained[0]:.2g} ml leave the "
-            f"range of {LEAST} to {MOST} that was measured on brain tissue",
-            file=sys.stderr,
+        notes.append(
+            f"stretches are {least:.2g} to {most:.2g}; {1e6 * deformation.strained[0]:.2g} ml leave the "
+            f"range of {LEAST} to {MOST} that was measured on brain tissue"
         )
+    if bond > 1.0:
+        notes.append(f"the bond on the skull bears {bond:.2g} times its strength: it would tear, which is not computed")
+    if moved == 0.0:
+        notes.append("nothing moves: no force acts on a node that is free, and no motion is prescribed")
+    for note in notes:
+        print(f"{args.mesh}: {note}", file=sys.stderr)
     report = {
         "outcome": outcome.name.lower(),
         "message": outcome.value,
@@ -112,8 +122,9 @@ def run(args: argparse.Namespace) -> int:
         "stretch": [round(float(least), 4), round(float(most), 4)],
         "strained_ml": round(1e6 * float(deformation.strained[0]), 4),
         "leaked": float(deformation.leaked[0]),
-        "bond": float(deformation.bond[0]),
-        "largest_displacement_mm": round(1e3 * float(np.linalg.norm(deformation.displacement[0], axis=1).max()), 6),
+        "bond": bond,
+        "largest_displacement_mm": round(1e3 * moved, 6),
+        "notes": notes,
         "out": str(out),
     }
     print(json_line({**report, "plan": plan} if plan else report))
