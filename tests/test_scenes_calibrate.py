@@ -165,6 +165,18 @@ def test_two_bodies_are_found_from_two_files(tmp_path, capsys):
     assert "still.csv: 0 motions turn the bodies" in refused(["--hand-eye", one, still], capsys)
 
 
+def test_pose_rows_not_seen_are_counted_in_full(tmp_path):
+    path, good = tmp_path / "poses.csv", "1,2,3,0,0,0,1"
+    poses = [good, good, good, "nan,nan,nan,nan,nan,nan,nan", "0,0,0,0,0,0,0", "0,0,0,0,0,0,1", good]
+    cells = ["OK", "MISSING", "OUT_OF_VIEW", "OK", "OK", "OK", "OK"]
+    rows = [f"{row},{pose},{cell}" for row, (pose, cell) in enumerate(zip(poses, cells, strict=True))]
+    path.write_text("\n".join([f"{HEAD},status", *rows]))
+    with pytest.warns(UserWarning, match="5 rows are not seen") as caught:
+        read_poses(path)
+    parts = str(caught[0].message).rpartition(": ")[2].split(", ")
+    assert sum(int(part.split()[0]) for part in parts) == 5 and parts[-1] == "2 other"
+
+
 @pytest.mark.parametrize(
     ("column", "cells", "pose"),
     [

@@ -91,7 +91,9 @@ def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         for name in with_errors[1:8]:
             columns[name][rows] = np.nan
     if unseen.total():
-        counted = ", ".join(f"{count} {what}" for what, count in unseen.most_common(MOST_WORDS) if count)
+        named = dict(unseen.most_common(MOST_WORDS))
+        named["other"] = unseen.total() - sum(named.values())
+        counted = ", ".join(f"{count} {what}" for what, count in named.items() if count)
         warnings.warn(
             f"{path}: {unseen.total()} rows are not seen by the tracker and not used: {counted}", stacklevel=1
         )
