@@ -165,6 +165,66 @@ def test_two_bodies_are_found_from_two_files(tmp_path, capsys):
     assert "still.csv: 0 motions turn the bodies" in refused(["--hand-eye", one, still], capsys)
 
 
+def w_first(turns):
+    """The rotations that are read if quaternions are stored as w, x, y, z."""
+    return Rotation.from_quat(np.roll(turns.as_quat(), 1, axis=1))
+
+
+def pivoting(count=60):
+    """Turns, and places [m] of a tool whose tip stays."""
+    turns = turned(count)
+    return turns, [0.1, 0.2, 0.3] - turns.apply([0.003, -0.002, -0.15])
+
+
+@pytest.mark.parametrize(
+    ("stored", "hint"),
+    [
+        (w_first, "The quaternions fit as w, x, y, z in "),
+        (Rotation.inv, "The quaternions fit inverted in "),
+        (lambda turns: turned(len(turns), 5), "Leave out wrong rows, and give qx,qy,qz,qw"),
+    ],
+)
+def test_pivot_with_wrong_quaternions_is_rejected(tmp_path, capsys, stored, hint):
+    turns, places = pivoting()
+    line = refused(["--pivot", write_poses(tmp_path / "poses.csv", stored(turns), places)], capsys)
+    assert "mm (rms): at most 3 mm are required. The largest residual is " in line and hint in line
+
+
+def test_pivot_with_one_wrong_row_names_the_row(tmp_path, capsys):
+    turns, places = pivoting()
+    places[20] += [0.0, 0.3, 0.0]
+    path = write_poses(tmp_path / "poses.csv", turns, places)
+    assert f"mm, in row 22 of {path}. Leave out" in refused(["--pivot", path], capsys)
+    lines = path.read_text().splitlines()
+    lines[3] = "0.2,,,,,,,"  # a row without a pose keeps its number
+    path.write_text("\n".join(lines))
+    assert "in row 22 of" in refused(["--pivot", path], capsys)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "hint"),
+    [
+        (w_first, w_first, "fit as w, x, y, z in {one} and as w, x, y, z in {other}: give"),
+        (None, w_first, "fit as w, x, y, z in {other}: give"),
+        (Rotation.inv, None, "fit inverted in {one}: give"),
+        (None, None, "in row 9 of {one}. Leave out wrong rows, and give"),
+    ],
+)
+def test_hand_eye_that_does_not_fit_is_rejected(tmp_path, capsys, first, second, hint):
+    turns, places = turned(20), np.random.default_rng(1).normal(size=(20, 3))
+    others = places + turns.apply([0.05, -0.02, 0.12])
+    others[7] += 0.3 * (first is second is None)
+    one, other = (
+        write_poses(tmp_path / name, each if stored is None else stored(each), where)
+        for name, stored, each, where in (
+            ("one.csv", first, turns, places),
+            ("other.csv", second, turns * Rotation.from_rotvec([0.3, -0.5, 0.9]), others),
+        )
+    )
+    line = refused(["--hand-eye", one, other], capsys)
+    assert "mm (rms): at most 2 and 10 are required" in line and hint.format(one=one, other=other) in line
+
+
 def test_pose_rows_not_seen_are_counted_in_full(tmp_path):
     path, good = tmp_path / "poses.csv", "1,2,3,0,0,0,1"
     poses = [good, good, good, "nan,nan,nan,nan,nan,nan,nan", "0,0,0,0,0,0,0", "0,0,0,0,0,0,1", good]

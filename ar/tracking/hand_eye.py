@@ -17,6 +17,10 @@ LEAST_SPREAD = np.radians(8.0)
 MOST_MOTIONS = 2000
 # Poses of which every pair is looked at, spread evenly over all.
 MOST_POSES = 300
+# Root mean square residual angle of motions [rad]: two trackers with noise of 0.5 degrees give 1 degree.
+LARGEST_TURN = np.radians(2.0)
+# Root mean square residual distance of motions [m]: two trackers with noise of 0.5 degrees give 7 mm over 0.7 m.
+LARGEST_SHIFT = 10e-3
 TURN = "Turn the bodies by 30 degrees or more, about at least two different axes."
 
 
@@ -34,6 +38,8 @@ class HandEye:
         How many were used.
     spread
         Root mean square angle [rad] of the motions' axes from the one that they are nearest to.
+    distances
+        (n,) root mean square `shift` of the motions from and to each pose [m]; 0 for poses without any.
     """
 
     X: np.ndarray
@@ -41,6 +47,17 @@ class HandEye:
     shift: float
     motions: int
     spread: float
+    distances: np.ndarray
+
+    @property
+    def misfit(self) -> str:
+        """Residuals and their limits in words; empty within the limits."""
+        if self.turn <= LARGEST_TURN and self.shift <= LARGEST_SHIFT:
+            return ""
+        found = (
+            f"motions of the bodies differ by {np.degrees(self.turn):.1f} degrees and {1e3 * self.shift:.1f} mm (rms)"
+        )
+        return f"{found}: at most {np.degrees(LARGEST_TURN):.0f} and {1e3 * LARGEST_SHIFT:.0f} are required"
 
 
 def hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
@@ -58,7 +75,7 @@ def hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
         raise ValueError(f"{len(first)} and {len(second)} poses: give both bodies' poses at the same times.")
     if len(first) < FEWEST_POSES:
         raise ValueError(f"{len(first)} poses are too few: record {FEWEST_POSES} or more. {TURN}")
-    A, B = _motions(first, second)
+    A, B, ends = _motions(first, second)
     (a, a_dual), (b, b_dual) = dual_quaternions(A), dual_quaternions(B)
     axes = a[:, 1:] / np.linalg.norm(a[:, 1:], axis=1, keepdims=True)
     across = 1.0 - np.linalg.eigvalsh(axes.T @ axes / len(axes))[-1]
@@ -72,11 +89,12 @@ def hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
     left, right = A @ X, X @ B
     turns = angles_of(left[:, :3, :3] @ right[:, :3, :3].transpose(0, 2, 1))
     shifts = np.linalg.norm(left[:, :3, 3] - right[:, :3, 3], axis=1)
-    return HandEye(X, _rms(turns), _rms(shifts), len(A), spread)
+    squares, counts = (np.bincount(ends.ravel(), each, len(first)) for each in (np.tile(shifts**2, 2), None))
+    return HandEye(X, _rms(turns), _rms(shifts), len(A), spread, np.sqrt(squares / np.maximum(counts, 1)))
 
 
-def _motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Motions of both bodies (m, 4, 4) between pairs of poses, those that turn most."""
+def _motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Motions of both bodies (m, 4, 4) that turn most, and the poses (2, m) that they lead from and to."""
     kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), MOST_POSES)).round().astype(int))
     start, end = np.triu_indices(len(kept), 1)
     A, B = (np.linalg.inv(poses[kept])[start] @ poses[kept][end] for poses in (first, second))
@@ -88,7 +106,7 @@ def _motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndar
             f"{FEWEST_POSES} are needed. {TURN}"
         )
     best = good[np.argsort(-angles[0, good], kind="stable")[:MOST_MOTIONS]]
-    return A[best], B[best]
+    return A[best], B[best], kept[[start[best], end[best]]]
 
 
 def dual_quaternions(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -37,3 +37,13 @@ def is_rigid(T: np.ndarray, rounding: float) -> bool:
 def turn_vectors(rotations: np.ndarray) -> np.ndarray:
     """Axes (n, 3) of rotations (n, 3, 3), as long as they turn [rad]."""
     return Rotation.from_matrix(rotations).as_rotvec()
+
+
+def reread(poses: np.ndarray) -> dict[str, np.ndarray]:
+    """Poses (n, 4, 4) as they are, and under other conventions for their quaternions, by the convention."""
+    read = Rotation.from_matrix(poses[:, :3, :3])
+    forms = {"": read, "as w, x, y, z": Rotation.from_quat(np.roll(read.as_quat(), -1, axis=1)), "inverted": read.inv()}
+    found = {how: poses.copy() for how in forms}
+    for how, turns in forms.items():
+        found[how][:, :3, :3] = turns.as_matrix()
+    return found

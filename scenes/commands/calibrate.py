@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -13,6 +17,11 @@ from .camera_options import size
 from .json_line import json_line
 from .outputs import add_force, claimed
 
+if TYPE_CHECKING:
+    from ar.tracking.hand_eye import HandEye
+    from ar.tracking.pivot import Pivot
+
+Found = TypeVar("Found", "Pivot", "HandEye")
 KIND, TABLE = "a calibration of `sulcus calibrate`", "a covariance of `sulcus calibrate`"
 MOST_VIEWS = 40
 # The share of the picture that corners should cover.
@@ -139,13 +148,10 @@ def _tip(args: argparse.Namespace) -> int:
     """A tool's tip, from its poses while it pivots."""
     from ar.tracking.pivot import pivoted
 
-    from ..script.pose_file import read_poses
+    from ..script.pose_file import read_numbered_poses
 
-    _, poses = read_poses(args.pivot)
-    try:
-        found = pivoted(poses)
-    except ValueError as error:
-        raise InputError(f"{args.pivot}: {error}") from error
+    rows, _, poses = read_numbered_poses(args.pivot)
+    found = _fitted(pivoted, [args.pivot], [poses], rows)
     deviations = 1e3 * np.sqrt(np.diag(found.covariance))
     if args.json:
         report = {
@@ -169,20 +175,42 @@ def _said(values: np.ndarray, deviations: np.ndarray) -> str:
     return ", ".join(f"{value:.3f} +- {off:.2g}" for value, off in zip(values, deviations, strict=True))
 
 
+def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray], rows: np.ndarray) -> Found:
+    """Calibration by `fit` from poses of files; InputError if it fails, or if its residuals exceed its limits."""
+    from ar.tracking.rigid import reread
+
+    names = " and ".join(map(str, files))
+    try:
+        found = fit(*poses)
+    except ValueError as error:
+        raise InputError(f"{names}: {error}") from error
+    if not found.misfit:
+        return found
+    worst = int(found.distances.argmax())
+    hint = "Leave out wrong rows, and"
+    for forms in product(*(reread(each).items() for each in poses)):
+        with suppress(ValueError):  # Poses of this form may turn too little.
+            if not fit(*(form for _, form in forms)).misfit:
+                fitting = [f"{how} in {file}" for file, (how, _) in zip(files, forms, strict=True) if how]
+                hint = f"The quaternions fit {' and '.join(fitting)}:"
+                break
+    raise InputError(
+        f"{names}: {found.misfit}. The largest residual is {1e3 * found.distances[worst]:.1f} mm, in row {rows[worst]} "
+        f"of {files[0]}. {hint} give qx,qy,qz,qw from the body to its tracker."
+    )
+
+
 def _bodies(args: argparse.Namespace) -> int:
     """How one body lies in another, from poses of both."""
     from ar.tracking.hand_eye import hand_eye
 
-    from ..script.pose_file import read_poses
+    from ..script.pose_file import read_numbered_poses
 
     one, other = args.hand_eye
-    (times, first), (again, second) = read_poses(one), read_poses(other)
+    (rows, times, first), (_, again, second) = read_numbered_poses(one), read_numbered_poses(other)
     if len(times) != len(again) or np.abs(times - again).max(initial=0.0) > SAME_TIME:
         raise InputError(f"{one} and {other} have rows at different times: keep those that both have, in one order.")
-    try:
-        found = hand_eye(first, second)
-    except ValueError as error:
-        raise InputError(f"{one} and {other}: {error}") from error
+    found = _fitted(hand_eye, [one, other], [first, second], rows)
     if args.json:
         report = {
             "rotation": found.X[:3, :3].tolist(),

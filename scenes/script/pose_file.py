@@ -50,12 +50,17 @@ def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         A file that is missing or no such table, times that do not ascend, quaternions that are not of length 1, or
         places farther than 100 m.
     """
+    return read_numbered_poses(path)[1:]
+
+
+def read_numbered_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows (n,) in the file, then times and poses as of `read_poses`."""
     times, poses, _ = _read(path)
     back = np.flatnonzero(np.diff(times) <= 0.0)
     if len(back):
         raise InputError(f"{path}: row {back[0] + 3} is not later than the row before it: sort the rows by time_s.")
-    kept = ~np.isnan(poses[:, 0, 0])
-    return times[kept], poses[kept]
+    kept = np.flatnonzero(~np.isnan(poses[:, 0, 0]))
+    return kept + 2, times[kept], poses[kept]
 
 
 def read_stream(path: str | Path) -> PoseStream:
