@@ -225,6 +225,13 @@ def test_hand_eye_that_does_not_fit_is_rejected(tmp_path, capsys, first, second,
     assert "mm (rms): at most 2 and 10 are required" in line and hint.format(one=one, other=other) in line
 
 
+def test_pivot_in_metres_is_noted(tmp_path):
+    turns, places = pivoting()
+    words = ["calibrate", "--pivot", str(write_poses(tmp_path / "poses.csv", turns, 1e-3 * places))]
+    with pytest.warns(UserWarning, match=r"poses\.csv: positions move by only 0\.25 mm: are they metres\?"):
+        assert main(words) == 0
+
+
 def test_pose_rows_not_seen_are_counted_in_full(tmp_path):
     path, good = tmp_path / "poses.csv", "1,2,3,0,0,0,1"
     poses = [good, good, good, "nan,nan,nan,nan,nan,nan,nan", "0,0,0,0,0,0,0", "0,0,0,0,0,0,1", good]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from itertools import product
@@ -28,6 +29,8 @@ MOST_VIEWS = 40
 WANTED_COVER = 0.6
 # Seconds by which the times of two files of poses may differ.
 SAME_TIME = 1e-3
+# Largest distance [m] along each axis between places that may be in metres by mistake.
+STILL = 1e-3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -184,6 +187,10 @@ def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray
         found = fit(*poses)
     except ValueError as error:
         raise InputError(f"{names}: {error}") from error
+    for file, each in zip(files, poses, strict=True):
+        moved = np.ptp(each[:, :3, 3], axis=0).max()
+        if moved < STILL:
+            warnings.warn(f"{file}: positions move by only {1e3 * moved:.2g} mm: are they metres?", stacklevel=1)
     if not found.misfit:
         return found
     worst = int(found.distances.argmax())
