@@ -25,6 +25,7 @@ BRAIN, REST = rows(MESH.tets[:10] + 1), rows(MESH.tets[10:] + 1, 11)
 HALF = rows(MESH.tets[20:] + 1, 21)
 SETS = f"*ELEMENT, TYPE=C3D4, ELSET=BRAIN\n{BRAIN}\n*ELEMENT, TYPE=C3D4, ELSET=TUMOR\n{REST}"
 TET = f"*ELEMENT, TYPE=C3D4\n{TETS}"
+ASSEMBLY = f"*PART, NAME=P\n{NODE}\n{TET}\n*END PART\n*ASSEMBLY, NAME=A\n*INSTANCE, NAME=I, PART=P\n"
 
 
 @pytest.mark.parametrize("text", [
@@ -59,9 +60,18 @@ def test_abaqus_blocks_of_any_order_make_one_mesh(tmp_path: Path, text: str) -> 
     (f"*NODE, SYSTEM=C\n{NODES}\n{MORE}\n{TET}", r"its \*NODE computes coordinates"),
     (f"*NODE, INPUT=b.inp\n{TET}", r"includes another file\. Join the two"),
     (f"{NODE}\n{TET}\n*ELSET, ELSET=A, GENERATE\n1, 1000000000000, 1", "arrays take more than 4.29 GB"),
+    (f"{ASSEMBLY}0., 0., 0.\n0., 0., 0., 0., 0., 1., 90.", r"\*INSTANCE is rotated: its nodes must be listed where"),
+    (f"{ASSEMBLY}*END INSTANCE\n*INSTANCE, NAME=J, PART=Q\n0, 1, 0", "moved apart, or several of one part: every node"),
+    (f"{ASSEMBLY}*END INSTANCE\n*INSTANCE, NAME=J, PART=P", "moved apart, or several of one part: every node"),
     ("*NODE\n1, 0, 0, x", "it is damaged, or of another kind"),
 ])  # fmt: skip
 def test_abaqus_that_is_not_read_states_the_reason(tmp_path: Path, text: str, reason: str) -> None:
     (tmp_path / "a.inp").write_text(text)
     with pytest.raises(InputError, match=reason):
         read_mesh(tmp_path / "a.inp")
+
+
+@pytest.mark.parametrize(("line", "moved"), [("0.1, 0, -2.", (0.1, 0, -2)), (", 3,", (0, 3, 0)), ("", (0, 0, 0))])
+def test_abaqus_instance_is_translated(tmp_path: Path, line: str, moved: tuple[float, ...]) -> None:
+    (tmp_path / "a.inp").write_text(f"{ASSEMBLY}{line}\n*END INSTANCE\n*END ASSEMBLY\n")
+    np.testing.assert_allclose(read_mesh(tmp_path / "a.inp").mesh.nodes, MESH.nodes + moved, atol=1e-15)

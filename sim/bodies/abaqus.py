@@ -49,10 +49,12 @@ def read_abaqus(path: Path) -> AbaqusMesh:
     Raises
     ------
     InputError
-        A file that refers to another, computes nodes by a rule, or uses a number for two nodes or for none.
+        A file that refers to another, computes nodes by a rule, or uses a number for two nodes or for none. Instances
+        that are rotated, moved apart, or of one part.
     """
     index, points = dict[int, int](), list[list[float]]()
     blocks, sets = list[tuple[str, np.ndarray]](), dict[str, list[np.ndarray]]()
+    instances = list[tuple[str, list[str]]]()
     apart = False  # nodes of an assembly that are in none of its instances: reference points
     with path.open(encoding="utf-8-sig", errors="replace") as lines:
         for keyword, options, rows in _sections(lines):
@@ -62,6 +64,7 @@ def read_abaqus(path: Path) -> AbaqusMesh:
                 raise InputError(f"its *{keyword} computes coordinates or elements: save it with all of them listed.")
             if keyword in ("ASSEMBLY", "INSTANCE", "END INSTANCE", "END ASSEMBLY"):
                 apart = keyword in ("ASSEMBLY", "END INSTANCE")
+                instances += [(options.get("PART", ""), rows)] if keyword == "INSTANCE" else []
             elif keyword == "NODE" and not apart:
                 _add_nodes(rows, index, points)
             elif keyword == "ELEMENT" and rows:
@@ -78,7 +81,7 @@ def read_abaqus(path: Path) -> AbaqusMesh:
         raise InputError(f"an element names node {error}, which no *NODE lists: list it there.") from error
     known = {name: np.concatenate(numbers) for name, numbers in sets.items() if numbers}
     within = {name: [np.flatnonzero(np.isin(table[:, 0], n)) for _, table in blocks] for name, n in known.items()}
-    return AbaqusMesh(np.array(points).reshape(-1, 3), cells, within)
+    return AbaqusMesh(np.array(points).reshape(-1, 3) + _translation(instances), cells, within)
 
 
 def _sections(lines: Iterable[str]) -> Iterator[tuple[str, dict[str, str], list[str]]]:
@@ -94,6 +97,21 @@ def _sections(lines: Iterable[str]) -> Iterator[tuple[str, dict[str, str], list[
             head += line  # its parameters continue
         elif line and not line.startswith("**"):
             rows.append(line)
+
+
+def _translation(instances: list[tuple[str, list[str]]]) -> np.ndarray:
+    """Translation (3,) that all instances (name of the part, data lines) share; 0 without instances."""
+    parts = [part for part, _ in instances if part]
+    if any(len(rows) > 1 for _, rows in instances):
+        raise InputError("an *INSTANCE is rotated: its nodes must be listed where they lie. Save it as one mesh.")
+    moves = {tuple(float(cell or 0.0) for cell in f"{''.join(rows)},,,".replace(" ", "").split(",")[:3])
+             for _, rows in instances}  # fmt: skip
+    if len(moves) > 1 or len(set(parts)) < len(parts):
+        raise InputError(
+            "its instances are moved apart, or several of one part: every node must be listed where it lies. Save it "
+            "as one mesh."
+        )
+    return np.array(moves.pop() if moves else (0.0, 0.0, 0.0))
 
 
 def _add_nodes(rows: list[str], index: dict[int, int], points: list[list[float]]) -> None:
