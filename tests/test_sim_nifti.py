@@ -36,13 +36,28 @@ def test_volume_without_orientation_needs_axes(tmp_path):
     np.testing.assert_allclose(where["PIR"], (where["RAS"] * [-1.0, -1.0, 1.0])[[2, 0, 1]], atol=1e-6)
 
 
-def test_forms_that_mirror_each_other_say_left_and_right(tmp_path):
+@pytest.mark.parametrize(
+    ("signs", "swapped"), [((-1, 1, 1), True), ((-1, -1, 1), True), ((-1, 1, -1), True), ((1, -1, -1), False)]
+)
+def test_forms_that_swap_sides_say_left_and_right(tmp_path, signs, swapped):
     affine, places = grid(AFFINES["straight"])
     image = nibabel.Nifti1Image(np.where(ball(places), 3, ellipsoid(places)).astype(np.int16), affine)
-    image.set_qform(np.diag([-1.0, 1.0, 1.0, 1.0]) @ affine, 1)
+    image.set_qform(np.diag([*signs, 1.0]) @ affine, 1)
     image.set_sform(affine, 1)
     nibabel.save(image, tmp_path / "l.nii")
-    assert "left and right are swapped in one of them" in volume_subject(tmp_path / "l.nii", (1,), (3,)).notes[0]
+    note = volume_subject(tmp_path / "l.nii", (1,), (3,)).notes[0]
+    assert ("left and right are swapped in one of them" in note) == swapped
+    assert "sform is taken" in note.lower()
+
+
+@pytest.mark.parametrize("form", ["set_sform", "set_qform"])
+def test_axes_of_a_file_with_a_place_are_ignored_with_a_note(tmp_path, form):
+    image = nibabel.Nifti1Image(np.ones((4, 4, 4), np.int16), None)
+    getattr(image, form)(np.eye(4), 1)
+    nibabel.save(image, tmp_path / "l.nii")
+    read = read_labels(tmp_path / "l.nii", Voxels(axes="LPS"))
+    assert read.notes == ("its own orientation is used: axes LPS are ignored",)
+    np.testing.assert_array_equal(read.affine[:3, :3], 1e-3 * np.eye(3))
 
 
 @pytest.mark.parametrize(

@@ -164,14 +164,20 @@ def _placed(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -> tup
         qform = None
     if sform is None and qform is None:
         return _turned(path, image, metre, voxels.axes), ()
+    ignored = (f"its own orientation is used: axes {voxels.axes} are ignored",) if voxels.axes else ()
     if sform is None or qform is None:
-        return _affine(image, metre), ()
+        return _affine(image, metre), ignored
     corners = np.stack([*np.ndindex(2, 2, 2)]) * (np.array(image.shape[:3]) - 1)
     apart = metre * np.linalg.norm(corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3], axis=1).max()
     note = f"its sform and qform place it up to {apart * 1e3:.3g} mm apart: the sform is taken"
     if np.linalg.det(sform[:3, :3]) * np.linalg.det(qform[:3, :3]) < 0.0:
         note = "its sform and qform mirror each other: left and right are swapped in one of them. The sform is taken"
-    return _affine(image, metre), (note,) if apart > voxels.same_place else ()
+    elif sform[0, :3] @ qform[0, :3] < -0.5 * np.linalg.norm(sform[0, :3]) * np.linalg.norm(qform[0, :3]):
+        note = (
+            f"its sform and qform disagree on which side is left (up to {apart * 1e3:.3g} mm apart): left and right "
+            "are swapped in one of them. The sform is taken"
+        )
+    return _affine(image, metre), (*ignored, note) if apart > voxels.same_place else ignored
 
 
 def _turned(path: Path, image: Nifti1Image, metre: float, axes: str) -> np.ndarray:
