@@ -278,7 +278,7 @@ def test_an_overload_says_how_far_it_got() -> None:
 
 @pytest.mark.parametrize("mesh", [TINY, HUGE], ids=["0.1 mm", "100 m"])
 def test_a_doubtful_size_names_the_option(mesh: TetMesh) -> None:
-    with pytest.warns(MeshWarning, match="--unit"):
+    with pytest.warns(MeshWarning, match="with unit m"):
         TetMesh(mesh.nodes, mesh.tets, mesh.region)
 
 

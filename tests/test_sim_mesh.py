@@ -41,9 +41,9 @@ def test_bad_meshes_are_refused(fields: dict, sentence: str) -> None:
         changed(**fields)
 
 
-@pytest.mark.parametrize("scale", [0.009, 101.0])
-def test_doubtful_sizes_are_warned_of(scale: float) -> None:
-    with pytest.warns(MeshWarning, match="--unit mm"):
+@pytest.mark.parametrize(("scale", "unit"), [(0.009, "m if it has metres"), (101.0, "mm if it has millimetres")])
+def test_doubtful_sizes_are_warned_of(scale: float, unit: str) -> None:
+    with pytest.warns(MeshWarning, match=f"Read it with unit {unit}"):
         changed(nodes=scale * CORNERS)
 
 

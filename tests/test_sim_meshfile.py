@@ -111,7 +111,7 @@ def test_formats(tmp_path: Path, suffix: str) -> None:
 def test_millimetres(tmp_path: Path) -> None:
     path = write(tmp_path / "a.vtu", points=1e3 * MESH.nodes)
     np.testing.assert_allclose(read_mesh(path, "mm").mesh.nodes, MESH.nodes, rtol=1e-15)
-    with pytest.warns(MeshWarning, match="--unit mm"):
+    with pytest.warns(MeshWarning, match="with unit mm if it has millimetres"):
         read_mesh(path)
 
 

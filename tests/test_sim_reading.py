@@ -265,7 +265,7 @@ class TestMeshes:
         mesh = TetMesh(BODY.mesh.nodes, BODY.mesh.tets, BODY.mesh.region)
         write_mesh(tmp_path / "m.vtu", mesh, self.fields())
         assert read_anatomy(tmp_path / "m.vtu").digest == BODY.digest
-        with pytest.warns(UserWarning, match="--unit mm"):
+        with pytest.warns(UserWarning, match="with unit mm"):
             large = TetMesh(1e3 * mesh.nodes, mesh.tets, mesh.region)
         write_mesh(tmp_path / "mm.vtu", large, self.fields())
         with pytest.raises(InputError, match=r"measures 2e.04 mm, .*must be metres"):

@@ -212,8 +212,9 @@ def _check_middles(mesh: TetMesh) -> None:
 def _warn_of_doubtful(mesh: TetMesh) -> None:
     size = float(np.ptp(mesh.nodes[np.unique(mesh.tets)], axis=0).max())
     if not 1e-3 <= size <= 10.0:
+        unit, held = ("m", "metres") if size < 1.0 else ("mm", "millimetres")
         warnings.warn(
-            f"the body measures {size:.3g} m: coordinates are metres; give --unit mm if the file has millimetres.",
+            f"the body measures {size:.3g} m: coordinates must be metres. Read it with unit {unit} if it has {held}.",
             MeshWarning,
             stacklevel=4,
         )
