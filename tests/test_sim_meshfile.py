@@ -275,3 +275,33 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
         write_mesh(path, MESH, {})
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(("title", "signs"), [
+    ("3D Slicer. SPACE=LPS", [-1, -1, 1]), ("mm;SPACE = lps", [-1, -1, 1]), ("SPACE=RAS", 1), ("FE space=H1", 1),
+])  # fmt: skip
+@pytest.mark.parametrize("form", ["vtk42", "vtk51"])
+def test_vtk_in_lps_is_turned_with_a_note(tmp_path: Path, form: str, title: str, signs: list[int] | int) -> None:
+    force = np.random.default_rng(2).normal(size=(len(MESH.nodes), 3))
+    path = write(tmp_path / "a.vtk", form, points=CURVED.nodes * signs, cells=[("tetra10", CURVED.table)],
+                 point_data={"force": np.resize(force, CURVED.nodes.shape) * signs})  # fmt: skip
+    head, _, rest = path.read_bytes().split(b"\n", 2)
+    path.write_bytes(b"\n".join([head, title.encode(), rest]))
+    file = read_mesh(path)
+    np.testing.assert_allclose(file.mesh.nodes, CURVED.nodes, atol=1e-15)
+    np.testing.assert_array_equal(file.mesh.table, CURVED.table)
+    np.testing.assert_array_equal(file.point_data["force"], np.resize(force, CURVED.nodes.shape))
+    turned = "turned x and y of points and vectors from LPS, which its title states, to RAS"
+    assert file.notes == (() if signs == 1 else (turned,))
+
+
+def test_mesh_in_an_unknown_space_is_rejected(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.vtk")
+    path.write_bytes(path.read_bytes().replace(b"written by meshio", b"SPACE=LAS"))
+    with pytest.raises(InputError, match="title states SPACE=LAS: LPS or RAS is required"):
+        read_mesh(path)
+    path = write(tmp_path / "a.vtu")
+    text = b'<FieldData><Array type="String" Name="SPACE" format="ascii">76 80 83 0</Array></FieldData>'
+    path.write_bytes(path.read_bytes().replace(b"<UnstructuredGrid>", b"<UnstructuredGrid>" + text))
+    with pytest.raises(InputError, match=r"array of text, .*: save it as \.vtk, whose title"):
+        read_mesh(path)

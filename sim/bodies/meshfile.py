@@ -22,6 +22,7 @@ from ..runtime.file_limits import MESH_BYTES, MeshBytes, at_most
 from ..runtime.outside_files import path_of, read_as
 from .abaqus import AbaqusMesh, read_abaqus
 from .given_cells import demand_one_body, demand_tetrahedra, merged, pieces_note, regions_of
+from .markups import SIGNS
 from .mesh_references import demand_own
 from .vtu_size import demand_small
 
@@ -42,6 +43,9 @@ REASONS = {
     r"[Pp]arametric ?[Nn]odes": (
         "its nodes have parameters of the geometry: save it without them (Mesh.SaveParametric = 0 in Gmsh)."
     ),
+    r"Illegal data type 'String'": (
+        "it has an array of text, as 3D Slicer writes of the space: save it as .vtk, whose title states the space."
+    ),
     r"\$NOD": "it is of MSH 1, of which no mesh is read: save it as MSH 4.1.",
 }
 """Messages by a pattern in meshio's reason, or in the name of a section of an MSH file."""
@@ -53,7 +57,7 @@ SMALLEST, LARGEST = 5e-3, 1.0
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """What a file held: the mesh in metres, its point data as stored, and what was changed in reading."""
+    """Mesh in metres, point data (as stored, but vectors in the mesh's space), and notes of what was changed."""
 
     mesh: TetMesh
     point_data: Mapping[str, np.ndarray]
@@ -64,14 +68,14 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
     """Read tetrahedra with cell data `region`, or else with the groups of a mesher (absent: one region 0).
 
     Quadratic ones (`tetra10`) are taken as they are, curved edges too. Points, lines and surfaces are dropped, nodes
-    that coincide are merged and tetrahedra of negative orientation are turned, each with a note. `limits` bound what a
-    file may inflate to.
+    that coincide are merged and tetrahedra of negative orientation are turned, each with a note. LPS in the title of a
+    `.vtk` becomes RAS, with a note. `limits` bound what a file may inflate to.
 
     Raises
     ------
     InputError
         A file that is missing or unreadable, without tetrahedra, with both kinds or with other volume cells, or with
-        data that does not fit. Tetrahedra that are listed twice, or overlap.
+        data that does not fit. Tetrahedra that are listed twice, or overlap. A title with a space that is not known.
     """
     path = path_of(path)
     if not path.is_file():
@@ -137,8 +141,13 @@ def _taken(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
         notes.append(f"dropped cells that are not tetrahedra: {', '.join(dropped)}")
     region, said = regions_of(raw, blocks)
     table, turned = oriented(raw.points, np.concatenate([raw.cells[number].data for number in blocks]))
-    data = {name: np.asarray(field) for name, field in raw.point_data.items()}
-    points, table, data, gone = merged(np.asarray(raw.points, np.float64), table, data)
+    data, places = {name: np.asarray(field) for name, field in raw.point_data.items()}, np.asarray(raw.points, float)
+    if _space_of(path) == "LPS":  # half a turn about z, which keeps orientations
+        places = places * SIGNS["LPS"]
+        vectors = {name for name, field in data.items() if field.shape[1:] == (3,) and field.dtype.kind in "if"}
+        data.update({name: data[name] * SIGNS["LPS"] for name in vectors})
+        notes.append("turned x and y of points and vectors from LPS, which its title states, to RAS")
+    points, table, data, gone = merged(places, table, data)
     if gone:
         notes.append(f"merged {gone} nodes with others at the same place: results are numbered without them")
     tets, middles = np.split(table, [4], axis=1)
@@ -147,6 +156,20 @@ def _taken(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
     if turned:
         notes.append(f"turned {turned} tetrahedra of negative orientation")
     return MeshFile(mesh, data, (*notes, *said, *pieces_note(mesh)))
+
+
+def _space_of(path: Path) -> str:
+    """Space that the title of a `.vtk` states as 3D Slicer does (`SPACE=LPS`); empty where it states none."""
+    if path.suffix.lower() != ".vtk":
+        return ""
+    with path.open("rb") as lines:
+        lines.readline(LONGEST)
+        said = re.search(
+            r"\bSPACE\s*=\s*([LRAPSI]{3})\b", lines.readline(2 * LONGEST).decode(errors="replace"), re.IGNORECASE
+        )
+    if said and said[1].upper() not in SIGNS:
+        raise InputError(f"{path}: its title states SPACE={said[1]}: {' or '.join(SIGNS)} is required. {REMEDY}")
+    return said[1].upper() if said else ""
 
 
 def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray], space: str = "") -> None:
