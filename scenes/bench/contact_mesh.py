@@ -1,8 +1,7 @@
-"""The mesh's share of a contact force: a ball is moved over one cell of a mesh, and of a mesh half as coarse."""
+"""The mesh's share of a contact force: a ball is moved over one cell, and over the same cell cut into smaller ones."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -19,6 +18,7 @@ from sim.tools import Ball
 from surrogate.data.tool_loads import axes_about
 
 from .elements import above_tumour
+from .stopwatch import timed
 
 # Places of the ball along one long edge of the surface, as shares of its length.
 PLACES = np.linspace(0.0, 1.0, 5)
@@ -81,9 +81,8 @@ def rows(
             T[:, 0, :3, 3] = places - depth * normal
             forces, seconds = [], []
             for fem in solvers:
-                began = time.perf_counter()
-                found = fem.deform(Loads((Touching(T.copy()),)))
-                seconds.append(time.perf_counter() - began)
+                found, took = timed(fem.deform, Loads((Touching(T.copy()),)))
+                seconds.append(took)
                 good = np.array([outcome.good for outcome in found.outcome])
                 forces.append(np.where(good[:, None], found.reaction[:, 0, :3], np.nan))
             along, finer = (np.abs(force @ normal) for force in forces)

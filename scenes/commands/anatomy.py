@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     beside = sidecar(args.out)
     claimed(beside, ".gz", "a scan that sulcus put beside an anatomy", args.force, read)
     chosen = {**DEFAULTS, **PRESETS[args.preset], **_given(args)}
-    plan = MeshPlan(args.nodes, 1e-3 * chosen["craniotomy"], args.fine_opening)
+    plan = MeshPlan(args.nodes, 1e-3 * chosen["craniotomy"], fine_opening=args.fine_opening)
     with stage("labels" if args.labels else "head" if args.mask or args.head else "template"):
         subject = opened(_subject(args, chosen), args)
     for note in subject.notes:

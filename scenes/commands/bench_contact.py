@@ -17,12 +17,16 @@ from ..script.shipped_files import template_path
 from .json_line import json_line
 from .tissue_options import add_tissue_arguments, tissue_of
 
+COLUMNS = (
+    *("element", "depth [mm]", "force [mN]", "over halved cells", "range over a cell", "sideways, most"),
+    *("seconds", "seconds, halved"),
+)
 LEGEND = """
 over halved cells: excess over the force with the cells at the opening halved, as a share. That one is itself too
   large by about a third of this.
 range over a cell: the largest force less the smallest over five places along one edge, as a share of the mean.
 sideways, most: the force across the surface's normal, as a share of that along it.
-seconds: of all places together, on the mesh as it is, and with halved cells."""
+seconds: duration of all places together, on the mesh as it is, and with halved cells."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,16 +51,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if an answer is not good."""
     from ..bench.contact_mesh import rows
+    from ..bench.stages import machine
 
     if min(*args.depths, args.ball) <= 0.0:
         raise InputError("--depths and --ball are lengths in mm: give numbers above 0.")
-    from ..bench.stages import machine
-
     table, where = sys.stderr if args.json else sys.stdout, machine(args.device)
     anatomy, found = read_anatomy(args.anatomy or template_path()), []
-    names = ("element", "depth [mm]", "force [mN]", "over halved cells", "range over a cell", "sideways, most")
-    names = (*names, "seconds", "seconds, halved")
-    print(f"{where}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}", file=table)
+    print(f"{where}\n\n| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", file=table)
     depths = [depth / 1e3 for depth in args.depths]
     for row in rows(anatomy, args.elements, depths, args.ball / 1e3, tissue_of(args), args.device):
         force = f"{row.element} | {1e3 * row.depth:g} | {1e3 * row.along.mean():.1f}"

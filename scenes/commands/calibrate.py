@@ -6,7 +6,7 @@ import argparse
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -195,7 +195,7 @@ def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray
         return found
     worst = int(found.distances.argmax())
     hint = "Leave out wrong rows, and"
-    for forms in product(*(reread(each).items() for each in poses)):
+    for forms in islice(product(*(reread(each).items() for each in poses)), 1, None):  # the first is as read
         with suppress(ValueError):  # Poses of this form may turn too little.
             if not fit(*(form for _, form in forms)).misfit:
                 fitting = [f"{how} in {file}" for file, (how, _) in zip(files, forms, strict=True) if how]

@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; an interrupted run goes on when the same command is given again."""
     # What can be said now is, not after minutes of reading and meshing.
-    plan = MeshPlan(args.nodes, 1e-3 * args.craniotomy, args.fine_opening)
+    plan = MeshPlan(args.nodes, 1e-3 * args.craniotomy, fine_opening=args.fine_opening)
     regions = regions_of(args.region, replace(BRAIN, law=args.material))
     strange = set(regions) - set(REGION_NAMES.values())
     if strange:

@@ -33,7 +33,7 @@ def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--fine-opening", action="store_true",
-        help="halve the cells at the open cortex, contact forces depend less on the mesh, at a cost in time",
+        help="halve the cells at the open cortex: contact forces depend less on the mesh, and solves take longer",
     )  # fmt: skip
 
 

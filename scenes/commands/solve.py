@@ -85,11 +85,8 @@ def run(args: argparse.Namespace) -> int:
     seconds = time.perf_counter() - clock
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
     outcome, reached, inverted = deformation.outcome[0], float(deformation.reached[0]), int(deformation.inverted[0])
-    moved, bond, notes = (
-        float(np.linalg.norm(deformation.displacement[0], axis=1).max()),
-        float(deformation.bond[0]),
-        [],
-    )
+    moved, bond = float(np.linalg.norm(deformation.displacement[0], axis=1).max()), float(deformation.bond[0])
+    notes: list[str] = []
     if reached < 1.0:
         what = f"in equilibrium under {reached:.1%} of the load" if reached else "the last state, in no equilibrium"
         notes.append(f"{outcome.value}; what is written is {what}")

@@ -128,7 +128,7 @@ def _flat(theatre: Theatre, scene: Scene, found: Uncertainty) -> dict[str, Any]:
     return {
         "scene": scene.name, "said": error_lines(promised, error, model is not None), "time_s": found.times[moment],
         "model_mm": None if promised is None else 1e3 * promised, "tumour_mm": 1e3 * (error.bound or 0.0),
-        "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment], 
+        "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment],
         "largest_part": None if found.few else error.largest,
         "draws": found.draws, "failed": found.failed, "frames": found.frames, "folded": found.folded,
         "fitted_numbers": found.numbers, "few": found.few, "guess": found.guess,

@@ -34,8 +34,8 @@ UNITS = {"m": 1.0, "mm": 1e-3}
 CELLS = {4: "tetra", 10: "tetra10"}
 
 REMEDY = "Convert it to .vtu or .msh."
-# Of meshio's reason in a message [characters].
-LONGEST = 200
+# Longest part of meshio's reason that a message has, and of a VTK title that is read [characters].
+LONGEST, TITLE = 200, 400
 REASONS = {
     r"Incompatible cell data '([^']+)'": (
         "its `{}` is given of some cells only: put every volume into a group, and save it again."
@@ -163,9 +163,9 @@ def _space_of(path: Path) -> str:
     if path.suffix.lower() != ".vtk":
         return ""
     with path.open("rb") as lines:
-        lines.readline(LONGEST)
+        lines.readline(TITLE)
         said = re.search(
-            r"\bSPACE\s*=\s*([LRAPSI]{3})\b", lines.readline(2 * LONGEST).decode(errors="replace"), re.IGNORECASE
+            r"\bSPACE\s*=\s*([LRAPSI]{3})\b", lines.readline(TITLE).decode(errors="replace"), re.IGNORECASE
         )
     if said and said[1].upper() not in SIGNS:
         raise InputError(f"{path}: its title states SPACE={said[1]}: {' or '.join(SIGNS)} is required. {REMEDY}")

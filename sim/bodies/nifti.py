@@ -65,15 +65,14 @@ def load_nifti(path: Path) -> Nifti1Image:
     from nibabel.spatialimages import HeaderDataError
 
     with opened(path) as file:
-        start = file.read(348)
+        start = file.read(540)  # a header of NIfTI-2
     two = start[4:8] in (b"n+2\0", b"ni2\0")
     if not two and 348 not in (int.from_bytes(start[:4], "little"), int.from_bytes(start[:4], "big")):
         raise ValueError("no header of NIfTI")
     if not two and start[344:348] != b"n+1\0":
         raise InputError(f"{path}: is no NIfTI volume in one file. {REMEDY}")
     kind = nibabel.Nifti2Image if two else nibabel.Nifti1Image
-    with opened(path) as file:
-        header = kind.header_class.from_fileobj(file, check=False)
+    header = kind.header_class(start[: kind.header_class.template_dtype.itemsize], check=False)
     over = sum(float(header[f"quatern_{axis}"]) ** 2 for axis in "bcd") - 1.0
     if over > ROUNDED and int(header["qform_code"]) > 0 >= int(header["sform_code"]):
         raise InputError(

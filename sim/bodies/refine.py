@@ -71,8 +71,8 @@ def refined(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
     if near_opening:
         reach = edge_lengths(nodes[anatomy.open_surface]).mean()
         halved[count:] = KDTree(nodes[np.unique(opening)]).query(nodes[count:])[0] <= reach
-    cut = _conforming(table, halved)
-    tets, parent = _children(nodes, table, cut)
+    halved = _conforming(table, halved)
+    tets, parent = _children(nodes, table, halved[table[:, 4:]])
     held, normal = space.held(anatomy.held), space.sliding(anatomy.slide_normal, anatomy.held)
     craniotomy = np.zeros(space.count, bool)
     craniotomy[opening] = True
@@ -85,17 +85,18 @@ def refined(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
 
 
 def _conforming(table: np.ndarray, halved: np.ndarray) -> np.ndarray:
-    """Halved edges (T, 6) bool of each tetrahedron, a pattern in each; their middles are marked in `halved` (N,)."""
+    """Nodes (N,) bool: those given, and middles of further edges, until each tetrahedron has a pattern."""
+    halved, middles = halved.copy(), table[:, 4:]
     while True:
-        asked = halved[table[:, 4:]]
+        asked = halved[middles]
         cut = CLOSED[asked @ (1 << np.arange(6))]
         if (cut == asked).all():
-            return cut
-        halved[table[:, 4:][cut]] = True
+            return halved
+        halved[middles[cut]] = True
 
 
 def _children(nodes: np.ndarray, table: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tetrahedra (C, 4) over the nodes, and which each is a part of (C,), in the parents' order."""
+    """Tetrahedra (C, 4) and their parents (C,), in the parents' order; `cut` (T, 6) are the edges that are halved."""
     tets, parent = [], []
     for pattern, parts in PATTERNS.items():
         rows = np.flatnonzero((cut == np.isin(np.arange(4, 10), pattern)).all(axis=1))

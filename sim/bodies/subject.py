@@ -36,12 +36,12 @@ class MeshPlan:
         Wanted in the mesh.
     craniotomy
         [m] Diameter of the opening along the cortex.
-    fine_opening
-        Whether cells at the open cortex are halved, beyond the nodes wanted: contact forces depend less on the mesh.
     meshing
         How the mesh is searched for and smoothed.
     placement
         Where the brain is held, and how many nodes an opening needs.
+    fine_opening
+        Whether cells at the open cortex are halved, beyond the nodes wanted: contact forces depend less on the mesh.
 
     Raises
     ------
@@ -51,9 +51,9 @@ class MeshPlan:
 
     nodes: int = 5300
     craniotomy: float = 0.050
-    fine_opening: bool = False
     meshing: Meshing = field(default_factory=Meshing)
     placement: Placement = field(default_factory=Placement)
+    fine_opening: bool = False
 
     def __post_init__(self) -> None:
         if not FEWEST_NODES <= self.nodes <= MOST_NODES:
