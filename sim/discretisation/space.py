@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import scipy.sparse as sp
@@ -88,7 +88,8 @@ class Discretisation:
             return (Part(linear_elements(self.mesh, chosen), "whole"),)
         if self.element == "p2":
             return (Part(quadratic_elements(self.nodes, self.table, chosen), "whole"),)
-        return Part(edge_elements(self.mesh, chosen), "shape"), Part(node_elements(self.mesh, chosen), "volume")
+        edges, nodes = _smoothed(self.mesh, chosen.tobytes())
+        return Part(edges, "shape"), Part(nodes, "volume")
 
     def held(self, held: np.ndarray) -> np.ndarray:
         """Held components (N, 3) from the mesh's own (V, 3).
@@ -131,6 +132,13 @@ class Discretisation:
     def interpolated(self, field: np.ndarray) -> np.ndarray:
         """(..., N, 3) from (..., V, 3): linear along each edge."""
         return np.concatenate([field, field[..., self.edges, :].mean(axis=-2)], axis=-2)
+
+
+@lru_cache(2)  # effects, tissues and diagnostics share them: a tenth of a locator's set-up on a graphics card
+def _smoothed(mesh: TetMesh, chosen: bytes) -> tuple[Elements, Elements]:
+    """Edge and node elements over the `chosen` tetrahedra (T,), as bytes of bool."""
+    tets = np.frombuffer(chosen, bool)
+    return edge_elements(mesh, tets), node_elements(mesh, tets)
 
 
 def recommended(mesh: TetMesh) -> str:
