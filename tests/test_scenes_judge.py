@@ -58,6 +58,11 @@ def test_simulate_answers_by_the_element_asked_for_and_says_so(body, tmp_path, c
     assert f"element {element}, but now element is {other}" in capsys.readouterr().err
 
 
+def test_simulate_of_a_body_without_tumour_says_so(tmp_path, capsys) -> None:
+    simulated(make_box(cells=(6, 6, 4), spacing=12e-3, tumour=0.0), tmp_path)
+    assert "has no tumour: `sulcus train` will reject the data." in capsys.readouterr().err
+
+
 def test_simulate_takes_quadratic_anatomies_as_they_are(body, tmp_path, capsys) -> None:
     mesh = quadratic(body.mesh)
     more = len(mesh.nodes) - len(body.mesh.nodes)

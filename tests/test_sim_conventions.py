@@ -47,6 +47,10 @@ class TestConventions:
             head_masks(Sources(tmp_path / "seg.nii", convention="brats", mask=tmp_path / "t1.nii"))
         masks = head_masks(Sources(tmp_path / "seg.nii", tumour=(3,), convention="brats", mask=tmp_path / "t1.nii"))
         assert masks.tumour.sum() == (labels == 3).sum()
+        for parts, noted in (({}, True), ({"ventricles": (4,)}, False)):
+            post = Sources(tmp_path / "seg.nii", convention="brats-post", mask=tmp_path / "t1.nii", parts=parts)
+            notes = " ".join(head_masks(post).notes)
+            assert ("1.7 ml are a cavity, label 4: " in notes and "--ventricles 4" in notes) == noted
 
     def tumour(self, folder, roles, missing=(), open_rim=False, depth=30.0):
         """A tumour in two pieces, cut by the cortex `depth` [mm] above it; a third of its rim may be open."""

@@ -193,9 +193,15 @@ def test_gmsh_groups_of_some_volumes_only_are_rejected(tmp_path: Path) -> None:
         ("$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 1 1 1\n3 1 1 1\n1\n0 0 0 0 0 0\n$EndNodes",
          "parameters of the geometry"),
         ("$NOD\n1\n1 0 0 0\n$ENDNOD", "MSH 1, of which no mesh is read: save it as MSH 4.1"),
+        ("$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n1\n1 0 0 0\n$EndNodes\n"
+         '$NodeData\n1\n"fixed"\n1\n0.0\n3\n0\n1\n1\n1 np.float64(1.0)\n$EndNodeData',
+         "as meshio writes ASCII: save it as binary"),
+        ("# vtk DataFile Version 3.0\nt\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 1 double\n0 0 0\nCELLS 1 2\n1 0\n"
+         "CELL_TYPES 1\n1\nFIELD FieldData 1\nnames 1 2 string\ngrey\nwhite\n", "has an array of text"),
     ],
 )  # fmt: skip
-def test_msh_of_an_unread_kind_states_the_remedy(tmp_path: Path, text: str, reason: str) -> None:
-    (tmp_path / "a.msh").write_text(text)
+def test_mesh_of_an_unread_kind_states_the_remedy(tmp_path: Path, text: str, reason: str) -> None:
+    path = tmp_path / ("a.vtk" if "vtk" in text else "a.msh")
+    path.write_text(text)
     with pytest.raises(InputError, match=reason):
-        read_mesh(tmp_path / "a.msh")
+        read_mesh(path)

@@ -58,6 +58,8 @@ def test_axes_of_a_file_with_a_place_are_ignored_with_a_note(tmp_path, form):
     read = read_labels(tmp_path / "l.nii", Voxels(axes="LPS"))
     assert read.notes == ("its own orientation is used: axes LPS are ignored",)
     np.testing.assert_array_equal(read.affine[:3, :3], 1e-3 * np.eye(3))
+    nibabel.save(nibabel.MGHImage(np.ones((4, 4, 4), np.int16), np.eye(4)), tmp_path / "l.mgz")
+    assert read_labels(tmp_path / "l.mgz", Voxels(axes="LPS")).notes == read.notes
 
 
 @pytest.mark.parametrize(

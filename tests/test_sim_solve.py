@@ -183,6 +183,13 @@ def test_no_force_at_all_is_rest(solve) -> None:
     assert run.report["notes"] == ["nothing moves: no force acts on a node that is free, and no motion is prescribed"]
 
 
+@pytest.mark.parametrize(("times", "doubted"), [(0.5, False), (1000.0, True)])
+def test_prescribed_motion_beyond_the_body_is_doubted(solve, times: float, doubted: bool) -> None:
+    motion = np.where(BASE[:, None], times * np.ptp(MESH.nodes, axis=0).max() * np.eye(3)[0], 0.0)
+    run = solve({"fixed": BASE.astype(int), "prescribed": motion}, "--any-strain")
+    assert ("see that it is in the unit of length of the file" in run.errors) == doubted
+
+
 @pytest.mark.parametrize(("times", "torn"), [(0.1, False), (40.0, True)])
 def test_bond_beyond_its_strength_is_noted(solve, times: float, torn: bool) -> None:
     side = np.where((MESH.nodes[:, 0] < 1e-9)[:, None] & ~BASE[:, None], [1.0, 0.0, 0.0], 0.0)

@@ -219,7 +219,7 @@ def _sentences(figures: dict) -> str:
         *(f"{name} {held} nodes that do not move" for name, held in figures["septa_nodes"].items()),
         *_pieces(figures["tumour_pieces"], figures["opening"]["over"]),
         f"opening: {_said(figures['opening'])}",
-        "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} sliding, {held_nodes} held",
+        "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} at the skull, {held_nodes} held",
         "written to {mesh}" + (", intensities to {t1}" if figures["t1"] else "") + " in {seconds} s",
     ]
     return "\n".join(lines).format(**figures)

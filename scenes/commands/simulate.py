@@ -99,6 +99,8 @@ def run(args: argparse.Namespace) -> int:
     out = claimed(args.out, ".h5", DATA, args.force)
     with stage("draw"):
         anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
+        if not len(anatomy.tumour_nodes):
+            print(f"{args.anatomy}: has no tumour: `sulcus train` will reject the data.", file=sys.stderr)
         elasticity = elasticity_of(args, anatomy.mesh)
         tissue = tissue_of(args)
         tool, loads = _drawn(args, anatomy, tissue)

@@ -177,6 +177,12 @@ def problem_of(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Loads,
                 notes.append(f"`prescribed` is ignored on {free.sum()} components that are not `fixed`")
             stored = np.where(held & ~orphan[:, None], stored, 0.0)
         prescribed = metre * _field(name, "prescribed", stored, {(count, 3)})
+        most, size = np.linalg.norm(prescribed, axis=1).max(), np.ptp(mesh.nodes[~orphan], axis=0).max()
+        if most > size:
+            notes.append(
+                f"`prescribed` moves a node by {1e3 * most:.3g} mm, and the body is {1e3 * size:.3g} mm long: see that "
+                "it is in the unit of length of the file"
+            )
         if prescribed.any():
             causes.append(Prescribed(prescribed[None]))
     if not causes:

@@ -89,7 +89,7 @@ def demand_one_body(points: np.ndarray, tets: np.ndarray) -> None:
     if inside:
         raise InputError(
             f"its tetrahedra overlap, at {inside} {'faces' if folded else 'nodes or middles'}: each place must lie in "
-            "one. Cut the bodies out of each other, and mesh them together."
+            "one. Mesh it anew; of several bodies, cut them out of each other first, and mesh them together."
         )
 
 

@@ -142,7 +142,7 @@ def head_masks(sources: Sources) -> HeadMasks:
     if not sources.tumour_in:
         notes += _doubtful(whole, tumour, sources.parts)
     if sources.mask:
-        notes += _outside(marked, affine)
+        notes += _outside(marked, affine) + _cavity(whole, convention, named)
     if either:
         notes += (_side(marked, affine, next(iter(others.values())).path),)
     marked, affine = _cropped(marked, affine)
@@ -200,6 +200,18 @@ def _outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[str, ..
         return ()
     lost = 1e6 * out * abs(float(np.linalg.det(affine[:3, :3])))
     return (f"{lost:.2g} ml of what is labelled lie outside of the mask: see that both files are of one space",)
+
+
+def _cavity(whole: LabelMap, convention: Convention | None, named: Mapping[str, Sequence[Label]]) -> tuple[str, ...]:
+    """A note on fluid that a convention of tumours marks, as a mask of the brain holds it."""
+    fluid = _there(convention.csf, whole) if convention and convention.tumour else ()
+    if not fluid or set(fluid) <= {label for labels in named.values() for label in labels}:
+        return ()
+    ml = 1e6 * int(whole.mask(fluid).sum()) * abs(float(np.linalg.det(whole.affine[:3, :3])))
+    return (
+        f"{ml:.2g} ml are a cavity, label {listed(fluid)}: where the mask holds it, it becomes brain. For a region "
+        f"with a stiffness of its own add --ventricles {','.join(map(str, fluid))}",
+    )
 
 
 def _cropped(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:

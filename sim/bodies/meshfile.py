@@ -47,9 +47,11 @@ REASONS = {
         "it has an array of text, as 3D Slicer writes of the space: save it as .vtk, whose title states the space."
     ),
     r"\$NOD": "it is of MSH 1, of which no mesh is read: save it as MSH 4.1.",
+    r"np\.float": "it has `np.float64(...)` in place of numbers, as meshio writes ASCII: save it as binary.",
+    r" string$": "it has an array of text (`string`): save it without, as arrays of numbers alone are read.",
 }
-"""Messages by a pattern in meshio's reason, or in the name of a section of an MSH file."""
-SECTIONS = b"$ParametricNodes", b"$NOD"
+"""Messages by a pattern in meshio's reason, or in a line that meshio cannot read."""
+UNREAD = re.compile(rb"^\$ParametricNodes|^\$NOD\b|np\.float|^\S+ \d+ \d+ string$")
 
 # An anatomy's longest side [m]: a mouse's brain has 15 mm, a whole head 0.3 m.
 SMALLEST, LARGEST = 5e-3, 1.0
@@ -112,9 +114,9 @@ def _by_meshio(path: Path) -> meshio.Mesh:
         if (last.line or "").startswith("raise ") and "meshio" in Path(last.filename).parts:
             printed.write(str(error))
         said = " ".join(re.sub(r"[^!-~]", " ", printed.getvalue()).split()).rstrip(".")
-        if not said and path.suffix.lower() == ".msh":
+        if not said and path.suffix.lower() in (".msh", ".vtk"):
             with path.open("rb") as lines:
-                said = next((line.strip().decode() for line in lines if line.strip() in SECTIONS), "")
+                said = next((str(found[0], "ascii") for line in lines if (found := UNREAD.search(line.strip()))), "")
         if not said:
             raise
         reason = f"meshio reports `{said[:LONGEST]}`. {REMEDY}"

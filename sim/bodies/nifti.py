@@ -163,9 +163,8 @@ def _placed(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -> tup
         qform = None
     if sform is None and qform is None:
         return _turned(path, image, metre, voxels.axes), ()
-    ignored = (f"its own orientation is used: axes {voxels.axes} are ignored",) if voxels.axes else ()
     if sform is None or qform is None:
-        return _affine(image, metre), ignored
+        return _affine(image, metre), voxels.ignored_axes
     corners = np.stack([*np.ndindex(2, 2, 2)]) * (np.array(image.shape[:3]) - 1)
     apart = metre * np.linalg.norm(corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3], axis=1).max()
     note = f"its sform and qform place it up to {apart * 1e3:.3g} mm apart: the sform is taken"
@@ -176,7 +175,7 @@ def _placed(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -> tup
             f"its sform and qform disagree on which side is left (up to {apart * 1e3:.3g} mm apart): left and right "
             "are swapped in one of them. The sform is taken"
         )
-    return _affine(image, metre), (*ignored, note) if apart > voxels.same_place else ignored
+    return _affine(image, metre), (*voxels.ignored_axes, note) if apart > voxels.same_place else voxels.ignored_axes
 
 
 def _turned(path: Path, image: Nifti1Image, metre: float, axes: str) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from ..errors import InputError
@@ -41,4 +42,7 @@ def read_volume(path: str | Path, voxels: Voxels = OF_BRAINS, finite: bool = Tru
         raise InputError(f"{path}: is not called {', '.join(READERS)}. {REMEDY}")
     kind, read = READERS[ending]
     with read_as(path, kind, REMEDY):
-        return checked(path, read(path, voxels), voxels, finite, layered)
+        volume = read(path, voxels)
+        if kind != "NIfTI":  # whose reader uses `axes` where a file states none
+            volume = replace(volume, notes=(*volume.notes, *voxels.ignored_axes))
+        return checked(path, volume, voxels, finite, layered)

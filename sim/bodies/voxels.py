@@ -43,6 +43,11 @@ class Voxels:
     same_place: float = 1e-3
     axes: str = ""
 
+    @property
+    def ignored_axes(self) -> tuple[str, ...]:
+        """A note for a file that states its orientation itself, where `axes` are given."""
+        return (f"its own orientation is used: axes {self.axes} are ignored",) if self.axes else ()
+
 
 OF_BRAINS = Voxels()
 """What a scanner of brains makes."""

@@ -46,8 +46,8 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, felt: float 
             )
         what = "the body" if len(part) == used.sum() else f"a loose piece of {where}"
         raise InputError(
-            f"{what} can move rigidly in {free} of 6 ways: hold at least three nodes of it that are not in line"
-            f"{'' if len(part) == used.sum() else ', or give it common nodes with the body that it touches'}."
+            f"{what} can move rigidly in {free} of 6 ways: hold at least three nodes of it that are not in line, in "
+            f"x, y and z{'' if len(part) == used.sum() else ', or give it common nodes with the body that it touches'}."
         )
 
 
