@@ -127,7 +127,7 @@ def test_what_misses_the_opening_is_refused(site, tmp_path):
 
 def test_commands_play_scenes_along_it(site, tmp_path, capsys):
     """The push of `press`; near the rim the bone stops the tool and that is said; a scene without a tool stays."""
-    from scenes.commands.demo import add_theatre, scene_asked
+    from scenes.commands.theatre_options import add_theatre, scene_asked
 
     def asked(name: str, line: np.ndarray):
         parser = argparse.ArgumentParser()

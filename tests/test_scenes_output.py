@@ -13,7 +13,6 @@ from ar.optics.calibration import Calibration
 from ar.screen import signature, write_film, write_png
 from ar.tracking.pages import Page, listed_targets, png_bytes
 from ar.tracking.registration import Registration
-from scenes.bench.figure_record import Origin, record_of, write_record
 from scenes.cli import main
 from scenes.commands.companion_files import demand_no_strangers, remove_data, strangers
 from scenes.commands.outputs import KINDS, claimed, claimed_frames, recognised
@@ -117,7 +116,6 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
     (tmp_path / "table.csv").write_text("what,default,now,force mean_mm\n")
     (tmp_path / "factorial.csv").write_text("opening [mm],depth [mm],skull,nu\n")
     (tmp_path / "index.html").write_text("<!doctype html><title>What accuracy costs in time</title>")
-    write_record(tmp_path / "bench.json", record_of(Origin("1", "a machine", "a body", "2026-11-23"), []))
     picture = np.zeros((8, 8, 3), np.uint8)
     write_png(tmp_path / "picture.png", picture)
     write_film(tmp_path / "film.gif", [picture, picture])
@@ -153,7 +151,6 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
         "a table of `sulcus sensitivity`": "table.csv",
         "a table of `sulcus sensitivity --factorial`": "factorial.csv",
         "a page of `sulcus report`": "index.html",
-        "a record of `sulcus bench all`": "bench.json",
         "a picture of sulcus": "picture.png",
         "a film of `sulcus render`": "film.gif",
         "a page of `sulcus markers`": "page.png",

@@ -2,7 +2,7 @@
 
 import pytest
 
-from scenes.bench.csv_tables import append_rows, read_rows
+from scenes.bench.recorded_rows import append_rows, read_rows
 from scenes.bench.robustness import Record
 from scenes.bench.scaling import Row
 from scenes.report.artefact_time import note_seconds, noted_seconds

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from theatres import player, small, theatre_of
 
-from scenes.commands.demo import add_theatre, theatre_asked
+from scenes.commands.theatre_options import add_theatre, theatre_asked
 from scenes.play.deformers import GUARDED, AtRest
 from scenes.play.page.cast import ALL, Cast
 from scenes.script.tool_paths import Touch

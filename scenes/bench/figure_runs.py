@@ -21,7 +21,7 @@ from .child_process import HOUSE, Ended, run_to_end
 from .figure_readings import number_at
 from .figure_record import Entry, Origin, Value
 from .figures import Figure, command_of, words_of
-from .stages import machine
+from .machine import machine
 
 BENCH = (sys.executable, "-m", "scenes.cli", "bench")
 LONGEST = 400

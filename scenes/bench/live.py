@@ -24,8 +24,6 @@ SPEED = 20e-3
 # Frames before the first that counts: the tool arrives, and kernels are loaded.
 WARM_UP = 30
 CONVERGED = Accuracy(tolerance=1e-6)
-# Largest distance of a node from the converged solution that LIVE promises [m].
-PROMISED = 5e-5
 
 
 @dataclass(frozen=True)

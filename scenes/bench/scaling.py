@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import resource
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
 from sim.accuracy import TRAIN
 from sim.bodies.meshfile import read_anatomy, write_anatomy
@@ -29,6 +26,7 @@ from sim.strategy.memory_needed import foreseen
 from surrogate.data.tool_loads import draw
 
 from .loglog_chart import Curve, Panel
+from .process_memory import watched_card
 from .stopwatch import timed
 
 # Batches are solved until so many loads, or so many seconds, are spent.
@@ -176,26 +174,3 @@ def panels(found: Sequence[Row]) -> tuple[Panel, ...]:
 def _kind(name: str) -> str:
     """Without the number of levels."""
     return name.split(",")[0]
-
-
-@contextmanager
-def watched_card(device: str) -> Iterator[list[int]]:
-    """The bytes of the card that are taken while the block runs, beyond those taken before; zero without a card."""
-    where = wp.get_device(None if device == "auto" else device)
-    taken = [0]
-    if not where.is_cuda:
-        yield taken
-        return
-    before, ended = where.free_memory, threading.Event()
-
-    def watch() -> None:
-        while not ended.wait(0.02):
-            taken.append(before - where.free_memory)
-
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        yield taken
-    finally:
-        ended.set()
-        watcher.join()

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import date
 
 import numpy as np
-import warp as wp
 
 from sim.accuracy import LIVE, TRAIN
 from sim.fem import Fem
 from sim.resected_fem import Operated
-from sim.runtime.device import find_device
-from sim.runtime.versions import version_of
 from surrogate.data.tool_loads import draw
 
 from ..play.deformers import Theatre
@@ -93,23 +87,3 @@ def rows(
         "frame", "ms", 1e3, len(times), f"deform ({deformer}), render {size}, composite: {scene.name}",
         lambda i: player.draw(i, float(times[i]), scene.path(float(times[i]))),
     )  # fmt: skip
-
-
-def machine(device: str) -> str:
-    """Hardware, versions and date, in one line.
-
-    Raises
-    ------
-    InputError
-        A device that this machine does not have.
-    """
-    names = [wp.get_device(find_device(device, "float32").name).name]
-    try:
-        with open("/proc/cpuinfo") as file:
-            names += [line.split(":")[1].strip() for line in file if line.startswith("model name")][:1]
-    except OSError:
-        names.append(platform.processor())
-    versions = ", ".join(f"{name} {version_of(name)}" for name in ("sulcus", "warp-lang", "torch", "numpy"))
-    return (
-        f"{' / '.join(names)}, {os.cpu_count()} cores; Python {platform.python_version()}, {versions}; {date.today()}"
-    )

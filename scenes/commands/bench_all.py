@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from sim.errors import InputError
 
+from ..bench.figure_record import KIND, read_record
 from ..bench.figures import NAMED
 from ..script.shipped_files import template_path
 from .interrupt import INTERRUPTED, terminated_as_interrupted
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from ..bench.figure_record import Record
 
 OUT = Path("bench.json")
+KINDS = {KIND: read_record}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +68,6 @@ def _named(word: str) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, write tables, compare; 1 if a figure failed, missed what it was asked, or got worse."""
-    from ..bench.figure_record import read_record
     from ..bench.figure_tables import read_page, table, write_page
 
     if args.source and (args.json or args.again or args.quick or args.anatomy):
@@ -102,13 +103,13 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
     """The record, with what it lacked of the figures that were asked for."""
     from sim.bodies.meshfile import read_anatomy
 
-    from ..bench.figure_record import KIND, read_record, record_of, write_record
+    from ..bench.figure_record import record_of, write_record
     from ..bench.figure_runs import Run, entry_of, version_here
 
-    out = claimed(args.json or OUT, ".json", KIND, args.force, [args.anatomy, args.against, *args.tables])
+    out = claimed(args.json or OUT, ".json", KIND, args.force, [args.anatomy, args.against, *args.tables], KINDS)
     body = read_anatomy(args.anatomy or template_path()).digest
     run = Run(version_here(), body, args.anatomy, args.quick, args.again)
-    found = {entry.name: entry for entry in read_record(out).rows} if recognised(out, KIND) else {}
+    found = {entry.name: entry for entry in read_record(out).rows} if recognised(out, KIND, KINDS) else {}
     whole = [name for name in args.only if name in found and found[name].values and not found[name].quick]
     if args.quick and whole:
         raise InputError(

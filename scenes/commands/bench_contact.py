@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if an answer is not good."""
     from ..bench.contact_mesh import rows
-    from ..bench.stages import machine
+    from ..bench.machine import machine
 
     if min(*args.depths, args.ball) <= 0.0:
         raise InputError("--depths and --ball are lengths in mm: give numbers above 0.")

@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a solve did not converge."""
     from ..bench.elements import Press, limits, rows
-    from ..bench.stages import machine
+    from ..bench.machine import machine
 
     bodies = [read_anatomy(path) for path in args.anatomies or [template_path()]]
     anatomies = bodies if args.coarse else [mesh for body in bodies for mesh in (body, refined(body))]

@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 
 from sim.arguments import at_least
 
-from .demo import add_theatre, deformer_name, scene_asked, theatre_asked
+from .theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..bench.frame import batch_rate, frames_of, size_of, table
-    from ..bench.stages import machine
+    from ..bench.machine import machine
 
     at_least("--frames", args.frames, 1)
     if args.batch is not None:

@@ -43,10 +43,10 @@ def run(args: argparse.Namespace) -> int:
     from sim.bodies.subject import MeshPlan
     from sim.runtime.device import find_device
 
-    from ..bench.csv_tables import append_rows, read_rows
     from ..bench.loglog_chart import drawn
+    from ..bench.machine import machine
+    from ..bench.recorded_rows import append_rows, read_rows
     from ..bench.scaling import Row, Trial, panels, rows
-    from ..bench.stages import machine
 
     at_least("--batch", min(args.batch), 1)
     for size in args.sizes:

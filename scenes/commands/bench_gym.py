@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..bench.frame import size_of
     from ..bench.gym_rates import rate_of
-    from ..bench.stages import machine
+    from ..bench.machine import machine
     from ..gym.vector import many
 
     for name in ("envs", "steps", "repeats"):

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure. Returns 0."""
     from ..bench.link_latency import CLIENTS, measured
-    from ..bench.stages import machine
+    from ..bench.machine import machine
 
     at_least("--points", args.points, 3)
     at_least("--runs", args.runs, 1)

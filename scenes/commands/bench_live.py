@@ -44,8 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play every tool; 1 if a frame did not converge, or was farther off than promised."""
-    from ..bench.live import PROMISED, RIDES, errors, frames_of, live_fem, loads_of, tally
-    from ..bench.stages import machine
+    from ..bench.budget import PROMISED
+    from ..bench.live import RIDES, errors, frames_of, live_fem, loads_of, tally
+    from ..bench.machine import machine
     from ..script.scene import find_scene
     from ..script.site import site_of
 

@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     from ..bench.locate_rivals import rivals
     from ..bench.locate_study import rows, sights_of
     from ..bench.locate_twins import twins
-    from ..bench.stages import machine
+    from ..bench.machine import machine
     from ..script.shipped_files import template_path
 
     _check(args)

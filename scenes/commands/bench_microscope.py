@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 from sim.arguments import at_least
 
 from .bench_locate import bar
-from .demo import add_theatre, scene_asked, theatre_asked
+from .theatre_options import add_theatre, scene_asked, theatre_asked
 
 HEADS = (
     "seed", "frames", "refused", "points", "tumour moves by up to [mm]", "off: median", "95 %", "most", "removed [%]",

@@ -40,9 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
-    from ..bench.csv_tables import append_rows, read_rows
+    from ..bench.machine import machine
+    from ..bench.recorded_rows import append_rows, read_rows
     from ..bench.robustness import Record, Trial, records, tallies
-    from ..bench.stages import machine
 
     if args.count < 2 or args.batch < 1:
         raise InputError(f"--count {args.count} --batch {args.batch} tries nothing: give --count >= 2, --batch >= 1.")

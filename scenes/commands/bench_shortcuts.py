@@ -27,8 +27,8 @@ def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
     from sim.runtime.device import find_device
 
+    from ..bench.machine import machine
     from ..bench.shortcuts import measure, works
-    from ..bench.stages import machine
     from ..script.site import site_of
 
     at_least("--runs", args.runs, 1)

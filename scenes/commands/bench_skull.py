@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a solve did not converge."""
+    from ..bench.machine import machine
     from ..bench.skull_models import rows
-    from ..bench.stages import machine
 
     at_least("--loads", args.loads, 1)
     plans = [MeshPlan(count) for count in args.nodes]

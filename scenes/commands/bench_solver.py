@@ -66,8 +66,8 @@ def run(args: argparse.Namespace) -> int:
     """Compare; 1 if one of our answers is off."""
     from sim.runtime.device import find_device
 
+    from ..bench.machine import machine
     from ..bench.peers import LEAST, LIVE, OWN, PEERS, case_of, compare, judge_of
-    from ..bench.stages import machine
 
     for name, value, least in (
         ("--loads", args.loads, 2),

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from sim.arguments import at_least
 from sim.errors import InputError
 
-from .demo import add_theatre, deformer_name, scene_asked, theatre_asked
+from .theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,8 @@ def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
     from sim.effects import ToolForce
 
-    from ..bench.stages import machine, rows
+    from ..bench.machine import machine
+    from ..bench.stages import rows
     from ..play.deformers import plan_of
     from ..script.scene import SCENES, find_scene
 

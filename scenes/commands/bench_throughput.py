@@ -71,8 +71,8 @@ def run(args: argparse.Namespace) -> int:
     from sim.runtime.device import device_names
     from surrogate.data.tool_poses import ROUND, tool_of
 
+    from ..bench.machine import machine
     from ..bench.robustness import Trial
-    from ..bench.stages import machine
     from ..bench.throughput import drawn, rows, together
 
     devices = device_names(args.device)

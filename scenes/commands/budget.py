@@ -18,8 +18,8 @@ from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
 from .camera_options import add_camera, filmed_with_targets
-from .demo import add_bodies, scene_asked
 from .json_line import json_line
+from .theatre_options import add_bodies, scene_asked
 from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from sim.arguments import at_least
 from sim.errors import InputError
 
 from .camera_options import add_camera, filmed
-from .demo import add_theatre, deformer_name, playable, scene_asked, theatre_asked
 from .style_option import add_style
+from .theatre_options import add_theatre, deformer_name, playable, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
     from sim.deformation import Deformation

@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from .camera_options import add_camera, filmed
-from .demo import add_theatre, deformer_name, scene_asked, theatre_asked
 from .outputs import add_force, claimed
 from .style_option import add_style
+from .theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sim.arguments import at_least
 
-from .demo import add_trajectory, scene_asked
+from .theatre_options import add_trajectory, scene_asked
 from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", "")

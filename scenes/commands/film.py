@@ -17,9 +17,9 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
 from .camera_options import add_camera, filmed_with_targets
-from .demo import add_theatre, scene_asked, theatre_asked
 from .json_line import json_line
 from .outputs import add_force, claimed, claimed_folder, claimed_frames
+from .theatre_options import add_theatre, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre

@@ -18,7 +18,7 @@ import numpy as np
 from sim.errors import InputError
 
 from .interrupt import until_ended
-from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments
+from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
 from .tracked_scene import mover, tracked_scene
 
 if TYPE_CHECKING:
@@ -235,7 +235,7 @@ def opened(args: argparse.Namespace) -> Session:
     if said:
         print(f"sulcus link: {said}", file=sys.stderr)
     tool = tool or _tool_of(theatre, args.anatomy)
-    scene = tracked_scene(args, tool.shape, theatre)
+    scene = dressed(args, tracked_scene(args, tool.shape), theatre)
     deformer, who = mover(args, theatre, scene, True)
     stage, tracking = theatre.stage(scene), 1e-3 * args.tracking_mm
     eye = None

@@ -6,7 +6,7 @@ import argparse
 import json
 import re
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from sim.runtime.atomic_files import check_output
 
 FRAME = re.compile(r"frame_\d{4,}\.png")
 HEAD = 1 << 16
+Kinds = Mapping[str, Callable[[Path], object]]
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:
@@ -23,12 +24,17 @@ def add_force(parser: argparse.ArgumentParser) -> None:
 
 
 def claimed(
-    path: str | Path, suffix: str, kind: str, force: bool = False, inputs: Sequence[str | Path | None] = ()
+    path: str | Path,
+    suffix: str,
+    kind: str,
+    force: bool = False,
+    inputs: Sequence[str | Path | None] = (),
+    kinds: Kinds | None = None,
 ) -> Path:
     """The path of an output that can be written and may be replaced; nothing is left behind by asking.
 
-    An existing file is replaced only if it is recognised as one of the same `kind`, a key of `KINDS`, or by `force`.
-    What the command reads, its `inputs`, is never replaced.
+    An existing file is replaced only if it is recognised as one of the same `kind`, or by `force`. A `kind` is a
+    key of `kinds` (default: `KINDS`). What the command reads, its `inputs`, is never replaced.
 
     Raises
     ------
@@ -41,7 +47,7 @@ def claimed(
         return path
     if any(one is not None and Path(one).exists() and path.samefile(one) for one in inputs):
         raise InputError(f"{path}: is what this command reads, and would be lost. Choose another name.")
-    if not force and not recognised(path, kind):
+    if not force and not recognised(path, kind, kinds):
         raise InputError(
             f"{path}: exists, and is not recognised as {kind}. Choose another name, or give --force to replace it."
         )
@@ -92,10 +98,10 @@ def claimed_frames(folder: Path, source: str, force: bool) -> list[Path]:
     return others
 
 
-def recognised(path: Path, kind: str) -> bool:
-    """Whether a file is of a kind that sulcus writes; what cannot be read is not."""
+def recognised(path: Path, kind: str, kinds: Kinds | None = None) -> bool:
+    """Return True if a file is of a kind that sulcus writes; what cannot be read is not."""
     try:
-        return KINDS[kind](path)
+        return bool((kinds or KINDS)[kind](path))
     except (OSError, ValueError, LookupError, zipfile.BadZipFile):
         return False
 
@@ -192,13 +198,7 @@ def _is_scan(path: Path) -> bool:
     return is_sidecar(path)
 
 
-def _is_record(path: Path) -> bool:
-    from ..bench.figure_record import read_record
-
-    return bool(read_record(path))
-
-
-KINDS: dict[str, Callable[[Path], bool]] = {
+KINDS: Kinds = {
     "an anatomy of sulcus": lambda path: {b"region", b"held", b"slide_normal", b"craniotomy"} <= _names(path),
     "a scan that sulcus put beside an anatomy": _is_scan,
     "a result of `sulcus solve`": _is_solution,
@@ -214,7 +214,6 @@ KINDS: dict[str, Callable[[Path], bool]] = {
     "a table of `sulcus sensitivity`": _begins(b"what,default,now,"),
     "a table of `sulcus sensitivity --factorial`": _begins(b"opening [mm],depth [mm],"),
     "a page of `sulcus report`": _begins(b"<title>What accuracy costs in time</title>"),
-    "a record of `sulcus bench all`": _is_record,
     "a picture of sulcus": _is_picture,
     "a film of `sulcus render`": _is_film,
     "a calibration of `sulcus calibrate`": _begins(b"sulcus calibrate"),

@@ -18,13 +18,13 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
 from .address_option import add_address, addresses_of, say_addresses
-from .demo import add_bodies
 from .interrupt import until_ended
 from .json_line import json_line
 from .outputs import add_force, claimed
 from .poses_options import add_poses, demand_poses, elsewhere_of
 from .style_option import add_style
-from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments
+from .theatre_options import add_bodies
+from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
 from .tracked_scene import REST, mover, tracked_scene
 
 if TYPE_CHECKING:
@@ -237,7 +237,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     said = other_mesh(registration, theatre.anatomy, args.registration)
     if said:
         print(f"sulcus overlay: {said}", file=sys.stderr)
-    scene = tracked_scene(args, None if tool is None else tool.shape, theatre)
+    scene = dressed(args, tracked_scene(args, None if tool is None else tool.shape), theatre)
     stage = theatre.stage(scene)
     deformer, who = mover(args, theatre, scene, tool is not None)
     motion = ToolMotion(stage, deformer)

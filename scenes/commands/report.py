@@ -75,7 +75,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     """The rows of each data set; the page is written anew after each."""
     from sim.runtime.device import device_names
 
-    from ..bench.stages import machine
+    from ..bench.machine import machine
     from ..report.adaptation import debulked_study, simulate_debulked
     from ..report.page import Section, write_report
     from ..report.reference import solve_beyond, solve_reference

@@ -16,9 +16,9 @@ from sim.elements import ELEMENTS
 from sim.errors import InputError
 from surrogate.data.tool_loads import PRESETS, draw
 
-from .demo import add_bodies
 from .json_line import json_line
 from .outputs import add_force, claimed
+from .theatre_options import add_bodies
 
 if TYPE_CHECKING:
     from surrogate.model.learned import Learned
@@ -77,9 +77,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
     from ..bench.csv_tables import write_table
+    from ..bench.machine import machine
     from ..bench.sensitivity import Study, rows
     from ..bench.sensitivity_variants import Body, variants
-    from ..bench.stages import machine
     from ..play.deformers import open_theatre
 
     if args.out:

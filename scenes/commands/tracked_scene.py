@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
-from .tissue_options import dressed
-
 if TYPE_CHECKING:
     from sim.deformation import Deformer
     from sim.tools import BuiltIn
@@ -21,7 +19,7 @@ REST = "rest"
 """The deformer that lets the brain stay as in the scan."""
 
 
-def tracked_scene(args: argparse.Namespace, shape: BuiltIn | None, theatre: Theatre) -> Scene:
+def tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
     """What acts on the brain: the tool, moved by pose, and the skull."""
     from sim.effects import SKULLS, Elasticity, Held, ToolContact
 
@@ -29,7 +27,7 @@ def tracked_scene(args: argparse.Namespace, shape: BuiltIn | None, theatre: Thea
 
     touched = () if shape is None else (ToolContact((shape,)),)
     effects = (Elasticity(), Held(), SKULLS[args.skull], *touched)
-    return dressed(args, Scene(args.command, "A tracked tool.", effects=effects), theatre)
+    return Scene(args.command, "A tracked tool.", effects=effects)
 
 
 def mover(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool) -> tuple[Deformer | None, str]:

@@ -15,10 +15,10 @@ from tqdm import tqdm
 
 from sim.arguments import at_least
 
-from .demo import add_bodies, scene_asked
 from .fit import fitted_beside
 from .json_line import json_line
 from .outputs import claimed
+from .theatre_options import add_bodies, scene_asked
 from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 if TYPE_CHECKING:
