@@ -9,7 +9,7 @@ PAGES := tests/test_ar_browser.py tests/test_scenes_demo.py tests/test_scenes_ov
 QUICK := house sim_reference sim_material sim_physics sim_plan sim_warm sim_loads sim_term sim_given sim_meshfile sim_solve \
 	sim_readme surrogate_bound surrogate_store ar_camera ar_raster ar_overlay scenes_tissue scenes_output
 
-.PHONY: demo quick test test-gpu docs lint template locator bench-check clean
+.PHONY: demo quick test test-gpu docs lint template locator bench bench-check clean
 
 demo: $(STAMP)
 	$(VENV)/bin/sulcus demo
@@ -44,12 +44,16 @@ template: $(STAMP)
 locator: $(STAMP)
 	$(VENV)/bin/sulcus locator scenes/data/template.vtu --small
 
+# One measurement, as in `make bench NAME=contact ARGS="--device cpu"`; without NAME, a list of them.
+bench: $(STAMP)
+	$(VENV)/bin/python -m benchmarks $(or $(NAME),--help) $(ARGS)
+
 # What got slower by more than 10 %: `make bench-check OLD=old.json` measures now, and with NEW=new.json it only compares.
 OLD ?= $(word 1,$(filter %.json,$(MAKECMDGOALS)))
 NEW ?= $(word 2,$(filter %.json,$(MAKECMDGOALS)))
 bench-check: $(STAMP)
-	$(if $(OLD),,$(error give OLD=old.json, a record of `sulcus bench all`))
-	$(VENV)/bin/sulcus bench all --against '$(OLD)' $(if $(NEW),--from '$(NEW)',--json build/bench.json)
+	$(if $(OLD),,$(error give OLD=old.json, a record of `python -m benchmarks all`))
+	$(VENV)/bin/python -m benchmarks all --against '$(OLD)' $(if $(NEW),--from '$(NEW)',--json build/bench.json)
 
 # The pages for the browser, from docs/: open build/docs/index.html. Warnings are errors.
 docs: $(STAMP)

@@ -6,7 +6,6 @@ from .episodes.reading.torch_dataset import EpisodeDataset
 from .episodes.reading.windows import Episodes, read_episodes
 from .play.deformers import Theatre, open_theatre
 from .play.player import Frame, Player
-from .script.calibration_file import read_calibration, write_calibration
 from .script.camera_paths import Focus, HandHeld, Microscope, Orbit
 from .script.debulking import Debulking
 from .script.head_posture import Lying
@@ -17,6 +16,7 @@ from .script.site import Site, site_of
 from .script.tool import Blade, Instrument, Probe
 from .script.tool_paths import Touch, draw, idle, lay, palpate, press, slide, wander
 from .script.viewpoint import Viewpoint
+from .tracked.calibration_file import read_calibration, write_calibration
 
 __all__ = [
     "Blade",

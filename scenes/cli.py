@@ -15,7 +15,6 @@ from sim.runtime.kernel_cache import ensure_writable_cache
 from sim.runtime.user_script import run_script
 from sim.runtime.versions import version_of
 
-from .commands.bench import BENCHES
 from .commands.guidance import guidance
 from .commands.interrupt import INTERRUPTED
 
@@ -50,7 +49,6 @@ COMMANDS = {
     "sensitivity": "measure how the tumour's motion changes with tissue, skull, tool and element, one at a time",
     "uncertainty": "measure how far a scene's tumour may be from where it is in a patient, and what of that is whose",
     "budget": "tell how many millimetres to believe of an overlay on a tracked camera, and what takes most of them",
-    "bench": "measure what each stage costs, what each element is worth, how robust and how fast the solver is",
     "report": "measure what accuracy costs in time, for every deformer, as a page",
     "check": "play scenes without display, and fail where a picture is farther off than its stated bounds",
 }
@@ -61,9 +59,6 @@ READING = (
     "judge", "export", "scenes", "effects", "demo", "render", "film", "overlay", "link", "collect", "sensitivity",
     "uncertainty", "budget", "check",
 )  # fmt: skip
-
-# Commands with commands of their own; the first is meant where none is named.
-INNER = {"bench": tuple(BENCHES)}
 
 
 # More threads of a library's wait for one another: products here are small.
@@ -79,22 +74,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         limit_threads()
     arguments = with_points(sys.argv[1:] if argv is None else argv)
     asked = arguments[0] if arguments else None
-    inner = INNER.get(asked or "", ())
-    if inner and (len(arguments) == 1 or arguments[1] not in (*inner, "-h", "--help")):
-        arguments.insert(1, inner[0])
+    if asked == "bench":
+        print("sulcus bench: is now `python -m benchmarks NAME`, from a checkout of the repository.", file=sys.stderr)
+        return 2
     parser, _ = make_parsers(asked)
-    args = parser.parse_args(arguments)
-    warnings.formatwarning = lambda message, *rest: f"sulcus {args.command}: {message}\n"
+    return carried_out(parser.parse_args(arguments), "scenes")
+
+
+def carried_out(args: argparse.Namespace, package: str) -> int:
+    """Run a command, of `package`, and say what is wrong with its input. Returns as `main`."""
+    warnings.formatwarning = lambda message, *rest: f"{args.program}: {message}\n"
     try:
         ensure_writable_cache()
         for path in getattr(args, "plugin", ()):
             run_script(path)
-        return importlib.import_module(f"scenes.commands.{args.command}").run(args)
+        return importlib.import_module(f"{package}.commands.{args.command}").run(args)
     except InputError as error:
-        print(f"sulcus {args.command}: {error}", file=sys.stderr)
+        print(f"{args.program}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"sulcus {args.command}: stopped", file=sys.stderr)
+        print(f"{args.program}: stopped", file=sys.stderr)
         return INTERRUPTED
 
 
@@ -120,6 +119,7 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
             description=text[0].upper() + text[1:] + ".",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+        command.set_defaults(program=f"sulcus {name}")
         if name in asked:
             command.epilog = guidance(name)
             importlib.import_module(f"scenes.commands.{name}").add_arguments(command)

@@ -3,7 +3,20 @@
 import numpy as np
 import pytest
 
-from scenes.bench.loglog_chart import BOTTOM, COLOURS, HEIGHT, LEFT, PAPER, RIGHT, TOP, WIDTH, Curve, Dot, Panel, drawn
+from scenes.analysis.loglog_chart import (
+    BOTTOM,
+    COLOURS,
+    HEIGHT,
+    LEFT,
+    PAPER,
+    RIGHT,
+    TOP,
+    WIDTH,
+    Curve,
+    Dot,
+    Panel,
+    drawn,
+)
 
 PALE = tuple(int(0.35 * ink + 0.65 * paper) for ink, paper in zip(COLOURS[0], PAPER, strict=True))
 

@@ -11,8 +11,8 @@ from scipy.stats import chi2
 from ar.tracking.pair_residuals import pair_residuals
 from ar.tracking.registration import refined, registered
 from scenes.cli import main
-from scenes.script.registration_file import other_mesh, read_registration, scanned_of, write_registration
 from scenes.script.shipped_files import template_path
+from scenes.tracked.registration_file import other_mesh, read_registration, scanned_of, write_registration
 from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 

@@ -114,7 +114,7 @@ def test_every_link_inside_the_pages_arrives(site, pages):
 def test_every_command_and_public_name_is_in_the_reference(site, pages):
     assert set(COMMANDS) <= pages["generated/command-line"].anchors
     text = (site / "generated/command-line.html").read_text()
-    assert "--opening-over" in text and "FILE.py" in text and "bench throughput" in text
+    assert "--opening-over" in text and "FILE.py" in text and "python -m benchmarks throughput" in text
     for package in ("sim", "surrogate", "ar", "scenes"):
         names = importlib.import_module(package).__all__
         for name in names:

@@ -13,8 +13,9 @@ import pytest
 from plain_english import docstrings, messages, paragraphs, prose, sentences, too_long, words
 
 HOUSE = Path(__file__).parents[1]
-ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
-"""Each room and the rooms that it may import."""
+WHEEL = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
+"""Each room of the wheel and the rooms that it may import."""
+ROOMS = WHEEL | {"benchmarks": set(WHEEL)}
 ORDER = (
     {"sim.errors", "sim.elements"},
     {"sim.arguments", "sim.skulls", "sim.tools", "sim.material", "sim.geometry"},
@@ -40,14 +41,21 @@ ORDER = (
     {"ar.page"},
     {"scenes.script"},
     {"scenes.builtin", "scenes.play"},
+    {"scenes.page"},
+    {"scenes.tracked"},
     {"scenes.gym", "scenes.link"},
-    {"scenes.bench", "scenes.episodes"},
+    {"scenes.analysis", "scenes.episodes"},
     {"scenes.report", "scenes.warp"},
+    {"scenes.options"},
     {"scenes.commands"},
+    {"benchmarks.peers", "benchmarks.studies"},
+    {"benchmarks.figures"},
+    {"benchmarks.commands", "benchmarks.displacement_from_pictures"},
+    {"benchmarks.heads", "benchmarks.liver_sequences", "benchmarks.located_scenes"},
 )
 """Folders from below, and the modules that lie beside them: each imports itself and what lies under it."""
-TOGETHER = {"scenes.cli": "scenes.commands"}
-"""The command line and its commands call each other."""
+TOGETHER = {"scenes.cli": "scenes.commands", "benchmarks.__main__": "benchmarks.commands"}
+"""Command lines and their commands call each other."""
 OWNERS = {
     "torch": {
         *(f"sim/{of}.py" for of in ["linalg/dense_inverse", "linalg/block_inverse", "runtime/dense_product"]),
@@ -76,13 +84,12 @@ JOBS = {
 }
 """Libraries with several jobs: these files, at least, must import them."""
 PAGES = sorted(name.relative_to(HOUSE).as_posix() for name in (*HOUSE.glob("*.md"), *HOUSE.glob("docs/*.md")))
-PLAIN = ("ar", "scenes", "sim", "surrogate")
-"""Packages whose docstrings and messages are held to plain English."""
 OURS = re.compile(r"\b(?:(?:un)?taught|teach(?:es|ing)?|told|vicinit(?:y|ies)|lanes?|rungs?)\b", re.IGNORECASE)
 """Words of our own, for which the field has others: trained, given or stated, local problem, columns, steps."""
 IMPORT_NAMES = {"opencv-python-headless": "cv2", "pillow": "PIL", "scikit-learn": "sklearn", "warp-lang": "warp"}
 """Where they are other than the name to install by, with `_` for `-`."""
 FILES = sorted(path for room in ROOMS for path in (HOUSE / room).rglob("*.py"))
+PACKAGED = [path for path in FILES if path.relative_to(HOUSE).parts[0] in WHEEL]
 
 
 def name_of(path):
@@ -129,7 +136,7 @@ def libraries(path, everywhere=True):
 
 
 def importers(library):
-    return {name_of(path) for path in FILES if library in libraries(path)}
+    return {name_of(path) for path in PACKAGED if library in libraries(path)}
 
 
 def test_the_reader_of_imports_reads():
@@ -208,7 +215,7 @@ def test_each_library_does_its_job(library):
 
 def test_rooms_without_pictures_or_networks_import_none():
     outside = {name for name in importers("cv2") if not name.startswith("ar/")}
-    assert outside == {"scenes/episodes/episode.py", "scenes/bench/loglog_chart.py"}
+    assert outside == {"scenes/episodes/episode.py", "scenes/analysis/loglog_chart.py"}
     assert not {name for name in importers("warp") if name.startswith("surrogate/")}
 
 
@@ -218,7 +225,7 @@ def test_what_is_imported_is_declared_and_what_is_declared_is_imported():
     declared = [*project["dependencies"], *extras["exports"], *extras["gym"], *extras["link"], *extras["onnx"]]
     names = {re.split(r"[<>=!~\[ ]", line)[0] for line in declared}
     allowed = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
-    used = set().union(*map(libraries, FILES)) - set(sys.stdlib_module_names) - set(ROOMS)
+    used = set().union(*map(libraries, PACKAGED)) - set(sys.stdlib_module_names) - set(ROOMS)
     assert used == allowed
 
 
@@ -257,7 +264,7 @@ def test_everything_public_has_a_docstring():
     assert not missing
 
 
-@pytest.mark.parametrize("room", PLAIN)
+@pytest.mark.parametrize("room", [*WHEEL, "benchmarks/commands", "benchmarks/figures", "benchmarks/studies"])
 def test_docstrings_and_messages_are_in_plain_english(room):
     """Sentences of less than 30 words, and none of the words that we once had for the field's own."""
     long, ours = {}, {}

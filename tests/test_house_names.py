@@ -90,7 +90,9 @@ def texts_and_names():
     """Docstrings and comments of the packages with their places, and every name and word of their code."""
     said, known = [], {*dir(builtins), *FOREIGN}
     for path in [
-        path for room in ("sim", "surrogate", "ar", "scenes") for path in sorted((HOUSE / room).rglob("*.py"))
+        path
+        for room in ("sim", "surrogate", "ar", "scenes", "benchmarks")
+        for path in sorted((HOUSE / room).rglob("*.py"))
     ]:
         text, docs = path.read_text(), set()
         tree = ast.parse(text)
@@ -125,7 +127,9 @@ def test_cited_titles_are_those_that_were_compared_with_their_sources():
     """A new citation, or one that a rename has changed, is compared with its source, then listed."""
     listed = set((HOUSE / "tests/data/citations.txt").read_text().splitlines())
     paths = [
-        path for room in ("sim", "surrogate", "ar", "scenes", "docs", "examples") for path in (HOUSE / room).rglob("*")
+        path
+        for room in ("sim", "surrogate", "ar", "scenes", "benchmarks", "docs", "examples")
+        for path in (HOUSE / room).rglob("*")
     ]
     found = set()
     for path in [*paths, HOUSE / "README.md"]:

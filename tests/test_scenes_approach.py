@@ -14,7 +14,7 @@ from test_sim_volumes import grid, head, nifti
 from theatres import short
 
 from scenes.cli import main
-from scenes.commands.placement_options import add_opening_arguments, opening_words, trajectory_given
+from scenes.options.placement_options import add_opening_arguments, opening_words, trajectory_given
 from scenes.play.deformers import Theatre
 from scenes.script.approach import Approach, approach_of
 from scenes.script.scene import PALPATION, find_scene
@@ -127,12 +127,14 @@ def test_what_misses_the_opening_is_refused(site, tmp_path):
 
 def test_commands_play_scenes_along_it(site, tmp_path, capsys):
     """The push of `press`; near the rim the bone stops the tool and that is said; a scene without a tool stays."""
-    from scenes.commands.theatre_options import add_theatre, scene_asked
+    from scenes.options.theatre_options import add_theatre, scene_asked
 
     def asked(name: str, line: np.ndarray):
         parser = argparse.ArgumentParser()
         add_theatre(parser)
-        words = parser.parse_args(["--trajectory", str(marked(tmp_path, line))], argparse.Namespace(command="demo"))
+        words = parser.parse_args(
+            ["--trajectory", str(marked(tmp_path, line))], argparse.Namespace(program="sulcus demo")
+        )
         return scene_asked(words, name, Theatre(site.anatomy, None, {}, "cpu"))
 
     entry, way, line = planned(site, 6e-3, 4e-3, (0.3, 0.1))

@@ -9,10 +9,11 @@ import pytest
 from conftest import make_box
 from theatres import coarse_brain
 
-from scenes.bench import contact_mesh, stages, stopwatch
-from scenes.bench.elements import Press, Row, limits, rows
-from scenes.bench.robustness import SETS, Record, Trial, records, shares, tallies
-from scenes.cli import main
+from benchmarks.__main__ import main
+from benchmarks.studies import contact_mesh, stages
+from benchmarks.studies.elements import Press, Row, limits, rows
+from benchmarks.studies.robustness import SETS, Record, Trial, records, shares, tallies
+from scenes.analysis import stopwatch
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.refine import refined
 from sim.deformation import Outcome
@@ -98,7 +99,7 @@ def test_the_tally_counts_what_happened():
 
 def test_an_interrupted_trial_goes_on(tmp_path, capsys):
     write_anatomy(tmp_path / "brain.vtu", make_box((7, 7, 4), 8e-3, depth=18e-3))
-    words = ["bench", "robust", "--anatomy", str(tmp_path / "brain.vtu"), "--count", "12", "--batch", "4"]
+    words = ["robust", "--anatomy", str(tmp_path / "brain.vtu"), "--count", "12", "--batch", "4"]
     out = tmp_path / "loads.csv"
     assert main([*words, "--out", str(out), "--json"]) == 0
     sets = json.loads(capsys.readouterr().out)["sets"]
@@ -123,13 +124,15 @@ def test_an_interrupted_trial_goes_on(tmp_path, capsys):
         (["robust", "--out", "loads.txt"], ".csv"),
         (["robust", "--anatomy", "none.vtu"], "no such file"),
         (["elements", "none.vtu"], "no such file"),
-        (["solvers"], "`sulcus bench --help`"),
-        (["palpate"], "in the scene palpate no tool pushes, which is what is measured: choose press, slide, draw."),
+        (
+            ["stages", "palpate"],
+            "in the scene palpate no tool pushes, which is what is measured: choose press, slide, draw.",
+        ),
     ],
 )
 def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["bench", *words]) == 2
+    assert main([*words]) == 2
     assert reason in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -150,7 +153,7 @@ def test_random_loads_converge(anatomy):
 def test_bench_contact_prints_what_its_columns_are(tmp_path, capsys):
     path = tmp_path / "box.vtu"
     write_anatomy(path, make_box(cells=(5, 5, 3), spacing=8e-3, tumour=12e-3, opening=34e-3))
-    words = ["bench", "contact", "--anatomy", str(path), "--device", "cpu", "--elements", "p1", "--ball", "8"]
+    words = ["contact", "--anatomy", str(path), "--device", "cpu", "--elements", "p1", "--ball", "8"]
     assert main([*words, "--depths", "2"]) == 0
     said = capsys.readouterr().out
     head, row = (

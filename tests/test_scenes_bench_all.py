@@ -1,4 +1,4 @@
-"""`sulcus bench all`: every figure in its own process, a record that goes on, tables of pages, and what got slower."""
+"""`python -m benchmarks all`: figures in processes of their own, records, tables of pages, and what got slower."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from pathlib import Path
 import pytest
 from conftest import make_box
 
-from scenes.bench import figure_runs
-from scenes.bench.child_process import Ended, run_to_end
-from scenes.bench.figure_comparison import compared
-from scenes.bench.figure_readings import LIVE, number_at
-from scenes.bench.figure_record import Entry, Origin, Value, read_record, record_of, write_record
-from scenes.bench.figure_runs import Run, entry_of
-from scenes.bench.figures import NAMED, Figure, command_of
-from scenes.cli import main
+from benchmarks.__main__ import main
+from benchmarks.figures import figure_runs
+from benchmarks.figures.figure_comparison import compared
+from benchmarks.figures.figure_readings import LIVE, number_at
+from benchmarks.figures.figure_record import Entry, Origin, Value, read_record, record_of, write_record
+from benchmarks.figures.figure_runs import Run, entry_of
+from benchmarks.figures.figures import NAMED, Figure, command_of
+from benchmarks.peers.child_process import Ended, run_to_end
 from sim.bodies.meshfile import write_anatomy
 
 HOUSE = Path(__file__).parents[1]
@@ -49,13 +49,13 @@ def brain(tmp_path_factory):
 
 def test_one_fails_one_is_skipped_one_is_measured_and_the_same_command_goes_on(brain, tmp_path, capsys):
     out = tmp_path / "new.json"
-    words = ["bench", "all", "--json", str(out), "--quick", "--anatomy", str(brain), "--only"]
+    words = ["all", "--json", str(out), "--quick", "--anatomy", str(brain), "--only"]
     words += ["elements-limit-cpu", "live-cuda", "throughput-cpu"]
     assert main(words) == 1
     captured, record = capsys.readouterr(), read_record(out)
     rows = {row.name: row for row in record.rows}
     assert rows["elements-limit-cpu"].state == "failed" and not rows["elements-limit-cpu"].values
-    assert re.search("ended with 2: sulcus bench: the anatomy has no tumour", rows["elements-limit-cpu"].reason)
+    assert re.search("ended with 2: benchmarks elements: the anatomy has no tumour", rows["elements-limit-cpu"].reason)
     assert rows["throughput-cpu"].state == "measured" and rows["throughput-cpu"].seconds > 0.0
     assert {value.name for value in rows["throughput-cpu"].values} == {
         reading.name for reading in NAMED["throughput-cpu"].readings
@@ -110,14 +110,14 @@ def test_what_is_measured_is_kept_when_a_run_is_stopped(number, tmp_path, capsys
     asked = []
 
     def run(command, folder, heard):
-        asked.append(command[4])
+        asked.append(command[3])
         if len(asked) == 2:
             signal.raise_signal(number)
         return Ended(0, spoken(NAMED["live-cpu"]), "", 2.0)
 
     monkeypatch.setattr(figure_runs, "run_to_end", run)
     out = tmp_path / "new.json"
-    words = ["bench", "all", "--json", str(out), "--only", "live-cpu", "live-linear-cpu"]
+    words = ["all", "--json", str(out), "--only", "live-cpu", "live-linear-cpu"]
     assert main(words) == 130
     assert [row.name for row in read_record(out).rows] == ["live-cpu"] and list(tmp_path.iterdir()) == [out]
     assert "goes on" in capsys.readouterr().err
@@ -221,14 +221,14 @@ def test_a_number_is_found_by_what_its_row_is():
 def test_slower_numbers_are_named_and_fail(tmp_path, capsys):
     old = put(tmp_path / "old.json", entry(a=1.0, b=1.0), entry("stages-cpu", a=2.0))
     new = put(tmp_path / "new.json", entry(a=1.2, b=1.05), entry("stages-cpu", a=1.0))
-    assert main(["bench", "all", "--from", new, "--against", old]) == 1
+    assert main(["all", "--from", new, "--against", old]) == 1
     said = capsys.readouterr().out
     assert "| live-cpu, a | 1 | 1.2 | ms | **1.20** |" in said and "| stages-cpu, a | 2 | 1 | ms | 0.50 |" in said
     assert said.splitlines()[-1] == "worse by more than 10%: live-cpu, a (1.20 times)" and said.count("worse") == 1
     assert "differs" not in said
-    assert main(["bench", "all", "--from", new, "--against", new]) == 0
+    assert main(["all", "--from", new, "--against", new]) == 0
     assert "nothing is worse" in capsys.readouterr().out
-    assert main(["bench", "all", "--from", new, "--against", old, "--only", "stages-cpu"]) == 0
+    assert main(["all", "--from", new, "--against", old, "--only", "stages-cpu"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -255,24 +255,24 @@ def test_worse_is_worse_by_more_than_a_tenth(better, old, new, worse):
 
 def test_what_differs_besides_is_said(tmp_path, capsys):
     elsewhere = replace(HERE, machine="another machine", version="0.0.9")
-    other = replace(entry("stages-cpu", a=9.0), command="sulcus bench stages slide")
+    other = replace(entry("stages-cpu", a=9.0), command="python -m benchmarks stages slide")
     old = put(tmp_path / "old.json", entry(a=1.0, origin=elsewhere), other, entry("robust-cuda", a=1.0))
     new = put(tmp_path / "new.json", entry(a=1.0), entry("stages-cpu", a=1.0), entry("robust-cuda", "failed"))
-    assert main(["bench", "all", "--from", new, "--against", old]) == 1
+    assert main(["all", "--from", new, "--against", old]) == 1
     said = capsys.readouterr().out
     assert "The machine differs. Before: another machine. Now: a machine." in said and "version differs" in said
     assert "stages-cpu is not compared: it was measured by another command" in said
     assert "no longer measured as before: robust-cuda: it broke" in said
     missed = put(tmp_path / "missed.json", entry(a=1.0), entry("robust-cuda", "missed", a=1.0))
-    assert main(["bench", "all", "--from", missed, "--against", old]) == 1
+    assert main(["all", "--from", missed, "--against", old]) == 1
     assert "no longer measured as before: robust-cuda: it broke" in capsys.readouterr().out
-    assert main(["bench", "all", "--from", missed, "--against", missed]) == 0
+    assert main(["all", "--from", missed, "--against", missed]) == 0
     capsys.readouterr()
     skipped = put(tmp_path / "skipped.json", entry(a=1.0), entry("robust-cuda", "skipped"))
-    assert main(["bench", "all", "--from", skipped, "--against", old]) == 0
+    assert main(["all", "--from", skipped, "--against", old]) == 0
     assert "robust-cuda is not compared: it broke." in capsys.readouterr().out
     apart = put(tmp_path / "apart.json", entry("stages-cpu", a=1.0))
-    assert main(["bench", "all", "--from", apart, "--against", old]) == 2
+    assert main(["all", "--from", apart, "--against", old]) == 2
     assert re.search("no figure in common.*: measure one of them anew, with the --only", capsys.readouterr().err)
 
 
@@ -302,11 +302,11 @@ def test_a_damaged_record_is_one_sentence(kind, tmp_path, capsys):
     bad = tmp_path / "bad.json"
     bad.write_text(damaged(Path(good).read_text())[kind])
     for words in (["--from", good, "--against", str(bad)], ["--from", str(bad), "--against", good]):
-        assert main(["bench", "all", *words]) == 2
+        assert main(["all", *words]) == 2
         said = capsys.readouterr()
-        assert not said.out and said.err.count("\n") == 1 and said.err.startswith(f"sulcus bench: {bad}: ")
-    assert main(["bench", "all", "--json", str(bad)]) == 2  # nor is it replaced
-    assert "not recognised as a record of `sulcus bench all`" in capsys.readouterr().err
+        assert not said.out and said.err.count("\n") == 1 and said.err.startswith(f"benchmarks all: {bad}: ")
+    assert main(["all", "--json", str(bad)]) == 2  # nor is it replaced
+    assert "not recognised as a record of `python -m benchmarks all`" in capsys.readouterr().err
 
 
 PAGE = "# Page\n\n<!-- bench: live-cpu stages-cpu -->\nold\n<!-- end -->\n\nBy hand: | 1 |\n"
@@ -315,13 +315,13 @@ PAGE = "# Page\n\n<!-- bench: live-cpu stages-cpu -->\nold\n<!-- end -->\n\nBy h
 def test_tables_are_written_between_their_marks_and_stay_as_they_are(tmp_path, capsys):
     page, record = tmp_path / "page.md", put(tmp_path / "new.json", entry(a=0.01234, b=19183.0))
     page.write_text(PAGE)
-    words = ["bench", "all", "--tables", str(page), "--from", record]
+    words = ["all", "--tables", str(page), "--from", record]
     assert main(words) == 0
     once = page.read_bytes()
     table = (
         "\n| figure | measured | command |\n|---|---|---|\n"
-        "| `live-cpu` | a 0.0123 ms; b 19,183 ms | `sulcus bench live --frames 60 --device cpu` |\n"
-        "| `stages-cpu` | not measured here | `sulcus bench stages press --device cpu` |\n\n"
+        "| `live-cpu` | a 0.0123 ms; b 19,183 ms | `python -m benchmarks live --frames 60 --device cpu` |\n"
+        "| `stages-cpu` | not measured here | `python -m benchmarks stages press --device cpu` |\n\n"
         "Measured on a machine; 2026-11-23.\n\n"
     )
     assert once.decode() == PAGE.replace("old\n", table)
@@ -349,7 +349,7 @@ def test_a_page_that_is_marked_wrongly_is_left_alone(text, reason, tmp_path, cap
     page = tmp_path / "page.md"
     page.write_text(text)
     record = put(tmp_path / "new.json", entry(a=1.0))
-    assert main(["bench", "all", "--tables", str(page), "--from", record]) == 2
+    assert main(["all", "--tables", str(page), "--from", record]) == 2
     assert reason in capsys.readouterr().err and page.read_text() == text
 
 
@@ -368,14 +368,14 @@ def test_bad_input_is_a_sentence(words, reason, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(figure_runs, "run_to_end", lambda *asked: pytest.fail("it measures"))
     put(tmp_path / "new.json", entry(a=1.0))
-    assert main(["bench", "all", *words]) == 2
+    assert main(["all", *words]) == 2
     assert reason in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["new.json"]
 
 
 def test_only_figures_that_there_are(capsys):
     with pytest.raises(SystemExit) as end:
-        main(["bench", "all", "--only", "lively-cpu"])
+        main(["all", "--only", "lively-cpu"])
     said = capsys.readouterr().err
     assert end.value.code == 2 and "'lively-cpu': try live-cpu" in said and "growth" not in said
 
@@ -383,7 +383,7 @@ def test_only_figures_that_there_are(capsys):
 def test_the_tables_of_the_page_are_marked_as_they_are_written(tmp_path):
     page = shutil.copy(HOUSE / "docs/figures.md", tmp_path)
     words = ["--from", put(tmp_path / "new.json", entry(a=1.0)), "--force"]
-    assert main(["bench", "all", "--tables", page, *words]) == 0
+    assert main(["all", "--tables", page, *words]) == 0
     before, after = (HOUSE / "docs/figures.md").read_text(), Path(page).read_text()
     outside = [re.sub(r"(<!-- bench.*?-->).*?<!-- end -->", r"\1", text, flags=re.DOTALL) for text in (before, after)]
     assert outside[0] == outside[1] and before != after
@@ -396,4 +396,4 @@ def test_make_calls_it(words, tmp_path):
         (tmp_path / name).touch()
     make = ["make", "-n", "-f", str(HOUSE / "Makefile"), "-o", ".venv/.installed", "bench-check", *words]
     done = subprocess.run(make, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert ".venv/bin/sulcus bench all --against 'a.json' --from 'b.json'\n" in done.stdout
+    assert ".venv/bin/python -m benchmarks all --against 'a.json' --from 'b.json'\n" in done.stdout

@@ -8,10 +8,11 @@ import pytest
 from locators import in_a_skull
 from scipy.spatial.transform import Rotation
 
-from scenes.bench import locate_twins
-from scenes.bench.kelvinlets import kelvinlets
-from scenes.bench.locate_rivals import kelvin_forces, oracle, rigid, springs, thin_plates
-from scenes.bench.locate_study import (
+from benchmarks.__main__ import main
+from benchmarks.studies import locate_twins
+from benchmarks.studies.kelvinlets import kelvinlets
+from benchmarks.studies.locate_rivals import kelvin_forces, oracle, rigid, springs, thin_plates
+from benchmarks.studies.locate_study import (
     ORACLE,
     OURS,
     Estimate,
@@ -24,8 +25,7 @@ from scenes.bench.locate_study import (
     sights_of,
     spoilt,
 )
-from scenes.bench.locate_twins import CAUSES, Twin, drawn, effects_of, loads_of, solved, twins
-from scenes.cli import main
+from benchmarks.studies.locate_twins import CAUSES, Twin, drawn, effects_of, loads_of, solved, twins
 from sim.accuracy import REFERENCE
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.open_cortex import open_cortex
@@ -349,7 +349,7 @@ def test_the_command_prints_a_row_for_each_estimator_and_goes_on(body, locator, 
     monkeypatch.setattr(setup, "make_locator", lambda *each, **named: made.append("locator") or locator)
     path, folder = tmp_path / "body.vtu", tmp_path / "kept"
     write_anatomy(path, body)
-    words = ["bench", "locate", "--anatomy", str(path), "--finer", str(path), "--twins", "4", "--points", "60", "80"]
+    words = ["locate", "--anatomy", str(path), "--finer", str(path), "--twins", "4", "--points", "60", "80"]
     words += ["--cover", "50", "--noise", "0", "1", "--folder", str(folder), "--device", "cpu"]
     assert main(words) == 1  # one twin failed
     out, err = capsys.readouterr()
@@ -379,5 +379,5 @@ def test_the_command_prints_a_row_for_each_estimator_and_goes_on(body, locator, 
     ],
 )
 def test_what_cannot_be_measured_is_refused_before_anything_is_solved(words, match, capsys):
-    assert main(["bench", "locate", *words]) == 2
+    assert main(["locate", *words]) == 2
     assert match in capsys.readouterr().err

@@ -1,10 +1,10 @@
-"""`sulcus bench all --quick`: what small counts measured neither replaces figures nor reaches a page."""
+"""`python -m benchmarks all --quick`: what small counts measured neither replaces figures nor reaches a page."""
 
 from dataclasses import replace
 
-from scenes.bench.figure_record import Entry, Origin, Value, read_record, record_of, write_record
-from scenes.bench.figures import NAMED, command_of
-from scenes.cli import main
+from benchmarks.__main__ import main
+from benchmarks.figures.figure_record import Entry, Origin, Value, read_record, record_of, write_record
+from benchmarks.figures.figures import NAMED, command_of
 
 HERE = Origin("0.1.0 (code 1)", "a machine", "a body", "2026-11-23")
 WHOLE = Entry(
@@ -27,7 +27,7 @@ def test_an_entry_knows_whether_its_counts_were_small():
 def test_small_counts_do_not_reach_a_page(tmp_path, capsys):
     page = tmp_path / "page.md"
     page.write_text("<!-- bench: live-cpu -->\n<!-- end -->\n")
-    words = ["bench", "all", "--tables", str(page), "--from"]
+    words = ["all", "--tables", str(page), "--from"]
     assert main([*words, put(tmp_path / "whole.json", WHOLE)]) == 0
     text = page.read_text()
     assert main([*words, put(tmp_path / "quick.json", QUICK)]) == 2
@@ -37,6 +37,6 @@ def test_small_counts_do_not_reach_a_page(tmp_path, capsys):
 
 def test_small_counts_do_not_replace_what_was_measured_in_full(tmp_path, capsys):
     record = tmp_path / "whole.json"
-    assert main(["bench", "all", "--quick", "--only", "live-cpu", "--json", put(record, WHOLE)]) == 2
+    assert main(["all", "--quick", "--only", "live-cpu", "--json", put(record, WHOLE)]) == 2
     assert "holds live-cpu as measured in full" in capsys.readouterr().err
     assert read_record(record).rows == (WHOLE,)

@@ -5,8 +5,19 @@ import json
 import numpy as np
 import pytest
 
-from scenes.bench.track_study import AWAY, LEANING, TIP, TURNED, Shot, between, pivoted, row_of, spread, trial_camera
-from scenes.cli import main
+from benchmarks.__main__ import main
+from benchmarks.studies.track_study import (
+    AWAY,
+    LEANING,
+    TIP,
+    TURNED,
+    Shot,
+    between,
+    pivoted,
+    row_of,
+    spread,
+    trial_camera,
+)
 
 
 def shot(tip, off=None, deviation=1e-3, markers=30.0):
@@ -54,9 +65,9 @@ def first_turn(poses):
 
 
 def test_the_command_prints_a_row_for_each_protocol(capsys):
-    assert main(["bench", "track", "--pictures", "2", "--json"]) == 0
+    assert main(["track", "--pictures", "2", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert len(rows) == 3 and all(row["wrong"] == 0 and row["certain"] in (100.0, None) for row in rows)
     assert all(row["most"] < 1.5 for row in rows)
-    assert main(["bench", "track", "--pictures", "1"]) == 2
+    assert main(["track", "--pictures", "1"]) == 2
     assert "--pictures" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ar.tracking.registration import Registration
-from scenes.bench.error_budget import (
+from scenes.analysis.error_budget import (
     CLINICAL,
     LATENCY,
     MARKERS,
@@ -20,12 +20,12 @@ from scenes.bench.error_budget import (
     budgeted,
     errors_of,
 )
-from scenes.bench.tracking_errors import changed, usual_covariance
+from scenes.analysis.tracking_errors import changed, usual_covariance
 from scenes.cli import main
 from scenes.script.priors import OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION
-from scenes.script.reference_place import USUAL, VIEW, reference_beside
 from scenes.script.site import site_of
 from scenes.script.uncertainty import SURROGATE
+from scenes.tracked.reference_place import USUAL, VIEW, reference_beside
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
 

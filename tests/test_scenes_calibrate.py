@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from ar.screen import write_video
 from scenes.cli import main
-from scenes.script.calibration_file import read_calibration
-from scenes.script.pose_file import read_poses
+from scenes.tracked.calibration_file import read_calibration
+from scenes.tracked.pose_file import read_poses
 from sim.errors import InputError
 
 HEAD = "time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw"

@@ -7,7 +7,7 @@ import pytest
 from ar.optics.calibration import Calibration
 from ar.optics.calibration_text import LONGEST_TEXT
 from ar.optics.lens import Lens
-from scenes.script.calibration_file import read_calibration, write_calibration
+from scenes.tracked.calibration_file import read_calibration, write_calibration
 from sim.errors import InputError
 
 SOME = Calibration((820.5, 818.25), (321.0, 236.5), 640, 480, Lens(-0.31, 0.12, 1e-3, -2e-3, -0.02), "left")

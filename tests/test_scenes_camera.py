@@ -14,16 +14,16 @@ from ar.optics.lens import Lens
 from ar.overlay.outlines import iou, silhouette
 from ar.screen import read_png
 from scenes.cli import main
-from scenes.commands.camera_options import PATHS as NAMES
+from scenes.options.camera_options import PATHS as NAMES
 from scenes.play.checks import measure
 from scenes.play.picture_checks import drawn_off
 from scenes.play.reference import truth_of
-from scenes.script.calibration_file import write_calibration
 from scenes.script.camera_paths import PATHS, Focus, HandHeld, Microscope, Orbit, wandering
 from scenes.script.scene import Bounds
 from scenes.script.site import site_of
 from scenes.script.tool_paths import press
 from scenes.script.viewpoint import USUAL, Viewpoint
+from scenes.tracked.calibration_file import write_calibration
 from sim.errors import InputError
 
 LENS = Lens(-4.0, 6.0, 0.02, -0.015, 0.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from theatres import put, theatre_of
 
-from scenes.bench.budget import offers
+from scenes.analysis.budget import offers
 from scenes.cli import main
 from scenes.play.certificates import certified
 from scenes.script.scene import find_scene

@@ -9,7 +9,7 @@ from visitor import free_port, wait_for
 
 from ar.page.aside import HELP, TABS
 from ar.page.sight import HISTORY, PICTURE, SAID, SLICES
-from scenes.play.page.demo import Demo
+from scenes.page.demo import Demo
 from scenes.script.tool_paths import press
 
 LOADED = f"document.querySelector('#{PICTURE} img') && document.querySelector('#{SLICES} img')"
@@ -23,7 +23,7 @@ def demo(box):
     """A page that has played up to frame 40 and is paused."""
     scene = small(path=press(0.3, rise=1.0, hold=1.0), duration=2.0, frames_per_second=60.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scenes.play.page.cast.Referee", Silent)
+        patch.setattr("scenes.page.cast.Referee", Silent)
         demo = Demo(theatre_of(box), scene, "linear", "127.0.0.1", free_port())
         demo.wish.set(plays=False, number=40)
         done = threading.Event()

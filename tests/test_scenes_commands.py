@@ -8,10 +8,12 @@ import pytest
 from balls import EGG, ball
 from boxes import base_held
 from boxes import box as cube
+from programs import main
 from theatres import put, theatre_of
 
-from scenes.cli import COMMANDS, main
-from scenes.commands.json_line import json_line
+from benchmarks.__main__ import BENCHMARKS
+from scenes.cli import COMMANDS
+from scenes.options.json_line import json_line
 from scenes.play.deformers import model_path
 from sim.bodies.intensity import sidecar
 from sim.bodies.meshfile import read_anatomy, write_anatomy, write_mesh
@@ -49,7 +51,7 @@ def test_a_patient_in_one_go(tmp_path, capsys, short_fits):
 @pytest.mark.parametrize(
     "words",
     ["render x --out o", "collect x --out o.h5", "film x --out o", "demo x", "check press x", "effects x", "budget x",
-     "uncertainty press x", "bench frame x", "bench stages x"],
+     "uncertainty press x", "benchmarks frame x", "benchmarks stages x"],
 )  # fmt: skip
 def test_a_wrong_name_of_a_scene_is_refused_before_an_anatomy_is_opened(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -118,7 +120,7 @@ PLAYING = {
     "render": ["render", "press", "--out", "frames"],
     "collect": ["collect", "press", "--out", "press.h5"],
     "check": ["check", "press"],
-    "bench": ["bench", "press"],
+    "stages": ["benchmarks", "stages", "press"],
 }
 ALL = [
     (["--anatomy", "none.vtu"], "no such file"),
@@ -146,14 +148,14 @@ OWN = [
     ("demo", ["--port", "-1"], "-1 is no port"),
     ("demo", ["--host", "no.such.host.invalid"], "no.such.host.invalid"),
     ("demo", ["--seconds", "nan"], "--seconds nan"),
-    ("bench", ["--batch", "0"], "--batch is 0"),
-    ("bench", ["--solves", "0"], "count"),
+    ("stages", ["--batch", "0"], "--batch is 0"),
+    ("stages", ["--solves", "0"], "count"),
 ]
 CASES = [
     *((PLAYING[name] + words, reason) for name in PLAYING for words, reason in ALL),
     *((PLAYING[name] + DEFORMER[0], DEFORMER[1]) for name in PLAYING),
     *((PLAYING[name] + ["--anatomy", "box.vtu", *words], reason) for name, words, reason in OWN),
-    *(([name, "dance", *PLAYING[name][2:]], "'dance'") for name in PLAYING),
+    *((["dance" if word == "press" else word for word in words], "'dance'") for words in PLAYING.values()),
 ]
 
 
@@ -164,7 +166,8 @@ def test_bad_input_is_a_sentence_and_nothing_is_written(folder, monkeypatch, cap
     assert main(words) == 2
     out, error = capsys.readouterr()
     sentence = error.splitlines()[-1]
-    assert reason in sentence and sentence.startswith(f"sulcus {words[0]}: ") and sentence.endswith(".")
+    program = f"benchmarks {words[1]}" if words[0] == "benchmarks" else f"sulcus {words[0]}"
+    assert reason in sentence and sentence.startswith(f"{program}: ") and sentence.endswith(".")
     assert "Traceback" not in error and "address" not in out
     assert {path: path.stat().st_mtime_ns for path in sorted(folder.rglob("*"))} == before
 
@@ -188,3 +191,17 @@ def test_numbers_that_are_not_finite_are_null_in_json():
     """NaN and Infinity are no JSON, though Python writes them."""
     said = {"rows": [{"bond": math.nan, "worst": (1.5, -math.inf)}], "good": True, "name": "nan"}
     assert json.loads(json_line(said)) == {"rows": [{"bond": None, "worst": [1.5, None]}], "good": True, "name": "nan"}
+
+
+@pytest.mark.parametrize("words", [[], ["throughput", "--count", "4"], ["--help"]])
+def test_bench_names_what_replaces_it(words, capsys):
+    assert main(["bench", *words]) == 2
+    said = capsys.readouterr().err
+    assert "`python -m benchmarks NAME`" in said and said.count("\n") == 1
+
+
+def test_benchmarks_help_lists_every_name(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["benchmarks", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert end.value.code == 0 and all(f"{name} {text[:20]}" in said for name, text in BENCHMARKS.items())

@@ -14,14 +14,14 @@ from ar.overlay.refind import of_ink, stands
 from ar.screen import write_film
 from ar.tracking.pictures import Named, film_of
 from scenes.cli import main
-from scenes.play.overlay.follower import Follower
-from scenes.play.overlay.picture import Painter
-from scenes.play.overlay.run import overlaid, timed
-from scenes.play.overlay.tool_motion import ToolMotion
 from scenes.play.stage import TUMOUR_COLOUR
-from scenes.script.calibration_file import read_calibration
-from scenes.script.registration_file import read_registration
 from scenes.script.scene import find_scene
+from scenes.tracked.calibration_file import read_calibration
+from scenes.tracked.follower import Follower
+from scenes.tracked.picture import Painter
+from scenes.tracked.registration_file import read_registration
+from scenes.tracked.run import overlaid, timed
+from scenes.tracked.tool_motion import ToolMotion
 
 FILM = Path(__file__).parent / "data" / "film"
 INK = ink_of(TUMOUR_COLOUR)

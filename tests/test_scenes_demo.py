@@ -12,13 +12,13 @@ from visitor import Visitor, free_port, wait_for
 from ar.overlay.hud import FINE
 from ar.overlay.refind import stands
 from ar.page.browser import Browser
-from scenes.play.page.controls import PLAN
-from scenes.play.page.demo import Demo
-from scenes.play.page.moment import Moment
-from scenes.play.page.referee import Referee
-from scenes.play.page.requests import HAND, SCRIPT, Wish
-from scenes.play.page.text import plan_words
-from scenes.play.page.view import FEM_COLOUR, STALE_COLOUR
+from scenes.page.controls import PLAN
+from scenes.page.demo import Demo
+from scenes.page.moment import Moment
+from scenes.page.referee import Referee
+from scenes.page.requests import HAND, SCRIPT, Wish
+from scenes.page.text import plan_words
+from scenes.page.view import FEM_COLOUR, STALE_COLOUR
 from scenes.script.tool_paths import Touch, press
 from sim.fem import Fem
 from surrogate.model.learned import Learned

@@ -13,12 +13,12 @@ from visitor import Visitor, free_port, wait_for
 
 from scenes.builtin.retract import RELAXING
 from scenes.episodes.episode import UNITS, collect
+from scenes.page.demo import Demo
 from scenes.play.checks import measure
 from scenes.play.deformers import Theatre
 from scenes.play.effect_ablation import without
 from scenes.play.label import labelled
 from scenes.play.load_text import acting
-from scenes.play.page.demo import Demo
 from scenes.play.reference import truth_of
 from scenes.play.stage import CORTEX, TOOL, Stage
 from scenes.script.head_posture import SUPINE, Lying, drained_then_turned, supine

@@ -22,15 +22,15 @@ from ar.tracking.targets import patient_reference
 from ar.tracking.track import Tracked
 from scenes.link.answer import Answering
 from scenes.link.heard import Heard, Names
-from scenes.play.overlay.agreement import Agreement
-from scenes.play.overlay.elsewhere import Elsewhere, Eye
-from scenes.play.overlay.follower import PATIENT, Known, State, tip_covariance
-from scenes.play.overlay.rows import write_rows
-from scenes.play.overlay.run import Shown
-from scenes.play.overlay.tool_motion import UNBOUND, Motion, ToolMotion
-from scenes.play.overlay.truth import Off, off, summary
 from scenes.script.scene import find_scene
-from scenes.script.tracked_tool import TrackedTool
+from scenes.tracked.agreement import Agreement
+from scenes.tracked.elsewhere import Elsewhere, Eye
+from scenes.tracked.follower import PATIENT, Known, State, tip_covariance
+from scenes.tracked.rows import write_rows
+from scenes.tracked.run import Shown
+from scenes.tracked.tool_motion import UNBOUND, Motion, ToolMotion
+from scenes.tracked.tracked_tool import TrackedTool
+from scenes.tracked.truth import Off, off, summary
 from sim.loads import Touching
 from sim.tools import Ball
 from surrogate.model.learned import predicted
@@ -137,7 +137,7 @@ def test_tool_error_is_of_a_deeper_tool_and_each_start_the_last():
 @pytest.mark.parametrize(("bound", "expected", "doubt"), [(3e-4, 3e-4, ""), (np.inf, 0.0, UNBOUND)])
 def test_model_error_without_a_bound_is_the_models_own(bound, expected, doubt, monkeypatch):
     model = SimpleNamespace(bound=bound)
-    monkeypatch.setattr("scenes.play.overlay.tool_motion.answering", lambda deformer, answer: model)
+    monkeypatch.setattr("scenes.tracked.tool_motion.answering", lambda deformer, answer: model)
     stage = template_theatre().stage(find_scene("palpate"))
     found = ToolMotion(stage, Sinking(stage)).under(np.eye(4), np.zeros((3, 3)))
     assert (found.model, found.doubt) == (expected, doubt)

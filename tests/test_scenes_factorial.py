@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from scenes.bench import factorial
-from scenes.bench.factorial import LEVELS, Cell, cells, panels, shares
+from scenes.analysis import factorial
+from scenes.analysis.factorial import LEVELS, Cell, cells, panels, shares
 from scenes.cli import main
 
 FEW = {

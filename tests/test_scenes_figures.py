@@ -9,22 +9,11 @@ from pathlib import Path
 import pytest
 from conftest import make_box
 
-from scenes.bench import (
-    elements,
-    frame,
-    live,
-    peers,
-    robustness,
-    scaling,
-    shortcuts,
-    skull_models,
-    stages,
-    throughput,
-)
-from scenes.bench.figure_readings import LIVE, STAGES
-from scenes.bench.figures import FIGURES, NAMED, SHORTCUTS, words_of
-from scenes.cli import make_parsers
-from scenes.commands.bench import BENCHES
+from benchmarks.__main__ import BENCHMARKS, make_parser
+from benchmarks.figures.figure_readings import LIVE, STAGES
+from benchmarks.figures.figures import FIGURES, NAMED, SHORTCUTS, words_of
+from benchmarks.peers import comparison as peers
+from benchmarks.studies import elements, frame, live, robustness, scaling, shortcuts, skull_models, stages, throughput
 from scenes.script.site import site_of
 from surrogate.data.tool_loads import PRESETS
 
@@ -46,10 +35,11 @@ ROWS = {
 
 @pytest.mark.parametrize("name", NAMED)
 def test_every_command_parses(name):
-    parser, figure = make_parsers("bench")[0], NAMED[name]
+    figure = NAMED[name]
+    parser = make_parser(figure.command.split()[0])
     for quick in (False, True):
         for anatomy in (None, "brain.vtu"):
-            args = parser.parse_args(["bench", *words_of(figure, quick, anatomy), "--json"])
+            args = parser.parse_args([*words_of(figure, quick, anatomy), "--json"])
             given = next((getattr(args, key) for key in ("anatomy", "anatomies", "mesh") if hasattr(args, key)), None)
             assert args.device == figure.device and args.json
             taken = anatomy is not None and figure.body is not None
@@ -81,6 +71,6 @@ def test_every_bench_that_the_pages_state_is_a_figure():
     stated = set()
     for name in ("figures.md", "floor.md"):
         text = re.sub(r"<!-- bench.*?<!-- end -->", "", (HOUSE / "docs" / name).read_text(), flags=re.DOTALL)
-        stated |= {*re.findall(r"`(?:\w+=\w+ )?sulcus bench\s+(\w+)", text)} & set(BENCHES)
+        stated |= {*re.findall(r"`(?:\w+=\w+ )?sulcus bench\s+(\w+)", text)} & set(BENCHMARKS)
     assert len(stated) > 8 and stated - {"all"} <= measured
     assert len({figure.name for figure in FIGURES}) == len(FIGURES)

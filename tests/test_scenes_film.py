@@ -16,14 +16,14 @@ from ar.tracking.targets import patient_reference, tool_cube
 from ar.tracking.track import Tracker
 from scenes.cli import main
 from scenes.play.deformers import AtRest
-from scenes.play.overlay.filming import Taking, Trouble, mounted, registered, shots_of
 from scenes.play.player import Player
-from scenes.script.calibration_file import read_intrinsic_covariance, write_calibration
-from scenes.script.film_truth import read_truth
-from scenes.script.reference_place import USUAL, VIEW
-from scenes.script.registration_file import read_registration
 from scenes.script.scene import find_scene
-from scenes.script.tracked_tool import TrackedTool, read_tool, write_tool
+from scenes.tracked.calibration_file import read_intrinsic_covariance, write_calibration
+from scenes.tracked.film_truth import read_truth
+from scenes.tracked.filming import Taking, Trouble, mounted, registered, shots_of
+from scenes.tracked.reference_place import USUAL, VIEW
+from scenes.tracked.registration_file import read_registration
+from scenes.tracked.tracked_tool import TrackedTool, read_tool, write_tool
 from sim.errors import InputError
 from sim.tools import Ball, Capsule, Spatula
 

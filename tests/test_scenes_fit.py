@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from locators import dent, in_a_skull, locator_of
 
-from scenes.bench.fit_study import row
-from scenes.bench.fit_twins import loads_of, patient, places
+from benchmarks.studies.fit_study import row
+from benchmarks.studies.fit_twins import loads_of, patient, places
 from scenes.cli import main
 from scenes.commands.fit import fitted_beside, sentences
 from sim.bodies.meshfile import write_anatomy

@@ -13,8 +13,8 @@ from ar.tracking.detection import Corners
 from ar.tracking.focal_fit import focal_fit
 from ar.tracking.targets import tool_cube
 from scenes.cli import main
-from scenes.script.calibration_file import read_calibration, write_calibration
-from scenes.script.film_camera import demand_film
+from scenes.tracked.calibration_file import read_calibration, write_calibration
+from scenes.tracked.film_camera import demand_film
 
 CUBE = tool_cube()
 
@@ -49,7 +49,7 @@ def test_a_focal_length_is_found_by_the_relief_of_a_target():
 
 @pytest.mark.parametrize(("factor", "way"), [(1.15, "13% shorter"), (0.85, "18% longer")])
 def test_a_film_of_another_zoom_is_refused_before_it_is_followed(factor, way, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("scenes.script.followed.followed", lambda *given: pytest.fail("the whole film is followed"))
+    monkeypatch.setattr("scenes.tracked.followed.followed", lambda *given: pytest.fail("the whole film is followed"))
     calibration = read_calibration(FILM / "camera.yaml")
     path = tmp_path / "camera.yaml"
     write_calibration(path, replace(calibration, focal=tuple(factor * each for each in calibration.focal)))

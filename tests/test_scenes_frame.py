@@ -1,4 +1,4 @@
-"""`sulcus bench frame`: every stage of a page's frame is timed, and the page gets the pictures."""
+"""`python -m benchmarks frame`: every stage of a page's frame is timed, and the page gets the pictures."""
 
 import json
 from functools import partial
@@ -8,9 +8,9 @@ from theatres import put, short, theatre_of
 
 from ar.page.browser import Browser
 from ar.rendering.renderer import Renderer
-from scenes.bench import frame
-from scenes.bench.frame import STAGES, WARM_UP, batch_rate, frames_of, size_of, table
-from scenes.cli import main
+from benchmarks.__main__ import main
+from benchmarks.studies import frame
+from benchmarks.studies.frame import STAGES, WARM_UP, batch_rate, frames_of, size_of, table
 from scenes.play.player import Player
 
 
@@ -58,7 +58,7 @@ def test_a_batch_is_of_so_many_frames_and_cameras(box, monkeypatch):
 
 def test_the_command_says_the_size_and_every_stage(box, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(frame, "batch_rate", partial(frame.batch_rate, seconds=0.01))
-    words = ["bench", "frame", "--anatomy", str(put(theatre_of(box), tmp_path / "box.vtu")), "--device", "cpu"]
+    words = ["frame", "--anatomy", str(put(theatre_of(box), tmp_path / "box.vtu")), "--device", "cpu"]
     words += ["--deformer", "linear", "--size", "160x120", "--frames", "2"]
     assert main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
@@ -70,6 +70,6 @@ def test_the_command_says_the_size_and_every_stage(box, tmp_path, capsys, monkey
 
 @pytest.mark.parametrize("text", ["640", "0x480", "640x-1", "640x480x3", "9999x10", "axb"])
 def test_what_is_no_size_is_refused(text, capsys):
-    assert main(["bench", "frame", "--size", text]) == 2
+    assert main(["frame", "--size", text]) == 2
     assert "--size" in capsys.readouterr().err
     assert size_of("1280X720") == (1280, 720)

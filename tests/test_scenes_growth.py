@@ -1,4 +1,4 @@
-"""`sulcus bench growth`: rows, the plot, and a run that goes on where it was stopped."""
+"""`python -m benchmarks growth`: rows, the plot, and a run that goes on where it was stopped."""
 
 import json
 from dataclasses import replace
@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ar.screen import read_png
-from scenes.bench import scaling
-from scenes.bench.scaling import LOADS, Row, Trial, measured, panels, rows, template_mesh
-from scenes.cli import main
+from benchmarks.__main__ import main
+from benchmarks.studies import scaling
+from benchmarks.studies.scaling import LOADS, Row, Trial, measured, panels, rows, template_mesh
 from sim.errors import InputError
 
 ROW = Row(2000, 1, 1977, 8987, "sparse factor", 1, 1.0, 0.05, 8.0, 12, 12, 0.3, 0.0, 0.0)
@@ -33,7 +33,7 @@ def test_a_row_is_what_was_solved(folder):
 
 def test_what_is_measured_is_not_measured_again(folder, tmp_path, monkeypatch, capsys):
     """The first row is taken from the record; the other is measured in a process of its own."""
-    words = ["bench", "growth", "--sizes", "2000", "--batch", "1", "2", "--device", "cpu"]
+    words = ["growth", "--sizes", "2000", "--batch", "1", "2", "--device", "cpu"]
     out = folder / "growth.png"
     asked = []
 
@@ -90,6 +90,6 @@ def test_the_switch_is_marked_between_the_sizes_beside_it():
 )
 def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["bench", "growth", *words]) == 2
+    assert main(["growth", *words]) == 2
     assert reason in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -15,10 +15,11 @@ from test_scenes_approach import marked
 from theatres import put, theatre_of
 
 from ar.screen import read_png, signature
+from benchmarks.__main__ import BENCHMARKS, make_parser
 from scenes.cli import COMMANDS, main, make_parsers, with_points
 from scenes.commands.guidance import EXAMPLES, NAMES, PLAYING
-from scenes.commands.placement_options import opened
 from scenes.commands.train import notes_on
+from scenes.options.placement_options import opened
 from scenes.play.reference import truth_of
 from scenes.script.scene import SCENES
 from sim.bodies.label_volume import volume_subject
@@ -49,8 +50,9 @@ def arguments_of(name, parser):
 
 
 def test_every_argument_of_every_command_has_help_in_short_sentences():
-    known = dict(each for name, parser in make_parsers(*COMMANDS)[1].items() for each in arguments_of(name, parser))
-    assert len(known) > 200 and "solve --precision" in known and "bench live --frames" in known
+    parsers = {**make_parsers(*COMMANDS)[1], "benchmarks": make_parser(*BENCHMARKS)}
+    known = dict(each for name, parser in parsers.items() for each in arguments_of(name, parser))
+    assert len(known) > 200 and "solve --precision" in known and "benchmarks live --frames" in known
     assert not [name for name, text in known.items() if not (text or "").strip()]
     # A default alone does not say what it is of.
     assert not [name for name, text in known.items() if text.startswith("(")]

@@ -9,10 +9,10 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from programs import main
 from theatres import put, theatre_of
 
 import scenes.gym
-from scenes.cli import main
 from scenes.gym.hertz import Hertz
 from scenes.gym.observation import FELT, TRACKED
 from scenes.gym.pressed_model import PressedModel
@@ -314,12 +314,12 @@ def test_hostile_input_is_refused():
 
 
 def test_the_bench_counts_steps(boxed, capsys):
-    words = ["bench", "gym", "debulk", "--anatomy", boxed, "--device", "cpu", "--envs", "2", "--steps", "2"]
+    words = ["benchmarks", "gym", "debulk", "--anatomy", boxed, "--device", "cpu", "--envs", "2", "--steps", "2"]
     assert main([*words, "--repeats", "2", "--size", "32x24", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [(row["task"], row["observation"]) for row in rows] == [("debulk", "states"), ("debulk", "rgbd")]
     assert all(0.0 < row["least"] <= row["median"] <= row["most"] and row["environments"] == 2 for row in rows)
-    assert main([*words, "--repeats", "0"]) == 2 and main(["bench", "gym", "juggle", "--device", "cpu"]) == 2
+    assert main([*words, "--repeats", "0"]) == 2 and main(["benchmarks", "gym", "juggle", "--device", "cpu"]) == 2
     assert "choose one of palpate, retract, debulk" in capsys.readouterr().err
 
 

@@ -7,10 +7,10 @@ import pytest
 from theatres import Silent, small, theatre_of
 from visitor import Visitor, free_port, wait_for
 
+from scenes.page.demo import READING, SCRIPT, Demo
+from scenes.page.referee import Referee
+from scenes.page.requests import HAND
 from scenes.play.deformers import Theatre
-from scenes.play.page.demo import READING, SCRIPT, Demo
-from scenes.play.page.referee import Referee
-from scenes.play.page.requests import HAND
 from scenes.play.player import Player
 from scenes.play.tool_holder import holding
 from scenes.script.tool_paths import press
@@ -29,7 +29,7 @@ def scene():
 
 @pytest.fixture
 def demo(theatre, scene, monkeypatch):
-    monkeypatch.setattr("scenes.play.page.cast.Referee", Silent)
+    monkeypatch.setattr("scenes.page.cast.Referee", Silent)
     demo = Demo(theatre, scene, "linear", "127.0.0.1", free_port())
     demo.wish.set(plays=False)
     yield demo

@@ -43,7 +43,7 @@ theatre = Names(models={"linear": Names(bound=1e-4, left_out=None)}, learned_tis
                 knowing=lambda scene: True, refusals=lambda scene: {}, described=lambda name, scene: name)
 sys.modules["ar.overlay.composite"] = Names(load_kernels=lambda: None)
 sys.modules["sim.runtime.device"] = Names(find_device=lambda *words: None)
-sys.modules["scenes.play.page.demo"] = Names(Demo=Demo)
+sys.modules["scenes.page.demo"] = Names(Demo=Demo)
 scene = Names(name="none", viewpoint=None, elasticity=Names(default=None, regions={}),
               made_of=lambda tissue, element: scene, with_regions=lambda regions: scene)
 sys.modules["scenes.script.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",), demand_scene=len)

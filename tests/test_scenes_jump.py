@@ -10,9 +10,9 @@ import pytest
 from conftest import make_box
 from visitor import Visitor, free_port, wait_for
 
+from scenes.page.demo import Demo
+from scenes.page.referee import Referee
 from scenes.play.deformers import AtRest, Theatre
-from scenes.play.page.demo import Demo
-from scenes.play.page.referee import Referee
 from scenes.play.player import Player
 from scenes.script.scene import Viewpoint, find_scene
 from scenes.script.tool_paths import lay

@@ -19,10 +19,10 @@ from scenes.link.clients import Clients
 from scenes.link.frame import HEADER, BadMessageError, framed, stamp_of
 from scenes.link.messages import points, read_points, string, transform
 from scenes.link.outgoing import Outgoing
-from scenes.play.overlay.follower import Known, State
-from scenes.play.overlay.tool_motion import Motion
-from scenes.script.registration_file import read_registration
 from scenes.script.scene import find_scene
+from scenes.tracked.follower import Known, State
+from scenes.tracked.registration_file import read_registration
+from scenes.tracked.tool_motion import Motion
 from sim.loads import Loads, Touching
 from surrogate.model.learned import predicted
 

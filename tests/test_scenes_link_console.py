@@ -17,8 +17,8 @@ from theatres import template_theatre
 from scenes.link.console import limited, printed
 from scenes.link.frame import stamp_of
 from scenes.link.messages import transform
-from scenes.script.registration_file import read_registration
 from scenes.script.scene import find_scene
+from scenes.tracked.registration_file import read_registration
 
 BEGUN = stamp_of(time.time())
 

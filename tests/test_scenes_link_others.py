@@ -15,21 +15,21 @@ import numpy as np
 import pytest
 from films import FILM, follower_of, truth_of
 from links import HOST, NAMES, in_mm, linked, peers, played
+from programs import main
 from theatres import template_theatre
 
 from ar.overlay.outlines import ink_of, silhouette
 from ar.overlay.refind import of_ink, outline_gap
 from ar.tracking.pictures import film_of
-from scenes.cli import main
 from scenes.link.frame import HEADER, read_header, stamp_of
 from scenes.link.heard import Names
 from scenes.link.messages import image, read_image, transform
 from scenes.link.session import Eye
-from scenes.play.overlay.picture import Painter
 from scenes.play.stage import TUMOUR_COLOUR
-from scenes.script.registration_file import read_registration
 from scenes.script.scene import find_scene
 from scenes.script.shipped_files import template_path
+from scenes.tracked.picture import Painter
+from scenes.tracked.registration_file import read_registration
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -296,5 +296,5 @@ def test_what_cannot_be_served_is_refused(words, why, capsys):
 
 
 def test_a_bench_of_no_poses_is_refused(capsys):
-    assert main(["bench", "link", "--rate", "0"]) == 2
+    assert main(["benchmarks", "link", "--rate", "0"]) == 2
     assert "--rate and --seconds" in capsys.readouterr().err

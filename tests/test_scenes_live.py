@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from conftest import make_box
 
-from scenes.bench import live
-from scenes.bench.budget import PROMISED
-from scenes.bench.live import RIDES, WARM_UP, Frame, Ride, errors, frames_of, loads_of, tally
-from scenes.cli import main
+from benchmarks.__main__ import main
+from benchmarks.studies import live
+from benchmarks.studies.live import RIDES, WARM_UP, Frame, Ride, errors, frames_of, loads_of, tally
+from scenes.analysis.budget import PROMISED
 from scenes.script.scene import find_scene
 from scenes.script.site import site_of
 from scenes.script.tool_paths import wander
@@ -93,7 +93,7 @@ def test_the_tally_counts_what_happened(site, pretender):
 
 def test_the_command_tells_every_tool(site, tmp_path, capsys, monkeypatch):
     write_anatomy(tmp_path / "box.vtu", site.anatomy)
-    words = ["bench", "live", "--anatomy", str(tmp_path / "box.vtu"), "--frames", "3", "--checked", "2"]
+    words = ["live", "--anatomy", str(tmp_path / "box.vtu"), "--frames", "3", "--checked", "2"]
     assert main([*words, "--device", "cpu", "--json"]) == 0
     rides = json.loads(capsys.readouterr().out)["rides"]
     assert [item["ride"] for item in rides] == [ride.name for ride in RIDES]
@@ -108,10 +108,10 @@ def test_the_command_tells_every_tool(site, tmp_path, capsys, monkeypatch):
 
 
 def test_bad_input_is_a_sentence(tmp_path, capsys):
-    assert main(["bench", "live", "--frames", "3", "--checked", "4"]) == 2
+    assert main(["live", "--frames", "3", "--checked", "4"]) == 2
     assert "--checked 4" in capsys.readouterr().err
-    assert main(["bench", "live", "--frames", "0"]) == 2
+    assert main(["live", "--frames", "0"]) == 2
     assert "--frames is 0: give a whole number from 1 up" in capsys.readouterr().err
     write_anatomy(tmp_path / "small.vtu", make_box(opening=9e-3))
-    assert main(["bench", "live", "--anatomy", str(tmp_path / "small.vtu")]) == 2
+    assert main(["live", "--anatomy", str(tmp_path / "small.vtu")]) == 2
     assert "larger craniotomy" in capsys.readouterr().err

@@ -7,7 +7,7 @@ import pytest
 from balls import ball
 
 from scenes.cli import main
-from scenes.commands.placement_options import point_or_file
+from scenes.options.placement_options import point_or_file
 from sim.bodies.markups import read_markup
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.placement import within_outline

@@ -19,21 +19,21 @@ from ar.tracking.pose_stream import AHEAD, DAY, LONGEST, stream_of
 from ar.tracking.rigid import moved_about
 from ar.tracking.targets import patient_reference
 from scenes.cli import main
-from scenes.play.overlay.agreement import Agreement
-from scenes.play.overlay.elsewhere import Elsewhere, Eye
-from scenes.play.overlay.follower import Follower, State
-from scenes.play.overlay.picture import head_lines
-from scenes.play.overlay.plausible import buried
-from scenes.play.overlay.run import timed
-from scenes.play.overlay.tool_motion import ToolMotion
-from scenes.play.overlay.words import overlay_error
-from scenes.script.calibration_file import read_calibration, read_intrinsic_covariance, write_exactly_known
-from scenes.script.film_truth import read_truth
-from scenes.script.hand_eye_file import read_hand_eye
-from scenes.script.pose_file import TrackedRow, read_stream, write_poses
-from scenes.script.registration_file import read_registration
 from scenes.script.scene import find_scene
-from scenes.script.tracked_tool import read_tool
+from scenes.tracked.agreement import Agreement
+from scenes.tracked.calibration_file import read_calibration, read_intrinsic_covariance, write_exactly_known
+from scenes.tracked.elsewhere import Elsewhere, Eye
+from scenes.tracked.film_truth import read_truth
+from scenes.tracked.follower import Follower, State
+from scenes.tracked.hand_eye_file import read_hand_eye
+from scenes.tracked.picture import head_lines
+from scenes.tracked.plausible import buried
+from scenes.tracked.pose_file import TrackedRow, read_stream, write_poses
+from scenes.tracked.registration_file import read_registration
+from scenes.tracked.run import timed
+from scenes.tracked.tool_motion import ToolMotion
+from scenes.tracked.tracked_tool import read_tool
+from scenes.tracked.words import overlay_error
 from sim.errors import InputError
 
 FILM = Path(__file__).parent / "data" / "film"
@@ -294,7 +294,7 @@ class Still:
     """A deformer of a brain that does not move."""
 
     def deform(self, loads, start=None, at=None):
-        from scenes.play.overlay.drawn_film import Dent
+        from scenes.tracked.drawn_film import Dent
 
         found = Dent(template_theatre().anatomy, template_theatre().site).deform(loads)
         return replace(found, displacement=0.0 * found.displacement)

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from boxes import base_held, top_forces
 from boxes import box as cube
+from programs import main
 
 from ar.optics.calibration import Calibration
 from ar.screen import signature, write_film, write_png
 from ar.tracking.pages import Page, listed_targets, png_bytes
 from ar.tracking.registration import Registration
-from scenes.cli import main
 from scenes.commands.companion_files import demand_no_strangers, remove_data, strangers
-from scenes.commands.outputs import KINDS, claimed, claimed_frames, recognised
 from scenes.episodes.exports.card import LICENCE
-from scenes.play.overlay.rows import write_rows
-from scenes.script.calibration_file import write_calibration
-from scenes.script.film_truth import Truth, write_table, write_truth
-from scenes.script.registration_file import write_registration
-from scenes.script.tracked_tool import TrackedTool, write_tool
+from scenes.options.outputs import KINDS, claimed, claimed_frames, recognised
+from scenes.tracked.calibration_file import write_calibration
+from scenes.tracked.film_truth import Truth, write_table, write_truth
+from scenes.tracked.registration_file import write_registration
+from scenes.tracked.rows import write_rows
+from scenes.tracked.tracked_tool import TrackedTool, write_tool
 from sim.bodies.intensity import Intensity, sidecar, write_intensity
 from sim.bodies.meshfile import read_mesh, write_anatomy, write_mesh
 from sim.errors import InputError
@@ -40,7 +40,7 @@ WRITING = {
     "patient": (["patient", "none.nii.gz", "--brain", "1", "--tumour", "2"], "x.vtu"),
     "collect": (["collect", "press", "--anatomy", "none.vtu"], "x.h5"),
     "sensitivity": (["sensitivity", "--anatomy", "none.vtu"], "x.csv"),
-    "bench growth": (["bench", "growth", "--element", "p1"], "x.png"),
+    "growth": (["benchmarks", "growth", "--element", "p1"], "x.png"),
 }
 FOLDERS = {
     "scenes": (["scenes", "--anatomy", "none.vtu"], "sheet.png"),

@@ -19,16 +19,16 @@ from ar.rendering.real_picture import real_picture
 from ar.tracking.live_camera import camera_pictures, newest
 from ar.tracking.pictures import Named, film_of
 from scenes.cli import main
-from scenes.play.overlay.follower import HELD, State
-from scenes.play.overlay.picture import Painter
-from scenes.play.overlay.plausible import implausible
-from scenes.play.overlay.run import Timed, aged, overlaid, paced, timed
-from scenes.play.overlay.tool_motion import ToolMotion
-from scenes.play.overlay.truth import off, summary
 from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
-from scenes.script.calibration_file import read_calibration
-from scenes.script.film_truth import read_truth
 from scenes.script.scene import find_scene
+from scenes.tracked.calibration_file import read_calibration
+from scenes.tracked.film_truth import read_truth
+from scenes.tracked.follower import HELD, State
+from scenes.tracked.picture import Painter
+from scenes.tracked.plausible import implausible
+from scenes.tracked.run import Timed, aged, overlaid, paced, timed
+from scenes.tracked.tool_motion import ToolMotion
+from scenes.tracked.truth import off, summary
 from sim.errors import InputError
 from sim.loads import Touching
 from surrogate.model.learned import predicted

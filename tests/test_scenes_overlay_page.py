@@ -17,11 +17,11 @@ from ar.page.aside import KEYS, TABS
 from ar.page.sight import HISTORY, PICTURE, SAID, SLICES
 from ar.tracking.pictures import film_of
 from scenes.cli import main
-from scenes.play.overlay.follower import State
-from scenes.play.overlay.page import OverlayPage
-from scenes.play.overlay.picture import Painter
-from scenes.play.overlay.seekable_film import SeekableFilm
 from scenes.script.scene import find_scene
+from scenes.tracked.follower import State
+from scenes.tracked.page import OverlayPage
+from scenes.tracked.picture import Painter
+from scenes.tracked.seekable_film import SeekableFilm
 
 
 @pytest.fixture(scope="module")

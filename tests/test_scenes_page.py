@@ -8,14 +8,14 @@ import pytest
 from theatres import short, sinking, small, theatre_of
 
 from ar.page.parts import Choice, Fold, Slider
+from scenes.page.beside import TIP, TUMOUR_MIDDLE, lines_of, sample_of, slices_of
+from scenes.page.controls import clocked, controls
+from scenes.page.referee import Truth
+from scenes.page.requests import Wish
+from scenes.page.text import RESEARCH, about, fem_words, plan_words, report, side, trust, words
+from scenes.page.verdict import Judged, judge, verdict_words
 from scenes.play.deformers import GUARDED, plan_of
 from scenes.play.load_text import doubt_of
-from scenes.play.page.beside import TIP, TUMOUR_MIDDLE, lines_of, sample_of, slices_of
-from scenes.play.page.controls import clocked, controls
-from scenes.play.page.referee import Truth
-from scenes.play.page.requests import Wish
-from scenes.play.page.text import RESEARCH, about, fem_words, plan_words, report, side, trust, words
-from scenes.play.page.verdict import Judged, judge, verdict_words
 from scenes.play.player import Player
 from scenes.play.stage import Stage
 from scenes.play.waiting_notice import NOTICED, Busy

@@ -13,12 +13,12 @@ from conftest import make_box
 from theatres import sinking
 from visitor import free_port
 
+from scenes.page.demo import Demo
+from scenes.page.referee import Referee
+from scenes.page.requests import HAND, SCRIPT
+from scenes.page.view import move_bodies
 from scenes.play.deformers import AtRest, Theatre
 from scenes.play.effect_ablation import without
-from scenes.play.page.demo import Demo
-from scenes.play.page.referee import Referee
-from scenes.play.page.requests import HAND, SCRIPT
-from scenes.play.page.view import move_bodies
 from scenes.play.player import Frame, Player
 from scenes.play.replay import IN_ORDER, Course, Reel, Session, course_of
 from scenes.script.debulking import Debulking
@@ -234,7 +234,7 @@ class TestPages:
             shown[owners[browser]].append(frame)
             move_bodies(browser, frame, player)
 
-        monkeypatch.setattr("scenes.play.page.demo.move_bodies", moved)
+        monkeypatch.setattr("scenes.page.demo.move_bodies", moved)
 
         def seen(page: Demo, **wishes: object) -> Deformation:
             shown[page].clear()

@@ -11,10 +11,10 @@ import pytest
 from test_sim_necrosis import hollowed, necrotic_labels
 from theatres import short, small
 
-from scenes.bench.uncertainty import changed, tissue_of
+from scenes.analysis.uncertainty import changed, tissue_of
 from scenes.builtin.retract import RELAXING
 from scenes.cli import main
-from scenes.commands.tissue_options import add_element_argument, add_tissue_arguments, dressed
+from scenes.options.tissue_options import add_element_argument, add_tissue_arguments, dressed
 from scenes.play.deformers import open_theatre
 from scenes.report.finite_elements import tissue_of as tissue_of_law
 from scenes.report.study import Study

@@ -12,7 +12,7 @@ from poison import poisoned
 from studies import TISSUE, nothing, read_back, study_of
 
 from ar.screen import read_png
-from scenes.bench.process_memory import peak_memory
+from scenes.analysis.process_memory import peak_memory
 from scenes.cli import main
 from scenes.report.adaptation import debulked, debulked_study, simulate_debulked, simulating_seconds
 from scenes.report.artefact_time import series_seconds, tabulate_series

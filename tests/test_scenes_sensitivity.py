@@ -11,8 +11,8 @@ import pytest
 from conftest import make_box
 from theatres import knowing_nothing
 
-from scenes.bench.sensitivity import Study, change, moved_alike, rows
-from scenes.bench.sensitivity_variants import Aim, Body, aimed, variants
+from scenes.analysis.sensitivity import Study, change, moved_alike, rows
+from scenes.analysis.sensitivity_variants import Aim, Body, aimed, variants
 from scenes.cli import main
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL

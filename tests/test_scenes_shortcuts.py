@@ -1,4 +1,4 @@
-"""`sulcus bench shortcuts`: both solvers answer the same loads, and only what a solver has is measured."""
+"""`python -m benchmarks shortcuts`: both solvers answer the same loads, and only what a solver has is measured."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenes.bench import shortcuts
-from scenes.bench.shortcuts import Row, Work, measure, works
-from scenes.cli import main
+from benchmarks.__main__ import main
+from benchmarks.studies import shortcuts
+from benchmarks.studies.shortcuts import Row, Work, measure, works
 from scenes.script.site import Site, site_of
 from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
@@ -81,10 +81,10 @@ def test_the_command_prints_what_was_measured(
     found = iter([row, None])
     monkeypatch.setattr(shortcuts, "works", lambda *known: [1, 2])
     monkeypatch.setattr(shortcuts, "measure", lambda *known: next(found))
-    assert main(["bench", "shortcuts", "--device", "cpu", "--json"]) == 0
+    assert main(["shortcuts", "--device", "cpu", "--json"]) == 0
     captured = capsys.readouterr()
     (said,) = json.loads(captured.out)["rows"]
     assert (said["ratio"], said["ratio_of_totals"]) == (2.5, 1.5)
     assert "| short | work | 4 | 2, 3 | 5, 6 | 2.50 | 1.50 |" in captured.err
-    assert main(["bench", "shortcuts", "--runs", "0"]) == 2
+    assert main(["shortcuts", "--runs", "0"]) == 2
     assert "--runs" in capsys.readouterr().err

@@ -13,13 +13,13 @@ from ar.optics.camera import look_at
 from ar.optics.rolling_shutter import row_bands, row_time, time_of_point
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Lamp, Renderer
-from scenes.play.overlay.filming import Taking, mounted, registered, shots_of
-from scenes.play.overlay.follower import Follower, State
-from scenes.play.overlay.tool_motion import ToolMotion
 from scenes.play.player import Player
 from scenes.script.camera_paths import HandHeld
-from scenes.script.reference_place import USUAL, VIEW
 from scenes.script.scene import find_scene
+from scenes.tracked.filming import Taking, mounted, registered, shots_of
+from scenes.tracked.follower import Follower, State
+from scenes.tracked.reference_place import USUAL, VIEW
+from scenes.tracked.tool_motion import ToolMotion
 from sim.anatomy import Anatomy
 from surrogate.model.learned import predicted
 

@@ -12,11 +12,11 @@ from ar.overlay.hud import FINE, NARROW, bound_words, folded, millimetres
 from ar.overlay.outlines import ink_of
 from ar.overlay.refind import of_ink, stands
 from scenes.cli import main
+from scenes.page.text import estimated, legend, report
 from scenes.play.checks import measure, objections, within
 from scenes.play.deformers import Theatre, open_theatre
 from scenes.play.label import labelled
 from scenes.play.observer import ELLIPSOID_COLOUR, Observer
-from scenes.play.page.text import estimated, legend, report
 from scenes.play.player import REFUSED
 from scenes.play.reference import truth_of
 from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR

@@ -5,10 +5,10 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+from programs import main
 from theatres import coarse_brain
 
-from scenes.bench.skull_models import rows
-from scenes.cli import main
+from benchmarks.studies.skull_models import rows
 from sim.accuracy import TRAIN
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
@@ -37,7 +37,7 @@ def test_the_bench_measures_what_it_says(brain, capsys):
     """By the bench, and by finite elements and a mean over the tumour's volume put together here."""
     path, anatomy = brain
     words = [path, "--loads", "2", "--poisson", "0.49", "--device", "cpu", "--json"]
-    assert main(["bench", "skull", *words]) == 0
+    assert main(["benchmarks", "skull", *words]) == 0
     bonded, slide = json.loads(capsys.readouterr().out)["rows"]
     assert (bonded["skull"], slide["skull"], bonded["failed"]) == ("bonded", "slide", 0)
     assert abs(slide["motion"] / bonded["motion"] - 1.0) > 0.02
@@ -55,7 +55,7 @@ def test_the_bench_measures_what_it_says(brain, capsys):
 
 def test_a_skull_that_only_presses_lets_the_tumour_go_farther_than_one_that_holds(brain, capsys):
     words = [brain[0], "--loads", "1", "--poisson", "0.45", "--device", "cpu", "--json"]
-    assert main(["bench", "skull", *words, "--skulls", "bonded", "tearing", "pressing"]) == 0
+    assert main(["benchmarks", "skull", *words, "--skulls", "bonded", "tearing", "pressing"]) == 0
     bonded, tearing, pressing = json.loads(capsys.readouterr().out)["rows"]
     assert bonded["bond"] < 1.0 and tearing["motion"] == pytest.approx(bonded["motion"], rel=1e-6)
     assert pressing["motion"] > 1.1 * bonded["motion"] and pressing["leaked"] is None and pressing["bond"] == 0.0
@@ -65,8 +65,8 @@ def test_a_tear_that_does_not_come_to_rest_is_in_no_figure(brain, capsys, monkey
     path, anatomy = brain
     (row,) = rows([anatomy], ["pressing"], [0.45], draw("palpation", anatomy, 1, 0), "cpu", Tearing(rounds=1))
     assert row.failed == 1 and row.bond is None
-    monkeypatch.setattr("scenes.bench.skull_models.rows", lambda *words: iter([row]))
-    assert main(["bench", "skull", path, "--loads", "1", "--device", "cpu", "--json"]) == 1
+    monkeypatch.setattr("benchmarks.studies.skull_models.rows", lambda *words: iter([row]))
+    assert main(["benchmarks", "skull", path, "--loads", "1", "--device", "cpu", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["rows"] == [asdict(row) | {"motion": pytest.approx(np.nan, nan_ok=True)}]
 
 
@@ -84,7 +84,7 @@ def test_skull_rows_under_strained_loads_count_them(brain):
     ("words", "reason"), [(["--loads", "0"], "--loads is 0: give a whole"), (["--device", "tpu"], "no device")]
 )
 def test_what_cannot_be_measured_is_a_sentence(brain, capsys, words, reason):
-    assert main(["bench", "skull", brain[0], *words]) == 2
+    assert main(["benchmarks", "skull", brain[0], *words]) == 2
     assert reason in capsys.readouterr().err
 
 

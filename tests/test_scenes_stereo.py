@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from programs import main
 from theatres import template_theatre
 
 from ar.overlay.outlines import silhouette
-from scenes.bench.stereo_study import row
-from scenes.cli import main
+from benchmarks.studies.stereo_study import row
 from scenes.play.deformers import AtRest
 from scenes.play.player import REFUSED, Player
 from scenes.play.stereo_observer import StereoObserver
@@ -203,5 +203,5 @@ def test_a_study_sums_up_what_was_refused_too(observer, moved):
 
 
 def test_the_bench_asks_for_a_scene_that_two_eyes_see(capsys):
-    assert main(["bench", "microscope", "--scene", "sag", "--device", "cpu"]) == 2
+    assert main(["benchmarks", "microscope", "--scene", "sag", "--device", "cpu"]) == 2
     assert "no pair of eyes sees the scene sag" in capsys.readouterr().err

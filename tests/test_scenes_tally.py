@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable
 
-from scenes.play.page.tally import RECENT, Row, Tally
-from scenes.play.page.text import table
+from scenes.page.tally import RECENT, Row, Tally
+from scenes.page.text import table
 from surrogate.evaluation.choose import unbeaten
 
 

@@ -1,4 +1,4 @@
-"""`sulcus bench throughput`: a row for each tissue and set of loads, every count and second accounted for."""
+"""`python -m benchmarks throughput`: a row for each tissue and set of loads, every count and second accounted for."""
 
 import json
 from dataclasses import replace
@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 from conftest import make_box
 
-from scenes.bench.robustness import Trial
-from scenes.bench.throughput import Row, checked, drawn, rows, together
-from scenes.cli import main
+from benchmarks.__main__ import main
+from benchmarks.studies.robustness import Trial
+from benchmarks.studies.throughput import Row, checked, drawn, rows, together
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome
 from sim.fem import Fem
@@ -28,7 +28,7 @@ def words(tmp_path_factory, box):
     """The command on the box."""
     path = tmp_path_factory.mktemp("throughput") / "box.vtu"
     write_anatomy(path, box)
-    return ["bench", "throughput", "--anatomy", str(path), "--device", "cpu", "--laws", "stable-neo-hookean"]
+    return ["throughput", "--anatomy", str(path), "--device", "cpu", "--laws", "stable-neo-hookean"]
 
 
 def test_a_row_for_each_tissue_and_set(words, capsys):

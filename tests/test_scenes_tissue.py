@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from boxes import box, top_forces
 from oracle import internal_forces
+from programs import main
 
-from scenes.cli import main
-from scenes.commands.tissue_options import add_tissue_arguments, regions_of, stiffness_doubt, tissue_of
+from scenes.options.tissue_options import add_tissue_arguments, regions_of, stiffness_doubt, tissue_of
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
@@ -155,7 +155,7 @@ def test_the_help_of_solve_names_every_tissue_with_its_source(capsys: pytest.Cap
     assert all(law in said for law in LAWS)
 
 
-@pytest.mark.parametrize("command", ["simulate", "demo", "effects", "bench robust", "bench live"])
+@pytest.mark.parametrize("command", ["simulate", "demo", "effects", "benchmarks robust", "benchmarks live"])
 def test_other_helps_name_the_tissues_and_say_where_more_stands(command: str, capsys: pytest.CaptureFixture) -> None:
     said = help_on_tissue(capsys, *command.split())
     words = " ".join(said.replace("-\n", "-").split())

@@ -2,9 +2,9 @@
 
 import pytest
 
-from scenes.bench.recorded_rows import append_rows, read_rows
-from scenes.bench.robustness import Record
-from scenes.bench.scaling import Row
+from benchmarks.studies.recorded_rows import append_rows, read_rows
+from benchmarks.studies.robustness import Record
+from benchmarks.studies.scaling import Row
 from scenes.report.artefact_time import note_seconds, noted_seconds
 from sim.errors import InputError
 

@@ -15,9 +15,9 @@ from ar.optics.calibration import Calibration
 from ar.tracking.pictures import film_of, pictures_of
 from ar.tracking.targets import TIP
 from scenes.cli import main
-from scenes.script.calibration_file import read_calibration, write_calibration
-from scenes.script.followed import followed
-from scenes.script.pose_file import COVARIANCE, read_poses
+from scenes.tracked.calibration_file import read_calibration, write_calibration
+from scenes.tracked.followed import followed
+from scenes.tracked.pose_file import COVARIANCE, read_poses
 
 PLATE_AT = flat((20.0, 15.0, 5.0), (-0.08, 0.0, 0.28))
 TIP_AT = np.array([0.0, 0.0, -TIP, 1.0])

@@ -8,10 +8,10 @@ import pytest
 from theatres import template_theatre
 
 from scenes.cli import main
-from scenes.play.overlay.drawn_film import drawn_film
-from scenes.play.overlay.follower import Follower, State
-from scenes.play.overlay.picture import Painter
-from scenes.play.overlay.tracking_checks import TrackingFigures, measure_tracking, usual
+from scenes.tracked.drawn_film import drawn_film
+from scenes.tracked.follower import Follower, State
+from scenes.tracked.picture import Painter
+from scenes.tracked.tracking_checks import TrackingFigures, measure_tracking, usual
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def test_check_exit_status_is_1_where_tracking_alone_fails(film, parts, monkeypa
     names = {"drawn_film.drawn_film": film, "tracking_checks.usual": parts}
     names["tracking_checks.measure_tracking"] = TrackingFigures(16, 1, 0, 0.0, 0.0)
     for name, found in names.items():
-        monkeypatch.setattr(f"scenes.play.overlay.{name}", lambda *given, found=found: found)
+        monkeypatch.setattr(f"scenes.tracked.{name}", lambda *given, found=found: found)
     assert main(["check", "tracking", "--device", "cpu", "--json"]) == 1
     said = json.loads(capsys.readouterr().out)
     assert not said["passed"] and said["scenes"] == [] and len(said["tracking"]["broken"]) == 1

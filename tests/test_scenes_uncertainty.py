@@ -9,7 +9,7 @@ from theatres import put, short, small, theatre_of
 
 from ar.overlay.hud import FINE, NARROW, folded, millimetres
 from ar.overlay.refind import stands
-from scenes.bench.uncertainty import (
+from scenes.analysis.uncertainty import (
     Motions,
     Solved,
     causes,
@@ -393,7 +393,7 @@ def test_other_tissues_are_refused(theatre, tmp_path, monkeypatch, capsys):
     scene = short().made_of(MATERIALS["minutes"].tissue, None)
     with pytest.raises(InputError, match="Young's modulus"):
         changed(scene, SAME)
-    monkeypatch.setattr("scenes.bench.uncertainty.nominal", None)  # before anything is solved
+    monkeypatch.setattr("scenes.analysis.uncertainty.nominal", None)  # before anything is solved
     out = tmp_path / "found.json"
     assert main(["uncertainty", "press", "--material", "minutes", "--device", "cpu", "--out", str(out)]) == 2
     assert "the scene press has another tissue: ogden" in capsys.readouterr().err

@@ -10,8 +10,8 @@ import pytest
 import ar.overlay.hud
 from ar.overlay.outlines import outlines, silhouette
 from ar.overlay.styles import Style
+from scenes.page.demo import pictured
 from scenes.play.deformers import open_theatre
-from scenes.play.page.demo import pictured
 from scenes.play.player import Player, gauged
 from scenes.play.stage import TOOL
 from scenes.script.scene import find_scene

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenes.bench.locate_study import PointsSeen, observed
+from benchmarks.studies.locate_study import PointsSeen, observed
 from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.open_cortex import open_cortex

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from theatres import player, small, theatre_of
 
-from scenes.commands.theatre_options import add_theatre, theatre_asked
+from scenes.options.theatre_options import add_theatre, theatre_asked
+from scenes.page.cast import ALL, Cast
 from scenes.play.deformers import GUARDED, AtRest
-from scenes.play.page.cast import ALL, Cast
 from scenes.script.tool_paths import Touch
 from sim.deformation import Outcome
 from sim.errors import InputError

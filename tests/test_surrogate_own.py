@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import main
 
-from scenes.cli import main
 from scenes.play.deformers import GUARDED
 from sim.accuracy import TRAIN
 from sim.bodies.meshfile import write_anatomy
@@ -89,7 +89,7 @@ def test_a_file_brings_one_that_is_trained_stored_and_plays(folder, box, monkeyp
         assert all(not file[name].dtype.hasobject for name in file.files)
 
 
-READING = "train judge export patient scenes effects demo render collect sensitivity check bench-stages"
+READING = "train judge export patient scenes effects demo render collect sensitivity check benchmarks-stages"
 
 
 @pytest.mark.parametrize("command", READING.split())

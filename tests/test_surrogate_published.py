@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from programs import main
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from scenes.cli import main
 from sim.deformation import Deformer, Outcome
 from sim.errors import InputError
 from sim.loads import Displaced, Loads, Pushed, push
@@ -239,7 +239,7 @@ def test_damping_that_rounding_swallows_leaves_no_singular_matrix():
 
 def test_the_command_scores_them(pretender, loads, tmp_path, capsys):
     simulate(tmp_path / "data.h5", pretender, loads, {"preset": "seed"})
-    words = ["bench", "published", str(tmp_path / "data.h5"), "--learners", "published-svr", "--count", "90"]
+    words = ["benchmarks", "published", str(tmp_path / "data.h5"), "--learners", "published-svr", "--count", "90"]
     assert main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["loads"] == 90 and said["rows"][0]["name"] == "svr" and said["rows"][0]["seconds"] > 0.0

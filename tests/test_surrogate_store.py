@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from scenes.commands.companion_files import stated as stated_beside
-from scenes.commands.outputs import model_header, recognised
-from scenes.script.film_truth import read_truth
+from scenes.options.outputs import model_header, recognised
+from scenes.tracked.film_truth import read_truth
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from surrogate.data.dataset import read_dataset

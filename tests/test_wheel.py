@@ -27,7 +27,7 @@ def ran(*words, **where):
 def wheel(tmp_path_factory):
     """Built from a copy: a build leaves folders in its source."""
     folder = tmp_path_factory.mktemp("wheel")
-    for room in (*ROOMS, "tests"):
+    for room in (*ROOMS, "benchmarks", "tests"):
         shutil.copytree(HOUSE / room, folder / "source" / room, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(HOUSE / name, folder / "source")

@@ -4,7 +4,7 @@ import felupe
 import numpy as np
 from symmetric import solve as solve_symmetric
 
-from scenes.bench.engine_process import Case, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve
 
 
 def set_up(case: Case) -> Solve:

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 from symmetric import Factor
 
-from scenes.bench.engine_process import Case, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve
 
 STEPS, TRIALS = 500, 8
 SLOPE_LEFT = 0.5

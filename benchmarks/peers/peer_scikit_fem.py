@@ -6,7 +6,7 @@ from skfem import solve as solve_linear
 from skfem.helpers import ddot, det, grad, inv, mul, trace, transpose
 from symmetric import solve as solve_symmetric
 
-from scenes.bench.engine_process import Case, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve
 
 STEPS, HALVINGS = 30, 10
 

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from scenes.bench.engine_process import Case, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve
 
 wp.config.enable_backward = False
 wp.config.log_level = wp.LOG_ERROR

@@ -5,7 +5,7 @@ import torch
 from torchfem import Solid
 from torchfem.materials import Hyperelastic3D
 
-from scenes.bench.engine_process import Case, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve
 
 
 def psi(F: torch.Tensor, lame: torch.Tensor) -> torch.Tensor:

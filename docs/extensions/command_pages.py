@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterator
 from functools import partial
 
+from benchmarks.__main__ import BENCHMARKS, make_parser
 from scenes.cli import COMMANDS, make_parsers
 
 WIDTH = 72
@@ -16,7 +17,7 @@ def command_page() -> str:
     """A page in Markdown: a section for each command, with its usage, its arguments and its examples."""
     _, parsers = make_parsers(*COMMANDS)
     whole = ["# Command line", "What `sulcus COMMAND --help` prints, of every command. In words: {doc}`/commands`."]
-    for name, parser in parsers.items():
+    for name, parser in {**parsers, "python -m benchmarks": make_parser(*BENCHMARKS)}.items():
         whole += _section(name, parser, "##")
     return "\n\n".join(whole) + "\n"
 

@@ -24,11 +24,11 @@ from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh, dihedral_angles
 from sim.runtime.timing import stage
 
+from ..options.drawn_options import add_drawn_arguments, demand_no_drawn, drawn, source
+from ..options.label_options import add_label_arguments, regions_asked, sources_of
+from ..options.outputs import add_force, claimed
+from ..options.placement_options import add_opening_arguments, opened, opened_over
 from .companion_files import demand_no_strangers
-from .drawn_options import add_drawn_arguments, demand_no_drawn, drawn, source
-from .label_options import add_label_arguments, regions_asked, sources_of
-from .outputs import add_force, claimed
-from .placement_options import add_opening_arguments, opened, opened_over
 
 # Lengths in millimetres, as on the command line.
 DEFAULTS = {

@@ -17,15 +17,15 @@ from sim.arguments import at_least
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
-from .camera_options import add_camera, filmed_with_targets
-from .json_line import json_line
-from .theatre_options import add_bodies, scene_asked
-from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
+from ..options.camera_options import add_camera, filmed_with_targets
+from ..options.json_line import json_line
+from ..options.theatre_options import add_bodies, scene_asked
+from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
 
-    from ..bench.error_budget import Budget, Errors, Filmed
+    from ..analysis.error_budget import Budget, Errors, Filmed
     from ..play.deformers import Theatre
     from ..script.priors import Draw
     from ..script.scene import Scene
@@ -94,12 +94,12 @@ def run(args: argparse.Namespace) -> int:
     InputError
         What cannot be read, numbers out of range, or a scene that cannot be solved.
     """
-    from ..bench.error_budget import Filmed, budgeted, moment_of, velocity_at
-    from ..bench.uncertainty import mesh_errors, nominal, parts
+    from ..analysis.error_budget import Filmed, budgeted, moment_of, velocity_at
+    from ..analysis.uncertainty import mesh_errors, nominal, parts
     from ..play.deformers import open_theatre
     from ..play.stage import Stage
-    from ..script.reference_place import reference_beside
-    from ..script.registration_file import other_mesh, read_registration
+    from ..tracked.reference_place import reference_beside
+    from ..tracked.registration_file import other_mesh, read_registration
 
     at_least("--draws", args.draws, FEWEST)
     at_least("--samples", args.samples, FEWEST_SAMPLES)
@@ -151,7 +151,7 @@ def _seen(args: argparse.Namespace, theatre: Theatre) -> Scene:
     InputError
         A scene whose tumour is found by what is seen, or whose tissue is none that is drawn; a camera that zooms.
     """
-    from ..bench.uncertainty import tissue_of
+    from ..analysis.uncertainty import tissue_of
 
     scene = scene_asked(args, args.scene, theatre)
     if scene.sight is not None:
@@ -178,7 +178,7 @@ def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
     InputError
         A file that is missing, no such covariance, or of another camera.
     """
-    from ..bench.tracking_errors import usual_covariance
+    from ..analysis.tracking_errors import usual_covariance
 
     path = args.intrinsics
     if path is None:
@@ -204,7 +204,7 @@ def _bodies(args: argparse.Namespace, theatre: Theatre, scene: Scene, count: int
     InputError
         Too few have one.
     """
-    from ..bench.uncertainty import enough_of, ensemble
+    from ..analysis.uncertainty import enough_of, ensemble
     from ..script.priors import drawn
 
     draws = drawn(count, seed)
@@ -214,7 +214,7 @@ def _bodies(args: argparse.Namespace, theatre: Theatre, scene: Scene, count: int
 
 def _at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """How the tumour's surface moves in each body at a moment, and what their meshes and own ones are off by."""
-    from ..bench.uncertainty import mesh_errors, mesh_prior, skull_of
+    from ..analysis.uncertainty import mesh_errors, mesh_prior, skull_of
 
     draws = [draw for draw, _ in bodies]
     own = mesh_prior(scene, skull_of(scene)).range[1] * np.array([draw.mesh for draw in draws])
@@ -230,7 +230,7 @@ def _promised(theatre: Theatre, scene: Scene, time: float) -> float:
 
 def _flat(args: argparse.Namespace, filmed: Filmed, found: Budget, split: dict[str, float]) -> dict[str, Any]:
     """All figures [mm, pixel]."""
-    from ..bench.error_budget import PARAMETERS
+    from ..analysis.error_budget import PARAMETERS
 
     calibration, rows = filmed.calibration, found.alone | {"technical": found.technical, "clinical": found.clinical}
     inside = {name: 1e3 * split[name] for name in sorted(split, key=lambda name: -split[name]) if name not in rows}

@@ -14,9 +14,9 @@ import numpy as np
 
 from sim.errors import InputError
 
-from .camera_options import size
-from .json_line import json_line
-from .outputs import add_force, claimed
+from ..options.camera_options import size
+from ..options.json_line import json_line
+from ..options.outputs import add_force, claimed
 
 if TYPE_CHECKING:
     from ar.tracking.hand_eye import HandEye
@@ -85,8 +85,8 @@ def _camera(args: argparse.Namespace) -> int:
     from ar.tracking.intrinsics import calibrated
     from ar.tracking.targets import calibration_board
 
-    from ..script.board_pictures import seen_views
-    from ..script.calibration_file import SUFFIXES, intrinsics_header, write_calibration
+    from ..tracked.board_pictures import seen_views
+    from ..tracked.calibration_file import SUFFIXES, intrinsics_header, write_calibration
 
     if not args.out:
         raise InputError("give --out K.yaml for the camera.")
@@ -151,7 +151,7 @@ def _tip(args: argparse.Namespace) -> int:
     """A tool's tip, from its poses while it pivots."""
     from ar.tracking.pivot import pivoted
 
-    from ..script.pose_file import read_numbered_poses
+    from ..tracked.pose_file import read_numbered_poses
 
     rows, _, poses = read_numbered_poses(args.pivot)
     found = _fitted(pivoted, [args.pivot], [poses], rows)
@@ -211,7 +211,7 @@ def _bodies(args: argparse.Namespace) -> int:
     """How one body lies in another, from poses of both."""
     from ar.tracking.hand_eye import hand_eye
 
-    from ..script.pose_file import read_numbered_poses
+    from ..tracked.pose_file import read_numbered_poses
 
     one, other = args.hand_eye
     (rows, times, first), (_, again, second) = read_numbered_poses(one), read_numbered_poses(other)

@@ -14,9 +14,9 @@ from sim.accuracy import TRAIN
 from sim.arguments import at_least
 from sim.errors import InputError
 
-from .camera_options import add_camera, filmed
-from .style_option import add_style
-from .theatre_options import add_theatre, deformer_name, playable, scene_asked, theatre_asked
+from ..options.camera_options import add_camera, filmed
+from ..options.style_option import add_style
+from ..options.theatre_options import add_theatre, deformer_name, playable, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
     from sim.deformation import Deformation
@@ -111,8 +111,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _tracking(args: argparse.Namespace, theatre: Theatre, table: TextIO) -> dict[str, object]:
     """What a drawn film shows whose markers are lost and found."""
-    from ..play.overlay.drawn_film import drawn_film
-    from ..play.overlay.tracking_checks import measure_tracking, usual
+    from ..tracked.drawn_film import drawn_film
+    from ..tracked.tracking_checks import measure_tracking, usual
 
     film = drawn_film(theatre)
     figures = measure_tracking(film, *usual(film, args.style))

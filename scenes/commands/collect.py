@@ -9,10 +9,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from .camera_options import add_camera, filmed
-from .outputs import add_force, claimed
-from .style_option import add_style
-from .theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
+from ..options.camera_options import add_camera, filmed
+from ..options.outputs import add_force, claimed
+from ..options.style_option import add_style
+from ..options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from sim.errors import InputError
 from sim.runtime.atomic_files import unfinished_path
 
-from .outputs import head_of, model_header
+from ..options.outputs import head_of, model_header
 
 # What of a data set must stay as it was for a run to go on with it.
 KEPT = ("anatomy", "effects", "tissue", "element", "accuracy", "preset", "seed", "shape")

@@ -12,8 +12,8 @@ from typing import Any
 from sim.errors import InputError
 from sim.runtime.versions import install_hint
 
-from .json_line import json_line
-from .outputs import add_force, claimed
+from ..options.json_line import json_line
+from ..options.outputs import add_force, claimed
 
 FORMATS = ("lerobot", "robomimic", "folder", "xdmf", "card")
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
-from .address_option import add_address, addresses_of, say_addresses
-from .camera_options import add_camera, filmed
-from .style_option import add_style
-from .theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
+from ..options.address_option import add_address, addresses_of, say_addresses
+from ..options.camera_options import add_camera, filmed
+from ..options.style_option import add_style
+from ..options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
     from ..script.scene import Scene
@@ -71,7 +71,7 @@ def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitSta
     """Open the page, and play when `kernels` has loaded those of the first picture; `closing` closes the page."""
     from ar.page.guard import UnguardedError
 
-    from ..play.page.demo import Demo
+    from ..page.demo import Demo
 
     theatre = theatre_asked(args, args.scene)
 

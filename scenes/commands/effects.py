@@ -10,8 +10,8 @@ from pathlib import Path
 
 from sim.arguments import at_least
 
-from .theatre_options import add_trajectory, scene_asked
-from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
+from ..options.theatre_options import add_trajectory, scene_asked
+from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", "")
 

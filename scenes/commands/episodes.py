@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
+from ..options.json_line import json_line
+from ..options.outputs import claimed_folder
 from .interrupt import INTERRUPTED, terminated_as_interrupted
-from .json_line import json_line
-from .outputs import claimed_folder
 
 if TYPE_CHECKING:
     from ..episodes.engine import Heard, Tally

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sim.errors import InputError
 
-from .outputs import add_force, claimed
+from ..options.outputs import add_force, claimed
 
 ENDING = ".model.npz"
 

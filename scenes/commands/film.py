@@ -16,16 +16,16 @@ from sim.arguments import at_least
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
-from .camera_options import add_camera, filmed_with_targets
-from .json_line import json_line
-from .outputs import add_force, claimed, claimed_folder, claimed_frames
-from .theatre_options import add_theatre, scene_asked, theatre_asked
+from ..options.camera_options import add_camera, filmed_with_targets
+from ..options.json_line import json_line
+from ..options.outputs import add_force, claimed, claimed_folder, claimed_frames
+from ..options.theatre_options import add_theatre, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
-    from ..play.overlay.filming import Shot, Trouble
     from ..play.player import Player
     from ..script.scene import Scene
+    from ..tracked.filming import Shot, Trouble
 
 # Named here too, so that a command's help waits for no picture to be drawn.
 TROUBLES = ("reference", "tool", "bright", "smear", "gap")
@@ -92,11 +92,11 @@ def run(args: argparse.Namespace) -> int:
     InputError
         What cannot be read, written or filmed; numbers that are out of range.
     """
-    from ..play.overlay.filming import Taking, Trouble, mounted, registered, shots_of
-    from ..script.calibration_file import write_calibration, write_exactly_known
-    from ..script.film_truth import Truth, write_table, write_truth
-    from ..script.registration_file import write_registration
-    from ..script.tracked_tool import write_tool
+    from ..tracked.calibration_file import write_calibration, write_exactly_known
+    from ..tracked.film_truth import Truth, write_table, write_truth
+    from ..tracked.filming import Taking, Trouble, mounted, registered, shots_of
+    from ..tracked.registration_file import write_registration
+    from ..tracked.tracked_tool import write_tool
 
     at_least("--every", args.every, 1)
     for name, value in (

@@ -13,11 +13,11 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.errors import InputError
 from sim.material import BRAIN
 
-from .json_line import json_line
+from ..options.json_line import json_line
+from ..options.outputs import add_force, claimed
+from ..options.tissue_options import add_region_argument, regions_of
 from .locate import rows_left_out
 from .locator import REGIONS, located_by
-from .outputs import add_force, claimed
-from .tissue_options import add_region_argument, regions_of
 
 if TYPE_CHECKING:
     from surrogate.fitting.frame import Frame

@@ -125,13 +125,6 @@ next: open the table in a spreadsheet""",
   sulcus uncertainty press --anatomy patient.vtu
   sulcus uncertainty press palpate --draws 40 --twins 20 --out tried.json
 next: sulcus demo press --anatomy patient.vtu, whose picture and words have it""",
-    "bench": """examples:
-  sulcus bench
-  sulcus bench throughput
-  sulcus bench solver --peers tled --tolerance 1e-4 1e-6
-  sulcus bench locate --twins 8
-  sulcus bench all --json new.json
-next: sulcus report --quick""",
     "report": """example:
   sulcus report --quick --out report
 next: open report/index.html""",

@@ -18,7 +18,7 @@ from sim.bodies.subject import Subject
 from sim.effects import Elasticity
 from sim.material import Tissue
 
-from .tissue_options import stiffness_doubt
+from ..options.tissue_options import stiffness_doubt
 
 # [ml] Brains of adults, with their ventricles: beyond, a mask lacks a part or holds more than brain.
 SMALL, LARGE = 850.0, 2000.0

@@ -17,15 +17,15 @@ import numpy as np
 
 from sim.errors import InputError
 
+from ..options.tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
+from ..tracked.tracked_scene import mover, tracked_scene
 from .interrupt import until_ended
-from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
-from .tracked_scene import mover, tracked_scene
 
 if TYPE_CHECKING:
     from ..link.heard import Names
     from ..link.session import Session
     from ..play.deformers import Theatre
-    from ..script.tracked_tool import TrackedTool
+    from ..tracked.tracked_tool import TrackedTool
 
 NAMES = "--tool-name", "--reference-name", "--camera-name", "--registration-name"
 PORT = 18944
@@ -215,11 +215,11 @@ def opened(args: argparse.Namespace) -> Session:
     from ..link.outgoing import Outgoing
     from ..link.session import Eye, Session
     from ..play.deformers import open_theatre
-    from ..play.overlay.picture import Painter
-    from ..play.overlay.tool_motion import ToolMotion
-    from ..script.calibration_file import read_calibration
-    from ..script.registration_file import other_mesh, read_registration
-    from ..script.tracked_tool import read_tool
+    from ..tracked.calibration_file import read_calibration
+    from ..tracked.picture import Painter
+    from ..tracked.registration_file import other_mesh, read_registration
+    from ..tracked.tool_motion import ToolMotion
+    from ..tracked.tracked_tool import read_tool
 
     calibration = None if args.camera is None else read_calibration(args.camera)
     registration = None if args.registration is None else read_registration(args.registration)
@@ -260,7 +260,7 @@ def opened(args: argparse.Namespace) -> Session:
 
 def _tool_of(theatre: Theatre, path: Path) -> TrackedTool:
     """The tool that the best model of poses knows, at its tip as PLUS has it: z points away from the shaft."""
-    from ..script.tracked_tool import TrackedTool
+    from ..tracked.tracked_tool import TrackedTool
 
     posed = [(model.bound, model.tool) for model in theatre.models.values() if model.tool is not None]
     if not posed:

@@ -12,10 +12,10 @@ import numpy as np
 from sim.anatomy import region_name
 from sim.arguments import at_least
 
-from .json_line import json_line
+from ..options.json_line import json_line
+from ..options.outputs import add_force, claimed
+from ..options.tissue_options import add_region_argument
 from .locator import REGIONS, located_by
-from .outputs import add_force, claimed
-from .tissue_options import add_region_argument
 
 if TYPE_CHECKING:
     from surrogate.locating.locator import Location

@@ -14,8 +14,8 @@ from sim.arguments import at_least
 from sim.errors import InputError
 from sim.material import BRAIN
 
-from .outputs import add_force, claimed
-from .tissue_options import AS_LEARNED, add_region_argument, regions_of
+from ..options.outputs import add_force, claimed
+from ..options.tissue_options import AS_LEARNED, add_region_argument, regions_of
 
 if TYPE_CHECKING:
     from sim.anatomy import Anatomy

@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from .outputs import add_force, claimed
+from ..options.outputs import add_force, claimed
 
 KIND, LIST = "a page of `sulcus markers`", "a list of `sulcus markers`"
 

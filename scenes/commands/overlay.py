@@ -17,23 +17,23 @@ import numpy as np
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
-from .address_option import add_address, addresses_of, say_addresses
+from ..options.address_option import add_address, addresses_of, say_addresses
+from ..options.json_line import json_line
+from ..options.outputs import add_force, claimed
+from ..options.poses_options import add_poses, demand_poses, elsewhere_of
+from ..options.style_option import add_style
+from ..options.theatre_options import add_bodies
+from ..options.tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
+from ..tracked.tracked_scene import REST, mover, tracked_scene
 from .interrupt import until_ended
-from .json_line import json_line
-from .outputs import add_force, claimed
-from .poses_options import add_poses, demand_poses, elsewhere_of
-from .style_option import add_style
-from .theatre_options import add_bodies
-from .tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
-from .tracked_scene import REST, mover, tracked_scene
 
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
 
-    from ..play.overlay.follower import Follower
-    from ..play.overlay.page import OverlayPage
-    from ..play.overlay.picture import Painter
-    from ..play.overlay.run import Shown
+    from ..tracked.follower import Follower
+    from ..tracked.page import OverlayPage
+    from ..tracked.picture import Painter
+    from ..tracked.run import Shown
 
 FILMS = (".mp4", ".gif", ".webp")
 TABLE = "a table of `sulcus overlay`"
@@ -105,9 +105,9 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Files that cannot be read, written, or do not belong together; pictures of another size than the camera's.
     """
-    from ..play.overlay.rows import write_rows
-    from ..play.overlay.truth import off, summary
-    from ..script.film_truth import read_truth
+    from ..tracked.film_truth import read_truth
+    from ..tracked.rows import write_rows
+    from ..tracked.truth import off, summary
 
     camera = args.pictures.isdecimal() and not Path(args.pictures).exists()
     if not 0.0 < args.rate < np.inf:
@@ -138,7 +138,7 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
     """Show a film, or what a camera sees, on a page, until the time is over or a signal comes."""
     from ar.page.guard import UnguardedError, check_address
 
-    from ..play.overlay.rows import write_rows
+    from ..tracked.rows import write_rows
 
     films = {"--out": args.out, "--truth": args.truth, "--covered": args.covered, "--poses": args.poses}
     given = [name for name, value in (films | {"--live": args.live or None}).items() if value is not None]
@@ -164,7 +164,7 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
 def _camera_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
     from ar.tracking.live_camera import camera_pictures, newest, opened
 
-    from ..play.overlay.follower import GAP
+    from ..tracked.follower import GAP
 
     again = partial(opened, int(args.pictures), parts.calibration.width, parts.calibration.height)
     name, source = f"camera {args.pictures}", again()
@@ -174,14 +174,14 @@ def _camera_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) ->
 
 
 def _film_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
-    from ..play.overlay.seekable_film import SeekableFilm
+    from ..tracked.seekable_film import SeekableFilm
 
     film = SeekableFilm(Path(args.pictures), args.rate)
     return _page(args, parts, closing, film.path.name, film.count).play(film, args.seconds)
 
 
 def _page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name: str, frames: int = 0) -> OverlayPage:
-    from ..play.overlay.page import OverlayPage
+    from ..tracked.page import OverlayPage
 
     page = OverlayPage(parts.follower, parts.painter, name, parts.who, HOST, args.port, frames, addresses_of(args))
     closing.callback(page.close)
@@ -212,13 +212,13 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     from sim.runtime.device import find_device
 
     from ..play.deformers import open_theatre
-    from ..play.overlay.follower import Follower
-    from ..play.overlay.picture import Painter
-    from ..play.overlay.tool_motion import ToolMotion
-    from ..script.calibration_file import read_calibration, read_intrinsic_covariance
-    from ..script.film_camera import demand_film
-    from ..script.registration_file import other_mesh, read_registration
-    from ..script.tracked_tool import read_tool
+    from ..tracked.calibration_file import read_calibration, read_intrinsic_covariance
+    from ..tracked.film_camera import demand_film
+    from ..tracked.follower import Follower
+    from ..tracked.picture import Painter
+    from ..tracked.registration_file import other_mesh, read_registration
+    from ..tracked.tool_motion import ToolMotion
+    from ..tracked.tracked_tool import read_tool
 
     if args.tool is None and args.deformer not in (None, REST):
         raise InputError(f"--deformer {args.deformer} answers for a tool's poses: give --tool TOOL.json, too.")
@@ -252,7 +252,7 @@ def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Sh
     from ar.screen import write_film
     from ar.tracking.pictures import film_of, rate_of
 
-    from ..play.overlay.run import overlaid, timed
+    from ..tracked.run import overlaid, timed
 
     shown: list[Shown] = []
 
@@ -278,7 +278,7 @@ def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Sh
 
 def _report(shown: list[Shown], who: str) -> dict[str, object]:
     """What a run was like, for machines."""
-    from ..play.overlay.run import latencies
+    from ..tracked.run import latencies
 
     count = len(shown)
     states = Counter(each.known.state.value for each in shown)

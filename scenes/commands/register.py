@@ -11,8 +11,8 @@ import numpy as np
 
 from sim.errors import InputError
 
-from .json_line import json_line
-from .outputs import add_force, claimed
+from ..options.json_line import json_line
+from ..options.outputs import add_force, claimed
 
 if TYPE_CHECKING:
     from ar.tracking.pair_residuals import PairResiduals
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from sim import read_anatomy
     from surrogate.locating.observed_files import read_columns
 
-    from ..script.registration_file import as_stored, scanned_of, write_registration
+    from ..tracked.registration_file import as_stored, scanned_of, write_registration
 
     if args.surface is not None and args.anatomy is None:
         raise InputError("--surface is traced on an anatomy: give it by --anatomy.")

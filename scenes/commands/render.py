@@ -15,10 +15,10 @@ from sim.arguments import at_least
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
-from .camera_options import add_camera, filmed
-from .outputs import add_force, claimed, claimed_folder, claimed_frames
-from .style_option import add_style
-from .theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
+from ..options.camera_options import add_camera, filmed
+from ..options.outputs import add_force, claimed, claimed_folder, claimed_frames
+from ..options.style_option import add_style
+from ..options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre

@@ -15,9 +15,9 @@ from tqdm import tqdm
 
 from sim.errors import InputError
 
-from .devices_option import add_devices
+from ..options.devices_option import add_devices
+from ..options.outputs import add_force, claimed
 from .interrupt import INTERRUPTED
-from .outputs import add_force, claimed
 
 if TYPE_CHECKING:
     from ..report.page import Section
@@ -75,7 +75,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     """The rows of each data set; the page is written anew after each."""
     from sim.runtime.device import device_names
 
-    from ..bench.machine import machine
+    from ..analysis.machine import machine
     from ..report.adaptation import debulked_study, simulate_debulked
     from ..report.page import Section, write_report
     from ..report.reference import solve_beyond, solve_reference

@@ -10,8 +10,8 @@ from pathlib import Path
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
-from .outputs import add_force, claimed, claimed_folder
-from .theatre_options import playable
+from ..options.outputs import add_force, claimed, claimed_folder
+from ..options.theatre_options import playable
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,14 +16,14 @@ from sim.elements import ELEMENTS
 from sim.errors import InputError
 from surrogate.data.tool_loads import PRESETS, draw
 
-from .json_line import json_line
-from .outputs import add_force, claimed
-from .theatre_options import add_bodies
+from ..options.json_line import json_line
+from ..options.outputs import add_force, claimed
+from ..options.theatre_options import add_bodies
 
 if TYPE_CHECKING:
     from surrogate.model.learned import Learned
 
-    from ..bench.sensitivity import Change, Row, Study
+    from ..analysis.sensitivity import Change, Row, Study
 
 HEAD = ("what", "default", "now", "F mean", "F 95", "F %", "F x", "M mean", "M 95", "M %", "M x")
 WIDTHS = (18, 11, 9, 6, 6, 6, 5, 6, 6, 6, 5)
@@ -36,7 +36,7 @@ the motion over that by default. --out and --json give the 95th percentile and t
 counts in every way in which it can be: more and less, about two axes, to four sides along the cortex.
 """
 
-# What the element does to the rows of nu: `sulcus bench elements`, default brain.
+# What the element does to the rows of nu: `python -m benchmarks elements`, default brain.
 LOCKING = {
     "p1": "Linear tetrahedra lock as nu nears 0.5: much of what nu does here is theirs. Take --element smoothed.",
     "smoothed": "Smoothed elements, because linear ones lock as nu nears 0.5; at 0.495 these still lose some 5 %.",
@@ -76,10 +76,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
-    from ..bench.csv_tables import write_table
-    from ..bench.machine import machine
-    from ..bench.sensitivity import Study, rows
-    from ..bench.sensitivity_variants import Body, variants
+    from ..analysis.csv_tables import write_table
+    from ..analysis.machine import machine
+    from ..analysis.sensitivity import Study, rows
+    from ..analysis.sensitivity_variants import Body, variants
     from ..play.deformers import open_theatre
 
     if args.out:
@@ -129,9 +129,9 @@ def _factorial(args: argparse.Namespace) -> int:
 
     from ar.screen import write_png
 
-    from ..bench.csv_tables import write_table
-    from ..bench.factorial import LEVELS, cells, panels, shares
-    from ..bench.loglog_chart import drawn
+    from ..analysis.csv_tables import write_table
+    from ..analysis.factorial import LEVELS, cells, panels, shares
+    from ..analysis.loglog_chart import drawn
 
     if args.anatomy:
         raise InputError("--factorial makes its bodies of the template: leave --anatomy out.")

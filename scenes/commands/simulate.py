@@ -34,12 +34,18 @@ from surrogate.data.stated_tissue import stating
 from surrogate.data.tool_loads import BEYOND_TISSUE, PRESETS, draw, refused_share, refused_words
 from surrogate.data.tool_poses import draw_poses, tool_of
 
+from ..options.devices_option import add_devices
+from ..options.outputs import add_force, claimed
+from ..options.tissue_options import (
+    add_element_argument,
+    add_skull_argument,
+    add_tissue_arguments,
+    elasticity_of,
+    tissue_of,
+)
 from ..script.shipped_files import template_path
 from .companion_files import batch_begun, remove_data
-from .devices_option import add_devices
 from .interrupt import INTERRUPTED, terminated_as_interrupted
-from .outputs import add_force, claimed
-from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, elasticity_of, tissue_of
 
 # Sizes [mm] of tools that press on a brain.
 SMALLEST_MM, LARGEST_MM = 0.1, 200.0

@@ -18,9 +18,9 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Cause, Loads, Nodal, Prescribed
 
-from .json_line import json_line
-from .outputs import add_force, claimed
-from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, elasticity_of
+from ..options.json_line import json_line
+from ..options.outputs import add_force, claimed
+from ..options.tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, elasticity_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

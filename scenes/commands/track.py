@@ -11,8 +11,8 @@ import numpy as np
 
 from sim.errors import InputError
 
-from .json_line import json_line
-from .outputs import add_force, claimed
+from ..options.json_line import json_line
+from ..options.outputs import add_force, claimed
 
 KIND = "poses of `sulcus track`"
 # What may be followed, and in whose frame.
@@ -51,10 +51,10 @@ def run(args: argparse.Namespace) -> int:
     """
     from ar.tracking.targets import TIP
 
-    from ..script.calibration_file import read_calibration
-    from ..script.film_camera import demand_film
-    from ..script.followed import followed
-    from ..script.pose_file import write_poses
+    from ..tracked.calibration_file import read_calibration
+    from ..tracked.film_camera import demand_film
+    from ..tracked.followed import followed
+    from ..tracked.pose_file import write_poses
 
     if not 0.0 < args.rate < np.inf:
         raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")

@@ -25,8 +25,8 @@ from surrogate.model.store import save
 from surrogate.training.expansion import EXPANDED, Expansion
 from surrogate.training.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, learners_for, train
 
-from .devices_option import add_devices
-from .outputs import add_force, claimed
+from ..options.devices_option import add_devices
+from ..options.outputs import add_force, claimed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

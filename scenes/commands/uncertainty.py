@@ -15,11 +15,11 @@ from tqdm import tqdm
 
 from sim.arguments import at_least
 
+from ..options.json_line import json_line
+from ..options.outputs import claimed
+from ..options.theatre_options import add_bodies, scene_asked
+from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 from .fit import fitted_beside
-from .json_line import json_line
-from .outputs import claimed
-from .theatre_options import add_bodies, scene_asked
-from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve an ensemble of each scene, and keep what it says."""
-    from ..bench.uncertainty import coverage, ensemble, nominal, skulls_of, tissue_of, tumour_of, uncertainty
+    from ..analysis.uncertainty import coverage, ensemble, nominal, skulls_of, tissue_of, tumour_of, uncertainty
     from ..play.deformers import open_theatre
     from ..script.priors import drawn, drawn_from
     from ..script.scene import SCENES

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .json_line import json_line
+from ..options.json_line import json_line
 
 if TYPE_CHECKING:
     from ..episodes.reading.validation import Report

@@ -12,11 +12,11 @@ import numpy as np
 
 from sim.errors import InputError
 
-from .json_line import json_line
-from .label_options import add_axes
-from .outputs import add_force
-from .theatre_options import add_trajectory, scene_asked
-from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
+from ..options.json_line import json_line
+from ..options.label_options import add_axes
+from ..options.outputs import add_force
+from ..options.theatre_options import add_trajectory, scene_asked
+from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre

@@ -13,12 +13,12 @@ from ar.tracking.pose import Pose
 from ar.tracking.registration import Registration
 from ar.tracking.track import Tracked
 
-from ..play.overlay.follower import LIMIT, UNCHECKED, UNKNOWN, Known, State, tip_covariance, wide_words
-from ..play.overlay.picture import Painter
-from ..play.overlay.plausible import misplaced_tool
-from ..play.overlay.tool_motion import ToolMotion
-from ..script.tracked_tool import TrackedTool
 from ..script.uncertainty import LEVEL
+from ..tracked.follower import LIMIT, UNCHECKED, UNKNOWN, Known, State, tip_covariance, wide_words
+from ..tracked.picture import Painter
+from ..tracked.plausible import misplaced_tool
+from ..tracked.tool_motion import ToolMotion
+from ..tracked.tracked_tool import TrackedTool
 from .frame import stamp_of, time_of
 from .heard import Heard
 from .picture_time import placed_at

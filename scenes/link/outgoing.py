@@ -12,8 +12,8 @@ from ar.overlay.hud import bound_words, millimetres
 from sim.geometry.closest_point import closest
 from sim.geometry.locate import Located, locate
 
-from ..play.overlay.follower import Known, State
 from ..play.stage import Stage
+from ..tracked.follower import Known, State
 from .answer import Answer
 from .frame import BadMessageError, framed
 from .messages import NOTHING, Code, Mesh, points, polydata, status, string, transform

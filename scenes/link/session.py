@@ -15,8 +15,8 @@ import numpy as np
 
 from ar.optics.calibration import Calibration
 
-from ..play.overlay.follower import Known, State, across
-from ..play.overlay.picture import Painter
+from ..tracked.follower import Known, State, across
+from ..tracked.picture import Painter
 from .answer import Answer, Seen, bounded, late
 from .clients import Clients
 from .console import address_words

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from sim.accuracy import FLOOR, Accuracy, Precision
 from sim.anatomy import Anatomy
-from sim.bodies.meshfile import read_anatomy
+from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.refine import refined
+from sim.bodies.subject import MeshPlan, make_anatomy
+from sim.bodies.template import Tumour, template_subject
 from sim.discretisation.footprint import nearest_on
 from sim.effects import Elasticity, pushed_effects
 from sim.errors import InputError
@@ -18,8 +21,7 @@ from sim.geometry.locate import locate
 from sim.loads import Loads, Pushed
 from sim.material import Material, Tissue
 
-from ..bench.scaling import template_mesh
-from ..bench.stopwatch import timed
+from ..analysis.stopwatch import timed
 from .adaptation import debulked
 from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, of_times
 from .study import Study
@@ -112,6 +114,14 @@ def body_of(study: Study, mesh: str) -> Anatomy:
     if mesh == HALVED:
         return refined(study.anatomy)
     return read_anatomy(template_mesh(study.folder / "meshes", int(mesh)))
+
+
+def template_mesh(folder: Path, size: int) -> Path:
+    """The template's brain of about `size` nodes; made if it is not there."""
+    path = folder / f"template_{size}.vtu"
+    if not path.exists():
+        write_anatomy(path, make_anatomy(template_subject(Tumour()), MeshPlan(size)))
+    return path
 
 
 def law_of(tissue: Elasticity) -> str | None:

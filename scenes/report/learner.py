@@ -17,7 +17,7 @@ from surrogate.evaluation.solve_counts import SolveCounts
 from surrogate.training.published_models import MACHINES, published_model, published_nodes
 from surrogate.training.train import train
 
-from ..bench.stopwatch import timed
+from ..analysis.stopwatch import timed
 from .adaptation import debulked_study, simulating_seconds
 from .artefact_time import series_seconds
 from .reference import beyond_of

@@ -12,7 +12,7 @@ from sim.errors import InputError
 from sim.runtime.device import find_device
 from sim.runtime.threads import one_thread
 
-from ..bench.process_memory import peak_memory, watched_card
+from ..analysis.process_memory import peak_memory, watched_card
 from .finite_elements import Elements, measure_elements
 from .learner import Learner, measure_learner
 from .row import Row

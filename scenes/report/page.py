@@ -14,7 +14,7 @@ from ar.screen import write_png
 from sim.runtime.atomic_files import written_whole
 from surrogate.model.left_out import FEWEST_FOR_P999
 
-from ..bench.csv_tables import write_table
+from ..analysis.csv_tables import write_table
 from .plots import against_solves, against_time, front, learners_against_time
 from .row import Figures, Row
 

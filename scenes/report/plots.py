@@ -8,7 +8,7 @@ import numpy as np
 
 from surrogate.evaluation.choose import unbeaten
 
-from ..bench.loglog_chart import Curve, Dot, Panel, drawn
+from ..analysis.loglog_chart import Curve, Dot, Panel, drawn
 from .row import ERROR, TOLERANCE_ALONE, Figures, Row
 
 SIZE = (880, 560)

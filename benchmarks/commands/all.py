@@ -1,0 +1,151 @@
+"""`python -m benchmarks all`: every figure of the performance pages in one go, their tables, and what got slower."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from scenes.commands.interrupt import INTERRUPTED, terminated_as_interrupted
+from scenes.options.outputs import add_force, claimed, recognised
+from scenes.script.shipped_files import template_path
+from sim.errors import InputError
+
+from ..figures.figure_record import KIND, read_record
+from ..figures.figures import NAMED
+
+if TYPE_CHECKING:
+    from ..figures.figure_record import Record
+
+OUT = Path("bench.json")
+KINDS = {KIND: read_record}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.epilog = f"figures: {', '.join(NAMED)}"
+    parser.add_argument(
+        "--json", type=Path, metavar="OUT.json",
+        help=f"the record, written after every figure; an unfinished run goes on (default {OUT})",
+    )  # fmt: skip
+    parser.add_argument(
+        "--only", nargs="+", type=_named, default=list(NAMED), metavar="NAME",
+        help="these figures (default: all; their names stand below)",
+    )  # fmt: skip
+    parser.add_argument("--again", action="store_true", help="measure also what the record has already")
+    parser.add_argument("--quick", action="store_true", help="small counts: whether all runs, not how fast it is")
+    parser.add_argument("--anatomy", type=Path, help="measure on this .vtu instead of the template where a bench can")
+    parser.add_argument(
+        "--from", dest="source", type=Path, metavar="NEW.json", help="measure nothing: take this record"
+    )
+    parser.add_argument(
+        "--tables", nargs="+", type=Path, default=[], metavar="PAGE.md",
+        help="then write the tables between `<!-- bench: NAME ... -->` and `<!-- end -->` of these pages anew; "
+        "--force: also where numbers are lost",
+    )  # fmt: skip
+    parser.add_argument(
+        "--against", type=Path, metavar="OLD.json",
+        help="then compare with this record, and exit with 1 if a number is worse by more than 10 percent",
+    )  # fmt: skip
+    add_force(parser)
+
+
+def _named(word: str) -> str:
+    """The name of a figure, or an error with the names that are most like it."""
+    if word in NAMED:
+        return word
+    near = get_close_matches(word, NAMED) or list(NAMED)[:3]
+    raise argparse.ArgumentTypeError(
+        f"no figure is called {word!r:.80}: try {', '.join(near)}; `python -m benchmarks all --help` has all names."
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, write tables, compare; 1 if a figure failed, missed what it was asked, or got worse."""
+    from ..figures.figure_tables import read_page, table, write_page
+
+    if args.source and (args.json or args.again or args.quick or args.anatomy):
+        raise InputError("--from measures nothing: leave out --json, --again, --quick and --anatomy beside it.")
+    if args.source and not (args.tables or args.against):
+        raise InputError("--from alone does nothing: give --tables or --against with it.")
+    old = read_record(args.against) if args.against else None
+    for path in args.tables:
+        read_page(path)
+    try:
+        with terminated_as_interrupted() as stop_if_asked:
+            record = read_record(args.source) if args.source else _measured(args, stop_if_asked)
+    except KeyboardInterrupt:
+        print(f"stopped; the same command goes on from {args.json or OUT}", file=sys.stderr)
+        return INTERRUPTED
+    record = _only(record, args.only)
+    code = 0
+    if not args.source:
+        print(table(record.rows))
+        code = int(any(entry.state in ("failed", "missed") for entry in record.rows))
+    for path in args.tables:
+        print(f"{path}: {'written' if write_page(path, record, args.force) else 'these numbers stand there already'}")
+    if old and set(args.only) < set(NAMED):  # else its figures that are none any more are named
+        old = _only(old, args.only)
+    return max(code, _compared(old, record)) if old else code
+
+
+def _only(record: Record, names: Sequence[str]) -> Record:
+    return replace(record, rows=tuple(entry for entry in record.rows if entry.name in names))
+
+
+def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Record:
+    """The record, with what it lacked of the figures that were asked for."""
+    from sim.bodies.meshfile import read_anatomy
+
+    from ..figures.figure_record import record_of, write_record
+    from ..figures.figure_runs import Run, entry_of, version_here
+
+    out = claimed(args.json or OUT, ".json", KIND, args.force, [args.anatomy, args.against, *args.tables], KINDS)
+    body = read_anatomy(args.anatomy or template_path()).digest
+    run = Run(version_here(), body, args.anatomy, args.quick, args.again)
+    found = {entry.name: entry for entry in read_record(out).rows} if recognised(out, KIND, KINDS) else {}
+    whole = [name for name in args.only if name in found and found[name].values and not found[name].quick]
+    if args.quick and whole:
+        raise InputError(
+            f"{out}: holds {whole[0]} as measured in full, which --quick would replace: choose another --json."
+        )
+    with tqdm(total=len(args.only), unit="figure", file=sys.stderr) as bar:
+
+        def heard(line: str) -> None:
+            stop_if_asked()
+            if line:
+                bar.write(line, file=sys.stderr)
+            elif sys.stderr.isatty():  # the clock goes on
+                bar.refresh()
+
+        for name in args.only:
+            bar.set_description(name)
+            before = found.get(name)
+            entry = found[name] = entry_of(NAMED[name], run, before, heard)
+            write_record(out, record_of(run.origin("auto"), list(found.values())))
+            heard(f"{name}: {'kept' if entry is before else entry.state}{entry.reason and ': '}{entry.reason}")
+            bar.update()
+    return read_record(out)
+
+
+def _compared(old: Record, new: Record) -> int:
+    """Print what changed, and return 1 if something got worse."""
+    from ..figures.figure_comparison import MARGIN, compared
+
+    found = compared(old, new)
+    print("| number | old | new | unit | new / old |\n|---|---|---|---|---|")
+    print("\n".join(change.line for change in found.changes))
+    print("", *found.notes, sep="\n")
+    for reason in found.lost:
+        print(f"no longer measured as before: {reason}")
+    for change in found.worse:
+        print(f"worse by more than {MARGIN - 1.0:.0%}: {change.name} ({change.ratio:.2f} times)")
+    if not found.worse and not found.lost:
+        print(f"nothing is worse by more than {MARGIN - 1.0:.0%}")
+    return int(bool(found.worse or found.lost))

@@ -1,0 +1,97 @@
+"""`python -m benchmarks fit`: what `sulcus fit` says of patients whose tissue is known."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from sim.arguments import at_least
+
+from .locate import bar, check_finer, finer_of, locator_of
+
+HEADS = (
+    "noise", "ratio: off by", "within x1.5 [%]", "in its interval [%]", "held or sliding [%]", "skull [%]",
+    "Poisson's class [%]", "E: off by", "within 20 % [%]", "in its interval [%]", "patients, with force",
+)  # fmt: skip
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument("--finer", type=Path, metavar="FINER.vtu", help="a finer mesh of the same brain, of the truths")
+    parser.add_argument("--nodes", type=int, default=8000, help="of the template's finer mesh (default %(default)s)")
+    parser.add_argument("--twins", type=int, default=20, help="patients (default %(default)s)")
+    parser.add_argument("--presses", type=int, default=2, help="frames with a tool (default %(default)s)")
+    parser.add_argument("--drained", type=int, default=4, help="frames with drained fluid (default %(default)s)")
+    parser.add_argument("--forces", type=int, default=4, help="patients of whom a force is read (default %(default)s)")
+    parser.add_argument("--points", type=int, default=100, help="that are seen in a frame (default %(default)s)")
+    parser.add_argument("--cover", type=int, default=80, help="share of the open cortex [%%] (default %(default)s)")
+    parser.add_argument(
+        "--noise",
+        nargs="+",
+        type=int,
+        default=[0, 1, 2],
+        choices=(0, 1, 2),
+        help="levels, as of `benchmarks locate`",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the patients (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--locator", type=Path, metavar="FILE.npz", help="locator of the anatomy (default: a new one)")
+    parser.add_argument("--folder", type=Path, help="keeps what was made, so that a stopped run goes on")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure; 1 if of some patient no equilibrium was found."""
+    from scenes.script.shipped_files import template_path
+    from sim.bodies.meshfile import read_anatomy
+
+    from ..studies.fit_study import fitted_to, library_of, row
+    from ..studies.fit_twins import patients
+    from ..studies.locate_study import PointsSeen
+
+    for name, least in (("twins", 1), ("presses", 1), ("drained", 0), ("forces", 0), ("points", 6), ("cover", 1)):
+        at_least(f"--{name}", getattr(args, name), least)
+    check_finer(args)
+    body, finer = read_anatomy(args.anatomy or template_path()), finer_of(args)
+    with bar("patients") as heard:
+        every = list(
+            patients(body, finer, args.twins, args.presses, args.drained, args.seed, args.device, args.folder, heard)
+        )
+    found = [seen for seen in every if seen is not None]
+    locator = locator_of(args, body)
+    with bar("tissues") as heard:
+        library = library_of(locator, args.device, args.folder and args.folder / "fit.parts", heard)
+    table = sys.stderr if args.json else sys.stdout
+    print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", file=table)
+    made = []
+    for noise in args.noise:
+        sight, said = PointsSeen(args.points, args.cover, noise), []
+        with bar("fits") as heard:
+            for number, seen in enumerate(found):
+                tissue = fitted_to(locator, library, seen, sight, args.seed, number < args.forces, args.device)
+                said.append((seen.patient, tissue))
+                heard(number + 1, len(found))
+        made.append(row(noise, said))
+        print(f"| {' | '.join(_cells(asdict(made[-1])))} |", file=table, flush=True)
+    failed = len(every) - len(found)
+    if args.json:
+        print(json.dumps({"failed": failed, "rows": [asdict(each) for each in made]}))
+    if failed:
+        print(f"benchmarks fit: no equilibrium was found of {failed} patients: they are in no row", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _cells(row: dict[str, float | None]) -> list[str]:
+    """What stands in a line of the table."""
+
+    def said(name: str, digits: int = 0) -> str:
+        value = row[name]
+        return "" if value is None else f"{value:.{digits}f}"
+
+    shares = [said(name) for name in ("within", "held", "sliding", "skull", "poisson")]
+    young = [said("young", 2), said("young_within"), said("young_held")]
+    return [said("noise"), said("factor", 2), *shares, *young, f"{said('patients')}, {said('forces')}"]

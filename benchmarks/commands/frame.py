@@ -1,0 +1,63 @@
+"""`python -m benchmarks frame`: where the time of a page's frame goes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from contextlib import redirect_stdout
+from dataclasses import asdict, replace
+
+from scenes.options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
+from sim.arguments import at_least
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    from scenes.cli import add_plugin
+
+    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene (default %(default)s)")
+    add_theatre(parser)
+    add_plugin(parser)
+    parser.add_argument("--size", default="640x480", metavar="WxH", help="of the picture [pixel] (default %(default)s)")
+    parser.add_argument("--frames", type=int, default=120, help="frames that are timed (default %(default)s)")
+    parser.add_argument(
+        "--batch",
+        type=int,
+        help="pictures that are drawn together, for pictures a second (default: 64 on CUDA, else 4)",
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play the scene to a page that nobody looks at."""
+    from tqdm import tqdm
+
+    from scenes.analysis.machine import machine
+
+    from ..studies.frame import batch_rate, frames_of, size_of, table
+
+    at_least("--frames", args.frames, 1)
+    if args.batch is not None:
+        at_least("--batch", args.batch, 1)
+    width, height = size_of(args.size)
+    theatre = theatre_asked(args, args.scene)
+    scene = scene_asked(args, args.scene, theatre)
+    scene = replace(scene, viewpoint=replace(scene.viewpoint, width=width, height=height))
+    name = deformer_name(args, theatre, scene)
+    player = theatre.player(name, scene)
+    where = f"{machine(args.device)}; {scene.name} by {name}, {width} x {height}"
+    with redirect_stdout(sys.stderr):  # viser says there where it serves
+        frames = frames_of(player, args.frames)
+        found = table(list(tqdm(frames, "frames", args.frames, unit="frame", file=sys.stderr)))
+    count = args.batch or (4 if player.stage.device == "cpu" else 64)
+    rate = batch_rate(player, count)
+    if args.json:
+        rows = [asdict(row) for row in found]
+        print(json.dumps({"machine": where, "rows": rows, "batch": count, "pictures_per_second": rate}))
+        return 0
+    print(f"{where}\n\n| stage | frames | ms: median | p95 | mean |\n|---|---|---|---|---|")
+    for row in found:
+        print(f"| {row.stage} | {row.frames} | {row.median:.2f} | {row.p95:.2f} | {row.mean:.2f} |")
+    print(f"\n{rate:.3g} pictures a second, {count} together, with depth and segmentation, none brought to the host")
+    return 0

@@ -1,0 +1,87 @@
+"""`python -m benchmarks growth`: what a load takes in seconds and memory as the mesh grows, as a table and a plot."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from scenes.options.outputs import add_force, claimed
+from sim.arguments import at_least
+from sim.elements import ELEMENTS, RECOMMENDED
+
+if TYPE_CHECKING:
+    from ..studies.scaling import Row
+
+SIZES = (2000, 5300, 17_000, 50_000, 100_000, 200_000)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--sizes", nargs="+", type=int, default=list(SIZES), metavar="N", help="nodes (default: six)")
+    parser.add_argument("--batch", nargs="+", type=int, default=[1, 8], metavar="B", help="loads together (1 8)")
+    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("growth.png"), metavar="PLOT.png",
+        help="the plot; rows and meshes are kept beside it, and an unfinished run goes on (default %(default)s)",
+    )  # fmt: skip
+    add_force(parser)
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, row by row; 1 if a load did not converge."""
+    from ar.screen import write_png
+    from scenes.analysis.loglog_chart import drawn
+    from scenes.analysis.machine import machine
+    from sim.bodies.subject import MeshPlan
+    from sim.runtime.device import find_device
+
+    from ..studies.recorded_rows import append_rows, read_rows
+    from ..studies.scaling import Row, Trial, panels, rows
+
+    at_least("--batch", min(args.batch), 1)
+    for size in args.sizes:
+        MeshPlan(size)
+    find_device(args.device, "float32")
+    out = claimed(args.out, ".png", "a picture of sulcus", args.force)
+    where, record = machine(args.device), out.with_suffix(".csv")
+    trial = Trial(args.element, args.device, out.parent)
+    stated = f"{where.split(';')[0]}, {args.device} {args.element}, with the memory foreseen"
+    found = [row for row in read_rows(record, stated, Row) if row.size in args.sizes and row.asked in args.batch]
+    table = sys.stderr if args.json else sys.stdout
+    print(where, file=table)
+    with tqdm(total=len(args.sizes) * len(args.batch), initial=len(found), unit="row", file=sys.stderr) as bar:
+        for row in rows(trial, args.sizes, args.batch, tuple(found), bar.set_description):
+            append_rows(record, stated, [row])
+            found.append(row)
+            bar.update()
+    found.sort(key=lambda row: (row.nodes, row.batch))
+    write_png(out, drawn(panels(found)))
+    _print(found, table)
+    print(f"\n{out}: written; its rows are in {record}, its meshes beside it", file=table)
+    if args.json:
+        print(json.dumps({"machine": where, "rows": [asdict(row) for row in found], "plot": str(out)}))
+    return 0 if all(row.converged == row.loads for row in found) else 1
+
+
+def _print(found: Sequence[Row], table) -> None:
+    names = (
+        "nodes", "tetrahedra", "preconditioner", "set-up [s]", "batch", "a load [s]", "outer", "converged",
+        "host [GiB]", "card [GiB]", "card, foreseen [GiB]",
+    )  # fmt: skip
+    print(f"\n| {' | '.join(names)} |\n|{'---|' * len(names)}", file=table)
+    for row in found:
+        cells = (
+            row.nodes, row.tets, row.preconditioner, f"{row.set_up:.3g}", row.batch, f"{row.load:.3g}",
+            f"{row.outer:g}", f"{row.converged} of {row.loads}", f"{row.memory:.3g}",
+            *(f"{number:.3g}" if row.foreseen else "" for number in (row.card, row.foreseen)),  # none without a card
+        )  # fmt: skip
+        print(f"| {' | '.join(map(str, cells))} |", file=table)

@@ -1,0 +1,74 @@
+"""`python -m benchmarks gym`: how many steps a second the Gymnasium environments make."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import asdict
+
+from scenes.options.json_line import json_line
+from sim.arguments import at_least
+
+# The tasks of scenes.gym, which loads Gymnasium and is imported only as this runs.
+TASKS = ("palpate", "retract", "debulk")
+OBSERVATIONS = ("states", "rgbd")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)} (default: all)")
+    parser.add_argument("--envs", type=int, default=64, help="environments, stepped together (default %(default)s)")
+    parser.add_argument(
+        "--processes", action="store_true", help="every environment in a process of its own, by Gymnasium"
+    )
+    parser.add_argument(
+        "--observation",
+        nargs="+",
+        choices=OBSERVATIONS,
+        default=list(OBSERVATIONS),
+        help="states, or pictures too (default: both)",
+    )
+    parser.add_argument("--size", default="160x120", metavar="WxH", help="of pictures (default %(default)s)")
+    parser.add_argument("--steps", type=int, default=40, help="of every environment in a repeat (default %(default)s)")
+    parser.add_argument("--repeats", type=int, default=5, help="of which the median counts (default %(default)s)")
+    parser.add_argument("--anatomy", default="template", help="a .vtu file (default: the template that ships)")
+    parser.add_argument("--model", help="a file of trained models (default: the one beside the anatomy)")
+    parser.add_argument("--physics", default="auto", help="auto, model or fem (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:1 (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Step the environments under their scripted policies."""
+    from tqdm import tqdm
+
+    from scenes.analysis.machine import machine
+    from scenes.gym.vector import many
+
+    from ..studies.frame import size_of
+    from ..studies.gym_rates import rate_of
+
+    for name in ("envs", "steps", "repeats"):
+        at_least(f"--{name}", getattr(args, name), 1)
+    size, rows = size_of(args.size), []
+    apart = ", each in a process of its own" if args.processes else ""
+    where = f"{machine(args.device)}; {args.envs} environments{apart}, pictures of {size[0]} x {size[1]}"
+    for task in args.tasks or TASKS:
+        for observation in args.observation:
+            environment = many(
+                task, args.envs, args.processes, anatomy=args.anatomy, observation=observation, physics=args.physics,
+                device=args.device, size=size, model=args.model,
+            )  # fmt: skip
+            with tqdm(desc=f"{task}, {observation}", total=args.repeats + 1, unit="repeat", file=sys.stderr) as bar:
+                rows.append(rate_of(environment, task, observation, args.steps, args.repeats, bar.update))
+            environment.close()
+    if args.json:
+        print(json_line({"machine": where, "rows": [asdict(row) for row in rows]}))
+        return 0
+    print(f"{where}\n\n| task | observation | steps/s: median | least | most | in contact |\n|---|---|---|---|---|---|")
+    for row in rows:
+        print(
+            f"| {row.task} | {row.observation} | {row.median:.0f} | {row.least:.0f} | {row.most:.0f} | "
+            f"{100.0 * row.touching:.0f} % |"
+        )
+    return 0

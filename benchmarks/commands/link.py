@@ -1,0 +1,52 @@
+"""`python -m benchmarks link`: how long an OpenIGTLink client waits for the answer to a pose."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from dataclasses import asdict
+
+from sim.arguments import at_least
+from sim.errors import InputError
+
+from .locate import bar
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--points", type=int, default=5000, help="of the surface that is sent (default %(default)s)")
+    parser.add_argument("--rate", type=float, default=30.0, help="poses a second (default %(default)s)")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each run (default %(default)s)")
+    parser.add_argument("--runs", type=int, default=5, help="how often it is repeated (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure. Returns 0."""
+    from scenes.analysis.machine import machine
+
+    from ..studies.link_latency import CLIENTS, measured
+
+    at_least("--points", args.points, 3)
+    at_least("--runs", args.runs, 1)
+    if not (0.0 < args.rate <= 1000.0 and 0.0 < args.seconds <= 3600.0):
+        raise InputError("--rate and --seconds: give up to 1000 poses a second, and up to 3600 seconds, both above 0.")
+    found = []
+    with bar("runs") as heard:
+        for number in range(args.runs):
+            found.append(measured(args.points, args.rate, args.seconds))
+            heard(number + 1, args.runs)
+    best = min(found, key=lambda each: each.p99)
+    middle = sorted(found, key=lambda each: each.p99)[len(found) // 2]
+    load = os.getloadavg()[0]
+    where = f"{machine('cpu')}; {os.cpu_count()} cores, load {load:.1f}; {CLIENTS} clients, {args.points} points"
+    if args.json:
+        print(json.dumps({"machine": where, "best": asdict(best), "middle": asdict(middle)}))
+        return 0
+    print(f"{where}, {args.rate:g} poses a second, {args.seconds:g} s.")
+    print("From a pose's time stamp to when a client has its whole surface. No deformer's time is in it.")
+    print("| run | median [ms] | p99 [ms] | largest [ms] | poses answered [%] |\n|---|---|---|---|---|")
+    for name, each in (("best", best), ("middle", middle)):
+        print(f"| {name} of {args.runs} | {each.median:.1f} | {each.p99:.1f} | {each.most:.1f} | {each.answered:.0f} |")
+    return 0

@@ -1,0 +1,86 @@
+"""`python -m benchmarks live`: what a frame of a moving tool takes, and how far off it is."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from scenes.options.tissue_options import add_tissue_arguments, elasticity_of
+from scenes.script.shipped_files import template_path
+from sim.arguments import at_least
+from sim.bodies.meshfile import read_anatomy
+from sim.effects import pushed_effects
+from sim.elements import ELEMENTS, RECOMMENDED
+from sim.errors import InputError
+
+if TYPE_CHECKING:
+    from ..studies.live import Tally
+
+CHECKED = 20
+"""Frames that are held against the converged solution, unless another number is given."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument("--frames", type=int, default=1000, help="frames of each tool (default %(default)s)")
+    parser.add_argument(
+        "--checked", type=int,
+        help=f"frames held against the converged solution (default {CHECKED}, or all where there are fewer)",
+    )  # fmt: skip
+    add_tissue_arguments(parser)
+    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play every tool; 1 if a frame did not converge, or was farther off than promised."""
+    from scenes.analysis.budget import PROMISED
+    from scenes.analysis.machine import machine
+    from scenes.script.scene import find_scene
+    from scenes.script.site import site_of
+
+    from ..studies.live import RIDES, errors, frames_of, live_fem, loads_of, tally
+
+    at_least("--frames", args.frames, 1)
+    checked = min(CHECKED, args.frames) if args.checked is None else args.checked
+    if not 1 <= checked <= args.frames:
+        raise InputError(
+            f"--frames {args.frames} --checked {checked} measures nothing: give 1 <= --checked <= --frames."
+        )
+    site = site_of(read_anatomy(args.anatomy or template_path()))
+    scene = replace(find_scene("press"), effects=pushed_effects(site.anatomy, elasticity_of(args, site.anatomy.mesh)))
+    fem = live_fem(scene, site, args.device, args.element)
+    found = []
+    for ride in RIDES:
+        loads = loads_of(ride, scene, site, args.frames)
+        frames = list(tqdm(frames_of(fem, loads), ride.name, args.frames, unit="frame", file=sys.stderr))
+        sample = frames[:: args.frames // checked][:checked]
+        found.append(tally(ride, frames, errors(sample, scene, site, args.element)))
+    where = f"{machine(args.device)}; {len(site.anatomy.mesh.nodes)} nodes, {args.element}"
+    if args.json:
+        print(json.dumps({"machine": where, "promised_mm": 1e3 * PROMISED, "rides": [asdict(item) for item in found]}))
+    else:
+        _print(where, found)
+    return 0 if all(item.good and item.error <= 1e3 * PROMISED for item in found) else 1
+
+
+def _print(where: str, rides: Sequence[Tally]) -> None:
+    names = ("tool", "frames", "ms: median", "p95", "p99", "worst", "outer steps: mean", "most", "outcomes", "off [mm]")
+    print(f"{where}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}")
+    for item in rides:
+        outcomes = ", ".join(f"{count} {name.lower()}" for name, count in item.outcomes.items())
+        times = (f"{value:.3g}" for value in (item.median, item.p95, item.p99, item.worst))
+        cells = (
+            item.ride, item.frames, *times, f"{item.steps:.1f}", item.most_steps, outcomes,
+            f"<= {item.error:.4f} of {item.checked}",
+        )  # fmt: skip
+        print(f"| {' | '.join(map(str, cells))} |")

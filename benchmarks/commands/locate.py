@@ -1,0 +1,201 @@
+"""`python -m benchmarks locate`: the share of a tumour's motion that `sulcus locate` and its rivals find."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim.arguments import at_least
+from sim.elements import ELEMENTS, RECOMMENDED
+from sim.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from sim.anatomy import Anatomy
+    from surrogate.locating.locator import Locator
+
+    from ..studies.locate_study import Row
+
+HEADS = (
+    "points", "cover [%]", "noise", "estimator", "removed [%]", "error: mean [mm]", "p95 [mm]", "in the 95 % ellipsoid",
+    "refused", "in doubt", "warned", "ms",
+)  # fmt: skip
+
+# Farther no registration slips unnoticed [mm].
+MOST_SLIPPED = 50.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument(
+        "--finer", type=Path, metavar="FINER.vtu",
+        help="a finer mesh of the same brain, of which the truths are (default: the template's, of --nodes)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--nodes", type=int, default=8000, help="of the template's finer mesh, without --finer (default %(default)s)"
+    )
+    parser.add_argument(
+        "--element", choices=ELEMENTS, default=RECOMMENDED,
+        help="finite element of the truths (default %(default)s); p2 takes minutes a twin on a CPU",
+    )  # fmt: skip
+    parser.add_argument("--twins", type=int, default=20, help="truths, a quarter by each cause (default %(default)s)")
+    parser.add_argument("--points", nargs="+", type=int, default=[100], help="points that are seen (default 100)")
+    parser.add_argument(
+        "--cover", nargs="+", type=int, default=[36], help="share of the open cortex that they lie on [%%] (default 36)"
+    )
+    parser.add_argument(
+        "--noise", nargs="+", type=int, default=[0, 1, 2], choices=(0, 1, 2),
+        help="levels (default 0 1 2). 0: none. 1 and 2: white 0.3 mm, smooth 0.5 mm, and a rigid error of half a "
+        "degree and 1 or 2 mm, whose size `sulcus locate` is given",
+    )  # fmt: skip
+    parser.add_argument(
+        "--clouds", action="store_true", help="points have no names: where the surface is; rivals need names, and rest"
+    )
+    parser.add_argument(
+        "--slip", type=float, default=0.0, metavar="MM",
+        help="all points are displaced so far along the open cortex, as by a registration that slipped (default 0)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--wrong-registration", action="store_true",
+        help="all points are displaced by 2 to 5 mm or rotated by 2 to 4 degrees, in a random direction",
+    )  # fmt: skip
+    parser.add_argument(
+        "--locator", type=Path, metavar="FILE.npz", help="locator of the anatomy (default: a new one, kept in --folder)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the twins and of what is seen (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument(
+        "--folder", type=Path, help="keeps meshes, twins and the locator, so that a stopped run goes on (default: none)"
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, row by row; 1 if of some twin no equilibrium was found."""
+    from scenes.analysis.machine import machine
+    from scenes.script.shipped_files import template_path
+    from sim.bodies.meshfile import read_anatomy
+
+    from ..studies.locate_rivals import rivals
+    from ..studies.locate_study import rows, sights_of
+    from ..studies.locate_twins import twins
+
+    _check(args)
+    body = read_anatomy(args.anatomy or template_path())
+    finer = finer_of(args)
+    with bar("twins") as heard:
+        found = list(twins(body, finer, args.twins, args.seed, args.device, args.element, args.folder, heard))
+    failed = [number for number, twin in enumerate(found) if twin is None]
+    some = [twin for twin in found if twin is not None]
+    locator = locator_of(args, body)
+    table = sys.stderr if args.json else sys.stdout
+    where = f"{machine(args.device)}; truths of {len(finer.mesh.nodes)} nodes, {args.element}"
+    print(f"{where}\n\n{len(some)} twins\n\n| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", file=table)
+    others = {"named": not args.clouds, "slip": 1e-3 * args.slip, "wrong": args.wrong_registration}
+    sights = sights_of(args.points, args.cover, args.noise, **others)
+    made = []
+    with bar("observations") as heard:
+        for row in rows(some, sights, rivals(body), locator, args.seed, heard):
+            made.append(row)
+            print(f"| {' | '.join(_cells(row))} |", file=table, flush=True)
+    if failed:
+        print(f"benchmarks locate: no equilibrium was found of twins {failed}: they are in no row", file=sys.stderr)
+    if args.json:
+        print(json.dumps({"machine": where, "failed": failed, "rows": [asdict(row) for row in made]}))
+    return 1 if failed else 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse, before anything is solved, what would be refused after.
+
+    Raises
+    ------
+    InputError
+        Counts, shares or a seed that cannot be; a brain of one's own without its finer mesh.
+    """
+    at_least("--twins", args.twins, 1)
+    at_least("--seed", args.seed, 0)
+    for count in args.points:
+        at_least("--points", count, 6)
+    for cover in args.cover:
+        if not 1 <= cover <= 100:
+            raise InputError(f"--cover {cover}: give a share of the open cortex, from 1 to 100 [%].")
+    if not 0.0 <= args.slip <= MOST_SLIPPED:
+        raise InputError(
+            f"--slip {args.slip:g}: give how far all points are displaced, from 0 to {MOST_SLIPPED:g} [mm]."
+        )
+    check_finer(args)
+
+
+def check_finer(args: argparse.Namespace) -> None:
+    """Raise InputError for a brain of one's own without its finer mesh."""
+    if args.anatomy is not None and args.finer is None:
+        raise InputError("--anatomy needs --finer: a finer mesh of the same brain, by `sulcus anatomy --nodes`.")
+
+
+def finer_of(args: argparse.Namespace) -> Anatomy:
+    """The mesh that the truths are solved on."""
+    from sim.bodies.meshfile import read_anatomy, write_anatomy
+    from sim.bodies.subject import MeshPlan, make_anatomy
+    from sim.bodies.template import Tumour, template_subject
+
+    kept = args.finer or (args.folder and args.folder / f"template-{args.nodes}.vtu")
+    if args.finer or (kept and kept.is_file()):
+        return read_anatomy(kept)
+    print(f"benchmarks locate: meshing with about {args.nodes} nodes ...", file=sys.stderr)
+    anatomy = make_anatomy(template_subject(Tumour()), MeshPlan(args.nodes))
+    if kept:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        write_anatomy(kept, anatomy)
+    return anatomy
+
+
+def locator_of(args: argparse.Namespace, body: Anatomy) -> Locator:
+    """Read the locator that is given, or the one that the folder keeps, or make a new one."""
+    from surrogate.locating.locator_files import load_locator, save_locator
+    from surrogate.locating.setup import make_locator
+
+    path = args.locator or (args.folder and args.folder / f"{body.digest}.locator.npz")
+    if args.locator or (path and path.is_file()):
+        return load_locator(path, body)
+    parts = None if path is None else path.with_suffix(".parts")
+    with bar("locator") as heard:
+        locator = make_locator(
+            body, device=args.device, folder=parts, progress=lambda stage, done, total: heard(done, total, stage)
+        )
+    if path is not None:
+        save_locator(path, locator)
+    return locator
+
+
+@contextmanager
+def bar(name: str) -> Iterator[Callable[..., None]]:
+    """A progress bar on the error stream, and what sets it: how many are done, of how many, and of what."""
+    from tqdm import tqdm
+
+    with tqdm(desc=name, file=sys.stderr) as bar:
+
+        def heard(done: int, total: int, stage: str = name) -> None:
+            bar.total, bar.n = total, done
+            bar.set_description(stage)
+
+        yield heard
+
+
+def _cells(row: Row) -> Iterable[str]:
+    """What stands in a line of the table."""
+    held = "" if row.held is None else f"{row.held:.0f} %"
+    took = "" if row.milliseconds is None else f"{row.milliseconds:.3g}"
+    return (
+        f"{row.points}", f"{row.cover}", f"{row.noise}", row.estimator, f"{row.removed:.0f}", f"{row.mean:.2f}",
+        f"{row.p95:.2f}", held, f"{row.refused or ''}", f"{row.doubted or ''}",
+        f"{row.warned or ''}", took,
+    )  # fmt: skip

@@ -1,0 +1,62 @@
+"""`python -m benchmarks microscope`: how far off a tumour is that is located from pictures of two eyes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict, replace
+
+from scenes.options.theatre_options import add_theatre, scene_asked, theatre_asked
+from sim.arguments import at_least
+
+from .locate import bar
+
+HEADS = (
+    "seed", "frames", "refused", "points", "tumour moves by up to [mm]", "off: median", "95 %", "most", "removed [%]",
+    "in the 95 % ellipsoid [%]", "95 % radius [mm]", "update [ms]: median", "95 %",
+)  # fmt: skip
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        "--scene", default="microscope", help="a scene that two eyes see, or MY_SCENE.py (default %(default)s)"
+    )
+    parser.add_argument("--seeds", type=int, default=5, help="how many, from 0 (default %(default)s)")
+    parser.add_argument("--every", type=int, default=10, help="one frame in so many (default %(default)s)")
+    parser.add_argument("--cloud", action="store_true", help="give points without names, as a cloud of the cortex")
+    parser.add_argument("--plain", action="store_true", help="draw no vessels: the scan's grey alone")
+    add_theatre(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure."""
+    from scenes.script.sight import StereoSight
+
+    from ..studies.stereo_study import rows
+
+    at_least("--seeds", args.seeds, 1)
+    at_least("--every", args.every, 1)
+    theatre = theatre_asked(args, args.scene)
+    scene = scene_asked(args, args.scene, theatre)
+    if isinstance(scene.sight, StereoSight):
+        sight = replace(scene.sight, named=not args.cloud, vessels=not args.plain)
+        scene = replace(scene, sight=sight)
+    with bar("estimates") as heard:
+        found = list(rows(theatre, scene, range(args.seeds), args.every, heard))
+    if args.json:
+        print(json.dumps([asdict(row) for row in found]))
+        return 0
+    print("Drawn pictures, not filmed ones. Errors are those of the tumour's middle, beside finite elements.")
+    print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}")
+    for row in found:
+        cells = (row.moved_mm, row.off_mm, row.p95_mm, row.most_mm)
+        shares = (100.0 * row.removed, 100.0 * row.covered)
+        times = f"{row.radius_mm:.2f} | {row.milliseconds:.0f} | {row.slowest_ms:.0f}"
+        print(f"| {'all' if row.seed < 0 else row.seed} | {row.frames} | {row.refused} | {row.points:.0f} ", end="")
+        print(
+            f"| {' | '.join(f'{each:.2f}' for each in cells)} | {' | '.join(f'{each:.0f}' for each in shares)} ", end=""
+        )
+        print(f"| {times} |")
+    return 0

@@ -1,0 +1,87 @@
+"""`python -m benchmarks robust`: how many of thousands of random loads converge."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from scenes.options.tissue_options import add_tissue_arguments, elasticity_of
+from scenes.script.shipped_files import template_path
+from sim.bodies.meshfile import read_anatomy
+from sim.effects import pushed_effects
+from sim.elements import ELEMENTS, RECOMMENDED
+from sim.errors import InputError
+from sim.runtime.atomic_files import check_output
+
+if TYPE_CHECKING:
+    from ..studies.robustness import Tally
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument("--count", type=int, default=10_000, help="loads, half of them brutal (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
+    add_tissue_arguments(parser)
+    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
+    parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--out", type=Path, metavar="LOADS.csv", help="a line for each load; an unfinished run goes on")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve them all; 1 if one did not converge."""
+    from scenes.analysis.machine import machine
+
+    from ..studies.recorded_rows import append_rows, read_rows
+    from ..studies.robustness import Record, Trial, records, tallies
+
+    if args.count < 2 or args.batch < 1:
+        raise InputError(f"--count {args.count} --batch {args.batch} tries nothing: give --count >= 2, --batch >= 1.")
+    anatomy = read_anatomy(args.anatomy or template_path())
+    effects = pushed_effects(anatomy, elasticity_of(args, anatomy.mesh))
+    trial = Trial(anatomy, effects, args.element, args.device, args.batch)
+    stated = f"{anatomy.digest} {effects!r} {args.element} count {args.count} seed {args.seed}"
+    if args.out:
+        check_output(args.out, ".csv")
+    found = read_rows(args.out, stated, Record) if args.out else []
+    with tqdm(total=args.count, initial=len(found), unit="load", file=sys.stderr) as bar:
+        for some in records(trial, args.count, args.seed, tuple(found)):
+            found += some
+            bar.update(len(some))
+            if args.out:
+                append_rows(args.out, stated, some)
+    sets = tallies(found)
+    where = machine(args.device)
+    if args.json:
+        print(json.dumps({"machine": where, "sets": [asdict(item) for item in sets]}))
+    else:
+        _print(where, sets)
+    return 0 if all(item.converged == item.loads for item in sets) else 1
+
+
+def _print(where: str, sets: Sequence[Tally]) -> None:
+    names = ("set", "loads", "converged", "rescued", "outer: median", "p99", "ms a load", "float64 residual", "hardest")
+    print(f"{where}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}")
+    for item in sets:
+        hard = item.hardest
+        cells = (
+            item.preset,
+            item.loads,
+            f"{item.converged} ({item.converged / item.loads:.2%})",
+            item.rescued,
+            f"{item.outer_median:g}",
+            f"{item.outer_p99:g}",
+            f"{item.milliseconds:.3g}",
+            f"<= {item.double:.1e} of {item.checked}" if item.checked else "",
+            f"{hard.force:.3g} N on {1e3 * hard.footprint:.3g} mm: {hard.outcome.lower()}, {hard.outer} outer",
+        )
+        print(f"| {' | '.join(map(str, cells))} |")

@@ -1,0 +1,50 @@
+"""`python -m benchmarks shortcuts`: what each shortcut of the solver is worth on work that users do."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from scenes.script.shipped_files import template_path
+from sim.accuracy import LIVE
+from sim.arguments import at_least
+from sim.bodies.meshfile import read_anatomy
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument("--runs", type=int, default=20, help="loads or frames of each row (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line on stdout, the table on stderr")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, row by row."""
+    from scenes.analysis.machine import machine
+    from scenes.script.site import site_of
+    from sim.runtime.device import find_device
+
+    from ..studies.shortcuts import measure, works
+
+    at_least("--runs", args.runs, 1)
+    site = site_of(read_anatomy(args.anatomy or template_path()))
+    table, where = sys.stderr if args.json else sys.stdout, machine(args.device)
+    print(f"{where}\n\n| shortcut | work | runs | with: median, p95 [ms] | without | ratio | of totals |", file=table)
+    print(f"|{'---|' * 7}", file=table)
+    found = []
+    for work in works(site, args.runs, find_device(args.device, LIVE.precision).on_cuda):
+        row = measure(work, site, args.device)
+        if row is None:
+            continue
+        found.append(row)
+        times = f"{row.median:.3g}, {row.p95:.3g} | {row.median_without:.3g}, {row.p95_without:.3g}"
+        shares = f"{row.ratio:.2f} | {row.ratio_of_totals:.2f}"
+        print(f"| {row.shortcut} | {row.work} | {row.runs} | {times} | {shares} |", file=table, flush=True)
+    if args.json:
+        rows = [{**asdict(row), "ratio": row.ratio, "ratio_of_totals": row.ratio_of_totals} for row in found]
+        print(json.dumps({"machine": where, "rows": rows}))
+    return 0

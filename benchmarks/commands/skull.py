@@ -1,0 +1,63 @@
+"""`python -m benchmarks skull`: how far the tumour moves under each skull, on meshes of several sizes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from sim.arguments import at_least
+from sim.bodies.meshfile import read_anatomy
+from sim.bodies.subject import MeshPlan, make_anatomy
+from sim.bodies.template import Tumour, template_subject
+from sim.effects import SKULLS
+from surrogate.data.tool_loads import PRESETS, draw
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        "anatomies", nargs="*", type=Path, metavar="ANATOMY.vtu", help="bodies (default: the template of --nodes)"
+    )
+    parser.add_argument("--nodes", nargs="+", type=int, default=[5300, 17_000, 40_000], help="of the template's meshes")
+    parser.add_argument(
+        "--skulls", nargs="+", default=["bonded", "slide"], choices=(*SKULLS, "tearing", "pressing"),
+        help="what the skull does (default bonded slide). tearing: the bond lets go where it bears too much. "
+        "pressing: it bears nothing and has no gap",
+    )  # fmt: skip
+    parser.add_argument("--poisson", nargs="+", type=float, default=[0.45, 0.49], help="Poisson's ratios (0.45 0.49)")
+    parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (%(default)s)")
+    parser.add_argument("--loads", type=int, default=8, help="how many (%(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, row by row; 1 if a solve did not converge."""
+    from scenes.analysis.machine import machine
+
+    from ..studies.skull_models import rows
+
+    at_least("--loads", args.loads, 1)
+    plans = [MeshPlan(count) for count in args.nodes]
+    bodies = [read_anatomy(path) for path in args.anatomies]
+    bodies = bodies or [make_anatomy(template_subject(Tumour()), plan) for plan in plans]
+    loads = draw(args.preset, bodies[0], args.loads, 0)
+    table = sys.stderr if args.json else sys.stdout
+    where = machine(args.device)
+    print(f"{where}\n\n{len(loads)} {args.preset} loads\n", file=table)
+    print("| skull | nu | vertices | tumour moves [mm] | leaks | bond bears | a load [s] |", file=table)
+    print("|---|---|---|---|---|---|---|", file=table)
+    found = []
+    for row in rows(bodies, args.skulls, args.poisson, loads, args.device):
+        found.append(row)
+        moved = f"{row.motion:.4f}" + (f" ({row.failed} not converged)" if row.failed else "")
+        bond = "" if row.bond is None else f"{row.bond:.2f}"
+        leaked = "" if row.leaked is None else f"{row.leaked:.2g}"
+        cells = (row.skull, f"{row.poisson:g}", row.vertices, moved, leaked, bond, f"{row.seconds:.2f}")
+        print(f"| {' | '.join(map(str, cells))} |", file=table, flush=True)
+    if args.json:
+        print(json.dumps({"machine": where, "rows": [asdict(row) for row in found]}))
+    return 1 if any(row.failed for row in found) else 0

@@ -1,0 +1,139 @@
+"""`python -m benchmarks solver`: the first load and a further one on a mesh, beside other finite-element packages."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from scenes.options.json_line import json_line
+from scenes.script.shipped_files import template_path
+from sim.arguments import at_least
+from sim.bodies.meshfile import read_anatomy
+from sim.errors import InputError
+
+if TYPE_CHECKING:
+    from ..peers.comparison import Row
+
+NAMES = ("tled", "modified-newton", "torch-fem", "scikit-fem", "felupe")
+COLUMNS = (
+    "engine",
+    "tolerance",
+    "first [s]",
+    "/ ours",
+    "further [s]",
+    "/ ours",
+    "converged",
+    "residual",
+    "off the reference [mm]",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        "--peers", nargs="*", choices=NAMES, help="these too, or all of them (most want the extra `peers`)"
+    )
+    parser.add_argument(
+        "--tolerance",
+        nargs="+",
+        type=float,
+        default=[1e-6],
+        help="relative residuals that are asked for, each in a run of its own (default 1e-6)",
+    )
+    parser.add_argument(
+        "--device", choices=("cpu", "cuda"), default="cpu", help="of ours and of tled; others have the CPU"
+    )
+    parser.add_argument(
+        "--mesh", nargs="+", type=Path, metavar="MESH.vtu", help="made by `sulcus anatomy` (default: the template)"
+    )
+    parser.add_argument("--loads", type=int, default=20, help="palpation loads, each from rest (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
+    parser.add_argument("--starts", type=int, default=3, help="first answers of each engine (default %(default)s)")
+    parser.add_argument("--threads", type=int, default=2, help="of every engine (default %(default)s)")
+    parser.add_argument("--live", action="store_true", help="ours is set up for many single loads, which takes longer")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compare; 1 if one of our answers is off."""
+    from scenes.analysis.machine import machine
+    from sim.runtime.device import find_device
+
+    from ..peers.comparison import LEAST, LIVE, OWN, PEERS, case_of, compare, judge_of
+
+    for name, value, least in (
+        ("--loads", args.loads, 2),
+        ("--starts", args.starts, 1),
+        ("--threads", args.threads, 1),
+    ):
+        at_least(name, value, least)
+    if wrong := [tolerance for tolerance in args.tolerance if not LEAST <= tolerance < 1.0]:
+        raise InputError(f"--tolerance {wrong[0]:g} cannot be judged: give numbers from {LEAST:g} to below 1.")
+    find_device(args.device, "float64")
+    asked = () if args.peers is None else args.peers or NAMES
+    own = LIVE if args.live else OWN
+    engines = [engine.on(args.device) for engine in (own, *(peer for peer in PEERS if peer.name in asked))]
+    cases = [case_of(read_anatomy(path), args.loads, args.seed) for path in args.mesh or [template_path()]]
+    table = sys.stderr if args.json else sys.stdout
+    where = machine(args.device)
+    print(
+        f"{where}\n\nLog neo-Hookean, E 3 kPa, nu 0.45, linear tetrahedra, skull nodes held (not sliding: not every "
+        f"peer can). {args.loads} palpation loads as nodal forces, each from rest and alone. One routine measures all "
+        f"residuals, and distances from our answers to 1e-11. {args.threads} threads; imports not counted, compiled "
+        "code in its cache.",
+        file=table,
+    )
+    found, each = [], args.starts + args.loads
+    for case in cases:
+        started = sum(not engine.missing for engine in engines)
+        size = {"nodes": len(case.nodes), "tets": len(case.tets)}
+        print(f"\n{size['nodes']} nodes, {size['tets']} tetrahedra\n\n| {' | '.join(COLUMNS)} |", file=table)
+        print(f"|{'---|' * len(COLUMNS)}", file=table, flush=True)
+        judge = judge_of(case)
+        with tqdm(total=len(args.tolerance) * started * each, unit="answer", file=sys.stderr) as bar:
+            for tolerance in args.tolerance:
+                to_this = replace(case, tolerance=tolerance)
+                rows = compare(to_this, judge, engines, args.starts, args.threads, bar.update)
+                _print(rows, table)
+                found.append({**size, "tolerance": tolerance, "rows": [_plain(row) for row in rows]})
+    if args.json:
+        print(json_line({"machine": where, "threads": args.threads, "meshes": found}))
+    return 0 if all(answer["good"] for mesh in found for answer in mesh["rows"][0]["answers"]) else 1
+
+
+def _print(rows: Sequence[Row], table: Any) -> None:
+    for row in rows:
+        if row.missing:
+            print(f"| {row.engine} | {row.tolerance:g} | {row.missing} |{' |' * (len(COLUMNS) - 3)}", file=table)
+            continue
+        good = [answer for answer in row.answers if answer.good]
+        bad = next((answer for answer in row.answers if not answer.good), None)
+        why = f"; not converged: {bad.reason or f'residual {bad.residual:.1e}'}" if bad else ""
+        cells = (
+            f"{row.engine} ({row.setting})",
+            f"{row.tolerance:g}",
+            _figure(row.first, ".2f"),
+            _figure(row.first_ratio, ".2f"),
+            _figure(row.further, ".3f"),
+            _figure(row.ratio, ".1f"),
+            f"{len(good)} of {len(row.answers)}{why}",
+            f"<= {max(answer.residual for answer in good):.0e}" if good else "",
+            f"<= {max(answer.apart for answer in good):.1e}" if good else "",
+        )
+        print(f"| {' | '.join(cells)} |", file=table, flush=True)
+
+
+def _figure(value: float, form: str) -> str:
+    return format(value, form) if np.isfinite(value) else ""
+
+
+def _plain(row: Row) -> dict[str, Any]:
+    answers = [{**asdict(answer), "good": answer.good} for answer in row.answers]
+    return {**asdict(row), "first": row.first, "further": row.further, "answers": answers}

@@ -1,0 +1,59 @@
+"""`python -m benchmarks stages`: what each stage costs, as a table."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+
+from scenes.options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
+from sim.arguments import at_least
+from sim.errors import InputError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    from scenes.cli import add_plugin
+
+    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene (default %(default)s)")
+    add_theatre(parser)
+    add_plugin(parser)
+    parser.add_argument("--solves", type=int, default=64, help="loads in the batch (default %(default)s)")
+    parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, row by row."""
+    from scenes.analysis.machine import machine
+    from scenes.play.deformers import plan_of
+    from scenes.script.scene import SCENES, find_scene
+    from sim.effects import ToolForce
+
+    from ..studies.stages import rows
+
+    at_least("--batch", args.batch, 1)
+    theatre = theatre_asked(args, args.scene)
+    scene = scene_asked(args, args.scene, theatre)
+    if not any(isinstance(effect, ToolForce) for effect in scene.effects):
+        pushing = ", ".join(
+            name for name in SCENES if find_scene(name).sight is None and ToolForce() in find_scene(name).effects
+        )
+        raise InputError(f"in the scene {scene.name} no tool pushes, which is what is measured: choose {pushing}.")
+    name = deformer_name(args, theatre, scene)
+    player = theatre.player(name, scene)
+    found, solvers = [], []
+    where = machine(args.device)
+    table = sys.stderr if args.json else sys.stdout
+    print(f"{where}\n\n| stage | median | p95 | | what |\n|---|---|---|---|---|", file=table)
+    for row in rows(theatre, player, name, args.solves, args.batch, solvers.append):
+        found.append(row)
+        p95 = "" if row.p95 is None else f"{row.p95:.3g}"
+        print(f"| {row.name} | {row.median:.3g} | {p95} | {row.unit} | {row.note} |", file=table, flush=True)
+    plan = tuple(line for fem in solvers for line in plan_of(fem))
+    if plan:
+        print("\nHow the finite elements go about a load:\n", *(f"- {line}" for line in plan), sep="\n", file=table)
+    if args.json:
+        print(json.dumps({"machine": where, "plan": plan, "rows": [asdict(row) for row in found]}))
+    return 0

@@ -1,0 +1,48 @@
+"""`python -m benchmarks track`: how far off a tool's tip is that a camera sees by its printed cube."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+
+from sim.arguments import at_least
+
+from .locate import bar
+
+HEADS = (
+    "protocol", "pictures", "tip: median [mm]", "p95", "largest", "certain [%]", "wrong", "held at 95 % [%]", "ms",
+)  # fmt: skip
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--pictures", type=int, default=60, help="of each protocol (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of poses and noise (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure; 1 if a wrong pose was called certain."""
+    from ..studies.track_study import studied
+
+    at_least("--pictures", args.pictures, 2)
+    at_least("--seed", args.seed, 0)
+    with bar("pictures") as heard:
+        rows = studied(args.pictures, args.seed, heard)
+    if args.json:
+        print(json.dumps([asdict(row) for row in rows]))
+    else:
+        print("Drawn pictures, not filmed ones: bent paper, motion blur and a wrong calibration come on top.")
+        print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}")
+        for row in rows:
+            cells = (row.median, row.p95, row.most)
+            certain = "-" if row.certain is None else f"{row.certain:.0f}"
+            shares = (certain, str(row.wrong), f"{row.held:.0f}", f"{row.milliseconds:.1f}")
+            print(f"| {row.protocol} | {row.pictures} | {' | '.join(f'{each:.2f}' for each in cells)} ", end="")
+            print(f"| {' | '.join(shares)} |")
+    wrong = sum(row.wrong for row in rows)
+    if wrong:
+        print(f"benchmarks track: {wrong} wrong poses were called certain", file=sys.stderr)
+    return 1 if wrong else 0

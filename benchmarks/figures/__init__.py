@@ -1,0 +1,1 @@
+"""Figures of the performance pages: their benches, records, tables and comparison."""

@@ -1,0 +1,140 @@
+"""Figures measured one by one, each by its own process, and its numbers taken out of what that process says."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from scenes.analysis.machine import machine
+from sim.errors import InputError
+from sim.geometry.tetmesh import digest_of
+from sim.runtime.versions import install_hint, version_of
+
+from ..peers.child_process import HOUSE, Ended, run_to_end
+from .figure_readings import number_at
+from .figure_record import Entry, Origin, Value
+from .figures import Figure, command_of, words_of
+
+BENCH = (sys.executable, "-m", "benchmarks")
+LONGEST = 400
+"""Characters of a reason."""
+
+
+def version_here() -> str:
+    """The version of sulcus with a digest of its code, which changes while the version stays."""
+    paths = sorted(
+        path for room in ("ar", "benchmarks", "scenes", "sim", "surrogate") for path in (HOUSE / room).rglob("*.py")
+    )
+    code = b"\0".join(path.relative_to(HOUSE).as_posix().encode() + b"\0" + path.read_bytes() for path in paths)
+    return f"{version_of('sulcus')} (code {digest_of(np.frombuffer(code, np.uint8))})"
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run of figures is of.
+
+    Parameters
+    ----------
+    version
+        As `version_here` gives it.
+    digest
+        Of the anatomy.
+    anatomy
+        Its file; None: each bench takes the template.
+    quick
+        Whether counts are small.
+    again
+        Whether figures are measured that are there already.
+    bench
+        What is run, before a figure's words.
+    """
+
+    version: str
+    digest: str
+    anatomy: Path | None = None
+    quick: bool = False
+    again: bool = False
+    bench: Sequence[str] = BENCH
+
+    def origin(self, device: str) -> Origin:
+        """Where a figure of a device comes from today.
+
+        Raises
+        ------
+        InputError
+            A device that is not here.
+        """
+        where, _, today = machine(device).rpartition("; ")
+        return Origin(self.version, where, self.digest, today)
+
+
+def entry_of(figure: Figure, run: Run, before: Entry | None, heard: Callable[[str], object]) -> Entry:
+    """The entry of a figure: the one from before if it has these numbers or none can be had here, or a new one.
+
+    `heard` is as `run_to_end` has it.
+    """
+    command = command_of(figure, run.quick)
+    try:
+        origin, reason = run.origin(figure.device), _not_installed(figure)
+    except InputError as error:
+        origin, reason = run.origin("auto"), str(error)
+    entry = Entry(figure.name, command, "skipped", (), reason, 0.0, origin)
+    if before is not None and before.values and (reason or (not run.again and _same(before, entry))):
+        return before
+    return entry if reason else _measured(figure, run, entry, heard)
+
+
+def _not_installed(figure: Figure) -> str:
+    gone = [name for name in figure.modules if find_spec(name) is None]
+    return f"{', '.join(gone)} not installed. {install_hint('peers')}" if gone else ""
+
+
+def _same(before: Entry, now: Entry) -> bool:
+    """Whether both are by one command and one origin, whatever the date."""
+    return before.command == now.command and replace(before.origin, date=now.origin.date) == now.origin
+
+
+def _measured(figure: Figure, run: Run, entry: Entry, heard: Callable[[str], object]) -> Entry:
+    """The entry with what a process of its own measured; what went wrong there is its reason."""
+    words = words_of(figure, run.quick, None if run.anatomy is None else str(run.anatomy.absolute()))
+    with TemporaryDirectory() as folder:
+        ended = run_to_end((*run.bench, *words, "--json"), Path(folder), heard)
+    values, reason = _values(figure, ended)
+    state = "failed" if not values else "missed" if reason else "measured"
+    return replace(entry, state=state, values=values, reason=reason, seconds=ended.seconds)
+
+
+def _values(figure: Figure, ended: Ended) -> tuple[tuple[Value, ...], str]:
+    """The numbers that a process gave, and what is wrong with them or with its end."""
+    lines = ended.output.strip().splitlines()
+    try:
+        said = json.loads(lines[-1])
+    except (ValueError, IndexError, RecursionError):
+        said = None
+    found = [(reading, number_at(said, reading.place)) for reading in figure.readings]
+    values = tuple(Value(it.name, number, it.unit, it.better) for it, number in found if number is not None)
+    gone = [reading.name for reading, number in found if number is None]
+    if ended.code:
+        return values, _why(ended, bool(values))
+    if gone:
+        return values, f"its JSON has no number for {', '.join(gone)}"[:LONGEST]
+    return values, ""
+
+
+def _why(ended: Ended, has_numbers: bool) -> str:
+    """Why a process did not end well, without control characters."""
+    if ended.code < 0:
+        name = signal.strsignal(-ended.code) or f"signal {-ended.code}"
+        return f"its process was ended ({name})" + (", as where memory runs out" if name == "Killed" else "")
+    if ended.code == 1 and has_numbers:
+        return "its command ended with 1: not all that it measures came out as it asks"
+    said = "".join(letter if letter.isprintable() else " " for letter in ended.complaint)
+    return f"its command ended with {ended.code}: {said or 'it said nothing'}"[:LONGEST]

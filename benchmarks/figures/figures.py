@@ -1,0 +1,199 @@
+"""The figures of the performance pages: by which bench, on which device, and which of its numbers they are."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from typing import Literal
+
+from .figure_readings import (
+    LIMIT,
+    LIVE,
+    PICTURE,
+    STAGES,
+    TOGETHER,
+    Reading,
+    beside,
+    elements,
+    growth,
+    rates,
+    robust,
+    shortcuts,
+    skulls,
+    steps,
+)
+
+Kind = Literal["cpu", "cuda"]
+PROGRAM = ("python", "-m", "benchmarks")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A bench and the numbers that the pages take from it.
+
+    Parameters
+    ----------
+    command
+        The words after `python -m benchmarks`, without the device.
+    device
+        The device that it needs.
+    readings
+        The numbers.
+    quick
+        Words that make it small, for a smoke test; they stand behind the others, and the last word counts.
+    body
+        The option by which the bench takes an anatomy; empty: it takes one without option; None: it takes none.
+    modules
+        Of Python, which it needs besides.
+    """
+
+    name: str
+    command: str
+    device: Kind
+    readings: tuple[Reading, ...]
+    quick: str = ""
+    body: str | None = "--anatomy"
+    modules: tuple[str, ...] = ()
+
+
+TOOLS = ("bipolar", "dissector", "palpation", "spatula")
+PEERS = ("tled", "modified-newton", "scikit-fem", "felupe")
+SHORTCUTS = (
+    ("nonlinear elimination near the opening", "32 palpation loads together, smoothed"),
+    ("nonlinear elimination near the opening", "32 palpation loads together, p1"),
+    ("nonlinear elimination, clamped", "a palpation load from rest, quadratic"),
+    ("L-BFGS before Newton", "a palpation load from rest"),
+    ("contact solved apart", "16 poses of a ball together"),
+    ("nonlinear elimination of a patch", "frames of `press`, p1"),
+    ("contact solved apart", "frames of `palpate`, smoothed"),
+    ("curvature of the last frame", "frames of `press`, smoothed"),
+)
+DEFAULT, LINEAR = "--laws neo-hookean --poisson 0.49", "--element p1 --material stable-neo-hookean"
+STABLE = "--laws stable-neo-hookean --poisson 0.45"
+
+
+def _throughput(name: str, device: Kind, words: str, *presets: str, more: tuple[Reading, ...] = ()) -> Figure:
+    command = f"throughput {words} --presets {' '.join(presets)}"
+    return Figure(name, command, device, (*rates(*presets), *more), "--count 4 --repeats 1")
+
+
+def _live(name: str, device: Kind, words: str) -> Figure:
+    return Figure(name, f"live {words}", device, LIVE, "--frames 3 --checked 2")
+
+
+def _picture(device: Kind, size: str) -> Figure:
+    command = f"frame press --size {size} --frames 100"
+    return Figure(f"picture-{size}-{device}", command, device, PICTURE, "--frames 3 --batch 1")
+
+
+def _growth(device: Kind, size: int, *batches: str) -> Figure:
+    command = f"growth --element p1 --sizes {size} --batch {' '.join(batches)}"
+    return Figure(f"growth-{size}-{device}", command, device, growth(*batches), "--sizes 2000", None)
+
+
+def _poses(element: str, count: int) -> Figure:
+    words = f"--poses --element {element} --laws neo-hookean --poisson 0.45 --count {count} --repeats 2"
+    return _throughput(f"poses-{element}-{count}-cuda", "cuda", words, "palpation", "bipolar")
+
+
+def _solver(name: str, device: Kind, words: str, tolerances: str, *peers: str, modules=()) -> Figure:
+    command = f"solver --peers {' '.join(peers)} --starts 1 --tolerance {tolerances} {words}"
+    return Figure(name, command, device, beside(tolerances.split(), peers), "--loads 2", "--mesh", modules)
+
+
+def _skull(name: str, nodes: int, *skull: str) -> Figure:
+    command = f"skull --nodes {nodes} --poisson 0.49 --skulls {' '.join(skull)}"
+    return Figure(f"skull-{name}-cpu", command, "cpu", skulls(*skull), "--loads 1", "")
+
+
+_STEPS = steps("palpation", "spatula")
+_ALL = (*TOOLS, "mixed")
+_PACKAGES = ("pypardiso", "felupe", "skfem")
+
+FIGURES = (
+    _throughput("throughput-cpu", "cpu", f"{DEFAULT} --count 32", *_ALL, more=(*_STEPS, *TOGETHER)),
+    _throughput("throughput-cuda", "cuda", f"{DEFAULT} --count 4096", *_ALL, more=(*_STEPS, *TOGETHER)),
+    _live("live-cpu", "cpu", "--frames 60"),
+    _live("live-cuda", "cuda", "--frames 1000"),
+    Figure("stages-cpu", "stages press", "cpu", STAGES, "--solves 4 --batch 4"),
+    Figure("shortcuts-cpu", "shortcuts --runs 8", "cpu", shortcuts(*SHORTCUTS), "--runs 1"),
+    Figure(
+        "shortcuts-cuda",
+        "shortcuts --runs 40",
+        "cuda",
+        shortcuts(("frame as one captured graph", "frames of `press`, smoothed")),
+        "--runs 1",
+    ),
+    *(_picture(device, size) for device in Kind.__args__ for size in ("640x480", "800x600", "960x540")),
+    _live("live-linear-cpu", "cpu", f"{LINEAR} --frames 200"),
+    _live("live-linear-cuda", "cuda", f"{LINEAR} --frames 1000"),
+    _throughput("throughput-linear-cpu", "cpu", f"--element p1 {STABLE} --count 64", *TOOLS, more=TOGETHER),
+    *(
+        _throughput(
+            f"throughput-linear-{law}-{nu}-cuda",
+            "cuda",
+            f"--element p1 --laws {law} --poisson {nu} --count 16384",
+            *_ALL,
+            more=(*_STEPS, *TOGETHER),
+        )
+        for law in ("stable-neo-hookean", "neo-hookean")
+        for nu in (0.45, 0.49)
+    ),
+    _throughput(
+        "throughput-beyond-surgery-cuda",
+        "cuda",
+        f"--element p1 {STABLE} --count 6600",
+        "seed",
+        "brutal",
+        more=steps("seed", "brutal"),
+    ),
+    _throughput(
+        "throughput-quadratic-cuda",
+        "cuda",
+        f"--element p2 {STABLE} --count 2048",
+        *TOOLS,
+        more=(*steps(*TOOLS), *TOGETHER),
+    ),
+    *(_poses(element, count) for element in ("p1", "smoothed") for count in (64, 1024)),
+    *(_growth("cpu", size, "1", "8") for size in (2000, 5300, 17_000, 50_000, 100_000, 200_000)),
+    *(_growth("cuda", size, "1", "64") for size in (2000, 5300, 17_000, 50_000, 100_000, 200_000)),
+    *(
+        _solver(
+            f"solver-{threads}-cpu",
+            "cpu",
+            f"--loads 6 --threads {threads}",
+            "1e-4 1e-6 1e-10",
+            *PEERS,
+            modules=_PACKAGES,
+        )
+        for threads in (1, 2)
+    ),
+    _solver("solver-cuda", "cuda", "--loads 4", "1e-4", "tled"),
+    Figure("robust-cuda", f"robust --batch 1024 {LINEAR}", "cuda", robust(*TOOLS, "seed", "brutal"), "--count 12"),
+    _skull("5300", 5300, "bonded", "slide"),
+    _skull("17000", 17_000, "bonded", "slide"),
+    _skull("40000", 40_000, "bonded"),
+    _skull("tearing", 5300, "bonded", "tearing", "pressing"),
+    Figure(
+        "elements-cpu",
+        "elements --coarse",
+        "cpu",
+        elements(("p1", "smoothed", "p2"), (0.30, 0.45, 0.49, 0.495)),
+        body="",
+    ),
+    Figure("elements-limit-cpu", "elements --poisson 0.495", "cpu", LIMIT, body=""),
+)
+"""Every figure of docs/figures.md and docs/floor.md that a bench gives."""
+NAMED = {figure.name: figure for figure in FIGURES}
+
+
+def words_of(figure: Figure, quick: bool = False, anatomy: str | None = None) -> tuple[str, ...]:
+    """The words after `PROGRAM`; the anatomy stands behind the first, where no option's list takes it in."""
+    first, *rest = figure.command.split()
+    body = () if anatomy is None or figure.body is None else (*filter(None, [figure.body]), anatomy)
+    return (first, *body, *rest, *(figure.quick.split() if quick else ()), "--device", figure.device)
+
+
+def command_of(figure: Figure, quick: bool = False) -> str:
+    """The command by which a reader measures a figure."""
+    return shlex.join((*PROGRAM, *words_of(figure, quick)))

@@ -1,0 +1,105 @@
+"""The mesh's share of a contact force: a ball is moved over one cell, and over the same cell cut into smaller ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.analysis.stopwatch import timed
+from sim.accuracy import TRAIN
+from sim.anatomy import Anatomy
+from sim.bodies.refine import refined
+from sim.effects import ToolContact, ToolForce, pushed_effects
+from sim.fem import Fem
+from sim.loads import Loads, Touching
+from sim.material import Tissue
+from sim.tools import Ball
+from surrogate.data.tool_loads import axes_about
+
+from .elements import above_tumour
+
+# Places of the ball along one long edge of the surface, as shares of its length.
+PLACES = np.linspace(0.0, 1.0, 5)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Forces on a ball [N] over the places; NaN where the answer is not good.
+
+    Parameters
+    ----------
+    element, depth
+        Finite element, and how deep the ball stands in the surface at rest [m].
+    along
+        (places,) component along the surface's normal.
+    sideways
+        (places,) length of the rest.
+    fine
+        (places,) the component along the normal on the mesh whose cells at the opening are halved.
+    seconds, fine_seconds
+        Duration of all places together on each mesh.
+    """
+
+    element: str
+    depth: float
+    along: np.ndarray
+    sideways: np.ndarray
+    fine: np.ndarray
+    seconds: float
+    fine_seconds: float
+
+    @property
+    def share(self) -> float:
+        """Mean excess of the force over that on the finer mesh, as a share of the latter."""
+        return float(np.mean(self.along / self.fine - 1.0))
+
+    @property
+    def scatter(self) -> float:
+        """Range of the force over the places, as a share of its mean."""
+        return float(np.ptp(self.along) / self.along.mean())
+
+
+def rows(
+    anatomy: Anatomy, elements: Sequence[str], depths: Sequence[float], radius: float, tissue: Tissue, device: str
+) -> Iterator[Row]:
+    """One row for each element and depth [m] of a ball of a radius [m].
+
+    Raises
+    ------
+    InputError
+        An anatomy without tumour or open cortex.
+    """
+    normal, places = _line(anatomy)
+    T = np.zeros((len(places), 1, 4, 4))
+    T[..., :3, :3], T[..., 3, 3] = axes_about(normal[None]), 1.0
+    fine = refined(anatomy, near_opening=True)
+    for element in elements:
+        solvers = [_solver(body, element, radius, tissue, device) for body in (anatomy, fine)]
+        for depth in depths:
+            T[:, 0, :3, 3] = places - depth * normal
+            forces, seconds = [], []
+            for fem in solvers:
+                found, took = timed(fem.deform, Loads((Touching(T.copy()),)))
+                seconds.append(took)
+                good = np.array([outcome.good for outcome in found.outcome])
+                forces.append(np.where(good[:, None], found.reaction[:, 0, :3], np.nan))
+            along, finer = (np.abs(force @ normal) for force in forces)
+            sideways = np.sqrt(np.maximum((forces[0] ** 2).sum(axis=1) - along**2, 0.0))
+            yield Row(element, depth, along, sideways, finer, *seconds)
+
+
+def _line(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
+    """The outward normal (3,) over the tumour, and places (p, 3) [m] along the open triangle's longest edge there."""
+    point, _ = above_tumour(anatomy)
+    corners = anatomy.mesh.nodes[anatomy.open_surface]
+    a, b, c = corners[np.linalg.norm(corners.mean(axis=1) - point, axis=1).argmin()]
+    normal = np.cross(b - a, c - a)
+    start, end = max(((a, b), (b, c), (c, a)), key=lambda edge: float(np.linalg.norm(edge[1] - edge[0])))
+    return normal / np.linalg.norm(normal), start + PLACES[:, None] * (end - start)
+
+
+def _solver(anatomy: Anatomy, element: str, radius: float, tissue: Tissue, device: str) -> Fem:
+    passive = (effect for effect in pushed_effects(anatomy, tissue) if not isinstance(effect, ToolForce))
+    return Fem(anatomy, [*passive, ToolContact((Ball(radius),))], TRAIN, device, element=element)

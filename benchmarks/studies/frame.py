@@ -1,0 +1,134 @@
+"""A frame of the page, stage by stage: load, deform, render, composite, encode, send."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ar.page.browser import Browser
+from ar.page.parts import Body, Playback, Viewpoint
+from ar.page.sight import coded
+from ar.rendering.renderer import Renderer
+from scenes.page.demo import pictured
+from scenes.play.player import Player
+from scenes.play.stage import CORTEX_COLOUR, TUMOUR_COLOUR
+from sim.errors import InputError
+
+STAGES = ("load", "deform", "render", "composite", "encode", "send")
+# Frames before the first that counts: kernels are loaded, and what stands still is drawn.
+WARM_UP = 10
+
+
+@dataclass(frozen=True)
+class Spent:
+    """What a stage of so many frames took [ms]: median, 95th percentile and mean."""
+
+    stage: str
+    frames: int
+    median: float
+    p95: float
+    mean: float
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """The width and height [pixel] that a text such as 640x480 asks for.
+
+    Raises
+    ------
+    InputError
+        Another text, or a picture of less than 16 or more than 8,192 pixels a side.
+    """
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() and 16 <= int(part) <= 8192 for part in parts):
+        raise InputError(f"--size {text} is no size: give WIDTHxHEIGHT such as 640x480, each from 16 to 8192.")
+    return int(parts[0]), int(parts[1])
+
+
+def frames_of(player: Player, count: int) -> Iterator[tuple[float, ...]]:
+    """The seconds of each of `STAGES`, frame by frame: the scene is played in order, again and again.
+
+    The page is open on this machine alone, and nobody looks at it.
+    """
+    page, last = open_page(player), None
+    try:
+        for done in range(-WARM_UP, count):
+            number = (done + WARM_UP) % len(player.scene.times)
+            begun = clock.perf_counter()
+            touch = player.touch(number)
+            loads = player.loads(number, touch)
+            loaded = clock.perf_counter()
+            last = player.answer(loads, last)
+            deformed = clock.perf_counter()
+            frame = player.drawn(number, touch, loads, last, deformed - loaded)
+            picture = pictured(frame)
+            drawn = clock.perf_counter()
+            code = coded(picture)
+            encoded = clock.perf_counter()
+            positions = player.positions(last)
+            stage = player.stage.at(loads)
+            for layer in (stage.cortex(positions), stage.tumour(positions)):
+                page.move(layer.name, layer.vertices, layer.triangles)
+            page.put_sight(code, f"frame {number}")
+            sent = clock.perf_counter()
+            if done >= 0:
+                rendered = frame.seconds["render"]
+                yield (
+                    loaded - begun, deformed - loaded, rendered, drawn - deformed - rendered, encoded - drawn,
+                    sent - encoded,
+                )  # fmt: skip
+    finally:
+        page.close()
+
+
+def batch_rate(player: Player, count: int, seconds: float = 2.0) -> float:
+    """Pictures a second, of as many frames together, each by a camera of its own: colour, depth and segmentation.
+
+    The vertices come from the host; the pictures stay on the device that draws them.
+    """
+    stage, scene = player.stage, player.scene
+    scenes = []
+    for number in np.linspace(0, len(scene.times) - 1, count).astype(int).tolist():
+        touch = player.touch(number)
+        positions = player.positions(player.answer(player.loads(number, touch)))
+        held = None if scene.tool is None else player.tool(scene.tool, touch, positions)
+        scenes.append(stage.layers(positions, None if held is None else held.pose))
+    moved = np.stack([np.concatenate([layer.vertices for layer in each if not layer.still]) for each in scenes])
+    # All within half a degree.
+    cameras = [player.camera.perturbed(0.5 * (row - 0.5 * count) / count) for row in range(count)]
+    renderer = Renderer(scenes[0], stage.lamp, stage.device)
+    renderer.pictures(moved, cameras)
+    wp.synchronize()
+    done, begun = 0, clock.perf_counter()
+    while clock.perf_counter() - begun < seconds:
+        renderer.pictures(moved, cameras)
+        wp.synchronize()
+        done += count
+    return done / (clock.perf_counter() - begun)
+
+
+def open_page(player: Player) -> Browser:
+    """A page with the scene's moving bodies, on this machine alone."""
+    positions, site = player.site.anatomy.mesh.nodes, player.site
+    bodies = [
+        Body(layer.name, layer.vertices, layer.triangles, colour)
+        for layer, colour in (
+            (player.stage.cortex(positions), CORTEX_COLOUR),
+            (player.stage.tumour(positions), TUMOUR_COLOUR),
+        )
+    ]
+    view = Viewpoint(site.origin - 0.1 * site.axis, site.origin, site.up)
+    return Browser(bodies, view, Playback(2, lambda playing: None, lambda number: None))
+
+
+def table(seconds: Sequence[tuple[float, ...]]) -> list[Spent]:
+    """What each of `STAGES` and the whole frame took; seconds: a row for each frame."""
+    each = 1e3 * np.array(seconds)
+    columns = dict(zip(STAGES, each.T, strict=True)) | {"frame": each.sum(axis=1)}
+    return [
+        Spent(stage, len(each), float(np.median(spent)), float(np.percentile(spent, 95.0)), float(spent.mean()))
+        for stage, spent in columns.items()
+    ]

@@ -1,0 +1,73 @@
+"""How many steps a second Gymnasium environments make, all of them stepped together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.analysis.stopwatch import timed
+from scenes.gym.scripted import scripted
+from scenes.gym.vector import VectorEnv
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Steps a second of a task, summed over its environments.
+
+    Parameters
+    ----------
+    task, observation, environments
+        What was stepped.
+    median, least, most
+        Of the repeats [1/s].
+    touching
+        Share of the steps in which a tool exerted a force.
+    """
+
+    task: str
+    observation: str
+    environments: int
+    median: float
+    least: float
+    most: float
+    touching: float
+
+
+def rate_of(
+    environment: VectorEnv,
+    task: str,
+    observation: str,
+    steps: int,
+    repeats: int,
+    progress: Callable[[], object] = lambda: None,
+) -> Rate:
+    """Measure a task under its scripted policy; a first repeat is not counted, as it compiles and solves what is kept.
+
+    Parameters
+    ----------
+    steps
+        Of every environment in a repeat.
+    repeats
+        That are counted.
+    progress
+        Is called after each repeat.
+    """
+    seen, _ = environment.reset(seed=0)
+    rates, touched = [], []
+    for _ in range(repeats + 1):
+        spent = 0.0
+        for _ in range(steps):
+            action = scripted(task, seen if isinstance(seen, np.ndarray) else seen["states"])
+            (seen, *_, truth), seconds = timed(environment.step, action)
+            spent += seconds
+            touched.append(np.linalg.norm(truth["force"], axis=1) > 0.0)
+        rates.append(environment.num_envs * steps / spent)
+        progress()
+    kept = np.array(rates[1:])
+    touching = float(np.mean(touched[steps:]))
+    return Rate(
+        task, observation, environment.num_envs, float(np.median(kept)), float(kept.min()),
+        float(kept.max()), touching,
+    )  # fmt: skip

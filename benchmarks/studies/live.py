@@ -1,0 +1,127 @@
+"""Live frames: a tool moves over the open cortex, one warm-started solve a frame; how long they take, how exact."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scenes.analysis.stopwatch import timed
+from scenes.script.scene import Scene
+from scenes.script.site import Site
+from scenes.script.tool import Probe
+from scenes.script.tool_paths import wander
+from sim.accuracy import LIVE, Accuracy
+from sim.deformation import Deformation
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, stacked
+
+SPEED = 20e-3
+# Frames before the first that counts: the tool arrives, and kernels are loaded.
+WARM_UP = 30
+CONVERGED = Accuracy(tolerance=1e-6)
+
+
+@dataclass(frozen=True)
+class Ride:
+    """A tool of a footprint's `radius` [m] that presses with `force` [N] while it wanders over the open cortex."""
+
+    name: str
+    force: float
+    radius: float
+
+
+RIDES = (Ride("palpation", 0.25, 7e-3), Ride("spatula", 0.5, 10e-3))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Loads, their answer and the wall seconds that it took."""
+
+    loads: Loads
+    answer: Deformation
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Tally:
+    """One ride: milliseconds a frame, outer steps, outcomes by name; error of `checked` frames [mm]."""
+
+    ride: str
+    frames: int
+    median: float
+    p95: float
+    p99: float
+    worst: float
+    steps: float
+    most_steps: int
+    outcomes: Mapping[str, int]
+    good: bool
+    checked: int
+    error: float
+
+
+def loads_of(ride: Ride, scene: Scene, site: Site, frames: int) -> list[Loads]:
+    """The loads of each frame, those of the warm-up first.
+
+    Raises
+    ------
+    InputError
+        An opening in which the tool cannot move.
+    """
+    room = site.clearance - ride.radius
+    if room <= 0.0:
+        raise InputError(
+            f"a {ride.name} tool of {1e3 * ride.radius:g} mm radius cannot move in an opening that is clear for "
+            f"{1e3 * site.clearance:.3g} mm: choose a body with a larger craniotomy."
+        )
+    wandering = replace(scene, tool=Probe(radius=ride.radius), path=wander(ride.force, room, SPEED))
+    times = np.arange(WARM_UP + frames) / scene.frames_per_second
+    return [wandering.loads(site, wandering.path(time), time) for time in times.tolist()]
+
+
+def frames_of(fem: Fem, loads: Sequence[Loads]) -> Iterator[Frame]:
+    """Each frame in turn, from the last one's answer; the device is waited for at each reading."""
+    last = None
+    for number, load in enumerate(loads):
+        last, seconds = timed(fem.deform, load, start=last)
+        if number >= WARM_UP:
+            yield Frame(load, replace(last, memory={}, warm={}), seconds)
+
+
+def live_fem(scene: Scene, site: Site, device: str, element: str) -> Fem:
+    """Finite elements for live frames."""
+    return Fem(site.anatomy, scene.effects, LIVE, device, element=element, live=True)
+
+
+def errors(frames: Sequence[Frame], scene: Scene, site: Site, element: str) -> np.ndarray:
+    """Largest distance (n,) [m] over all nodes between each frame's answer and the converged solution."""
+    exact = Fem(site.anatomy, scene.effects, CONVERGED, "cpu", element=element)
+    converged = exact.deform(stacked([frame.loads for frame in frames])).displacement
+    found = np.concatenate([frame.answer.displacement for frame in frames])
+    return np.linalg.norm(found - converged, axis=2).max(axis=1)
+
+
+def tally(ride: Ride, frames: Sequence[Frame], off: np.ndarray) -> Tally:
+    """What became of a ride's frames, of which some were found `off` (n,) [m]."""
+    milliseconds = 1e3 * np.array([frame.seconds for frame in frames])
+    steps = np.array([frame.answer.iterations[0] for frame in frames])
+    outcomes = [frame.answer.outcome[0] for frame in frames]
+    median, p95, p99, worst = np.percentile(milliseconds, [50.0, 95.0, 99.0, 100.0]).tolist()
+    return Tally(
+        ride=ride.name,
+        frames=len(frames),
+        median=median,
+        p95=p95,
+        p99=p99,
+        worst=worst,
+        steps=float(steps.mean()),
+        most_steps=int(steps.max()),
+        outcomes=dict(Counter(outcome.name for outcome in outcomes)),
+        good=all(outcome.good for outcome in outcomes),
+        checked=len(off),
+        error=1e3 * float(off.max()),
+    )

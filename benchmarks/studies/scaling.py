@@ -1,0 +1,166 @@
+"""What a load costs as the mesh grows: seconds and memory, each size and batch in a process of its own."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from itertools import pairwise
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from scenes.analysis.loglog_chart import Curve, Panel
+from scenes.analysis.process_memory import watched_card
+from scenes.analysis.stopwatch import timed
+from scenes.report.finite_elements import template_mesh
+from sim.accuracy import TRAIN
+from sim.bodies.meshfile import read_anatomy
+from sim.effects import pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.material import BRAIN
+from sim.strategy.memory_needed import foreseen
+from surrogate.data.tool_loads import draw
+
+# Batches are solved until so many loads, or so many seconds, are spent.
+LOADS, PATIENCE = 12, 60.0
+SEED = 4
+
+
+@dataclass(frozen=True)
+class Row:
+    """What loads on one mesh cost, in batches of one size.
+
+    Parameters
+    ----------
+    size, asked
+        Nodes and batch that were asked for.
+    nodes, tets, preconditioner, batch
+        What was had.
+    set_up, load
+        Seconds: of the set-up, and of each load.
+    outer
+        Median of the loads' outer steps.
+    loads, converged
+        How many were solved, and how many of these converged.
+    memory, card
+        Peak of the process's own memory, and of what it took of the graphics card [GiB].
+    foreseen
+        What it was thought to take of the card before it began [GiB].
+    """
+
+    size: int
+    asked: int
+    nodes: int
+    tets: int
+    preconditioner: str
+    batch: int
+    set_up: float
+    load: float
+    outer: float
+    loads: int
+    converged: int
+    memory: float
+    card: float
+    foreseen: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What is measured: the element, the device, and the folder where meshes are kept."""
+
+    element: str
+    device: str
+    folder: Path
+
+
+def measured(trial: Trial, size: int, batch: int) -> Row:
+    """Solve palpation loads on one mesh, to 1e-4 in single precision, in this process.
+
+    Raises
+    ------
+    InputError
+        As `Fem`; a card on which they would not fit.
+    """
+    anatomy = read_anatomy(template_mesh(trial.folder, size))
+    needed = foreseen(anatomy, trial.element, TRAIN, trial.device, batch, batch)
+    if needed is not None:
+        print(f"{needed}.", file=sys.stderr)
+        needed.demand()
+    with watched_card(trial.device) as card:
+        effects = pushed_effects(anatomy, BRAIN)
+        fem, made = timed(Fem, anatomy, effects, TRAIN, trial.device, batch, trial.element)
+        loads = draw("palpation", anatomy, max(LOADS, batch) + 1, SEED)
+        fem.deform(loads.rows(np.array([-1])).scaled(1e-3))  # kernels are compiled or loaded at their first launch
+        seconds, outer, good = [], [], 0
+        while sum(seconds) < PATIENCE and len(outer) + batch <= max(LOADS, batch):
+            some = loads.rows(np.arange(len(outer), len(outer) + batch))
+            answer, spent = timed(fem.deform, some)
+            seconds.append(spent)
+            outer += list(answer.iterations)
+            good += sum(outcome.good for outcome in answer.outcome)
+    return Row(
+        size, batch, len(anatomy.mesh.nodes), len(anatomy.mesh.tets), fem.plan.preconditioner, batch, made,
+        float(np.median(seconds)) / batch, float(np.median(outer)), len(outer), good,
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, max(card) / 2**30,
+        0.0 if needed is None else needed.peak / 2**30,
+    )  # fmt: skip
+
+
+def rows(
+    trial: Trial, sizes: Sequence[int], batches: Sequence[int], done: Sequence[Row], said: Callable[[str], object]
+) -> Iterator[Row]:
+    """A row for each size and batch that is not `done`, each measured in a fresh process. `said` hears what is done.
+
+    Raises
+    ------
+    InputError
+        What meshes, devices and memory refuse; a process that was ended, for want of memory most likely.
+    """
+    known = {(row.size, row.asked) for row in done}
+    for size in sizes:
+        for batch in batches:
+            if (size, batch) in known:
+                continue
+            said(f"{size} nodes, the mesh")
+            template_mesh(trial.folder, size)
+            said(f"{size} nodes, batch of {batch}")
+            with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+                try:
+                    yield pool.submit(measured, trial, size, batch).result()
+                except BrokenProcessPool:
+                    raise InputError(
+                        f"{size} nodes with --batch {batch}: the process was ended, for want of memory most likely; "
+                        "leave this size out, or give a smaller batch."
+                    ) from None
+
+
+def panels(found: Sequence[Row]) -> tuple[Panel, ...]:
+    """Seconds and memory over nodes; where another preconditioner is chosen, a mark between the two sizes."""
+    batches = sorted({row.asked for row in found})
+    by_size = sorted({row.nodes: row.preconditioner for row in found}.items())
+    marks = tuple(((a * b) ** 0.5, _kind(two)) for (a, one), (b, two) in pairwise(by_size) if _kind(one) != _kind(two))
+
+    def curve(name: str, value: str, batch: int) -> Curve:
+        return Curve(name, tuple((row.nodes, getattr(row, value)) for row in found if row.asked == batch))
+
+    seconds = [curve("one load" if batch == 1 else f"one of {batch} together", "load", batch) for batch in batches]
+    memory = [curve(f"host, batch of {batch}", "memory", batch) for batch in batches]
+    if any(row.card for row in found):
+        memory += [curve(f"card, batch of {batch}", "card", batch) for batch in batches]
+    first = f"left of the first mark: {by_size[0][1]}" if marks else by_size[0][1]
+    seconds.append(curve("set-up", "set_up", batches[0]))
+    return (
+        Panel("What a load takes", "nodes", f"seconds; {first}", tuple(seconds), marks),
+        Panel("What it needs", "nodes", f"GiB at the peak; {first}", tuple(memory), marks),
+    )
+
+
+def _kind(name: str) -> str:
+    """Without the number of levels."""
+    return name.split(",")[0]

@@ -1,0 +1,149 @@
+"""What each shortcut of the solver is worth: the same loads with it and without it, in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scenes.analysis.stopwatch import timed
+from scenes.script.scene import find_scene
+from scenes.script.site import Site
+from sim.accuracy import LIVE, TRAIN, Accuracy
+from sim.effects import Effect, ToolContact, pushed_effects
+from sim.fem import Fem
+from sim.loads import Loads
+from sim.material import BRAIN
+from sim.strategy.plan import Step
+from surrogate.data.tool_loads import draw
+from surrogate.data.tool_poses import draw_poses, tool_of
+
+SEED = 4
+BATCH, BATCH_ON_CUDA, POSES = 32, 2048, 16
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """Loads that users ask for, and how.
+
+    Parameters
+    ----------
+    shortcut
+        In words.
+    name
+        The work in words.
+    step
+        The solver that is left out; None: what is warm in a start is dropped.
+    loads
+        One after the other.
+    effects, accuracy, element, live
+        As `Fem` has them.
+    follows
+        Whether each load starts from the last answer.
+    """
+
+    shortcut: str
+    name: str
+    step: Step | None
+    loads: Sequence[Loads]
+    effects: tuple[Effect, ...]
+    accuracy: Accuracy = TRAIN
+    element: str | None = None
+    live: bool = False
+    follows: bool = False
+
+
+@dataclass(frozen=True)
+class Row:
+    """Median and 95th percentile [ms] of a load (of a batch) with a shortcut, and without; how often each was timed."""
+
+    shortcut: str
+    work: str
+    runs: int
+    median: float
+    p95: float
+    median_without: float
+    p95_without: float
+    total: float
+    total_without: float
+
+    @property
+    def ratio(self) -> float:
+        """Median without over median with."""
+        return self.median_without / self.median
+
+    @property
+    def ratio_of_totals(self) -> float:
+        """All the time without over all the time with: rare loads that take long count here."""
+        return self.total_without / self.total
+
+
+def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
+    """What is measured; of each the first load only warms up."""
+    anatomy, some = site.anatomy, BATCH_ON_CUDA if on_cuda else BATCH
+    pushed = pushed_effects(anatomy, BRAIN)
+    loads = draw("palpation", anatomy, runs + 1, SEED)
+    single = [loads.rows(np.array([row])) for row in range(len(loads))]
+    many = draw("palpation", anatomy, some * (runs + 1), SEED)
+    batches = [many.rows(np.arange(first, first + some)) for first in range(0, len(many), some)]
+    for element in ("smoothed", "p1"):
+        name = f"{some} palpation loads together, {element}"
+        yield Work("nonlinear elimination near the opening", name, Step.NEAR, batches, pushed, element=element)
+    name = "a palpation load from rest, quadratic"
+    yield Work("nonlinear elimination, clamped", name, Step.CLAMPED, single, pushed, element="p2")
+    yield Work("L-BFGS before Newton", "a palpation load from rest", Step.LBFGS, single, pushed)
+    poses = draw_poses("palpation", anatomy, POSES * (runs + 1), SEED)
+    together = [poses.rows(np.arange(first, first + POSES)) for first in range(0, len(poses), POSES)]
+    tool = (*pushed, ToolContact((tool_of("palpation"),)))
+    yield Work("contact solved apart", f"{POSES} poses of a ball together", Step.CONTACT, together, tool)
+    for scene, step, shortcut in (
+        ("press", Step.PATCH, "nonlinear elimination of a patch"),
+        ("press", Step.STRAINED, "a stiffness that knows strained tissue"),
+        ("palpate", Step.CONTACT, "contact solved apart"),
+        ("press", None, "curvature of the last frame"),
+        ("press", Step.FRAME, "frame as one captured graph"),
+    ):
+        element = "p1" if step is Step.PATCH else None
+        played = find_scene(scene)
+        effects, first = played.effects_on(anatomy), len(played.times) // 3  # the tool has arrived
+        frames = [
+            played.loads(site, played.path(time), time) for time in played.times[first : first + runs + 1].tolist()
+        ]
+        name = f"frames of `{scene}`, {element or 'smoothed'}"
+        yield Work(shortcut, name, step, frames, effects, LIVE, element, live=True, follows=True)
+
+
+def tried(fem: Fem, step: Step | None) -> bool:
+    """Whether a solver has a shortcut at all on its device, with its element and effects."""
+    plan = fem.plan
+    own = {plan.many, plan.single, plan.contact}
+    return step is None or step in own or (plan.quick and step is Step.LBFGS) or (plan.frames and step is Step.FRAME)
+
+
+def measure(work: Work, site: Site, device: str) -> Row | None:
+    """Time a work with and without its shortcut, load by load in turn; None where the shortcut is not taken."""
+    avoid = () if work.step is None else (work.step,)
+    batch = len(work.loads[0])
+    fem, without = (
+        Fem(site.anatomy, work.effects, work.accuracy, device, batch, work.element, work.live, out)
+        for out in ((), avoid)
+    )
+    if not tried(fem, work.step):
+        return None
+    both = zip(_timed(fem, work, True), _timed(without, work, work.step is not None), strict=True)
+    seconds = 1e3 * np.array(list(both)[1:]).T
+    (median, other), (p95, other_p95) = np.median(seconds, axis=1), np.percentile(seconds, 95, axis=1)
+    return Row(
+        work.shortcut, work.name, seconds.shape[1], *map(float, (median, p95, other, other_p95, *seconds.sum(1)))
+    )
+
+
+def _timed(fem: Fem, work: Work, warm: bool) -> Iterator[float]:
+    """Seconds of each load."""
+    last = None
+    for loads in work.loads:
+        answer, seconds = timed(fem.deform, loads, last)
+        yield seconds
+        if work.follows and all(outcome.good for outcome in answer.outcome):
+            last = answer if warm else replace(answer, warm={})

@@ -1,0 +1,95 @@
+"""What the skull and the mesh decide: the tumour's motion, what passes the closed skull, what its bond bears."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.analysis.stopwatch import timed
+from sim.accuracy import STRAINED
+from sim.anatomy import Anatomy
+from sim.deformation import Deformation, joined
+from sim.effects import Bonded, pushed_effects
+from sim.fem import Fem
+from sim.loads import Loads
+from sim.material import Material
+from sim.tearing import TEARING, Tearing, torn
+
+from .elements import tumour_motion
+
+# A bond that lets go where it bears too much, and one that bears nothing: the skull presses only, without a gap.
+TORN = {"tearing": Bonded(), "pressing": Bonded(1e-6, 1e-6)}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One skull on one mesh at one Poisson's ratio.
+
+    Parameters
+    ----------
+    motion
+        Mean motion of the tumour by volume, its mean over the loads [mm].
+    leaked, bond
+        The largest over the loads, as in `Deformation`; None where nothing is bonded, and of what passes a skull that
+        the brain may leave.
+    seconds
+        A load, set-up left out.
+    failed
+        Loads that did not converge; they are in no figure.
+    """
+
+    skull: str
+    poisson: float
+    vertices: int
+    motion: float
+    leaked: float | None
+    bond: float | None
+    seconds: float
+    failed: int
+
+
+def rows(
+    anatomies: Sequence[Anatomy],
+    skulls: Sequence[str],
+    poissons: Sequence[float],
+    loads: Loads,
+    device: str,
+    tearing: Tearing = TEARING,
+) -> Iterator[Row]:
+    """The same loads on every mesh, Poisson's ratio and skull; E 3 kPa, neo-Hookean, the recommended element."""
+    for poisson in poissons:
+        for skull in skulls:
+            for anatomy in anatomies:
+                yield _measured(anatomy, skull, poisson, loads, device, tearing)
+
+
+def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device: str, tearing: Tearing) -> Row:
+    mesh, tissue = anatomy.mesh, Material("neo-hookean", 3000.0, poisson)
+    weak = loads.rows(slice(0, 1)).scaled(1e-3)
+    _answered(anatomy, skull, tissue, weak, device, tearing)  # kernels are compiled or loaded
+    answer, good, seconds = _answered(anatomy, skull, tissue, loads, device, tearing)
+    if not good.any():
+        return Row(skull, poisson, len(mesh.nodes), float("nan"), None, None, seconds, len(good))
+    moved = tumour_motion(anatomy, answer.displacement[good])
+    leaked, bond = (float(values[good].max()) for values in (answer.leaked, answer.bond))
+    return Row(
+        skull, poisson, len(mesh.nodes), 1e3 * float(np.linalg.norm(moved, axis=1).mean()),
+        None if skull in TORN else leaked, bond if np.isfinite(bond) else None, seconds, int((~good).sum()),
+    )  # fmt: skip
+
+
+def _answered(
+    anatomy: Anatomy, skull: str, tissue: Material, loads: Loads, device: str, tearing: Tearing
+) -> tuple[Deformation, np.ndarray, float]:
+    """Answers, which of them are good (B,), and seconds a load: set-up left out, but for what tears, which needs it."""
+    if skull in TORN:
+        effects = [TORN[skull] if isinstance(one, Bonded) else one for one in pushed_effects(anatomy, tissue)]
+        each = [loads.rows(np.array([row])) for row in range(len(loads))]
+        found = [timed(torn, anatomy, effects, load, STRAINED, device, tearing=tearing) for load in each]
+        good = np.array([one.rested and one.answer.outcome[0].good for one, _ in found])
+        return joined([one.answer for one, _ in found]), good, float(np.mean([seconds for _, seconds in found]))
+    fem = Fem(anatomy, pushed_effects(anatomy, tissue, skull), STRAINED, device)
+    answer, seconds = timed(fem.deform, loads)
+    return answer, np.array([outcome.good for outcome in answer.outcome]), seconds / len(loads)

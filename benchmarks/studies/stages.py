@@ -1,0 +1,88 @@
+"""What each stage costs: medians where a stage is short, warm-up excluded, the device waited for at each reading."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.analysis.stopwatch import timed
+from scenes.play.deformers import Theatre
+from scenes.play.player import Player
+from sim.accuracy import LIVE, TRAIN
+from sim.fem import Fem
+from sim.resected_fem import Operated
+from surrogate.data.tool_loads import draw
+
+WARM_UP = 3
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure in `unit`: median and 95th percentile of `runs` (None: one reading); `note` says what was done."""
+
+    name: str
+    median: float
+    p95: float | None
+    unit: str
+    runs: int
+    note: str
+
+
+def figure(name: str, unit: str, scale: float, runs: int, note: str, work: Callable[[int], object]) -> Row:
+    """Run `work(i)` and report seconds x scale."""
+    seconds = [timed(work, run % runs)[1] for run in range(-WARM_UP, runs)][WARM_UP:]
+    return Row(name, scale * float(np.median(seconds)), scale * float(np.percentile(seconds, 95)), unit, runs, note)
+
+
+def rows(
+    theatre: Theatre,
+    player: Player,
+    deformer: str,
+    solves: int,
+    batch: int,
+    made: Callable[[Fem | Operated], object] = lambda fem: None,
+) -> Iterator[Row]:
+    """The figures of a theatre, one by one: finite elements, learners, and the pictures of a player of `deformer`.
+
+    `made` hears of the finite elements that solve the batch.
+    """
+    scene = player.scene
+    nodes = theatre.anatomy.tumour_nodes
+    size = f"{len(theatre.anatomy.mesh.nodes)} nodes, {len(theatre.anatomy.mesh.tets)} tetrahedra"
+    loads = draw("palpation", theatre.anatomy, solves, seed=20)
+    single = [loads.rows(np.array([row])) for row in range(len(loads))]
+
+    fem, seconds = timed(theatre.fem, scene, TRAIN, batch)
+    seconds += timed(fem.deform, single[0])[1]
+    made(fem)
+    yield Row("FEM set-up", seconds, None, "s", 1, f"compile or load kernels, factorise; {size}")
+    answers, seconds = timed(fem.deform, loads)
+    each = 1e3 * seconds / len(loads)
+    good = sum(outcome.good for outcome in answers.outcome)
+    note = f"{good} of {len(loads)} converged to {TRAIN.tolerance:g}; palpation loads, batches of {batch}"
+    yield Row("FEM, a load in a batch", each, None, "ms", len(loads), note)
+    runs = min(20, len(single))
+    yield figure(
+        "FEM, a single load", "ms", 1e3, runs, f"from rest, to {TRAIN.tolerance:g}", lambda i: fem.deform(single[i])
+    )
+
+    live = Player(player.stage, theatre.fem(scene, LIVE, live=True))
+    frames = [frame.seconds["deform"] for frame in live.frames()][WARM_UP:]
+    yield Row(
+        "FEM, live", 1e3 * float(np.median(frames)), 1e3 * float(np.percentile(frames, 95)), "ms", len(frames),
+        f"scene {scene.name}, warm start, to {LIVE.tolerance:g}",
+    )  # fmt: skip
+
+    for name, model in theatre.models.items():
+        yield figure(
+            name, "us", 1e6, 200, f"one load, all {len(nodes)} tumour nodes",
+            lambda i, model=model: model.deform(single[i % len(single)], at=nodes),
+        )  # fmt: skip
+    times = scene.times
+    size = f"{scene.viewpoint.width} x {scene.viewpoint.height}"
+    yield figure(
+        "frame", "ms", 1e3, len(times), f"deform ({deformer}), render {size}, composite: {scene.name}",
+        lambda i: player.draw(i, float(times[i]), scene.path(float(times[i]))),
+    )  # fmt: skip

@@ -1,0 +1,111 @@
+"""How far off a tumour is that is located from pairs of pictures, frame by frame, and how long an update takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scenes.play.deformers import Theatre
+from scenes.play.observer import Estimate
+from scenes.script.scene import Scene
+from scenes.script.sight import StereoSight
+from sim.errors import InputError
+
+
+@dataclass(frozen=True)
+class Row:
+    """What came of the frames of a scene by one seed, or by several.
+
+    Parameters
+    ----------
+    seed
+        Of vessels, noise and rigid errors; -1: of all.
+    frames, refused
+        How many there are, and how many pairs were refused.
+    points
+        Median number of points of those that were not.
+    moved_mm, off_mm, p95_mm, most_mm
+        Of the tumour's middle: how far it truly moves at most, and how far off the estimate is: median, 95 % of the
+        frames, most. A refused pair shows the scan, and counts as so far off.
+    removed, covered
+        Share of its motion over all frames that the estimate removes. Share of the ellipsoids that hold it, of pairs
+        that were not refused.
+    radius_mm
+        Median radius that is said to hold it in 95 of 100 cases.
+    milliseconds, slowest_ms
+        Of an update, from two pictures to the estimate: median, and 95 % of the frames.
+    """
+
+    seed: int
+    frames: int
+    refused: int
+    points: float
+    moved_mm: float
+    off_mm: float
+    p95_mm: float
+    most_mm: float
+    removed: float
+    covered: float
+    radius_mm: float
+    milliseconds: float
+    slowest_ms: float
+
+
+def rows(
+    theatre: Theatre,
+    scene: Scene,
+    seeds: Sequence[int],
+    every: int,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Iterator[Row]:
+    """A row for each seed, and one for all. The finite elements answer once for all seeds.
+
+    Raises
+    ------
+    InputError
+        A scene that no pair of eyes sees; an anatomy without a locator.
+    """
+    if not isinstance(scene.sight, StereoSight):
+        raise InputError(f"no pair of eyes sees the scene {scene.name}: choose one with a StereoSight, as microscope.")
+    player, numbers = theatre.player("fem", scene), range(0, len(scene.times), every)
+    seen, last, total, done = [], None, len(numbers) * (1 + len(seeds)), 0
+    for number in numbers:
+        touch = player.touch(number)
+        last = player.answer(player.loads(number), last)
+        positions = player.positions(last)
+        held = None if scene.tool is None else player.tool(scene.tool, touch, positions)
+        seen.append((number, positions, player.stage.corners(None if held is None else held.pose)))
+        done += 1
+        progress(done, total)
+    found: list[Estimate] = []
+    for seed in seeds:
+        observer = theatre.stage(replace(scene, sight=replace(scene.sight, seed=seed))).observer
+        assert observer is not None
+        own = []
+        for number, positions, tool in seen:
+            own.append(observer.estimate(number, positions, tool))
+            done += 1
+            progress(done, total)
+        found += own
+        yield row(seed, own)
+    yield row(-1, found)
+
+
+def row(seed: int, estimates: Sequence[Estimate]) -> Row:
+    """Sum estimates up."""
+    off = 1e3 * np.array([each.off for each in estimates])
+    true = 1e3 * np.array([np.linalg.norm(each.true) for each in estimates])
+    seen = [each for each in estimates if each.location is not None]
+    radius = [1e3 * each.location.p95 for each in seen if each.location is not None]
+    spent = 1e3 * np.array([each.seconds for each in estimates])
+    points = [len(each.observation.now) for each in seen]
+    return Row(
+        seed, len(estimates), len(estimates) - len(seen), float(np.median(points)) if seen else 0.0,
+        float(true.max()), float(np.median(off)), float(np.quantile(off, 0.95)), float(off.max()),
+        float(1.0 - off.sum() / true.sum()) if true.any() else np.nan,
+        float(np.mean([each.held for each in seen])) if seen else np.nan,
+        float(np.median(radius)) if seen else np.nan,
+        float(np.median(spent)), float(np.quantile(spent, 0.95)),
+    )  # fmt: skip

@@ -1,0 +1,255 @@
+"""How many loads a second the finite elements solve: one mesh, thousands of loads, set-up off the clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from scenes.analysis.stopwatch import timed
+from sim.accuracy import REFERENCE, STRAINED
+from sim.anatomy import Anatomy
+from sim.deformation import Deformation
+from sim.effects import Effect, pushed_effects
+from sim.fem import Fem
+from sim.loads import Loads
+from sim.material import Material
+from sim.runtime.device import find_device
+from sim.runtime.processes import at_once, working
+from surrogate.data.tool_loads import TOOLS, draw
+from surrogate.data.tool_poses import draw_poses
+
+from .robustness import CHECKED, Trial
+
+SEED = 0
+# However few the loads, so many have their residual computed again in double precision.
+LEAST_CHECKED = 4
+
+
+# Loads of one preset, and the seconds that drawing them took.
+Drawn = tuple[Loads, float]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One set of loads on one tissue.
+
+    Parameters
+    ----------
+    devices
+        That solve at the same time, each all the loads of the set; `loads` counts each of them.
+    set_up
+        Seconds from the mesh to a solver; kernels are compiled in the warm-up, which nobody counts.
+    converged
+        Of the loads, in the worst repeat.
+    steps_median, steps_p99
+        Outer steps of a load.
+    seconds
+        Of each repeat: all loads solved, the tumour's vertices fetched. From the first device's beginning to the last
+        one's end.
+    draw_seconds
+        Of drawing the loads, apart.
+    checked, double
+        So many loads solved again for every vertex, and the largest of their residuals in double precision.
+    """
+
+    law: str
+    poisson: float
+    element: str
+    nodes: int
+    preconditioner: str
+    set_up: float
+    preset: str
+    loads: int
+    converged: int
+    steps_median: float
+    steps_p99: float
+    seconds: tuple[float, ...]
+    draw_seconds: float
+    checked: int
+    double: float
+    devices: int = 1
+
+    @property
+    def median(self) -> float:
+        """Seconds for all loads, median of the repeats."""
+        return float(np.median(self.seconds))
+
+    @property
+    def rate(self) -> float:
+        """Solves a second."""
+        return self.loads / self.median
+
+
+@dataclass(frozen=True)
+class Together:
+    """The tools of surgery on one tissue: their names, all their loads, the seconds for all, and to draw them."""
+
+    law: str
+    poisson: float
+    set_up: float
+    presets: tuple[str, ...]
+    loads: int
+    seconds: float
+    draw_seconds: float
+
+    @property
+    def rate(self) -> float | None:
+        """Solves a second; None where no tool was asked for."""
+        return self.loads / self.seconds if self.loads else None
+
+
+def drawn(anatomy: Anatomy, presets: Sequence[str], count: int, posed: bool = False) -> dict[str, Drawn]:
+    """`count` loads of each preset, or poses of its ball; of the published protocol no more than it has.
+
+    Raises
+    ------
+    InputError
+        As `draw`, or as `draw_poses`.
+    """
+    out, by = {}, draw_poses if posed else draw
+    for preset in presets:
+        by(preset, anatomy, 1, SEED)  # the cortex is measured at the first draw
+        out[preset] = timed(by, preset, anatomy, count, SEED)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A trial's finite elements, and the seconds that they took."""
+
+    fem: Fem
+    set_up: float
+
+
+@dataclass(frozen=True, eq=False)
+class Repeat:
+    """When all loads of a set were begun and solved, on a clock that all processes share [s]; what came of them."""
+
+    begun: float
+    ended: float
+    converged: int
+    steps: np.ndarray
+
+
+# Work and task -> what each device gives for it.
+Asked = Callable[[Callable[[Made, Any], Any], Any], list[Any]]
+
+
+@contextmanager
+def on_each(devices: Sequence[str], trial: Trial) -> Iterator[Asked]:
+    """Finite elements on each of the devices, asked at the same time; on one device they are in this process.
+
+    Raises
+    ------
+    InputError
+        As `Fem`.
+    LostError
+        A process that was ended.
+    """
+    if len(devices) == 1:
+        own = made(devices[0], trial)
+        yield lambda work, task: [work(own, task)]
+        return
+    with working(devices, made, trial) as children:
+        yield lambda work, task: at_once(children, work, [task] * len(children))
+
+
+def made(device: str, trial: Trial) -> Made:
+    """A trial's finite elements on a device, in single precision."""
+    find_device(device, STRAINED.precision)  # starts Warp, off the clock
+    return Made(*timed(replace(trial, device=device).fem, STRAINED))
+
+
+def facts(made: Made, task: None) -> tuple[int, str, float]:
+    """Nodes, preconditioner, and the seconds of set-up."""
+    return made.fem.space.count, made.fem.plan.preconditioner, made.set_up
+
+
+def warmed(made: Made, loads: Loads) -> None:
+    """Solve once what nobody counts."""
+    made.fem.deform(loads, at=made.fem.anatomy.tumour_nodes)
+
+
+def repeated(made: Made, loads: Loads) -> Repeat:
+    """Solve all loads, and fetch the tumour's vertices."""
+    wp.synchronize()
+    begun = time.monotonic()
+    answer = made.fem.deform(loads, at=made.fem.anatomy.tumour_nodes)
+    wp.synchronize()
+    good = sum(outcome.good for outcome in answer.outcome)
+    return Repeat(begun, time.monotonic(), good, answer.iterations)
+
+
+def solved(made: Made, loads: Loads) -> Deformation:
+    """Solve for every vertex."""
+    return made.fem.deform(loads)
+
+
+def rows(
+    trial: Trial,
+    material: Material,
+    sets: Mapping[str, Drawn],
+    repeats: int,
+    done: Callable[[], object],
+    tools: tuple[Effect, ...] = (),
+    devices: Sequence[str] = (),
+) -> Iterator[Row]:
+    """A row for each set of loads on one tissue under `tools`, to 1e-4 in single precision.
+
+    Each of the `devices`, by default the trial's, has a process and solves all loads of a set. `done` is called
+    `repeats` + 2 times a row: after the warm-up, after each repeat, and after the check.
+
+    Raises
+    ------
+    InputError
+        As `on_each`.
+    """
+    trial = replace(trial, effects=(*pushed_effects(trial.anatomy, material), *tools))
+    with on_each(devices or (trial.device,), trial) as asked:
+        known = asked(facts, None)
+        nodes, preconditioner, _ = known[0]
+        # Judged on the host whatever the device: other kernels and other arithmetic than those that are measured.
+        judge = replace(trial, device="cpu", batch=CHECKED).fem(REFERENCE)
+        for preset, (loads, drawing) in sets.items():
+            asked(warmed, loads.rows(slice(trial.batch)))
+            done()
+            seconds, converged = [], []
+            steps = np.zeros(0)
+            for _ in range(repeats):
+                found: list[Repeat] = asked(repeated, loads)
+                seconds.append(max(each.ended for each in found) - min(each.begun for each in found))
+                converged.append(sum(each.converged for each in found))
+                steps = np.concatenate([each.steps for each in found])
+                done()
+            chosen = loads.rows(checked(len(loads)))
+            again = np.concatenate([judge.residual(chosen, answer) for answer in asked(solved, chosen)])
+            done()
+            yield Row(
+                material.law, material.poisson, trial.element, nodes, preconditioner,
+                max(set_up for _, _, set_up in known), preset, len(known) * len(loads), min(converged),
+                float(np.median(steps)), float(np.percentile(steps, 99)), tuple(seconds), drawing, len(again),
+                float(again.max()), len(known),
+            )  # fmt: skip
+
+
+def together(found: Sequence[Row]) -> list[Together]:
+    """The tools of surgery taken together, tissue by tissue."""
+    out = []
+    for law, poisson in dict.fromkeys((row.law, row.poisson) for row in found):
+        mine = [row for row in found if (row.law, row.poisson) == (law, poisson)]
+        tools = [row for row in mine if row.preset in TOOLS]
+        loads, seconds = sum(row.loads for row in tools), sum(row.median for row in tools)
+        drawing = sum(row.draw_seconds for row in tools)
+        out.append(Together(law, poisson, mine[0].set_up, tuple(row.preset for row in tools), loads, seconds, drawing))
+    return out
+
+
+def checked(count: int) -> np.ndarray:
+    """Which (k,) of so many loads are checked: one in a hundred, evenly picked."""
+    return np.linspace(0, count - 1, min(count, max(LEAST_CHECKED, -(-count // CHECKED)))).astype(int)

@@ -1,0 +1,1 @@
+"""What accuracy costs, and what else moves the tumour."""

@@ -1,0 +1,88 @@
+"""What a camera's calibration and the corners of printed targets are off by, for a Monte Carlo without pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ar.optics.calibration import Calibration
+from ar.optics.camera import Camera
+from ar.optics.lens import Lens
+from ar.tracking.board_views import View
+from ar.tracking.detection import Corners
+from ar.tracking.intrinsics import covariance_of
+from ar.tracking.targets import Target, calibration_board, seen_from_front
+
+CORNER = 0.1
+"""Deviation of a corner along each axis [pixel], by default: twice that of sharp pictures (`benchmarks track`)."""
+# Views of a usual calibration; how far the board is tilted in them, and the shares of the picture that it is wide.
+VIEWS, TILT, WIDE = 24, np.radians(35.0), (0.45, 0.8)
+
+
+def usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarray:
+    """The covariance (9, 9) of intrinsics, in the order of `ar.tracking.intrinsics.PARAMETERS`, of a good calibration.
+
+    It has 24 views of the printed board, tilted by up to 35 degrees to all sides, near and far, all over the picture.
+    """
+    random, board = np.random.default_rng(seed), calibration_board().faces[0]
+    points = board.corners - np.array([*(0.5 * board.size), 0.0])
+    camera, views, poses = calibration.camera(np.eye(4)), [], []
+    for number in range(VIEWS):
+        way = 2.0 * np.pi * number / VIEWS
+        turn = TILT * random.uniform(0.5, 1.0) * np.array([np.cos(way), np.sin(way), 0.3 * random.standard_normal()])
+        depth = board.size[0] * calibration.focal[0] / (random.uniform(*WIDE) * calibration.width)
+        aside = 0.25 * random.uniform(-1.0, 1.0, 2) * np.array([calibration.width, calibration.height])
+        shift = depth * np.array([*(aside / calibration.focal), 1.0])
+        at = points @ Rotation.from_rotvec(turn).as_matrix().T + shift
+        pixels, _ = camera.project(at)
+        inside = np.isfinite(pixels).all(axis=1)
+        noisy = pixels + CORNER * random.standard_normal(pixels.shape)
+        views.append(View(str(number), points[inside], noisy[inside], 1.0))
+        poses.append((turn, shift))
+    return covariance_of(calibration, views, poses)[0]
+
+
+def changed(calibration: Calibration, step: np.ndarray) -> Calibration:
+    """A calibration whose nine parameters differ by `step` (9,); further coefficients of its lens stay."""
+    fx, fy, cx, cy = (np.array([*calibration.focal, *calibration.principal]) + step[:4]).tolist()
+    coefficients = calibration.lens.coefficients.copy()
+    coefficients[:5] += step[4:]
+    return replace(calibration, focal=(fx, fy), principal=(cx, cy), lens=Lens(*coefficients.tolist()))
+
+
+def corners_in(camera: Camera, target: Target, T_world_target: np.ndarray, off: np.ndarray) -> Corners:
+    """The corners of a target's faces that look at a camera, each off by a row of `off` (n, 2) [pixel]."""
+    points, faces, T = [], [], camera.T_camera_world @ T_world_target
+    for number, face in enumerate(target.faces):
+        if seen_from_front(T @ face.T_target_face):
+            points.append(face.corners)
+            faces += [number] * len(face.corners)
+    at = np.concatenate([np.zeros((0, 3)), *points])
+    pixels, _ = camera.project(at @ T_world_target[:3, :3].T + T_world_target[:3, 3])
+    inside = (np.isfinite(pixels) & (pixels >= 0.0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=1)
+    return Corners(at[inside], (pixels + off[: len(at)])[inside], np.array(faces, int)[inside])
+
+
+def seen_by_rows(
+    seen: Corners, camera_at: Callable[[float], Camera], readout: float, T_world_target: np.ndarray
+) -> Corners:
+    """Corners as a rolling shutter sees them, which reads a picture's rows one after the other in `readout` [s].
+
+    `camera_at` says where the camera is so long [s] after the middle row is read. The noise of `seen` corners stays.
+    """
+    at = seen.points @ T_world_target[:3, :3].T + T_world_target[:3, 3]
+    middle = camera_at(0.0)
+    still, _ = middle.project(at)
+    moved = [
+        camera_at(readout * after_middle(middle, row)).project(place[None])[0][0]
+        for place, row in zip(at, still[:, 1].tolist(), strict=True)
+    ]
+    return replace(seen, pixels=seen.pixels + np.reshape(moved, still.shape) - still)
+
+
+def after_middle(camera: Camera, row: float) -> float:
+    """When a row [pixel] is read, after the middle one, as a share of the readout."""
+    return (row + 0.5) / camera.height - 0.5

@@ -1,0 +1,86 @@
+"""Which camera films a scene, and how it moves, on the command line."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim.errors import InputError
+
+if TYPE_CHECKING:
+    from ..script.scene import Scene
+
+# Named here too, so that a command's help waits for no camera to be imported.
+PATHS = ("hand-held", "microscope", "orbit")
+
+
+def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None:
+    """Declare the camera's options: shared by every command that draws a scene; `path` is the usual one."""
+    group = parser.add_argument_group("the camera; docs/camera.md says more")
+    group.add_argument(
+        "--camera", type=Path, metavar="FILE.yaml", help="calibration of a camera, of OpenCV or ROS (default: ideal)"
+    )
+    group.add_argument(
+        "--size", type=size, metavar="WxH", help="scale the calibration of --camera to pictures of this size [pixel]"
+    )
+    group.add_argument(
+        "--path", choices=PATHS, default=path, help=f"how the camera moves (default: {path or 'it stays'})"
+    )
+    group.add_argument("--path-seed", type=int, default=0, help="of --path hand-held (default %(default)s)")
+    group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")
+
+
+def size(text: str) -> tuple[int, int]:
+    """WxH as two numbers, for argparse."""
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 640x480 [pixel]")
+    return int(found[1]), int(found[2])
+
+
+def filmed(args: argparse.Namespace, scene: Scene) -> Scene:
+    """The scene as the camera of `add_camera`'s options sees it, where there are any.
+
+    Raises
+    ------
+    InputError
+        As `read_calibration`; a size without a calibration, or of another shape; as `HandHeld`.
+    """
+    from ..script.camera_paths import PATHS as MADE
+    from ..tracked.calibration_file import read_calibration
+
+    view = scene.viewpoint
+    if args.camera is not None:
+        calibration = read_calibration(args.camera)
+        if args.size is not None:
+            try:
+                calibration = calibration.sized(*args.size, scale=True)
+            except ValueError as error:
+                raise InputError(f"{args.camera}: {error}") from error
+        view = view.calibrated(calibration)
+    elif args.size is not None:
+        raise InputError("--size scales the calibration of --camera: give both, or neither.")
+    if args.path is not None:
+        view = replace(view, path=MADE[args.path](args.path_seed))
+    if args.eye is not None:
+        view = replace(view, eye=args.eye)
+    return scene if view is scene.viewpoint else replace(scene, viewpoint=view)
+
+
+def filmed_with_targets(args: argparse.Namespace, scene: Scene) -> Scene:
+    """The scene as a tracked camera films it, from where it sees the opening, the reference and the tool's cube.
+
+    Raises
+    ------
+    InputError
+        As `filmed`; a camera that zooms.
+    """
+    from ..tracked.reference_place import VIEW, from_where_it_sees_all
+
+    if args.path == "microscope":
+        raise InputError("--path microscope zooms, and a tracked camera has one calibration: choose another path.")
+    scene = filmed(args, replace(scene, viewpoint=VIEW))
+    return replace(scene, viewpoint=from_where_it_sees_all(scene.viewpoint))

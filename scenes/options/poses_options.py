@@ -1,0 +1,138 @@
+"""Poses of another tracker on the command line: its files, its clock, and where it has the camera."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.errors import InputError
+
+if TYPE_CHECKING:
+    from ar.optics.calibration import Calibration
+    from ar.tracking.clocks import Clock
+    from ar.tracking.pose_stream import PoseStream
+
+    from ..tracked.elsewhere import Elsewhere
+
+AUTO = "auto"
+
+
+def add_poses(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    group = parser.add_argument_group("poses of another tracker, with a clock of its own; docs/overlay.md says more")
+    group.add_argument(
+        "--poses", type=Path, nargs=2, metavar=("TOOL.csv", "PATIENT.csv"),
+        help="poses of the tool and of the patient's reference in the tracker's frame, as `sulcus track` writes them",
+    )  # fmt: skip
+    group.add_argument(
+        "--clock", nargs="+", metavar="S", default=["0"],
+        help="the tracker's time less the pictures' [s], and by how much that is off (default 0). auto: from the "
+        "motion of a cube and a reference that the film shows, too",
+    )  # fmt: skip
+    group.add_argument(
+        "--hand-eye", type=Path, metavar="H.json",
+        help="where the camera is in the tracker's frame, from `sulcus calibrate --hand-eye --json` (default: the film "
+        "says it by the printed reference)",
+    )  # fmt: skip
+    group.add_argument(
+        "--camera-poses", type=Path, metavar="CAMERA.csv",
+        help="poses of the body that the camera is fixed to; --hand-eye is then beside that body",
+    )  # fmt: skip
+
+
+def demand_poses(args: argparse.Namespace) -> None:
+    """Refuse options that do not go together, before anything is read.
+
+    Raises
+    ------
+    InputError
+        Options without --poses, poses without a tool, or a clock that is none.
+    """
+    if args.poses is None:
+        if args.clock != ["0"] or args.hand_eye is not None or args.camera_poses is not None:
+            raise InputError("--clock, --hand-eye and --camera-poses belong to another tracker: give --poses, too.")
+        return
+    if args.tool is None:
+        raise InputError("--poses has the poses of a tool: give --tool TOOL.json, too.")
+    if args.camera_poses is not None and args.hand_eye is None:
+        raise InputError("--camera-poses has a body that the camera is fixed to: give --hand-eye H.json, too.")
+    if args.clock != [AUTO]:
+        _clock(args.clock)
+
+
+def _clock(words: list[str]) -> tuple[float, float]:
+    """An offset, and by how much it is off [s]."""
+    try:
+        offset, error = float(words[0]), float(words[1]) if len(words) > 1 else 0.0
+    except ValueError:
+        offset, error = np.nan, np.nan
+    if len(words) > 2 or not np.isfinite([offset, error]).all() or error < 0.0:
+        raise InputError(f"--clock {' '.join(words)}: give seconds, and by how much they are off; or {AUTO}.")
+    return offset, error
+
+
+def elsewhere_of(args: argparse.Namespace, calibration: Calibration) -> Elsewhere | None:
+    """The other tracker's poses; None where none are asked for.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read; clocks that cannot be compared.
+    """
+    from ..tracked.elsewhere import Elsewhere, Eye
+    from ..tracked.hand_eye_file import read_hand_eye
+    from ..tracked.pose_file import read_stream
+
+    if args.poses is None:
+        return None
+    tool, patient = (read_stream(path) for path in args.poses)
+    eye = None
+    if args.hand_eye is not None:
+        body = None if args.camera_poses is None else read_stream(args.camera_poses)
+        eye = Eye(*read_hand_eye(args.hand_eye), body)
+    elsewhere = Elsewhere(tool, patient, _clock_of(args, calibration, tool, patient), eye)
+    _say_apart(args, elsewhere)
+    return elsewhere
+
+
+def _say_apart(args: argparse.Namespace, elsewhere: Elsewhere) -> None:
+    """Say when poses and pictures are, if the film begins where there are no poses."""
+    from ar.tracking.pictures import film_of
+
+    from ..tracked.run import timed
+
+    first = next(timed(film_of(Path(args.pictures), args.rate))).picture.time
+    outside = elsewhere.outside(first)
+    if not outside:
+        return
+    when = [
+        f"the {name}'s poses of {each.times[0]:.2f} to {each.times[-1]:.2f} s"
+        for name, each in elsewhere.streams.items()
+    ]
+    clock = f"; --clock is {elsewhere.clock.offset:g} s" if elsewhere.clock.offset else ""
+    said = f"{outside}. It is of {first:.2f} s, {', '.join(when)}{clock}. Give --clock S, or {AUTO}"
+    print(f"sulcus overlay: {said}", file=sys.stderr)
+
+
+def _clock_of(args: argparse.Namespace, calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:
+    """The clock that is stated, or that the film's own markers tell."""
+    from ar.tracking.clocks import Clock
+    from ar.tracking.pictures import film_of
+
+    from ..tracked.elsewhere import clock_of_film
+    from ..tracked.run import timed
+
+    if args.clock != [AUTO]:
+        return Clock(*_clock(args.clock))
+    try:
+        film = (each.picture for each in timed(film_of(Path(args.pictures), args.rate)))
+        found = clock_of_film(film, calibration, tool, patient)
+    except ValueError as error:
+        raise InputError(f"--clock {AUTO}: {error}") from error
+    said = f"the tracker's clock is {found.offset:.4f} s ahead of the pictures', +- {found.error:.4f} s"
+    print(f"sulcus overlay: {said}", file=sys.stderr)
+    return found

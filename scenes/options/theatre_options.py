@@ -1,0 +1,166 @@
+"""Who plays a scene, on which anatomy: the options that commands which play scenes share."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim.errors import InputError
+
+from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
+
+if TYPE_CHECKING:
+    from ..play.deformers import Theatre
+    from ..script.scene import Scene
+    from ..script.site import Site
+
+
+def add_bodies(parser: argparse.ArgumentParser) -> None:
+    """Declare which anatomy and models there are."""
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument(
+        "--model", type=Path, help="MODEL.npz made by `sulcus train` (default: MESH.model.npz beside the anatomy)"
+    )
+    add_trajectory(parser)
+
+
+def add_trajectory(parser: argparse.ArgumentParser) -> None:
+    """Declare --trajectory."""
+    parser.add_argument(
+        "--trajectory",
+        type=Path,
+        metavar="LINE.mrk.json",
+        help="from 3D Slicer: the tool goes in where this line enters the open cortex, and along it. A point says only "
+        "where; the tool then goes straight inwards. Default: at the middle of the opening",
+    )
+
+
+def add_theatre(parser: argparse.ArgumentParser) -> None:
+    """Declare who plays, on which anatomy: shared by every command that plays a scene."""
+    add_bodies(parser)
+    parser.add_argument(
+        "--deformer",
+        help="who answers: a trained model (linear, ann, svr, ...), fem, or guarded: the best of them, and finite "
+        "elements where it is unsure. auto: chosen by --within-mm or --within-ms. Default: the model of least error",
+    )
+    parser.add_argument(
+        "--guard-mm",
+        type=float,
+        metavar="MM",
+        help="how far off a tumour's vertex may be, in 95 of 100 loads, before the finite elements of guarded answer "
+        "[mm] (default 0.2)",
+    )
+    budget = parser.add_argument_group("a budget, in place of --deformer; errors are those that models state")
+    budget.add_argument(
+        "--within-mm",
+        type=float,
+        metavar="MM",
+        help="take the fastest deformer whose stated error is at most this [mm]",
+    )
+    budget.add_argument(
+        "--within-ms",
+        type=float,
+        metavar="MS",
+        help="take the most accurate deformer that needs at most this a frame [ms]",
+    )
+    add_tissue_arguments(parser, default_regions=AS_LEARNED)
+    add_element_argument(parser)
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
+
+
+def theatre_asked(args: argparse.Namespace, *scenes: str) -> Theatre:
+    """The theatre that `add_theatre`'s arguments ask for, to play scenes of these names there.
+
+    Raises
+    ------
+    InputError
+        As `open_theatre`; a limit of guarded models not above 0.
+    """
+    from ..play.deformers import open_theatre
+
+    theatre = open_theatre(args.anatomy, args.model, args.device, scenes)
+    if args.guard_mm is None:
+        return theatre
+    if not 0.0 < args.guard_mm < float("inf"):
+        raise InputError(f"--guard-mm {args.guard_mm:g}: give a positive number of millimetres, or leave it out.")
+    return replace(theatre, limit=1e-3 * args.guard_mm)
+
+
+def scene_asked(args: argparse.Namespace, name: str, theatre: Theatre) -> Scene:
+    """A scene by name, of the tissue and on the element that `add_theatre`'s arguments ask for, if they ask for any.
+
+    Raises
+    ------
+    InputError
+        As `find_scene`, `dressed`, `read_markup` and `approach_of`.
+    """
+    from ..script.scene import find_scene
+
+    scene = dressed(args, find_scene(name), theatre)
+    return scene if args.trajectory is None else _approached(args, scene, theatre.site)
+
+
+def _approached(args: argparse.Namespace, scene: Scene, site: Site) -> Scene:
+    """The scene whose tool follows the trajectory; what keeps it from that is said."""
+    from sim.bodies.markups import read_markup
+
+    from ..script.approach import approach_of
+    from ..script.tool_paths import idle
+
+    approach = approach_of(read_markup(args.trajectory), site)
+    if scene.tool is None:
+        print(f"{args.program}: {scene.name} has no tool that could follow {args.trajectory}", file=sys.stderr)
+        return scene
+    stopped = scene.stopped(site, approach.followed(idle)(0.0))
+    if stopped:
+        print(f"{args.program}: where {args.trajectory} enters, {stopped}", file=sys.stderr)
+    return replace(scene, path=approach.followed(scene.path), tool=approach.held(scene.tool))
+
+
+def playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]) -> list[Scene]:
+    """The scenes that were named; of none, those of all that the anatomy has a locator for, and the others are said."""
+    left = [] if args.scenes else [scene for scene in scenes if theatre.lacks_locator(scene)]
+    if left:
+        names = ", ".join(scene.name for scene in left)
+        said = f"no {names}: this anatomy has no locator, which `sulcus locator` makes"
+        print(f"{args.program}: {said}", file=sys.stderr)
+    return [scene for scene in scenes if scene not in left]
+
+
+def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> str:
+    """The deformer that `add_theatre`'s arguments ask for; one that a budget chose is said, and why.
+
+    Raises
+    ------
+    InputError
+        A deformer and a budget, or a budget that none here meets.
+    """
+    budget = args.within_mm, args.within_ms
+    if args.deformer != "auto" and budget == (None, None):
+        if args.deformer is None and not theatre.knowing(scene):
+            from ..play.deformers import TRUTH
+
+            none = "none lies beside this anatomy; `sulcus train` makes them" if scene.sight is None else TRUTH
+            why = next(iter(theatre.refusals(scene).values()), none)
+            print(f"{args.program}: finite elements play {scene.name}, no learned model: {why}", file=sys.stderr)
+        best = theatre.best(scene)
+        if args.deformer is None and best in theatre.models:
+            from surrogate.model.guarded import judged, off_by
+
+            model = theatre.models[best]
+            if off_by(model).weak:
+                print(f"{args.program}: on left-out cortex {best} is {judged(model)}", file=sys.stderr)
+        return args.deformer or theatre.usual(scene)
+    if args.deformer not in (None, "auto"):
+        raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
+    from surrogate.evaluation.choose import choose
+
+    from ..analysis.budget import offers
+
+    choice = choose(offers(theatre, scene), *budget)
+    print(f"{args.program}: {choice.reason}", file=sys.stderr)
+    return choice.offer.name

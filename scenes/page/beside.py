@@ -1,0 +1,79 @@
+"""What stands beside the 3-D view of a page: slices of the scan round the tumour, and what was read lately."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ar.page.history import Line, Sample
+from ar.page.slices import Cut, sliced
+from ar.rendering.layer import Layer
+from sim.deformation import Deformation
+from sim.loads import Loads, Pushed
+
+from ..play.player import Frame, Player
+from ..play.stage import TOOL, TOOL_COLOUR, Stage
+from ..script.scene import Scene
+
+TUMOUR_MIDDLE, TIP = "the tumour's middle", "the tool's tip"
+"""Where the slices lie."""
+DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of the model (95 %); dotted: none is stated")
+FORCE = Line("force", "N", "#ffa94d", "band: error of the model (95 %); dotted: none is stated")
+SET = Line("force", "N", "#ffa94d", "as it is set")
+MOVED = Line("tumour moved", "mm", "#4cf28c", "band: error of the tumour (95 %); dotted: not known")
+
+
+def lines_of(scene: Scene) -> tuple[Line, ...]:
+    """What is read in a scene: of one without a tool, how far the tumour has moved."""
+    if scene.tool is None:
+        return (MOVED,)
+    return DISTANCE, FORCE if scene.posed else SET
+
+
+def sample_of(frame: Frame, scene: Scene, now: float) -> Sample:
+    """What is read in a frame that is shown at a time [s], with its errors: `lines_of` says in which order."""
+    if scene.tool is None:
+        known = frame.estimate.location if frame.estimate is not None else None
+        error = frame.tumour_error.bound if known is None else known.p95
+        return Sample(now, (1e3 * frame.moved,), (_scaled(error, 1e3),))
+    force, force_error = force_of(frame.loads, frame.deformation)
+    distance = _scaled(frame.distance, 1e3), _scaled(frame.distance_error, 1e3)
+    return Sample(now, (distance[0], force), (distance[1], force_error))
+
+
+def force_of(loads: Loads, answer: Deformation) -> tuple[float | None, float | None]:
+    """How hard the tool pushes, and that number's error [N]: a force that is set has none; None: not known."""
+    pushed = loads.every(Pushed)
+    if pushed:
+        return float(np.linalg.norm(pushed[0].force[0])), 0.0
+    if not answer.reaction.shape[1]:
+        return None, None
+    bound = float(answer.reaction_bound[0, 0])
+    known = answer.outcome[0].good and np.isfinite(bound)
+    return float(np.linalg.norm(answer.reaction[0, -1, :3])), bound if known else None
+
+
+def slices_of(frame: Frame, player: Player, through: str) -> np.ndarray:
+    """Three slices (h, 3 h, 3) uint8 through the tumour's middle, or through the tool's tip where there is one."""
+    stage, positions = player.stage.at(frame.loads), player.believed(frame)
+    others, tool = [], player.scene.tool
+    if tool is not None and frame.pose is not None:
+        corners = np.asarray(tool.mesh.vertices) @ frame.pose[:3, :3].T + frame.pose[:3, 3]
+        others.append(Layer("tool", TOOL, corners, np.asarray(tool.mesh.faces), TOOL_COLOUR))
+    if frame.estimate is not None:
+        others.append(replace(stage.truth(player.positions(frame.deformation)), name="truth"))
+    now, before = stage.tumour(positions), stage.tumour_at_rest
+    cut = Cut(now, before, frame.tumour_error.bound, bool(frame.doubt), others, frame.tip)
+    return sliced_where(player.stage, cut, through)
+
+
+def sliced_where(stage: Stage, cut: Cut, through: str) -> np.ndarray:
+    """Three slices (h, 3 h, 3) uint8 of a stage's scan through one of the places above; of no tip, the middle's."""
+    shape = cut.now if len(cut.now.vertices) else stage.tumour_at_rest
+    middle = 0.5 * (shape.vertices.min(axis=0) + shape.vertices.max(axis=0))
+    return sliced(stage.scan, cut.tip if through == TIP and cut.tip is not None else middle, cut)
+
+
+def _scaled(value: float | None, by: float) -> float | None:
+    return None if value is None or not np.isfinite(value) else by * value

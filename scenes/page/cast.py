@@ -1,0 +1,157 @@
+"""Who plays a scene on a page: trained models, and finite elements, which solve in threads of their own."""
+
+from __future__ import annotations
+
+import threading
+import time as clock
+from contextlib import nullcontext
+from dataclasses import replace
+
+from sim.deformation import Deformation, Deformer
+
+from ..play.deformers import GUARDED, Theatre
+from ..play.effect_ablation import without
+from ..play.player import Player
+from ..play.replay import Session
+from ..play.stage import Stage
+from ..script.camera_paths import PATHS
+from ..script.scene import Scene
+from .referee import Question, Referee, Truth
+
+ALL: frozenset[str] = frozenset()
+"""What is switched off where all effects act."""
+
+
+class Cast:
+    """The stages, models and finite elements of one scene, with all its effects or without some.
+
+    `playable` says whether any of them is ready to answer.
+    """
+
+    def __init__(self, theatre: Theatre, scene: Scene, deformer: str, turn: threading.Lock) -> None:
+        """Have the `deformer` of that name play. Finite elements are prepared one at a time, by who holds `turn`.
+
+        Raises
+        ------
+        InputError
+            A deformer that does not know the scene.
+        """
+        self.theatre, self.turn = theatre, turn
+        # Not on a card: there, what is drawn while a solver's thread records a CUDA graph would be recorded with it.
+        self.stages = {ALL: replace(theatre.stage(scene), device="cpu")}
+        self.players: dict[tuple[str, frozenset[str]], Player] = {}
+        self.filmed: dict[tuple[frozenset[str], str], Stage] = {}
+        self.last: dict[str, Deformation] = {}
+        self.sessions: dict[str, Session] = {}
+        self.solvers: dict[frozenset[str], Referee] = {}
+        # The finite elements that are asked for what is shown next, and their question.
+        self.seeking: tuple[Referee, Question] | None = None
+        self.playable = deformer != "fem"
+        if self.playable:
+            self.player(deformer)
+
+    def stage(self, off: frozenset[str] = ALL) -> Stage:
+        """The stage of the scene without some effects, of the tissue that it has with them."""
+        if off not in self.stages:
+            scene = self.stages[ALL].scene
+            for effect in scene.effects_on(self.theatre.anatomy):
+                scene = without(scene, effect) if type(effect).__name__ in off else scene
+            self.stages[off] = replace(self.stages[ALL], scene=scene)
+        return self.stages[off]
+
+    def solver(self, off: frozenset[str] = ALL) -> Referee:
+        """The finite elements of the scene without some effects."""
+        if off not in self.solvers:
+            self.solvers[off] = Referee(self.theatre, self.stage(off).scene, self.turn)
+        return self.solvers[off]
+
+    def player(self, name: str, off: frozenset[str] = ALL) -> Player:
+        """Who plays the scene without some effects: a trained model, or finite elements that have answered."""
+        if (name, off) not in self.players:
+            stage = self.stage(off)
+            if name == "fem":
+                solved = self.solver(off).player
+                assert solved is not None
+                deformer = solved.deformer
+            else:
+                deformer = self._trained(name, stage.scene)
+            uncertainty = self.theatre.uncertainty(stage.scene)
+            self.players[name, off] = Player(stage, deformer, uncertainty=uncertainty)
+        return self.players[name, off]
+
+    def seen(self, name: str, off: frozenset[str], path: str) -> Player:
+        """The same, with the camera on a path of that name; "" as the scene has it."""
+        player = self.player(name, off)
+        if not path:
+            return player
+        if (off, path) not in self.filmed:
+            view = replace(player.scene.viewpoint, path=PATHS[path](0) if path in PATHS else None)
+            self.filmed[off, path] = replace(player.stage, scene=replace(player.scene, viewpoint=view))
+        return replace(player, stage=self.filmed[off, path])
+
+    def _trained(self, name: str, scene: Scene) -> Deformer:
+        """A trained model. Finite elements behind it are made in turn, and on the CPU, for the reason of the stages."""
+        with self.turn if name == GUARDED else nullcontext():
+            return replace(self.theatre, device="cpu").deformer(name, scene)
+
+    def predicted(self, name: str, question: Question) -> Truth:
+        """A trained model's answer; finite elements behind it start from its last one.
+
+        One that follows its tissue in time goes through the frames before.
+        """
+        begun, player = clock.perf_counter(), self.player(name)
+        if player.follows:
+            session = self.sessions.setdefault(name, Session(player))
+            number, answer = session.towards(*question)
+            while number != question[0]:
+                number, answer = session.towards(*question)
+            return Truth(number, player.loads(*question), answer, clock.perf_counter() - begun, question)
+        loads = player.loads(*question)
+        answer = self.last[name] = player.answer(loads, self.last.get(name))
+        return Truth(question[0], loads, answer, clock.perf_counter() - begun, question)
+
+    def solved(self, off: frozenset[str], question: Question, seen: Truth | None, patience: float) -> Truth | None:
+        """The finite elements' answer, or that to a frame on the way there. They are asked, if they were not yet.
+
+        Parameters
+        ----------
+        seen
+            An answer that is known already.
+        patience
+            How long to wait for another [s]; None is returned where none came.
+
+        Raises
+        ------
+        Exception
+            Whatever the solver's thread raised.
+        """
+        solver = self.solver(off)
+        if self.seeking != (solver, question):
+            self._seek(solver, question)
+        if solver.failure is not None and (solver.refused == question or not solver.thread.is_alive()):
+            self.seeking = None
+            if not solver.thread.is_alive():
+                del self.solvers[off]
+            raise solver.failure
+        truth = solver.newer(question, seen, patience)
+        self.playable = self.playable or solver.player is not None
+        return truth
+
+    def _seek(self, solver: Referee, question: Question) -> None:
+        """Ask for what is shown next; what was asked before is not wanted any more."""
+        if self.seeking is not None and self.seeking[0] is not solver:
+            self.seeking[0].drop()
+        self.seeking = solver, question
+        solver.ask(*question)
+
+    def rest(self) -> None:
+        """Nothing more is wanted: what is under way ends with the step in hand."""
+        if self.seeking is not None:
+            self.seeking[0].drop()
+            self.seeking = None
+
+    def dismiss(self) -> list[Referee]:
+        """Stop the finite elements, without waiting for the steps in hand; returns those that have one."""
+        for solver in self.solvers.values():
+            solver.dismiss()
+        return [solver for solver in self.solvers.values() if solver.thread.is_alive()]

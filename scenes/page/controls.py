@@ -1,0 +1,162 @@
+"""What a visitor can set on the page, in the visitor's words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from ar.overlay.hud import bearings
+from ar.overlay.styles import STYLES, Style
+from ar.page.aside import STYLE
+from ar.page.parts import Choice, Fold, Note, Slider, Toggle
+from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, Resection, Slide, remember
+
+from ..script.camera_paths import PATHS
+from ..script.scene import SCENES, Scene
+from ..script.site import Site
+from ..script.tool_paths import AIR, Touch
+from .beside import TIP, TUMOUR_MIDDLE
+from .requests import HAND, SCRIPT, Wish
+from .text import effect_words
+
+MOST_FORCE, MOST_DEPTH, MOST_TILT = 0.4, 8.0, 40.0
+"""Ends of the sliders [N], [mm], [deg]."""
+STAYS = "stays"
+"""What a visitor calls a camera that does not move."""
+PLAN = "how the finite elements solve a load"
+"""Label of the note that says which solvers they try."""
+OWN_FILM = "your own film or camera"
+"""Label of the note that says how to have them in the scene's place."""
+ASKED = (
+    "<p>The same page shows your own film, or what a camera of this machine sees, with the tumour drawn into it:</p>"
+    "<p><code>sulcus overlay FILM --page --camera K.yaml --registration R.json --tool T.json</code></p>"
+    "<p>A camera's number in the film's place asks for that camera. <code>sulcus film palpate --out film</code> makes "
+    "a film to try it on. <code>sulcus overlay --help</code> says which command makes each file.</p>"
+)
+HANDS = "A slider takes the tool in your hand; 'script' gives it back."
+
+
+def controls(
+    scene: Scene,
+    site: Site,
+    names: tuple[str, ...],
+    wish: Wish,
+    give: Callable[[str], None],
+    take: Callable[..., None],
+) -> list[Slider | Choice | Toggle | Fold | Note]:
+    """All that a visitor can set in a scene that deformers of these names answer.
+
+    `give` takes who gets the tool, `take` numbers of its touch, as `Wish.hand` does.
+    """
+    cameras = "as the scene has it", STAYS, *PATHS
+
+    def film(name: str) -> None:
+        wish.set(path="" if name == cameras[0] else name)
+
+    switches = tuple(
+        Toggle(effect, True, partial(wish.switch, effect), effect_words(effect), "what happens without it?")
+        for effect in switched(scene, site)
+    )
+    slices = through(wish.through, lambda name: wish.set(through=name))
+    scenes = SCENES if scene.name in SCENES else (scene.name, *SCENES)
+    return [
+        Choice("scene", scenes, scene.name, lambda name: wish.set(scene=name), hint="what happens to the brain"),
+        Choice(
+            "deformer",
+            names,
+            wish.deformer,
+            lambda name: wish.set(deformer=name),
+            "answered by",
+            "fem: finite elements, solved anew; the others: models that were trained on them",
+        ),
+        overlays(wish.style, lambda style: wish.set(style=style)),
+        Choice("camera", cameras, wish.path or cameras[0], film, hint="how the camera moves"),
+        *([] if scene.tool is None else [*hand(scene, site, wish, give, take), slices]),
+        *([Fold("more: switch parts of the physics off", switches)] if switches else []),
+        Note(PLAN),
+        Note(OWN_FILM, ASKED),
+    ]
+
+
+def overlays(now: Style, choose: Callable[[Style], None]) -> Choice:
+    """How the overlay is drawn."""
+    styles: dict[str, Style] = {words: style for style, words in STYLES.items()}
+    return Choice(
+        "overlay", tuple(styles), STYLES[now], lambda words: choose(styles[words]), hint="how it is drawn", key=STYLE
+    )
+
+
+def through(now: str, choose: Callable[[str], None]) -> Choice:
+    """Where the slices of the scan lie."""
+    places = TUMOUR_MIDDLE, TIP
+    hint = "where the slices of the scan lie, which a tab beside the 3-D view shows"
+    return Choice("slices", places, now or places[0], choose, hint=hint)
+
+
+def switched(scene: Scene, site: Site) -> list[str]:
+    """Effects that a scene can be without: all but those that make it a body at rest."""
+    kinds = (type(effect) for effect in scene.effects_on(site.anatomy))
+    return [kind.__name__ for kind in kinds if kind not in (Elasticity, Held, Bonded, Slide)]
+
+
+def clocked(scene: Scene, site: Site) -> bool:
+    """Whether anything moves by itself while the hand is still."""
+    effects = scene.effects_on(site.anatomy)
+    relaxing = remember(effect for effect in effects if isinstance(effect, Elasticity))
+    return relaxing or any(isinstance(effect, Gravity | Inertia | Pulsation | Resection) for effect in effects)
+
+
+def hand(
+    scene: Scene, site: Site, wish: Wish, give: Callable[[str], None], take: Callable[..., None]
+) -> list[Slider | Choice]:
+    """Who has the tool, and where: as far as the opening lets it go, in directions of the patient."""
+    assert scene.tool is not None
+    room = max(0.5, np.floor(2e3 * (site.clearance - scene.tool.radius)) / 2.0)
+    sides = bearings(scene.viewpoint.camera(site).T_camera_world[:3, :3])
+    stops = "the bone stops the tool at the rim of the opening"
+    against = "which way the tool pushes, against straight inwards"
+    ways = (("right", "x", sides["right"]), ("up", "y", sides["top"]))
+    places = (
+        Slider(
+            f"place {way} [mm]", -room, room, 0.5, 0.0, lambda value, axis=axis: take(**{axis: 1e-3 * value}),
+            f"{way}, to {side} [mm]", stops,
+        )
+        for way, axis, side in ways
+    )  # fmt: skip
+    tilts = (
+        Slider(
+            f"direction {way} [deg]", -MOST_TILT, MOST_TILT, 1.0, 0.0,
+            lambda value, way=way: take(**{way: np.radians(value)}), f"tilt {way}, to {side} [deg]", against,
+        )
+        for way, _, side in ways
+    )  # fmt: skip
+    return [Choice("tool", (SCRIPT, HAND), SCRIPT, give, hint=HANDS), strength(scene, wish, take), *places, *tilts]
+
+
+def slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
+    """Values of the tool's sliders at a touch, by their labels."""
+    strong = {"depth [mm]": 1e3 * touch.depth} if scene.posed else {"force [N]": touch.force}
+    places = {"place right [mm]": 1e3 * touch.x, "place up [mm]": 1e3 * touch.y}
+    tilts = {f"direction {way} [deg]": np.degrees(tilt) for way, tilt in zip(("right", "up"), touch.tilt, strict=True)}
+    return {label: round(float(value), 2) for label, value in (strong | places | tilts).items()}
+
+
+def strength(scene: Scene, wish: Wish, take: Callable[..., None]) -> Slider:
+    """How hard the hand pushes, or how deep it goes."""
+    touch = wish.touch
+    if scene.posed:
+        low = -1e3 * AIR
+        now = min(max(1e3 * touch.depth, low), MOST_DEPTH)
+        hint = "how far the tool is beyond where it just touches; negative: in the air"
+        return Slider("depth [mm]", low, MOST_DEPTH, 0.1, now, lambda value: take(depth=1e-3 * value), hint=hint)
+    return Slider(
+        "force [N]",
+        0.0,
+        MOST_FORCE,
+        0.01,
+        min(touch.force, MOST_FORCE),
+        lambda value: take(force=value),
+        hint="how hard it pushes",
+    )

@@ -1,0 +1,385 @@
+"""The page comes alive: a scripted or hand-set tool, any deformer, and the finite elements checking it behind."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time as clock
+import traceback
+from collections.abc import Callable
+from dataclasses import replace
+from html import escape
+
+from ar.overlay.styles import Style
+from ar.page.browser import Browser
+from ar.page.history import History
+from ar.page.parts import Playback
+from sim.errors import InputError
+from sim.loads import Loads
+from surrogate.data.dataset import digest_of_loads
+
+from ..play.deformers import AtRest, Theatre
+from ..play.player import Frame, Player
+from ..play.stage import Stage
+from ..play.tool_holder import holding
+from ..play.waiting_notice import Busy
+from ..script.scene import Scene, find_scene
+from ..script.tool_paths import Touch
+from .beside import lines_of, sample_of, slices_of
+from .cast import Cast
+from .controls import PLAN, clocked, controls, slider_values
+from .moment import Moment
+from .referee import Referee, Truth
+from .requests import HAND, SCRIPT, Wish
+from .tally import Tally
+from .text import effect_words, pending_words, plan_words, report, words, work_words
+from .verdict import OWN, TRUTH, changed, judge, verdict_words
+from .view import (
+    FEM_COLOUR,
+    STALE_COLOUR,
+    bodies_of,
+    move_bodies,
+    move_wire,
+    pictured,
+    signs_of,
+    viewpoint_of,
+)
+
+WAITS = "The finite elements are working on this load."
+RESTS = '<p class="stale">The body at rest, as in the scan. The first answer is on its way.</p>'
+# How long a page that plays shows why a frame is left out [s].
+READING = 2.0
+
+
+class Demo:
+    """A scene on a page, for as long as `run` is let run; visitors change it for another built-in one."""
+
+    def __init__(
+        self,
+        theatre: Theatre,
+        scene: Scene,
+        deformer: str,
+        host: str,
+        port: int,
+        anatomy: str = "the default",
+        find: Callable[[str], Scene] = find_scene,
+        style: Style = "window",
+        origins: tuple[str, ...] = (),
+    ) -> None:
+        """Open the page; `anatomy` is whose brain, in words, and `find` makes the scenes that visitors choose."""
+        self.theatre, self.anatomy, self.first, self.find = theatre, anatomy, scene, find
+        self.turn = threading.Lock()
+        self._cast(scene, deformer)
+        self.wish.set(style=style)
+        size, site = (scene.viewpoint.width, scene.viewpoint.height), theatre.site
+        parts = self._parts(deformer)
+        self.browser = Browser(
+            parts[0],
+            viewpoint_of(site),
+            *parts[1:],
+            host=host,
+            port=port,
+            size=size,
+            signs=signs_of(site),
+            origins=origins,
+        )
+        self.busy = Busy(lambda line: self.browser.status(escape(line)))
+        self.dismissed: list[Referee] = []
+        self.asked, self.drawn = self.wish.now(), 0
+
+    def run(self, seconds: float = float("inf")) -> int:
+        """Play until the time is over; returns the frames drawn. What fails is said on the page, and is left out.
+
+        Raises
+        ------
+        InputError
+            The finite elements of the first scene cannot be had, and nothing else was asked to play it.
+        """
+        self.drawn, end = 0, clock.perf_counter() + seconds
+        while (left := end - clock.perf_counter()) > 0.0:
+            try:
+                self._run(left)
+            except Exception as error:
+                if isinstance(error, InputError) and not self.cast.playable:
+                    raise
+                self._leave_out(error, end)
+        return self.drawn
+
+    def _leave_out(self, error: Exception, end: float) -> None:
+        """Say why a frame is not shown, until there is time to read it or a visitor asks for another; then go on."""
+        self.busy.off()
+        said = str(error)
+        if not isinstance(error, InputError):
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            said = f"a defect: {type(error).__name__}, {error}"
+            print(f"sulcus demo: {said} (line {place.lineno} of {place.filename})", file=sys.stderr)
+        self.browser.report(f'<p class="warn">error: this frame is left out ({escape(said)})</p>')
+        self._tell()
+        until = min(end, clock.perf_counter() + READING)
+        while self.wish.now() == self.asked and self.wish.scene == self.stage.scene.name:
+            if clock.perf_counter() >= (until if self.wish.plays else end):
+                break
+            clock.sleep(1.0 / self.stage.scene.frames_per_second)
+        self.wish.go_on(self.asked[0], len(self.stage.scene.times))
+
+    def _run(self, seconds: float) -> None:
+        """Play until the time is over or something fails."""
+        now, end = Moment(), clock.perf_counter() + seconds
+        while clock.perf_counter() < end:
+            begun = clock.perf_counter()
+            if self.wish.scene != self.stage.scene.name:
+                self._change(self.wish.scene)
+                now = Moment()
+            self.drawn += self.answer(now)
+            self.browser.plays(self.wish.plays)
+            self._tell()
+            if now.frame is None:
+                continue
+            self._check(now)
+            rest = 1.0 / self.stage.scene.frames_per_second - (clock.perf_counter() - begun)
+            clock.sleep(max(0.0, rest))
+
+    def _tell(self) -> None:
+        """Tell each visitor who has the tool, and who leads."""
+        tool, holder, here = self.stage.scene.tool, self.wish.holder, self.browser.here
+        self.browser.tell(lambda visitor: "" if tool is None else holding(visitor, holder, here))
+
+    def close(self) -> None:
+        """Stop the page and the finite elements."""
+        self.busy.close()
+        self.browser.close()
+        for solver in (*self.cast.solvers.values(), *self.dismissed):
+            solver.close()
+
+    @property
+    def stage(self) -> Stage:
+        """What is drawn, with all effects."""
+        return self.cast.stage()
+
+    @property
+    def referee(self) -> Referee:
+        """The finite elements under all effects, which judge the models."""
+        return self.cast.solver()
+
+    def _cast(self, scene: Scene, deformer: str) -> None:
+        """Have a deformer play a scene."""
+        self.cast, self.tally = Cast(self.theatre, scene, deformer, self.turn), Tally()
+        self.history = History(lines_of(scene))
+        # The frame that is shown.
+        self.reached: int | None = None
+        self.wish = Wish(deformer, scene.path(0.0), scene.name, clocked=clocked(scene, self.theatre.site))
+
+    def _change(self, name: str) -> None:
+        """Play another scene; where this body has none of that name, stay, and say why."""
+        old = self.cast, self.tally, self.wish, self.history
+        self.busy.on(f"preparing the scene {name}")
+        try:
+            scene = self.first if name == self.first.name else self.find(name)
+            deformer = self.theatre.usual(scene)
+            self._cast(scene, deformer)
+            self.wish.set(style=old[2].style, path=old[2].path, through=old[2].through)
+            parts = self._parts(deformer)
+        except InputError as error:
+            self.cast, self.tally, self.wish, self.history = old
+            self.wish.set(scene=self.stage.scene.name)
+            self.browser.put("scene", self.stage.scene.name)
+            self.browser.report(f'<p class="warn">{escape(str(error))}</p>')
+            return
+        finally:
+            self.busy.off()
+        self.browser.fill(*parts)
+        self.dismissed = [solver for solver in self.dismissed if solver.thread.is_alive()] + old[0].dismiss()
+
+    def answer(self, now: Moment) -> int:
+        """Bring the page nearer to what is wished; returns how many frames were drawn, 0 or 1."""
+        self.asked = self.wish.now()
+        if self.asked == now.asked:
+            self._arrive()
+        elif (found := self._found(now)) is not None:
+            self._draw(now, found)
+            return 1
+        if now.frame is not None and self.wish.look != now.look:
+            self._restyle(now)
+        return 0
+
+    def _arrive(self) -> None:
+        """All is shown: nothing more is wanted, and playing goes on."""
+        self.busy.off()
+        self.cast.rest()
+        self.wish.go_on(self.asked[0], len(self.stage.scene.times))
+
+    def _found(self, now: Moment) -> Truth | None:
+        """The answer to what is wished, or to a frame on the way there; None until there is one."""
+        number, name, touch, off = self.asked
+        question, scene = (number, touch), self.stage.scene
+        if name != "fem" and not off:  # no model was trained without
+            self.busy.on(work_words(scene, name, *question))
+            return self.cast.predicted(name, question)
+        found = self.cast.solved(off, question, now.shown, 0.0)
+        if found is not None:
+            return found
+        if self.cast.solver(off).player is None:
+            self.busy.on("preparing the finite elements")
+            if now.frame is None and not now.rests:
+                self._rest(now)
+        elif now.goal == self.asked and now.frame is not None:
+            self.busy.on(f"on the way to frame {number}: frame {now.frame.number} is solved")
+        else:
+            self.busy.on(work_words(scene, "fem", *question))
+        return self.cast.solved(off, question, now.shown, 1.0 / scene.frames_per_second)
+
+    def _rest(self, now: Moment) -> None:
+        """Show the body at rest while nothing else can be shown."""
+        number, _, touch, _ = self.asked
+        stage = replace(self.stage, observer=None)  # there is no truth yet to be seen
+        player = Player(stage, AtRest(stage.site.anatomy), self.wish.style)
+        frame = player.draw(number, float(self.stage.scene.times[number]), touch or player.touch(number))
+        move_bodies(self.browser, frame, player)
+        self.browser.show(number, pictured(frame), RESTS)
+        self._beside(frame, player)
+        now.rests = True
+
+    def _draw(self, now: Moment, found: Truth) -> None:
+        """Draw an answer, and have it judged by the finite elements unless it is theirs."""
+        number, name, touch, off = self.asked
+        fem = name == "fem" or bool(off)
+        look = self.wish.look
+        player = self._seen(self.asked, look)
+        hand = touch or player.touch(found.number)
+        self.reached, now.goal, now.asked = found.number, self.asked, (found.number, name, touch, off)
+        now.look, now.shown, now.own = look, found, None
+        now.load = digest_of_loads(self._whole(found.number, touch) if off else found.loads)
+        now.frame = frame = player.drawn(found.number, hand, found.loads, found.deformation, found.seconds)
+        self.history.add(sample_of(frame, self.stage.scene, clock.monotonic()))
+        if found.number == number:
+            self._arrive()
+        if fem and not off:
+            now.own = found
+        elif found.number == number:
+            self.referee.ask(number, touch)
+        if not off:
+            self.tally.took(name, now.load, found.deformation.cost.total)
+        now.picture = pictured(frame)
+        move_bodies(self.browser, frame, player)
+        self._beside(frame, player)
+        if touch is None:
+            self._show_touch(hand, lambda: self.wish.tool == SCRIPT)
+
+    def _show_touch(self, touch: Touch, wanted: Callable[[], bool]) -> None:
+        """Set the tool's sliders to a touch, so that a hand that takes the tool starts there."""
+        if self.stage.scene.tool is not None:
+            for label, value in slider_values(self.stage.scene, touch).items():
+                self.browser.put(label, value, wanted)
+
+    def _restyle(self, now: Moment) -> None:
+        """Draw the same answer in another way."""
+        assert now.frame is not None and now.asked is not None
+        frame, now.look = now.frame, self.wish.look
+        player, seconds = self._seen(now.asked, now.look), frame.seconds["deform"]
+        now.frame = player.drawn(frame.number, frame.touch, frame.loads, frame.deformation, seconds)
+        now.picture = pictured(now.frame)
+        self._beside(now.frame, player)
+
+    def _seen(self, asked: tuple, look: tuple[Style, str, str]) -> Player:
+        """Who plays what is asked, drawn in that way."""
+        _, name, _, off = asked
+        style, path, _ = look
+        return replace(self.cast.seen("fem" if off else name, off, path), style=style)
+
+    def _beside(self, frame: Frame, player: Player) -> None:
+        """Show slices of a frame, and what was read lately, when there is time for it."""
+        through, history = self.wish.through, self.history
+        self.browser.show_beside(lambda: (slices_of(frame, player, through), history.chart()))
+
+    def _check(self, now: Moment) -> None:
+        """Show what the finite elements say of what is shown, and whether it is of the same load."""
+        assert now.frame is not None and now.asked is not None
+        _, name, _, off = now.asked
+        name = "fem" if off else name
+        truth = now.own or self.referee.truth
+        fresh = truth is not None and digest_of_loads(truth.loads) == now.load
+        if truth is not None and (truth is not now.truth or now.by != (name, off)):
+            whole = self.cast.player(name)
+            move_wire(self.browser, self.stage, truth, whole)
+            if whole.follows and not fresh:
+                now.judged = None
+            elif not off:
+                shown = now.frame.deformation if whole.follows else None
+                now.judged = judge(truth, whole, name == "fem", shown)
+                if now.judged.mean is not None:
+                    self.tally.missed(name, digest_of_loads(truth.loads), now.judged.mean)
+            now.truth, now.by = truth, (name, off)
+        if now.stale is not (not fresh):
+            now.stale = not fresh
+            self.browser.tint("finite elements", FEM_COLOUR if fresh else STALE_COLOUR)
+        gone = [effect_words(effect) for effect in sorted(off)]
+        if self.referee.failure is not None:
+            what = "this" if self.referee.thread.is_alive() else "any more"
+            why = escape(str(self.referee.failure))
+            verdict = f'<p class="warn">error: the finite elements do not answer {what} ({why})</p>'
+        elif off and truth is not None:
+            shown, whole = now.frame.deformation, self.cast.player(name)
+            verdict = changed(truth, whole, shown, gone) if fresh else verdict_words(None, True, WAITS)
+        else:
+            own = OWN if now.frame.estimate is None else TRUTH
+            verdict = verdict_words(now.judged if truth is not None else None, not fresh, WAITS, own)
+        plan = self.cast.solver(off).plan or self.referee.plan
+        if plan != now.plan:
+            now.plan = plan
+            self.browser.write(PLAN, plan_words(plan))
+        scene = self.stage.scene
+        said = report(now.frame, self.stage, name, verdict, self.tally.rows, len(scene.times), gone)
+        if now.asked != self.asked and self.busy.noticed:
+            said = pending_words(now.frame.number, self.asked[0], len(scene.times)) + said
+        assert now.picture is not None
+        self.browser.show(now.frame.number, now.picture, said, self.asked[0])
+
+    def _whole(self, number: int, touch: Touch | None) -> Loads:
+        """What acts in a frame under all effects of the scene."""
+        scene, time = self.stage.scene, float(self.stage.scene.times[number])
+        return scene.loads(self.stage.site, touch or scene.path(time), time)
+
+    def _parts(self, deformer: str) -> tuple:
+        """What the page is filled with: bodies, playback, controls, title, words."""
+        scene, site = self.stage.scene, self.stage.site
+        wish, names = self.wish, self.theatre.names(scene)
+        playback = Playback(len(scene.times), self._play, lambda number: self._give(SCRIPT, number=number))
+        given = controls(scene, site, names, wish, self._give, self._take)
+        return bodies_of(self.stage), playback, given, f"sulcus: {scene.name}", words(self.theatre, scene, self.anatomy)
+
+    def _play(self, plays: bool) -> None:
+        """The button: where nothing moves by itself, playing gives the tool to the script. A pause stops on the way."""
+        self.wish.play(plays)
+        if not plays and self.reached is not None:
+            self.wish.set(number=self.reached)
+        if self.wish.tool == SCRIPT:
+            self.wish.set(holder=None)
+        if self.stage.scene.tool is not None:
+            self.browser.put("tool", self.wish.tool)
+
+    def _give(self, tool: str, **wishes: int) -> None:
+        """The menu, or the frame slider, gave the tool away; the menu says so after whatever is on its way to it."""
+        if tool == HAND:
+            self._start_hand()
+        self.wish.set(tool=tool, holder=self._visitor() if tool == HAND else None, **wishes)
+        if self.stage.scene.tool is not None:
+            self.browser.put("tool", tool)
+
+    def _take(self, **values: float) -> None:
+        """A slider was moved: the tool is in the visitor's hand."""
+        self._start_hand()
+        self.wish.set(holder=self._visitor())
+        self.wish.hand(**values)
+        self._show_touch(self.wish.touch, lambda: True)
+        self.browser.put("tool", HAND)
+
+    def _start_hand(self) -> None:
+        """Where the script has the tool, a hand takes it as it is in the frame that is shown."""
+        if self.wish.tool == SCRIPT:
+            number = self.wish.number if self.reached is None else self.reached
+            scene = self.stage.scene
+            self.wish.set(touch=scene.path(float(scene.times[number])))
+
+    def _visitor(self) -> int | None:
+        """Who set what is heard now."""
+        return None if self.browser.deed is None else self.browser.deed.visitor

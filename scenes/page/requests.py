@@ -1,0 +1,77 @@
+"""What the visitors of a page ask for."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field, replace
+
+from ar.overlay.styles import Style
+
+from ..script.tool_paths import Touch
+
+SCRIPT, HAND = "script", "hand"
+
+
+@dataclass
+class Wish:
+    """What the visitors ask for, written by the page's threads and read by the loop, under its lock.
+
+    `path` is how the camera moves, by its name; "" as the scene has it. `through` is where slices lie.
+    `clocked` says whether anything moves by itself under a hand that is still: otherwise a hand pauses the script.
+    """
+
+    deformer: str
+    touch: Touch
+    scene: str = ""
+    tool: str = SCRIPT
+    holder: int | None = None
+    plays: bool = True
+    number: int = 0
+    off: frozenset[str] = frozenset()
+    style: Style = "window"
+    path: str = ""
+    through: str = ""
+    clocked: bool = False
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def set(self, **values: object) -> None:
+        """Change some wishes at once."""
+        with self.lock:
+            for name, value in values.items():
+                setattr(self, name, value)
+
+    def hand(self, right: float | None = None, up: float | None = None, **values: float) -> None:
+        """Take the tool over with some numbers of its touch changed; `right` and `up` tilt its force [rad]."""
+        with self.lock:
+            tilt = self.touch.tilt[0] if right is None else right, self.touch.tilt[1] if up is None else up
+            self.touch, self.tool = replace(self.touch, tilt=tilt, **values), HAND
+            self.plays = self.plays and self.clocked
+
+    def play(self, plays: bool) -> None:
+        """Play or pause; where nothing moves by itself, playing takes the tool from the hand."""
+        with self.lock:
+            self.plays = plays
+            if plays and not self.clocked:
+                self.tool = SCRIPT
+
+    def switch(self, effect: str, on: bool) -> None:
+        """Switch an effect on or off."""
+        with self.lock:
+            self.off = self.off - {effect} if on else self.off | {effect}
+
+    @property
+    def look(self) -> tuple[Style, str, str]:
+        """How an answer is shown: the overlay's style, the camera's path, and where slices lie."""
+        with self.lock:
+            return self.style, self.path, self.through
+
+    def now(self) -> tuple[int, str, Touch | None, frozenset[str]]:
+        """Frame number, deformer, hand-set touch (None: the script's) and effects that are off."""
+        with self.lock:
+            return self.number, self.deformer, self.touch if self.tool == HAND else None, self.off
+
+    def go_on(self, number: int, frames: int) -> None:
+        """A frame was shown: playing goes on to the next, unless a visitor has sought another meanwhile."""
+        with self.lock:
+            if self.plays and self.number == number:
+                self.number = (number + 1) % frames

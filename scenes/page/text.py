@@ -1,0 +1,309 @@
+"""The words of the page, as HTML: what is seen, what it is of, what was answered, and how far to trust it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from ar.overlay import hud
+from sim.anatomy import region_name
+from sim.deformation import Deformation, Outcome
+from sim.material import Material, Tissue
+
+from ..play.deformers import GUARDED, Theatre
+from ..play.observer import ELLIPSOID_COLOUR, Estimate
+from ..play.player import Frame, is_undeformed
+from ..play.stage import TRUTH_COLOUR, TUMOUR_COLOUR, Stage
+from ..script.scene import Scene
+from ..script.site import Site
+from ..script.tool_paths import Touch
+from ..script.uncertainty import TumourError
+from .tally import Row
+
+SEEN = (
+    "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; "
+    "the green outline shows where it is computed to be now, while the tissue moves."
+)
+ESTIMATED = (
+    "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; the green "
+    "outline shows where it is estimated to be, from the dots on the cortex alone. No force and no stiffness is known."
+)
+RESEARCH = "Research only. Not a medical device."
+MIDLINE = 5e-3
+ELEMENTS = {"p1": "linear tetrahedra", "p2": "quadratic tetrahedra", "smoothed": "smoothed linear tetrahedra"}
+EFFECTS = {
+    "ToolForce": "push of the tool",
+    "ToolContact": "contact of the tool",
+    "Retraction": "the spatula",
+    "Gravity": "gravity and fluid",
+    "Resection": "the resection",
+    "Pulsation": "heartbeat and breath",
+    "SkullContact": "contact with the skull",
+    "Inertia": "inertia",
+}
+"""What a visitor calls the effects of a scene."""
+
+
+def effect_words(name: str) -> str:
+    """What a visitor calls an effect of this class name."""
+    return EFFECTS.get(name, name)
+
+
+def words(theatre: Theatre, scene: Scene, anatomy: str) -> str:
+    """What stands under the picture: what is seen, what the lines mean, and whose brain it is."""
+    title = " ".join(scene.title.split())
+    seen = SEEN if scene.sight is None else ESTIMATED
+    return (
+        f"<p>{seen} <b>{RESEARCH}</b></p><p>Scene: {escape(title)}</p>{legend(scene)}"
+        f'<p class="dim">{escape(about(theatre, scene, anatomy))}</p>'
+    )
+
+
+def legend(scene: Scene) -> str:
+    """What the lines mean, each beside a piece of it."""
+    scan = ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan")
+    now, true, ellipsoid = (stroked(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
+    under = (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone")
+    keys = [
+        (f'{now} stroke-width="3"', "tumour now (predicted)"),
+        under,
+        (f'{now} stroke-width="1.5" stroke-dasharray="4 3"', "where it is, 95 of 100 times"),
+        scan,
+        (f'{true} stroke-width="1.5"', "finite elements (3-D view)"),
+    ]
+    if scene.sight is not None:
+        keys = [
+            (f'{now} stroke-width="3"', "tumour now (estimate)"),
+            under,
+            (f'{true} stroke-width="2" stroke-dasharray="8 3"', "tumour now (truth: finite elements)"),
+            (f'{ellipsoid} stroke-width="2" stroke-dasharray="5 3"', "its middle, with 95 % probability"),
+            scan,
+        ]
+    if scene.tool is not None:
+        keys.append(('stroke="#fff" stroke-width="1.5"', "tip to tumour, in mm"))
+    return keyed(keys)
+
+
+def keyed(keys: Sequence[tuple[str, str]]) -> str:
+    """A legend: each line's attributes as SVG has them, and what it means."""
+    lines = (
+        f'<span><svg width="26" height="8"><line x1="1" y1="4" x2="25" y2="4" {line}/></svg>{text}</span>'
+        for line, text in keys
+    )
+    return f'<div class="legend">{"".join(lines)}</div>'
+
+
+def stroked(colour: Sequence[float]) -> str:
+    """A colour, sRGB in [0, 1], as a line has it in HTML."""
+    return 'stroke="#' + "".join(f"{round(255.0 * share):02x}" for share in colour) + '"'
+
+
+def about(theatre: Theatre, scene: Scene, anatomy: str) -> str:
+    """Whose brain, which side, and what the finite elements take it to be made of."""
+    mesh = theatre.anatomy.mesh
+    return (
+        f"Brain: {anatomy}, opened {side(theatre.site)}; {len(mesh.nodes)} mesh points. Finite elements: "
+        f"{fem_words(theatre, scene)}."
+    )
+
+
+def side(site: Site) -> str:
+    """Where the opening is, from the middle of the brain's width."""
+    nodes = site.anatomy.mesh.nodes[:, 0]
+    off = float(site.origin[0] - 0.5 * (nodes.min() + nodes.max()))
+    return "near the midline" if abs(off) < MIDLINE else f"on the patient's {'right' if off > 0.0 else 'left'}"
+
+
+def fem_words(theatre: Theatre, scene: Scene) -> str:
+    """Element and tissue that the theatre's finite elements have in a scene."""
+    element, elasticity = theatre.element_of(scene), scene.elasticity
+    own = (f"; the {region_name(label)} of {tissue_words(one)}" for label, one in elasticity.regions.items())
+    return f"{ELEMENTS.get(element, element)}, {tissue_words(elasticity.default)}{''.join(own)}"
+
+
+def tissue_words(tissue: Tissue | None) -> str:
+    """A tissue's law and constants."""
+    if tissue is None:
+        return "a tissue for each region"
+    fades = ", which relaxes under a held load" if tissue.prony else ""
+    if not isinstance(tissue, Material):
+        return f"{tissue.law} tissue{fades}"
+    return (
+        f"{tissue.law} tissue of Young's modulus {1e-3 * tissue.young:g} kPa and Poisson's ratio {tissue.poisson:g}"
+        f"{fades}"
+    )
+
+
+def deformer_words(name: str) -> str:
+    """What a deformer is."""
+    if name == GUARDED:
+        return "best trained model, finite elements where it is unsure"
+    return "finite elements" if name == "fem" else f"trained model {name}"
+
+
+def work_words(scene: Scene, name: str, number: int, touch: Touch | None) -> str:
+    """What a deformer is solving: a frame of the script, or what the hand's touch asks for."""
+    if touch is None:
+        return f"solving frame {number} ({deformer_words(name)})"
+    how = f"{1e3 * touch.depth:.1f} mm deep" if scene.posed else f"{touch.force:.2f} N"
+    return f"solving the tool in your hand, {how} ({deformer_words(name)})"
+
+
+def pending_words(shown: int, asked: int, frames: int) -> str:
+    """A line that says of a picture that it does not yet answer what is asked."""
+    way = f" on the way to frame {asked}, this is frame {shown} of {frames - 1}" if shown != asked else ""
+    return f'<p class="stale">Not yet what is asked:{way or " it is being solved"}.</p>'
+
+
+def plan_words(lines: Sequence[str]) -> str:
+    """Which solvers the finite elements try, as a list; nothing of none."""
+    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>" if lines else ""
+
+
+def trust(answer: Deformation, name: str) -> str:
+    """How an answer came about, and how far off it may be; in another colour, with the reason, where it is not good."""
+    outcome = answer.outcome[0]
+    who = f"<b>{escape(_guarded_words(outcome) if name == GUARDED else deformer_words(name))}</b>"
+    if outcome is Outcome.EXTRAPOLATED:
+        return (
+            f'<p>{who}</p><p class="warn">Do not rely on this answer: the load lies outside the range that the model '
+            "was trained on, so nothing is promised about its error.</p>"
+        )
+    if not outcome.good:
+        return f'<p>{who}</p><p class="warn">Do not rely on this answer: {escape(outcome.value)}.</p>'
+    how = "inside the range that it was trained on" if outcome is Outcome.PREDICTED else "solved to its tolerance"
+    if is_undeformed(answer):
+        return f"<p>{who}: {how}. Nothing moves the tumour.</p>"
+    bound = float(answer.bound[0, 0])
+    if not np.isfinite(bound):
+        return f"<p>{who}: {how}.</p>"
+    return (
+        f"<p>{who}: {how}. Error of the model: in 95 of 100 loads no point of the tumour is more than "
+        f"{hud.bound_words(bound, 2)} from where its finite elements have it.</p>"
+    )
+
+
+def _guarded_words(outcome: Outcome) -> str:
+    """Which of the two answered, where a model has finite elements behind it."""
+    by_model = outcome in (Outcome.PREDICTED, Outcome.EXTRAPOLATED)
+    return "trained model (guarded)" if by_model else "finite elements, as the trained model is unsure of this load"
+
+
+def tumour_trust(error: TumourError) -> str:
+    """How far the tumour may be from where it is in the patient: no matter of the model alone."""
+    if error.bound is None:
+        return (
+            "<p>Error of the tumour: not known. It is known of scripted scenes alone, after "
+            "<code>sulcus uncertainty SCENE</code>.</p>"
+        )
+    within = hud.bound_words(error.bound, 1)
+    said = f"Error of the tumour: 95 of 100 times no point of it is more than {within} from where it is"
+    guess = ": a guess, of few draws or a load beyond the law of the tissue" if error.guess else ""
+    if error.registration_words:
+        said += f" ({error.registration_words} along each axis, as a standard deviation)"
+    if error.observed is None:
+        return f"<p>{said}{guess or f'; the largest part is {escape(error.largest)}'}.</p>"
+    without = "" if error.prior is None else f"; without observation {hud.bound_words(error.prior, 1)}{guess}"
+    return f"<p>{said}{without}.</p>"
+
+
+def report(
+    frame: Frame, stage: Stage, name: str, verdict: str, rows: Sequence[Row], frames: int, without: Sequence[str] = ()
+) -> str:
+    """What was answered: the distance first, then how far to trust it, what acts, the verdict and the table."""
+    left = stage.at(frame.loads).left
+    facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
+    if frame.estimate is not None or not is_undeformed(frame.deformation):
+        facts += [moved_words(frame)]
+    if frame.distance_error is not None and frame.distance_error < np.inf:
+        facts += [
+            f"tip to tumour within {hud.bound_words(frame.distance_error, 1)} of the model's finite elements (95 %)"
+        ]
+    off = None if frame.doubt else frame.tumour_error.bound
+    parts = [] if frame.distance is None else [tip_words(frame.distance, off, frame.inside)]
+    number, *found = [""] if frame.estimate is None else estimated(frame.estimate)
+    # A narrow window shows the first lines alone: both errors are among them.
+    parts += [number, trust(frame.deformation, name), tumour_trust(frame.tumour_error), *found]
+    parts.append(f"<p>{escape('; '.join(facts))}</p>")
+    if without:
+        parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
+    if left is not None and len(left.loose):
+        parts.append(f"<p>{len(left.loose)} tetrahedra that nothing held any more came off with the last steps.</p>")
+    spent = {"deform": "answer", "render": "camera picture", "overlay": "overlay"}
+    took = ", ".join(f"{spent.get(stage, stage)} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
+    return "".join([*parts, verdict, table(rows), f'<p class="dim">milliseconds: {took}</p>'])
+
+
+def moved_words(frame: Frame) -> str:
+    """How far the tumour moved, and what that is off by: of the model, and of the tumour in the patient."""
+    said = f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' by the estimate'}"
+    if frame.moved_error is not None:
+        off = f"error of the tumour {hud.bound_words(frame.moved_error, 1)}"
+    else:
+        off = f"error of the {'answer' if frame.doubt else 'tumour'} not known"
+    if frame.model_error is not None and frame.estimate is None:
+        off = f"error of the model {hud.bound_words(frame.model_error, 2)}, {off}"
+    return f"{said} ({off})"
+
+
+def estimated(found: Estimate) -> list[str]:
+    """What an estimate says, how far it is from the truth, and what it was given; or why it was refused."""
+    truth = f"truly {unbroken(found.truly)}"
+    if found.location is None:
+        return [
+            f'<p class="number">where the tumour is, is not known ({truth})</p>',
+            f'<p class="warn">What is seen was refused: {escape(found.refusal)}</p>',
+        ]
+    moved = unbroken(found.moved, found.location.p95)
+    held = "inside" if found.held else "outside of"
+    guess = f" {found.location.doubt}" if found.location.doubt else ""
+    still = "" if found.noticed else " The estimate sees no motion beyond its error."
+    return [
+        f'<p class="number">tumour moved {moved} by the estimate ({truth})</p>',
+        f"<p><b>estimate</b> from {escape(found.source)}: {1e3 * found.off:.1f} mm off the truth, which is {held} the "
+        f"ellipsoid. Causes: {found.location.named_causes}.{still}{guess}</p>",
+    ]
+
+
+def tip_words(distance: float, error: float | None, inside: bool) -> str:
+    """The page's first line: from the tip to the tumour's surface, with its error [m], as HTML; None: not known."""
+    what = "tip inside the tumour, its edge" if inside else "tip to tumour"
+    return f'<p class="number">{what} {unbroken(distance, error)}</p>'
+
+
+def unbroken(length: float, error: float | None = None) -> str:
+    """A length and its error [m] in millimetres, whose unit no new line parts from them."""
+    said = hud.millimetres(length, error).replace("+-", "\N{PLUS-MINUS SIGN}")
+    return said.replace(" ", "&nbsp;")
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Time and error of the deformers so far; nothing is ranked that was not shown the same loads."""
+    if not rows:
+        return ""
+    ranked = rows[0].best is not None
+    what = (
+        f"Medians over the same {counted(rows[0].loads)}; bold: no other is both faster and more accurate."
+        if ranked
+        else "Medians so far."
+    )
+    if len(rows) > 1 and not ranked:
+        what = "Medians so far, each over loads of its own: not to be compared."
+    lines = (
+        f"<tr{' class=best' if row.best else ''}><td>{escape(row.name)}</td>"
+        f"<td>{row.milliseconds:.1f} ms</td><td>{_off(row.millimetres)} mm off</td><td>{counted(row.loads)}</td></tr>"
+        for row in rows
+    )
+    return f'<p class="dim">{what}</p><table>{"".join(lines)}</table>'
+
+
+def _off(millimetres: float) -> str:
+    """The error in millimetres; a small one is not rounded to none."""
+    return f"{millimetres:.3f}" if millimetres >= 1e-3 else "under 0.001"
+
+
+def counted(loads: int) -> str:
+    """So many loads, in words."""
+    return f"{loads} load{'' if loads == 1 else 's'}"

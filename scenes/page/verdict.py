@@ -1,0 +1,87 @@
+"""The finite elements' verdict on what is shown, as HTML, and whether it is on the load that acts now."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from ar.overlay.hud import millimetres
+from sim.deformation import Deformation
+from sim.loads import Pushed
+
+from ..play.load_text import doubt_of
+from ..play.player import Player
+from ..play.tip_reading import measured
+from ..script.tool_paths import lifted
+from .referee import Truth
+
+OWN, TRUTH = "this is the finite elements' own answer", "the truth is the finite elements' own answer"
+
+
+@dataclass(frozen=True)
+class Judged:
+    """How far off a deformer is where the finite elements have answered: mean and largest, and the motion [m].
+
+    doubt says why their answer may not be relied on. mean and largest are None where the answer shown is theirs.
+    distance is theirs from tip to tumour [m].
+    """
+
+    number: int
+    seconds: float
+    doubt: str
+    motion: float
+    mean: float | None
+    largest: float | None
+    distance: float | None = None
+
+
+def judge(truth: Truth, player: Player, own: bool, shown: Deformation | None = None) -> Judged:
+    """Hold a deformer against the finite elements under the loads that they answered.
+
+    `shown` is what it answered these loads with, where that depends on what it answered before.
+    """
+    nodes = player.stage.at(truth.loads).anatomy.tumour_nodes
+    right = truth.deformation.at(nodes).displacement[0]
+    error = None
+    if not own:
+        answer = player.deformer.deform(truth.loads, at=nodes) if shown is None else shown.at(nodes)
+        error = np.linalg.norm(answer.displacement[0] - right, axis=1)
+    motion = float(np.linalg.norm(right, axis=1).mean())
+    off = (None, None) if error is None else (float(error.mean()), float(error.max()))
+    pushed = truth.loads.every(Pushed)
+    lift = lifted(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
+    gauge = measured(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
+    distance = None if gauge is None else gauge.distance
+    return Judged(truth.number, truth.seconds, doubt_of(truth.deformation.outcome[0]), motion, *off, distance)
+
+
+def verdict_words(judged: Judged | None, stale: bool, waits: str, own: str = OWN) -> str:
+    """The verdict; of an earlier load it is greyed and says so, and what the finite elements do meanwhile.
+
+    `own` says that an answer is the finite elements' own.
+    """
+    if judged is None:
+        return f'<p class="stale">{escape(waits)}</p>'
+    said = own
+    if judged.mean is not None and judged.largest is not None:
+        said = f"error against FEM: mean {1e3 * judged.mean:.3f}, largest {1e3 * judged.largest:.3f} mm"
+    tip = "" if judged.distance is None else f"tip to tumour {millimetres(judged.distance)}, "
+    tail = f"{tip}tumour moved {1e3 * judged.motion:.2f} mm by FEM, without the error of the tumour"
+    tail += f" (frame {judged.number}, FEM {1e3 * judged.seconds:.0f} ms"
+    tail += f", {judged.doubt})" if judged.doubt else ")"
+    if stale:
+        return f'<p class="stale">of an earlier load: {said}; {tail}. {escape(waits)}</p>'
+    return f"<p>{said}; {tail}</p>"
+
+
+def changed(truth: Truth, player: Player, shown: Deformation, off: Sequence[str]) -> str:
+    """How far from where all effects together have it the tumour of an answer without some lies."""
+    nodes = player.stage.at(truth.loads).anatomy.tumour_nodes
+    apart = truth.deformation.at(nodes).displacement[0] - shown.at(nodes).displacement[0]
+    mean = 1e3 * float(np.linalg.norm(apart, axis=1).mean())
+    return (
+        f"<p>without {escape(', '.join(off))} the tumour is {mean:.2f} mm from where all effects together have it</p>"
+    )

@@ -1,0 +1,87 @@
+"""The 3-D view of a page: which surfaces it shows, the patient's sides round them, and where it is seen from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ar.overlay.hud import marked
+from ar.page.browser import Browser
+from ar.page.parts import Body, Sign, Viewpoint
+
+from ..play.observer import BALL, BALL_FACES, ELLIPSOID_COLOUR
+from ..play.player import Frame, Player
+from ..play.stage import CORTEX_COLOUR, TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR, Stage
+from ..script.site import Site
+from .referee import Truth
+
+FEM_COLOUR = TRUTH_COLOUR
+STALE_COLOUR = (0.45, 0.45, 0.45)
+"""Of the finite elements' tumour while it belongs to another load than the one that is shown."""
+# Radius of an ellipsoid before there is one [m].
+SMALL = 1e-4
+# How far the patient's sides stand from the brain [m].
+BESIDE = 12e-3
+
+
+def bodies_of(stage: Stage) -> list[Body]:
+    """Brain, open cortex, tumour, the finite elements' tumour, an estimate's ellipsoid and the tool, at rest."""
+    tool, site, tumour = stage.scene.tool, stage.site, stage.tumour(stage.site.anatomy.mesh.nodes)
+    wire = Body("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True)
+    bodies = [*brain_of(stage), wire]
+    if stage.observer is not None:
+        middle = tumour.vertices.mean(axis=0)
+        bodies.append(Body("ellipsoid", middle + SMALL * BALL, BALL_FACES, ELLIPSOID_COLOUR, wireframe=True))
+    if tool is not None:
+        pose = tool.pose(site.origin - 0.02 * site.axis, site.axis, site.right)
+        at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        bodies.append(Body("tool", at, tool.mesh.faces, TOOL_COLOUR))
+    return bodies
+
+
+def brain_of(stage: Stage) -> list[Body]:
+    """Brain, open cortex and tumour, at rest."""
+    positions = stage.site.anatomy.mesh.nodes
+    brain, cortex, tumour = stage.brain, stage.cortex(positions), stage.tumour(positions)
+    return [
+        Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
+        Body("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
+        Body("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
+    ]
+
+
+def signs_of(site: Site) -> list[Sign]:
+    """The patient's sides round the brain."""
+    nodes = site.anatomy.mesh.nodes
+    middle, half = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + BESIDE
+    ways = zip(("RL", "AP", "SI"), np.diag(half), strict=True)
+    return [Sign(word, middle + way) for (plus, minus), arm in ways for word, way in ((plus, arm), (minus, -arm))]
+
+
+def viewpoint_of(site: Site) -> Viewpoint:
+    """Obliquely onto the open cortex."""
+    eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
+    return Viewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))
+
+
+def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
+    """Put the bodies of the 3-D view where a frame has them."""
+    positions, tool = player.believed(frame), player.scene.tool
+    stage = player.stage.at(frame.loads)
+    for layer in (stage.cortex(positions), stage.tumour(positions)):
+        browser.move(layer.name, layer.vertices, layer.triangles)
+    ellipsoid = None if frame.estimate is None else frame.estimate.ellipsoid()
+    if ellipsoid is not None:
+        browser.move(ellipsoid.name, ellipsoid.vertices)
+    if tool is not None and frame.pose is not None:
+        browser.move("tool", tool.mesh.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
+
+
+def move_wire(browser: Browser, stage: Stage, truth: Truth, player: Player) -> None:
+    """Show where the finite elements, under all effects, have the tumour."""
+    seen = stage.at(truth.loads).tumour(player.positions(truth.deformation))
+    browser.move("finite elements", seen.vertices, seen.triangles)
+
+
+def pictured(frame: Frame) -> np.ndarray:
+    """A frame's picture (H, W, 3) uint8 with the patient's sides."""
+    return marked(frame.shown, frame.camera.T_camera_world[:3, :3], frame.taken)

@@ -1,0 +1,44 @@
+"""What stands beside the 3-D view of an overlay's page: slices of the scan, and what was read lately."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ar.overlay.gauge import Gauge
+from ar.page.history import Line, Sample
+from ar.page.slices import Cut
+
+from ..page.beside import sliced_where
+from .follower import Known
+from .picture import Painter
+
+DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of tip and motion (95 %); dotted: not to be relied on")
+WITHIN = Line("error of the overlay", "mm", "#4cf28c", "across the view (95 %), without tissue and segmentation")
+
+
+def lines_of(tooled: bool) -> tuple[Line, ...]:
+    """What is read of each picture."""
+    return (DISTANCE, WITHIN) if tooled else (WITHIN,)
+
+
+def sample_of(known: Known, gauge: Gauge | None, tooled: bool, now: float) -> Sample:
+    """What is read of a picture that is shown at a time [s]: `lines_of` says in which order."""
+    within = 1e3 * known.band if known.relied and known.band is not None else None
+    if not tooled:
+        return Sample(now, (within,), (0.0,))
+    distance = None if gauge is None else 1e3 * gauge.distance
+    error = 1e3 * gauge.error if gauge is not None and gauge.error is not None and known.relied else None
+    return Sample(now, (distance, within), (error, 0.0))
+
+
+def slices_of(known: Known, painter: Painter, through: str) -> np.ndarray:
+    """Three slices (h, 3 h, 3) uint8 of the scan, through one of the places of `scenes.page.beside`.
+
+    Their band is the error of the motion, for tracking and registration do not move the tumour in the scan.
+    """
+    stage, tool = painter.stage, painter.held(known, cubed=False)
+    tip = None if known.T_scan_tool is None else known.T_scan_tool[:3, 3]
+    others = [] if tool is None else [tool]
+    error = known.motion.error if known.relied and known.motion.known else None
+    now = stage.tumour(known.motion.positions)
+    return sliced_where(stage, Cut(now, stage.tumour_at_rest, error, not known.relied, others, tip, "motion"), through)

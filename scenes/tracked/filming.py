@@ -1,0 +1,238 @@
+"""Films of a scene as a real camera would take them, with printed targets in view and all that is true of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, uniform_filter1d
+from scipy.spatial.transform import Rotation
+
+from ar.optics.camera import Camera
+from ar.optics.rolling_shutter import row_bands, time_of_point
+from ar.rendering.layer import Layer
+from ar.rendering.renderer import Renderer
+from ar.tracking.detection import window_round
+from ar.tracking.drawn import drawn
+from ar.tracking.registration import Registration
+from ar.tracking.rigid import moved_about
+from ar.tracking.stamp import stamped
+from ar.tracking.targets import Target, patient_reference, tool_cube
+from sim.errors import InputError
+from sim.tools import BuiltIn
+
+from ..play.player import Player
+from ..play.stage import TOOL, TOOL_COLOUR
+from ..script.site import Site
+from .reference_place import reference_beside
+from .registration_file import scanned_of
+from .tracked_tool import TrackedTool
+
+# From the tool's tip up its shaft to the middle of its cube [m].
+MOUNT = 0.09
+# Of a hand that covers a target; by what an over-exposed picture is brighter; pixels of a smear.
+HAND, BRIGHT, SMEAR = (196, 148, 128), 12.0, 41
+KINDS = {
+    "reference": "a hand covers the patient's reference",
+    "tool": "a hand covers the tool's cube",
+    "bright": "the picture is over-exposed",
+    "smear": "the picture is smeared by motion",
+    "gap": "there are no pictures",
+}
+"""What may go wrong in a film, and how it is called."""
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """Something that goes wrong from one time to another [s].
+
+    Raises
+    ------
+    InputError
+        A kind that is not in `KINDS`, or times without order.
+    """
+
+    kind: str
+    since: float
+    until: float
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError(f"no trouble is called {self.kind!r}: choose one of {', '.join(KINDS)}.")
+        if not 0.0 <= self.since < self.until < np.inf:
+            raise InputError(f"{self.kind} is from {self.since:g} to {self.until:g} s: give two times in order.")
+
+
+@dataclass(frozen=True)
+class Taking:
+    """How pictures are taken: blur [pixel] and noise [of 255] as standard deviations, and what goes wrong."""
+
+    blur: float = 0.5
+    noise: float = 2.0
+    troubles: tuple[Trouble, ...] = ()
+    seed: int = 0
+
+    def happening(self, time: float) -> set[str]:
+        """What goes wrong at a time [s]."""
+        return {each.kind for each in self.troubles if each.since <= time < each.until}
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One picture and what is true of it.
+
+    Parameters
+    ----------
+    time
+        [s].
+    colour
+        (H, W, 3) uint8.
+    T_camera_scan, T_scan_tool
+        (4, 4) [m].
+    displacement
+        (n, 3) [m] of the tumour's surface vertices, in the stage's order.
+    """
+
+    time: float
+    colour: np.ndarray
+    T_camera_scan: np.ndarray
+    T_scan_tool: np.ndarray
+    displacement: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Mounted:
+    """What is printed in a film, and where: the tool with its cube, and T_scan_patient (4, 4) of the reference."""
+
+    tool: TrackedTool
+    T_scan_patient: np.ndarray
+
+
+def mounted(player: Player) -> Mounted:
+    """A cube on the scene's tool and a reference beside the opening, both turned towards the camera as it starts.
+
+    Raises
+    ------
+    InputError
+        A scene whose tool is none that can be tracked.
+    """
+    scene, site, camera = player.scene, player.site, player.camera
+    shape = None if scene.tool is None else scene.tool.shape
+    if scene.tool is None or not isinstance(shape, BuiltIn):
+        raise InputError(
+            f"the scene {scene.name} has no ball, rod or blade that a cube could be put on: choose another."
+        )
+    touch = player.touch(0)
+    pose = player.tool(scene.tool, touch, site.anatomy.mesh.nodes).pose
+    T_tool_cube = np.eye(4)
+    T_tool_cube[2, 3] = MOUNT
+    towards = pose[:3, :3].T @ (camera.centre - pose[:3, :3] @ T_tool_cube[:3, 3] - pose[:3, 3])
+    turn = np.arctan2(towards[1], towards[0]) - 0.25 * np.pi  # the edge between the cube's sides comes to the front
+    T_tool_cube[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
+    return Mounted(TrackedTool(shape, np.linalg.inv(T_tool_cube)), reference_beside(site, camera))
+
+
+def registered(site: Site, mounts: Mounted, shift: float, turn: float, seed: int) -> Registration:
+    """The reference's registration to the scan, with an error that is drawn once, and stated.
+
+    `shift` [mm] and `turn` [degree] are its standard deviations along and about each axis, about the opening's middle.
+    """
+    deviations = np.repeat([1e-3 * shift, np.radians(turn)], 3)
+    error = deviations * np.random.default_rng([seed, 1]).standard_normal(6)
+    centre = site.origin
+    T = moved_about(np.linalg.inv(mounts.T_scan_patient), centre, error)
+    return Registration(T, np.diag(deviations**2), centre, 0.0, 0, scanned=scanned_of(site.anatomy))
+
+
+def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) -> Iterator[Shot]:
+    """The pictures of a scene, one in `every` frame; the deformer's answers are what is true.
+
+    A camera with a rolling shutter is where its path has it for each row; tool and tissue stay as at the picture's
+    time. The camera that is true of such a picture is that of the row in which the tumour's middle is seen.
+    """
+    tool, site, stage, last = player.scene.tool, player.site, player.stage, None
+    assert tool is not None
+    renderer: Renderer | None = None
+    calibration = player.scene.viewpoint.calibration
+    readout = 0.0 if calibration is None else calibration.readout
+    rest = site.anatomy.mesh.nodes
+    for number in range(0, len(player.scene.times), every):
+        time, touch = float(player.scene.times[number]), player.touch(number)
+        last = player.answer(player.loads(number, touch), last)
+        wrong = taking.happening(time)
+        if "gap" in wrong:
+            continue
+        positions = player.positions(last)
+        pose = player.tool(tool, touch, positions).pose
+        held = Layer("tool", TOOL, *mounts.tool.at(pose), TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)
+        layers = [*stage.layers(positions, None), held]
+        renderer = renderer or Renderer(layers, stage.lamp, stage.device)
+        targets = [
+            (tool_cube(), pose @ np.linalg.inv(mounts.tool.T_cube_tool)),
+            (patient_reference(), mounts.T_scan_patient),
+        ]
+        view = partial(_seen, renderer, [layer.vertices for layer in layers if not layer.still], targets, wrong)
+        camera_at = partial(_later, player, time)
+        tumour = positions[stage.tumour_vertices]
+        places = np.stack([tumour.mean(axis=0), site.origin, *(T[:3, 3] for _, T in targets)])
+        shown = (
+            view(player.camera_at(time))
+            if readout == 0.0
+            else np.concatenate([view(camera) for _, camera in row_bands(camera_at, readout, places)])
+        )
+        camera = camera_at(time_of_point(camera_at, readout, places[0]))
+        moved = tumour - rest[stage.tumour_vertices]
+        yield Shot(time, stamped(_taken(shown, taking, wrong, number), time), camera.T_camera_world, pose, moved)
+
+
+def _later(player: Player, time: float, after: float) -> Camera:
+    """The camera so long after a picture's time [s]."""
+    return player.camera_at(time + after)
+
+
+def _seen(
+    renderer: Renderer,
+    moving: Sequence[np.ndarray],
+    targets: Sequence[tuple[Target, np.ndarray]],
+    wrong: set[str],
+    camera: Camera,
+) -> np.ndarray:
+    """What a camera sees (H, W, 3) uint8 with targets T_scan_target (4, 4), some of which a hand covers."""
+    sharp = renderer.picture(camera, moving).colour
+    shown = drawn(sharp, camera, [each for each in targets if NAMES[each[0].name] not in wrong])
+    for target, T in targets:
+        if NAMES[target.name] in wrong:
+            shown = _covered(shown, camera, target, T)
+    return shown
+
+
+NAMES = {"tool": "tool", "patient": "reference"}
+"""The trouble of each target's name."""
+
+
+def _covered(colour: np.ndarray, camera: Camera, target: Target, T_scan_target: np.ndarray) -> np.ndarray:
+    """The picture with a hand before a target."""
+    T = camera.T_camera_world @ T_scan_target
+    outline = target.outline
+    where = window_round(replace(camera, T_camera_world=np.eye(4)), outline @ T[:3, :3].T + T[:3, 3], 0.1, 0.0)
+    out = colour.copy()
+    if where is not None:
+        out[where] = HAND
+    return out
+
+
+def _taken(colour: np.ndarray, taking: Taking, wrong: Sequence[str] | set[str], number: int) -> np.ndarray:
+    """The picture with blur and noise, and what goes wrong with it as a whole."""
+    out = colour.astype(np.float32)
+    if "bright" in wrong:
+        out *= BRIGHT
+    if "smear" in wrong:
+        out = uniform_filter1d(out, SMEAR, axis=1)
+    if taking.blur > 0.0:
+        out = gaussian_filter(out, (taking.blur, taking.blur, 0.0))
+    if taking.noise > 0.0:
+        random = np.random.default_rng([taking.seed, number])
+        out = out + taking.noise * random.standard_normal(out.shape, np.float32)
+    return np.clip(np.rint(out), 0.0, 255.0).astype(np.uint8)

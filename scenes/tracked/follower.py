@@ -1,0 +1,328 @@
+"""From one picture of a real camera to the next: where the tumour is, how far off that may be, and what is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+from scipy.stats import chi2
+
+from ar.optics.calibration import Calibration
+from ar.optics.camera import Camera
+from ar.tracking.calibration_error import calibration_error
+from ar.tracking.pose import Pose
+from ar.tracking.registration import Registration
+from ar.tracking.targets import patient_reference, tool_cube
+from ar.tracking.track import Tracked, Tracker
+
+from ..script.uncertainty import DEVIATIONS, LEVEL
+from .agreement import Agreement
+from .elsewhere import Elsewhere
+from .plausible import implausible, misplaced_tool
+from .tool_motion import Motion, ToolMotion
+from .tracked_tool import TrackedTool
+
+# So long a picture's overlay stays where it was when the reference is lost: in a hand's picture it is off by less than
+# LIMIT then. And so long pictures may be missing [s].
+HELD, GAP = 0.1, 0.2
+# A slow film's pictures may be apart by so many of its own intervals, which are no longer than this [s].
+MISSED, SLOWEST = 1.5, 1.0
+# Times of pictures are rounded [s].
+ROUNDING = 1e-6
+# A tumour whose place in the picture is not known this well is not to be relied on [m].
+LIMIT = 5e-3
+UNKNOWN = "as in the scan, and nobody says how it moved: do not rely on it"
+# What is seen moves while a rolling shutter reads a picture. So much of that way is an overlay's error, and so many
+# times as much the error of a tool's tip, which is far from its cube: measured in docs/overlay.md, "A rolling shutter".
+SKEW, LEVER = 0.5, 2.0
+# What is left after a second of how fast a hand was.
+CALMS = 0.1
+UNCHECKED = "not checked whose registration this is: make one by `sulcus register --anatomy`"
+NO_PACE = "a rolling shutter, and how the camera moves is not known yet: do not rely on it"
+TOOL, PATIENT = tool_cube().name, patient_reference().name
+
+
+class State(Enum):
+    """What a picture shows of the tumour."""
+
+    GOOD = "where it is now"
+    REST = "as in the scan"
+    UNKNOWN = "as in the scan, its motion not known"
+    UNSURE = "not to be relied on"
+    NO_TOOL = "tool lost"
+    STALE = "stale"
+    NO_REFERENCE = "reference lost"
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known after a picture.
+
+    Parameters
+    ----------
+    time
+        When it was taken [s].
+    state, words
+        What it shows; why that is no more, or not to be relied on, for people; empty where it may be.
+    tracked
+        What was seen of the targets.
+    motion
+        The brain as it is believed to be.
+    camera
+        With T_camera_scan; None where the reference has been lost for longer than `HELD`.
+    T_scan_tool, tip_covariance
+        (4, 4) [m] and (3, 3) [m^2], where the tool is seen.
+    band
+        With a probability of 95 % the tumour is no farther off across the line of sight [m]; None where that is not
+        known.
+    parts
+        The same by what it comes from [m].
+    seen, felt
+        When the reference, and the tool beside it, were seen last [s]; None: never.
+    interval
+        The shortest between two pictures so far [s].
+    near
+        Whether the tool has been near the head: until then its place may be due to another patient's registration.
+    pace
+        How fast the brain has moved across the picture lately [m/s]; None: not known.
+    agreement
+        What printed targets in the pictures say of another tracker's poses.
+    """
+
+    time: float
+    state: State
+    words: str
+    tracked: Tracked
+    motion: Motion
+    camera: Camera | None = None
+    T_scan_tool: np.ndarray | None = None
+    tip_covariance: np.ndarray | None = None
+    band: float | None = None
+    parts: Mapping[str, float] = field(default_factory=dict)
+    seen: float | None = None
+    felt: float | None = None
+    interval: float = SLOWEST
+    near: bool = False
+    pace: float | None = None
+    agreement: Agreement = field(default_factory=Agreement)
+
+    @property
+    def relied(self) -> bool:
+        """Whether the tumour is drawn as known."""
+        return self.state in (State.GOOD, State.REST)
+
+
+@dataclass(frozen=True, eq=False)
+class Follower:
+    """Follows reference and tool through the pictures of a calibrated camera, and asks how the brain lies.
+
+    Parameters
+    ----------
+    calibration
+        Of the camera.
+    registration
+        Of the patient's reference to the scan.
+    tool
+        With its cube; None: no tool is looked for.
+    motion
+        Who says how the brain lies under it.
+    elsewhere
+        Poses of another tracker, which take the place of the cube's; where they say where the camera is, the
+        reference's, too.
+    intrinsic
+        (9, 9), covariance of the camera's calibration, as of `ar.tracking.intrinsics.PARAMETERS`; None: not known.
+    """
+
+    calibration: Calibration
+    registration: Registration
+    tool: TrackedTool | None
+    motion: ToolMotion
+    elsewhere: Elsewhere | None = None
+    intrinsic: np.ndarray | None = None
+
+    @cached_property
+    def tracker(self) -> Tracker:
+        """Of the targets that are wanted."""
+        wanted = (patient_reference(),) if self.tool is None else (patient_reference(), tool_cube())
+        return Tracker(self.calibration.camera(np.eye(4)), wanted)
+
+    def step(self, grey: np.ndarray, time: float, before: Known | None = None) -> Known:
+        """What is known after a picture (H, W) uint8 that was taken at a time [s], from what was known `before`.
+
+        Raises
+        ------
+        ValueError
+            As `Tracker.track`.
+        """
+        known = self._agreeing(self._looked(grey, time, before), before)
+        if before is None:
+            return known
+        apart = time - before.time
+        known = replace(known, near=known.near or before.near)
+        return replace(known, interval=min(before.interval, apart) if apart > 0.0 else before.interval)
+
+    def _agreeing(self, known: Known, before: Known | None) -> Known:
+        """With what printed targets say of another tracker's poses, which may make the tumour's place not known."""
+        if self.elsewhere is None:
+            return known
+        agreement = Agreement() if before is None else before.agreement
+        known = replace(known, agreement=self.elsewhere.agreed(known.time, known.tracked.poses, agreement))
+        if not known.agreement.doubt or not (known.relied or known.state is State.UNSURE):
+            return known
+        return replace(known, state=State.UNSURE, words=known.agreement.doubt, band=None, parts={})
+
+    def _looked(self, grey: np.ndarray, time: float, before: Known | None) -> Known:
+        """As `step`, whatever the intervals are."""
+        apart = None if before is None else time - before.time
+        longest = GAP if before is None else max(GAP, MISSED * before.interval)
+        stale = apart is not None and not 0.0 < apart <= longest
+        forgotten = before is None or (apart is not None and not 0.0 <= apart <= longest)
+        tracked = self.tracker.track(grey, None if before is None or forgotten else before.tracked)
+        other = self.elsewhere
+        reference = tracked.poses.get(PATIENT) if other is None or other.eye is None else other.reference(time)
+        if reference is None:
+            return self._without_reference(tracked, time, before)
+        T_patient_scan = self.registration.T_patient_scan
+        camera = self.calibration.camera(reference.T_camera_target @ T_patient_scan)
+        pace = self._pace(reference, time, None if forgotten else before)
+        shutter = SKEW * self.calibration.readout * (pace or 0.0)
+        known = self._with_tool(tracked, reference, time, before, shutter)
+        middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
+        band, parts = self._band(reference, middle, known.motion, shutter)
+        known = replace(known, camera=camera, band=band, parts=parts, seen=time, pace=pace)
+        doubt, near = self._implausible(camera, known.T_scan_tool, before)
+        known = replace(known, near=near)
+        if known.relied and pace is None and self.calibration.readout > 0.0:
+            known = replace(known, state=State.UNSURE, words=NO_PACE)
+        if known.relied and self.registration.scanned is None:
+            known = replace(known, state=State.UNSURE, words=UNCHECKED)
+        if doubt:
+            known = replace(known, state=State.UNSURE, words=doubt)
+        if doubt or known.state is State.UNKNOWN:
+            known = replace(known, band=None, parts={})
+        if stale and apart is not None:
+            why = f"no picture for {apart:.1f} s" if apart > 0.0 else "the camera repeats a picture"
+            return replace(known, state=State.STALE, words=f"stale, {why}: do not rely on it")
+        if known.state in (State.GOOD, State.REST) and band > LIMIT:
+            return replace(known, state=State.UNSURE, words=wide_words(band))
+        return known
+
+    def _implausible(self, camera: Camera, tool: np.ndarray | None, before: Known | None) -> tuple[str, bool]:
+        """Why this can be no registration of this patient, in words; and whether the tool has been near the head."""
+        stage, near = self.motion.stage, before is not None and before.near
+        theirs = "is this its registration?" if self.elsewhere is None else "are these its poses and registration?"
+        misplaced, near = ("", near) if tool is None else misplaced_tool(self.tool, tool, stage, near, theirs)
+        doubt = implausible(self.registration, stage, camera) or misplaced
+        return doubt, near
+
+    def _without_reference(self, tracked: Tracked, time: float, before: Known | None) -> Known:
+        """The reference is not seen: for a moment the overlay stays where it was."""
+        seen = None if before is None else before.seen
+        motion = self.motion.rest if before is None else before.motion
+        held = before is not None and seen is not None and 0.0 <= time - seen < HELD + ROUNDING
+        camera = before.camera if before is not None and held else None
+        why = self._late(time) or ("not seen yet" if seen is None else "lost")
+        what = "nothing is drawn" if camera is None else "drawn where it was"
+        return Known(
+            time, State.NO_REFERENCE, f"reference {why}: {what}", tracked, motion, camera, seen=seen,
+            felt=None if before is None else before.felt,
+        )  # fmt: skip
+
+    def _pace(self, reference: Pose, time: float, before: Known | None) -> float | None:
+        """The fastest that the brain has moved across the picture lately [m/s]; None where that is not known.
+
+        A hand trembles: what it does while one picture is taken may be faster than from this picture to the next.
+        """
+        last = None if before is None else before.tracked.poses.get(PATIENT)
+        if before is None or last is None or not time > before.time:
+            return None
+        scan = self.registration.T_patient_scan @ np.append(self.motion.stage.site.origin, 1.0)
+        now, then = ((pose.T_camera_target @ scan)[:2] for pose in (reference, last))
+        speed = float(np.linalg.norm(now - then)) / (time - before.time)
+        return max(speed, CALMS ** (time - before.time) * (before.pace or 0.0))
+
+    def _with_tool(self, tracked: Tracked, reference: Pose, time: float, before: Known | None, shutter: float) -> Known:
+        """How the brain lies under the tool, by its pose beside the reference, and what a `shutter` adds to it [m]."""
+        felt, last = (None, None) if before is None else (before.felt, before.motion)
+        beside = self._beside(tracked, reference, time)
+        if self.tool is None or beside is None:
+            if self.motion.deformer is None:
+                return Known(time, State.UNKNOWN, UNKNOWN, tracked, self.motion.rest, felt=felt)
+            if felt is None or last is None:
+                words = f"tool {self._late(time) or 'not seen yet'}: the tumour as in the scan"
+                return Known(time, State.NO_TOOL, words, tracked, self.motion.rest)
+            words = f"tool {self._late(time) or 'lost'}: the tumour as {time - felt:.1f} s ago"
+            return Known(time, State.NO_TOOL, words, tracked, last, felt=felt)
+        into = np.linalg.inv(self.registration.T_patient_scan)
+        pose = into @ beside.T_camera_target @ self.tool.T_cube_tool
+        spread = tip_covariance(self.registration, self.tool, beside) + (LEVER * shutter / DEVIATIONS) ** 2 * np.eye(3)
+        motion = self.motion.under(pose, spread, last)
+        moved = State.GOOD if motion.moved > 0.0 else State.REST
+        state = State.UNSURE if motion.doubt else moved if motion.known else State.UNKNOWN
+        words = UNKNOWN if state is State.UNKNOWN else motion.doubt
+        return Known(time, state, words, tracked, motion, None, pose, spread, felt=time)
+
+    def _beside(self, tracked: Tracked, reference: Pose, time: float) -> Pose | None:
+        """The tool's cube beside the reference."""
+        if self.elsewhere is not None:
+            return self.elsewhere.beside(time)
+        cube = tracked.poses.get(TOOL)
+        return None if cube is None else cube.seen_from(reference)
+
+    def _late(self, time: float) -> str:
+        """How old the poses of another tracker are, where they are what is missing; else empty."""
+        age = None if self.elsewhere is None else self.elsewhere.age(time)
+        if self.elsewhere is None or age is None:
+            return ""
+        if outside := self.elsewhere.outside(time):
+            return f"not known, {outside} (see --clock)"
+        return f"stale, no pose for {age:.1f} s" if np.isfinite(age) else "not seen yet by the other tracker"
+
+    def _band(
+        self, reference: Pose, middle: np.ndarray, motion: Motion, shutter: float
+    ) -> tuple[float, dict[str, float]]:
+        """How far off the tumour's `middle` (3,) [m] may be across the line of sight, by what is known of it."""
+        place, beside = self.registration.point(middle)
+        at, tracked = reference.point(place)
+        turned = reference.T_camera_target[:3, :3]
+        registered = turned @ beside @ turned.T
+        camera = None
+        if self.intrinsic is not None and (self.elsewhere is None or self.elsewhere.eye is None):
+            corners = patient_reference().faces[0].corners
+            camera = calibration_error(self.tracker.camera, reference.T_camera_target, corners, place, self.intrinsic)
+        seen = tracked + registered + (0.0 if camera is None else camera)
+        parts = {
+            "tracking": across(tracked, at),
+            **({} if camera is None else {"camera": across(camera, at)}),
+            "registration": across(registered, at),
+            "tool": motion.tool,
+            "model": motion.model,
+            **({"shutter": shutter} if self.calibration.readout > 0.0 else {}),
+        }
+        return float(np.linalg.norm([across(seen, at), motion.error, shutter])), parts
+
+
+def wide_words(band: float) -> str:
+    """Why a place that is known no better than to `band` [m] may not be relied on."""
+    return f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
+
+
+def tip_covariance(registration: Registration, tool: TrackedTool, beside: Pose) -> np.ndarray:
+    """Of a tool's tip in the scan (3, 3) [m^2]: by its pose beside the reference, its calibration and registration."""
+    T = registration.T_patient_scan
+    arm, tracked = beside.point(tool.T_cube_tool[:3, 3])
+    turned = beside.T_camera_target[:3, :3]
+    _, registered = registration.point((arm - T[:3, 3]) @ T[:3, :3])
+    whole = tracked + turned @ tool.tip_covariance @ turned.T + registered
+    return T[:3, :3].T @ whole @ T[:3, :3]
+
+
+def across(covariance: np.ndarray, sight: np.ndarray) -> float:
+    """The radius [m] that holds 95 % of an error of covariance (3, 3) [m^2] across a line of sight along (3,)."""
+    ray = sight / np.linalg.norm(sight)
+    plane = np.eye(3) - np.outer(ray, ray)
+    largest = float(np.linalg.eigvalsh(plane @ covariance @ plane)[-1])
+    return float(np.sqrt(chi2.ppf(LEVEL, 2) * max(largest, 0.0)))

@@ -1,0 +1,285 @@
+"""The page of a film, or of what a camera sees now, with the tumour in it."""
+
+from __future__ import annotations
+
+import time as clock
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from html import escape
+
+import numpy as np
+
+from ar.overlay.composite import DOUBTFUL
+from ar.overlay.gauge import Gauge
+from ar.overlay.styles import Style
+from ar.page.browser import Browser
+from ar.page.history import History
+from ar.page.parts import Body, Playback
+from ar.tracking.pictures import Named
+
+from ..page.controls import overlays, through
+from ..page.view import STALE_COLOUR, brain_of, signs_of, viewpoint_of
+from ..play.stage import TOOL_COLOUR, TUMOUR_COLOUR
+from ..play.waiting_notice import Busy
+from .beside import lines_of, sample_of, slices_of
+from .follower import GAP, SLOWEST, Follower, Known, State
+from .picture import IN_GREY, Painter
+from .run import Shown, Timed, overlaid_one
+from .seekable_film import SeekableFilm
+from .words import about, report
+
+# Of a picture's brightness, what is left of one that is old; how long the page stays when it cannot go on [s].
+FADED, STAYS = 0.35, 2.0
+# How often a page that shows nothing new looks for what is asked [s].
+LOOKS = 0.03
+# A camera that gave no picture for so long may be unplugged [s].
+UNPLUGGED = 1.0
+# So many pictures are kept for a table and a summary, without their colours.
+KEPT = 20_000
+
+
+@dataclass(eq=False)
+class OverlayPage:
+    """The page of one film, or of one camera.
+
+    Parameters
+    ----------
+    follower, painter
+        What looks at its pictures, and draws into them.
+    name, who
+        Of the film or the camera, and who says how the brain lies, in words.
+    host, port
+        Where it is served.
+    frames
+        How many pictures the film has; 0: it is a camera.
+    origins
+        Further addresses of the page, as `ar.page.browser.Browser` takes them.
+    """
+
+    follower: Follower
+    painter: Painter
+    name: str = "camera"
+    who: str = "nobody"
+    host: str = "127.0.0.1"
+    port: int = 8080
+    frames: int = 0
+    origins: tuple[str, ...] = ()
+    browser: Browser = field(init=False)
+    busy: Busy = field(init=False)
+    history: History = field(init=False)
+    shown: deque[Shown] = field(default_factory=lambda: deque(maxlen=KEPT), init=False)
+    # What visitors ask for, written by the page's threads.
+    plays: bool = field(default=True, init=False)
+    style: Style = field(init=False)
+    through: str = field(default="", init=False)
+    sought: deque[int] = field(default_factory=lambda: deque(maxlen=1), init=False)
+    # What is shown: the picture as it came, its overlay, and how that is drawn.
+    taken: Timed | None = field(default=None, init=False)
+    newest: Shown | None = field(default=None, init=False)
+    number: int = field(default=-1, init=False)
+    # The shortest between two pictures so far [s].
+    interval: float = field(default=SLOWEST, init=False)
+    place: str = field(default="", init=False)
+    drawn: tuple[str, ...] = field(default=(), init=False)
+    tints: dict[str, tuple[float, float, float]] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        """Open the page; errors as of `ar.page.browser.Browser`."""
+        stage, tool, calibration = self.painter.stage, self.painter.tool, self.follower.calibration
+        self.style, self.history = self.painter.style, History(lines_of(self.tooled))
+        bodies = brain_of(stage)
+        if tool is not None:
+            # Of no size, until it is seen.
+            away = np.tile(stage.site.origin, (len(tool.bare[0]), 1))
+            bodies.append(Body("tool", away, tool.bare[1], TOOL_COLOUR))
+        self.browser = Browser(
+            bodies,
+            viewpoint_of(stage.site),
+            Playback(self.frames, lambda playing: setattr(self, "plays", playing), self.sought.append),
+            [
+                overlays(self.style, lambda style: setattr(self, "style", style)),
+                through(self.through, lambda name: setattr(self, "through", name)),
+            ],
+            f"sulcus: {self.name}",
+            about(self.name, self.who, self.tooled),
+            self.host,
+            self.port,
+            (calibration.width, calibration.height),
+            signs_of(stage.site),
+            origins=self.origins,
+        )
+        self.busy = Busy(lambda line: self.browser.status(escape(line)))
+
+    @property
+    def tooled(self) -> bool:
+        """Whether a tool is looked for."""
+        return self.painter.tool is not None
+
+    def close(self) -> None:
+        """Stop the page."""
+        self.busy.close()
+        self.browser.close()
+
+    def play(self, film: SeekableFilm, seconds: float = np.inf) -> list[Shown]:
+        """Play a film, again and again, until the time is over; returns what was shown last, without colours.
+
+        No picture is left out: where they take longer than the film does, it plays more slowly. A picture that is not
+        the next one is looked at as if it were the first.
+
+        Raises
+        ------
+        ValueError
+            A film that cannot be read, or of another size than the camera's; the page says it, too.
+        """
+        due = clock.perf_counter()
+        end, known = due + seconds, None
+        with self._failing(end):
+            while (now := clock.perf_counter()) < end:
+                self.browser.tell(lambda visitor: "")
+                wanted = self._wanted(film.count, now >= due)
+                if wanted is None:
+                    self._restyle()
+                    clock.sleep(LOOKS)
+                    continue
+                self.busy.on(f"looking at picture {wanted}")
+                taken = film.at(wanted)
+                if taken is None:
+                    if film.count < 1:
+                        raise ValueError(f"{film.path}: holds no picture.")
+                    if wanted != self.number + 1:
+                        self.sought.append(film.count - 1)
+                    continue
+                before = known if wanted == self.number + 1 else None
+                one = overlaid_one(taken, None, before, self.follower, self._painter())
+                self.busy.off()
+                apart = 0.0 if before is None else taken.picture.time - before.time
+                due = now + min(max(apart, 0.0), SLOWEST)
+                self.interval = min(self.interval, one.known.interval)
+                known = replace(one.known, interval=self.interval)
+                self._show(taken, one, wanted, f"picture {wanted} of {film.count - 1}, {taken.picture.time:.2f} s")
+        return list(self.shown)
+
+    def _wanted(self, count: int, due: bool) -> int | None:
+        """The number of the picture that is to be shown, if it is another than the one that is."""
+        wanted, first = self.number, self.number < 0
+        if self.sought:
+            wanted = self.sought.pop()
+        elif first or (self.plays and due):
+            wanted = (self.number + 1) % max(count, 1)
+        return None if wanted == self.number else wanted
+
+    def watch(self, pictures: Iterator[Named | None], seconds: float = np.inf) -> list[Shown]:
+        """Show what a camera sees until it ends, or the time is over; None stands for no picture that came.
+
+        Returns what was shown last, without colours. What is no longer the view is dimmed, and said to be old.
+
+        Raises
+        ------
+        ValueError
+            Pictures of another size than the camera's; the page says it, too.
+        """
+        came = clock.perf_counter()
+        end, known = came + seconds, None
+        with self._failing(end):
+            for picture in pictures:
+                now = clock.perf_counter()
+                if now >= end:
+                    break
+                self.browser.tell(lambda visitor: "")
+                if not self.plays:
+                    self._fade("paused")
+                elif picture is None:
+                    self._silent(now - came)
+                else:
+                    one = overlaid_one(Timed(picture, False), 0.0, known, self.follower, self._painter())
+                    known, came = one.known, now
+                    self.browser.status("")
+                    self._show(Timed(picture, False), one, 0, f"live from {self.name}")
+        return list(self.shown)
+
+    def _silent(self, seconds: float) -> None:
+        """Say that a camera gives no picture for so long."""
+        if seconds < UNPLUGGED:
+            self._fade(f"no picture for {GAP:g} s")
+        else:
+            self._fade(f"no picture for {seconds:.0f} s", f"Is {self.name} plugged in? This page waits for it.")
+
+    @contextmanager
+    def _failing(self, end: float) -> Iterator[None]:
+        """Say on the page, for a while, why it cannot go on."""
+        try:
+            yield
+        except ValueError as error:
+            self.busy.off()
+            self._fade(str(error))
+            clock.sleep(min(STAYS, max(0.0, end - clock.perf_counter())))
+            raise
+
+    def _painter(self) -> Painter:
+        """Who draws as visitors want it."""
+        return replace(self.painter, style=self.style)
+
+    def _show(self, taken: Timed, one: Shown, number: int, place: str) -> None:
+        """Show a picture, in words too, and note what was read of it."""
+        before = self.number
+        self.taken, self.newest, self.number, self.place = taken, one, number, place
+        self.shown.append(one.without_mesh())
+        now = clock.monotonic()
+        if number not in (before, before + 1):
+            self.history.break_off(now)
+        self.history.add(sample_of(one.known, self._gauge(one.known), self.tooled, now))
+        self._draw(one)
+
+    def _gauge(self, known: Known) -> Gauge | None:
+        """From tip to tumour, where both are known."""
+        if known.state in IN_GREY:
+            return None
+        return self.painter.gauge(known, self.painter.stage.tumour(known.motion.positions))
+
+    def _draw(self, one: Shown) -> None:
+        """Put a picture, its words, bodies, slices and chart on the page."""
+        known, look, painter = one.known, self.through, self.painter
+        self.drawn = self.style, self.through
+        said = report(one, self._gauge(known), self.tooled, self.place)
+        self.browser.show(max(self.number, 0), one.colour, said)
+        self.browser.move("tumour", painter.stage.tumour(known.motion.positions).vertices)
+        grey = known.state in IN_GREY
+        self._tint("tumour", STALE_COLOUR if grey else TUMOUR_COLOUR if known.relied else DOUBTFUL)
+        tool = painter.held(known, cubed=False)
+        if tool is not None:
+            self.browser.move("tool", tool.vertices)
+        if self.tooled:
+            self._tint("tool", STALE_COLOUR if grey or tool is None else TOOL_COLOUR)
+        self.browser.show_beside(lambda: (slices_of(known, painter, look), self.history.chart()))
+
+    def _tint(self, name: str, colour: tuple[float, float, float]) -> None:
+        if self.tints.get(name) != colour:
+            self.tints[name] = colour
+            self.browser.tint(name, colour)
+
+    def _restyle(self) -> None:
+        """Draw the same picture in another way, where that is asked for."""
+        if self.newest is None or self.taken is None or self.drawn == (self.style, self.through):
+            return
+        assert self.taken.picture.colour is not None
+        colour = self._painter().paint(self.taken.picture.colour, self.newest.known).colour
+        self.newest = replace(self.newest, colour=colour)
+        self._draw(self.newest)
+
+    def _fade(self, why: str, hint: str = "") -> None:
+        """Show that the last picture is old, unless that is shown already."""
+        said = f"{why}: what is shown is old"
+        if self.drawn == (said, self.style, self.through):
+            return
+        self.browser.status(escape(said))
+        if self.newest is None or self.taken is None:
+            self.browser.report(f'<p class="warn">{escape(why)}</p><p>{escape(hint)}</p>')
+        else:
+            assert self.taken.picture.colour is not None
+            known = replace(self.newest.known, state=State.STALE, words=said)
+            dim = (FADED * self.taken.picture.colour).astype(np.uint8)
+            self.place = f"{hint} The last picture" if hint else "the last picture"
+            self._draw(replace(self.newest, known=known, colour=self._painter().paint(dim, known).colour, latency=None))
+        self.drawn = said, self.style, self.through

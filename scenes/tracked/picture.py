@@ -1,0 +1,141 @@
+"""The tumour over a real picture: as it is known, in grey what was known a moment ago, and never what is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ar.optics.camera import Camera
+from ar.overlay.composite import HEAD_WIDTHS, Overlaid, composite, write_doubt, write_head
+from ar.overlay.gauge import Gauge
+from ar.overlay.hud import bound_words, folded
+from ar.overlay.outlines import box_around, dash, ink_of, joined, outlines, silhouette
+from ar.overlay.styles import NOTICED, Opening, Style
+from ar.overlay.traces import BEFORE, DOTTED
+from ar.rendering.layer import Layer
+from ar.rendering.real_picture import real_picture
+
+from ..play.player import gauged
+from ..play.stage import CORTEX, PREDICTED_LINES, TOOL, TOOL_COLOUR, Stage
+from ..script.uncertainty import DEVIATIONS
+from .follower import Known, State
+from .tracked_tool import TrackedTool
+
+ABOVE = "the tool does not touch: as in the scan"
+SEEN_THROUGH = Opening((CORTEX,), (), "seen through bone or drape")
+"""Where the drape has its hole, the opening is; all else may be bone."""
+IN_GREY = (State.NO_TOOL, State.STALE, State.NO_REFERENCE)
+"""States in which the tumour is drawn in grey, and dotted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Painter:
+    """Draws what is known over pictures.
+
+    Parameters
+    ----------
+    stage
+        The brain that is drawn.
+    tool
+        What hides the tumour where it is seen; None: nothing does.
+    style
+        As of `ar.overlay.composite.composite`.
+    device
+        A Warp device.
+    """
+
+    stage: Stage
+    tool: TrackedTool | None = None
+    style: Style = "window"
+    device: str = "cpu"
+
+    def paint(self, colour: np.ndarray, known: Known, covered: np.ndarray | None = None) -> Overlaid:
+        """A picture (H, W, 3) uint8 with what is known of it.
+
+        covered (H, W) bool is what lies in front of the brain, as a hand. Nothing is drawn over it, and the picture
+        says how much of the tumour that hides.
+        """
+        if known.state in IN_GREY or known.camera is None:
+            return self._grey(colour, known, covered)
+        camera, tumour = known.camera, self.stage.tumour(known.motion.positions)
+        gauge = self.gauge(known, tumour)
+        before = self.stage.tumour_at_rest if known.motion.known and known.motion.moved > 0.0 else None
+        doubt = "" if known.relied else known.words
+        band = 0.0 if known.band is None else known.band
+        box = box_around(camera, tumour.vertices)
+        if gauge is not None:
+            box = joined(box, box_around(camera, np.stack([gauge.tip, gauge.nearest])))
+        layers = [] if box is None else self._layers(known)
+        whole = slice(0, camera.height), slice(0, camera.width)
+        picture = real_picture(colour, camera, layers, box or whole, self.device)
+        lines = [*head_lines(known), *self._hidden_words(camera, tumour, covered)]
+        head = [part for line in lines for part in folded(line, HEAD_WIDTHS[0] * camera.width)]
+        return composite(
+            picture, camera, tumour, (TOOL,), self.style, band, gauge, before, doubt,
+            moved=(known.motion.moved, known.motion.error), head=head, opening=SEEN_THROUGH, error=known.band,
+            names=PREDICTED_LINES, covered=covered,
+        )  # fmt: skip
+
+    def _hidden_words(self, camera: Camera, tumour: Layer, covered: np.ndarray | None) -> Sequence[str]:
+        """What a picture says of what lies in front of the tumour, where that hides a noticeable share of it."""
+        box = box_around(camera, tumour.vertices)
+        if covered is None or box is None or self.style == "none":
+            return ()
+        mask = silhouette(camera.cropped(*box), tumour.vertices, tumour.triangles)
+        hidden = np.count_nonzero(mask & covered[box])
+        share = hidden / max(np.count_nonzero(mask), 1)
+        return (f"{share:.0%} of the tumour is behind what lies in front",) if share >= NOTICED else ()
+
+    def _layers(self, known: Known) -> list[Layer]:
+        """The open cortex, under which the tumour is seen, the drape round it as films have it, and the tool."""
+        tool = self.held(known)
+        return [*self.stage.layers(known.motion.positions, None), *([] if tool is None else [tool])]
+
+    def held(self, known: Known, cubed: bool = True) -> Layer | None:
+        """The tool where it is seen, with its cube or without."""
+        pose = known.T_scan_tool
+        if self.tool is None or pose is None:
+            return None
+        return Layer("tool", TOOL, *self.tool.at(pose, cubed), TOOL_COLOUR)
+
+    def gauge(self, known: Known, tumour: Layer) -> Gauge | None:
+        """From the tool's tip to the tumour, with the error of both; None where one is not known."""
+        if known.T_scan_tool is None or known.tip_covariance is None or known.band is None:
+            return None
+        gauge = gauged(known.T_scan_tool[:3, 3], tumour)
+        along = (gauge.nearest - gauge.tip) / max(gauge.distance, np.finfo(float).tiny)
+        spread = DEVIATIONS * float(np.sqrt(along @ known.tip_covariance @ along))
+        return Gauge(gauge.tip, gauge.nearest, error=float(np.hypot(spread, known.motion.error)))
+
+    def _grey(self, colour: np.ndarray, known: Known, covered: np.ndarray | None) -> Overlaid:
+        """The outline in grey, if it has a place, and why."""
+        over = Overlaid(colour.copy(), np.zeros(colour.shape[:2], np.uint8))
+        if known.camera is not None and self.style != "none":
+            self._dot(over, known.camera, self.stage.tumour(known.motion.positions))
+            if covered is not None:
+                over.colour[covered] = colour[covered]
+        write_head(over, [])
+        write_doubt(over, known.words)
+        return over
+
+    def _dot(self, over: Overlaid, camera: Camera, tumour: Layer) -> None:
+        box = box_around(camera, tumour.vertices)
+        if box is None:
+            return
+        mask = silhouette(camera.cropped(*box), tumour.vertices, tumour.triangles)
+        dash(over.colour[box], outlines(mask), ink_of(BEFORE), DOTTED)
+
+
+def head_lines(known: Known) -> Sequence[str]:
+    """What is known of the tumour's place and its error, for the picture's head."""
+    if known.band is None:
+        return ()
+    largest = max(known.parts, key=lambda name: known.parts[name])
+    lines = [ABOVE] if known.state is State.REST else []
+    if known.relied:
+        lines.append(f"tumour: within {bound_words(known.band, 1)} across the view (95 %), above all {largest}")
+    motion = "; of motion: not known" if not known.motion.known else ""
+    camera = "" if "camera" in known.parts else ", camera"
+    return (*lines, f"error by tissue{camera} and segmentation: not known{motion}")

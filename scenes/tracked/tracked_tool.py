@@ -1,0 +1,130 @@
+"""The tool that carries the printed cube: its shape, and where it is on the cube."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ar.tracking.rigid import is_rigid
+from ar.tracking.targets import TIP, tool_cube
+from sim.errors import InputError
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import path_of, read_as
+from sim.tools import BuiltIn, tool_from_text
+
+from ..script.tool import shafted
+
+FORMAT = "sulcus tool 1"
+WANTED = "Give a tool of `sulcus film`, or one with format, shape, T_cube_tool and tip_covariance_mm2."
+# A file of a tool has no more bytes.
+LONGEST = 100_000
+# How far rows of a rotation may be from square [1], and a tool's tip from its cube [m].
+SQUARE, FARTHEST = 1e-3, 1.0
+
+
+def nominal() -> np.ndarray:
+    """T_cube_tool (4, 4) of a cube whose axes are the tool's, the tip below its middle."""
+    T = np.eye(4)
+    T[2, 3] = -TIP
+    return T
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedTool:
+    """A tool with the printed cube on its shaft.
+
+    Parameters
+    ----------
+    shape
+        What of it touches tissue.
+    T_cube_tool
+        (4, 4) [m]: from the tool's own frame, whose origin is its lowest point, to the cube's.
+    tip_covariance
+        (3, 3) [m^2] of that origin in the cube's frame, as calibrated.
+    """
+
+    shape: BuiltIn
+    T_cube_tool: np.ndarray = field(default_factory=nominal)
+    tip_covariance: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+
+    @cached_property
+    def bare(self) -> tuple[np.ndarray, np.ndarray]:
+        """How it looks without its cube, which hides what lies behind: vertices (n, 3) [m], triangles (m, 3)."""
+        return shafted(self.shape, np.linalg.inv(self.T_cube_tool)[:3, 3])
+
+    @cached_property
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """How it looks, as far as that is known, with its cube: vertices (n, 3) [m] in its own frame, triangles (m, 3).
+
+        The faces with print alone are there, with their borders.
+        """
+        T_tool_cube, (vertices, triangles) = np.linalg.inv(self.T_cube_tool), self.bare
+        box, sides = _cube()
+        at = box @ T_tool_cube[:3, :3].T + T_tool_cube[:3, 3]
+        return np.concatenate([vertices, at]), np.concatenate([triangles, sides + len(vertices)])
+
+    def at(self, T_scan_tool: np.ndarray, cubed: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """How it looks at a pose (4, 4) [m], with its cube or without: vertices (n, 3) [m], triangles (m, 3)."""
+        vertices, triangles = self.mesh if cubed else self.bare
+        return vertices @ T_scan_tool[:3, :3].T + T_scan_tool[:3, 3], triangles
+
+
+def _cube() -> tuple[np.ndarray, np.ndarray]:
+    """The printed cube as a box in its own frame: corners (8, 3) [m], and triangles (12, 3)."""
+    half = float(max(abs(face.T_target_face[:3, 3]).max() for face in tool_cube().faces))
+    signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = [corner for a, b, c, d in quads for corner in ((a, b, c), (a, c, d))]
+    return half * signs, np.array(triangles)
+
+
+def read_tool(path: str | Path) -> TrackedTool:
+    """The tool in a JSON file, whose lengths are millimetres.
+
+    Raises
+    ------
+    InputError
+        A file that is missing or no such tool; a shape that is none, or a transform that is not rigid.
+    """
+    path = path_of(path)
+    with read_as(path, "a tracked tool", WANTED):
+        with path.open("rb") as file:
+            stored = json.loads(file.read(LONGEST))
+        if stored["format"] != FORMAT:
+            raise InputError(f"its format is not {FORMAT!r}. {WANTED}")
+        T, covariance = np.array(stored["T_cube_tool"], float), np.array(stored["tip_covariance_mm2"], float)
+        T[:3, 3] *= 1e-3
+        _demand_rigid(T)
+        if covariance.shape != (3, 3) or not np.isfinite(covariance).all() or _least(covariance) < -1e-9:
+            raise InputError(f"tip_covariance_mm2 is no covariance (3, 3). {WANTED}")
+        return TrackedTool(tool_from_text(str(stored["shape"])), T, 1e-6 * covariance)
+
+
+def _least(matrix: np.ndarray) -> float:
+    return float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0])
+
+
+def _demand_rigid(T: np.ndarray) -> None:
+    if not is_rigid(T, SQUARE):
+        raise InputError(f"T_cube_tool is no rigid transform (4, 4). {WANTED}")
+    if np.linalg.norm(T[:3, 3]) > FARTHEST:
+        raise InputError("T_cube_tool has the tip farther than 1 m from the cube: give millimetres.")
+
+
+def write_tool(path: Path, tool: TrackedTool) -> None:
+    """Write a tool as JSON, in millimetres; the file appears whole or not at all."""
+    T = tool.T_cube_tool.copy()
+    T[:3, 3] *= 1e3
+    stored = {
+        "format": FORMAT,
+        "spaces": {"tool": "origin at its lowest point, z up the shaft [mm]", "cube": "the cube's own [mm]"},
+        "shape": repr(tool.shape),
+        "T_cube_tool": T.tolist(),
+        "tip_covariance_mm2": (1e6 * tool.tip_covariance).tolist(),
+    }
+    with written_whole(path, ".json") as partial:
+        partial.write_text(json.dumps(stored, indent=1) + "\n", encoding="utf-8")

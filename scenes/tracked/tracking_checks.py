@@ -1,0 +1,145 @@
+"""Whether an overlay can be trusted when its markers are lost and found, and its pictures are old: by its pixels."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from ar.overlay.composite import HIDDEN, WARNING, doubt_lines
+from ar.overlay.hud import FINE, WHITE
+from ar.overlay.outlines import ink_of, silhouette
+from ar.overlay.refind import of_ink, outline_gap, stands
+from ar.overlay.styles import Style
+
+from ..play.picture_checks import SOFT
+from ..play.stage import TUMOUR_COLOUR
+from .drawn_film import DrawnFilm
+from .filming import Shot, registered
+from .follower import Follower, Known
+from .picture import Painter
+from .run import OLD, Timed, overlaid_one
+from .tool_motion import ToolMotion
+
+# What is lost is looked for in every third picture, and then is found. A drawn outline may be so far off [pixel].
+BACK, OFF = 3, 2.0
+# So many pixels of an ink are no line.
+NO_LINE = 5
+# What a picture must say, by what is covered.
+WORDS = {"reference": "reference lost", "tool": "tool lost"}
+STALE = "stale"
+# The picture that is repeated, and the one that is shown too late [s]; how late.
+REPEATED, DELAYED, LATE = 0.1, 0.2, 2.5 * OLD
+
+
+@dataclass(frozen=True)
+class TrackingFigures:
+    """The worst of a film.
+
+    Parameters
+    ----------
+    pictures
+        How many there are.
+    confident
+        Pictures in which a place that is lost or old is drawn in the ink of a known one.
+    unsaid
+        Such pictures that do not say in their own pixels why.
+    back
+        Pictures until the tumour is drawn as known again, at the film's begin and after what went wrong; infinite:
+        never.
+    off
+        How far the outline of a known place is from the true one [pixel].
+    """
+
+    pictures: int
+    confident: int
+    unsaid: int
+    back: float
+    off: float
+
+    def broken(self) -> list[str]:
+        """A sentence for each bound that is not kept."""
+        rules = {
+            f"{self.confident} pictures draw a lost or old place as if it were known": self.confident == 0,
+            f"{self.unsaid} pictures do not say that something is lost or old": self.unsaid == 0,
+            f"the tumour is back after {self.back:g} pictures, more than {BACK}": self.back <= BACK,
+            f"a place drawn as known is {self.off:.1f} pixels off, more than {OFF:g}": self.off <= OFF,
+        }
+        return [sentence for sentence, kept in rules.items() if not kept]
+
+    def row(self) -> dict[str, float | None]:
+        """For machines: None is a figure that could not be measured."""
+        return {name: value if np.isfinite(value) else None for name, value in asdict(self).items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Event:
+    """A picture as it comes: how old it is then [s], and what it must say; empty where all is well."""
+
+    shot: Shot
+    late: float = 0.0
+    words: str = ""
+
+
+def events_of(film: DrawnFilm) -> Iterator[Event]:
+    """The pictures of a film in order, of which one is repeated, one is old, and one comes after a gap."""
+    before = 0.0
+    for shot in film.shots:
+        covered = film.taking.happening(shot.time)
+        words = next((WORDS[kind] for kind in WORDS if kind in covered), "")
+        if shot.time - before > OLD:
+            words = STALE
+        late = LATE if np.isclose(shot.time, DELAYED) else 0.0
+        yield Event(shot, late, STALE if late else words)
+        if np.isclose(shot.time, REPEATED):
+            yield Event(shot, words=STALE)
+        before = shot.time
+
+
+def usual(film: DrawnFilm, style: Style = "window") -> tuple[Follower, Painter]:
+    """Who follows a film with all that is known of it and an exact registration, and who draws that."""
+    mounts, stage = film.mounts, film.stage
+    exact = registered(stage.site, mounts, 0.0, 0.0, 0)
+    follower = Follower(film.calibration, exact, mounts.tool, ToolMotion(stage, film.deformer))
+    return follower, Painter(stage, mounts.tool, style, stage.device)
+
+
+def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> TrackingFigures:
+    """Follow a film, draw what is known, and find in the pictures themselves what they show."""
+    known: Known | None = None
+    confident, unsaid, waits, worst, waiting, count = 0, 0, [0], 0.0, True, 0
+    for event in events_of(film):
+        count += 1
+        begun = clock.perf_counter() - event.shot.time - event.late if event.late else None
+        shown = overlaid_one(Timed(film.picture(event.shot), True), begun, known, follower, painter)
+        known = shown.known
+        drawn = bool(np.count_nonzero(of_ink(shown.colour, ink_of(TUMOUR_COLOUR))) >= NO_LINE)
+        if event.words:
+            confident += drawn
+            unsaid += not _says(shown.colour, known.words, event.words)
+            waits += [] if waiting else [0]
+            waiting = True
+            continue
+        if waiting:
+            waits[-1] += 1
+        waiting = waiting and not drawn
+        if drawn:
+            worst = max(worst, _off(film, event.shot, shown.colour))
+    return TrackingFigures(count, confident, unsaid, np.inf if waiting else max(waits), worst)
+
+
+def _says(colour: np.ndarray, words: str, wanted: str) -> bool:
+    """Whether words that begin as wanted stand in a picture."""
+    lines = doubt_lines(words, colour.shape[1])
+    return words.startswith(wanted) and all(stands(colour, line, FINE, ink_of(WARNING)) for line in lines)
+
+
+def _off(film: DrawnFilm, shot: Shot, colour: np.ndarray) -> float:
+    """How far the outline in a picture is from the true one [pixel]."""
+    camera, rest = film.calibration.camera(shot.T_camera_scan), film.stage.tumour_at_rest
+    mask = silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
+    tool = silhouette(camera, *film.mounts.tool.at(shot.T_scan_tool))
+    words = of_ink(colour, WHITE, 0)
+    return outline_gap(colour, ink_of(TUMOUR_COLOUR), mask, tool | words, gap=HIDDEN[1] + SOFT)

@@ -1,0 +1,85 @@
+"""The words of an overlay's page, as HTML: what is drawn, why it is not to be relied on, and both errors."""
+
+from __future__ import annotations
+
+from html import escape
+
+from ar.overlay.composite import DOUBTFUL
+from ar.overlay.gauge import Gauge
+from ar.overlay.hud import bound_words
+
+from ..page.text import RESEARCH, keyed, stroked, tip_words, unbroken
+from ..play.stage import TUMOUR_COLOUR
+from .follower import Known, State
+from .run import Shown
+
+PATIENT_ERROR = "<p>Error of the tumour: not known. Tissue and segmentation add to the error of the overlay.</p>"
+DRAWN = {
+    State.GOOD: "The tumour is drawn where it is now.",
+    State.REST: "The tumour is drawn as in the scan, for the tool does not touch.",
+}
+
+
+def about(name: str, who: str, tooled: bool) -> str:
+    """What stands under the picture: what it is, what the lines mean, and who says how the brain lies."""
+    now, doubt = stroked(TUMOUR_COLOUR), stroked(DOUBTFUL)
+    keys = [
+        (f'{now} stroke-width="3"', "tumour now"),
+        (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone"),
+        (f'{now} stroke-width="1.5" stroke-dasharray="4 3"', "where it is, 95 of 100 times"),
+        ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan; lost or stale: where it was"),
+        (f'{doubt} stroke-width="3" stroke-dasharray="5 3"', "not to be relied on"),
+        *([('stroke="#fff" stroke-width="1.5"', "tip to tumour, in mm")] if tooled else []),
+    ]
+    seen = (
+        f"What you see: {escape(name)}, with the tumour drawn into it that is hidden under the cortex. Reference and "
+        "tool are tracked in each picture."
+    )
+    return (
+        f"<p>{seen} <b>{RESEARCH}</b></p>{keyed(keys)}<p>Motion of the brain by {escape(who)}.</p>"
+        '<p class="dim">A scene in its place: <code>sulcus demo</code>.</p>'
+    )
+
+
+def report(shown: Shown, gauge: Gauge | None, tooled: bool, place: str) -> str:
+    """What is said beside a picture: the distance first, then the state, both errors, and what it took.
+
+    `place` says which picture it is.
+    """
+    known = shown.known
+    parts = [distance_words(gauge, known.relied)] if tooled else []
+    doubt = f'<p class="warn">{escape(known.words)}</p>'
+    parts.append(f"<p><b>{DRAWN[known.state]}</b></p>" if known.relied else doubt)
+    parts += [overlay_error(known), PATIENT_ERROR]
+    placed = known.seen == known.time
+    tool = "seen" if known.T_scan_tool is not None else "not seen" if placed else "not placed without the reference"
+    facts = [place, f"reference {'seen' if placed else 'not seen'}", *([f"tool {tool}"] if tooled else [])]
+    if known.motion.known and known.relied:
+        facts.append(f"tumour moved {unbroken(known.motion.moved, known.motion.error)} (error of model and tool)")
+    took = f"looked at and drawn in {1e3 * shown.seconds:.0f} ms"
+    if shown.latency is not None:
+        took += f"; shown {1e3 * shown.latency:.0f} ms after it was taken"
+    return "".join([*parts, f"<p>{'; '.join(facts)}</p>", f'<p class="dim">{took}</p>'])
+
+
+def distance_words(gauge: Gauge | None, relied: bool) -> str:
+    """The distance from tip to tumour with its error, where there is one that may be relied on."""
+    if gauge is None:
+        return '<p class="number">tip to tumour: not known</p>'
+    return tip_words(gauge.distance, gauge.error if relied else None, gauge.inside)
+
+
+def overlay_error(known: Known) -> str:
+    """How far off the outline may be across the view, and by what."""
+    if not known.relied or known.band is None:
+        return "<p>Error of the overlay: not known.</p>"
+    stated = [f"{name} {bound_words(length, 2)}" for name, length in known.parts.items() if length > 0.0]
+    none = ", ".join(name for name, length in known.parts.items() if not length > 0.0 and name != "camera")
+    off = known.parts.get("camera")
+    camera = " What the camera's calibration adds is not known." if off is None else ""
+    camera = " The camera is stated to be exactly known." if off == 0.0 else camera
+    parts = ", ".join([*stated, *([f"none stated of {none}"] if none else [])])
+    return (
+        f"<p>Error of the overlay: 95 of 100 times the tumour is within {bound_words(known.band, 1)} of where it is "
+        f"drawn, across the view ({parts}).{camera}</p>"
+    )
