@@ -71,6 +71,6 @@ def test_every_bench_that_the_pages_state_is_a_figure():
     stated = set()
     for name in ("figures.md", "floor.md"):
         text = re.sub(r"<!-- bench.*?<!-- end -->", "", (HOUSE / "docs" / name).read_text(), flags=re.DOTALL)
-        stated |= {*re.findall(r"`(?:\w+=\w+ )?sulcus bench\s+(\w+)", text)} & set(BENCHMARKS)
+        stated |= {*re.findall(r"`(?:\w+=\w+ )?python -m benchmarks\s+(\w+)", text)} & set(BENCHMARKS)
     assert len(stated) > 8 and stated - {"all"} <= measured
     assert len({figure.name for figure in FIGURES}) == len(FIGURES)

@@ -57,9 +57,6 @@ class Engine:
     @property
     def missing(self) -> str:
         """Why it cannot be started here; empty if it can."""
-        script = Path(self.words[0])
-        if script.suffix == ".py" and not script.exists():
-            return f"{script.name} is not here: run it in a checkout of the repository"
         if any(find_spec(module) is None for module in self.modules):
             return f"not installed. {install_hint('peers')}"
         return ""

@@ -1,4 +1,4 @@
-"""The clock of all benches."""
+"""Wall time of a call; the device is waited for."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Options that several commands declare, and what commands read from and write by them."""
+"""Options that several commands declare, and the objects that they ask for."""

@@ -1,1 +1,1 @@
-"""A real or drawn film in, an overlay out."""
+"""A real or drawn film in, an overlay out; the files of a real camera."""
