@@ -64,7 +64,6 @@ SHORTCUTS = (
     ("nonlinear elimination, clamped", "a palpation load from rest, quadratic"),
     ("L-BFGS before Newton", "a palpation load from rest"),
     ("contact solved apart", "16 poses of a ball together"),
-    ("nonlinear elimination of a patch", "frames of `press`, p1"),
     ("contact solved apart", "frames of `palpate`, smoothed"),
     ("curvature of the last frame", "frames of `press`, smoothed"),
 )

@@ -98,20 +98,18 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
     tool = (*pushed, ToolContact((tool_of("palpation"),)))
     yield Work("contact solved apart", f"{POSES} poses of a ball together", Step.CONTACT, together, tool)
     for scene, step, shortcut in (
-        ("press", Step.PATCH, "nonlinear elimination of a patch"),
         ("press", Step.STRAINED, "a stiffness that knows strained tissue"),
         ("palpate", Step.CONTACT, "contact solved apart"),
         ("press", None, "curvature of the last frame"),
         ("press", Step.FRAME, "frame as one captured graph"),
     ):
-        element = "p1" if step is Step.PATCH else None
         played = find_scene(scene)
         effects, first = played.effects_on(anatomy), len(played.times) // 3  # the tool has arrived
         frames = [
             played.loads(site, played.path(time), time) for time in played.times[first : first + runs + 1].tolist()
         ]
-        name = f"frames of `{scene}`, {element or 'smoothed'}"
-        yield Work(shortcut, name, step, frames, effects, LIVE, element, live=True, follows=True)
+        name = f"frames of `{scene}`, smoothed"
+        yield Work(shortcut, name, step, frames, effects, LIVE, live=True, follows=True)
 
 
 def tried(fem: Fem, step: Step | None) -> bool:

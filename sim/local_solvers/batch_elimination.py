@@ -127,11 +127,11 @@ def has_small_opening(space: Discretisation, constraint: Constraint) -> bool:
     return 0 < len(open_vertices(space, constraint)) <= NEAR.largest_opening * len(np.unique(space.mesh.surface))
 
 
-def near_tetrahedra(space: Discretisation, constraint: Constraint, share: float = NEAR.share) -> np.ndarray:
-    """(T,) bool: the share nearest to where the surface is free."""
+def near_tetrahedra(space: Discretisation, constraint: Constraint) -> np.ndarray:
+    """(T,) bool: the share `NEAR.share` nearest to where the surface is free."""
     mesh = space.mesh
     distance, _ = KDTree(mesh.nodes[open_vertices(space, constraint)]).query(mesh.nodes[mesh.tets].mean(axis=1))
-    return distance <= np.quantile(distance, share)
+    return distance <= np.quantile(distance, NEAR.share)
 
 
 def open_vertices(space: Discretisation, constraint: Constraint) -> np.ndarray:

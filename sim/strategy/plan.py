@@ -20,11 +20,10 @@ from ..linalg.pcg import BlockJacobi, Preconditioner
 from ..linalg.preconditioner import is_exact, name_of
 from ..local_solvers.batch_elimination import BatchElimination, batch_elimination, has_small_opening
 from ..local_solvers.clamped_elimination import ClampedElimination
-from ..local_solvers.patch_elimination import PatchElimination, patch_elimination
 from ..local_solvers.strained_descent import StrainedDescent, strained_part
 from .captured_frame import FRAME_EVALUATIONS
 
-Alone = PatchElimination | ClampedElimination | StrainedDescent
+Alone = ClampedElimination | StrainedDescent
 """What solves a single load by itself."""
 # So many load cases are worth the set-up of a local problem that they share.
 WORTH = 16
@@ -38,7 +37,6 @@ class Step(Enum):
     """What may be tried for a load; the value says what it is."""
 
     NEAR = "nonlinear elimination: the tissue near the opening, which all loads share, is solved by itself"
-    PATCH = "nonlinear elimination: the few hundred nodes that the load strains most are solved by themselves"
     STRAINED = "L-BFGS from a stiffness that knows the few hundred nodes that the load strains most"
     CLAMPED = "nonlinear elimination: the tissue near the load, clamped at its rim, is solved by itself"
     CONTACT = "proximal quasi-Newton: the nodes that tools touch are solved apart from the tissue"
@@ -49,7 +47,7 @@ class Step(Enum):
     @property
     def eliminates(self) -> bool:
         """Whether a part of the body is solved by itself."""
-        return self in (Step.NEAR, Step.PATCH, Step.CLAMPED)
+        return self in (Step.NEAR, Step.CLAMPED)
 
 
 @dataclass(frozen=True)
@@ -150,9 +148,7 @@ def plan_for(
         if space.element == "p2" and isinstance(preconditioner, TwoLevel):
             single = Step.CLAMPED
         elif live and strained:
-            single = Step.STRAINED  # a patch would take longer to solve than it spares the whole
-        elif live and small and space.element == "p1" and isinstance(preconditioner, Factor):
-            single = Step.PATCH
+            single = Step.STRAINED
     contact = None
     if problem.barriers:
         # The model of contact knows one barrier, and needs a preconditioner that is alike at every state.
@@ -191,9 +187,6 @@ def local_solvers(
     near = cache(partial(batch_elimination, problem, preconditioner, effects, space) if plan.many else lambda: None)
     if plan.single is Step.CLAMPED:
         return near, ClampedElimination(problem, preconditioner, effects, space)
-    if plan.single is Step.PATCH:
-        assert isinstance(preconditioner, Factor)
-        return near, patch_elimination(problem, preconditioner, effects, space)
     if plan.single is Step.STRAINED:
         assert isinstance(preconditioner, Factor)
         return near, StrainedDescent(problem, preconditioner, strained_part(problem, preconditioner, space))

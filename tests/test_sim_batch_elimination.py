@@ -5,26 +5,31 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import warp as wp
-from openings import EFFECTS, FINE, TOTAL, begun, body, descent_of, loads_of
+from openings import EFFECTS, FINE, LAWS_AND_ELEMENTS, TOTAL, begun, body, descent_of, equilibria, loads_of
 from oracle import tissue
 
 from scenes.script.shipped_files import template_path
 from sim.accuracy import TRAIN, Accuracy
 from sim.bodies.meshfile import read_anatomy
-from sim.compile import compile_part
+from sim.compile import compile_part, compile_problem
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
 from sim.linalg.preconditioner import rest_solver
 from sim.linalg.schur import condensed
-from sim.local_solvers.batch_elimination import batch_elimination, near_tetrahedra
+from sim.local_solvers.batch_elimination import BatchElimination, batch_elimination, near_tetrahedra
 from sim.local_solvers.outer_loop import Limits
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from sim.runtime.device import find_device
 from sim.strategy.plan import Step
 from sim.terms.schur_stiffness import Exterior
 from surrogate.data.tool_loads import draw
+
+LAW = "stable-neo-hookean"
+STEP = "_corrected"
+"""Method that takes a cycle's correction."""
 
 
 def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
@@ -44,9 +49,8 @@ def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
 
 
 def test_columns_go_each_by_itself() -> None:
-    law = "stable-neo-hookean"
-    problem, space = begun(law)
-    elimination = descent_of(batch_elimination, problem, space, law)
+    problem, space = begun(LAW)
+    elimination = descent_of(batch_elimination, problem, space, LAW)
     together = elimination.descend(problem.device.zeros(problem.rows, len(TOTAL)), np.full(len(TOTAL), 1e-5), 100)
     for row in range(len(TOTAL)):
         problem.begin(Cases(loads_of(TOTAL[[row]]), np.zeros(1)))
@@ -56,9 +60,8 @@ def test_columns_go_each_by_itself() -> None:
 
 
 def test_the_budget_leaves_the_last_finite_state_and_says_so() -> None:
-    law = "stable-neo-hookean"
-    problem, space = begun(law)
-    elimination = descent_of(batch_elimination, problem, space, law)
+    problem, space = begun(LAW)
+    elimination = descent_of(batch_elimination, problem, space, LAW)
     start = problem.device.zeros(problem.rows, len(TOTAL)).numpy()
     start[:, 1] = np.nan
     found = elimination.descend(problem.device.array(start), np.full(len(TOTAL), 1e-12), 1)
@@ -71,9 +74,8 @@ def test_the_budget_leaves_the_last_finite_state_and_says_so() -> None:
 
 
 def test_rounding_of_what_follows_leaves_no_plane() -> None:
-    law = "stable-neo-hookean"
-    problem, space = begun(law)
-    elimination, random = descent_of(batch_elimination, problem, space, law), np.random.default_rng(0)
+    problem, space = begun(LAW)
+    elimination, random = descent_of(batch_elimination, problem, space, LAW), np.random.default_rng(0)
 
     def rounded(x: wp.array, out: wp.array) -> None:
         elimination.follow(x, out)
@@ -86,12 +88,11 @@ def test_rounding_of_what_follows_leaves_no_plane() -> None:
 
 
 def test_the_condensed_surroundings_are_the_schur_complement() -> None:
-    law = "linear"
-    problem, space = begun(law, "smoothed")
+    problem, space = begun("linear", "smoothed")
     chosen = near_tetrahedra(space, problem.constraint)
     assert chosen is not None and 0.15 < chosen.mean() < 0.25
     nodes = np.unique(space.table[chosen])
-    own = compile_part((Elasticity(tissue(law)), *EFFECTS), space, problem, chosen, nodes)
+    own = compile_part((Elasticity(tissue("linear")), *EFFECTS), space, problem, chosen, nodes)
     around = condensed(problem, nodes, own.rest_curvature())
     basis, whole = problem.constraint.basis(), problem.rest_curvature().toarray()
     part = (3 * nodes[:, None] + np.arange(3)).ravel()
@@ -137,3 +138,40 @@ def test_the_surroundings_are_a_potential() -> None:
         exterior.energy(device.array(at), value)
     rise = energy[0].numpy() - energy[1].numpy()
     np.testing.assert_allclose(rise, 2.0 * (out.numpy() * d).sum(axis=0), rtol=1e-12)
+
+
+def larger(force: wp.array, factor: float) -> wp.array:
+    return wp.array(factor * force.numpy().astype(np.float64), dtype=force.dtype, device=force.device)
+
+
+@LAWS_AND_ELEMENTS
+def test_it_ends_where_the_whole_does(law: str, element: str) -> None:
+    problem, space = begun(law, element)
+    descent, expected = descent_of(batch_elimination, problem, space, law), equilibria(problem)
+    problem.begin(Cases(loads_of(TOTAL), np.zeros(len(TOTAL))))
+    found = descent.descend(problem.device.zeros(problem.rows, len(TOTAL)), np.full(len(TOTAL), FINE), 100)
+    assert (found.status == DONE).all() and (found.residual <= FINE).all()
+    np.testing.assert_allclose(found.u.numpy(), expected, atol=1e-5 * np.abs(expected).max())
+    assert found.steps[-1] == 0 and not found.u.numpy()[:, -1].any()
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e12, 1e30])
+def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
+    """Forces so large that they overflow, or that what is free of them looks small beside the rest."""
+    anatomy, space = body()
+    problem = compile_problem((Elasticity(tissue(LAW)), *EFFECTS), anatomy, find_device("cpu", "float32"), space)
+    problem.begin(Cases(loads_of(TOTAL[:4]), np.zeros(4)))
+    descent, inside = descent_of(batch_elimination, problem, space, LAW), getattr(BatchElimination, STEP)
+    monkeypatch.setattr(BatchElimination, STEP, lambda *args: larger(inside(*args), factor))
+    found = descent.descend(problem.device.zeros(problem.rows, 4), np.full(4, 1e-4), 100)
+    assert (found.status == LIVE).all() and not found.u.numpy().any()
+    np.testing.assert_allclose(found.residual, 1.0)
+
+
+def test_what_gets_no_nearer_is_left_to_others() -> None:
+    problem, space = begun(LAW, total=TOTAL[:1])
+    found = descent_of(batch_elimination, problem, space, LAW).descend(
+        problem.device.zeros(problem.rows, 1), np.zeros(1), 100
+    )
+    assert found.status[0] == LIVE and found.residual[0] < 1e-12
+    assert found.steps[0] <= Limits().cycles and found.steps[0] < 20 + Limits().patience
