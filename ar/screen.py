@@ -1,4 +1,4 @@
-"""Where pictures go: nowhere, a folder, a film file; the page is in `browser.py`."""
+"""Files of pictures: PNG with a signature, a folder of frames, a film."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import struct
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -15,21 +14,6 @@ import numpy as np
 START, KEYWORD = 33, b"tEXtSoftware\0sulcus"
 # At a film's end: in MPEG-4 an empty box, in the others bytes that no player reads.
 END = b"\0\0\0\x0efreesulcus"
-
-
-class Screen(Protocol):
-    """Takes pictures (H, W, 3) uint8 sRGB, one a frame."""
-
-    def show(self, number: int, colour: np.ndarray) -> None:
-        """Show frame `number` (from 0)."""
-        ...
-
-
-class Blank:
-    """Shows nothing: the screen of checks and benchmarks."""
-
-    def show(self, number: int, colour: np.ndarray) -> None:
-        """Let the frame go."""
 
 
 class Film:

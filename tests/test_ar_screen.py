@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ar.screen import Blank, Film, Screen, read_png, write_film
+from ar.screen import Film, read_png, write_film
 
 
 def picture(number: int = 0) -> np.ndarray:
@@ -15,19 +15,12 @@ def picture(number: int = 0) -> np.ndarray:
 
 
 def test_a_folder_holds_the_frames_as_shown(tmp_path):
-    screen: Screen = Film(tmp_path / "deep" / "frames")
+    screen = Film(tmp_path / "deep" / "frames")
     for number in (0, 1, 12):
         screen.show(number, picture(number))
     files = sorted(path.name for path in (tmp_path / "deep" / "frames").iterdir())
     assert files == ["frame_0000.png", "frame_0001.png", "frame_0012.png"]
     assert np.array_equal(read_png(tmp_path / "deep" / "frames" / "frame_0012.png"), picture(12))
-
-
-def test_blank_shows_nothing(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    screen: Screen = Blank()
-    screen.show(0, picture())
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_video_has_every_picture_in_its_colours(tmp_path):

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy.spatial.transform import Rotation
 from tiny_episodes import HEIGHT, WIDTH, Wanted, write_episode
 
 from scenes import read_episodes, write_card
@@ -20,7 +21,7 @@ from scenes.cli import main
 from scenes.episodes.exports.card import keep_card
 from scenes.episodes.exports.columns import rate_of
 from scenes.episodes.exports.datasheet import listed
-from scenes.episodes.exports.motion import poses_after, states, twists
+from scenes.episodes.exports.motion import states, twists
 from scenes.episodes.exports.statistics import Spread
 from scenes.episodes.exports.tasks import TASKS, held_out
 from scenes.episodes.exports.whole_folder import written_folder
@@ -46,6 +47,17 @@ def lerobot(folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("lerobot") / "set"
     assert main(["convert", str(folder), "--to", "lerobot", "--out", str(out)]) == 0
     return out
+
+
+def poses_after(first, steps):
+    """Poses (T, 4, 4) from the first (4, 4) on, by twists (T, 6)."""
+    found = [np.asarray(first, np.float64)]
+    for step in np.asarray(steps, np.float64)[:-1]:
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ found[-1][:3, :3]
+        pose[:3, 3] = found[-1][:3, 3] + step[:3]
+        found.append(pose)
+    return np.stack(found)
 
 
 def test_twists_lead_from_pose_to_pose(folder):

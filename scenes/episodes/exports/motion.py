@@ -26,14 +26,3 @@ def twists(poses: np.ndarray) -> np.ndarray:
     turns = Rotation.from_matrix(poses[1:, :3, :3]) * Rotation.from_matrix(poses[:-1, :3, :3]).inv()
     found = np.concatenate([shifts, turns.as_rotvec().reshape(-1, 3)], axis=1)
     return np.concatenate([found, np.zeros((1, 6))]).astype(np.float32)
-
-
-def poses_after(first: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """(T, 4, 4) poses from the `first` (4, 4) on by `twists` (T, 6): what undoes them."""
-    found = [np.asarray(first, np.float64)]
-    for step in np.asarray(steps, np.float64)[:-1]:
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ found[-1][:3, :3]
-        pose[:3, 3] = found[-1][:3, 3] + step[:3]
-        found.append(pose)
-    return np.stack(found)
