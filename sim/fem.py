@@ -39,7 +39,6 @@ from .runtime.threads import one_thread
 from .strategy.bone import solve_off_bone
 from .strategy.extrapolation import moved_on, pushes_of, way_of
 from .strategy.frame_sequence import FrameSequence, frame_sequence
-from .strategy.newton_correction import step_from
 from .strategy.plan import Plan, Step, local_solvers, plan_for
 from .strategy.strategy import Answer, Strategy
 from .strategy.time_steps import KEPT, Still, alike
@@ -227,32 +226,6 @@ class Fem:
         self._check_static(loads)
         self.problem.begin(Cases(loads, answer.time, answer.memory))
         return shortfall(self.problem, self.problem.device.array(self.guess(loads, answer)))
-
-    @alone
-    def corrected(
-        self, loads: Loads, answer: Deformation, at: np.ndarray
-    ) -> tuple[Deformation, np.ndarray, np.ndarray]:
-        """One step towards equilibrium from somebody's answers at every vertex, as `newton_correction.step_from`.
-
-        The answers after it, at every vertex, and the relative residual (B,) before it. The third is what is still
-        missing (B, n, 3) [m] at vertices `at` (n,), as the rest stiffness has it.
-
-        Raises
-        ------
-        InputError
-            As `residual`.
-        """
-        self._check_static(loads)
-        at = self._vertices(at)
-        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self.strategy.held)
-        guess, cases = self.guess(loads, answer), Cases(loads, answer.time, answer.memory)
-        parts = []
-        for rows in self._batches(len(loads)):
-            step = step_from(self.strategy, cases.rows(rows), guess[:, rows])
-            left = unstacked(self.problem.device, step.left, at)
-            parts.append((self._answered(cases.rows(rows), step.answer, {}, None, step.seconds), step.before, left))
-        answers, before, left = zip(*parts, strict=True)
-        return _joined(list(answers)), np.concatenate(before), np.concatenate(left)
 
     @alone
     def reading(self, nodes: np.ndarray, modes: np.ndarray) -> Reading:

@@ -4,7 +4,6 @@ from .data.dataset import Dataset, read_dataset
 from .data.simulate import simulate
 from .data.tool_loads import draw
 from .data.tool_poses import draw_poses
-from .evaluation.certificate import Certificate, certify
 from .evaluation.coverage import Coverage, coverage
 from .evaluation.score import Score, score
 from .fitting.fit import fit_tissue
@@ -26,7 +25,6 @@ from .regressors.protocol import Regressor
 from .training.train import Trained, train
 
 __all__ = [
-    "Certificate",
     "Coverage",
     "Dataset",
     "FittedTissue",
@@ -40,7 +38,6 @@ __all__ = [
     "Score",
     "Tool",
     "Trained",
-    "certify",
     "coverage",
     "draw",
     "draw_poses",

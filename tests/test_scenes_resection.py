@@ -142,8 +142,6 @@ def test_the_page_shows_the_rest(theatre, scene):
         demo.close()
 
 
-def test_it_is_checked_but_not_certified(theatre, tmp_path, capsys):
+def test_it_is_checked(theatre, tmp_path):
     words = ["check", "resection", "--anatomy", str(put(theatre, tmp_path / "box.vtu")), "--every", "75"]
     assert main([*words, "--device", "cpu"]) == 0
-    assert main([*words, "--device", "cpu", "--certify"]) == 2
-    assert "leave --certify out" in capsys.readouterr().err

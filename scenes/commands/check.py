@@ -7,20 +7,16 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, TextIO
 
-from sim.accuracy import TRAIN
 from sim.arguments import at_least
-from sim.errors import InputError
 
 from ..options.camera_options import add_camera, filmed
 from ..options.style_option import add_style
 from ..options.theatre_options import add_theatre, deformer_name, playable, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
-    from sim.deformation import Deformation
-
     from ..play.checks import Figures
     from ..play.deformers import Theatre
     from ..play.player import Frame
@@ -39,9 +35,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="built-in scenes, or MY_SCENE.py; tracking: a drawn film whose markers are lost and found (default: all)",
     )  # fmt: skip
     parser.add_argument("--every", type=int, default=10, help="check one frame in so many (default %(default)s)")
-    parser.add_argument(
-        "--certify", action="store_true", help="give each frame's error without solving to the end, and correct it"
-    )
     add_theatre(parser)
     add_camera(parser)
     add_style(parser, without=("none",))  # there is an outline to be found
@@ -98,8 +91,6 @@ def run(args: argparse.Namespace) -> int:
         )
         for sentence in error_lines(promised, error, name != "fem"):
             print(f"{'':11s} {sentence}", file=table)
-        if args.certify:
-            rows[-1]["certificates"] = _certificates(theatre, scene, frames, truth, table)
         for sentence in (*broken, *against):
             print(f"{'':11s} {sentence}", file=table)
     tracking = _tracking(args, theatre, table) if TRACKING in asked else None
@@ -156,22 +147,3 @@ def _estimates(figures: Figures) -> str:
         return ""
     held = f"Its middle is in the ellipsoid in {figures.covered:.0%} of the frames"
     return f". {held}; estimates remove {figures.removed:.0%} of its motion"
-
-
-def _certificates(
-    theatre: Theatre, scene: Scene, frames: Sequence[Frame], truth: Deformation, table: TextIO
-) -> list[dict[str, float | bool]]:
-    """Every frame's certificate, printed as it comes."""
-    from sim.fem import Fem
-    from surrogate.evaluation.certificate import SCOPE
-
-    from ..play.certificates import certified
-
-    fem, found = theatre.fem(scene, TRAIN, live=True), []
-    if not isinstance(fem, Fem):
-        raise InputError(f"the scene {scene.name} cuts tissue away, which is not certified: leave --certify out.")
-    for certificate in certified(fem, frames, truth):
-        print(f"{'':11s} {certificate}", file=table, flush=True)
-        found.append(asdict(certificate))
-    print(f"{'':11s} {SCOPE}", file=table)
-    return found

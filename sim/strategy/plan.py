@@ -44,11 +44,6 @@ class Step(Enum):
     LBFGS = "L-BFGS from the stiffness at rest"
     NEWTON = "Newton-CG in a trust region"
 
-    @property
-    def eliminates(self) -> bool:
-        """Whether a part of the body is solved by itself."""
-        return self in (Step.NEAR, Step.CLAMPED)
-
 
 @dataclass(frozen=True)
 class Plan:
