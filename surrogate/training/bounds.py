@@ -32,6 +32,7 @@ TUMOUR = Way(CLASS, True)
 TIP = Way(100, False)
 # Of the force that a tool moved by pose exerts.
 FORCE = Way(CLASS, True)
+WAYS = {"tumour": TUMOUR, "tip": TIP, "force": FORCE}
 
 
 @dataclass(frozen=True, eq=False)

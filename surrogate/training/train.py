@@ -2,45 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim.bodies.tip_distance import tip_gauge
 from sim.errors import InputError
-from sim.loads import Loads, Pushed, rows_of
 from sim.runtime.timing import stage
 
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
 from ..data.disc_split import APART, MOST_APART, Split, leave_discs_out
-from ..data.holding import stated_series
-from ..data.indentation import indented, with_relaxed
 from ..evaluation.coverage import TENTHS, Coverage
-from ..evaluation.force_score import ForceScore, force_errors, force_score
-from ..evaluation.score import Score, errors, score
+from ..evaluation.force_score import ForceScore, force_score
+from ..evaluation.score import Score, score
 from ..model.conformal import LEVELS, USUAL_GROWTH, conformal
-from ..model.learned import Learned, only_pushed
+from ..model.learned import Learned, Part
 from ..model.left_out import left_out_of
 from ..model.own_learners import OWN, find_own
-from ..model.relaxation import followed
 from ..model.tip_distance import TipModel
-from ..model.training_range import envelope_of
-from .bounds import FORCE, TIP, TUMOUR, Missed, bound_by, bounds_on_discs, covered_by, growth_by, missed
+from ..model.tool_force import ForceModel
+from ..model.training_range import Envelope, envelope_of
+from .answers import Answers, Errors, answers_of
+from .bounds import WAYS, bound_by, bounds_on_discs, covered_by, growth_by
 from .examples import Examples
 from .expansion import EXPANDED, TOUCHED, Expansion
 from .learners import LEARNT, POSED, force_of, parts_of
 from .shared_inputs import SharedInputs
-from .tip_distance import Measured, corrected_if_better, distance_errors, with_correction
+from .tip_distance import corrected_if_better, with_correction
 
 # Of pushes, and of poses.
 LEARNERS = ("linear", *LEARNT, *EXPANDED)
 OF_POSES = (*TOUCHED, *POSED)
 # Fewer could not promise 95 in 100.
 FEWEST_APART = 19
-# Of the errors at the tumour, and of the distance to it.
-WAYS = (TUMOUR, TIP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,118 +129,128 @@ def train(
     check_learners(wanted, of_poses=data.tool is not None, where=str(data.path))
     if most is not None and most < 1:
         raise InputError(f"{most} loads train nothing: give at least 1.")
-    if not data.unit_good.all():
-        raise InputError(
-            f"{data.path}: {int((~data.unit_good).sum())} unit responses did not converge, so there is no compliance "
-            "table: simulate anew with a looser --tolerance."
-        )
-    loads = data.loads.rows(np.flatnonzero(data.good))
-    shared = expansion or Expansion(data)
-    patch, nodes = shared.patch, shared.tumour
-    pushed = _asked(data, loads, patch)
-    if not len(nodes):
-        raise InputError(f"{data.path}: its anatomy has no tumour to predict: make one that has.")
-    apart = np.zeros(len(loads), bool)
-    if split is None:
-        apart[len(loads) - min(len(loads) // APART, MOST_APART) :] = True
-        split = _without(leave_discs_out(pushed.point[~apart], patch), apart)
     with stage("read"):
-        truth = data.displacement(nodes)[data.good]
-        motion = np.linalg.norm(truth, axis=2).mean(axis=1)
-        cortex = data.displacement(shared.cortex)[data.good]
-        at = np.concatenate([nodes, shared.cortex])
-        both = np.concatenate([truth, cortex], axis=1)
-        distances = Measured(loads, tip_gauge(data.anatomy).distances(loads, both, at, data.tool))
-
-    reaction = None if data.tool is None else data.reaction()
-    exerted = None if reaction is None else reaction[data.good, 0, :3]
-    ways = (*WAYS, FORCE) if exerted is not None else WAYS
-
-    def examples(rows: np.ndarray) -> Examples:
-        return Examples(rows_of(pushed, rows), truth[rows], cortex[rows], None if exerted is None else exerted[rows])
-
-    def forces_off(model: Learned, rows: np.ndarray) -> list[Missed]:
-        """How far a model is off in its tool's force on the chosen rows (B,) bool, if that is known: one, or none."""
-        if exerted is None:
-            return []
-        asked = rows_of(pushed, rows)
-        return [missed(model, patch, asked, force_errors(model.exerted(asked), exerted[rows]))]
-
-    def unseen(model: Learned, rows: np.ndarray) -> list[Missed]:
-        """How far a model is off at the tumour, in its distance, and in its force, on the chosen rows (B,) bool."""
-        some, asked, known = np.flatnonzero(rows), rows_of(pushed, rows), distances.rows(rows)
-        of_tumour = errors(model, loads.rows(some), truth[rows], nodes).max(axis=1)
-        of_tip = distance_errors(model, known)
-        both = [missed(model, patch, asked, error) for error in (of_tumour, of_tip)]
-        return both + forces_off(model, rows)
-
+        shared = expansion or Expansion(data)
+        answers = answers_of(data, shared)
+    apart = np.zeros(len(answers.loads), bool)
+    if split is None:
+        apart[len(apart) - min(len(apart) // APART, MOST_APART) :] = True
+        split = _without(leave_discs_out(answers.pushed.point[~apart], answers.patch), apart)
     chosen = [_first(split.train, most), *([_first(~apart, most)] if apart.any() else [])]
-    example_sets = [examples(rows) for rows in chosen]
-    inputs = [SharedInputs(each, shared, left) for each, left in zip(example_sets, (split, None), strict=False)]
-    test = loads.rows(np.flatnonzero(split.test))
-    beside = apart & ~split.covers(pushed.point)
-    envelopes = [envelope_of(patch, each.loads) for each in example_sets]
-    models, scores, left_out, distance_left_out, force = {}, [], {}, {}, {}
+    fits = [_fit_of(answers, rows, shared, left) for rows, left in zip(chosen, (split, None), strict=False)]
+    results = {}
     for name in wanted:
-        with stage(f"learn {name}"):
-            parts = parts_of(name, inputs[0], example_sets[0])
-            model = Learned(
-                data.anatomy,
-                parts,
-                envelopes[0],
-                training={"learner": name, **data.provenance},
-                tool=data.tool,
-                force=force_of(name, parts, patch, example_sets[0]),
-            )
-        with stage("score"):
-            solves = inputs[0].solve_counts(name, example_sets[0])
-            scores.append(score(name, model, test, truth[split.test], nodes, solves))
-            distance = errors(model, test, truth[split.test], nodes)
-            error = distance.max(axis=1)
-            model, off = corrected_if_better(model, patch, distances.rows(chosen[0]), distances.rows(split.test))
-            tested = rows_of(pushed, split.test)
-            far = [missed(model, patch, tested, each) for each in (error, off)] + forces_off(model, split.test)
-        models[name] = replace(model, bound=min(conformal(far[0].error, LEVELS[0]), float(far[0].error.max())))
-        growth, promised = [USUAL_GROWTH] * len(ways), None
-        if beside.sum() >= 2 * FEWEST_APART and len(test) >= TENTHS:
-            with stage("calibrate"):
-                near = unseen(model, beside)
-                every = list(zip(near, far, ways, strict=True))
-                growth = [growth_by(here, there, way) for here, there, way in every]
-                bound = [bounds_on_discs(model, here, there, split, way) for here, there, way in every]
-                left_out[name], distance_left_out[name] = map(covered_by, bound[: len(WAYS)], far)
-                alone = left_out_of(distance, motion[split.test], bound[0][0], far[0].extrapolated)
-                models[name] = replace(models[name], left_out=alone)
-                promised = bound[-1] if exerted is not None else None
-        if exerted is not None:
-            force[name] = force_score(far[-1].error, exerted[split.test], promised)
-        if apart.any():
-            with stage(f"learn {name}"):
-                parts = parts_of(name, inputs[1], example_sets[1])
-                of_force = force_of(name, parts, patch, example_sets[1])
-                models[name] = replace(models[name], parts=parts, envelope=envelopes[1], force=of_force)
-                if model.tip is not None and model.tip.correction is not None:
-                    models[name] = with_correction(models[name], patch, distances.rows(chosen[1]))
-        if apart.sum() >= FEWEST_APART:
-            with stage("calibrate"):
-                used = models[name]
-                each = zip(unseen(used, apart), ways, growth, far, strict=True)
-                bounds, tip, *of_force = (bound_by(near, way, grown, seen) for near, way, grown, seen in each)
-                models[name] = replace(used, bounds=bounds, tip=replace(used.tip or TipModel(), bound=tip))
-                if used.force is not None:
-                    models[name] = replace(models[name], force=replace(used.force, bound=of_force[0]))
+        results[name] = _learn(name, data, answers, split, apart, fits)
         progress(name)
     return Trained(
-        models,
-        tuple(scores),
-        split,
-        float(motion[split.test].mean()),
-        int(apart.sum()),
-        len(example_sets[-1].loads.point),
-        left_out,
-        distance_left_out,
-        force,
+        models={name: each.model for name, each in results.items()},
+        scores=tuple(each.score for each in results.values()),
+        split=split,
+        motion=float(_motion(answers, split.test).mean()),
+        calibrated=int(apart.sum()),
+        training_loads=int(fits[-1].rows.sum()),
+        left_out={name: each.left_out for name, each in results.items() if each.left_out},
+        distance_left_out={name: each.distance_left_out for name, each in results.items() if each.distance_left_out},
+        force={name: each.force for name, each in results.items() if each.force},
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What models are fitted on: rows (B,) bool of the answers, these as examples, and what learners share of them."""
+
+    rows: np.ndarray
+    examples: Examples
+    inputs: SharedInputs
+    envelope: Envelope
+
+    def parts(self, name: str, patch: Patch) -> tuple[tuple[Part, ...], ForceModel | None]:
+        """Fit a learner: the parts of its model, and its model of a tool's force."""
+        with stage(f"learn {name}"):
+            parts = parts_of(name, self.inputs, self.examples)
+            return parts, force_of(name, parts, patch, self.examples)
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A learner's model, its score on the discs left out, and how often its bounds held there."""
+
+    model: Learned
+    score: Score
+    left_out: Coverage | None
+    distance_left_out: Coverage | None
+    force: ForceScore | None
+
+
+def _fit_of(answers: Answers, rows: np.ndarray, shared: Expansion, left: Split | None) -> Fit:
+    examples = answers.examples(rows)
+    return Fit(rows, examples, SharedInputs(examples, shared, left), envelope_of(answers.patch, examples.loads))
+
+
+def _learn(name: str, data: Dataset, answers: Answers, split: Split, apart: np.ndarray, fits: Sequence[Fit]) -> Result:
+    """Fit one learner outside the discs and score it inside, then fit it on all that calibrates no bound."""
+    outside, patch = fits[0], answers.patch
+    parts, force = outside.parts(name, patch)
+    training = {"learner": name, **data.provenance}
+    model = Learned(data.anatomy, parts, outside.envelope, training=training, tool=data.tool, force=force)
+    with stage("score"):
+        test = answers.loads.rows(np.flatnonzero(split.test))
+        solves = outside.inputs.solve_counts(name, outside.examples)
+        scored = score(name, model, test, answers.tumour[split.test], answers.nodes, solves)
+        distance = answers.vertex_errors(model, split.test)
+        trained, held_out = (answers.distances.rows(rows) for rows in (outside.rows, split.test))
+        model, off = corrected_if_better(model, patch, trained, held_out)
+        far = answers.errors_of(model, split.test, distance.max(axis=1), off)
+        model = replace(model, bound=min(conformal(far.tumour.error, LEVELS[0]), float(far.tumour.error.max())))
+    growth = dict.fromkeys(WAYS, USUAL_GROWTH)
+    of_tumour = of_tip = None
+    promised, beside = None, apart & ~split.covers(answers.pushed.point)
+    if beside.sum() >= 2 * FEWEST_APART and len(test) >= TENTHS:
+        with stage("calibrate"):
+            near, there = answers.errors_of(model, beside).known(), far.known()
+            growth = {way: growth_by(near[way], there[way], WAYS[way]) for way in near}
+            bound = {way: bounds_on_discs(model, near[way], there[way], split, WAYS[way]) for way in near}
+            of_tumour, of_tip = covered_by(bound["tumour"], far.tumour), covered_by(bound["tip"], far.tip)
+            motion = _motion(answers, split.test)
+            model = replace(model, left_out=left_out_of(distance, motion, bound["tumour"][0], far.tumour.extrapolated))
+            promised = bound.get("force")
+    forces = None
+    if far.force is not None and answers.force is not None:
+        forces = force_score(far.force.error, answers.force[split.test], promised)
+    if apart.any():
+        model = _fitted_on_all(name, model, answers, fits[1])
+    if apart.sum() >= FEWEST_APART:
+        with stage("calibrate"):
+            model = _calibrated(model, answers.errors_of(model, apart), growth, far)
+    return Result(model, scored, of_tumour, of_tip, forces)
+
+
+def _fitted_on_all(name: str, model: Learned, answers: Answers, fit: Fit) -> Learned:
+    """The model fitted on further loads, with a correction of its distances where it had one."""
+    parts, force = fit.parts(name, answers.patch)
+    fitted = replace(model, parts=parts, envelope=fit.envelope, force=force)
+    if model.tip is None or model.tip.correction is None:
+        return fitted
+    with stage(f"learn {name}"):
+        return with_correction(fitted, answers.patch, answers.distances.rows(fit.rows))
+
+
+def _calibrated(model: Learned, near: Errors, growth: Mapping[str, float], far: Errors) -> Learned:
+    """The model with bounds from errors `near` its training loads; they grow by `growth` [1/m] to those `far` off."""
+    seen = far.known()
+    bounds = {way: bound_by(here, WAYS[way], growth[way], seen[way]) for way, here in near.known().items()}
+    tip, force = model.tip or TipModel(), model.force
+    return replace(
+        model,
+        bounds=bounds["tumour"],
+        tip=replace(tip, bound=bounds["tip"]),
+        force=force and replace(force, bound=bounds["force"]),
+    )
+
+
+def _motion(answers: Answers, rows: np.ndarray) -> np.ndarray:
+    """Mean displacement [m] of the tumour under the chosen rows (B,) bool."""
+    return np.linalg.norm(answers.tumour[rows], axis=2).mean(axis=1)
 
 
 def _first(rows: np.ndarray, most: int | None) -> np.ndarray:
@@ -258,18 +263,3 @@ def _without(split: Split, apart: np.ndarray) -> Split:
     disc = np.full(len(apart), -2)
     disc[~apart] = split.disc
     return replace(split, disc=disc)
-
-
-def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
-    """What loads of a data set ask of a model, as `Learned.asked` has it."""
-    if data.tool is not None:
-        pushed, series = indented(loads, data.tool, patch), stated_series(data.provenance)
-        if not series:
-            return pushed
-        return with_relaxed(pushed, followed(series, pushed, loads.times, None, 0.0).share)
-    if loads.only(Pushed) is None:
-        raise InputError(
-            "the data holds other loads than `Pushed`, which the learners do not take: simulate pushes, or one tool's "
-            "poses."
-        )
-    return only_pushed(loads)
