@@ -57,7 +57,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
     parser.add_argument("--starts", type=int, default=3, help="first answers of each engine (default %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="of every engine (default %(default)s)")
-    parser.add_argument("--live", action="store_true", help="ours is set up for many single loads, which takes longer")
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
 
 
@@ -66,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     from scenes.analysis.machine import machine
     from sim.runtime.device import find_device
 
-    from ..peers.comparison import LEAST, LIVE, OWN, PEERS, case_of, compare, judge_of
+    from ..peers.comparison import LEAST, OWN, PEERS, case_of, compare, judge_of
 
     for name, value, least in (
         ("--loads", args.loads, 2),
@@ -78,8 +77,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--tolerance {wrong[0]:g} cannot be judged: give numbers from {LEAST:g} to below 1.")
     find_device(args.device, "float64")
     asked = () if args.peers is None else args.peers or NAMES
-    own = LIVE if args.live else OWN
-    engines = [engine.on(args.device) for engine in (own, *(peer for peer in PEERS if peer.name in asked))]
+    engines = [engine.on(args.device) for engine in (OWN, *(peer for peer in PEERS if peer.name in asked))]
     cases = [case_of(read_anatomy(path), args.loads, args.seed) for path in args.mesh or [template_path()]]
     table = sys.stderr if args.json else sys.stdout
     where = machine(args.device)

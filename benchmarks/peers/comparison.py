@@ -78,7 +78,6 @@ def _peer(name: str, setting: str, *modules: str, cards: bool = False) -> Engine
 OWN = Engine(
     "sulcus", "float64; rest stiffness factorised once", (), ("-m", f"{__package__}.engine_sulcus"), cards=True
 )
-LIVE = Engine("sulcus", "the same, live: set up for many single loads", (), (*OWN.words, "live"), cards=True)
 PEERS = (
     _peer("tled", "explicit, dynamic relaxation; float64, Warp", "warp", cards=True),
     _peer("modified-newton", "line search; PARDISO's factor at rest kept, renewed where steps are slow", "pypardiso"),

@@ -18,22 +18,22 @@ from sim.material import Material
 from .engine_process import Case, Solve, serve
 
 
-def fem_of(case: Case, live: bool = False, device: str = "cpu") -> Fem:
-    """The finite elements of a case, in double precision; `live` as `Fem` has it."""
+def fem_of(case: Case, device: str = "cpu") -> Fem:
+    """The finite elements of a case, in double precision."""
     mesh = TetMesh(case.nodes, case.tets, np.zeros(len(case.tets), int))
     held = np.repeat(case.held[:, None], 3, axis=1)
     anatomy = Anatomy(mesh, held, np.zeros_like(mesh.nodes), ~case.held)
     tissue = Material("neo-hookean", case.young, case.poisson)
     effects: tuple[Effect, ...] = (Elasticity(tissue), Held(), NodalForce())
     # As the peers have it: the judge of all residuals must be of their discretisation.
-    return Fem(anatomy, effects, Accuracy(case.tolerance), device, element="p1", live=live)
+    return Fem(anatomy, effects, Accuracy(case.tolerance), device, element="p1")
 
 
-def set_up(case: Case, live: bool = False, device: str = "cpu") -> Solve:
+def set_up(case: Case, device: str = "cpu") -> Solve:
     """Kernels and the factor, kept for all loads."""
-    fem = fem_of(case, live, device)
+    fem = fem_of(case, device)
     return lambda force: fem.deform(Loads((Nodal(force[None]),))).displacement[0]
 
 
 if __name__ == "__main__":
-    serve(partial(set_up, live="live" in sys.argv, device="cuda" if "cuda" in sys.argv else "cpu"))
+    serve(partial(set_up, device="cuda" if "cuda" in sys.argv else "cpu"))
