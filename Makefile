@@ -7,9 +7,9 @@ PAGES := tests/test_ar_browser.py tests/test_scenes_demo.py tests/test_scenes_ov
 
 # The most telling tests: a minute on two cores.
 QUICK := house sim_reference sim_material sim_physics sim_plan sim_warm sim_loads sim_term sim_given sim_meshfile sim_solve \
-	sim_readme surrogate_bound surrogate_store ar_camera ar_raster ar_overlay scenes_tissue scenes_output
+	sim_readme surrogate_conformal surrogate_store ar_camera ar_rasteriser ar_outlines scenes_tissue_options scenes_outputs
 
-.PHONY: demo quick test test-gpu docs lint template locator bench bench-check clean
+.PHONY: demo quick test test-of test-gpu docs lint template locator bench bench-check clean
 
 demo: $(STAMP)
 	$(VENV)/bin/sulcus demo
@@ -21,6 +21,13 @@ test: $(STAMP)
 	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile \
 		--no-loadscope-reorder --durations 15 -rs $(PAGES:%=--ignore=%)
 	$(VENV)/bin/python -m pytest -rs $(PAGES)
+
+# Tests of one module: the file of its name, and those that import it. `make test-of FILE=sim/linalg/pcg.py`
+MODULE = $(subst /,.,$(basename $(FILE)))
+test-of: $(STAMP)
+	$(if $(wildcard $(FILE)),,$(error give FILE=PACKAGE/.../MODULE.py))
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest $$( (ls tests/test_$(word 1,$(subst /, ,$(FILE)))_$(notdir $(FILE)) 2>/dev/null; \
+		grep -lE "from $(MODULE) import|from $(basename $(MODULE)) import .*\b$(notdir $(basename $(FILE)))\b" tests/test_*.py) | sort -u)
 
 # Those that need a graphics card alone.
 test-gpu: $(STAMP)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from test_ar_raster import sphere
+from test_ar_rasteriser import sphere
 from test_ar_renderer import BALL, FLOOR, LAMP, ball, floor, scene
 
 from ar.optics.camera import Camera, look_at, project_cv2

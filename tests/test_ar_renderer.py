@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import warp as wp
-from test_ar_raster import sphere
+from test_ar_rasteriser import sphere
 
 from ar.optics.camera import Camera, look_at
 from ar.overlay.composite import composite

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_sim_septa import PLAN
-from test_sim_volumes import grid, head, nifti
+from test_sim_dural_septa import PLAN
+from test_sim_head_masks import grid, head, nifti
 from theatres import short
 
 from scenes.cli import main

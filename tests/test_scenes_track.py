@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from test_ar_tracking import CAMERA, CUBE, PLATE, flat, looking, taken
+from test_ar_track import CAMERA, CUBE, PLATE, flat, looking, taken
 
 from ar.optics.calibration import Calibration
 from ar.tracking.pictures import film_of, pictures_of

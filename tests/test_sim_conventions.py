@@ -5,7 +5,7 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from test_sim_volumes import AXES, EDGE, MIDDLE, TUMOUR, grid, head, mgz, nifti
+from test_sim_head_masks import AXES, EDGE, MIDDLE, TUMOUR, grid, head, mgz, nifti
 
 from sim.bodies.head_masks import Sources, head_masks
 from sim.bodies.label_map import read_labels

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_sim_volumes import EDGE, TUMOUR, grid, head, nifti
+from test_sim_head_masks import EDGE, TUMOUR, grid, head, nifti
 
 from scenes.script.debulking import Debulking
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL

@@ -10,7 +10,7 @@ from contextlib import nullcontext
 import nibabel
 import numpy as np
 import pytest
-from test_sim_labels import AFFINES, ball, ellipsoid, grid
+from test_sim_label_volume import AFFINES, ball, ellipsoid, grid
 
 from sim.bodies.head_masks import Sources, head_masks
 from sim.bodies.label_map import read_labels

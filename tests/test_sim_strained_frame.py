@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from conftest import make_box
-from test_sim_following import EFFECTS, same
+from test_sim_frame_sequence import EFFECTS, same
 
 from sim.accuracy import LIVE
 from sim.deformation import Deformation, Outcome

@@ -7,7 +7,7 @@ from io import StringIO
 
 import numpy as np
 import pytest
-from test_sim_volumes import MIDDLE, grid, head, nifti
+from test_sim_head_masks import MIDDLE, grid, head, nifti
 
 from scenes.cli import main
 from sim.bodies.boundary_conditions import bounded

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from test_scenes_bench_all import PAGE, entry, put
+from test_benchmarks_figure_record import PAGE, entry, put
 
 from benchmarks.__main__ import main
 from benchmarks.figures.figures import NAMED, command_of

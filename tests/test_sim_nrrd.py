@@ -3,7 +3,7 @@
 import nrrd as reference
 import numpy as np
 import pytest
-from test_sim_volumes import grid, head, nrrd
+from test_sim_head_masks import grid, head, nrrd
 
 from sim.bodies.volume import read_volume
 from sim.errors import InputError
