@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 
 from scenes.options.json_line import json_line
+from scenes.options.shared_options import add_anatomy, add_device, add_json
 from scenes.options.tissue_options import add_tissue_arguments, tissue_of
 from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy
@@ -30,7 +30,7 @@ seconds: duration of all places together, on the mesh as it is, and with halved 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    add_anatomy(parser)
     parser.add_argument(
         "--elements",
         nargs="+",
@@ -43,8 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--ball", type=float, default=6.0, help="radius of the ball [mm] (default %(default)g)")
     add_tissue_arguments(parser)
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_device(parser)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

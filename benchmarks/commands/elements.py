@@ -8,6 +8,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from scenes.options.shared_options import add_device, add_json
 from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.refine import refined
@@ -25,8 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--elements", nargs="+", default=list(ELEMENTS), choices=ELEMENTS, help="which (default: all)")
     parser.add_argument("--poisson", nargs="+", type=float, default=[0.30, 0.45, 0.49, 0.495], help="Poisson's ratios")
     parser.add_argument("--force", type=float, default=0.1, help="of the press, on a 7 mm disc [N] (%(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_device(parser)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -8,6 +8,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from scenes.options.shared_options import add_anatomy, add_device, add_json, add_seed
 from sim.arguments import at_least
 
 from .locate import bar, check_finer, finer_of, locator_of
@@ -20,7 +21,7 @@ HEADS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    add_anatomy(parser)
     parser.add_argument("--finer", type=Path, metavar="FINER.vtu", help="a finer mesh of the same brain, of the truths")
     parser.add_argument("--nodes", type=int, default=8000, help="of the template's finer mesh (default %(default)s)")
     parser.add_argument("--twins", type=int, default=20, help="patients (default %(default)s)")
@@ -37,11 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=(0, 1, 2),
         help="levels, as of `benchmarks locate`",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the patients (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    add_seed(parser, "the patients")
+    add_device(parser)
     parser.add_argument("--locator", type=Path, metavar="FILE.npz", help="locator of the anatomy (default: a new one)")
     parser.add_argument("--folder", type=Path, help="keeps what was made, so that a stopped run goes on")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -8,6 +8,7 @@ import sys
 from contextlib import redirect_stdout
 from dataclasses import asdict, replace
 
+from scenes.options.shared_options import add_json
 from scenes.options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 from sim.arguments import at_least
 
@@ -26,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         help="pictures that are drawn together, for pictures a second (default: 64 on CUDA, else 4)",
     )
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

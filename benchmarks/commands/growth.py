@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from scenes.options.outputs import add_force, claimed
+from scenes.options.shared_options import add_device, add_json
 from sim.arguments import at_least
 from sim.elements import ELEMENTS, RECOMMENDED
 
@@ -27,13 +28,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sizes", nargs="+", type=int, default=list(SIZES), metavar="N", help="nodes (default: six)")
     parser.add_argument("--batch", nargs="+", type=int, default=[1, 8], metavar="B", help="loads together (1 8)")
     parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    add_device(parser)
     parser.add_argument(
         "--out", type=Path, default=Path("growth.png"), metavar="PLOT.png",
         help="the plot; rows and meshes are kept beside it, and an unfinished run goes on (default %(default)s)",
     )  # fmt: skip
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ import sys
 from dataclasses import asdict
 
 from scenes.options.json_line import json_line
+from scenes.options.shared_options import add_device, add_json
 from sim.arguments import at_least
 
 # The tasks of scenes.gym, which loads Gymnasium and is imported only as this runs.
@@ -34,8 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--anatomy", default="template", help="a .vtu file (default: the template that ships)")
     parser.add_argument("--model", help="a file of trained models (default: the one beside the anatomy)")
     parser.add_argument("--physics", default="auto", help="auto, model or fem (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:1 (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_device(parser)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ import json
 import os
 from dataclasses import asdict
 
+from scenes.options.shared_options import add_json
 from sim.arguments import at_least
 from sim.errors import InputError
 
@@ -19,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, default=30.0, help="poses a second (default %(default)s)")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each run (default %(default)s)")
     parser.add_argument("--runs", type=int, default=5, help="how often it is repeated (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

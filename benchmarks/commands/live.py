@@ -7,11 +7,11 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from scenes.options.shared_options import add_anatomy, add_device, add_json
 from scenes.options.tissue_options import add_tissue_arguments, elasticity_of
 from scenes.script.shipped_files import template_path
 from sim.arguments import at_least
@@ -29,7 +29,7 @@ CHECKED = 20
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    add_anatomy(parser)
     parser.add_argument("--frames", type=int, default=1000, help="frames of each tool (default %(default)s)")
     parser.add_argument(
         "--checked", type=int,
@@ -37,8 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_tissue_arguments(parser)
     parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_device(parser)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scenes.options.shared_options import add_anatomy, add_device, add_json, add_seed
 from sim.arguments import at_least
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
@@ -34,7 +35,7 @@ MOST_SLIPPED = 50.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    add_anatomy(parser)
     parser.add_argument(
         "--finer", type=Path, metavar="FINER.vtu",
         help="a finer mesh of the same brain, of which the truths are (default: the template's, of --nodes)",
@@ -70,12 +71,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--locator", type=Path, metavar="FILE.npz", help="locator of the anatomy (default: a new one, kept in --folder)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the twins and of what is seen (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    add_seed(parser, "the twins and of what is seen")
+    add_device(parser)
     parser.add_argument(
         "--folder", type=Path, help="keeps meshes, twins and the locator, so that a stopped run goes on (default: none)"
     )
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

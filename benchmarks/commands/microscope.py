@@ -6,6 +6,7 @@ import argparse
 import json
 from dataclasses import asdict, replace
 
+from scenes.options.shared_options import add_json
 from scenes.options.theatre_options import add_theatre, scene_asked, theatre_asked
 from sim.arguments import at_least
 
@@ -27,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cloud", action="store_true", help="give points without names, as a cloud of the cortex")
     parser.add_argument("--plain", action="store_true", help="draw no vessels: the scan's grey alone")
     add_theatre(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

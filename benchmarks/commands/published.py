@@ -11,6 +11,7 @@ from dataclasses import asdict
 import numpy as np
 from tqdm import tqdm
 
+from scenes.options.shared_options import add_json
 from surrogate.data.dataset import read_dataset
 from surrogate.evaluation.score import score, table
 from surrogate.training.published_models import MACHINES, published_nodes
@@ -22,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("data", metavar="DATA.h5", help="from `sulcus simulate --preset seed`")
     parser.add_argument("--learners", nargs="+", default=list(MACHINES), choices=MACHINES, help="which (default: all)")
     parser.add_argument("--count", type=int, help="use the first so many loads only")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

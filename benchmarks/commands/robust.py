@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from scenes.options.shared_options import add_anatomy, add_device, add_json, add_seed
 from scenes.options.tissue_options import add_tissue_arguments, elasticity_of
 from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy
@@ -26,15 +27,15 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    add_anatomy(parser)
     parser.add_argument("--count", type=int, default=10_000, help="loads, half of them brutal (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
+    add_seed(parser)
     add_tissue_arguments(parser)
     parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
     parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    add_device(parser)
     parser.add_argument("--out", type=Path, metavar="LOADS.csv", help="a line for each load; an unfinished run goes on")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,8 +6,8 @@ import argparse
 import json
 import sys
 from dataclasses import asdict
-from pathlib import Path
 
+from scenes.options.shared_options import add_anatomy, add_device, add_json
 from scenes.script.shipped_files import template_path
 from sim.accuracy import LIVE
 from sim.arguments import at_least
@@ -16,10 +16,10 @@ from sim.bodies.meshfile import read_anatomy
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    add_anatomy(parser)
     parser.add_argument("--runs", type=int, default=20, help="loads or frames of each row (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON line on stdout, the table on stderr")
+    add_device(parser)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

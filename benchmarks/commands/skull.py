@@ -8,6 +8,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from scenes.options.shared_options import add_device, add_json
 from sim.arguments import at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
@@ -30,8 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--poisson", nargs="+", type=float, default=[0.45, 0.49], help="Poisson's ratios (0.45 0.49)")
     parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (%(default)s)")
     parser.add_argument("--loads", type=int, default=8, help="how many (%(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_device(parser)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

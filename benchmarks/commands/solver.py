@@ -13,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from scenes.options.json_line import json_line
+from scenes.options.shared_options import add_json, add_seed
 from scenes.script.shipped_files import template_path
 from sim.arguments import at_least
 from sim.bodies.meshfile import read_anatomy
@@ -54,10 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mesh", nargs="+", type=Path, metavar="MESH.vtu", help="made by `sulcus anatomy` (default: the template)"
     )
     parser.add_argument("--loads", type=int, default=20, help="palpation loads, each from rest (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
+    add_seed(parser)
     parser.add_argument("--starts", type=int, default=3, help="first answers of each engine (default %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="of every engine (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

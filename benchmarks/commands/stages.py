@@ -7,6 +7,7 @@ import json
 import sys
 from dataclasses import asdict
 
+from scenes.options.shared_options import add_json
 from scenes.options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 from sim.arguments import at_least
 from sim.errors import InputError
@@ -21,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_plugin(parser)
     parser.add_argument("--solves", type=int, default=64, help="loads in the batch (default %(default)s)")
     parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,12 +7,12 @@ import json
 import sys
 from dataclasses import asdict
 from itertools import chain
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from scenes.options.devices_option import add_devices
+from scenes.options.shared_options import add_anatomy, add_json
 from scenes.script.shipped_files import template_path
 from sim.accuracy import TRAIN
 from sim.arguments import at_least
@@ -39,7 +39,7 @@ NAMES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    add_anatomy(parser)
     parser.add_argument(
         "--presets",
         nargs="+",
@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch", type=int, help=f"loads solved together (default all; {CPU_BATCH} on the CPU)")
     parser.add_argument("--repeats", type=int, default=3, help="of each row; the median counts (default %(default)s)")
     add_devices(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON line on stdout, the table on stderr")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ import json
 import sys
 from dataclasses import asdict
 
+from scenes.options.shared_options import add_json, add_seed
 from sim.arguments import at_least
 
 from .locate import bar
@@ -19,8 +20,8 @@ HEADS = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("--pictures", type=int, default=60, help="of each protocol (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of poses and noise (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_seed(parser, "poses and noise")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -28,6 +28,7 @@ from ..options.drawn_options import add_drawn_arguments, demand_no_drawn, drawn,
 from ..options.label_options import add_label_arguments, regions_asked, sources_of
 from ..options.outputs import add_force, claimed
 from ..options.placement_options import add_opening_arguments, opened, opened_over
+from ..options.shared_options import add_json
 from .companion_files import demand_no_strangers
 
 # Lengths in millimetres, as on the command line.
@@ -75,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_drawn_arguments(parser)
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="print the summary as one line of JSON")
+    add_json(parser, "print the summary as one line of JSON")
 
 
 def run(args: argparse.Namespace) -> int:

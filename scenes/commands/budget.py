@@ -19,6 +19,7 @@ from sim.runtime.outside_files import read_as
 
 from ..options.camera_options import add_camera, filmed_with_targets
 from ..options.json_line import json_line
+from ..options.shared_options import add_device, add_json, add_seed
 from ..options.theatre_options import add_bodies, scene_asked
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
@@ -81,9 +82,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--twins", type=int, default=0, help="try the band on so many other bodies (default %(default)s)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the draws (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
-    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_seed(parser, "the draws")
+    add_device(parser, "finite elements")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -17,6 +17,7 @@ from sim.errors import InputError
 from ..options.camera_options import size
 from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_json
 
 if TYPE_CHECKING:
     from ar.tracking.hand_eye import HandEye
@@ -57,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", metavar="K.yaml", help="the camera; K.json beside it holds its covariance")
     parser.add_argument("--size", metavar="WxH", help="refuse pictures of another size, such as 1280x960")
-    parser.add_argument("--json", action="store_true", help="print one JSON line, with covariances, in place of words")
+    add_json(parser, "print one JSON line, with covariances, in place of words")
     add_force(parser)
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TextIO
 from sim.arguments import at_least
 
 from ..options.camera_options import add_camera, filmed
+from ..options.shared_options import add_json
 from ..options.style_option import add_style
 from ..options.theatre_options import add_theatre, deformer_name, playable, scene_asked, theatre_asked
 
@@ -38,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_theatre(parser)
     add_camera(parser)
     add_style(parser, without=("none",))  # there is an outline to be found
-    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

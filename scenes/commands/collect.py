@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ..options.camera_options import add_camera, filmed
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_json
 from ..options.style_option import add_style
 from ..options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 
@@ -23,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_camera(parser)
     add_style(parser)
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

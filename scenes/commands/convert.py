@@ -14,6 +14,7 @@ from sim.runtime.versions import install_hint
 
 from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_json
 
 FORMATS = ("lerobot", "robomimic", "folder", "xdmf", "card")
 
@@ -29,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, help="a new folder, or the .hdf5 file; a card lies in the data set itself")
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

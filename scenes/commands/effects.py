@@ -6,10 +6,10 @@ import argparse
 import json
 import sys
 from dataclasses import asdict
-from pathlib import Path
 
 from sim.arguments import at_least
 
+from ..options.shared_options import add_anatomy, add_device, add_json
 from ..options.theatre_options import add_trajectory, scene_asked
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
@@ -20,12 +20,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument("--every", type=int, default=5, help="solve one frame in so many (default %(default)s)")
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    add_anatomy(parser)
     add_trajectory(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_device(parser)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -15,6 +15,7 @@ from sim.errors import InputError
 
 from ..options.json_line import json_line
 from ..options.outputs import claimed_folder
+from ..options.shared_options import add_json, add_seed
 from .interrupt import INTERRUPTED, terminated_as_interrupted
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("plan", metavar="PLAN", help="a plan that ships with sulcus, or your own .toml")
     parser.add_argument("--count", required=True, type=_positive, help="episodes that are wanted")
-    parser.add_argument("--seed", type=_natural, default=0, help="seed of all draws (default %(default)s)")
+    add_seed(parser, "all draws", _natural)
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="their folder; unfinished, it goes on")
     parser.add_argument("--first", type=_natural, default=0, metavar="K", help="number of the first (default 0)")
     who = parser.add_mutually_exclusive_group()
@@ -52,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     instead.add_argument(
         "--slurm", type=_positive, metavar="MACHINES", help="make nothing: print a script for sbatch, for so many"
     )
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+    add_json(parser)
 
 
 def _whole(text: str, least: int) -> int:

@@ -19,6 +19,7 @@ from sim.runtime.atomic_files import REMEDY, why
 from ..options.camera_options import add_camera, filmed_with_targets
 from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed, claimed_folder, claimed_frames
+from ..options.shared_options import add_json, add_seed
 from ..options.theatre_options import add_theatre, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--readout", type=float, metavar="MS",
         help="a rolling shutter: how much later the last row is taken than the first [ms] (default: the camera's)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="of noise and of --registered (default %(default)s)")
+    add_seed(parser, "noise and of --registered")
     parser.add_argument(
         "--trouble", type=trouble, action="append", default=[], metavar="KIND:FROM-TO",
         help=f"what goes wrong between two times [s]: {', '.join(TROUBLES)}; may be given again",
@@ -70,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_theatre(parser)
     add_camera(parser)
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_json(parser)
 
 
 def trouble(text: str) -> tuple[str, float, float]:

@@ -15,6 +15,7 @@ from sim.material import BRAIN
 
 from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_device, add_json, add_seed
 from ..options.tissue_options import add_region_argument, regions_of
 from .locate import rows_left_out
 from .locator import REGIONS, located_by
@@ -53,10 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="as of `sulcus locate`; made where there is none, which takes minutes (default: beside the anatomy)",
     )  # fmt: skip
     add_region_argument(parser, REGIONS)
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of a locator that is made (default %(default)s)")
+    add_device(parser)
+    add_seed(parser, "a locator that is made")
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,12 +11,14 @@ import numpy as np
 
 from sim.errors import InputError
 
+from ..options.shared_options import add_json
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("model", metavar="MODEL.npz", help="from `sulcus train`")
     parser.add_argument("data", metavar="FRESH.h5", help="from `sulcus simulate` on the same mesh, with another --seed")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the tables")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -17,6 +17,7 @@ import numpy as np
 
 from sim.errors import InputError
 
+from ..options.shared_options import add_device
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
 from ..tracked.tracked_scene import mover, tracked_scene
 from .interrupt import until_ended
@@ -81,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_skull_argument(parser)
     add_element_argument(parser)
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for finite elements and pictures")
+    add_device(parser, "finite elements and pictures")
 
 
 def run(args: argparse.Namespace) -> int:

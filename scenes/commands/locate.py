@@ -14,6 +14,7 @@ from sim.arguments import at_least
 
 from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_device, add_json, add_seed
 from ..options.tissue_options import add_region_argument
 from .locator import REGIONS, located_by
 
@@ -57,19 +58,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="what is made once for an anatomy; made where there is none, which takes minutes (default: beside it)",
     )
     add_region_argument(parser, REGIONS)
-    parser.add_argument(
-        "--device",
-        default="auto",
-        help="auto, cpu or cuda: where a locator is made; without effect where there is one (default %(default)s)",
-    )
-    parser.add_argument(
-        "--seed",
-        type=int,
-        default=0,
-        help="of a locator that is made; without effect where there is one (default %(default)s)",
-    )
+    add_device(parser, "a locator that is made; without effect where there is one")
+    add_seed(parser, "a locator that is made; without effect where there is one")
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -15,6 +15,7 @@ from sim.errors import InputError
 from sim.material import BRAIN
 
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_device, add_json, add_seed
 from ..options.tissue_options import AS_LEARNED, add_region_argument, regions_of
 
 if TYPE_CHECKING:
@@ -39,10 +40,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "`sulcus locate` without --out",
     )
     add_region_argument(parser, REGIONS)
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="from which causes are drawn (default %(default)s)")
+    add_device(parser)
+    add_seed(parser, "the causes that are drawn")
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of a sentence")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

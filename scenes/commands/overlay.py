@@ -21,6 +21,7 @@ from ..options.address_option import add_address, addresses_of, say_addresses
 from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
 from ..options.poses_options import add_poses, demand_poses, elsewhere_of
+from ..options.shared_options import add_device, add_json
 from ..options.style_option import add_style
 from ..options.theatre_options import add_bodies
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
@@ -82,8 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_skull_argument(parser)
     add_element_argument(parser)
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for finite elements and pictures")
-    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_device(parser, "finite elements and pictures")
+    add_json(parser)
     add_force(parser)
 
 

@@ -25,6 +25,7 @@ from ..options.devices_option import add_devices
 from ..options.label_options import add_label_arguments, label_words, regions_asked, sources_of
 from ..options.outputs import add_force, claimed
 from ..options.placement_options import add_opening_arguments, opened, opening_words, trajectory_given
+from ..options.shared_options import add_json
 from ..options.tissue_options import OWN, add_element_argument, add_region_argument, regions_of
 
 
@@ -70,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_devices(parser, "loads are simulated on all of these; models are trained on the first. ")
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="a JSON line of each step, then one of the seconds")
+    add_json(parser, "a JSON line of each step, then one of the seconds")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from sim.errors import InputError
 
 from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_json
 
 if TYPE_CHECKING:
     from ar.tracking.pair_residuals import PairResiduals
@@ -35,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--surface", type=Path, metavar="CLOUD.csv",
         help="columns px,py,pz [mm]: places traced on the brain's surface of --anatomy, in the reference's frame",
     )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+    add_json(parser)
     add_force(parser)
 
 

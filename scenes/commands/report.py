@@ -17,6 +17,7 @@ from sim.errors import InputError
 
 from ..options.devices_option import add_devices
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_json
 from .interrupt import INTERRUPTED
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"how many loads to compare with the reference (--quick {QUICK[1]}, else {WHOLE[1]})",
     )
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

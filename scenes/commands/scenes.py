@@ -11,6 +11,7 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
 from ..options.outputs import add_force, claimed, claimed_folder
+from ..options.shared_options import add_anatomy, add_device, add_json
 from ..options.theatre_options import playable
 
 
@@ -20,10 +21,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, help="draw and time each scene: folder for SCENE.png, and for all in sheet.png"
     )
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
+    add_anatomy(parser)
+    add_device(parser, "finite elements")
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

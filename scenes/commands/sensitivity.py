@@ -18,6 +18,7 @@ from surrogate.data.tool_loads import PRESETS, draw
 
 from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_device, add_json, add_seed
 from ..options.theatre_options import add_bodies
 
 if TYPE_CHECKING:
@@ -58,8 +59,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
     parser.add_argument("--count", type=int, default=32, help="loads to draw (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    add_seed(parser)
+    add_device(parser)
     parser.add_argument(
         "--factorial", action="store_true",
         help="every combination of skull, Poisson's ratio, opening, depth and stiffness of the template's tumour, in "
@@ -71,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, metavar="TABLE.csv", help="the table, unrounded")
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

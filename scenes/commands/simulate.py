@@ -36,6 +36,7 @@ from surrogate.data.tool_poses import draw_poses, tool_of
 
 from ..options.devices_option import add_devices
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_json, add_seed
 from ..options.tissue_options import (
     add_element_argument,
     add_skull_argument,
@@ -84,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--blade", type=float, nargs=3, metavar=("WIDTH", "LENGTH", "EDGE"),
         help="a flat blade: sizes, and radius of its edge [mm] (in the scene retract 12 26 1.5)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
+    add_seed(parser)
     add_tissue_arguments(parser)
     add_element_argument(parser)
     add_skull_argument(parser, ("bonded", "slide"))
@@ -97,7 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_devices(parser)
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

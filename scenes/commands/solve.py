@@ -20,6 +20,7 @@ from sim.loads import Cause, Loads, Nodal, Prescribed
 
 from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_device, add_json
 from ..options.tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, elasticity_of
 
 
@@ -48,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"{FLOOR['float32']:g} (default %(default)s)",
     )
     parser.add_argument("--unit", default="m", choices=UNITS, help="unit of length in the file (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    add_device(parser)
     parser.add_argument(
         "--out", required=True, help=".vtu in metres with point data `displacement` [m]; not the mesh itself"
     )
@@ -56,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_skull_argument(parser, ("slide", "bonded", "contact"))
     add_force(parser)
     parser.add_argument("--explain", action="store_true", help="say first which solvers are tried, in which order")
-    parser.add_argument("--json", action="store_true", help="changes nothing: the result is one JSON line in any case")
+    add_json(parser, "changes nothing: the result is one JSON line in any case")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from sim.errors import InputError
 
 from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_json
 
 KIND = "poses of `sulcus track`"
 # What may be followed, and in whose frame.
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the tool's tip in the frame of its cube [mm], from `sulcus calibrate --pivot` (default 0 0 -150)",
     )  # fmt: skip
     parser.add_argument("--rate", type=float, default=30.0, help="pictures a second, of a folder (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+    add_json(parser)
     add_force(parser)
 
 

@@ -27,6 +27,7 @@ from surrogate.training.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, 
 
 from ..options.devices_option import add_devices
 from ..options.outputs import add_force, claimed
+from ..options.shared_options import add_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--most", type=int, metavar="LOADS", help="train on at most so many loads (default: all)")
     add_devices(parser, "where finite elements make the series; of a list the first. ")
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -17,6 +17,7 @@ from sim.arguments import at_least
 
 from ..options.json_line import json_line
 from ..options.outputs import claimed
+from ..options.shared_options import add_device, add_json, add_seed
 from ..options.theatre_options import add_bodies, scene_asked
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 from .fit import fitted_beside
@@ -55,13 +56,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="tissue fitted by `sulcus fit`, from which bodies are drawn in place of priors (default: "
         "MESH.tissue.json beside the anatomy, where there is one)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="seed of the draws (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
+    add_seed(parser, "the draws")
+    add_device(parser, "finite elements")
     parser.add_argument(
         "--out", type=Path, metavar="FILE.json",
         help="where scenes are added (default: MESH.uncertainty.json beside the anatomy, where `sulcus demo` reads it)",
     )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..options.json_line import json_line
+from ..options.shared_options import add_device, add_json
 
 if TYPE_CHECKING:
     from ..episodes.reading.validation import Report
@@ -23,8 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("episodes", nargs="+", type=Path, help="folders of episodes, or episodes, .h5")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes at a time (%(default)s)")
     parser.add_argument("--solve", type=int, default=0, metavar="K", help="solve K frames of each episode again")
-    parser.add_argument("--device", default="auto", help="for --solve: cpu, cuda, cuda:1, or auto (%(default)s)")
-    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_device(parser, "--solve")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

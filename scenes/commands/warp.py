@@ -15,6 +15,7 @@ from sim.errors import InputError
 from ..options.json_line import json_line
 from ..options.label_options import add_axes
 from ..options.outputs import add_force
+from ..options.shared_options import add_device, add_json
 from ..options.theatre_options import add_trajectory, scene_asked
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
 
@@ -69,9 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_trajectory(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
+    add_device(parser, "finite elements")
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_json(parser)
 
 
 def load(text: str) -> tuple[float, float, float, float]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
+from .shared_options import add_anatomy, add_device
 from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 def add_bodies(parser: argparse.ArgumentParser) -> None:
     """Declare which anatomy and models there are."""
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    add_anatomy(parser)
     parser.add_argument(
         "--model", type=Path, help="MODEL.npz made by `sulcus train` (default: MESH.model.npz beside the anatomy)"
     )
@@ -69,7 +70,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     )
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
+    add_device(parser, "finite elements")
 
 
 def theatre_asked(args: argparse.Namespace, *scenes: str) -> Theatre:
