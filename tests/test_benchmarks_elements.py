@@ -65,7 +65,9 @@ def test_contact_force_of_p2_depends_less_on_the_mesh_than_that_of_p1():
 
 
 def test_the_limit_is_that_of_a_second_order_error():
-    row = Row(0.45, "p2", 1000, 7000, 0.0, 1.0, 1.0, 4, True)
+    row = Row(
+        poisson=0.45, element="p2", vertices=1000, nodes=7000, motion=0.0, set_up=1.0, solve=1.0, outer=4, good=True
+    )
     series = [replace(row, vertices=n, motion=2.0 - 3.0 * n ** (-2.0 / 3.0)) for n in (1000, 8000, 27000)]
     assert limits(series) == {0.45: pytest.approx(2.0)}
     assert limits(series[:1]) == {}
@@ -81,7 +83,17 @@ def test_half_of_the_loads_are_brutal_and_none_is_lost():
 
 
 def test_the_tally_counts_what_happened():
-    one = Record("brutal", 0, 1.0, 5e-3, "CONVERGED", 4, 1e-5, np.nan, 0.1)
+    one = Record(
+        preset="brutal",
+        number=0,
+        force=1.0,
+        footprint=5e-3,
+        outcome="CONVERGED",
+        outer=4,
+        residual=1e-5,
+        double=np.nan,
+        seconds=0.1,
+    )
     found = [
         one,
         replace(one, outer=40, double=3e-5),

@@ -12,7 +12,22 @@ from benchmarks.studies import scaling
 from benchmarks.studies.scaling import LOADS, Row, Trial, measured, panels, rows, template_mesh
 from sim.errors import InputError
 
-ROW = Row(2000, 1, 1977, 8987, "sparse factor", 1, 1.0, 0.05, 8.0, 12, 12, 0.3, 0.0, 0.0)
+ROW = Row(
+    size=2000,
+    asked=1,
+    nodes=1977,
+    tets=8987,
+    preconditioner="sparse factor",
+    batch=1,
+    set_up=1.0,
+    load=0.05,
+    outer=8.0,
+    loads=12,
+    converged=12,
+    memory=0.3,
+    card=0.0,
+    foreseen=0.0,
+)
 
 
 @pytest.fixture(scope="module")

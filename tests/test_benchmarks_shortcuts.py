@@ -77,7 +77,17 @@ def test_every_step_but_newton_is_some_work(site: Site) -> None:
 def test_the_command_prints_what_was_measured(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    row = Row("short", "work", 4, 2.0, 3.0, 5.0, 6.0, 10.0, 15.0)
+    row = Row(
+        shortcut="short",
+        work="work",
+        runs=4,
+        median=2.0,
+        p95=3.0,
+        median_without=5.0,
+        p95_without=6.0,
+        total=10.0,
+        total_without=15.0,
+    )
     found = iter([row, None])
     monkeypatch.setattr(shortcuts, "works", lambda *known: [1, 2])
     monkeypatch.setattr(shortcuts, "measure", lambda *known: next(found))

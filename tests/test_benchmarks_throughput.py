@@ -14,7 +14,23 @@ from sim.deformation import Outcome
 from sim.fem import Fem
 from sim.material import BRAIN
 
-ROW = Row("linear", 0.45, "p1", 99, "sparse factor", 1.0, "bipolar", 60, 60, 4.0, 7.0, (9.0, 2.0, 3.0), 0.1, 4, 9e-5)
+ROW = Row(
+    law="linear",
+    poisson=0.45,
+    element="p1",
+    nodes=99,
+    preconditioner="sparse factor",
+    set_up=1.0,
+    preset="bipolar",
+    loads=60,
+    converged=60,
+    steps_median=4.0,
+    steps_p99=7.0,
+    seconds=(9.0, 2.0, 3.0),
+    draw_seconds=0.1,
+    checked=4,
+    double=9e-5,
+)
 
 
 @pytest.fixture(scope="module")

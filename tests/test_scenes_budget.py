@@ -47,9 +47,10 @@ def filmed(box):
     rest = site.origin + 0.015 * site.axis + 5e-3 * ball
     bodies = 1e-3 * rng.normal(size=(100, 1, 3)) + np.zeros_like(rest)
     return Filmed(
-        site, VIEW, 2.0, reference_beside(site, VIEW.camera(site)), usual_covariance(USUAL), 1.0, rest,
-        0.002 * site.axis + np.zeros_like(rest), ball, np.zeros_like(rest), bodies,
-        0.2 * DEVIATES, 0.05 * DEVIATES, surrogate=0.3e-3,
+        site=site, viewpoint=VIEW, duration=2.0, T_scan_patient=reference_beside(site, VIEW.camera(site)),
+        covariance=usual_covariance(USUAL), time=1.0, rest=rest,
+        field=0.002 * site.axis + np.zeros_like(rest), normals=ball, velocity=np.zeros_like(rest), bodies=bodies,
+        meshes=0.2 * DEVIATES, own_mesh=0.05 * DEVIATES, surrogate=0.3e-3,
     )  # fmt: skip
 
 

@@ -8,7 +8,20 @@ from benchmarks.studies.scaling import Row
 from scenes.report.artefact_time import note_seconds, noted_seconds
 from sim.errors import InputError
 
-RECORDS = [Record("mixed", number, 1.5, 0.006, "CONVERGED", 4, 1e-5, 1e-5, 12.75) for number in range(3)]
+RECORDS = [
+    Record(
+        preset="mixed",
+        number=number,
+        force=1.5,
+        footprint=0.006,
+        outcome="CONVERGED",
+        outer=4,
+        residual=1e-5,
+        double=1e-5,
+        seconds=12.75,
+    )
+    for number in range(3)
+]
 
 
 def test_a_number_cut_short_is_not_read(tmp_path):

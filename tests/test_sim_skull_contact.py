@@ -120,7 +120,20 @@ def test_a_body_that_turns_slides_along_a_round_skull() -> None:
     def force(bend: np.ndarray, at: np.ndarray) -> np.ndarray:
         one, none = np.ones(1), np.zeros((1, 3))
         skull = Skull(
-            Bone(np.array([0]), n[None], bend[None], -one, none, 5e-5 * one, 1e-4 * one, 5e-5, 0.0), 1, 1000.0, device
+            Bone(
+                nodes=np.array([0]),
+                normal=n[None],
+                bend=bend[None],
+                inside=-one,
+                way=none,
+                felt=5e-5 * one,
+                area=1e-4 * one,
+                gap=5e-5,
+                edge=0.0,
+            ),
+            1,
+            1000.0,
+            device,
         )
         out = device.zeros(3, 1)
         skull.add_gradient(device.array(at[:, None]), out)

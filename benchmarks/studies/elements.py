@@ -113,8 +113,9 @@ def _measured(anatomy: Anatomy, element: str, poisson: float, press: Press, devi
     answer, seconds = timed(fem.deform, loads)
     motion = np.linalg.norm(tumour_motion(anatomy, answer.displacement)[0])
     return Row(
-        poisson, element, len(mesh.nodes), fem.space.count, 1e3 * float(motion), set_up, seconds,
-        int(answer.iterations[0]), answer.outcome[0].good,
+        poisson=poisson, element=element, vertices=len(mesh.nodes), nodes=fem.space.count,
+        motion=1e3 * float(motion), set_up=set_up, solve=seconds,
+        outer=int(answer.iterations[0]), good=answer.outcome[0].good,
     )  # fmt: skip
 
 

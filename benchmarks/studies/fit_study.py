@@ -110,8 +110,9 @@ def row(noise: int, said: Sequence[tuple[Patient, FittedTissue]]) -> Row:
     factor, within, inside = _off(ratio, NEAR)
     moduli = _off(young, NEAR_YOUNG) if young else (None, None, None)
     return Row(
-        noise, len(said), factor, within, inside, share[0], share[1], share[2],
-        moduli[0], moduli[1], moduli[2], len(young),
+        noise=noise, patients=len(said), factor=factor, within=within, held=inside, sliding=share[0], skull=share[1],
+        poisson=share[2],
+        young=moduli[0], young_within=moduli[1], young_held=moduli[2], forces=len(young),
     )  # fmt: skip
 
 

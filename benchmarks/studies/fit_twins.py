@@ -89,9 +89,9 @@ def patient(tools: Pushed, seed: int, number: int, presses: int, drainages: int)
     force = way * (pressure * np.pi * tools.footprint[chosen] ** 2)[:, None]
     left, tilt = random.uniform(LEFT[0], LEFT[1], drainages), TILT * random.standard_normal((drainages, 3))
     return Patient(
-        number, skull, stiffness, ratio, poisson,
-        tuple(chosen.tolist()), tuple(map(tuple, force.tolist())),
-        tuple(left.tolist()), tuple(map(tuple, tilt.tolist())),
+        number=number, skull=skull, stiffness=stiffness, ratio=ratio, poisson=poisson,
+        places=tuple(chosen.tolist()), force=tuple(map(tuple, force.tolist())),
+        left=tuple(left.tolist()), tilt=tuple(map(tuple, tilt.tolist())),
     )  # fmt: skip
 
 

@@ -91,7 +91,16 @@ def drawn(seed: int, number: int) -> Draw:
     left, tilt = float(random.uniform(*LEFT)), tuple((TILT * random.standard_normal(3)).tolist())
     tool, push = str(random.choice(TOOLS)), int(random.integers(2**31))
     return Draw(
-        number, cause, "contact" if cause == "drainage" else skull, tool, stiffness, ratio, swelling, left, tilt, push
+        number=number,
+        cause=cause,
+        skull="contact" if cause == "drainage" else skull,
+        tool=tool,
+        stiffness=stiffness,
+        ratio=ratio,
+        swelling=swelling,
+        left=left,
+        tilt=tilt,
+        push=push,
     )
 
 

@@ -87,8 +87,10 @@ def _written(
     force = np.linalg.norm(pushed.force, axis=1)
     return [
         Record(
-            preset, int(number), float(force[row]), float(pushed.footprint[row]), answer.outcome[row].name,
-            int(answer.iterations[row]), float(answer.residual[row]), float(again[row]), seconds,
+            preset=preset, number=int(number), force=float(force[row]), footprint=float(pushed.footprint[row]),
+            outcome=answer.outcome[row].name,
+            outer=int(answer.iterations[row]), residual=float(answer.residual[row]), double=float(again[row]),
+            seconds=seconds,
         )
         for row, number in enumerate(index)
     ]  # fmt: skip
@@ -127,9 +129,11 @@ def tallies(found: Sequence[Record]) -> list[Tally]:
         rescued = sum(record.outcome != Outcome.CONVERGED.name for record in good)
         out.append(
             Tally(
-                preset, len(mine), len(good), rescued, float(np.median(outer)), float(np.percentile(outer, 99)),
-                1e3 * float(np.mean([record.seconds for record in mine])), len(double), max(double, default=np.nan),
-                hardest,
+                preset=preset, loads=len(mine), converged=len(good), rescued=rescued,
+                outer_median=float(np.median(outer)), outer_p99=float(np.percentile(outer, 99)),
+                milliseconds=1e3 * float(np.mean([record.seconds for record in mine])), checked=len(double),
+                double=max(double, default=np.nan),
+                hardest=hardest,
             )
         )  # fmt: skip
     return out

@@ -105,10 +105,11 @@ def measured(trial: Trial, size: int, batch: int) -> Row:
             outer += list(answer.iterations)
             good += sum(outcome.good for outcome in answer.outcome)
     return Row(
-        size, batch, len(anatomy.mesh.nodes), len(anatomy.mesh.tets), fem.plan.preconditioner, batch, made,
-        float(np.median(seconds)) / batch, float(np.median(outer)), len(outer), good,
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, max(card) / 2**30,
-        0.0 if needed is None else needed.peak / 2**30,
+        size=size, asked=batch, nodes=len(anatomy.mesh.nodes), tets=len(anatomy.mesh.tets),
+        preconditioner=fem.plan.preconditioner, batch=batch, set_up=made,
+        load=float(np.median(seconds)) / batch, outer=float(np.median(outer)), loads=len(outer), converged=good,
+        memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, card=max(card) / 2**30,
+        foreseen=0.0 if needed is None else needed.peak / 2**30,
     )  # fmt: skip
 
 

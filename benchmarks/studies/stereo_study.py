@@ -102,10 +102,12 @@ def row(seed: int, estimates: Sequence[Estimate]) -> Row:
     spent = 1e3 * np.array([each.seconds for each in estimates])
     points = [len(each.observation.now) for each in seen]
     return Row(
-        seed, len(estimates), len(estimates) - len(seen), float(np.median(points)) if seen else 0.0,
-        float(true.max()), float(np.median(off)), float(np.quantile(off, 0.95)), float(off.max()),
-        float(1.0 - off.sum() / true.sum()) if true.any() else np.nan,
-        float(np.mean([each.held for each in seen])) if seen else np.nan,
-        float(np.median(radius)) if seen else np.nan,
-        float(np.median(spent)), float(np.quantile(spent, 0.95)),
+        seed=seed, frames=len(estimates), refused=len(estimates) - len(seen),
+        points=float(np.median(points)) if seen else 0.0,
+        moved_mm=float(true.max()), off_mm=float(np.median(off)), p95_mm=float(np.quantile(off, 0.95)),
+        most_mm=float(off.max()),
+        removed=float(1.0 - off.sum() / true.sum()) if true.any() else np.nan,
+        covered=float(np.mean([each.held for each in seen])) if seen else np.nan,
+        radius_mm=float(np.median(radius)) if seen else np.nan,
+        milliseconds=float(np.median(spent)), slowest_ms=float(np.quantile(spent, 0.95)),
     )  # fmt: skip

@@ -231,10 +231,13 @@ def rows(
             again = np.concatenate([judge.residual(chosen, answer) for answer in asked(solved, chosen)])
             done()
             yield Row(
-                material.law, material.poisson, trial.element, nodes, preconditioner,
-                max(set_up for _, _, set_up in known), preset, len(known) * len(loads), min(converged),
-                float(np.median(steps)), float(np.percentile(steps, 99)), tuple(seconds), drawing, len(again),
-                float(again.max()), len(known),
+                law=material.law, poisson=material.poisson, element=trial.element, nodes=nodes,
+                preconditioner=preconditioner,
+                set_up=max(set_up for _, _, set_up in known), preset=preset, loads=len(known) * len(loads),
+                converged=min(converged),
+                steps_median=float(np.median(steps)), steps_p99=float(np.percentile(steps, 99)),
+                seconds=tuple(seconds), draw_seconds=drawing, checked=len(again),
+                double=float(again.max()), devices=len(known),
             )  # fmt: skip
 
 

@@ -106,15 +106,15 @@ def row_of(name: str, shots: list[Shot], measure: Callable[[list[Shot]], np.ndar
     off = 1e3 * _off(certain)
     median, p95, most = np.percentile(error, [50, 95, 100]).tolist()
     return Row(
-        name,
-        len(shots),
-        median,
-        p95,
-        most,
-        100.0 * float(np.mean([shot.found is not None for shot in fair])) if fair else None,
-        int(sum(each > 5.0**2 and here > 1.0 for each, here in zip(far, off, strict=True))),
-        100.0 * float(np.mean(np.array(far) <= chi2.ppf(0.95, 3))),
-        1e3 * float(np.median([shot.seconds for shot in shots])),
+        protocol=name,
+        pictures=len(shots),
+        median=median,
+        p95=p95,
+        most=most,
+        certain=100.0 * float(np.mean([shot.found is not None for shot in fair])) if fair else None,
+        wrong=int(sum(each > 5.0**2 and here > 1.0 for each, here in zip(far, off, strict=True))),
+        held=100.0 * float(np.mean(np.array(far) <= chi2.ppf(0.95, 3))),
+        milliseconds=1e3 * float(np.median([shot.seconds for shot in shots])),
     )
 
 

@@ -285,11 +285,19 @@ def uncertainty(
         moved = float(np.linalg.norm(field, axis=1).mean())
         rows.append((*bounds, moved, parts(motion, field, kept, scene)))
     worst, middle, moved, by_name = zip(*rows, strict=True)
-    mark, failed = mark_of(scene, theatre.site, theatre.element_of(scene)), len(draws) - len(sound)
-    named = {name: tuple(row[name] for row in by_name) for name in by_name[0]}
-    numbers = sum(column.shape[1] for column in causes(kept, scene).values())
-    found = (scene.name, mark, len(draws), failed, still.times, worst, middle, moved, named)
-    return Uncertainty(*found, folded=folded, numbers=numbers)
+    return Uncertainty(
+        scene=scene.name,
+        mark=mark_of(scene, theatre.site, theatre.element_of(scene)),
+        draws=len(draws),
+        failed=len(draws) - len(sound),
+        times=still.times,
+        worst=worst,
+        middle=middle,
+        moved=moved,
+        parts={name: tuple(row[name] for row in by_name) for name in by_name[0]},
+        folded=folded,
+        numbers=sum(column.shape[1] for column in causes(kept, scene).values()),
+    )
 
 
 def off_by(motion: np.ndarray, field: np.ndarray, meshes: np.ndarray) -> np.ndarray:

@@ -127,11 +127,14 @@ def run(args: argparse.Namespace) -> int:
     draws = [draw for draw, _ in bodies]
     number = moment_of(still, [answer for _, answer in bodies], mesh_errors(scene, draws))
     time = still.times[number]
+    own_bodies, meshes, own_mesh = _at(scene, bodies, number)
     filmed = Filmed(
-        site, scene.viewpoint, scene.duration, reference_beside(site, scene.viewpoint.camera(site)), known, time,
-        Stage(scene, site).at(scene.loads(site, scene.path(time), time)).tumour_at_rest.vertices,
-        still.fields[number], still.normals[number], velocity_at(still, number), *_at(scene, bodies, number),
-        _promised(theatre, scene, time), registration, args.corner_px, 1e-3 * args.latency_ms, 1e-3 * args.clock_ms,
+        site=site, viewpoint=scene.viewpoint, duration=scene.duration, covariance=known, time=time,
+        T_scan_patient=reference_beside(site, scene.viewpoint.camera(site)),
+        rest=Stage(scene, site).at(scene.loads(site, scene.path(time), time)).tumour_at_rest.vertices,
+        field=still.fields[number], normals=still.normals[number], velocity=velocity_at(still, number),
+        bodies=own_bodies, meshes=meshes, own_mesh=own_mesh, surrogate=_promised(theatre, scene, time),
+        registration=registration, corner=args.corner_px, latency=1e-3 * args.latency_ms, clock=1e-3 * args.clock_ms,
     )  # fmt: skip
     twins = None
     if args.twins:

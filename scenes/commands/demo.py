@@ -82,7 +82,10 @@ def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitSta
     name = deformer_name(args, theatre, scene)
     anatomy = "the average of 152 healthy adults (ICBM 152)" if args.anatomy is None else args.anatomy.name
     try:
-        demo = Demo(theatre, scene, name, args.host, args.port, anatomy, asked, args.style, addresses_of(args))
+        demo = Demo(
+            theatre, scene, name, args.host, args.port,
+            anatomy=anatomy, find=asked, style=args.style, origins=addresses_of(args),
+        )  # fmt: skip
     except UnguardedError as error:
         raise InputError(str(error)) from error
     closing.callback(demo.close)

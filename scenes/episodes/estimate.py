@@ -89,13 +89,13 @@ def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
         )
 
     return Estimate(
-        episodes, bodies, len(own[EPISODE]), len(own[BODY]),
-        amount("seconds", {**own, EPISODE: by[LATER] if apart else own[EPISODE]}),
-        amount("frames", {EPISODE: own[EPISODE]}),
-        amount("bytes", own),
-        _longer(by[OF_PROCESS], by[LATER] if apart else []),
-        _longer(by[OF_BODY], by[LATER] if apart else []),
-        apart,
+        episodes=episodes, bodies=bodies, measured=len(own[EPISODE]), measured_bodies=len(own[BODY]),
+        seconds=amount("seconds", {**own, EPISODE: by[LATER] if apart else own[EPISODE]}),
+        frames=amount("frames", {EPISODE: own[EPISODE]}),
+        bytes=amount("bytes", own),
+        start=_longer(by[OF_PROCESS], by[LATER] if apart else []),
+        opening=_longer(by[OF_BODY], by[LATER] if apart else []),
+        apart=apart,
     )  # fmt: skip
 
 

@@ -255,15 +255,16 @@ class Player:
             over = Overlaid(picture.colour, np.zeros((camera.height, camera.width), np.uint8))
         spent = seconds, seen - begun - located, clock.perf_counter() - seen
         took = dict(zip(STAGES, spent, strict=True)) | ({} if estimate is None else {"locate": located})
+        how_far, moved_error = (motion, None) if moved is None else moved
         return Frame(
-            number, float(loads.times[0]), touch, loads, deformation, camera,
-            None if held is None else held.pose, None if held is None else held.tip, picture, over.colour, over.taken,
-            over.named,
-            None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
-            gauge is not None and gauge.inside,
-            *((motion, None) if moved is None else moved),
-            promised, error, doubt, acting(loads, deformation, self.site.anatomy.mesh.nodes), tuple(head), remark, took,
-            estimate,
+            number=number, time=float(loads.times[0]), touch=touch, loads=loads, deformation=deformation, camera=camera,
+            pose=None if held is None else held.pose, tip=None if held is None else held.tip,
+            picture=picture, shown=over.colour, taken=over.taken, named=over.named,
+            distance=None if gauge is None else gauge.distance, distance_error=None if gauge is None else gauge.error,
+            inside=gauge is not None and gauge.inside, moved=how_far, moved_error=moved_error,
+            model_error=promised, tumour_error=error, doubt=doubt,
+            acts=acting(loads, deformation, self.site.anatomy.mesh.nodes), head=tuple(head), remark=remark,
+            seconds=took, estimate=estimate,
         )  # fmt: skip
 
     def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:

@@ -102,12 +102,12 @@ class OverlayPage:
                 overlays(self.style, lambda style: setattr(self, "style", style)),
                 through(self.through, lambda name: setattr(self, "through", name)),
             ],
-            f"sulcus: {self.name}",
-            about(self.name, self.who, self.tooled),
-            self.host,
-            self.port,
-            (calibration.width, calibration.height),
-            signs_of(stage.site),
+            title=f"sulcus: {self.name}",
+            words=about(self.name, self.who, self.tooled),
+            host=self.host,
+            port=self.port,
+            size=(calibration.width, calibration.height),
+            signs=signs_of(stage.site),
             origins=self.origins,
         )
         self.busy = Busy(lambda line: self.browser.status(escape(line)))

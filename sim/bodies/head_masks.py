@@ -147,19 +147,19 @@ def head_masks(sources: Sources) -> HeadMasks:
         notes += (_side(marked, affine, next(iter(others.values())).path),)
     marked, affine = _cropped(marked, affine)
     return HeadMasks(
-        " and ".join(str(path) for path in (sources.labels, sources.mask, sources.tumour_in) if path),
-        f"the mask {sources.mask}" if sources.mask else f"the labels {listed(brain)}",
-        marked.pop("brain"),
-        marked.pop("tumour"),
-        affine,
-        notes,
-        on_border(others["brain"].marked if sources.mask else whole.mask(brain)),
-        marked,
-        (
+        name=" and ".join(str(path) for path in (sources.labels, sources.mask, sources.tumour_in) if path),
+        meant=f"the mask {sources.mask}" if sources.mask else f"the labels {listed(brain)}",
+        brain=marked.pop("brain"),
+        tumour=marked.pop("tumour"),
+        affine=affine,
+        notes=notes,
+        cut=on_border(others["brain"].marked if sources.mask else whole.mask(brain)),
+        parts=marked,
+        grids=(
             Grid(Path(sources.labels), whole.layers.shape[:3], whole.affine),
             *(one.grid for name, one in others.items() if name != NECROSIS),
         ),
-        sources.voxels,
+        voxels=sources.voxels,
     )
 
 

@@ -149,8 +149,9 @@ class ContactDescent:
         slow, steps, failed = np.zeros((3, count), int)
         stale, waiting, gone = np.zeros((3, count), bool)
         return Batch(
-            judge, now, pairs, model, stale, force, rest, force + 0.0, 0.0 * rest, none, none.copy(), none.copy(),
-            slow, steps, failed, waiting, gone,
+            judge=judge, now=now, pairs=pairs, model=model, stale=stale, force=force, rest=rest, aimed=force + 0.0,
+            x=0.0 * rest, length=none, promised=none.copy(), drag=none.copy(),
+            slow=slow, steps=steps, failed=failed, waiting=waiting, gone=gone,
         )  # fmt: skip
 
     def _replay(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, most: int) -> None:

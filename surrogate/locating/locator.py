@@ -273,15 +273,15 @@ class Locator:
         _demand_explained(found, len(outliers), len(some))
         found = replace(found, factor=covering_factor(self.tried, found.evidence))
         return Location(
-            prior,
-            found,
-            radius_of(found.covariance(prior.middle[:, None])[0]),
-            outliers,
-            found.outliers[found.outliers >= count] - count,
-            slipped,
-            observation.checked,
-            not slipped and was_tried(self.tried, found.evidence),
-            time.perf_counter() - begun,
+            prior=prior,
+            posterior=found,
+            p95=radius_of(found.covariance(prior.middle[:, None])[0]),
+            outliers=outliers,
+            tips_left_out=found.outliers[found.outliers >= count] - count,
+            slipped=slipped,
+            checked=observation.checked,
+            calibrated=not slipped and was_tried(self.tried, found.evidence),
+            seconds=time.perf_counter() - begun,
         )
 
 

@@ -299,15 +299,15 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
     for name in ("force", "footprint"):
         envelope[name] = tuple(envelope[name])
     return Learned(
-        anatomy,
-        tuple(parts),
-        Envelope(**envelope),
-        description["bound"],
-        _rebuilt_bound(description["bounds"], arrays, envelope["reach"]),
-        description["training"],
+        anatomy=anatomy,
+        parts=tuple(parts),
+        envelope=Envelope(**envelope),
+        bound=description["bound"],
+        bounds=_rebuilt_bound(description["bounds"], arrays, envelope["reach"]),
+        training=description["training"],
         # Older files do not have these.
-        stated_tool(description.get("tool"), description.get("ball")),
-        _rebuilt_tip(description.get("tip"), arrays, envelope["reach"]),
-        _left_out(description),
-        _rebuilt_force(description.get("force"), arrays, envelope["reach"]),
+        tool=stated_tool(description.get("tool"), description.get("ball")),
+        tip=_rebuilt_tip(description.get("tip"), arrays, envelope["reach"]),
+        left_out=_left_out(description),
+        force=_rebuilt_force(description.get("force"), arrays, envelope["reach"]),
     )

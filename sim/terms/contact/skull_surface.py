@@ -112,15 +112,15 @@ def bone_of(anatomy: Anatomy, space: Discretisation, gap: float, settings: BoneS
         inside[opened], felt[opened] = r.clip(0.0), settings.edge_felt * edge
     nodes = np.flatnonzero(slides | (way != 0.0).any(axis=1))
     return Bone(
-        nodes,
-        normal[nodes],
-        bend_of(space.nodes[nodes], normal[nodes], settings),
-        inside[nodes],
-        way[nodes],
-        felt[nodes],
-        _areas(space)[nodes],
-        gap,
-        edge,
+        nodes=nodes,
+        normal=normal[nodes],
+        bend=bend_of(space.nodes[nodes], normal[nodes], settings),
+        inside=inside[nodes],
+        way=way[nodes],
+        felt=felt[nodes],
+        area=_areas(space)[nodes],
+        gap=gap,
+        edge=edge,
     )
 
 

@@ -197,18 +197,9 @@ class Contact:
         nodes, own = self._nodes[self.touchable], np.searchsorted(self.touchable, self._triangles)
         corners, exact = own[:, :3], replace(self._device, precision="float64")
         term = Contact(
-            self.name,
-            self._shapes,
-            self._way,
-            nodes,
-            own,
-            corners,
-            own[:0],
-            self._asked,
-            self._shear,
-            exact,
-            self._touch,
-        )
+            self.name, self._shapes, self._way, nodes=nodes, triangles=own, whole=corners, bone=own[:0],
+            gap=self._asked, shear=self._shear, device=exact, touch=self._touch,
+        )  # fmt: skip
         return term, Reduced(term, len(nodes), own.shape[1], exact)
 
     def reduced(self, columns: np.ndarray) -> Reduced | None:
@@ -335,7 +326,10 @@ def contact_of(
     whole = space.surface[:, :3]
     solid = np.logical_or(anatomy.held.all(axis=1), anatomy.slide_normal.any(axis=1))
     bone = space.surface[solid[whole].all(axis=1)]
-    return Contact(name, tools, way, space.nodes, triangles, whole, bone, effect.gap, shear, device, touch)
+    return Contact(
+        name, tools, way, nodes=space.nodes, triangles=triangles, whole=whole, bone=bone,
+        gap=effect.gap, shear=shear, device=device, touch=touch,
+    )  # fmt: skip
 
 
 def _sampled(nodes: np.ndarray, triangles: np.ndarray, fine: float, device: Device) -> tuple[Surface, int]:

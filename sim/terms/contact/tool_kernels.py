@@ -245,5 +245,13 @@ def kernels_of(device: Device, size: int) -> Kernels:
                         wp.atomic_min(out, k, c, touch_of(shape_of(i, j, n) * own, half, radius).distance)
 
     return Kernels(
-        add_energy, add_gradient, add_curvature, add_diagonal, add_matrix, add_reaction, bound_step, clearance, nearest
+        add_energy=add_energy,
+        add_gradient=add_gradient,
+        add_curvature=add_curvature,
+        add_diagonal=add_diagonal,
+        add_matrix=add_matrix,
+        add_reaction=add_reaction,
+        bound_step=bound_step,
+        clearance=clearance,
+        nearest=nearest,
     )
