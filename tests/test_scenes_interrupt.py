@@ -16,7 +16,7 @@ import argparse, sys, threading, time
 from types import SimpleNamespace as Names
 
 class Demo:
-    def __init__(self, *words):
+    def __init__(self, *words, **named):
         self.browser = Names(address="here", addresses=(), token=None)
         self.busy, self.cast = Names(on=len), Names(predicted=lambda *asked: None)
         self.solve = threading.Thread(target=time.sleep, args=(100.0,), daemon=True)
