@@ -19,8 +19,8 @@ def test_lines_are_within_their_budget():
     assert not {name: count for name, count in found.items() if count > MOST[name]}
 
 
-def test_first_pages_are_read_in_two_minutes():
-    assert not [name for name in ("README.md", "CHANGELOG.md") if (HOUSE / name).stat().st_size > 8192]
+def test_the_changelog_is_read_in_two_minutes():
+    assert (HOUSE / "CHANGELOG.md").stat().st_size <= 8192
 
 
 def test_shared_options_are_declared_in_one_file():

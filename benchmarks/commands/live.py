@@ -1,4 +1,4 @@
-"""`python -m benchmarks live`: what a frame of a moving tool takes, and how far off it is."""
+"""`python -m benchmarks live`: duration and error of a frame of a moving tool."""
 
 from __future__ import annotations
 

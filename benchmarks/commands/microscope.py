@@ -1,4 +1,4 @@
-"""`python -m benchmarks microscope`: how far off a tumour is that is located from pictures of two eyes."""
+"""`python -m benchmarks microscope`: error of a tumour that is located from pictures of two eyes."""
 
 from __future__ import annotations
 

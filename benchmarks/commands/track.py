@@ -1,4 +1,4 @@
-"""`python -m benchmarks track`: how far off a tool's tip is that a camera sees by its printed cube."""
+"""`python -m benchmarks track`: error of a tool's tip that a camera sees by its printed cube."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from .figures import NAMED, PROGRAM, command_of
 
 FORMAT = "sulcus bench figures 1"
 FORMER = "sulcus bench "
-"""What the commands of older records begin with."""
+"""Beginning of the commands in older records."""
 KIND = "a record of `python -m benchmarks all`"
 LARGEST = 16 * 1024**2
 """Bytes of a file that is read: one of all figures has 0.1 million."""

@@ -1,1 +1,1 @@
-"""What accuracy costs, and what else moves the tumour."""
+"""Cost of accuracy, errors of the tumour, and other effects that move it."""

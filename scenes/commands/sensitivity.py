@@ -37,7 +37,7 @@ the motion over that by default. --out and --json give the 95th percentile and t
 counts in every way in which it can be: more and less, about two axes, to four sides along the cortex.
 """
 
-# What the element does to the rows of nu: `python -m benchmarks elements`, default brain.
+# Influence of the element on the rows of nu: `python -m benchmarks elements`, default brain.
 LOCKING = {
     "p1": "Linear tetrahedra lock as nu nears 0.5: much of what nu does here is theirs. Take --element smoothed.",
     "smoothed": "Smoothed elements, because linear ones lock as nu nears 0.5; at 0.495 these still lose some 5 %.",

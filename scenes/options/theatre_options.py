@@ -1,4 +1,4 @@
-"""Who plays a scene, on which anatomy: the options that commands which play scenes share."""
+"""Options of commands that play a scene: anatomy, models, solver, tissue and trajectory."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def scene_asked(args: argparse.Namespace, name: str, theatre: Theatre) -> Scene:
 
 
 def _approached(args: argparse.Namespace, scene: Scene, site: Site) -> Scene:
-    """The scene whose tool follows the trajectory; what keeps it from that is said."""
+    """Let the scene's tool follow the trajectory; a notice names what keeps it from that."""
     from sim.bodies.markups import read_markup
 
     from ..script.approach import approach_of
