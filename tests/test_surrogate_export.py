@@ -161,8 +161,9 @@ def test_a_series_has_one_radius_or_many(models, block, loads, taken):
     model = models["series"]
     (number, part), radii = _series_of(model, block.tumour_nodes), np.linspace(5e-3, 8e-3, len(taken))
     series = part.regressor
-    drawn = Series(series.corners, series.triangles, radii, series.table[:, taken])
-    kept = Series.restored(drawn.state())  # in half precision, as all that is stored
+    of_radii = series.table.whole.reshape(-1, len(series.radii), len(series.table.step))[:, taken]
+    table = replace(series.table, whole=of_radii.reshape(-1, len(series.table.step)))
+    kept = replace(series, radii=radii, table=table)
     parts = [*model.parts]
     parts[number] = replace(part, regressor=kept)
     other = replace(model, parts=tuple(parts))

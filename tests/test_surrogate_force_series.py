@@ -13,6 +13,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed
 from sim.material import Material, tissue_to_json
+from surrogate.array_functions import Rounded
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.disc_split import Split
@@ -54,7 +55,7 @@ def test_fields_of_second_degree_are_met_between_the_places(patch):
     table = np.zeros((len(places), len(radii), 19, 2), np.float32)
     table[:, :, 0, 0] = field(places)[:, None] + np.log(radii / 5e-3) ** 2
     table[:, :, 18, 1] = 1.0  # the form d_z^3
-    series = Series(patch.points, triangles, radii, table)
+    series = Series(patch.points, triangles, radii, unrounded(table))
     loads = pushes(patch, 200, 2, (5e-3, 8e-3))
     size, direction = directions(loads)
     predicted = series.predict(tool_features(patch, loads))
@@ -67,9 +68,15 @@ def test_fields_of_second_degree_are_met_between_the_places(patch):
 
 def test_of_no_loads_there_are_no_responses(patch):
     (triangles, places), radii = with_middles(patch), radii_between(5e-3, 8e-3)
-    series = Series(patch.points, triangles, radii, np.ones((len(places), len(radii), 19, 2), np.float32))
+    series = Series(patch.points, triangles, radii, unrounded(np.ones((len(places), len(radii), 19, 2))))
     none = tool_features(patch, Pushed(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))
     assert series.predict(none).shape == (0, 2)
+
+
+def unrounded(table):
+    """A table (places, radii, 19, r) that is not rounded."""
+    columns = table.reshape(-1, 19 * table.shape[-1]).astype(np.float32)
+    return Rounded(columns, np.ones(columns.shape[1], np.float32))
 
 
 def _row(loads, k):
@@ -100,7 +107,7 @@ def test_the_table_is_the_finite_elements_series(box, patch, tmp_path):
     (triangles, places), radii = with_middles(patch), np.array([7e-3])
     heard = []
     table = tabulated(fem, places, radii, reading, lambda done, total: heard.append((done, total)))
-    series = Series(patch.points, triangles, radii, table)
+    series = Series(patch.points, triangles, radii, unrounded(table))
     assert heard[-1] == (len(places), len(places))
     # Stopped at its second step, it goes on there, and comes to the same.
     kept = KeptRows(tmp_path / "rows", "a table")
@@ -163,8 +170,9 @@ def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, p
     for at, basis, found, exact in zip(nodes, bases, predicted, expansion.exact, strict=True):
         wanted = fem.series(units, ORDERS, every_motion(fem, at), 3) @ basis.modes.T
         for terms in SPANS[len(exact) :]:
-            miss = np.linalg.norm((found.table[places, 0] - wanted)[:, terms])
-            assert miss < 1e-3 * np.linalg.norm(wanted[:, terms])  # half precision has eleven bits
+            table = found.table.values.reshape(len(expansion.places), *wanted.shape[1:])
+            miss = np.linalg.norm((table[places] - wanted)[:, terms])
+            assert miss < 0.06 * np.linalg.norm(wanted[:, terms])  # rounded to 1 in 500 of the largest
 
 
 def test_two_orders_of_the_tumour_are_exact_wherever_a_tool_presses(expansion, box):

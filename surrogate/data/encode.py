@@ -9,6 +9,7 @@ import numpy as np
 
 from sim.loads import Pushed
 
+from ..array_functions import half_precision
 from .cortex_patch import Patch
 from .indentation import Indented, relaxed_of
 
@@ -120,10 +121,11 @@ class Basis:
 def reduce(nodes: np.ndarray, response: np.ndarray, tolerance: float, most: int) -> Basis:
     """The fewest modes, at most `most`, that leave `tolerance` of the responses (B, n, 3) in the Frobenius norm.
 
-    No mean is taken off: no force, no motion.
+    No mean is taken off: no force, no motion. Where as many are needed as there are components, these are the modes.
     """
     matrix = response.reshape(len(response), -1).astype(np.float64)
     _, size, modes = np.linalg.svd(matrix, full_matrices=False)
     left = np.sqrt(np.maximum(0.0, 1.0 - np.cumsum(size**2) / np.sum(size**2)))
     rank = min(most, int(np.searchsorted(-left, -tolerance)) + 1, len(size))
-    return Basis(nodes, modes[:rank].astype(np.float32))
+    complete = rank == matrix.shape[1]
+    return Basis(nodes, np.eye(rank, dtype=np.float32) if complete else half_precision(modes[:rank]))

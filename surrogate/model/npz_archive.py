@@ -6,6 +6,7 @@ import json
 import math
 import zipfile
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 import numpy as np
@@ -24,6 +25,16 @@ def seal_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
     names = sorted(arrays)
     stated = json.dumps([names, {name: value for name, value in header.items() if name != "seal"}], sort_keys=True)
     return digest_of(np.frombuffer(stated.encode(), np.uint8), *(arrays[name] for name in names))
+
+
+def write_archive(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays as `np.savez_compressed` does, by LZMA: rounded tables take three quarters of what Deflate makes."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in arrays.items():
+            entry = zipfile.ZipInfo(f"{name}.npy")  # without the time, so that the same arrays are the same bytes
+            entry.compress_type = zipfile.ZIP_LZMA
+            with archive.open(entry, "w", force_zip64=True) as member:
+                npy.write_array(member, array, allow_pickle=False)
 
 
 class Archive:

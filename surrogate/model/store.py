@@ -36,7 +36,7 @@ from ..regressors.svr import Svr
 from .conformal import GROWTH, Bound
 from .learned import Learned, Part
 from .left_out import LeftOut, OffBy
-from .npz_archive import Archive, seal_of
+from .npz_archive import Archive, seal_of, write_archive
 from .own_learners import find_own, name_of
 from .tip_distance import TipModel
 from .tool_force import ForceModel
@@ -93,7 +93,7 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
     }
     header["seal"] = seal_of(header, {})  # of the arrays, their names are the digests
     with written_whole(path, ".npz") as partial:
-        np.savez_compressed(partial, header=np.array(json.dumps(header)), **arrays)  # pyright: ignore[reportArgumentType]
+        write_archive(partial, {"header": np.array(json.dumps(header)), **arrays})
 
 
 def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from sim.errors import InputError
-from sim.runtime.versions import install_hint
+from sim.runtime.versions import needed_from
 
-from ..array_functions import columns_in_use, halved, product_of, squared_distances, taken
+from ..array_functions import Rounded, columns_in_use, product_of, squared_distances, taken
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -198,10 +197,8 @@ class Sheet:
         InputError
             Where the package `onnx` is not installed.
         """
-        try:
+        with needed_from("onnx", "an ONNX graph needs"):
             from onnx import helper, numpy_helper
-        except ImportError as error:
-            raise InputError(f"the package onnx is not installed. {install_hint('onnx')}") from error
 
         def described(ports: list[Port]) -> list:
             kinds = [KINDS[np.dtype(port.kind)] for port in ports]
@@ -292,34 +289,19 @@ def _(points: Wire, sites: np.ndarray) -> Any:
 
 
 @taken.register
-def _(index: Wire, table: np.ndarray) -> Any:
-    """A table that half precision holds without loss, as a series on disk, is stored so, in units of its columns."""
-    found, halved = table[index.sample], _halved(table)
-    if halved is None:
-        return index.sheet.put("Gather", found, table, index, axis=0)
-    share, unit = halved
-    return index.sheet.put("Gather", share[index.sample], share, index, axis=0).astype(np.float32) * unit
+def _(index: Wire, table: np.ndarray | Rounded) -> Any:
+    if not isinstance(table, Rounded):
+        return index.sheet.put("Gather", table[index.sample], table, index, axis=0)
+    found = index.sheet.put("Gather", table.whole[index.sample], table.whole, index, axis=0)
+    return found.astype(np.float32) * table.step
 
 
 @product_of.register
-def _(rows: Wire, table: np.ndarray) -> Any:
-    """As `taken` stores tables."""
-    halved = _halved(table)
-    if halved is None:
-        return rows @ table
-    share, unit = halved
-    return (rows @ rows.sheet.constant(share).astype(np.float32)) * unit
+def _(rows: Wire, table: Rounded, taken: np.ndarray) -> Any:
+    return (rows @ rows.sheet.constant(table.whole[taken]).astype(np.float32)) * table.step
 
 
 @columns_in_use.register
 def _(rows: Wire) -> np.ndarray:
     """All: which are zero, a graph does not know before it runs."""
     return np.arange(rows.shape[1])
-
-
-def _halved(table: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Shares (n, r) float16 and units (r,) of a table that is their product exactly; None if it is not."""
-    if table.dtype != np.float32 or table.ndim != 2:
-        return None
-    unit, share = halved(table, 0)
-    return (share, unit) if np.array_equal(share.astype(np.float32) * unit, table) else None

@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from ..array_functions import columns_in_use, halved, in_chunks, product_of
+from ..array_functions import Rounded, columns_in_use, in_chunks, product_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,11 +21,11 @@ class Pairs:
     pairs
         (P, 2): two force components, of the nodes of the open cortex.
     table
-        (P, r) float32: coefficients of the basis's modes for each pair's product [1/N^2].
+        (P, r): coefficients of the basis's modes for each pair's product [1/N^2].
     """
 
     pairs: np.ndarray
-    table: np.ndarray
+    table: Rounded
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of `rooted_shares` (B, 3 m)."""
@@ -36,7 +36,7 @@ class Pairs:
         row = self._rows[used[:, None], used]
         row = row[row >= 0]
         first, second = self.pairs[row].T
-        return product_of((X[:, first] * X[:, second]).astype(np.float32), self.table[row])
+        return product_of((X[:, first] * X[:, second]).astype(np.float32), self.table, row)
 
     @cached_property
     def _rows(self) -> np.ndarray:
@@ -46,11 +46,10 @@ class Pairs:
         return out
 
     def state(self) -> dict[str, np.ndarray]:
-        """Pairs, and the table in half precision, in units of its largest number for each mode."""
-        unit, share = halved(self.table, 0)
-        return {"pairs": self.pairs.astype(np.int32), "unit": unit, "share": share}
+        """Pairs, and the table: whole numbers of steps, `share`, and the step of each mode, `unit`."""
+        return {"pairs": self.pairs.astype(np.int32), "unit": self.table.step, "share": self.table.whole}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`: the table is what half precision kept of it, to 1 in 2,000."""
-        return cls(state["pairs"], state["share"].astype(np.float32) * state["unit"])
+        """From `state`; files of earlier versions have float16 in place of whole numbers."""
+        return cls(state["pairs"], Rounded(state["share"], state["unit"]))

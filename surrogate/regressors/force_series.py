@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from ..array_functions import halved, in_chunks, taken
+from ..array_functions import Rounded, in_chunks, taken
 
 ORDERS = 3
 # Which components of the direction are multiplied, order by order: 3, 6 and 10 products.
@@ -51,13 +51,21 @@ class Series:
     radii
         (R,) [m], rising.
     table
-        (places, R, 19, r) float32: coefficients of the basis's modes.
+        (places R, 19 r): coefficients of the basis's modes.
     """
 
     corners: np.ndarray
     triangles: np.ndarray
     radii: np.ndarray
-    table: np.ndarray
+    table: Rounded
+
+    @classmethod
+    def rounded(
+        cls, corners: np.ndarray, triangles: np.ndarray, radii: np.ndarray, table: np.ndarray, step: np.ndarray
+    ) -> Self:
+        """Round a table (places, R, 19, r) to the steps of its terms (19,)."""
+        steps = np.repeat(step, table.shape[-1])
+        return cls(corners, triangles, radii, Rounded.of(table.reshape(-1, len(steps)), steps))
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of `tool_features` (B, 8)."""
@@ -69,20 +77,19 @@ class Series:
         count = place.shape[1] * radius.shape[1]
         row = (place[:, :, None] * len(self.radii) + radius[:, None]).reshape(-1, count)
         factor = (share[:, :, None] * weight[:, None]).reshape(-1, 1, count).astype(np.float32)
-        known = taken(row, self.table.reshape(-1, TERMS * self.table.shape[-1]))
-        mixed = (factor @ known).reshape(-1, TERMS, self.table.shape[-1])
+        mixed = (factor @ taken(row, self.table)).reshape(-1, TERMS, len(self.table.step) // TERMS)
         return (forms(X[:, 3:6], X[:, 6]).astype(np.float32)[:, None] @ mixed)[:, 0]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Places, radii, and the table in half precision, in units of its largest number for each term and mode."""
-        unit, share = halved(self.table, (0, 1))
+        """Places, radii, and the table: whole numbers of steps, `share`, and the step of each column, `unit`."""
         known = {name: getattr(self, name) for name in ("corners", "triangles", "radii")}
-        return {**known, "unit": unit, "share": share}
+        return {**known, "unit": self.table.step, "share": self.table.whole}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`: the table is what half precision kept of it, to 1 in 2,000."""
-        table = state["share"].astype(np.float32) * state["unit"]
+        """From `state`; files of earlier versions have float16 in place of whole numbers, and more axes."""
+        step = state["unit"].ravel()
+        table = Rounded(state["share"].reshape(-1, len(step)), step)
         return cls(state["corners"], state["triangles"], state["radii"], table)
 
     @cached_property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -39,8 +40,8 @@ class Gp(Stored):
         Of the subsets.
     """
 
-    kept = ("mean", "deviation", "offset", "length", "noise", "seen", "dual")
-    """Standardisation, lengths (f,), noise, the rows seen (n, f) in lengths, and their dual coefficients (n, r)."""
+    kept = ("mean", "deviation", "offset", "length", "noise", "scaled", "dual")
+    """Standardisation, lengths (f,), noise, the standardised rows (n, f) seen, and their dual coefficients (n, r)."""
     rows: int = 600
     most: int = 4000
     strongest: int = 20
@@ -48,10 +49,11 @@ class Gp(Stored):
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Learn from rows X (n, f), Y (n, r)."""
-        vars(self).pop("_factor", None)
+        for name in ("_factor", "seen_"):
+            vars(self).pop(name, None)
         order = np.random.default_rng(self.seed).permutation(len(X))[: self.most]
         self.mean_, self.deviation_ = standardisation(X)
-        x = ((X - self.mean_) / self.deviation_)[order]
+        x = self.scaled_ = ((X - self.mean_) / self.deviation_)[order].astype(np.float32)
         self.offset_ = Y.mean(axis=0)
         y = (Y - self.offset_)[order]
         spread = y[: self.rows].std(axis=0)
@@ -71,9 +73,21 @@ class Gp(Stored):
                 )
             start = fitted.x
         self.length_, self.noise_ = np.exp(start[:-1]), np.exp(start[-1])
-        self.seen_ = x / self.length_
         self.dual_ = cho_solve(self._factor, y)
         return self
+
+    @classmethod
+    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
+        """From `state`; files of earlier versions have the rows in lengths, `seen`."""
+        known = dict(state)
+        if "seen" in known:
+            known["scaled"] = known.pop("seen") * known["length"]
+        return super().restored(known)
+
+    @cached_property
+    def seen_(self) -> np.ndarray:
+        """The rows seen (n, f) in lengths."""
+        return self.scaled_ / self.length_
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of features (B, f): the mean of the posterior."""

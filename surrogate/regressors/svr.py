@@ -53,7 +53,7 @@ class Svr(Stored):
             intercept[mode] = spread[mode] * machine.intercept_[0]
         intercept[spread <= 0.0] = np.median(Y[:, spread <= 0.0], axis=0)
         used = np.flatnonzero(dual.any(axis=1))
-        self.support_ = scaled[used]
+        self.support_ = scaled[used].astype(np.float32)
         self.dual_ = dual[used].astype(np.float32)
         self.intercept_ = intercept.astype(np.float32)
         return self

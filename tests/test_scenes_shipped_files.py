@@ -1,0 +1,13 @@
+"""Models that ship with the package: small enough for a repository that keeps each of them for ever."""
+
+import pytest
+
+from scenes.script.shipped_files import template_path
+
+MOST = 8_000_000  # bytes; see docs/develop/release.md
+MODELS = sorted(template_path().parent.glob("*.npz"))
+
+
+@pytest.mark.parametrize("path", MODELS, ids=lambda path: path.name)
+def test_shipped_model_is_small(path):
+    assert len(MODELS) >= 3 and path.stat().st_size < MOST
