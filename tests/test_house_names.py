@@ -54,7 +54,7 @@ def test_instructions_install_the_checkout_and_no_other_name():
             assert set(extras.split(",")) <= set(EXTRAS), f"{name}: {extras}"
 
 
-@pytest.mark.parametrize("extra", ["anatomies", "exports", "gym", "link", "onnx", "peers"])
+@pytest.mark.parametrize("extra", ["camera", "data", "gym", "heads", "onnx", "peers", "slicer"])
 def test_install_hint_names_an_extra_that_exists(extra):
     assert extra in EXTRAS and install_hint(extra).endswith(f"pip install -e '.[{extra}]'.")
 

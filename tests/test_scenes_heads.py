@@ -91,7 +91,7 @@ def test_fsaverage_is_what_its_inner_skull_holds_at_the_size_asked_for(skull, tm
     assert abs(summary["tumour_volume_error_percent"]) < 2.0
 
 
-@pytest.mark.skipif(find_spec("mne") is None, reason="the package mne is not installed: pip install -e '.[anatomies]'")
+@pytest.mark.skipif(find_spec("mne") is None, reason="the package mne is not installed: pip install -e '.[heads]'")
 def test_the_skull_that_mne_ships_is_of_a_head():
     points, triangles = read_surface(Path(find_spec("mne").origin).parent / INNER_SKULL)
     mask, _ = enclosed(points, triangles, 2e-3)
@@ -123,10 +123,10 @@ def test_a_skull_with_a_hole_or_none_is_refused(skull, tmp_path, capsys, monkeyp
     assert code == 2 and f"{skull}: the surface is not closed" in error
     skull.unlink()
     code, _, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
-    assert code == 2 and f"{skull}: no such file" in error and "pip install -e '.[anatomies]'" in error
+    assert code == 2 and f"{skull}: no such file" in error and "pip install -e '.[heads]'" in error
     monkeypatch.setitem(sys.modules, "mne", None)  # as where it is not installed
     code, _, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
-    assert code == 2 and "mne, which is not there" in error and "pip install -e '.[anatomies]'" in error
+    assert code == 2 and "mne, which is not there" in error and "pip install -e '.[heads]'" in error
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sim.errors import InputError
-from sim.runtime.versions import install_hint
+from sim.runtime.versions import needed_from
 
 from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
@@ -93,10 +93,8 @@ def folder_writer(name: str) -> Callable[..., dict[str, Any]]:
         LeRobot without the package that writes its tables.
     """
     if name == "lerobot":
-        try:
+        with needed_from("data", "--to lerobot needs"):
             from ..episodes.exports.lerobot import write_lerobot
-        except ImportError as error:
-            raise InputError(f"--to lerobot: needs pyarrow. {install_hint('exports')}") from error
         return write_lerobot
     if name == "folder":
         from ..episodes.exports.plain_folder import write_folder

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Set
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim.errors import InputError
+from sim.runtime.versions import needed_from
 
 from ..options.json_line import json_line
 from ..options.outputs import claimed_folder
@@ -98,7 +100,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _made(args: argparse.Namespace, plan: Plan, out: Path, stop_if_asked: Callable[[], None]) -> int:
-    from ..episodes.engine import make_all, still_missing
+    with needed_from("data", "sulcus episodes needs"):
+        from ..episodes.engine import make_all, still_missing
     from ..episodes.make import body_of, make_body, make_episode
     from ..episodes.run_folder import Run, begin, finished, read_run, versions_here
     from ..episodes.tasks import Work
@@ -139,8 +142,6 @@ def _card(out: Path, numbers: Set[int], changed: bool) -> str | None:
 
 
 def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Workers]:
-    from dask.system import CPU_COUNT
-
     from ..episodes.workers import own_workers, scheduled_workers
 
     if args.scheduler:
@@ -151,7 +152,7 @@ def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Wo
         cards = device_names("all")
         count = args.workers or len(cards)
         return own_workers([cards[number % len(cards)] for number in range(count)])
-    return own_workers(["cpu"] * (args.workers or CPU_COUNT))
+    return own_workers(["cpu"] * (args.workers or (os.cpu_count() or 1)))
 
 
 @contextmanager

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from sim.errors import InputError
-from sim.runtime.versions import install_hint
+from sim.runtime.versions import needed_from
 
 NAMESPACE = "sulcus"
 NAMES = ("Palpate", "Retract", "Debulk")
@@ -19,10 +18,8 @@ def register_environments() -> None:
     InputError
         Gymnasium is not installed.
     """
-    try:
+    with needed_from("gym", "these environments need"):
         from gymnasium.envs.registration import register, registry
-    except ImportError as error:
-        raise InputError(f"these environments need Gymnasium. {install_hint('gym')}") from error
     for name in NAMES:
         known = f"{NAMESPACE}/{name}-v0"
         if known not in registry:

@@ -6,13 +6,10 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from sim.errors import InputError
-from sim.runtime.versions import install_hint
+from sim.runtime.versions import needed_from
 
-try:
+with needed_from("slicer", "OpenIGTLink's checksums need"):
     from fastcrc import crc64
-except ImportError as error:
-    raise InputError(f"OpenIGTLink's checksums need fastcrc. {install_hint('link')}") from error
 
 HEADER = struct.Struct(">H12s20sQQQ")
 """Version, type, device name, time stamp, size of the body, checksum: 58 bytes, all numbers big-endian."""

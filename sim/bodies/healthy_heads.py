@@ -24,7 +24,7 @@ INNER_SKULL = Path("data", "fsaverage", "fsaverage-inner_skull-bem.fif")
 """Where the wheel of mne has it."""
 VOXEL = 1e-3
 """[m] The skull is put onto voxels of this edge."""
-REMEDY = install_hint("anatomies")
+REMEDY = install_hint("heads")
 
 
 def masked_head(mask: Path, t1: Path | None = None, volume: float | None = None) -> Healthy:

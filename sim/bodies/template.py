@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import InputError
+from ..runtime.versions import needed_from
 from .intensity import Intensity
 from .placement import Piece, site_over
 from .signed_distance import Field, mask_field
@@ -234,7 +235,8 @@ def size_of(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _scaled_template(head: Head) -> Healthy:
-    from nilearn.datasets import load_mni152_template  # takes seconds; only where an anatomy is made
+    with needed_from("heads", "an anatomy of the average brain needs"):
+        from nilearn.datasets import load_mni152_template  # takes seconds
 
     image = load_mni152_template(resolution=1)
     grey = np.asarray(image.dataobj)
