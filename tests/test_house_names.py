@@ -40,7 +40,7 @@ def instructions():
 def test_distribution_has_one_name():
     assert PROJECT["name"] == DISTRIBUTION and DISTRIBUTION != "sulcus"
     own = [one for extra in EXTRAS.values() for one in extra if re.match(r"sulcus\b", one)]
-    assert own == [f"{DISTRIBUTION}[docs,exports,gym,link,onnx]"]
+    assert own == [f"{DISTRIBUTION}[camera,data,docs,gym,onnx,slicer]"]
 
 
 def test_instructions_install_the_checkout_and_no_other_name():

@@ -380,4 +380,4 @@ def test_without_pyarrow_lerobot_names_what_to_install(folder, tmp_path):
     )
     words = [sys.executable, "-c", code, str(folder), str(tmp_path / "x")]
     done = subprocess.run(words, capture_output=True, text=True, cwd=Path(__file__).parents[1], check=False)
-    assert done.returncode == 2 and ".[exports]" in done.stderr
+    assert done.returncode == 2 and ".[data]" in done.stderr
