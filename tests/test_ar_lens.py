@@ -12,6 +12,7 @@ from ar.optics.camera import Camera, look_at, project_cv2
 from ar.optics.lens import Lens
 from ar.overlay.composite import composite
 from ar.overlay.gauge import Gauge
+from ar.overlay.marks import Marks
 from ar.overlay.outlines import box_around, silhouette
 from ar.overlay.refind import of_ink, outline_gap
 from ar.rendering.layer import Layer
@@ -188,7 +189,7 @@ def test_the_overlay_is_in_register_through_a_lens(lens):
     picture = render(camera, ground, LAMP)
     before = replace(hidden, vertices=hidden.vertices - [0.01, 0.0, 0.0])
     gauge = Gauge(np.array([-0.03, -0.03, 0.0]), hidden.vertices[0])
-    shown = composite(picture, camera, hidden, gauge=gauge, before=before).colour
+    shown = composite(picture, camera, hidden, marks=Marks(gauge=gauge, before=before)).colour
     mask = raycast(camera, hidden.vertices, hidden.triangles).mask
     ink = tuple(np.rint(255.0 * np.array([0.3, 0.95, 0.55])))
     clear = np.zeros(mask.shape, bool)
@@ -217,7 +218,7 @@ def test_what_lies_beyond_the_lens_is_not_drawn():
     assert np.abs(project_cv2(camera, aside.vertices) - camera.K[:2, 2]).max() < 0.5 * camera.K[0, 0]
     picture = render(camera, [aside], LAMP)
     assert not picture.segmentation.any() and np.isnan(camera.project(aside.vertices)[0]).all()
-    assert np.array_equal(composite(picture, camera, aside, before=aside).colour, picture.colour)
+    assert np.array_equal(composite(picture, camera, aside, marks=Marks(before=aside)).colour, picture.colour)
     gauge = Gauge(np.array([0.0, 0.0, 1.0]), aside.vertices[0])  # its tip is in sight: the number alone stands there
-    rows, columns = np.nonzero(composite(picture, camera, aside, gauge=gauge, before=aside).taken)
+    rows, columns = np.nonzero(composite(picture, camera, aside, marks=Marks(gauge=gauge, before=aside)).taken)
     assert np.ptp(rows) < 30 and np.ptp(columns) < 140

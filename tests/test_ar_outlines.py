@@ -10,6 +10,7 @@ from ar.optics.camera import look_at
 from ar.overlay.composite import DOUBTFUL, WARNING, composite, doubt_lines
 from ar.overlay.gauge import GAUGE, Gauge
 from ar.overlay.hud import FINE, HEAD, ROW, panel, write
+from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.outlines import ink_of, iou, silhouette
 from ar.overlay.refind import outline_gap, stands
 from ar.overlay.traces import BEFORE
@@ -183,13 +184,13 @@ def test_the_tool_is_in_front_of_the_overlay(style):
     here = camera()
     picture = render(here, [cortex(), tool((0.0, 0.0, 0.012))], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
-    shown = composite(picture, here, tumour(), [TOOL], style, 0.002, gauge)
+    shown = composite(picture, here, tumour(), style=style, cover=Cover([TOOL]), marks=Marks(0.002, gauge=gauge))
     covered = picture.segmentation == TOOL
     text_free = covered & (np.arange(150) < 100)[:, None]
     assert np.array_equal(shown.colour[text_free], picture.colour[text_free])
     # Without naming the tool as occluder the overlay covers it: the test can fail.
     assert not np.array_equal(
-        composite(picture, here, tumour(), (), style).colour[text_free], picture.colour[text_free]
+        composite(picture, here, tumour(), style=style).colour[text_free], picture.colour[text_free]
     )
     assert contour_mask(picture.colour, shown.colour)[~covered].any()
 
@@ -198,7 +199,7 @@ def test_the_margin_runs_outside_the_contour():
     here = camera()
     picture = render(here, [cortex()], LAMP)
     plain = composite(picture, here, tumour(), style="contour")
-    wide = composite(picture, here, tumour(), style="contour", margin=0.004)
+    wide = composite(picture, here, tumour(), style="contour", marks=Marks(0.004))
     rows, columns = np.nonzero(np.abs(plain.colour.astype(int) - wide.colour).sum(-1) > 0)
     middle, depth = here.project(np.array([0.0, 0.0, -0.02]))
     radius = np.hypot(columns - middle[0], rows - middle[1]) / here.K[0, 0] * depth
@@ -210,7 +211,7 @@ def test_no_line_runs_along_the_edge_that_cuts_a_margin_off(side):
     """Strokes end near the edge."""
     here, centre = camera(), (*side, -0.02)
     picture = render(here, [cortex()], LAMP)
-    plain, wide = (composite(picture, here, tumour(centre), style="contour", margin=each) for each in (0.0, 0.02))
+    plain, wide = (composite(picture, here, tumour(centre), style="contour", marks=Marks(each)) for each in (0.0, 0.02))
     changed = (plain.colour != wide.colour).any(axis=2)
     edge = np.ones_like(changed)
     edge[3:-3, 3:-3] = False
@@ -221,7 +222,14 @@ def test_lines_at_the_head_stand_there_whatever_the_style():
     here = camera(320, 240)
     picture = render(here, [cortex()], LAMP)
     for style in ("window", "none"):
-        said = composite(picture, here, tumour(), style=style, before=tumour((0.01, 0.0, -0.02)), head=["one", "two"])
+        said = composite(
+            picture,
+            here,
+            tumour(),
+            style=style,
+            marks=Marks(before=tumour((0.01, 0.0, -0.02))),
+            words=Words(head=["one", "two"]),
+        )
         assert stands(said.colour[HEAD : HEAD + 2 * ROW], "one", FINE)
         assert stands(said.colour[HEAD + ROW - 4 : HEAD + 3 * ROW], "two", FINE)
         assert said.taken[HEAD + ROW, 8:20].all()
@@ -247,14 +255,14 @@ def test_the_picture_says_how_far_the_tumour_moved():
     far = np.linspace(0.002, 0.004, len(now.vertices))[:, None] * [1.0, 0.0, 0.0]
     margin = np.linspace(0.0005, 0.0015, len(now.vertices))
     before = replace(now, vertices=now.vertices - far)
-    assert stands(composite(picture, here, now, margin=margin, before=before).colour, "moved 3.0 mm", FINE)
-    assert stands(composite(picture, here, now, before=before).colour, "moved 3.0 mm", FINE)
+    assert stands(composite(picture, here, now, marks=Marks(margin, before=before)).colour, "moved 3.0 mm", FINE)
+    assert stands(composite(picture, here, now, marks=Marks(before=before)).colour, "moved 3.0 mm", FINE)
 
 
 def test_the_arrow_points_to_where_the_tumour_is_now():
     here, before, now = camera(400, 300), tumour((-0.012, 0.0, -0.02), 0.006), tumour((0.012, 0.0, -0.02), 0.006)
     picture = render(here, [cortex()], LAMP)
-    shown = composite(picture, here, now, style="contour", before=before).colour
+    shown = composite(picture, here, now, style="contour", marks=Marks(before=before)).colour
     grey = np.argwhere((np.abs(shown.astype(int) - ink_of(BEFORE)) <= 2).all(axis=2))[:, ::-1]
     near = [
         np.count_nonzero(np.linalg.norm(grey - here.project(np.array([x, 0.0, -0.02]))[0], axis=1) < 8)
@@ -269,10 +277,10 @@ def test_motion_and_doubt_stand_on_lines_of_their_own():
     picture = render(here, [cortex()], LAMP)
     before, now = tumour((0.0, 0.0, -0.02)), tumour((0.003, 0.0, -0.02))
     doubt = "outside what the model learned: do not rely on it"
-    shown = composite(picture, here, now, before=before, margin=np.nan, doubt=doubt).colour
+    shown = composite(picture, here, now, marks=Marks(np.nan, before=before), words=Words(doubt)).colour
     assert stands(shown, "moved 3.0 mm", FINE)
     assert all(stands(shown, line, FINE, ink_of(WARNING)) for line in doubt_lines(doubt, 400))
-    assert stands(composite(picture, here, now, before=before, margin=np.nan).colour, "moved 3.0 mm", FINE)
+    assert stands(composite(picture, here, now, marks=Marks(np.nan, before=before)).colour, "moved 3.0 mm", FINE)
 
 
 def test_of_what_may_not_be_relied_on_nothing_is_promised():
@@ -280,10 +288,10 @@ def test_of_what_may_not_be_relied_on_nothing_is_promised():
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
-    sure = composite(picture, here, tumour(), margin=0.004, gauge=gauge).colour
+    sure = composite(picture, here, tumour(), marks=Marks(0.004, gauge=gauge)).colour
     assert stands(sure, "8.0 +- 1.2 mm", GAUGE) and not stands(sure, "do not rely on it", FINE, ink_of(WARNING))
     unsure, plain = (
-        composite(picture, here, tumour(), margin=margin, gauge=gauge, doubt="do not rely on it").colour
+        composite(picture, here, tumour(), marks=Marks(margin, gauge=gauge), words=Words("do not rely on it")).colour
         for margin in (0.004, 0.0)
     )
     assert stands(unsure, "8.0 mm", GAUGE) and stands(unsure, "do not rely on it", FINE, ink_of(WARNING))
@@ -306,7 +314,9 @@ def test_without_overlay_a_doubt_is_all_that_is_drawn():
     picture = render(here, [cortex()], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
     bare, unsure = (
-        composite(picture, here, tumour(), style="none", gauge=gauge, before=tumour(), doubt=doubt).colour
+        composite(
+            picture, here, tumour(), style="none", marks=Marks(gauge=gauge, before=tumour()), words=Words(doubt)
+        ).colour
         for doubt in ("", "do not rely on it")
     )
     assert np.array_equal(bare, picture.colour) and stands(unsure, "do not rely on it", FINE, ink_of(WARNING))
@@ -319,7 +329,9 @@ def test_what_lines_and_words_cover_is_reported():
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
-    drawn = composite(picture, here, tumour(), style="contour", gauge=gauge, before=tumour((0.01, 0.0, -0.02)))
+    drawn = composite(
+        picture, here, tumour(), style="contour", marks=Marks(gauge=gauge, before=tumour((0.01, 0.0, -0.02)))
+    )
     changed = (drawn.colour != picture.colour).any(axis=2)
     taken = drawn.taken > 0
     halo = cv2.dilate(taken.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0

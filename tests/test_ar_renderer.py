@@ -10,6 +10,7 @@ from test_ar_rasteriser import sphere
 
 from ar.optics.camera import Camera, look_at
 from ar.overlay.composite import composite
+from ar.overlay.marks import Cover
 from ar.overlay.outlines import box_around
 from ar.overlay.window import FADE, SURROUND, Lines, Roles, chamfer, overlaid
 from ar.rendering.layer import Layer, Solid, vertex_normals
@@ -250,7 +251,7 @@ def drawn_on(device: str) -> tuple[Pictures, Picture, np.ndarray]:
     together = renderer.pictures(moved, [camera(0.1 * row, 640, 480) for row in range(4)])
     alone = renderer.picture(camera(0.0, 640, 480), [moved[0]])
     hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG, colour=(0.2, 0.9, 0.3))
-    return together, alone, composite(alone, camera(0.0, 640, 480), hidden, (BALL,)).colour
+    return together, alone, composite(alone, camera(0.0, 640, 480), hidden, cover=Cover((BALL,))).colour
 
 
 @pytest.mark.gpu

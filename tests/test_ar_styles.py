@@ -14,6 +14,7 @@ from ar.overlay.distances import distance_of_seen, signed_distance, tree_of
 from ar.overlay.gauge import GAUGE, Gauge, gauge_words
 from ar.overlay.hud import FINE, FONT, HEAD, ROW, WHITE, folded, panel
 from ar.overlay.legend import SHEET, Names
+from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.measured import Measure
 from ar.overlay.outlines import ink_of, key_of, silhouette
 from ar.overlay.refind import found_at, of_ink, outline_gap, stands
@@ -54,16 +55,18 @@ def seen(edge=0.09, *more):
 @pytest.mark.parametrize("style", DRAWN)
 def test_every_style_has_the_outline_in_register_and_a_band(style):
     picture, at = seen(), tumour()
-    shown = composite(picture, CAMERA, at, style=style, opening=OPENING).colour
+    shown = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING)).colour
     mask = silhouette(CAMERA, at.vertices, at.triangles)
     words = (shown == np.asarray(WHITE, np.uint8)).all(axis=2)
     others = words | of_ink(shown, RING)
     assert outline_gap(shown, ink_of(GREEN), mask, others) < 1.5
     assert outline_gap(shown, ink_of(GREEN), np.roll(mask, 5, axis=1), others) > 3.0
-    wide = composite(picture, CAMERA, at, style=style, opening=OPENING, margin=0.004).colour
+    wide = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING), marks=Marks(0.004)).colour
     outside = cv2.dilate(mask.astype(np.uint8), np.ones((15, 15))) == 0
     assert 100 < (outside & (wide != shown).any(axis=2)).sum() < 2000
-    doubtful = composite(picture, CAMERA, at, style=style, opening=OPENING, doubt="do not rely on it").colour
+    doubtful = composite(
+        picture, CAMERA, at, style=style, cover=Cover(opening=OPENING), words=Words("do not rely on it")
+    ).colour
     assert not of_ink(doubtful, ink_of(GREEN)).any()
 
 
@@ -74,18 +77,18 @@ def test_tools_and_masks_stay_in_front_of_every_style(style):
     gauge = Gauge(np.array([0.0, 0.0, 0.001]), np.array([0.0, 0.0, -0.008]))
     hand = np.zeros(picture.segmentation.shape, bool)
     hand[230:420, 250:300] = True
-    given = {"style": style, "margin": 0.002, "gauge": gauge, "opening": OPENING}
-    shown = composite(picture, CAMERA, tumour(), (TOOL,), covered=hand, **given).colour
+    marks = Marks(0.002, gauge)
+    shown = composite(picture, CAMERA, tumour(), style, Cover((TOOL,), OPENING, hand), marks).colour
     tool = picture.segmentation == TOOL
     assert np.array_equal(shown[tool | hand], picture.colour[tool | hand])
-    bare = composite(picture, CAMERA, tumour(), **given).colour
+    bare = composite(picture, CAMERA, tumour(), style, Cover(opening=OPENING), marks).colour
     assert (bare[tool] != picture.colour[tool]).any() and (bare[hand] != picture.colour[hand]).any()
 
 
 @pytest.mark.parametrize("style", DRAWN)
 def test_under_the_drape_the_outline_is_broken_and_nothing_shines_through(style):
     picture, at = seen(0.0), tumour()
-    shown = composite(picture, CAMERA, at, style=style, opening=OPENING).colour
+    shown = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING)).colour
     mask, shut = silhouette(CAMERA, at.vertices, at.triangles), picture.segmentation == DRAPE
     outline = np.zeros(mask.shape, np.uint8)
     cv2.drawContours(outline, cv2.findContours(mask.astype(np.uint8), 0, 1)[0], -1, (1,))
@@ -112,12 +115,21 @@ def test_depth_is_the_stronger_the_nearer_and_has_a_scale():
     row, column = CAMERA.project(np.array([[-0.004, 0.0, -0.02]]))[0][0, ::-1].round().astype(int)
     red = []
     for depth in (0.015, 0.025, 0.04):
-        shown = composite(picture, CAMERA, tumour((0.0, 0.0, -depth), 0.01), style="depth", opening=OPENING, error=2e-3)
+        shown = composite(
+            picture,
+            CAMERA,
+            tumour((0.0, 0.0, -depth), 0.01),
+            style="depth",
+            cover=Cover(opening=OPENING),
+            words=Words(error=2e-3),
+        )
         red.append(int(shown.colour[row, column, 0]))
     assert red[0] < red[1] - 10 < red[2] - 20  # less of the cortex's red under more of the tint
     changed = (
         shown.colour
-        != composite(picture, CAMERA, tumour((0.0, 0.0, -0.04), 0.01), style="contour", opening=OPENING).colour
+        != composite(
+            picture, CAMERA, tumour((0.0, 0.0, -0.04), 0.01), style="contour", cover=Cover(opening=OPENING)
+        ).colour
     ).any(axis=2)
     assert changed[:, 480:].sum() > 1000  # the scale, on the drape
 
@@ -191,7 +203,7 @@ def test_distances_are_signed_and_end():
 def test_the_number_stands_beside_the_tip_inside_the_frame(tip):
     picture = seen()
     gauge = Gauge(np.array([*tip, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
-    shown = composite(picture, CAMERA, tumour(), gauge=gauge).colour
+    shown = composite(picture, CAMERA, tumour(), marks=Marks(gauge=gauge)).colour
     found = found_at(shown, str(gauge), GAUGE)
     assert found is not None
     left, top, right, foot = found
@@ -204,21 +216,27 @@ def test_a_tip_inside_is_said_to_be():
     assert gauge_words(2.1e-3, None, True) == "inside, 2.1 mm from its edge"
     assert gauge_words(2.1e-3, 1e-3, False) == "2.1 +- 1.0 mm"
     gauge = Gauge(np.array([0.0, 0.0, -0.02]), np.array([0.0, 0.0, -0.008]), inside=True)
-    assert stands(composite(seen(), CAMERA, tumour(), gauge=gauge).colour, "inside, 12.0 mm from its edge", GAUGE)
+    assert stands(
+        composite(seen(), CAMERA, tumour(), marks=Marks(gauge=gauge)).colour, "inside, 12.0 mm from its edge", GAUGE
+    )
 
 
 def test_the_legend_names_lines_without_their_ink_and_leaves_the_cortex_in_sight():
     picture, at = seen(0.0), tumour()
     names = Names("it", "its error", "before")
     plain, named = (
-        composite(picture, CAMERA, at, margin=0.003, before=at, opening=OPENING, names=each).colour
+        composite(
+            picture, CAMERA, at, cover=Cover(opening=OPENING), marks=Marks(0.003, before=at), words=Words(names=each)
+        ).colour
         for each in (Names(), names)
     )
     changed = (plain != named).any(axis=2)
     assert changed.sum() > 500 and (picture.segmentation[changed] == DRAPE).all()
     assert not of_ink(named, ink_of(GREEN))[changed].any()
-    crowded = composite(seen(), CAMERA, at, margin=0.003, before=at, opening=OPENING, names=names).colour
-    without = composite(seen(), CAMERA, at, margin=0.003, before=at, opening=OPENING).colour
+    crowded = composite(
+        seen(), CAMERA, at, cover=Cover(opening=OPENING), marks=Marks(0.003, before=at), words=Words(names=names)
+    ).colour
+    without = composite(seen(), CAMERA, at, cover=Cover(opening=OPENING), marks=Marks(0.003, before=at)).colour
     assert np.array_equal(crowded, without)  # there is cortex everywhere: no room
 
 
@@ -234,7 +252,7 @@ def test_a_panel_moves_out_of_sight_of_what_it_would_hide():
 
 def test_a_mask_of_another_size_is_refused():
     with pytest.raises(ValueError, match="covered"):
-        composite(seen(), CAMERA, tumour(), covered=np.zeros((4, 4), bool))
+        composite(seen(), CAMERA, tumour(), cover=Cover(covered=np.zeros((4, 4), bool)))
 
 
 def written(sheet, number):
@@ -261,8 +279,8 @@ def test_a_cut_has_letters_at_both_ends_also_where_a_tool_hides_one():
         picture = seen()
         roles = np.zeros((480, 640), bool)
         roles[:, 360:] = tool
-        shown = composite(picture, CAMERA, at, style="cut", covered=roles).colour
-        plain = composite(picture, CAMERA, at, style="contour", covered=roles).colour
+        shown = composite(picture, CAMERA, at, style="cut", cover=Cover(covered=roles)).colour
+        plain = composite(picture, CAMERA, at, style="contour", cover=Cover(covered=roles)).colour
         # The line lies level through the middle, and letters stand above it.
         (middle,), _ = CAMERA.project(at.vertices.mean(axis=0)[None])
         reach = np.ptp(CAMERA.project(at.vertices)[0][:, 0]) / 2.0
@@ -307,7 +325,14 @@ def test_a_ring_s_caption_stands_apart_from_the_number_beside_the_tip():
     """Right under the number, it would read as its explanation."""
     at, said = tumour((0.0, 0.0, -0.014)), "rings: mm to the surface; error not known"
     tip = CAMERA.unproject(np.array([[440.0, 20.0]]), np.array([0.2]))[0]
-    shown = composite(seen(0.01), CAMERA, at, style="rings", gauge=Gauge(tip, at.vertices[0]), opening=OPENING).colour
+    shown = composite(
+        seen(0.01),
+        CAMERA,
+        at,
+        style="rings",
+        cover=Cover(opening=OPENING),
+        marks=Marks(gauge=Gauge(tip, at.vertices[0])),
+    ).colour
     number = found_at(shown, str(Gauge(tip, at.vertices[0])), GAUGE)
     caption = found_at(shown, folded(said, 0.3 * 640)[0], FINE)
     assert number is not None and caption is not None
@@ -327,7 +352,9 @@ def test_rings_may_be_covered_and_their_numbers_may_not():
 def test_a_cut_leaves_the_foot_to_its_words():
     covered = np.zeros((480, 640), bool)
     covered[:270, 400:] = True  # the inset stands low
-    over = composite(seen(0.01), CAMERA, tumour((0.0, 0.0, -0.014)), style="cut", covered=covered, opening=OPENING)
+    over = composite(
+        seen(0.01), CAMERA, tumour((0.0, 0.0, -0.014)), style="cut", cover=Cover(opening=OPENING, covered=covered)
+    )
     assert (over.taken == SHEET).any() and not (over.taken[-HEAD:] == SHEET).any()
 
 
@@ -337,5 +364,5 @@ def test_a_cut_is_drawn_where_nothing_is_seen_along_it(covered, middle):
     hand = np.zeros((480, 640), bool)
     hand[:, :covered] = True
     at = tumour((0.0, 0.0, middle))
-    over = composite(seen(0.01), CAMERA, at, style="cut", covered=hand, opening=OPENING)
+    over = composite(seen(0.01), CAMERA, at, style="cut", cover=Cover(opening=OPENING, covered=hand))
     assert (over.taken == SHEET).any() == (covered < 640)

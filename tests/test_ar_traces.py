@@ -9,6 +9,7 @@ import trimesh
 from ar.optics.camera import Camera, look_at
 from ar.overlay.composite import SEEN, composite, draw_points
 from ar.overlay.hud import FINE
+from ar.overlay.marks import Marks, Words
 from ar.overlay.outlines import ink_of, silhouette
 from ar.overlay.refind import of_ink, outline_gap, stands
 from ar.overlay.traces import Trace
@@ -38,8 +39,10 @@ def test_traces_are_drawn_under_the_outline_and_the_motion_may_be_given():
     blue = replace(tumour((0.004, 0.0, -0.02)), colour=np.array((0.2, 0.4, 1.0)))
     trace = Trace(blue, (12, 4), np.array([0.004, 0.0, -0.02]))
     ink = ink_of(blue.colour)
-    plain = composite(picture, here, at, style="contour", before=at).colour
-    shown = composite(picture, here, at, style="contour", before=at, traces=[trace], moved=(2e-3, 1.24e-3)).colour
+    plain = composite(picture, here, at, style="contour", marks=Marks(before=at)).colour
+    shown = composite(
+        picture, here, at, style="contour", marks=Marks(before=at, traces=[trace]), words=Words(moved=(2e-3, 1.24e-3))
+    ).colour
     assert not of_ink(plain, ink).any() and of_ink(shown, ink).sum() > 100
     own = of_ink(plain, ink_of(at.colour))
     assert own.sum() > 100 and of_ink(shown, ink_of(at.colour))[own].all()

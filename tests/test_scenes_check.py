@@ -10,6 +10,7 @@ from theatres import PUSHING, SIGHTED, player, put, small, theatre_of
 
 from ar.overlay.composite import composite
 from ar.overlay.hud import millimetres
+from ar.overlay.marks import Cover, Marks
 from ar.rendering.renderer import Picture
 from scenes.cli import main
 from scenes.play.checks import Figures, measure
@@ -114,7 +115,13 @@ def drawn(play, frame, positions, camera=None, tip=None, opening=OPENING):
     gauge = gauged(at, tumour)
     if tip is None:
         gauge = replace(gauge, read=frame.distance)
-    shown = composite(frame.picture, camera or play.camera, tumour, (TOOL,), gauge=gauge, before=rest, opening=opening)
+    shown = composite(
+        frame.picture,
+        camera or play.camera,
+        tumour,
+        cover=Cover((TOOL,), opening=opening),
+        marks=Marks(gauge=gauge, before=rest),
+    )
     annotate(shown, frame.number, frame.remark)
     return replace(frame, shown=shown.colour)
 

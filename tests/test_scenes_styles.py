@@ -9,6 +9,7 @@ import pytest
 from ar.overlay.composite import DOUBTFUL, composite
 from ar.overlay.gauge import GAUGE, Gauge
 from ar.overlay.legend import SHEET
+from ar.overlay.marks import Cover, Marks
 from ar.overlay.outlines import ink_of
 from ar.overlay.refind import found_at
 from ar.overlay.styles import STYLES
@@ -96,7 +97,14 @@ def again(frame, play, opening, gauge=None, style="window"):
     if gauge is None:
         gauge = replace(gauged(frame.tip, tumour), read=frame.distance, error=frame.tumour_error.bound)
     band = frame.tumour_error.bound or 0.0
-    over = composite(frame.picture, play.camera, tumour, (TOOL,), style, band, gauge, rest, opening=opening)
+    over = composite(
+        frame.picture,
+        play.camera,
+        tumour,
+        style=style,
+        cover=Cover((TOOL,), opening=opening),
+        marks=Marks(band, gauge=gauge, before=rest),
+    )
     annotate(over, frame.number, frame.remark)
     return replace(frame, shown=over.colour)
 

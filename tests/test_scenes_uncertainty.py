@@ -329,8 +329,8 @@ class TestSaid:
         frame = player.draw(3, 0.1, scene.path(0.1))
         assert frame.tumour_error.prior == pytest.approx(np.hypot(3e-3, frame.model_error))
         assert frame.model_error == frame.deformation.bound[0, 0]
-        margin, gauge = drawn_with[0][5:7]
-        assert margin == gauge.error == frame.tumour_error.prior
+        marks = drawn_with[0][5]
+        assert marks.margin == marks.gauge.error == frame.tumour_error.prior
         assert list(frame.head) == error_lines(frame.model_error, frame.tumour_error, True)
         assert all(stands(frame.shown, line, FINE) for line in frame.head)
         # The panel of figures begins under them.

@@ -15,15 +15,16 @@ from ..rendering.parallel import load
 from ..rendering.rasteriser import Seen, seen
 from ..rendering.renderer import Picture
 from . import distances, window
-from .gauge import Gauge, draw_line, write_gauge
+from .gauge import draw_line, write_gauge
 from .hud import FINE, FONT, HEAD, NARROW, ROW, folded, lay, millimetres
-from .legend import Entry, Names, legend, place_sheet
+from .legend import Entry, legend, place_sheet
+from .marks import NO_COVER, NO_MARKS, NO_WORDS, Cover, Marks, Words
 from .measured import Measure
 from .outlines import blank, box_around, dash, ink_of, joined, key_of, outlines, pieces
 from .places import CLEAR, PAD
 from .rings import lines_of
 from .styles import STYLES, Opening, Style
-from .traces import BEFORE, DOTTED, Trace, draw_before, draw_trace
+from .traces import BEFORE, DOTTED, draw_before, draw_trace
 from .window import DARK, FRONT, SHUT, Lines, Roles, overlaid
 
 # What may not be relied on is drawn in amber, and broken, with words in a paler one, so that pixels of the outline are
@@ -38,7 +39,6 @@ FAINT = 0.75
 BROKEN, DASHED, HIDDEN = (9, 6), (12, 7), (9, 6)
 # Width of the latter [pixel].
 BOLD = 2
-UNNAMED = Names()
 # Width of lines that stand in the silhouette [pixel].
 SHORT = 96
 # Rows of text by which words of the head may be lower to leave a line in sight.
@@ -83,23 +83,38 @@ def load_kernels(device: str = "cpu") -> None:
     load(device, place, rasteriser, shade, vignette, window, distances)
 
 
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """A picture with its lines, before words.
+
+    Parameters
+    ----------
+    colour, taken
+        As of `Overlaid`.
+    faint, thin
+        (H, W) bool: lines of the margin, and of rings, which words may run over.
+    around
+        The box that was drawn in; None where nothing is in sight.
+    ground
+        What lies over the surface there, if the style tells.
+    """
+
+    colour: np.ndarray
+    taken: np.ndarray
+    faint: np.ndarray
+    thin: np.ndarray
+    around: tuple[slice, slice] | None = None
+    ground: Ground | None = None
+
+
 def composite(
     picture: Picture,
     camera: Camera,
     hidden: Layer,
-    occluders: Sequence[int] = (),
     style: Style = "window",
-    margin: float | np.ndarray = 0.0,
-    gauge: Gauge | None = None,
-    before: Layer | None = None,
-    doubt: str = "",
-    traces: Sequence[Trace] = (),
-    moved: tuple[float, float] | None = None,
-    head: Sequence[str] = (),
-    opening: Opening | None = None,
-    covered: np.ndarray | None = None,
-    error: float | None = None,
-    names: Names = UNNAMED,
+    cover: Cover = NO_COVER,
+    marks: Marks = NO_MARKS,
+    words: Words = NO_WORDS,
 ) -> Overlaid:
     """The picture with a hidden surface drawn into it. On a card, no depth comes back from it but for a cut.
 
@@ -109,126 +124,129 @@ def composite(
         What the camera sees, and that camera.
     hidden
         The surface to show; its colour is used, its place is its silhouette whatever lies in front.
-    occluders
-        Ids of the layers (tool, hand) that cover the overlay wherever the picture shows them.
     style
         "contour": the outline. "window": besides, the ground is dimmed round the outline and the surface shows through,
         shaded, and darker the deeper it lies. "fill": besides the outline, a flat tint. "depth": one that is the
         stronger the nearer the surface lies to the ground, with its scale. "rings": lines on the ground along which it
         is equally far from the surface (`rings.py`). "cut": an inset (`cut.py`). "none": nothing but a doubt.
-    margin
-        One number or (V,) [m]: how uncertain the surface is. Where positive, a dashed second outline runs that far out.
-    gauge
-        Draws the line from the tip to the hidden surface, and its length in millimetres beside the tip.
-    before
-        Where the hidden surface was before, as in the scan: a dotted grey outline, with an arrow from there to here and
-        the mean motion in millimetres.
-    doubt
-        Why the surface's place may not be relied on. It is written at the picture's foot, see `doubt_lines`, whatever
-        the style. The outline is amber and broken. Nothing is promised: no margin is drawn, and the number beside the
-        tip has no error.
-    traces
-        Outlines of other surfaces, drawn under the hidden one's.
-    moved
-        Length and error [m] to be written in place of the mean motion, which has none.
-    head
-        Lines that are written at the picture's head, whatever the style and whatever lies there.
-    opening
-        The ground that the surface may be seen through; None: any. Under other ground the outline is broken, nothing
-        shines through, and the picture says what it lies under where that is a noticeable share.
-    covered
-        (H, W) bool: what covers the overlay besides the occluders, as a hand or cottonoids in a real picture.
-    error
-        How far off the surface may be [m], for the words of the styles that measure; None where nobody knows.
-    names
-        What the lines are called in the legend, which is drawn where there is room.
+    cover, marks, words
+        What lies over the surface, and what is drawn and written besides its outline.
 
     Raises
     ------
     ValueError
         An unknown style, or a camera or a mask whose size is not the picture's.
     """
-    _check(picture, camera, style, covered)
-    shape = camera.height, camera.width
+    _check(picture, camera, style, cover.covered)
     if style == "none":
-        plain = Overlaid(picture.colour.copy(), np.zeros(shape, np.uint8))
-        write_head(plain, head)
-        write_doubt(plain, doubt)
+        plain = Overlaid(picture.colour.copy(), np.zeros((camera.height, camera.width), np.uint8))
+        write_head(plain, words.head)
+        write_doubt(plain, words.doubt)
         return plain
-    if doubt:
-        hidden, margin, error = replace(hidden, colour=DOUBTFUL), 0.0, None
-        gauge = None if gauge is None else replace(gauge, error=None)
+    if words.doubt:
+        gauge = None if marks.gauge is None else replace(marks.gauge, error=None)
+        hidden, words = replace(hidden, colour=DOUBTFUL), replace(words, error=None)
+        marks = replace(marks, margin=0.0, gauge=gauge)
     grown = None
-    if np.any(np.asarray(margin) > 0.0):
+    if np.any(np.asarray(marks.margin) > 0.0):
         normals = vertex_normals(hidden.vertices, hidden.triangles)
-        grown = replace(hidden, vertices=hidden.vertices + np.reshape(margin, (-1, 1)) * normals)
-    roles = Roles(tuple(occluders), None if opening is None else opening.ids, covered)
-    measure = Measure(style, picture, camera, hidden, roles, gauge, names.now, error)
-    surfaces = [layer.vertices for layer in (hidden, grown, before) if layer is not None]
-    surfaces += [trace.layer.vertices for trace in traces]
+        grown = replace(hidden, vertices=hidden.vertices + np.reshape(marks.margin, (-1, 1)) * normals)
+    roles = Roles(tuple(cover.occluders), None if cover.opening is None else cover.opening.ids, cover.covered)
+    measure = Measure(style, picture, camera, hidden, roles, marks.gauge, words.names.now, words.error)
+    surfaces = [layer.vertices for layer in (hidden, grown, marks.before) if layer is not None]
+    surfaces += [trace.layer.vertices for trace in marks.traces]
     box = box_around(camera, np.concatenate([*surfaces, measure.reached]))
-    around = box if gauge is None else joined(box, box_around(camera, np.stack([gauge.tip, gauge.nearest])))
-    taken, ground = np.zeros(shape, np.uint8), None
-    faint, thin = np.zeros(shape, bool), np.zeros(shape, bool)
-    if around is None:
-        out = picture.colour.copy()
-    else:
-        part, device = camera.cropped(*around), str(picture.drawn.colour.device)
-        found = seen(part, hidden.vertices, hidden.triangles, device=device)
-        under, above = blank(part), None
-        if before is not None:
-            draw_before(under, camera, around, before, hidden)
-        if grown is not None:
-            bare = under[..., 3] == 0
-            wider = seen(part, grown.vertices, grown.triangles, device=device).mask
-            dash(under, outlines(wider), margin_ink(hidden), DASHED, 1)
-            faint[around] = bare & (under[..., 3] > 0)
-        if opening is not None:
-            ground = ground_over(picture.segmentation[around], roles.of(picture.segmentation, around), found, opening)
-        for trace in traces:
-            draw_trace(under, part, trace)
-        draw_broken(under, found, ink_of(hidden.colour), ground, doubt)
-        if gauge is not None or style == "cut":
-            above = blank(part)
-        if gauge is not None and above is not None:
-            draw_line(above, part, gauge)
-        bare = under[..., 3] == 0
-        measure.draw(under, under if above is None else above, around)
-        if style == "rings":
-            thin[around] = lines_of(bare & (under[..., 3] > 0))
-        lines = Lines(ink_of(hidden.colour), not doubt, under, above)
-        out, taken[around] = overlaid(picture.drawn, around, part, hidden, found, roles, style, lines)
-    drawn, lined = Overlaid(out, taken), taken.copy()
-    # Head and corner first, so that their words seldom move; then by importance, for some are left out without room.
-    write_head(drawn, head)
-    if before is not None and box is not None:
-        motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
-        said = millimetres(motion) if moved is None else millimetres(*moved)
-        firm = taken * ~faint  # it keeps its place, though it stands on the margin's line
-        lay(out, firm, folded(f"{names.motion} {said}", NARROW * camera.width), (0, camera.height))
-        taken |= firm
-    write_doubt(drawn, doubt)
-    if gauge is None and opening is None and style not in ("depth", "rings", "cut"):
+    sketch = _sketched(measure, grown, marks, cover.opening, bool(words.doubt), box)
+    motion = "" if box is None or marks.before is None else _motion(hidden, marks.before, words)
+    drawn = _written(sketch, camera, words, motion)
+    if marks.gauge is None and cover.opening is None and style not in ("depth", "rings", "cut"):
         return drawn
-    whole = roles.of(picture.segmentation)
+    return _explained(drawn, sketch, measure, legend_entries(hidden, grown, marks, words))
+
+
+def _sketched(
+    measure: Measure, grown: Layer | None, marks: Marks, opening: Opening | None, doubtful: bool,
+    box: tuple[slice, slice] | None,
+) -> Sketch:  # fmt: skip
+    """Draw all lines of what a measure shows, `grown` by its margin; the surfaces lie in a `box`."""
+    picture, camera, hidden, style, gauge = measure.picture, measure.camera, measure.hidden, measure.style, marks.gauge
+    shape = camera.height, camera.width
+    taken, faint, thin = np.zeros(shape, np.uint8), np.zeros(shape, bool), np.zeros(shape, bool)
+    around = box if gauge is None else joined(box, box_around(camera, np.stack([gauge.tip, gauge.nearest])))
+    if around is None:
+        return Sketch(picture.colour.copy(), taken, faint, thin)
+    part, device = camera.cropped(*around), str(picture.drawn.colour.device)
+    found = seen(part, hidden.vertices, hidden.triangles, device=device)
+    under, above, ground = blank(part), None, None
+    if marks.before is not None:
+        draw_before(under, camera, around, marks.before, hidden)
+    if grown is not None:
+        bare = under[..., 3] == 0
+        wider = seen(part, grown.vertices, grown.triangles, device=device).mask
+        dash(under, outlines(wider), margin_ink(hidden), DASHED, 1)
+        faint[around] = bare & (under[..., 3] > 0)
+    if opening is not None:
+        role = measure.roles.of(picture.segmentation, around)
+        ground = ground_over(picture.segmentation[around], role, found, opening)
+    for trace in marks.traces:
+        draw_trace(under, part, trace)
+    draw_broken(under, found, ink_of(hidden.colour), ground, doubtful)
+    if gauge is not None or style == "cut":
+        above = blank(part)
+    if gauge is not None and above is not None:
+        draw_line(above, part, gauge)
+    bare = under[..., 3] == 0
+    measure.draw(under, under if above is None else above, around)
+    if style == "rings":
+        thin[around] = lines_of(bare & (under[..., 3] > 0))
+    lines = Lines(ink_of(hidden.colour), not doubtful, under, above)
+    out, taken[around] = overlaid(picture.drawn, around, part, hidden, found, measure.roles, style, lines)
+    return Sketch(out, taken, faint, thin, around, ground)
+
+
+def _motion(hidden: Layer, before: Layer, words: Words) -> str:
+    """How far the surface has moved, in words."""
+    mean = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
+    return f"{words.names.motion} {millimetres(mean) if words.moved is None else millimetres(*words.moved)}"
+
+
+def _written(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overlaid:
+    """Write head, motion and doubt.
+
+    Head and corner come first, so that their words seldom move; then by importance, for some are left out without room.
+    """
+    drawn = Overlaid(sketch.colour, sketch.taken.copy())
+    write_head(drawn, words.head)
+    if motion:
+        firm = drawn.taken * ~sketch.faint  # it keeps its place, though it stands on the margin's line
+        lay(drawn.colour, firm, folded(motion, NARROW * camera.width), (0, camera.height))
+        np.bitwise_or(drawn.taken, firm, out=drawn.taken)
+    write_doubt(drawn, words.doubt)
+    return drawn
+
+
+def _explained(drawn: Overlaid, sketch: Sketch, measure: Measure, keys: Sequence[Entry]) -> Overlaid:
+    """Write the number beside the tip, what closed ground covers, what the style means, and the legend."""
+    out, taken = drawn.colour, drawn.taken
+    whole = measure.roles.of(measure.picture.segmentation)
     front = (whole == FRONT).view(np.uint8)
     apart = np.zeros_like(taken)
-    if gauge is not None:
+    if measure.gauge is not None:
         before_it = taken.copy()
-        write_gauge(out, taken, camera, gauge, front, lined, thin)
+        write_gauge(out, taken, measure.camera, measure.gauge, front, sketch.taken, sketch.thin)
         # What explains the style is no explanation of the number.
-        apart = cv2.dilate(taken & ~before_it, np.ones((2 * APART + 1,) * 2, np.uint8))
-    if ground is not None and around is not None:
-        write_ground(drawn, around, ground, front, lined)
-        sights = (whole != SHUT).view(np.uint8)
-        needed = front.copy()
-        for each in (sights, needed):
-            each[around] |= ground.mask
-        measure.lay(out, taken, sights | apart, needed)
-        keys = legend_entries(hidden, grown, before, traces, doubt, names)
-        return replace(drawn, named=bool(keys) and place_sheet(out, taken, legend(keys), sights))
-    measure.lay(out, taken, front, front)
-    return drawn
+        apart = cv2.dilate(((taken > 0) & (before_it == 0)).view(np.uint8), np.ones((2 * APART + 1,) * 2, np.uint8))
+    ground, around = sketch.ground, sketch.around
+    if ground is None or around is None:
+        measure.lay(out, taken, front, front)
+        return drawn
+    write_ground(drawn, around, ground, front, sketch.taken)
+    sights = (whole != SHUT).view(np.uint8)
+    needed = front.copy()
+    for each in (sights, needed):
+        each[around] |= ground.mask
+    measure.lay(out, taken, sights | apart, needed)
+    return replace(drawn, named=bool(keys) and place_sheet(out, taken, legend(keys), sights))
 
 
 def _check(picture: Picture, camera: Camera, style: str, covered: np.ndarray | None) -> None:
@@ -252,10 +270,10 @@ def ground_over(segmentation: np.ndarray, role: np.ndarray, found: Seen, opening
 
 
 def draw_broken(
-    sheet: np.ndarray, found: Seen, ink: tuple[float, float, float], ground: Ground | None, doubt: str
+    sheet: np.ndarray, found: Seen, ink: tuple[float, float, float], ground: Ground | None, doubtful: bool
 ) -> None:
     """Draw what of an outline is no solid line, in place: all of a doubtful one, and what closed ground covers."""
-    if doubt:
+    if doubtful:
         dash(sheet, outlines(found.mask), ink, BROKEN)
     elif ground is not None and ground.shut.any():
         dash(sheet, pieces(outlines(ground.mask), ground.shut), ink, HIDDEN, BOLD)
@@ -266,16 +284,15 @@ def margin_ink(hidden: Layer) -> tuple[float, ...]:
     return tuple(FAINT * share for share in ink_of(hidden.colour))
 
 
-def legend_entries(
-    hidden: Layer, grown: Layer | None, before: Layer | None, traces: Sequence[Trace], doubt: str, names: Names
-) -> tuple[Entry, ...]:
+def legend_entries(hidden: Layer, grown: Layer | None, marks: Marks, words: Words) -> tuple[Entry, ...]:
     """The lines that are drawn and have a name."""
-    named = zip(traces, names.traces, strict=False)
+    names = words.names
+    named = zip(marks.traces, names.traces, strict=False)
     entries = [
-        Entry(names.now, key_of(ink_of(hidden.colour)), BROKEN if doubt else None, BOLD),
+        Entry(names.now, key_of(ink_of(hidden.colour)), BROKEN if words.doubt else None, BOLD),
         *([] if grown is None else [Entry(names.margin, margin_ink(hidden), DASHED, 1)]),
         *(Entry(name, key_of(ink_of(trace.layer.colour)), trace.pattern) for trace, name in named),
-        *([] if before is None else [Entry(names.before, ink_of(BEFORE), DOTTED)]),
+        *([] if marks.before is None else [Entry(names.before, ink_of(BEFORE), DOTTED)]),
     ]
     return tuple(entry for entry in entries if entry.name)
 

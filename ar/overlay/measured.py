@@ -45,7 +45,7 @@ class Measure:
     name
         What the hidden surface is called.
     error
-        How far off it may be [m]; None where nobody knows.
+        How far off it may be [m]; None where it is not known.
     """
 
     style: Style

@@ -14,6 +14,7 @@ from ar.overlay.composite import Overlaid, composite, draw_points, head_lines
 from ar.overlay.gauge import Gauge
 from ar.overlay.hud import NARROW, folded, lay
 from ar.overlay.legend import Names
+from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.styles import Style
 from ar.overlay.traces import Trace
 from ar.rendering.layer import Layer
@@ -244,10 +245,9 @@ class Player:
         remarks = self.scene.stopped(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
         if self.composed:
-            over = composite(
-                picture, camera, tumour, COVERS, self.style, band, shown, rest, doubt, traces, moved, head,
-                opening=OPENING, error=error.bound, names=names_of(estimate),
-            )  # fmt: skip
+            marks = Marks(band, shown, rest, traces)
+            words = Words(doubt, head, names_of(estimate), moved, error.bound)
+            over = composite(picture, camera, tumour, self.style, Cover(COVERS, OPENING), marks, words)
             if estimate is not None and self.style != "none":
                 draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
             annotate(over, number, remark)

@@ -9,6 +9,7 @@ import numpy as np
 from ar.optics.camera import look_at
 from ar.overlay.composite import DASHED, composite
 from ar.overlay.hud import panel
+from ar.overlay.marks import Cover
 from ar.overlay.outlines import dash, outlines, silhouette
 from sim.bodies.intensity import read_intensity, sidecar
 from sim.geometry.ball_at_rest import resting_tip
@@ -51,7 +52,7 @@ def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
     tool = Probe(radius)
     stage = Stage(replace(find_scene("press"), viewpoint=VIEW, tool=tool), site, scan)
     picture = stage.picture(camera, there, tool.pose(tip, site.axis, site.right))
-    shown = composite(picture, camera, stage.tumour(predicted), (TOOL,), "window").colour
+    shown = composite(picture, camera, stage.tumour(predicted), style="window", cover=Cover((TOOL,))).colour
     reference = stage.tumour(there)
     dash(shown, outlines(silhouette(camera, reference.vertices, reference.triangles)), YELLOW, DASHED, 1)
     force = float(np.linalg.norm(pushed.force[worst]))

@@ -11,6 +11,7 @@ from ar.optics.camera import Camera
 from ar.overlay.composite import HEAD_WIDTHS, Overlaid, composite, write_doubt, write_head
 from ar.overlay.gauge import Gauge
 from ar.overlay.hud import bound_words, folded
+from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.outlines import box_around, dash, ink_of, joined, outlines, silhouette
 from ar.overlay.styles import NOTICED, Opening, Style
 from ar.overlay.traces import BEFORE, DOTTED
@@ -72,11 +73,9 @@ class Painter:
         picture = real_picture(colour, camera, layers, box or whole, self.device)
         lines = [*head_lines(known), *self._hidden_words(camera, tumour, covered)]
         head = [part for line in lines for part in folded(line, HEAD_WIDTHS[0] * camera.width)]
-        return composite(
-            picture, camera, tumour, (TOOL,), self.style, band, gauge, before, doubt,
-            moved=(known.motion.moved, known.motion.error), head=head, opening=SEEN_THROUGH, error=known.band,
-            names=PREDICTED_LINES, covered=covered,
-        )  # fmt: skip
+        cover = Cover((TOOL,), SEEN_THROUGH, covered)
+        words = Words(doubt, head, PREDICTED_LINES, (known.motion.moved, known.motion.error), known.band)
+        return composite(picture, camera, tumour, self.style, cover, Marks(band, gauge, before), words)
 
     def _hidden_words(self, camera: Camera, tumour: Layer, covered: np.ndarray | None) -> Sequence[str]:
         """What a picture says of what lies in front of the tumour, where that hides a noticeable share of it."""
