@@ -51,7 +51,7 @@ ORDER = (
     {"scenes.commands"},
     {"benchmarks.peers", "benchmarks.studies"},
     {"benchmarks.figures"},
-    {"benchmarks.commands", "benchmarks.displacement_from_pictures"},
+    {"benchmarks.commands"},
     {"benchmarks.heads", "benchmarks.liver_sequences", "benchmarks.located_scenes"},
 )
 """Folders from below, and the modules that lie beside them: each imports itself and what lies under it."""
