@@ -33,14 +33,12 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.direction_split import leave_sectors_out
 from surrogate.data.encode import directions, reduce, tool_features
 from surrogate.model.training_range import envelope_of
-from surrogate.regressors.svr import Svr
 from surrogate.training.expansion import COARSE, EXPANDED
 from surrogate.training.learners import SVR
-from surrogate.training.published_models import from_angles, published_nodes, sites_of, thirteen, to_angles
 from surrogate.training.train import train
 from surrogate.training.tuning import Tuned
 
-SPECS = (Elements("FEM"), Elements("linear law", law="linear"), Learner("linear"), Learner("published-svr"))
+SPECS = (Elements("FEM"), Elements("linear law", law="linear"), Learner("linear"))
 
 
 @pytest.fixture(scope="module")
@@ -99,47 +97,36 @@ def test_numbers_are_those_recomputed_by_hand(study, page, box):
         assert np.allclose([held["worst"][each] for each in names], worst, rtol=1e-5)
         assert held["loads"] == test.sum() and held["values"] == test.sum() * len(box.tumour_nodes)
     assert stored[2]["loads"] == study.discs.train.sum() and stored[2]["units"] == 3 * box.craniotomy.sum()
-    # A published learner is given no unit responses.
-    assert stored[3]["loads"] == study.discs.train.sum() and stored[3]["units"] == stored[3]["series"] == 0
 
 
-@pytest.mark.parametrize("name", ["svr", "published-svr"])
-def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, box, tmp_path, name, monkeypatch):
+def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, box, tmp_path, monkeypatch):
     """Fitted here to the training rows; in the file that the report reads, answers to the discs' loads are wild."""
-    training, pushed, nodes = study.discs.train, study.pushed, Learner(name).vertices(box)
+    training, pushed, nodes = study.discs.train, study.pushed, box.tumour_nodes
     truth = study.dataset.displacement(nodes)[study.dataset.good]
     path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
     monkeypatch.setattr("scenes.report.learner.counts", lambda most: [])
     monkeypatch.setattr("scenes.report.learner.coverage_of", lambda *known: {})
     with one_thread():
-        row, field = measure_learner(replace(study, data=path), Learner(name))
+        row, field = measure_learner(replace(study, data=path), Learner("svr"))
     lesson = Pushed(pushed.point[training], pushed.force[training], pushed.footprint[training])
-    if name == "svr":
-        size, (every, direction) = directions(lesson)[0], directions(pushed)
-        basis = reduce(nodes, truth[training] / size[:, None, None], *COARSE)
-        machine = Tuned(SVR).fit(
-            tool_features(study.patch, lesson), basis.encode(truth[training] / size[:, None, None])
-        )
-        within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
-        guess = every[:, None, None] * basis.decode(machine.predict(tool_features(study.patch, within)))
-    else:
-        learnt, asked = (thirteen(*sites_of(box, nodes), each) for each in (lesson, pushed))
-        angles = to_angles(truth[training].astype(float))
-        predicted = [Svr().fit(x, angles[:, k]).predict(asked[k]) for k, x in enumerate(learnt)]
-        guess = from_angles(np.stack(predicted, axis=1).astype(float))
+    size, (every, direction) = directions(lesson)[0], directions(pushed)
+    basis = reduce(nodes, truth[training] / size[:, None, None], *COARSE)
+    machine = Tuned(SVR).fit(tool_features(study.patch, lesson), basis.encode(truth[training] / size[:, None, None]))
+    within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
+    guess = every[:, None, None] * basis.decode(machine.predict(tool_features(study.patch, within)))
     played = [np.flatnonzero((pushed.point == point).all(axis=1))[0] for point in study.played.of(Pushed).point]
     np.testing.assert_allclose(field, guess[played], rtol=1e-3, atol=1e-9)
     wanted = 1e3 * np.linalg.norm(guess[study.discs.test] - wild[nodes], axis=2)
     mm = row.own_fem["discs"].mm
     assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
     assert row.loads == training.sum()
-    if name == "svr":  # of loads that point into the sectors, by a model of those that do not
-        data, sectors = read_dataset(path), leave_sectors_out(pushed, study.patch)
-        asked = data.loads.rows(np.flatnonzero(data.good)[sectors.test])
-        guess = train(data, [name], split=sectors).models[name].deform(asked, at=nodes).displacement
-        wanted = 1e3 * np.linalg.norm(guess - data.displacement(nodes)[data.good][sectors.test], axis=2)
-        mm = row.own_fem["sectors"].mm
-        assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
+    # Of loads that point into the sectors, by a model of those that do not.
+    data, sectors = read_dataset(path), leave_sectors_out(pushed, study.patch)
+    asked = data.loads.rows(np.flatnonzero(data.good)[sectors.test])
+    guess = train(data, ["svr"], split=sectors).models["svr"].deform(asked, at=nodes).displacement
+    wanted = 1e3 * np.linalg.norm(guess - data.displacement(nodes)[data.good][sectors.test], axis=2)
+    mm = row.own_fem["sectors"].mm
+    assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
 
 
 def test_what_is_played_lies_in_the_discs_alone(study):
@@ -156,17 +143,14 @@ def test_what_is_played_lies_in_the_discs_alone(study):
     assert list(force) == [size.min(), size.max()]
 
 
-def test_rows_say_what_they_are(found, box):
-    fem, law, learner, published = found
+def test_rows_say_what_they_are(found):
+    fem, law, learner = found
     assert (fem.against, law.against, learner.against) == ("error", "model difference", "error")
     assert law.reference.mm.mean > fem.reference.mm.mean > 0.0 and not fem.own_fem
     assert set(learner.own_fem) == {"discs", "sectors", "beyond"} and learner.flagged["beyond"] == 1.0
-    assert (
-        set(learner.covered) == {"discs", "beyond"} and max(learner.covered.values()) <= 1.0 and not published.covered
-    )
+    assert set(learner.covered) == {"discs", "beyond"} and max(learner.covered.values()) <= 1.0
     assert learner.own_fem["beyond"].percent.mean > learner.own_fem["discs"].percent.mean
     assert (fem.timed, fem.p99, learner.timed) == (2, None, 30) and fem.median > learner.median > 0.0
-    assert published.reference.values == 2 * len(published_nodes(box)) and published.picture is None
     assert learner.adapt is None and fem.adapt > 0.0 and learner.curve[-1] == (learner.loads, learner.own_fem["discs"])
     assert read_back(learner) == learner
     assert 0.05 < peak_memory() < 50.0
@@ -212,19 +196,19 @@ def test_only_what_lacks_is_measured_again(study, found, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         list(rows(here, SPECS, run))
     assert tuple(rows(here, SPECS, run)) == found
-    assert asked == ["FEM", "linear law", "linear law", "linear", "published-svr"]
-    assert tuple(rows(here, SPECS, run)) == found and len(asked) == 5
+    assert asked == ["FEM", "linear law", "linear law", "linear"]
+    assert tuple(rows(here, SPECS, run)) == found and len(asked) == 4
     list(rows(replace(here, timed=31), SPECS[:1], run))
-    assert asked[5:] == ["FEM"]
+    assert asked[4:] == ["FEM"]
     kept = tmp_path / "rows" / "data-linear.json"
     stored = json.loads(kept.read_text())
     former = {"own_fem": "teacher", "loads": "taught"}
     row = {former.get(name, name): value for name, value in stored["row"].items()}
     kept.write_text(json.dumps({**stored, "row": row}))
-    assert tuple(rows(here, SPECS[2:3], run)) == found[2:3] and "teacher" in row and len(asked) == 6
+    assert tuple(rows(here, SPECS[2:3], run)) == found[2:3] and "teacher" in row and len(asked) == 5
     kept.write_text(kept.read_text()[:-9])
     list(rows(here, SPECS, run))
-    assert asked[6:] == ["FEM", "linear"], (
+    assert asked[5:] == ["FEM", "linear"], (
         "the first file held other inputs, the last was not whole; names from before are read"
     )
 

@@ -10,7 +10,6 @@ from scipy.spatial.distance import cdist
 
 from surrogate.model.store import REGRESSORS
 from surrogate.regressors.ann import Ann
-from surrogate.regressors.bayesian import Bayesian
 from surrogate.regressors.compliance_table import Linear
 from surrogate.regressors.gp import Gp, matern, negative_likelihood
 from surrogate.regressors.pcr import Pcr
@@ -18,9 +17,9 @@ from surrogate.regressors.svr import Svr
 from surrogate.training.learners import SVR
 from surrogate.training.tuning import Tuned, inner_discs
 
-MAKE = {"linear": Linear, "ann": lambda: Ann(hidden=12, steps=150), "svr": Svr, "gp": Gp, "bayesian": Bayesian}
+MAKE = {"linear": Linear, "ann": lambda: Ann(hidden=12, steps=150), "svr": Svr, "gp": Gp}
 MAKE["pcr"] = lambda: Pcr(share=1.0)  # its features here have several units
-LEARNT = {"linear": 0.25, "pcr": 0.25, "ann": 0.05, "svr": 0.25, "gp": 0.01, "bayesian": 0.05}
+LEARNT = {"linear": 0.25, "pcr": 0.25, "ann": 0.05, "svr": 0.25, "gp": 0.01}
 """Error in the largest output against its deviation."""
 RANDOM = np.random.default_rng(3)
 MIX, BEND = RANDOM.normal(size=(5, 4)), RANDOM.normal(size=(5, 4))

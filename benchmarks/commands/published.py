@@ -14,8 +14,9 @@ from tqdm import tqdm
 from scenes.options.shared_options import add_json
 from surrogate.data.dataset import read_dataset
 from surrogate.evaluation.score import score, table
-from surrogate.training.published_models import MACHINES, published_nodes
-from surrogate.training.published_protocol import positions_of, trained_in_turn
+
+from ..published.models import MACHINES, published_nodes
+from ..published.protocol import positions_of, trained_in_turn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

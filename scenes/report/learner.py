@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim.anatomy import Anatomy
 from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
 from surrogate.data.direction_split import leave_sectors_out
@@ -14,7 +13,6 @@ from surrogate.data.disc_split import Split
 from surrogate.evaluation.coverage import TENTHS, coverage
 from surrogate.evaluation.score import bare_microseconds, single_seconds
 from surrogate.evaluation.solve_counts import SolveCounts
-from surrogate.training.published_models import MACHINES, published_model, published_nodes
 from surrogate.training.train import train
 
 from ..analysis.stopwatch import timed
@@ -29,26 +27,20 @@ FEWEST_LOADS = 64
 
 @dataclass(frozen=True)
 class Learner:
-    """One of `train.LEARNERS`, or of `published_models.MACHINES`, which know every tenth vertex."""
+    """One of `train.LEARNERS`."""
 
     name: str
 
-    def vertices(self, anatomy: Anatomy) -> np.ndarray:
-        """Those of the tumour (k,) that it knows."""
-        return published_nodes(anatomy) if self.name in MACHINES else anatomy.tumour_nodes
-
 
 def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
-    """The row, and displacements (n, k, 3) [m] of the vertices that it knows under the played loads.
+    """The row, and displacements (n, k, 3) [m] of the tumour's vertices under the played loads.
 
     Raises
     ------
     InputError
         What `train` refuses.
     """
-    nodes = spec.vertices(study.anatomy)
-    known = np.isin(study.anatomy.tumour_nodes, nodes)
-    truth = study.answers[:, known]
+    nodes, truth = study.anatomy.tumour_nodes, study.answers
 
     def judged(model: Deformer, split: Split) -> tuple[Figures | None, float]:
         """Against the data's own answers to the loads that a split leaves out."""
@@ -56,20 +48,20 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         return _held(model, study.converged.rows(rows), truth[rows], nodes)
 
     discs, sectors = study.discs, leave_sectors_out(study.pushed, study.patch)
-    (model, solves), learning = timed(_trained, study, spec, discs, truth)
+    (model, solves), learning = timed(_trained, study, spec, discs)
     order = np.flatnonzero(discs.train)
     curve = []
     for count in counts(len(order)):
         left_aside = np.isin(np.arange(len(discs.disc)), order[count:])
         fewer = replace(discs, disc=np.where(left_aside, -2, discs.disc))
-        curve.append((count, judged(_trained(study, spec, fewer, truth)[0], discs)[0]))
-    of_discs, of_sectors = judged(model, discs), judged(_trained(study, spec, sectors, truth)[0], sectors)
+        curve.append((count, judged(_trained(study, spec, fewer)[0], discs)[0]))
+    of_discs, of_sectors = judged(model, discs), judged(_trained(study, spec, sectors)[0], sectors)
     beyond = beyond_of(study)
     outside = study.outside.rows(np.flatnonzero(beyond.good))
     sets = {
         "discs": of_discs,
         "sectors": of_sectors,
-        "beyond": _held(model, outside, beyond.displacement[beyond.good][:, known], nodes),
+        "beyond": _held(model, outside, beyond.displacement[beyond.good], nodes),
     }
     field = model.deform(study.played, at=nodes).displacement
     covered = coverage_of(study, spec, outside, beyond.displacement[beyond.good])
@@ -105,8 +97,6 @@ def counts(most: int) -> list[int]:
 
 def coverage_of(study: Study, spec: Learner, outside: Loads, truth: np.ndarray) -> dict[str, float]:
     """How often bounds at 0.95 hold where nothing is promised; `truth` (B, n, 3) [m] of the loads `outside`."""
-    if spec.name in MACHINES:
-        return {}
     trained = train(study.dataset, [spec.name], expansion=study.expansion)
     model, found = trained.models[spec.name], trained.left_out.get(spec.name)
     held = {} if found is None else {"discs": found.held[0]}
@@ -121,24 +111,18 @@ def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]
     if seconds is None:
         return None, None
     after = debulked_study(study)
-    nodes = spec.vertices(after.anatomy)
-    truth = after.answers[:, np.isin(after.anatomy.tumour_nodes, nodes)]
-    (model, _), learning = timed(_trained, after, spec, after.discs, truth)
+    (model, _), learning = timed(_trained, after, spec, after.discs)
     rows = np.flatnonzero(after.discs.test)
     seconds += learning + series_seconds(after, spec.name)
-    return seconds, _held(model, after.converged.rows(rows), truth[rows], nodes)[0]
+    return seconds, _held(model, after.converged.rows(rows), after.answers[rows], after.anatomy.tumour_nodes)[0]
 
 
-def _trained(study: Study, spec: Learner, split: Split, truth: np.ndarray) -> tuple[Deformer, SolveCounts]:
-    """A model of the split's training loads, and the solves that it took; truth (B, k, 3) [m] of all that converged."""
-    if spec.name not in MACHINES:
-        trained = train(study.dataset, [spec.name], split=split, expansion=study.expansion)
-        solves = trained.scores[0].solves
-        assert solves is not None
-        return trained.models[spec.name], solves
-    rows = np.flatnonzero(split.train)
-    solves = SolveCounts(len(rows), 0, 0, 0, study.dataset.seconds("load", len(rows)))
-    return published_model(spec.name, study.anatomy, study.converged.rows(rows), truth[rows]), solves
+def _trained(study: Study, spec: Learner, split: Split) -> tuple[Deformer, SolveCounts]:
+    """Train a model on the training loads of a split; with the solves that it took."""
+    trained = train(study.dataset, [spec.name], split=split, expansion=study.expansion)
+    solves = trained.scores[0].solves
+    assert solves is not None
+    return trained.models[spec.name], solves
 
 
 def _held(model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> tuple[Figures | None, float]:

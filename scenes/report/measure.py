@@ -42,8 +42,6 @@ def measured(study: Study, spec: Spec, picture: Path) -> Row:
     except InputError as error:
         return Row(spec.name, FAMILY[type(spec)], state=str(error))
     row = replace(row, memory=peak_memory())
-    if field.shape[1] < len(study.anatomy.tumour_nodes):
-        return row  # what knows some vertices alone has no surface to draw
     # What pictures take is not the row's.
     from ar.screen import write_png
 

@@ -23,7 +23,6 @@ from sim.accuracy import FLOOR, Precision
 from sim.geometry.tetmesh import digest_of
 from sim.material import LAWS
 from sim.runtime.atomic_files import written_whole
-from surrogate.training.published_models import MACHINES
 from surrogate.training.train import LEARNERS
 
 from .finite_elements import HALVED, OWN, STANDARD, Elements, law_of
@@ -67,8 +66,8 @@ def every(study: Study) -> tuple[Elements, ...]:
 
 
 def learners() -> tuple[Learner, ...]:
-    """Whatever `surrogate` knows, the published ones last."""
-    return tuple(Learner(name) for name in (*LEARNERS, *MACHINES))
+    """One for each learner of `surrogate`."""
+    return tuple(Learner(name) for name in LEARNERS)
 
 
 def apart(turn: AbstractContextManager[object], study: Study, spec: Spec, picture: Path) -> Row:

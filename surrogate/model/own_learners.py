@@ -18,7 +18,6 @@ GROUP = "sulcus.learners"
 RESERVED = frozenset(
     [
         "ann",
-        "bayesian",
         "contact",
         "contact-gp",
         "gp",

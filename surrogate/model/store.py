@@ -23,7 +23,6 @@ from sim.tools import stated_tool
 from ..data.encode import Basis
 from ..data.stated_tissue import first_stated
 from ..regressors.ann import Ann
-from ..regressors.bayesian import Bayesian
 from ..regressors.compliance_table import Linear
 from ..regressors.force_pairs import Pairs
 from ..regressors.force_series import Series
@@ -51,7 +50,6 @@ REGRESSORS: dict[str, type[Regressor]] = {
     "ann": Ann,
     "svr": Svr,
     "gp": Gp,
-    "bayesian": Bayesian,
 }
 # These know the tool's features, and their meaning.
 FITTED: dict[str, type[Fitted]] = {

@@ -37,8 +37,7 @@ def forward(x: Any, weights: Sequence[Any], biases: Sequence[Any], tanh: Callabl
 class Ann:
     """Two hidden layers of tanh units, fitted by L-BFGS with weight decay.
 
-    One network serves all vertices, where the published one (`bayesian.py`) has four units for each output of each
-    vertex. A quasi-Newton method fits it on the whole set, with a fixed weight decay.
+    One network serves all vertices. A quasi-Newton method fits it on the whole set, with a fixed weight decay.
 
     Parameters
     ----------

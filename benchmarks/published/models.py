@@ -1,4 +1,4 @@
-"""The published model and protocol: a learner for each tenth tumour vertex, one force position left out at a time.
+"""The published model: a learner for each tenth vertex of the tumour.
 
 Tonutti, Gras, Yang 2017, "A machine learning approach for real-time modelling of tissue deformation in image-guided
 neurosurgery", Artif. Intell. Med. 80:39-47. Substitutes: `Bayesian` for MATLAB's `trainbr`; `Svr` for its `fitrsvm`.
@@ -22,14 +22,14 @@ from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.loads import Loads, Pushed
 from sim.runtime.threads import one_thread
+from surrogate.data.cortex_patch import Patch, open_patch
+from surrogate.data.encode import directions
+from surrogate.model.learned import only_pushed, predicted
+from surrogate.model.training_range import Envelope, envelope_of
+from surrogate.regressors.protocol import Regressor
+from surrogate.regressors.svr import Svr
 
-from ..data.cortex_patch import Patch, open_patch
-from ..data.encode import directions
-from ..model.learned import only_pushed, predicted
-from ..model.training_range import Envelope, envelope_of
-from ..regressors.bayesian import Bayesian
-from ..regressors.protocol import Regressor
-from ..regressors.svr import Svr
+from .bayesian import Bayesian
 
 MACHINES: dict[str, Callable[[], Regressor]] = {"published-ann": Bayesian, "published-svr": Svr}
 # As the authors' own animation did: a machine for every vertex takes hours.

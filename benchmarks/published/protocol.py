@@ -11,10 +11,10 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformation, joined
 from sim.errors import InputError
 from sim.loads import Loads
+from surrogate.data.cortex_patch import nearest
+from surrogate.model.learned import only_pushed
 
-from ..data.cortex_patch import nearest
-from ..model.learned import only_pushed
-from .published_models import Published, published_model
+from .models import Published, published_model
 
 # Positions closer than this are one [m]; the published protocol has eleven.
 SAME, MOST = 1e-6, 11

@@ -9,12 +9,8 @@ from programs import main
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from sim.deformation import Deformer, Outcome
-from sim.errors import InputError
-from sim.loads import Displaced, Loads, Pushed, push
-from surrogate.data.simulate import simulate
-from surrogate.data.tool_loads import draw
-from surrogate.regressors.bayesian import (
+from benchmarks.published import models
+from benchmarks.published.bayesian import (
     Bayesian,
     descended,
     expansion,
@@ -24,8 +20,7 @@ from surrogate.regressors.bayesian import (
     strengths,
     well_determined,
 )
-from surrogate.training import published_models
-from surrogate.training.published_models import (
+from benchmarks.published.models import (
     MACHINES,
     from_angles,
     published_model,
@@ -34,7 +29,12 @@ from surrogate.training.published_models import (
     thirteen,
     to_angles,
 )
-from surrogate.training.published_protocol import positions_of, trained_in_turn
+from benchmarks.published.protocol import positions_of, trained_in_turn
+from sim.deformation import Deformer, Outcome
+from sim.errors import InputError
+from sim.loads import Displaced, Loads, Pushed, push
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
 
 RANDOM = np.random.default_rng(11)
 
@@ -170,7 +170,7 @@ class Spy:
 
 
 def test_a_position_left_out_is_never_shown(box, loads, truth, monkeypatch):
-    monkeypatch.setitem(published_models.MACHINES, "published-svr", Spy)
+    monkeypatch.setitem(models.MACHINES, "published-svr", Spy)
     pushed, seen = loads.of(Pushed), []
     with threadpool_limits(2, "blas"):
         model = trained_in_turn("published-svr", box, loads, truth, lambda: seen.append(1))

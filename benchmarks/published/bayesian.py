@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from .protocol import Stored
+from surrogate.regressors.protocol import Stored
 
 # The damping of MATLAB's `trainbr`: the first, its factors after a good and a bad step, and where a network ends.
 DAMPING, DOWN, UP, MOST_DAMPING = 5e-3, 0.1, 10.0, 1e10
