@@ -40,7 +40,7 @@ def instructions():
 def test_distribution_has_one_name():
     assert PROJECT["name"] == DISTRIBUTION and DISTRIBUTION != "sulcus"
     own = [one for extra in EXTRAS.values() for one in extra if re.match(r"sulcus\b", one)]
-    assert own == [f"{DISTRIBUTION}[camera,data,docs,gym,onnx,slicer]"]
+    assert own == [f"{DISTRIBUTION}[camera,data,docs,gym,onnx,report,slicer]"]
 
 
 def test_instructions_install_the_checkout_and_no_other_name():
@@ -54,7 +54,7 @@ def test_instructions_install_the_checkout_and_no_other_name():
             assert set(extras.split(",")) <= set(EXTRAS), f"{name}: {extras}"
 
 
-@pytest.mark.parametrize("extra", ["camera", "data", "gym", "heads", "onnx", "peers", "slicer"])
+@pytest.mark.parametrize("extra", ["camera", "data", "gym", "heads", "onnx", "peers", "report", "slicer"])
 def test_install_hint_names_an_extra_that_exists(extra):
     assert extra in EXTRAS and install_hint(extra).endswith(f"pip install -e '.[{extra}]'.")
 
