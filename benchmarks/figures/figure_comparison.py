@@ -73,13 +73,11 @@ def compared(old: Record, new: Record) -> Comparison:
     if not changes and not lost:
         raise InputError(
             "the two records have no figure in common that one command measured on one anatomy: "
-            "measure one of them anew, with the --only, --quick and --anatomy of the other."
+            "measure one of them anew, with the --only and --anatomy of the other."
         )
     here = {entry.name for entry in new.rows}
     notes = [f"{name} is not compared: the new record does not have it." for name in before if name not in here]
     notes += [note for pair in both for note in _notes(*pair)]
-    if any(mine.quick for _, mine in same):
-        notes.append("Figures were measured with --quick, whose times mean nothing.")
     return Comparison(changes, lost, tuple(dict.fromkeys(notes)))
 
 

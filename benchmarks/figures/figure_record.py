@@ -7,46 +7,39 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import msgspec
 
-from sim.arguments import LARGEST as LARGEST_NUMBER
-from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
 
 from .figure_readings import Better
-from .figures import NAMED, PROGRAM, command_of
+from .figures import PROGRAM
 
 FORMAT = "sulcus bench figures 1"
 FORMER = "sulcus bench "
 """Beginning of the commands in older records."""
 KIND = "a record of `python -m benchmarks all`"
-LARGEST = 16 * 1024**2
-"""Bytes of a file that is read: one of all figures has 0.1 million."""
-# Printed on terminals and into pages, so without control characters.
-Text = Annotated[str, msgspec.Meta(pattern=r"\A[^\x00-\x1f\x7f-\x9f]*\Z", max_length=2000)]
-Number = Annotated[float, msgspec.Meta(ge=0.0, le=LARGEST_NUMBER)]
 
 
 @dataclass(frozen=True)
 class Origin:
     """Where a figure comes from: version and digest of the code, machine, digest of the anatomy, date."""
 
-    version: Text
-    machine: Text
-    anatomy: Text
-    date: Text
+    version: str
+    machine: str
+    anatomy: str
+    date: str
 
 
 @dataclass(frozen=True)
 class Value:
     """A number that was measured."""
 
-    name: Text
-    value: Number
-    unit: Text
+    name: str
+    value: float
+    unit: str
     better: Better
 
 
@@ -66,19 +59,13 @@ class Entry:
         That its command took.
     """
 
-    name: Text
-    command: Text
+    name: str
+    command: str
     state: Literal["measured", "missed", "failed", "skipped"]
     values: tuple[Value, ...]
-    reason: Text
-    seconds: Number
+    reason: str
+    seconds: float
     origin: Origin
-
-    @property
-    def quick(self) -> bool:
-        """Whether it was measured with small counts, so that its times mean nothing."""
-        figure = NAMED.get(self.name)
-        return figure is not None and self.command == command_of(figure, quick=True) != command_of(figure)
 
 
 @dataclass(frozen=True)
@@ -86,9 +73,9 @@ class Record:
     """What a file holds; version, machine and date are the last run's, and each row has its own."""
 
     format: Literal["sulcus bench figures 1"]
-    version: Text
-    machine: Text
-    date: Text
+    version: str
+    machine: str
+    date: str
     rows: tuple[Entry, ...]
 
 
@@ -106,11 +93,7 @@ def read_record(path: Path) -> Record:
         A file that is not there, is damaged or is of another kind.
     """
     with read_as(path, KIND, "Choose another file, or measure anew by `python -m benchmarks all --json FILE.json`."):
-        with path.open("rb") as file:
-            content = file.read(LARGEST + 1)
-        if len(content) > LARGEST:
-            raise InputError(f"it has more than {LARGEST // 1024**2} MiB, which {KIND} has not: choose another file.")
-        record = msgspec.json.decode(content, type=Record)
+        record = msgspec.json.decode(path.read_bytes(), type=Record)
     now = f"{shlex.join(PROGRAM)} "
     return replace(record, rows=tuple(replace(row, command=row.command.replace(FORMER, now, 1)) for row in record.rows))
 

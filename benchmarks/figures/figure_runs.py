@@ -51,8 +51,6 @@ class Run:
         Its file; None: each bench takes the template.
     quick
         Whether counts are small.
-    again
-        Whether figures are measured that are there already.
     bench
         What is run, before a figure's words.
     """
@@ -61,7 +59,6 @@ class Run:
     digest: str
     anatomy: Path | None = None
     quick: bool = False
-    again: bool = False
     bench: Sequence[str] = BENCH
 
     def origin(self, device: str) -> Origin:
@@ -87,7 +84,7 @@ def entry_of(figure: Figure, run: Run, before: Entry | None, heard: Callable[[st
     except InputError as error:
         origin, reason = run.origin("auto"), str(error)
     entry = Entry(figure.name, command, "skipped", (), reason, 0.0, origin)
-    if before is not None and before.values and (reason or (not run.again and _same(before, entry))):
+    if before is not None and before.values and (reason or _same(before, entry)):
         return before
     return entry if reason else _measured(figure, run, entry, heard)
 

@@ -71,44 +71,20 @@ def read_page(path: Path) -> str:
         return text
 
 
-def write_page(path: Path, record: Record, force: bool = False) -> bool:
-    """Write the tables of a page anew; whether that changes anything. Numbers may be lost by `force` alone.
+def write_page(path: Path, record: Record) -> bool:
+    """Write the tables of a page again, and return True if that changes the page.
 
     Raises
     ------
     InputError
-        As `read_page`; a page that cannot be written; figures that were measured with small counts; numbers of the page
-        that the record lacks.
+        As `read_page`; a page that cannot be written.
     """
     before = read_page(path)
-    asked = {name for block in MARKED.findall(before) for name in block[1].split()}
-    for entry in record.rows:
-        if entry.quick and entry.values and entry.name in asked:
-            raise InputError(
-                f"{path}: {entry.name} was measured with --quick, whose times mean nothing: measure it in full."
-            )
-    if not force and (lost := _lost(before, record)):
-        raise InputError(
-            f"{path}: has numbers of {', '.join(lost)}, and the record has none, so that they would be lost: measure "
-            "these too, or give --force."
-        )
     after = MARKED.sub(lambda block: f"{block[1]}\n{_marked(block[2].split(), record)}\n\n{block[4]}", before)
     if after != before:
         with written_whole(path, ".md") as partial:
             partial.write_bytes(after.encode())
     return after != before
-
-
-def _lost(page: str, record: Record) -> list[str]:
-    """The figures of which a page has numbers, and the record has none."""
-    known = {entry.name for entry in record.rows if entry.values}
-    lines = {name: f"| `{name}` | " for block in MARKED.findall(page) for name in block[1].split() if name not in known}
-    tables = "".join(block[2] for block in MARKED.findall(page)).splitlines()
-    return [
-        name
-        for name, begun in lines.items()
-        if any(line.startswith(begun) and not line.startswith(begun + NOT_HERE) for line in tables)
-    ]
 
 
 def _marked(names: Sequence[str], record: Record) -> str:
