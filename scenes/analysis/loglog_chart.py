@@ -7,17 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.errors import InputError
-from sim.runtime.versions import install_hint
+from sim.runtime.versions import needed_from
 
-try:
+with needed_from("report", "a chart needs"):
     from matplotlib.axes import Axes
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullLocator
     from matplotlib.transforms import Bbox
-except ImportError as error:
-    raise InputError(f"charts are drawn by matplotlib. {install_hint('report')}") from error
 
 WIDTH, HEIGHT = 640, 480
 DPI = 100

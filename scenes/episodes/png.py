@@ -5,7 +5,11 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-from isal import isal_zlib
+
+from sim.runtime.versions import needed_from
+
+with needed_from("data", "writing an episode needs"):
+    from isal import isal_zlib
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 GREY, SUB = 0, 1

@@ -32,7 +32,8 @@ def needed_from(extra: str, what: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise InputError(f"{what} the package {error.name}, which is not installed. {install_hint(extra)}") from error
+        package = (error.name or "").partition(".")[0]
+        raise InputError(f"{what} the package {package}, which is not installed. {install_hint(extra)}") from error
 
 
 @cache
