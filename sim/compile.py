@@ -89,19 +89,7 @@ def compile_problem(
         Unknown or duplicate effects, none that resists deformation, a region without a law, a body that is not held. An
         effect of the caller's own that makes no term, or one of a name that is taken.
     """
-    effects = tuple(effects)
-    for effect in effects:
-        if isinstance(effect, type):
-            raise InputError(f"{effect.__name__} is a class, and no effect yet: write {effect.__name__}(...).")
-    kinds = [type(effect) for effect in effects]
-    for kind in kinds:
-        if kinds.count(kind) > 1:
-            raise InputError(f"the effect {kind.__name__} is asked for {kinds.count(kind)} times: once is enough.")
-    if Elasticity not in kinds:
-        raise InputError("no effect resists deformation: add Elasticity.")
-    skulls = [kind.__name__ for kind in (Bonded, Slide, SkullContact) if kind in kinds]
-    if len(skulls) > 1:
-        raise InputError(f"{' and '.join(skulls)} contradict each other: each says what the skull does. Choose one.")
+    effects = _compatible(effects)
     space = space or discretise(anatomy.mesh, "p1")
     skin = skin or Skin(space.nodes, space.surface, device)
     terms: list[Term] = []
@@ -166,6 +154,24 @@ def compile_problem(
     return Problem(
         (*terms, *own, *barriers), constraint, device, partial(_impose, space, skin), tuple(barriers), elastic
     )
+
+
+def _compatible(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """The effects, if they can act together."""
+    effects = tuple(effects)
+    for effect in effects:
+        if isinstance(effect, type):
+            raise InputError(f"{effect.__name__} is a class, and no effect yet: write {effect.__name__}(...).")
+    kinds = [type(effect) for effect in effects]
+    for kind in kinds:
+        if kinds.count(kind) > 1:
+            raise InputError(f"the effect {kind.__name__} is asked for {kinds.count(kind)} times: once is enough.")
+    if Elasticity not in kinds:
+        raise InputError("no effect resists deformation: add Elasticity.")
+    skulls = [kind.__name__ for kind in (Bonded, Slide, SkullContact) if kind in kinds]
+    if len(skulls) > 1:
+        raise InputError(f"{' and '.join(skulls)} contradict each other: each says what the skull does. Choose one.")
+    return effects
 
 
 def _check_names(terms: Iterable[Term], own: Iterable[Term]) -> None:

@@ -15,7 +15,8 @@ COMMANDS = {
 @pytest.mark.parametrize("words", COMMANDS)
 def test_command_without_its_extra_says_which(words, tmp_path):
     package, extra = COMMANDS[words]
-    script = f"import sys; sys.modules[{package!r}] = None\nfrom scenes.cli import main\nsys.exit(main({words.split()}))"
+    begin = f"import sys; sys.modules[{package!r}] = None\n"
+    script = f"{begin}from scenes.cli import main\nsys.exit(main({words.split()}))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 2 and done.stderr.splitlines()[-1].endswith(
         f"the package {package}, which is not installed. Install it in the checkout: pip install -e '.[{extra}]'."

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -55,3 +58,43 @@ class Gaps:
 
 
 GAPS = Gaps()
+
+
+@dataclass(frozen=True, eq=False)
+class Shares:
+    """Cases that are raised, or whose tools are moved, in steps: all arrays are changed in place.
+
+    Parameters
+    ----------
+    reached, step
+        (b,) shares: where an equilibrium was found, and how long the next step is.
+    gaps
+        (b,) gaps of their tools that the whole way measures, at least.
+    """
+
+    reached: np.ndarray
+    step: np.ndarray
+    gaps: np.ndarray
+
+    @classmethod
+    def at_rest(cls, first: float, gaps: np.ndarray) -> Self:
+        """Cases at the share 0, whose `first` step is so long."""
+        return cls(np.zeros(len(gaps)), np.full(len(gaps), first), gaps)
+
+    def limit(self, longest: np.ndarray, stepping: Stepping) -> tuple[np.ndarray, np.ndarray]:
+        """Limit steps to the `longest` (b,) at once; which (b,) bool are shorter than that, and which cases go on."""
+        shorter = self.step < longest
+        np.minimum(self.step, longest, out=self.step)
+        long_enough = self.step >= stepping.least * np.minimum(1.0, 4.0 * longest)
+        return shorter, (self.reached < 1.0) & long_enough
+
+    def aims(self, rows: np.ndarray) -> tuple[np.ndarray, float]:
+        """Shares (k,) that some rows (k,) step to, and the most gaps that their tools go."""
+        aim = np.minimum(self.reached[rows] + self.step[rows], 1.0)
+        return aim, float(((aim - self.reached[rows]) * self.gaps[rows]).max())
+
+    def take(self, rows: np.ndarray, aim: np.ndarray, good: np.ndarray, growth: np.ndarray, cut: float) -> None:
+        """Take the steps of rows (k,) that are `good`, and let these grow; the others are `cut`, from a wider gap."""
+        self.reached[rows[good]] = aim[good]
+        self.gaps[rows] *= np.where(good, 1.0, GAPS.wider)
+        self.step[rows] *= np.where(good, np.clip(growth, 0.5, 2.0), cut)

@@ -29,7 +29,7 @@ from ..runtime.columns import gathered, scattered
 from ..runtime.device import Device
 from ..runtime.views import in_order, on_host, view
 from .plan import Alone, Plan, Step
-from .stepping import GAPS, STEPPING, Gaps, Stepping
+from .stepping import GAPS, STEPPING, Gaps, Shares, Stepping
 
 NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
 
@@ -356,40 +356,42 @@ class Strategy:
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         gaps = np.maximum.reduce([np.zeros(count), *(term.gaps(cases) for term in problem.barriers)])
-        u, step, left, spent, done = wp.clone(start), np.full(count, first), most, 0, 1
-        reached, iterations, residual = np.zeros(count), np.zeros(count, int), np.full(count, np.inf)
-        outcome = np.full(count, Outcome.BUDGET, object)
+        shares = Shares.at_rest(first, gaps)
+        u, left, done = wp.clone(start), most, 1
+        none, outcome = np.zeros(count, int), np.full(count, Outcome.BUDGET, object)
+        answer = Answer(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
         outer = self.accuracy.outer
-        lets, outer = (outer, outer) if problem.barriers else (self.stepping.aimed, min(self.stepping.most, outer))
+        wanted, outer = (outer, outer) if problem.barriers else (self.stepping.aimed, min(self.stepping.most, outer))
         while left >= 0:
-            strides = [term.stride(aimed(cases, reached), u) for term in problem.barriers]
-            longest = np.minimum.reduce([np.ones(count), *strides])
-            step = np.minimum(step, longest)
-            long_enough = step >= self.stepping.least * np.minimum(1.0, 4.0 * longest)
-            live = np.flatnonzero((reached < 1.0) & long_enough & (iterations < self.accuracy.most))
-            if len(live) == 0 or spent > self.stepping.patience * self.accuracy.inner * done:
+            strides = [term.stride(aimed(cases, shares.reached), u) for term in problem.barriers]
+            shorter, going = shares.limit(np.minimum.reduce([np.ones(count), *strides]), self.stepping)
+            rows = np.flatnonzero(going & (answer.iterations < self.accuracy.most))
+            patience = self.stepping.patience * self.accuracy.inner * done
+            if len(rows) == 0 or answer.linear_iterations > patience:
                 break
-            aim = np.minimum(reached[live] + step[live], 1.0)
-            gone = float(((aim - reached[live]) * gaps[live]).max())
-            left -= int((step < longest)[live].any())
-            found = self._touching(aimed(cases.rows(live), aim), gathered(device, u, live), outer, gone)
-            spent += found.linear_iterations
+            aim, gone = shares.aims(rows)
+            left -= int(shorter[rows].any())
+            found = self._touching(aimed(cases.rows(rows), aim), gathered(device, u, rows), outer, gone)
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
-            iterations[live] += found.iterations
-            gaps[live] *= np.where(good, 1.0, self.gaps.wider)
-            step[live] *= np.where(good, np.clip(lets / np.maximum(found.iterations, 1), 0.5, 2.0), self.stepping.cut)
-            scattered(device, found.u, live[good], u, np.flatnonzero(good))
-            reached[live[good]], residual[live[good]] = aim[good], found.residual[good]
-            outcome[live] = found.outcome
+            shares.take(rows, aim, good, wanted / np.maximum(found.iterations, 1), self.stepping.cut)
+            scattered(device, found.u, rows[good], u, np.flatnonzero(good))
+            answer.iterations[rows] += found.iterations
+            answer.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome
+            answer = replace(answer, linear_iterations=answer.linear_iterations + found.linear_iterations)
+        return self._arrived(cases, aimed, answer)
+
+    def _arrived(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], answer: Answer) -> Answer:
+        """Judge cases that went as far as they could, in place: those that tools pierce, and those that fell short."""
+        problem, u, outcome, reached = self.problem, answer.u, answer.outcome, answer.reached
         short = np.flatnonzero(reached < 1.0)
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
-        if problem.barriers and len(short) < count:
-            problem.begin(aimed(cases, np.ones(count)))
+        if problem.barriers and len(short) < len(reached):
+            problem.begin(aimed(cases, np.ones(len(reached))))
             buried = np.logical_or.reduce([term.buried(u) for term in problem.barriers])
             pierced = (problem.overlaps(u)[0] | buried) & (reached == 1.0)
             outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0
         if len(short):
             problem.begin(cases.rows(short))
-            residual[short] = shortfall(problem, gathered(device, u, short))
-        return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent)
+            answer.residual[short] = shortfall(problem, gathered(problem.device, u, short))
+        return replace(answer, inverted=self.inversion.count(u))
