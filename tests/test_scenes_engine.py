@@ -29,7 +29,8 @@ from scenes.episodes.run_folder import (
 from scenes.episodes.tasks import attempted
 from scenes.episodes.workers import own_workers, scheduled_workers
 from sim.errors import InputError
-from sim.runtime.atomic_files import remove_left_overs, written_whole
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.partial_files import remove_left_overs
 
 PLAN = 'title = "tiny"\n'
 

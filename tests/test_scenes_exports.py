@@ -24,10 +24,11 @@ from scenes.episodes.exports.datasheet import listed
 from scenes.episodes.exports.motion import states, twists
 from scenes.episodes.exports.statistics import Spread
 from scenes.episodes.exports.tasks import TASKS, held_out
-from scenes.episodes.exports.whole_folder import written_folder
 from scenes.episodes.reading.contents import read_contents
 from scenes.episodes.run_folder import finished
 from sim.errors import InputError
+from sim.runtime.atomic_files import written_folder
+from sim.runtime.partial_files import partial_path
 
 FOREIGN = os.environ.get("SULCUS_FORMATS_PYTHON")
 """A Python that has lerobot, datasets and mlcroissant, whose own readers then read what is written here."""
@@ -351,7 +352,7 @@ def test_what_is_interrupted_leaves_nothing(tmp_path):
 
 def test_what_a_killed_run_left_is_removed_and_what_runs_is_not(tmp_path):
     out, code = tmp_path / "out", (
-        "import os, sys; from pathlib import Path; from scenes.episodes.exports.whole_folder import written_folder\n"
+        "import os, sys; from pathlib import Path; from sim.runtime.atomic_files import written_folder\n"
         "with written_folder(Path(sys.argv[1]), 10) as partial: (partial / 'a').mkdir(); os.kill(os.getpid(), 9)"
     )  # fmt: skip
     done = subprocess.run([sys.executable, "-c", code, str(out)], cwd=Path(__file__).parents[1], check=False)
@@ -362,6 +363,15 @@ def test_what_a_killed_run_left_is_removed_and_what_runs_is_not(tmp_path):
         with written_folder(tmp_path / "other", 10):
             assert partial.exists()
     assert {path.name for path in tmp_path.iterdir()} == {"out", "other"}
+
+
+def test_a_folder_that_another_run_is_writing_is_rejected(tmp_path):
+    folder = tmp_path / "out"
+    other = partial_path(folder).with_name(partial_path(folder).name.replace(str(os.getpid()), str(os.getppid())))
+    other.mkdir()
+    with pytest.raises(InputError, match="another run is writing it"), written_folder(folder):
+        pytest.fail("entered")
+    assert list(tmp_path.iterdir()) == [other]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")

@@ -18,7 +18,7 @@ from scenes.episodes.plan import load_plan, plan_from
 from scenes.episodes.run_folder import begin
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
-from sim.runtime.atomic_files import partial_path, unfinished_path
+from sim.runtime.partial_files import partial_path, unfinished_path
 from surrogate.data.simulate import simulate
 
 PLAN = """

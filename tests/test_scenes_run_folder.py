@@ -17,7 +17,8 @@ from scenes.episodes.reading.validation import validate_episode
 from scenes.episodes.run_folder import Run, begin, episode_name, finished, read_run
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
-from sim.runtime.atomic_files import remove_left_overs, written_whole
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.partial_files import remove_left_overs
 
 PLAN = 'title = "A box"\n[motion.press]\n[bodies]\nanatomies = "box.vtu"\n[bodies.learner]\nname = "none"\n'
 DECADE = 10 * 365 * 86400.0
@@ -47,7 +48,7 @@ def test_a_file_that_another_holds_is_said_to_be_locked(box, tmp_path):
 
 def test_where_nothing_can_be_renamed_nothing_is_left(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "rename", fails)
-    with pytest.raises(InputError, match=r"bodies/0000: cannot be made \(Operation not permitted\). Choose another"):
+    with pytest.raises(InputError, match=r"bodies/0000: cannot be written \(Operation not permitted\). Choose another"):
         make_body(tmp_path / "set", plan, 1, 0, "cpu")
     monkeypatch.setattr(Path, "replace", fails)
     with (

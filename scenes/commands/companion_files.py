@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import unfinished_path
+from sim.runtime.partial_files import unfinished_path
 
 from ..options.outputs import head_of, model_header
 

@@ -20,9 +20,9 @@ from sim.effects import Effect, NodalForce, ToolContact, ToolForce, pushed_effec
 from sim.errors import InputError
 from sim.loads import Loads
 from sim.material import Tissue
-from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.device import device_names
 from sim.runtime.memory import Budget
+from sim.runtime.partial_files import unfinished_path
 from sim.runtime.timing import stage
 from sim.runtime.versions import version_of
 from sim.tools import Ball, BuiltIn, Capsule, Spatula

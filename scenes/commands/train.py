@@ -12,8 +12,8 @@ import numpy as np
 from tqdm import tqdm
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.device import device_names
+from sim.runtime.partial_files import unfinished_path
 from sim.runtime.timing import stage
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.disc_split import APART

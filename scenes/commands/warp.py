@@ -14,7 +14,6 @@ from sim.errors import InputError
 
 from ..options.json_line import json_line
 from ..options.label_options import add_axes
-from ..options.outputs import add_force
 from ..options.shared_options import add_device, add_json
 from ..options.theatre_options import add_trajectory, scene_asked
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
@@ -66,12 +65,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--spacing", type=float, metavar="MM",
         help="of the fields' nodes, 0.3 to 5 mm (default: 1, or finer until tumour and landmarks are within 0.05 mm)",
     )  # fmt: skip
-    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for all that is written")
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="new folder for all that is written")
     add_trajectory(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
     add_device(parser, "finite elements")
-    add_force(parser)
     add_json(parser)
 
 
@@ -88,18 +86,19 @@ def run(args: argparse.Namespace) -> int:
     """Solve, write, say. 1: the answer did not converge, or space folds; all is written nevertheless."""
     from tqdm import tqdm
 
+    from sim.runtime.atomic_files import written_folder
+
     from ..play.deformers import open_theatre
     from ..script.scene import demand_scene
     from ..script.shipped_files import template_path
     from ..warp.export import Asked, write_warp
     from ..warp.images import read_picture
-    from ..warp.output_folder import written_warp
     from ..warp.spacing import steps_of
 
     demand_options(args)
     if args.scene is not None:
         demand_scene(args.scene)
-    with written_warp(args.out, args.force) as place:
+    with written_folder(args.out) as place:
         theatre = open_theatre(args.anatomy, None, args.device)
         scene = None if args.located else scene_of(args, theatre)
         pictures = [

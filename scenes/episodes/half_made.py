@@ -12,7 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from sim.runtime.atomic_files import unfinished_path, written_whole
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.partial_files import unfinished_path
 
 DATA = "training.h5"
 """The loads that a body's model is trained on, until it is trained."""

@@ -15,7 +15,8 @@ import numpy as np
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.resected_fem import Operated
-from sim.runtime.atomic_files import partial_path, partials_of, remove_left_overs, why
+from sim.runtime.atomic_files import written_folder
+from sim.runtime.partial_files import partial_path, partials_of
 
 from ..play.deformers import Theatre
 from ..play.reference import following
@@ -62,24 +63,18 @@ def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "a
         return Made(path, skipped=True)
     if path.exists() and not (path / ABOUT).is_file():  # asked again, as another may have made it meanwhile
         return Made(path, failed=f"{path}: is no whole body. Remove it, and give the same command with --again.")
-    partial, resumed = partial_path(path), False
+    resumed = False
     try:
-        emptied(partial)
-        resumed = write_body(partial, plan, seed, number, device, partials_of(path))
-        if not path.exists():
-            partial.rename(path)
+        with written_folder(path, kept=begun) as partial:
+            emptied(partial)
+            resumed = write_body(partial, plan, seed, number, device, partials_of(path))
     except InputError as error:
-        if isinstance(error.__cause__, PASSING):
+        whole = (path / ABOUT).is_file()  # another process was faster
+        if not whole and isinstance(error.__cause__, PASSING):
             raise
-        rmtree(partial, ignore_errors=True)
-        return Made(path, failed=str(error))
-    except OSError as error:
-        if not (path / ABOUT).is_file():  # nobody else was faster
-            raise InputError(f"{path}: cannot be made ({why(error)}). Choose another folder.") from error
-    finally:
-        if not begun(partial):
-            rmtree(partial, ignore_errors=True)
-    remove_left_overs(path.parent, path.name)
+        rmtree(partial_path(path), ignore_errors=True)
+        if not whole:
+            return Made(path, failed=str(error))
     size = sum(file.stat().st_size for file in path.iterdir())
     return Made(path, bytes=size, resumed=resumed)
 

@@ -16,7 +16,8 @@ from functools import cache
 from pathlib import Path
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import remove_left_overs, why, written_whole
+from sim.runtime.atomic_files import why, written_whole
+from sim.runtime.partial_files import remove_left_overs
 from sim.runtime.versions import version_of
 
 FORMAT = "sulcus run 1"

@@ -14,7 +14,7 @@ from sim.anatomy import Anatomy
 from sim.effects import NodalForce, pushed_effects
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
-from sim.runtime.atomic_files import unfinished_path
+from sim.runtime.partial_files import unfinished_path
 from surrogate.data.simulate import simulate
 
 from .artefact_time import note_seconds, noted_seconds

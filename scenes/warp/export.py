@@ -21,7 +21,6 @@ from .markups import write_markups
 from .meshes import mesh_of, write_glb, write_stl, write_vtp
 from .moment import Moment
 from .nrrd_files import write_field_nrrd, write_field_sequence
-from .output_folder import FORMAT, LISTED
 from .places import Folded, Places, folds_of, places_of
 from .readme import page
 from .segmentation import write_segmentation
@@ -57,7 +56,7 @@ class Asked:
 def write_warp(
     place: Path, moment: Moment, pictures: Sequence[Picture], asked: Asked, sequence: Sequence[tuple[float, Moment]]
 ) -> dict[str, Any]:
-    """Write a moment into the folder that `written_warp` yields, and moments of a `sequence` with their times [s].
+    """Write a moment into the folder that `written_folder` yields, and moments of a `sequence` with their times [s].
 
     Returns the figures.
 
@@ -89,8 +88,8 @@ def write_warp(
     (place / "README.txt").write_text(page(report, warped))
     files = sorted(path.name for path in place.iterdir())
     sums = {name: _sha256(place / name) for name in files}
-    report = {"format": FORMAT, "files": files, "spaces": spaces(files), "sha256": sums, **report}
-    (place / LISTED).write_text(json.dumps(report, indent=1) + "\n")
+    report = {"format": "sulcus warp 1", "files": files, "spaces": spaces(files), "sha256": sums, **report}
+    (place / "warp.json").write_text(json.dumps(report, indent=1) + "\n")
     return report
 
 

@@ -1,29 +1,21 @@
-"""Files that appear whole or not at all."""
+"""Files and folders that appear whole or not at all."""
 
 from __future__ import annotations
 
-import glob
 import os
-import platform
-import re
 import shutil
-import time
-import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import InputError
+from .partial_files import STALE, partial_path, partials_of, remove_left_overs
 
 
 def why(error: OSError) -> str:
     """Why a file cannot be had, in the system's own words and not a library's."""
     return os.strerror(error.errno) if error.errno else "the library that writes it failed"
-
-
-STALE = 24 * 3600.0
-"""Another machine's unfinished file is a left-over after so long [s]: whoever writes, writes every few minutes."""
 
 
 def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: bool = True) -> Path:
@@ -58,38 +50,6 @@ def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: boo
     return path
 
 
-def remove_left_overs(
-    folder: Path,
-    name: str | None = None,
-    stale: float = STALE,
-    kept: Callable[[str], bool] = lambda wanted: False,
-) -> None:
-    """Remove what dead processes of this machine left unfinished in a folder, and what others have not touched lately.
-
-    Parameters
-    ----------
-    name
-        Of the file whose left-overs are meant; None means all files.
-    stale
-        How long others need not have touched theirs [s].
-    kept
-        Whether what was to become the file of a name stays all the same, as somebody may go on with it.
-    """
-    form = _partial_form(name)
-    try:
-        for left in list(folder.iterdir()):
-            found = form.fullmatch(left.name)
-            if found is None or kept(found[3]):
-                continue
-            dead = not _alive(int(found[2])) if found[1] == _host() else time.time() - left.stat().st_mtime > stale
-            if dead and left.is_dir():
-                shutil.rmtree(left, ignore_errors=True)
-            elif dead:
-                left.unlink(missing_ok=True)
-    except OSError:  # a folder that may not be listed, or a left-over that may not be removed, stops no work
-        return
-
-
 @contextmanager
 def written_whole(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Path]:
     """A name beside `path`, of the same ending, to write under; it takes the name `path` when the block ends well.
@@ -112,6 +72,64 @@ def written_whole(path: str | Path, suffix: str, sweep: bool = True) -> Iterator
         raise InputError(f"{path}: cannot be written ({why(error)}). {REMEDY}") from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def written_folder(path: Path, size: int = 0, kept: Callable[[Path], bool] | None = None) -> Iterator[Path]:
+    """Yield a hidden folder next to `path`, which takes its name when the block ends well, and is removed if not.
+
+    Parameters
+    ----------
+    size
+        Bytes that it will hold, about.
+    kept
+        True of a hidden folder that stays all the same, as the same work resumes from it. Several processes may then
+        write one folder: the first that is done gives it. Without `kept` a second process is rejected.
+
+    Raises
+    ------
+    InputError
+        A file, or a folder that is not empty; a full disk; a place that cannot be written; another process.
+    """
+    target = path.resolve()
+    partial = partial_path(target)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{path}: is there and not empty. Choose another name, or remove it.")
+    if kept is None:
+        remove_left_overs(target.parent, target.name)
+        shutil.rmtree(partial, ignore_errors=True)  # of a dead process that had the same number
+        others = partials_of(target)
+        if others:
+            raise InputError(
+                f"{path}: another run is writing it, in {others[0].name}. Wait for it, or choose another --out; if no "
+                "run is at work, remove that folder."
+            )
+    demand_space(target, size)
+    with empty_parents_removed(target):
+        try:
+            partial.mkdir(parents=True, exist_ok=True)
+            yield partial
+            if target.exists():
+                target.rmdir()
+            partial.rename(target)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({why(error)}). {REMEDY}") from error
+        finally:
+            if kept is None or not kept(partial):
+                shutil.rmtree(partial, ignore_errors=True)
+    remove_left_overs(target.parent, target.name)
+
+
+@contextmanager
+def empty_parents_removed(path: Path) -> Iterator[None]:
+    """Remove the folders above `path` that were made in the block and stayed empty."""
+    missing = [folder for folder in path.parents if not folder.exists()]
+    try:
+        yield
+    finally:
+        for folder in missing:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 @contextmanager
@@ -217,42 +235,3 @@ REMEDY = "Choose another folder, or make room there."
 
 def _megabytes(size: int) -> str:
     return f"{size / 1e6:,.1f} MB"
-
-
-def _host() -> str:
-    """A name of 8 characters for the machine: process numbers tell nothing of another's."""
-    return f"{zlib.crc32(platform.node().encode()):08x}"
-
-
-def unfinished_path(path: Path) -> Path:
-    """Where a run that goes on keeps what it has done so far of `path`."""
-    return path.with_name(path.name + ".partial")
-
-
-def partial_path(path: Path) -> Path:
-    """The hidden name under which this process writes `path`, a file or a folder; `remove_left_overs` knows it."""
-    return path.with_name(f".sulcus-{_host()}-{os.getpid()}-{path.name}")
-
-
-def partials_of(path: Path) -> list[Path]:
-    """The hidden names under which any process of any machine writes `path`, or has left it unfinished."""
-    form = _partial_form(path.name)
-    return sorted(left for left in path.parent.glob(f".sulcus-*-{glob.escape(path.name)}") if form.fullmatch(left.name))
-
-
-def _partial_form(name: str | None) -> re.Pattern[str]:
-    """Of hidden names: machine, process, and the name that is to be; None: any."""
-    return re.compile(rf"\.sulcus-([0-9a-f]{{8}})-(\d{{1,9}})-({'.+' if name is None else re.escape(name)})")
-
-
-def _alive(process: int) -> bool:
-    """Whether a process of this number runs; where that cannot be found out, it may."""
-    if os.name != "posix" or process == os.getpid():
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True

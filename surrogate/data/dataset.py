@@ -22,9 +22,9 @@ from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh, digest_of
 from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Touching
-from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.file_limits import INFLATION, LARGEST_ARRAY
 from sim.runtime.outside_files import path_of, read_as
+from sim.runtime.partial_files import unfinished_path
 from sim.tools import BuiltIn, stated_tool
 
 from .answer_rows import checksums, numbered, row_type

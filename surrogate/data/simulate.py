@@ -17,8 +17,9 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformer
 from sim.errors import InputError
 from sim.loads import Loads, Touching
-from sim.runtime.atomic_files import check_output, demand_space, unfinished_path, written_stream
+from sim.runtime.atomic_files import check_output, demand_space, written_stream
 from sim.runtime.outside_files import read_as
+from sim.runtime.partial_files import unfinished_path
 from sim.runtime.processes import LostError
 from sim.runtime.timing import listened, stage
 from sim.runtime.versions import version_of

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sim.errors import InputError
+from sim.runtime.atomic_files import written_folder
 
 from ..reading.contents import Contents
 from ..reading.open_files import opened
@@ -26,7 +27,6 @@ from .along import write_along
 from .columns import SPACE, blocks, named_axes, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size
 from .statistics import Spread
 from .tasks import task_of
-from .whole_folder import written_folder
 
 VERSION = "v3.0"
 DEPTH_RANGE = (0.1, 0.6)

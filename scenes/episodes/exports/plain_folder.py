@@ -11,13 +11,14 @@ from typing import Any
 import h5py
 import numpy as np
 
+from sim.runtime.atomic_files import written_folder
+
 from ..reading.contents import Contents
 from ..reading.open_files import opened
 from ..reading.rows import code_of, numbers_in, rows_of
 from ..reading.schema import ARRAYS, PICTURES, SOLVED, suffix_of
 from .along import write_along
 from .columns import file_names, stored_size
-from .whole_folder import written_folder
 
 WIDE = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")
 """Arrays with many numbers a frame, each in a table of its own."""

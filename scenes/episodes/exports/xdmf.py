@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
 import h5py
 import numpy as np
 
-from sim.runtime.atomic_files import written_stream
+from sim.runtime.atomic_files import written_folder, written_stream
 
 from ..reading.bodies import anatomy_of, surface_rows
 from ..reading.contents import Contents, array_in
@@ -19,7 +19,6 @@ from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from .along import write_along
 from .columns import SPACE, file_names, stored_size
-from .whole_folder import written_folder
 
 SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
 """What is written, and the surface of the anatomy that it is of."""
