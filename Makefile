@@ -40,16 +40,16 @@ lint: $(STAMP)
 
 # The anatomy, its models and its locator that ship with the package: some minutes on a graphics card, an hour on two cores.
 template: $(STAMP)
-	$(VENV)/bin/sulcus anatomy --out scenes/data/template.vtu
+	$(VENV)/bin/sulcus anatomy --out scenes/data/template.vtu --force
 	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --count 5000 --out build/template.h5
-	$(VENV)/bin/sulcus train build/template.h5 --learners linear,ann,svr,series,series-gp --most 2000 --out scenes/data/template.model.npz
+	$(VENV)/bin/sulcus train build/template.h5 --learners linear,ann,svr,series,series-gp --most 2000 --out scenes/data/template.model.npz --force
 	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --poses --preset spatula --blade 12 26 1.5 --count 1000 --out build/spatula.h5
-	$(VENV)/bin/sulcus train build/spatula.h5 --learners contact-gp --out scenes/data/template.spatula.npz
+	$(VENV)/bin/sulcus train build/spatula.h5 --learners contact-gp --out scenes/data/template.spatula.npz --force
 	$(MAKE) locator
 
 # What locates the template's tumour in scenes: up to 13 minutes on two cores.
 locator: $(STAMP)
-	$(VENV)/bin/sulcus locator scenes/data/template.vtu --small
+	$(VENV)/bin/sulcus locator scenes/data/template.vtu --small --force
 
 # One measurement, as in `make bench NAME=contact ARGS="--device cpu"`; without NAME, a list of them.
 bench: $(STAMP)

@@ -1,68 +1,41 @@
-"""Files of pictures: PNG with a signature, a folder of frames, a film."""
+"""Files of pictures: PNG, a folder of frames, a film."""
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-# Of a PNG file all that stands before its second chunk; and what tells who wrote it, in a chunk that viewers pass over.
-START, KEYWORD = 33, b"tEXtSoftware\0sulcus"
-# At a film's end: in MPEG-4 an empty box, in the others bytes that no player reads.
-END = b"\0\0\0\x0efreesulcus"
-
 
 class Film:
     """A folder of `frame_0000.png`, `frame_0001.png`, ...; each file appears whole."""
 
-    def __init__(self, folder: Path, source: str = "") -> None:
-        """Make the folder where it is missing; ValueError when the path is a file. `source` signs every picture."""
-        self.folder, self.source = Path(folder), source
+    def __init__(self, folder: Path) -> None:
+        """Make the folder where it is missing; ValueError when the path is a file."""
+        self.folder = Path(folder)
         if self.folder.exists() and not self.folder.is_dir():
             raise ValueError(f"{self.folder} is a file: name a folder for the frames.")
         self.folder.mkdir(parents=True, exist_ok=True)
 
     def show(self, number: int, colour: np.ndarray) -> None:
         """Write one PNG."""
-        write_png(self.folder / f"frame_{number:04d}.png", colour, self.source)
+        write_png(self.folder / f"frame_{number:04d}.png", colour)
 
 
-def write_png(path: Path, colour: np.ndarray, source: str = "") -> None:
-    """Write a picture (H, W, 3) uint8 sRGB, signed; the file appears whole, and its folder if there is none.
+def write_png(path: Path, colour: np.ndarray) -> None:
+    """Write a picture (H, W, 3) uint8 sRGB; the file appears whole, and its folder if there is none.
 
     Raises OSError where it cannot be written.
-
-    `source` is an ASCII text that says which run drew it: `signature` reads it.
     """
     part = path.with_name(f".{path.name}.part")
-    code = cv2.imencode(".png", colour[..., ::-1])[1].tobytes()
-    text = KEYWORD + f" {source}".encode("ascii")
-    chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        part.write_bytes(code[:START] + chunk + code[START:])
+        part.write_bytes(cv2.imencode(".png", colour[..., ::-1])[1].tobytes())
         part.rename(path)
     finally:
         part.unlink(missing_ok=True)
-
-
-def signature(path: Path) -> str | None:
-    """The source of a picture that `write_png` wrote; None of any other file. Raises OSError where it is not there."""
-    with path.open("rb") as file:
-        head = file.read(START + 4)
-        if len(head) < START + 4:
-            return None
-        text = file.read(min(struct.unpack(">I", head[START:])[0] + 4, 1000))
-    return text.removeprefix(KEYWORD + b" ").decode("ascii", "replace") if text.startswith(KEYWORD) else None
-
-
-def is_our_film(path: Path) -> bool:
-    """Whether `write_film` wrote a file; OSError where it is not there."""
-    return path.read_bytes().endswith(END)
 
 
 def shrunk(colour: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -99,8 +72,6 @@ def write_film(path: Path, pictures: Iterable[np.ndarray], frames_per_second: fl
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
         writers[path.suffix](part, pictures, frames_per_second)
-        with part.open("ab") as file:
-            file.write(END)
         part.rename(path)
     finally:
         part.unlink(missing_ok=True)

@@ -51,7 +51,7 @@ def test_a_users_volume_with_and_without_intensities(brain, capsys):
     grey = read_intensity(sidecar(out))
     left, right = grey.at(np.array([[0.010, 0.0, 0.03], [0.030, 0.0, 0.03]]))
     assert right > left + 0.05
-    code, text, _ = run(capsys, *words)
+    code, text, _ = run(capsys, *words, "--force")
     assert code == 0 and "intensities" not in text
     assert not sidecar(out).exists()  # those of the earlier mesh do not belong to this one
 

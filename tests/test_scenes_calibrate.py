@@ -58,8 +58,8 @@ def test_a_folder_of_pictures_gives_the_camera_and_its_covariance(folder, tmp_pa
     covariance = np.array(report["covariance"])
     assert covariance.shape == (9, 9) and np.linalg.eigvalsh(covariance).min() > 0.0
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), report["standard_deviations"])
-    # Again: what it wrote itself it replaces, and says what it wrote.
-    assert main(["calibrate", str(folder), "--out", str(out), "--size", f"{WIDTH}x{HEIGHT}", "--json"]) == 0
+    # Again, by force: it says what it wrote.
+    assert main(["calibrate", str(folder), "--out", str(out), "--size", f"{WIDTH}x{HEIGHT}", "--json", "--force"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report == json.loads(out.with_suffix(".json").read_text()) and 0.3 < report["covered"] < 1.0
     assert len(report["used"]) == 10 and report["left_out"] == [] and report["looked_at"] == 11
@@ -108,7 +108,7 @@ def test_files_of_others_are_kept(folder, tmp_path, capsys):
     for name in ("camera.yaml", "camera.json"):
         mine = tmp_path / name
         mine.write_text("image_width: 3")
-        assert f"{name}: exists, and is not recognised" in refused([folder, "--out", tmp_path / "camera.yaml"], capsys)
+        assert f"{name}: exists. Give --force" in refused([folder, "--out", tmp_path / "camera.yaml"], capsys)
         assert [path.read_text() for path in tmp_path.iterdir()] == ["image_width: 3"]
         mine.unlink()
     assert "give a name that ends so" in refused([folder, "--out", tmp_path / "camera.txt"], capsys)

@@ -154,7 +154,7 @@ def test_lerobots_own_reader_reads_what_ours_reads(lerobot, folder, tmp_path):
 def test_robomimic_has_demonstrations_and_holds_one_out(folder, tmp_path, capsys):
     out = tmp_path / "set.hdf5"
     words = ["convert", str(folder), "--to", "robomimic", "--out", str(out), "--json"]
-    assert main(words) == 0 and main(words) == 0  # its own file it replaces
+    assert main(words) == 0 and main(words) == 2 and main([*words, "--force"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["held_out"] == 1
     ours = read_episodes(folder, ["depth", "colour", "T_world_tool"], window=7).at(0, 0)
     with h5py.File(out) as file:

@@ -72,7 +72,7 @@ def test_the_command_writes_table_and_plot(few, tmp_path, monkeypatch, capsys):
     assert (tmp_path / "all.png").stat().st_size > 10_000
     assert main([*words[:2], "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["failed"] == 0
-    assert main([*words, "--anatomy", "mine.vtu"]) == 2 and "leave --anatomy out" in capsys.readouterr().err
+    assert main([*words, "--anatomy", "mine.vtu", "--force"]) == 2 and "leave --anatomy out" in capsys.readouterr().err
 
 
 def test_the_plot_has_a_panel_for_each_opening_and_a_curve_for_each_change():

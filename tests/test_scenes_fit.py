@@ -65,9 +65,10 @@ def test_the_command_writes_what_it_says(body, folder, monkeypatch, capsys):
     rows = (folder / "2.csv").read_text().splitlines()
     rows[4] = ",".join([*rows[4].split(",")[:3], "9,9,-15"])
     (folder / "3.csv").write_text("\n".join(rows))
-    assert main([*words[:-1], str(folder / "3.csv"), "--json"]) == 0  # its own file is replaced
+    assert main([*words, "--json"]) == 2 and "box.tissue.json: exists" in capsys.readouterr().err
+    assert main([*words[:-1], str(folder / "3.csv"), "--json", "--force"]) == 0
     assert json.loads(capsys.readouterr().out)["outliers"] == [[], [3]]
-    assert main([*words[:-1], str(folder / "3.csv")]) == 0
+    assert main([*words[:-1], str(folder / "3.csv"), "--force"]) == 0
     said = capsys.readouterr().out
     assert "Frame 2: Left out, off the open cortex or without support by other points: rows 5 of the file." in said
     assert "times as stiff as the brain" in said
@@ -76,11 +77,11 @@ def test_the_command_writes_what_it_says(body, folder, monkeypatch, capsys):
 def test_bad_input_is_one_sentence(folder, capsys):
     body, first = str(folder / "box.vtu"), str(folder / "1.csv")
     (folder / "tools.csv").write_text("frame,x,y,z\n2,1,2,3\n")
-    assert main(["fit", body, first, first]) == 2
+    assert main(["fit", body, first, first, "--force"]) == 2
     assert "frames 1 and 2 are the same" in capsys.readouterr().err
-    assert main(["fit", body, first, "--tool", str(folder / "tools.csv")]) == 2
+    assert main(["fit", body, first, "--tool", str(folder / "tools.csv"), "--force"]) == 2
     assert "is of frame 2, but there are 1" in capsys.readouterr().err
-    assert main(["fit", body, first, "--region", "tumour:9000"]) == 2
+    assert main(["fit", body, first, "--region", "tumour:9000", "--force"]) == 2
     assert "--region tumour: its stiffness is what `sulcus fit` finds" in capsys.readouterr().err
 
 

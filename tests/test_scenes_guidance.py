@@ -11,10 +11,9 @@ import pytest
 import warp as wp
 from balls import ball
 from plain_english import too_long
-from test_scenes_approach import marked
 from theatres import put, theatre_of
 
-from ar.screen import read_png, signature
+from ar.screen import read_png
 from benchmarks.__main__ import BENCHMARKS, make_parser
 from scenes.cli import COMMANDS, main, make_parsers, with_points
 from scenes.commands.guidance import EXAMPLES, NAMES, PLAYING
@@ -118,25 +117,22 @@ def folder(box, tmp_path_factory):
     return folder
 
 
-def test_frames_of_another_run_are_refused_or_removed(folder, tmp_path, monkeypatch, capsys):
+def test_frames_that_are_there_are_kept_or_removed_by_force(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     words = ["render", "press", "--anatomy", "box.vtu", "--device", "cpu", "--out", str(tmp_path), "--plain"]
     assert main([*words, "--every", "60", "--film", str(tmp_path / "press.gif")]) == 0
     assert f"film {tmp_path / 'press.gif'}" in capsys.readouterr().out
     first = {path: path.read_bytes() for path in tmp_path.glob("frame_*.png")}
-    assert len(first) == 3 and len({signature(path) for path in first}) == 1
+    assert len(first) == 3
     assert all(read_png(path).shape == (600, 800, 3) for path in first)
     (tmp_path / "frame_mine.png").write_bytes(b"mine")
     assert main([*words, "--every", "120"]) == 2
-    assert "holds 3 frames of another run" in capsys.readouterr().err
+    assert "holds 3 frames. Give --force" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in first} == first
     assert main([*words, "--every", "120", "--force"]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "frame_0000.png", "frame_0120.png", "frame_mine.png", "press.gif",
     ]  # fmt: skip
-    assert main([*words, "--every", "120", "--film", str(tmp_path / "press.gif")]) == 0  # the same run once more
-    entry = marked(folder, np.array([[6e-3, 0.0, 0.0]]), "Fiducial")
-    assert main([*words, "--every", "120", "--trajectory", str(entry)]) == 2  # the tool goes elsewhere
 
 
 def test_checking_shows_how_far_it_is(folder, monkeypatch, capsys):
@@ -188,9 +184,10 @@ def test_an_anatomy_says_where_its_pieces_lie_and_refuses_to_leave_data_behind(t
     assert "2 pieces; the skull is opened over the point given" in said and "piece 2: 0.88 ml, left anterior" in said
     assert "opening: left anterior superior" in said
     (tmp_path / "me.h5.partial").write_text(json.dumps({"anatomy": "of another"}))
-    before = out.read_bytes()
+    assert main(words) == 2 and "me.vtu: exists. Give --force" in capsys.readouterr().err
+    out.rename(tmp_path / "other.vtu")
     assert main(words) == 2
-    assert "me.h5.partial" in (error := capsys.readouterr().err) and "--force" in error and out.read_bytes() == before
+    assert "me.h5.partial" in (error := capsys.readouterr().err) and "--force" in error and not out.exists()
 
 
 def test_a_patient_hands_force_and_opening_on_and_begins_nothing_that_it_cannot_end(tmp_path, monkeypatch, capsys):
@@ -203,4 +200,28 @@ def test_a_patient_hands_force_and_opening_on_and_begins_nothing_that_it_cannot_
     steps.clear()
     (tmp_path / "me.model.npz").write_bytes(b"mine")
     assert main(words) == 2 and not steps
-    assert "me.model.npz" in capsys.readouterr().err
+    assert "me.model.npz" in capsys.readouterr().err and not (tmp_path / "me.vtu.partial").exists()
+
+
+def test_a_stopped_patient_goes_on_after_the_steps_that_are_done(tmp_path, monkeypatch, capsys):
+    steps, codes = [], {"anatomy": 2, "simulate": 130, "train": 0}
+    made = {"anatomy": "me.vtu", "simulate": "me.h5", "train": "me.model.npz"}
+
+    def step(words):
+        steps.append(words[0])
+        if codes[words[0]] == 0:
+            (tmp_path / made[words[0]]).write_bytes(b"made")
+        return codes[words[0]]
+
+    monkeypatch.setattr("scenes.cli.main", step)
+    words = ["patient", "labels.nii.gz", "--brain", "1", "--tumour", "2", "--device", "cpu"]
+    words += ["--out", str(tmp_path / "me.vtu")]
+    assert main(words) == 2 and not list(tmp_path.iterdir())
+    codes["anatomy"] = 0
+    assert main(words) == 130 and (tmp_path / "me.vtu.partial").exists()
+    assert main([*words, "--nodes", "2000"]) == 2 and "was begun with anatomy" in capsys.readouterr().err
+    codes["simulate"] = 0
+    assert main(words) == 0
+    assert steps == ["anatomy", "anatomy", "simulate", "simulate", "train"]
+    assert {path.name for path in tmp_path.iterdir()} == set(made.values())
+    assert main(words) == 2 and "me.vtu: exists. Give --force" in capsys.readouterr().err

@@ -70,7 +70,7 @@ def test_the_result_is_a_mesh_and_numbers_in_millimetres(files, body, capsys):
     assert found.point_data["covariance"].shape == (len(field), 6)
     trace = found.point_data["covariance"][:, :3].sum(axis=1)
     assert found.point_data["deviation"] == pytest.approx(np.sqrt(np.maximum(trace, 0.0)), abs=1e-9)
-    assert main(words) == 0  # the same again, over its own file
+    assert main([*words, "--force"]) == 0  # the same again, over its own file
     assert json.loads(capsys.readouterr().out)["centroid_mm"] == said["centroid_mm"]
 
 
@@ -78,7 +78,16 @@ def test_what_a_tracker_is_known_to_do_is_given_in_millimetres(files, capsys):
     """Of no rigid error none is found; what no tracker does is refused before anything is written."""
     folder, _ = files
     out, bias = folder / "rigid.vtu", []
-    words = ["locate", str(folder / "box.vtu"), str(folder / "plain.csv"), "--out", str(out), "--json", "--rigid"]
+    words = [
+        "locate",
+        str(folder / "box.vtu"),
+        str(folder / "plain.csv"),
+        "--out",
+        str(out),
+        "--json",
+        "--force",
+        "--rigid",
+    ]
     for rigid in ("-1", "nan", "20.5"):
         assert main([*words, rigid]) == 2 and not out.exists()
         assert f"a rigid error of {rigid} mm is none that a tracker has" in capsys.readouterr().err
@@ -139,7 +148,7 @@ def test_what_is_said_is_in_json_too(files, body, tmp_path, capsys):
 def test_people_read_sentences(files, capsys, words):
     folder, _ = files
     words = [str(folder / word) if word.endswith(".csv") else word for word in words]
-    assert main(["locate", str(folder / "box.vtu"), *words, "--out", str(folder / "other.vtu")]) == 0
+    assert main(["locate", str(folder / "box.vtu"), *words, "--out", str(folder / "other.vtu"), "--force"]) == 0
     said = capsys.readouterr().out
     assert "The middle of the tumour has moved by" in said and "With a probability of 95 %" in said
 
@@ -269,15 +278,14 @@ def test_a_locator_is_made_beside_its_anatomy(files, body, tmp_path, capsys, mon
     beside = tmp_path / "box.locator.npz"
     assert asked == [(body.digest, 3, "cpu")] and str(beside) in capsys.readouterr().out
     assert np.array_equal(load_locator(beside, body).prior.shape, whole.prior.shape)
-    assert main(["locator", str(path), "--small", "--json"]) == 0  # over its own file
+    assert main(["locator", str(path), "--small", "--json", "--force"]) == 0
     said, small = json.loads(capsys.readouterr().out), load_locator(beside, body)
     assert not said["whole"] and np.array_equal(small.prior.nodes, whole.small().prior.nodes)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["box.locator.npz", "box.vtu"]
-    assert main(["locator", str(path), "--region", "tumour:9000,0.45"]) == 0
+    assert main(["locator", str(path), "--region", "tumour:9000,0.45", "--force"]) == 0
     assert "region 2 (tumour) 3 times as stiff as the brain, Poisson's ratio 0.45" in capsys.readouterr().out
     assert load_locator(beside, body).regions == (Region(2, 3.0, 0.45),)
-    beside.write_text("mine")
-    assert main(["locator", str(path)]) == 2 and "not recognised as a locator" in capsys.readouterr().err
+    assert main(["locator", str(path)]) == 2 and "box.locator.npz: exists. Give --force" in capsys.readouterr().err
 
 
 def test_a_locator_that_knows_other_regions_is_refused(files, body, tmp_path, capsys):

@@ -10,8 +10,8 @@ from scenes.cli import main
 
 def test_pages_and_their_list_are_written_and_written_again(tmp_path, capsys):
     out = tmp_path / "new" / "markers"
-    for _ in range(2):  # what it made itself it replaces
-        assert main(["markers", "--out", str(out)]) == 0
+    for words in ([], ["--force"]):
+        assert main(["markers", "--out", str(out), *words]) == 0
     assert "measure the rulers" in capsys.readouterr().out
     names = ["board.png", "markers.pdf", "patient.png", "targets.json", "tool.png"]
     assert sorted(path.name for path in out.iterdir()) == names
@@ -25,7 +25,7 @@ def test_files_of_others_are_kept(tmp_path, capsys):
         mine = tmp_path / name
         mine.write_bytes(b"mine")
         assert main(["markers", "--out", str(tmp_path)]) == 2
-        assert f"{name}: exists, and is not recognised" in capsys.readouterr().err
+        assert f"{name}: exists. Give --force" in capsys.readouterr().err
         assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"mine"]
         mine.unlink()
     (tmp_path / "file").write_bytes(b"mine")

@@ -44,7 +44,7 @@ def solve(tmp_path: Path, capsys: pytest.CaptureFixture):
         fields = {"points": MESH.nodes, "cells": [("tetra", MESH.tets)], "point_data": data} | changes
         meshio.Mesh(**fields).write(source)  # pyright: ignore[reportArgumentType]
         capsys.readouterr()
-        code = main(["solve", str(source), "--device", "cpu", "--out", str(out), *flags])
+        code = main(["solve", str(source), "--device", "cpu", "--out", str(out), "--force", *flags])
         printed = capsys.readouterr()
         lines = printed.out.splitlines()
         assert len(lines) == (0 if code == 2 else 1)

@@ -152,7 +152,9 @@ def test_a_damaged_data_file_is_a_sentence(folder, tmp_path, capsys):
 
 def test_models_are_judged_by_loads_that_they_have_never_seen(folder, small_box, capsys):
     data, model, fresh = (str(folder / name) for name in ("data.h5", "table.npz", "fresh.h5"))
-    assert main(["train", data, "--out", model, "--learners", "linear", "--device", "cpu,cpu", "--json"]) == 0
+    assert (
+        main(["train", data, "--out", model, "--learners", "linear", "--device", "cpu,cpu", "--json", "--force"]) == 0
+    )
     words = ["--count", "60", "--device", "cpu", "--json"]
     assert main(["simulate", str(folder / "box.vtu"), "--out", fresh, "--seed", "9", *words]) == 0
     capsys.readouterr()

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from scenes.commands.companion_files import stated as stated_beside
-from scenes.options.outputs import model_header, recognised
 from scenes.tracked.film_truth import read_truth
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
@@ -175,8 +174,6 @@ def test_model_with_another_array_than_named_is_rejected(stored, models, box, tm
 
 
 READERS = {
-    "header": model_header,
-    "recognised": lambda path: recognised(path, "a model of `sulcus train`"),
     "truth": lambda path: read_truth(path, "digest", 3, 2**20),
     "stated": stated_beside,
 }

@@ -94,11 +94,6 @@ def pdf_bytes(pages: Sequence[Page]) -> bytes:
     return _saved(pages, "PDF", resolution=DPI, creator=MAKER, title="Targets of sulcus")
 
 
-def is_page(content: bytes) -> bool:
-    """Whether `png_bytes` or `pdf_bytes` made a file's content."""
-    return MAKER.encode() in content or MAKER.encode("utf-16-be") in content
-
-
 def dictionary_name() -> str:
     """OpenCV's name of the dictionary that the markers are from."""
     names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]

@@ -12,18 +12,17 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from scenes.commands.interrupt import INTERRUPTED, terminated_as_interrupted
-from scenes.options.outputs import add_force, claimed, recognised
+from scenes.options.outputs import add_force, claimed
 from scenes.script.shipped_files import template_path
 from sim.errors import InputError
 
-from ..figures.figure_record import KIND, read_record
+from ..figures.figure_record import read_record
 from ..figures.figures import NAMED
 
 if TYPE_CHECKING:
     from ..figures.figure_record import Entry, Record
 
 OUT = Path("bench.json")
-KINDS = {KIND: read_record}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -98,8 +97,8 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
     out = args.json or OUT
     found: dict[str, Entry] = {}
     if not args.quick:
-        out = claimed(out, ".json", KIND, args.force, [args.anatomy, args.against, *args.tables], KINDS)
-        found = {entry.name: entry for entry in read_record(out).rows} if recognised(out, KIND, KINDS) else {}
+        out = claimed(out, ".json", True, [args.anatomy, args.against, *args.tables])
+        found = {entry.name: entry for entry in _begun(out, args.force)}
     body = read_anatomy(args.anatomy or template_path()).digest
     run = Run(version_here(), body, args.anatomy, args.quick)
     with tqdm(total=len(args.only), unit="figure", file=sys.stderr) as bar:
@@ -120,6 +119,16 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
             heard(f"{name}: {'kept' if entry is before else entry.state}{entry.reason and ': '}{entry.reason}")
             bar.update()
     return record_of(run.origin("auto"), list(found.values()))
+
+
+def _begun(out: Path, force: bool) -> tuple[Entry, ...]:
+    """Rows of the record to go on with; by `force` none of a file that is no record."""
+    try:
+        return read_record(out).rows if out.exists() else ()
+    except InputError:
+        if not force:
+            raise
+        return ()
 
 
 def _compared(old: Record, new: Record) -> int:

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     for size in args.sizes:
         MeshPlan(size)
     find_device(args.device, "float32")
-    out = claimed(args.out, ".png", "a picture of sulcus", args.force)
+    out = claimed(args.out, ".png", args.force or args.out.with_suffix(".csv").exists())
     where, record = machine(args.device), out.with_suffix(".csv")
     trial = Trial(args.element, args.device, out.parent)
     stated = f"{where.split(';')[0]}, {args.device} {args.element}, with the memory foreseen"

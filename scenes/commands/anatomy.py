@@ -83,9 +83,9 @@ def run(args: argparse.Namespace) -> int:
     """Make the anatomy, write it, and print what it is."""
     began = time.perf_counter()
     read = (args.labels, args.mask, args.tumour_in, args.t1)
-    claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, read)
+    claimed(args.out, ".vtu", args.force, read)
     beside = sidecar(args.out)
-    claimed(beside, ".gz", "a scan that sulcus put beside an anatomy", args.force, read)
+    claimed(beside, ".gz", args.force, read)
     chosen = {**DEFAULTS, **PRESETS[args.preset], **_given(args)}
     plan = MeshPlan(args.nodes, 1e-3 * chosen["craniotomy"], fine_opening=args.fine_opening)
     with stage("labels" if args.labels else "head" if args.mask or args.head else "template"):

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from ar.tracking.pivot import Pivot
 
 Found = TypeVar("Found", "Pivot", "HandEye")
-KIND, TABLE = "a calibration of `sulcus calibrate`", "a covariance of `sulcus calibrate`"
 MOST_VIEWS = 40
 # The share of the picture that corners should cover.
 WANTED_COVER = 0.6
@@ -92,8 +91,8 @@ def _camera(args: argparse.Namespace) -> int:
     if not args.out:
         raise InputError("give --out K.yaml for the camera.")
     suffix = Path(args.out).suffix
-    out = claimed(args.out, suffix if suffix in SUFFIXES else ".yaml", KIND, args.force, [args.pictures])
-    table = claimed(out.with_suffix(".json"), ".json", TABLE, args.force, [args.pictures])
+    out = claimed(args.out, suffix if suffix in SUFFIXES else ".yaml", args.force, [args.pictures])
+    table = claimed(out.with_suffix(".json"), ".json", args.force, [args.pictures])
     size = None if args.size is None else _size(args.size)
     board = calibration_board()
     seen = seen_views(args.pictures, board, size)

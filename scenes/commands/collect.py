@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..episodes.episode import collect
 
-    out = claimed(args.out, ".h5", "an episode of `sulcus collect`", args.force, [args.anatomy, args.camera])
+    out = claimed(args.out, ".h5", args.force, [args.anatomy, args.camera])
     theatre = theatre_asked(args, args.scene)
     scene = filmed(args, scene_asked(args, args.scene, theatre))
     name = deformer_name(args, theatre, scene)

@@ -10,8 +10,7 @@ from pathlib import Path
 from sim.errors import InputError
 from sim.runtime.partial_files import unfinished_path
 
-from ..options.outputs import head_of, model_header
-
+HEAD = 1 << 16
 # What of a data set must stay as it was for a run to go on with it.
 KEPT = ("anatomy", "effects", "tissue", "element", "accuracy", "preset", "seed", "shape")
 
@@ -20,13 +19,17 @@ def stated(path: Path) -> dict[str, str]:
     """What a data set, an unfinished one, or a model file says of itself as texts; nothing where none can be read."""
     import h5py
 
+    from surrogate.model.npz_archive import Archive
+
     try:
         if path.suffix == ".npz":
-            return {name: str(value) for name, value in model_header(path).items()}
+            with path.open("rb") as raw:
+                return {name: str(value) for name, value in json.loads(Archive(raw).text("header")).items()}
         if h5py.is_hdf5(path):
             with h5py.File(path, "r") as file:
                 return {name: str(value) for name, value in file.attrs.items()}
-        head = head_of(path).decode("latin-1")  # the journal of an unfinished run: its first record is JSON
+        with path.open("rb") as raw:  # the journal of an unfinished run: its first record is JSON
+            head = raw.read(HEAD).decode("latin-1")
         return {name: str(value) for name, value in json.JSONDecoder().raw_decode(head[head.index("{") :])[0].items()}
     except (OSError, ValueError, LookupError, AttributeError, zipfile.BadZipFile):
         return {}

@@ -79,7 +79,7 @@ def writer_of(args: argparse.Namespace) -> Callable[..., dict[str, Any]]:
     if args.to == "robomimic":
         from ..episodes.exports.robomimic import write_robomimic
 
-        out = claimed(args.out, ".hdf5", "a robomimic file of `sulcus convert`", args.force, args.episodes)
+        out = claimed(args.out, ".hdf5", args.force, args.episodes)
         return partial(write_robomimic, path=out)
     return partial(folder_writer(args.to), folder=args.out)
 

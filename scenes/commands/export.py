@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from surrogate.model.store import load
     from surrogate.onnx_export.export import write_onnx
 
-    out = claimed(args.out, ".onnx", "a graph of `sulcus export`", args.force)
+    out = claimed(args.out, ".onnx", args.force)
     if not args.model.is_file():
         raise InputError(f"{args.model}: no such file. Give a model of `sulcus train`.")
     mesh = args.anatomy

@@ -30,17 +30,8 @@ if TYPE_CHECKING:
 
 # Named here too, so that a command's help waits for no picture to be drawn.
 TROUBLES = ("reference", "tool", "bright", "smear", "gap")
-# What signs the pictures of a folder.
-SIGNED = "film"
-# What is written, and how it is recognised.
-FILES = {
-    "camera.yaml": "a camera of `sulcus film`",
-    "camera.json": "a covariance of `sulcus calibrate`",
-    "registration.json": "a registration of `sulcus register`",
-    "tool.json": "a tool of `sulcus film`",
-    "truth.npz": "what is true of a film of `sulcus film`",
-    "truth.csv": "a table of `sulcus film`",
-}
+# Files that are written beside the film.
+FILES = ("camera.yaml", "camera.json", "registration.json", "tool.json", "truth.npz", "truth.csv")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -117,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
     calibration = scene.viewpoint.calibration
     assert calibration is not None
     folder = claimed_folder(args.out, "film and its truth")
-    paths = {name: claimed(folder / name, Path(name).suffix, kind, args.force) for name, kind in FILES.items()}
+    paths = {name: claimed(folder / name, Path(name).suffix, args.force) for name in FILES}
     player = theatre.player(args.deformer or "fem", scene)
     mounts = mounted(player)
     shots: list[Shot] = []
@@ -181,14 +172,13 @@ def _write_film(args: argparse.Namespace, taken: Iterator[Shot], shots: list[Sho
     try:
         if not args.png:
             args.out.mkdir(parents=True, exist_ok=True)
-            film = claimed(args.out / "film.mp4", ".mp4", "a film of `sulcus render`", args.force)
+            film = claimed(args.out / "film.mp4", ".mp4", args.force)
             write_film(film, noted(), player.scene.frames_per_second / args.every)
             return film
         frames = claimed_folder(args.out / "frames", "pictures")
-        claimed_frames(frames, SIGNED, args.force)
-        for path in frames.glob("frame_*.png"):
+        for path in claimed_frames(frames, args.force):
             path.unlink()
-        screen = Film(frames, SIGNED)
+        screen = Film(frames)
         for number, colour in enumerate(noted()):
             screen.show(number, colour)
         return frames

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from surrogate.fitting.frame import Frame
     from surrogate.fitting.tissue import FittedTissue
 
-KIND = "fitted tissue of `sulcus fit`"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
@@ -71,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     from surrogate.fitting.support import unsupported
     from surrogate.fitting.tissue_files import save_tissue, tissue_path
 
-    out = claimed(args.out or tissue_path(args.anatomy), ".json", KIND, args.force, [args.anatomy, *args.frames])
+    out = claimed(args.out or tissue_path(args.anatomy), ".json", args.force, [args.anatomy, *args.frames])
     find_device(args.device, "float32")
     frames = _frames(args)
     anatomy = read_anatomy(args.anatomy)

@@ -71,11 +71,7 @@ def run(args: argparse.Namespace) -> int:
     from surrogate.locating.observation import placed
     from surrogate.locating.observed_files import read_observation
 
-    out = (
-        None
-        if args.out is None
-        else claimed(args.out, ".vtu", "a result of `sulcus locate`", args.force, [args.anatomy])
-    )
+    out = None if args.out is None else claimed(args.out, ".vtu", args.force, [args.anatomy])
     at_least("--seed", args.seed, 0)
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from surrogate.locating.locator import Locator
     from surrogate.locating.regions import Region
 
-KIND = "a locator of `sulcus locate`"
 REGIONS = f"{AS_LEARNED}. A locator knows how many times a region is as stiff as a brain of {1e-3 * BRAIN.young:g} kPa"
 
 
@@ -47,13 +46,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the locator, whatever lies there already. 0: done."""
+    """Make the locator. 0: done."""
     from sim.bodies.meshfile import read_anatomy
     from sim.runtime.device import find_device
     from surrogate.locating.locator_files import locator_path, save_locator
     from surrogate.locating.regions import regions_words
 
-    path = claimed(args.out or locator_path(args.anatomy), ".npz", KIND, args.force, [args.anatomy])
+    path = claimed(args.out or locator_path(args.anatomy), ".npz", args.force, [args.anatomy])
     at_least("--seed", args.seed, 0)
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
@@ -110,7 +109,7 @@ def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) 
                 "tumour alone, or name another file by --locator: a whole one is made there."
             )
         return locator
-    path = claimed(path, ".npz", KIND, args.force)
+    path = claimed(path, ".npz", args.force)
     locator = made(path, anatomy, args.seed, args.device, regions_known(args, anatomy))
     save_locator(path, locator)
     forget_parts(path)

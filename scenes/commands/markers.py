@@ -8,8 +8,6 @@ from pathlib import Path
 
 from ..options.outputs import add_force, claimed
 
-KIND, LIST = "a page of `sulcus markers`", "a list of `sulcus markers`"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -35,9 +33,9 @@ def run(args: argparse.Namespace) -> int:
     from sim.runtime.atomic_files import written_whole
 
     pages = printed_pages()
-    pictures = [claimed(args.out / f"{page.name}.png", ".png", KIND, args.force) for page in pages]
-    book = claimed(args.out / "markers.pdf", ".pdf", KIND, args.force)
-    table = claimed(args.out / "targets.json", ".json", LIST, args.force)
+    pictures = [claimed(args.out / f"{page.name}.png", ".png", args.force) for page in pages]
+    book = claimed(args.out / "markers.pdf", ".pdf", args.force)
+    table = claimed(args.out / "targets.json", ".json", args.force)
     contents = {
         book: pdf_bytes(pages),
         **{path: png_bytes(page) for path, page in zip(pictures, pages, strict=True)},

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from ..tracked.run import Shown
 
 FILMS = (".mp4", ".gif", ".webp")
-TABLE = "a table of `sulcus overlay`"
 # Only this machine reaches the page.
 HOST = "127.0.0.1"
 UNSTATED = (
@@ -119,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
     inputs += [*(args.poses or ()), args.hand_eye, args.camera_poses]
     demand_poses(args)
     out = None if args.out is None else _film_path(args.out, args.force, inputs)
-    table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, inputs)
+    table = None if args.table is None else claimed(args.table, ".csv", args.force, inputs)
     parts = _parts(args, film=True)
     stage = parts.painter.stage
     truth = None
@@ -148,7 +147,7 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
     addresses_of(args)
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
-    table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, [args.camera])
+    table = None if args.table is None else claimed(args.table, ".csv", args.force, [args.camera])
     try:
         check_address(HOST, args.port)
         parts = _parts(args, film=not camera)
@@ -203,7 +202,7 @@ def _ended(
 def _film_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path:
     if path.suffix not in FILMS:
         raise InputError(f"{path}: films are written as {', '.join(FILMS)}; give a name that ends so.")
-    return claimed(path, path.suffix, "a film of `sulcus render`", force, inputs)
+    return claimed(path, path.suffix, force, inputs)
 
 
 def _parts(args: argparse.Namespace, film: bool) -> Parts:

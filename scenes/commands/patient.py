@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 from sim.anatomy import PART_LABELS, REGION_NAMES
@@ -17,8 +19,10 @@ from sim.elements import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS, Tissue
 from sim.runtime.atomic_files import written_whole
+from sim.runtime.partial_files import unfinished_path
 from sim.runtime.timing import listened
 from surrogate.data.disc_split import APART, FEWEST
+from surrogate.data.journal import opened as opened_journal
 from surrogate.data.tool_loads import PRESETS
 
 from ..options.devices_option import add_devices
@@ -84,7 +88,9 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--region {min(strange)}: a patient has no such region. Choose from {', '.join(OWN)}.")
     # A part of another stiffness must be a region.
     args.regions = (*args.regions, *(name for name, label in PART_LABELS.items() if label in regions))
-    claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, [args.labels, args.mask, args.tumour_in, args.t1])
+    note = unfinished_path(args.out)
+    resumed = note.exists() and not args.force
+    claimed(args.out, ".vtu", args.force or args.inspect or resumed, _inputs(args))
     if args.inspect:
         return _inspect(args, plan, regions)
     from sim.runtime.device import device_names
@@ -95,8 +101,8 @@ def run(args: argparse.Namespace) -> int:
     from .train import asked_learners
 
     data, model = args.out.with_suffix(".h5"), model_path(args.out)
-    claimed(data, ".h5", "a data set of `sulcus simulate`", args.force)
-    claimed(model, ".npz", "a model of `sulcus train`", args.force)
+    for path, suffix in ((data, ".h5"), (model, ".npz")):
+        claimed(path, suffix, args.force or resumed, _inputs(args))
     device_names(args.device)
     check_learners(asked_learners(args.learners), of_poses=False, where=str(data))
     if args.count - args.count // APART < FEWEST + 1:
@@ -106,22 +112,32 @@ def run(args: argparse.Namespace) -> int:
     steps = [
         ["anatomy", *label_words(args), *t1,
          "--nodes", str(args.nodes), "--craniotomy", str(args.craniotomy), *opening_words(args),
-         "--out", str(args.out), *force],
+         "--out", str(args.out)],
         ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--preset", args.preset,
          "--device", args.device, "--material", args.material,
          *([] if args.element is None else ["--element", args.element]),
-         *(f"--region={text}" for text in args.region), *force],
-        ["train", str(data), "--out", str(model), "--learners", args.learners, "--device", args.device,
-         *force],
+         *(f"--region={text}" for text in args.region)],
+        ["train", str(data), "--out", str(model), "--learners", args.learners, "--device", args.device],
     ]  # fmt: skip
     began = time.perf_counter()
-    with listened() as seconds:
-        for step in steps:
-            if not args.json:
-                print(f"sulcus {' '.join(step)}", flush=True)
-            code = main([*step, "--json"] if args.json else step)
-            if code != 0:
-                return code
+    if args.force:
+        note.unlink(missing_ok=True)
+    changed = [path.stat().st_mtime for path in _inputs(args) if path.exists()]
+    begun = {"anatomy": shlex.join(steps[0]), "inputs": f"of {datetime.fromtimestamp(max(changed, default=0))}"}
+    with listened() as seconds, opened_journal(note, begun) as journal:
+        try:
+            for step in steps:
+                if (step[0], 0) in journal:
+                    continue
+                if not args.json:
+                    print(f"sulcus {' '.join(step)}", flush=True)
+                code = main([*step, *force, "--json"] if args.json else [*step, *force])
+                if code != 0:
+                    return code
+                journal.add((step[0], 0), b"")
+        finally:
+            if ("anatomy", 0) not in journal or ("train", 0) in journal:
+                note.unlink()
     whole = time.perf_counter() - began
     # Imports, checks and figures: what no stage claims.
     seconds["rest"] = whole - sum(seconds.values())
@@ -133,6 +149,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _inputs(args: argparse.Namespace) -> list[Path]:
+    return [path for path in (args.labels, args.mask, args.tumour_in, args.t1) if path is not None]
+
+
 def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tissue]) -> int:
     """Print what would be made, and draw it."""
     from ar.screen import write_png
@@ -142,7 +162,7 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
 
     began = time.perf_counter()
     picture = args.out.with_suffix(".inspect.png")
-    claimed(picture, ".png", "a picture of sulcus", args.force, [args.labels, args.mask, args.tumour_in, args.t1])
+    claimed(picture, ".png", True, _inputs(args))  # a preview, which is drawn until it looks right
     masks = head_masks(sources_of(args))
     subject = opened(masked_subject(masks, args.t1, regions=regions_asked(args)), args)
     found = inspected(masks, subject, regions)

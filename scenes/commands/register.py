@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from ar.tracking.registration import Nearest, Registration
     from sim.anatomy import Anatomy
 
-KIND = "a registration of `sulcus register`"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -57,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.surface is not None and args.anatomy is None:
         raise InputError("--surface is traced on an anatomy: give it by --anatomy.")
-    out = claimed(args.out, ".json", KIND, args.force, [args.pairs, args.surface])
+    out = claimed(args.out, ".json", args.force, [args.pairs, args.surface])
     columns = read_columns(args.pairs, {("x", "y", "z", "px", "py", "pz")})
     scan, patient = (1e-3 * np.column_stack([columns[name] for name in names]) for names in ("xyz", ("px", "py", "pz")))
     anatomy = None if args.anatomy is None else read_anatomy(args.anatomy)

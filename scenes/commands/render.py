@@ -6,7 +6,6 @@ import argparse
 import json
 import sys
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,8 +21,7 @@ from ..options.style_option import add_style
 from ..options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
-    from ..play.deformers import Theatre
-    from ..script.scene import Scene
+    pass
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,18 +49,17 @@ def run(args: argparse.Namespace) -> int:
     if args.film is not None:
         if args.film.suffix not in (".mp4", ".gif", ".webp"):
             raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
-        claimed(args.film, args.film.suffix, "a film of `sulcus render`", args.force, [args.camera])
+        claimed(args.film, args.film.suffix, args.force, [args.camera])
     theatre = theatre_asked(args, args.scene)
     scene = filmed(args, scene_asked(args, args.scene, theatre))
     name = deformer_name(args, theatre, scene)
     player = replace(theatre.player(name, scene), style=args.style)
-    run_of = _run(args, theatre, scene, name)
-    others = claimed_frames(args.out, run_of, args.force)
+    others = claimed_frames(args.out, args.force)
     written, bad = [], 0
     try:
         for path in others:
             path.unlink()
-        film = Film(args.out, run_of)
+        film = Film(args.out)
         for frame in tqdm(player.frames(every=args.every), total=len(scene.times[:: args.every]), file=sys.stderr):
             film.show(frame.number, frame.shown if args.plain else labelled(frame, name))
             written.append(args.out / f"frame_{frame.number:04d}.png")
@@ -80,12 +77,3 @@ def run(args: argparse.Namespace) -> int:
     said = f"{len(written)} frame{'s' * (len(written) != 1)} by {who}, written to {args.out}{beside}{unanswered}"
     print(json.dumps(report) if args.json else said)
     return 1 if bad else 0
-
-
-def _run(args: argparse.Namespace, theatre: Theatre, scene: Scene, name: str) -> str:
-    """What tells this run's frames from another's: scene, deformer, anatomy and all that changes the pictures."""
-    model, touches = theatre.models.get(name), [scene.path(time) for time in scene.times.tolist()]
-    about = scene.effects_on(theatre.anatomy), scene.element, scene.tool, touches, scene.viewpoint, scene.accuracy
-    trained = None if model is None else (model.bound, dict(model.training))
-    marks = repr((scene.name, name, theatre.anatomy.digest, about, trained, args.every, args.plain, args.style))
-    return f"run {sha256(marks.encode()).hexdigest()[:16]}"

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         claimed_folder(args.out, "pictures")
         for name in (*scenes, "sheet"):
-            claimed(args.out / f"{name}.png", ".png", "a picture of sulcus", args.force)
+            claimed(args.out / f"{name}.png", ".png", args.force)
     theatre = open_theatre(args.anatomy, device=args.device)
     lines = sys.stderr if args.json else sys.stdout
     drawn = [] if args.out is None else [scene.name for scene in playable(args, theatre, list(scenes.values()))]

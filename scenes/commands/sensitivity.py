@@ -84,8 +84,7 @@ def run(args: argparse.Namespace) -> int:
     from ..play.deformers import open_theatre
 
     if args.out:
-        table = "a table of `sulcus sensitivity --factorial`" if args.factorial else "a table of `sulcus sensitivity`"
-        claimed(args.out, ".csv", table, args.force)
+        claimed(args.out, ".csv", args.force)
     if args.factorial:
         return _factorial(args)
     theatre = open_theatre(args.anatomy, args.model, args.device)
@@ -136,7 +135,7 @@ def _factorial(args: argparse.Namespace) -> int:
 
     if args.anatomy:
         raise InputError("--factorial makes its bodies of the template: leave --anatomy out.")
-    picture = args.out and claimed(args.out.with_suffix(".png"), ".png", "a picture of sulcus", args.force)
+    picture = args.out and claimed(args.out.with_suffix(".png"), ".png", args.force)
     total = prod(map(len, LEVELS.values()))
     found = list(tqdm(cells(nodes=args.nodes, device=args.device), total=total, unit="cell", file=sys.stderr))
     table = [{**cell.levels, "force_mm": cell.force, "motion_mm": cell.motion} for cell in found]

@@ -7,6 +7,7 @@ import json
 import sys
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -45,13 +46,11 @@ from ..options.tissue_options import (
     tissue_of,
 )
 from ..script.shipped_files import template_path
-from .companion_files import batch_begun, remove_data
+from .companion_files import batch_begun, remove_data, stated
 from .interrupt import INTERRUPTED, terminated_as_interrupted
 
 # Sizes [mm] of tools that press on a brain.
 SMALLEST_MM, LARGEST_MM = 0.1, 200.0
-
-DATA = "a data set of `sulcus simulate`"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -103,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Returns 0: the file is complete, whether or not every case converged; it says which did."""
-    out = claimed(args.out, ".h5", DATA, args.force)
+    out = claimed(args.out, ".h5", args.force or "anatomy" in stated(Path(args.out)))
     with stage("draw"):
         anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
         if not len(anatomy.tumour_nodes):

@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
     Then the equilibrium under the largest share of the load that has one is written, or the last state where none has.
     """
-    out = claimed(args.out, ".vtu", "a result of `sulcus solve`", args.force, [args.mesh])
+    out = claimed(args.out, ".vtu", args.force, [args.mesh])
     accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision, limit_strain=not args.any_strain)
     file = read_mesh(args.mesh, args.unit)
     tissue = elasticity_of(args, file.mesh)

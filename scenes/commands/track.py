@@ -15,7 +15,6 @@ from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
 from ..options.shared_options import add_json
 
-KIND = "poses of `sulcus track`"
 # What may be followed, and in whose frame.
 BODIES, FRAMES = ("tool", "patient", "board", "camera"), ("camera", "patient", "board")
 
@@ -61,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")
     if args.body == args.frame:
         raise InputError(f"the {args.body} is at rest in its own frame: choose --frame camera, or another --body.")
-    out = claimed(args.out, ".csv", KIND, args.force, [args.pictures, Path(args.camera)])
+    out = claimed(args.out, ".csv", args.force, [args.pictures, Path(args.camera)])
     tip = np.array([0.0, 0.0, -TIP]) if args.tip is None else 1e-3 * np.array(args.tip)
     if not np.isfinite(tip).all():
         raise InputError("--tip has a number that is not finite: give three numbers in millimetres.")

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Returns 0 when the models are written."""
-    out = claimed(args.out, ".npz", "a model of `sulcus train`", args.force)
+    out = claimed(args.out, ".npz", args.force)
     device = device_names(args.device)[0]
     asked = None if args.learners is None else asked_learners(args.learners)
     with stage("read the data"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,11 +14,8 @@ from ..runtime.atomic_files import written_whole
 from .volume import read_volume
 from .voxels import OF_BRAINS, Voxels
 
-HEADER = 348  # bytes of NIfTI
 # Grey values that differ by less than this share of them are one.
 ALIKE = 1e-6
-SIGNED = b"sulcus: intensities beside a mesh"
-"""By which what was written here is distinguished from a user's own scan."""
 
 
 @dataclass(frozen=True)
@@ -132,15 +128,9 @@ def write_intensity(path: str | Path, intensity: Intensity) -> None:
     affine = np.diag([1e3, 1e3, 1e3, 1.0]) @ intensity.affine
     image = nibabel.Nifti1Image(intensity.values, affine)
     image.header.set_xyzt_units("mm")
-    image.header["descrip"] = SIGNED
+    image.header["descrip"] = b"sulcus: intensities beside a mesh"
     with written_whole(path, ".gz") as partial:
         nibabel.save(image, partial)
-
-
-def is_sidecar(path: str | Path) -> bool:
-    """Whether a file is one that `write_intensity` wrote; OSError where it cannot be read."""
-    with gzip.open(path, "rb") as file:
-        return SIGNED in file.read(HEADER)
 
 
 def read_intensity(path: str | Path, voxels: Voxels = OF_BRAINS) -> Intensity:
