@@ -1,7 +1,6 @@
 """What the command line says before, while and after it works."""
 
 import argparse
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -25,6 +24,7 @@ from sim.bodies.label_volume import volume_subject
 from sim.errors import InputError
 from sim.loads import push
 from sim.runtime.device import find_device
+from sim.runtime.journal import opened as opened_journal
 
 
 def helped(words, capsys):
@@ -183,7 +183,8 @@ def test_an_anatomy_says_where_its_pieces_lie_and_refuses_to_leave_data_behind(t
     assert "holds 8.7 % less tumour than" in noted and "ask for more nodes" in noted
     assert "2 pieces; the skull is opened over the point given" in said and "piece 2: 0.88 ml, left anterior" in said
     assert "opening: left anterior superior" in said
-    (tmp_path / "me.h5.partial").write_text(json.dumps({"anatomy": "of another"}))
+    with opened_journal(tmp_path / "me.h5.partial", {"anatomy": "of another"}):
+        pass
     assert main(words) == 2 and "me.vtu: exists. Give --force" in capsys.readouterr().err
     out.rename(tmp_path / "other.vtu")
     assert main(words) == 2

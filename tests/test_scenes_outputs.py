@@ -16,6 +16,7 @@ from sim.bodies.intensity import sidecar
 from sim.bodies.meshfile import read_mesh, write_mesh
 from sim.errors import InputError
 from sim.runtime.atomic_files import check_output
+from sim.runtime.journal import opened
 
 # None of what they read is there: whoever looks at it first says so, and not that nothing can be written.
 WRITING = {
@@ -130,7 +131,8 @@ def test_data_and_models_of_another_anatomy_are_found_beside_a_mesh(tmp_path):
     put_data(tmp_path / "me.h5", anatomy="new")
     np.savez(tmp_path / "me.model.npz", header=np.array(json.dumps({"format": "sulcus model 2", "anatomy": "old"})))
     assert strangers(mesh, "new") == [tmp_path / "me.model.npz"]
-    (tmp_path / "me.h5.partial").write_bytes(b"sulcus\r\n\0run\0" + json.dumps({"anatomy": "old"}).encode() + b"\0\x01")
+    with opened(tmp_path / "me.h5.partial", {"anatomy": "old"}):
+        pass
     with pytest.raises(InputError, match=r"me.h5.partial and me.model.npz beside it.*--force"):
         demand_no_strangers(mesh, "new", force=False)
     assert len(demand_no_strangers(mesh, "new", force=True)) == 2

@@ -21,9 +21,9 @@ from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import push
 from sim.material import tissue_from_json
+from sim.runtime.journal import DamageWarning
 from surrogate.data.answer_rows import checksums, row_type
 from surrogate.data.dataset import FORMAT, SEAL, UNCHECKED, read_dataset, stored
-from surrogate.data.journal import DamageWarning
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.training.train import train

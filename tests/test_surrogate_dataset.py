@@ -104,7 +104,7 @@ import glob, os, runpy, signal, sys
 import h5py
 tools = runpy.run_path(sys.argv[1])
 box = tools["make_box"]()
-from surrogate.data import journal
+from sim.runtime import journal
 from surrogate.data.tool_loads import draw
 from surrogate.data.simulate import simulate
 path, kind, last, count = sys.argv[2], sys.argv[3], int(sys.argv[4]), 0

@@ -13,6 +13,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed
 from sim.material import Material, tissue_to_json
+from sim.runtime.journal import opened
 from surrogate.array_functions import Rounded
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
@@ -24,7 +25,6 @@ from surrogate.regressors.force_series import ORDERS, SPANS, Series, forms
 from surrogate.regressors.left_out_tables import filled
 from surrogate.training.examples import Examples
 from surrogate.training.expansion import ADDED, COARSE, EXPANDED, Expansion
-from surrogate.training.kept_rows import KeptRows
 from surrogate.training.tabulate_series import radii_between, tabulated, with_middles
 from surrogate.training.train import learners_for, train
 
@@ -109,17 +109,17 @@ def test_the_table_is_the_finite_elements_series(box, patch, tmp_path):
     table = tabulated(fem, places, radii, reading, lambda done, total: heard.append((done, total)))
     series = Series(patch.points, triangles, radii, unrounded(table))
     assert heard[-1] == (len(places), len(places))
-    # Stopped at its second step, it goes on there, and comes to the same.
-    kept = KeptRows(tmp_path / "rows", "a table")
 
+    # Stopped at its second step, it goes on there, and comes to the same.
     def stop(done, total):
         if done > step:
             raise KeyboardInterrupt
 
     step, last = heard[0][0], []
-    with pytest.raises(KeyboardInterrupt):
-        tabulated(fem, places, radii, reading, stop, kept)
-    again = tabulated(fem, places, radii, reading, lambda done, total: last.append(done), kept)
+    with pytest.raises(KeyboardInterrupt), opened(tmp_path / "rows", {}) as journal:
+        tabulated(fem, places, radii, reading, stop, journal)
+    with opened(tmp_path / "rows", {}) as journal:
+        again = tabulated(fem, places, radii, reading, lambda done, total: last.append(done), journal)
     assert np.array_equal(again, table) and last == [done for done, _ in heard[2:]]
     size, _ = directions(loads)
     predicted = series.predict(tool_features(patch, loads)) * size[:, None]

@@ -40,36 +40,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a load did not converge."""
     from ar.screen import write_png
+    from scenes.analysis.csv_tables import write_table
     from scenes.analysis.loglog_chart import drawn
     from scenes.analysis.machine import machine
     from sim.bodies.subject import MeshPlan
     from sim.runtime.device import find_device
+    from sim.runtime.journal import opened
 
-    from ..studies.recorded_rows import append_rows, read_rows
     from ..studies.scaling import Row, Trial, panels, rows
 
     at_least("--batch", min(args.batch), 1)
     for size in args.sizes:
         MeshPlan(size)
     find_device(args.device, "float32")
-    out = claimed(args.out, ".png", args.force or args.out.with_suffix(".csv").exists())
-    where, record = machine(args.device), out.with_suffix(".csv")
-    trial = Trial(args.element, args.device, out.parent)
-    stated = f"{where.split(';')[0]}, {args.device} {args.element}, with the memory foreseen"
-    found = [row for row in read_rows(record, stated, Row) if row.size in args.sizes and row.asked in args.batch]
+    where, record, kept = machine(args.device), args.out.with_suffix(".csv"), args.out.with_suffix(".rows")
+    for path, suffix in ((args.out, ".png"), (record, ".csv")):
+        claimed(path, suffix, args.force or kept.exists())
+    if args.force:
+        kept.unlink(missing_ok=True)
+    trial = Trial(args.element, args.device, args.out.parent)
+    stated = {"machine": where.split(";")[0], "device": args.device, "element": args.element}
     table = sys.stderr if args.json else sys.stdout
     print(where, file=table)
-    with tqdm(total=len(args.sizes) * len(args.batch), initial=len(found), unit="row", file=sys.stderr) as bar:
+    with (
+        opened(kept, stated) as journal,
+        tqdm(total=len(args.sizes) * len(args.batch), unit="row", file=sys.stderr) as bar,
+    ):
+        found = [row for row in journal.rows(Row) if row.size in args.sizes and row.asked in args.batch]
+        bar.update(len(found))
         for row in rows(trial, args.sizes, args.batch, tuple(found), bar.set_description):
-            append_rows(record, stated, [row])
+            journal.append(row)
             found.append(row)
             bar.update()
     found.sort(key=lambda row: (row.nodes, row.batch))
-    write_png(out, drawn(panels(found)))
+    write_table(record, [asdict(row) for row in found])
+    write_png(args.out, drawn(panels(found)))
     _print(found, table)
-    print(f"\n{out}: written; its rows are in {record}, its meshes beside it", file=table)
+    print(f"\n{args.out}: written; its rows are in {record}, its meshes beside it", file=table)
     if args.json:
-        print(json.dumps({"machine": where, "rows": [asdict(row) for row in found], "plot": str(out)}))
+        print(json.dumps({"machine": where, "rows": [asdict(row) for row in found], "plot": str(args.out)}))
     return 0 if all(row.converged == row.loads for row in found) else 1
 
 

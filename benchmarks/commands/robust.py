@@ -6,12 +6,14 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from scenes.options.outputs import add_force, claimed
 from scenes.options.shared_options import add_anatomy, add_device, add_json, add_seed
 from scenes.options.tissue_options import add_tissue_arguments, elasticity_of
 from scenes.script.shipped_files import template_path
@@ -19,7 +21,6 @@ from sim.bodies.meshfile import read_anatomy
 from sim.effects import pushed_effects
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
-from sim.runtime.atomic_files import check_output
 
 if TYPE_CHECKING:
     from ..studies.robustness import Tally
@@ -35,14 +36,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
     add_device(parser)
     parser.add_argument("--out", type=Path, metavar="LOADS.csv", help="a line for each load; an unfinished run goes on")
+    add_force(parser)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
+    from scenes.analysis.csv_tables import write_table
     from scenes.analysis.machine import machine
+    from sim.runtime.journal import opened
 
-    from ..studies.recorded_rows import append_rows, read_rows
     from ..studies.robustness import Record, Trial, records, tallies
 
     if args.count < 2 or args.batch < 1:
@@ -50,16 +53,27 @@ def run(args: argparse.Namespace) -> int:
     anatomy = read_anatomy(args.anatomy or template_path())
     effects = pushed_effects(anatomy, elasticity_of(args, anatomy.mesh))
     trial = Trial(anatomy, effects, args.element, args.device, args.batch)
-    stated = f"{anatomy.digest} {effects!r} {args.element} count {args.count} seed {args.seed}"
-    if args.out:
-        check_output(args.out, ".csv")
-    found = read_rows(args.out, stated, Record) if args.out else []
-    with tqdm(total=args.count, initial=len(found), unit="load", file=sys.stderr) as bar:
+    stated = {"anatomy": anatomy.digest, "effects": repr(effects), "element": args.element}
+    stated |= {"count": str(args.count), "seed": str(args.seed)}
+    kept = args.out and args.out.with_suffix(".rows")
+    if kept:
+        claimed(args.out, ".csv", args.force or kept.exists())
+        if args.force:
+            kept.unlink(missing_ok=True)
+    with (
+        opened(kept, stated) if kept else nullcontext() as journal,
+        tqdm(total=args.count, unit="load", file=sys.stderr) as bar,
+    ):
+        found = journal.rows(Record) if journal is not None else []
+        bar.update(len(found))
         for some in records(trial, args.count, args.seed, tuple(found)):
             found += some
             bar.update(len(some))
-            if args.out:
-                append_rows(args.out, stated, some)
+            if journal is not None:
+                for record in some:
+                    journal.append(record)
+    if kept:
+        write_table(args.out, [asdict(record) for record in found])
     sets = tallies(found)
     where = machine(args.device)
     if args.json:

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sim.errors import InputError
+from sim.runtime.journal import run_of
 from sim.runtime.partial_files import unfinished_path
 
-HEAD = 1 << 16
 # What of a data set must stay as it was for a run to go on with it.
 KEPT = ("anatomy", "effects", "tissue", "element", "accuracy", "preset", "seed", "shape")
 
@@ -28,9 +28,7 @@ def stated(path: Path) -> dict[str, str]:
         if h5py.is_hdf5(path):
             with h5py.File(path, "r") as file:
                 return {name: str(value) for name, value in file.attrs.items()}
-        with path.open("rb") as raw:  # the journal of an unfinished run: its first record is JSON
-            head = raw.read(HEAD).decode("latin-1")
-        return {name: str(value) for name, value in json.JSONDecoder().raw_decode(head[head.index("{") :])[0].items()}
+        return run_of(path)
     except (OSError, ValueError, LookupError, AttributeError, zipfile.BadZipFile):
         return {}
 

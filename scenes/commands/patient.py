@@ -19,10 +19,10 @@ from sim.elements import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS, Tissue
 from sim.runtime.atomic_files import written_whole
+from sim.runtime.journal import opened as opened_journal
 from sim.runtime.partial_files import unfinished_path
 from sim.runtime.timing import listened
 from surrogate.data.disc_split import APART, FEWEST
-from surrogate.data.journal import opened as opened_journal
 from surrogate.data.tool_loads import PRESETS
 
 from ..options.devices_option import add_devices

@@ -49,6 +49,8 @@ def run(args: argparse.Namespace) -> int:
     """Returns 0 when the models are written."""
     out = claimed(args.out, ".npz", args.force)
     device = device_names(args.device)[0]
+    if args.force:
+        unfinished_path(out).unlink(missing_ok=True)
     asked = None if args.learners is None else asked_learners(args.learners)
     with stage("read the data"):
         data = read_dataset(args.data)

@@ -1,7 +1,7 @@
 """What a half-made body has solved for its model: whoever makes it next goes on with that.
 
 Each process makes a body in a hidden folder of its own, and copies what others have of the same body. So there are no
-locks: records of loads prove themselves (`surrogate.data.journal`), those of who is at work just now, too.
+locks: records of loads prove themselves (`sim.runtime.journal`), those of who is at work just now, too.
 """
 
 from __future__ import annotations

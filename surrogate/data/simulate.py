@@ -18,6 +18,7 @@ from sim.deformation import Deformer
 from sim.errors import InputError
 from sim.loads import Loads, Touching
 from sim.runtime.atomic_files import check_output, demand_space, written_stream
+from sim.runtime.journal import Batch, DamageWarning, Journal, opened
 from sim.runtime.outside_files import read_as
 from sim.runtime.partial_files import unfinished_path
 from sim.runtime.processes import LostError
@@ -40,7 +41,6 @@ from .dataset import (
     write_loads,
     write_provenance,
 )
-from .journal import Batch, DamageWarning, Journal, opened
 from .tasks import Crew, Task, answered, posed_tools
 
 # Names of the file's groups where their seconds are reported.

@@ -10,11 +10,11 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer
 from sim.loads import Loads, Nodal, Touching
+from sim.runtime.journal import Batch
 from sim.runtime.processes import Child, answers
 
 from .answer_rows import rows_of
 from .cortex_patch import open_patch
-from .journal import Batch
 
 # Far inside the small-strain range: 1 uN on one node of brain tissue strains its elements by some 1e-5, so that one
 # solve with the rest stiffness is the answer.

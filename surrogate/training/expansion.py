@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +19,7 @@ from sim.geometry.tetmesh import digest_of
 from sim.loads import Pushed
 from sim.minimisers.second_order import second_order
 from sim.runtime.atomic_files import written_whole
+from sim.runtime.journal import opened
 from sim.runtime.outside_files import read_as
 from sim.runtime.versions import version_of
 
@@ -38,7 +40,6 @@ from ..regressors.left_out_tables import filled
 from ..regressors.rigid_contact import Contact
 from .condense_contact import condensed, side_by_side
 from .examples import Examples, left_by
-from .kept_rows import KeptRows
 from .tabulate_series import in_one_disc, radii_between, tabulated, with_middles
 
 # Share of the responses that a learner's basis may lose, and its most modes; the same of what the series adds to the
@@ -286,12 +287,13 @@ class Expansion:
         table[few] = np.concatenate([part @ basis.modes.T for part, basis in zip(parts, bases, strict=True)], axis=-1)
         anew = True
         if len(others):
-            what = f"{version_of('sulcus')} {digest_of(whole.modes, self.places, self.radii)}"
-            kept = None if self.begun is None else KeptRows(self.begun, what)
-            anew = kept is None or not kept.some
-            table[others] = tabulated(
-                fem, self.places[others], self.radii, reading, lambda n, _: self.progress(n + len(few), count), kept
-            )
+            what = {"version": version_of("sulcus"), "table": digest_of(whole.modes, self.places, self.radii)}
+            with nullcontext() if self.begun is None else opened(self.begun, what) as journal:
+                anew = not journal
+                table[others] = tabulated(
+                    fem, self.places[others], self.radii, reading, lambda n, _: self.progress(n + len(few), count),
+                    journal,
+                )  # fmt: skip
         return bases, table, anew
 
     @cached_property

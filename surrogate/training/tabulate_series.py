@@ -10,11 +10,11 @@ from sim.fem import Fem
 from sim.geometry.surface import edge_lengths
 from sim.loads import Loads, Pushed
 from sim.minimisers.power_series import Reading
+from sim.runtime.journal import Journal
 
 from ..array_functions import squared_distances
 from ..data.cortex_patch import Patch
 from ..regressors.force_series import FACTORS, ORDERS, STENCIL, TERMS
-from .kept_rows import KeptRows
 
 # Neighbouring radii differ by this factor at most.
 RATIO = 1.5
@@ -34,25 +34,32 @@ def tabulated(
     radii: np.ndarray,
     reading: Reading,
     progress: Callable[[int, int], object] = lambda done, total: None,
-    kept: KeptRows | None = None,
+    journal: Journal | None = None,
 ) -> np.ndarray:
     """What `forms` are multiplied by at each of the places (P, 3) [m] and each radius: (P, R, 19, r) float32.
 
-    Of the r shares that a `reading` takes of the answers; `progress` hears places done and all. Places that are `kept`
-    are not asked again.
+    Of the r shares that a `reading` takes of the answers; `progress` hears places done and all. Places that the
+    `journal` has are not asked again.
     """
     table = np.empty((len(places), len(radii), TERMS, reading.count), np.float32)
     some = max(1, fem.batch // (len(radii) * FACTORS[-1].shape[1]))
-    done = 0 if kept is None else kept.restore(table)
-    for first in range(done, len(places), some):
-        here = places[first : first + some]
+    left = []
+    for number, row in enumerate(table):
+        if journal is None or ("row", number) not in journal:
+            left.append(number)
+        else:
+            row[:] = np.frombuffer(journal.read(("row", number)), table.dtype).reshape(row.shape)
+    for first in range(0, len(left), some):
+        rows = left[first : first + some]
+        here = places[rows]
         point = np.repeat(here, 3 * len(radii), axis=0)
         force = np.tile(np.eye(3), (len(here) * len(radii), 1))
         loads = Loads((Pushed(point, force, np.tile(np.repeat(radii, 3), len(here))),))
-        table[first : first + some] = fem.series(loads, ORDERS, reading, 3).reshape(len(here), *table.shape[1:])
-        if kept is not None:
-            kept.add(first, table[first : first + some])
-        progress(first + len(here), len(places))
+        table[rows] = fem.series(loads, ORDERS, reading, 3).reshape(len(here), *table.shape[1:])
+        if journal is not None:
+            for number in rows:
+                journal.add(("row", number), table[number].tobytes())
+        progress(len(places) - len(left) + first + len(here), len(places))
     return table
 
 

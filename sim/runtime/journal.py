@@ -1,5 +1,6 @@
-"""Batches of answers as they come, in a file that neither a kill nor damage can make wrong.
+"""Records of a run as they come, in a file that neither a kill nor damage can make wrong.
 
+A run that resumes its rows or batches does so by this file (docs/architecture.md).
 Every record proves itself: its digest is keyed with what the run is, so that a torn record, a damaged one and one of
 another run are none. They follow each other; behind one that is none, the next is found by its mark.
 """
@@ -13,12 +14,13 @@ import os
 import struct
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
-from sim.errors import InputError
-from sim.runtime.atomic_files import why, written_whole
+from ..errors import InputError
+from .atomic_files import why, written_whole
 
 MARK = b"sulcus\r\n"
 # Mark, group, first row, length of the payload that follows, digest of all that is not the mark.
@@ -27,6 +29,9 @@ HEAD = struct.Struct("<8s8sQQ16s")
 RUN = "run"
 Batch = tuple[str, int]
 Held = bytes | mmap.mmap
+R = TypeVar("R")
+LONGEST = 1 << 16
+"""Bytes of a description that are read of a file."""
 
 
 class DamageWarning(UserWarning):
@@ -41,6 +46,9 @@ class Journal:
 
     def __contains__(self, batch: Batch) -> bool:
         return batch in self._places
+
+    def __len__(self) -> int:
+        return len(self._places)
 
     def add(self, batch: Batch, payload: bytes) -> None:
         """Append a record; then a kill of this process does not lose it.
@@ -78,6 +86,15 @@ class Journal:
             )
         return record[HEAD.size :]
 
+    def append(self, row: Any) -> None:
+        """Add a dataclass of plain numbers and texts as the next row; InputError as `add`."""
+        number = 1 + max((first for _, first in self._places), default=-1)
+        self.add(("row", number), json.dumps(asdict(row)).encode())
+
+    def rows(self, kind: type[R]) -> list[R]:
+        """Rows that were appended, as dataclasses of one kind; InputError as `read`."""
+        return [kind(**json.loads(self.read(batch))) for batch in sorted(self._places)]
+
 
 @contextmanager
 def opened(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
@@ -105,6 +122,20 @@ def opened(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
     with file:
         _lock(path, file)
         yield Journal(path, file, key, _taken_up(path, file, opening, key, stated))
+
+
+def run_of(path: Path) -> dict[str, str]:
+    """Description of the run whose journal a file is; empty where none can be read."""
+    with suppress(OSError), path.open("rb") as file:
+        head = file.read(LONGEST)
+        if _proved(head, 0, b"") == (RUN, 0):
+            return json.loads(_payload(head))
+    return {}
+
+
+def _payload(held: Held) -> bytes:
+    """Payload of the first record, which is whole."""
+    return held[HEAD.size : HEAD.size + HEAD.unpack(held[: HEAD.size])[3]]
 
 
 def _taken_up(
@@ -140,7 +171,7 @@ def _demand_same(path: Path, held: Held, stated: Mapping[str, str]) -> None:
     """Raise where the file's beginning is whole and states something else."""
     if _proved(held, 0, b"") != (RUN, 0):
         return
-    before = json.loads(held[HEAD.size : HEAD.size + HEAD.unpack(held[: HEAD.size])[3]])
+    before = json.loads(_payload(held))
     for name, wanted in stated.items():
         found = before.get(name, "nothing")
         if found != wanted:
