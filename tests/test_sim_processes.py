@@ -13,7 +13,7 @@ from on_devices import doing, gone, named, refusing
 
 from sim.errors import InputError
 from sim.runtime.device import device_names, find_device
-from sim.runtime.processes import LostError, answers, at_once, working
+from sim.runtime.processes import LostError, map_unordered, process_pool, run_on_each
 
 NO_CARD = pytest.mark.skipif(wp.is_cuda_available(), reason="there is a card here")
 
@@ -60,11 +60,11 @@ def test_cards_are_listed_and_not_mixed_with_processors(monkeypatch):
 
 
 def test_every_task_is_answered_once_and_processes_end_with_the_block():
-    with working(["cpu", "cpu"], named, "a body") as children:
-        found = dict(answers(children, doing, range(7)))
+    with process_pool(["cpu", "cpu"], named, "a body") as children:
+        found = dict(map_unordered(children, doing, range(7)))
         assert sorted(found) == list(range(7))
         assert all(answer[:2] == (("cpu", ("a body",)), task) for task, answer in found.items())
-        each = at_once(children, doing, ["one", "other"])
+        each = run_on_each(children, doing, ["one", "other"])
         assert [answer[1] for answer in each] == ["one", "other"]
         numbers = {answer[2] for answer in each}
         assert len(numbers) == 2 and {answer[2] for answer in found.values()} <= numbers
@@ -74,39 +74,39 @@ def test_every_task_is_answered_once_and_processes_end_with_the_block():
 
 def test_a_process_sees_its_own_card_alone(monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    with working(["cpu", "cuda:0", "cuda:2"], named) as children:
-        said = at_once(children, doing, ["environment"] * 3)
-    assert said == [("cpu", ""), ("cuda:0", ""), ("cuda:0", "2")]
+    with process_pool(["cpu", "cuda:0", "cuda:2"], named) as children:
+        said = run_on_each(children, doing, ["environment"] * 3)
+    assert said == [("cpu", ""), ("cuda:0", "0"), ("cuda:0", "2")]
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,GPU-7")
-    with working(["cuda:1"], named) as children:
-        assert at_once(children, doing, ["environment"]) == [("cuda:0", "GPU-7")]
+    with process_pool(["cuda:1"], named) as children:
+        assert run_on_each(children, doing, ["environment"]) == [("cuda:0", "GPU-7")]
 
 
 def test_what_cannot_be_made_is_a_sentence():
-    with pytest.raises(InputError, match="nothing is made on cpu"), working(["cpu", "cpu"], refusing):
+    with pytest.raises(InputError, match="nothing is made on cpu"), process_pool(["cpu", "cpu"], refusing):
         pass
 
 
 def test_what_goes_wrong_names_its_device():
     """Errors of bad input stay what they are."""
-    with working(["cpu", "cuda:0"], named) as children:
+    with process_pool(["cpu", "cuda:0"], named) as children:
         with pytest.raises(InputError, match=r"^this is refused\.\n"):
-            at_once(children, doing, ["refuse", 1])
+            run_on_each(children, doing, ["refuse", 1])
         with pytest.raises(RuntimeError, match="out of memory") as failure:
-            at_once(children, doing, ["fail", 1])
+            run_on_each(children, doing, ["fail", 1])
         assert "in doing" in failure.value.__notes__[0]
     with (
-        working(["cpu", "cuda:0"], named) as children,
+        process_pool(["cpu", "cuda:0"], named) as children,
         pytest.raises(LostError, match=r"cuda:0 failed: out of memory\. If that happens again, give --device one"),
     ):
-        at_once(children, doing, [1, "fail"])
+        run_on_each(children, doing, [1, "fail"])
 
 
 def test_what_others_had_ready_is_given_before_a_death_is_reported():
     """One dies and the other has its answer while nobody looks; what was not begun then is not begun."""
     given = []
-    with working(["cpu", "cpu"], named) as children, pytest.raises(LostError) as lost:
-        for task, _ in answers(children, doing, ["doze and die", 0, "nap", 9]):
+    with process_pool(["cpu", "cpu"], named) as children, pytest.raises(LostError) as lost:
+        for task, _ in map_unordered(children, doing, ["doze and die", 0, "nap", 9]):
             given.append(task)
             time.sleep(1.5)
     assert "the process on cpu was ended (Killed), for want of memory most likely" in str(lost.value)
@@ -117,11 +117,11 @@ def test_none_outlives_a_parent_that_is_killed():
     """In the middle of a task that takes minutes."""
     code = (
         "from on_devices import doing, named\n"
-        "from sim.runtime.processes import at_once, working\n"
+        "from sim.runtime.processes import run_on_each, process_pool\n"
         "if __name__ == '__main__':\n"
-        "    with working(['cpu', 'cpu'], named) as children:\n"
+        "    with process_pool(['cpu', 'cpu'], named) as children:\n"
         "        print(*(child.process.pid for child in children), flush=True)\n"
-        "        at_once(children, doing, ['sleep', 'sleep'])\n"
+        "        run_on_each(children, doing, ['sleep', 'sleep'])\n"
     )
     paths = os.pathsep.join([str(Path(__file__).parents[1]), str(Path(__file__).parent)])
     parent = subprocess.Popen(

@@ -20,7 +20,7 @@ from sim.bodies.meshfile import write_anatomy
 from sim.effects import NodalForce, pushed_effects
 from sim.errors import InputError
 from sim.material import BRAIN
-from sim.runtime.processes import working
+from sim.runtime.processes import process_pool
 from surrogate.data.crew import Asked, even_batch, solving
 from surrogate.data.dataset import SEAL, read_dataset
 from surrogate.data.simulate import simulate
@@ -97,7 +97,7 @@ def test_a_killed_process_is_a_sentence_and_loses_no_finished_case(tmp_path, bod
     done = []
     sentence = r"the process on cpu was ended \(Killed\).*--device one cpu less. What was solved is kept: the same com"
     with (
-        working(["cpu", "cpu"], mortal, COUNT, 11, tmp_path / "mark") as children,
+        process_pool(["cpu", "cpu"], mortal, COUNT, 11, tmp_path / "mark") as children,
         pytest.raises(InputError, match=sentence),
     ):
         simulate(path, Crew(body, children), loads, SAID, 2, lambda *now: done.append(now[0]))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 HOUSE = Path(__file__).parents[2]
 POLL = 0.5
@@ -33,6 +34,19 @@ def package_environment(more: Mapping[str, str] | None = None) -> dict[str, str]
     return {**os.environ, **(more or {}), "PYTHONPATH": os.pathsep.join(paths)}
 
 
+def start_program(command: Sequence[str], variables: Mapping[str, str], **streams: Any) -> subprocess.Popen[str]:
+    """Start a program in a session of its own, so that `stop_program` ends what it has started, too."""
+    environment = package_environment(variables)
+    return subprocess.Popen(command, env=environment, start_new_session=True, text=True, **streams)
+
+
+def stop_program(child: subprocess.Popen[str]) -> None:
+    """End a program and all of its session."""
+    with suppress(ProcessLookupError):
+        os.killpg(child.pid, signal.SIGKILL)
+    child.communicate()
+
+
 def run_to_end(command: Sequence[str], folder: Path, heard: Callable[[str], object]) -> Ended:
     """Run a command in a folder to its end, and end then what it has started.
 
@@ -44,15 +58,8 @@ def run_to_end(command: Sequence[str], folder: Path, heard: Callable[[str], obje
     begun, complaint, left = time.perf_counter(), "", ""
     output, complaints = folder / "output.txt", folder / "complaints.txt"
     with output.open("wb") as out, complaints.open("wb") as err, complaints.open(errors="replace") as said:
-        child = subprocess.Popen(
-            command,
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            stdout=out,
-            stderr=err,
-            env=package_environment({"TQDM_MININTERVAL": "10"}),
-            start_new_session=True,
-        )
+        variables = {"TQDM_MININTERVAL": "10"}
+        child = start_program(command, variables, cwd=folder, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
         try:
             running = True
             while running:
@@ -64,7 +71,5 @@ def run_to_end(command: Sequence[str], folder: Path, heard: Callable[[str], obje
                     heard(line)
                     complaint = line.strip() or complaint
         finally:
-            with suppress(ProcessLookupError):
-                os.killpg(child.pid, signal.SIGKILL)
-            child.wait()
+            stop_program(child)
     return Ended(child.returncode, output.read_text(errors="replace"), complaint, time.perf_counter() - begun)

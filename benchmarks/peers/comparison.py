@@ -26,7 +26,7 @@ from sim.material import Material
 from sim.runtime.versions import install_hint
 from surrogate.data.tool_loads import draw
 
-from .child_process import HOUSE, package_environment
+from .child_process import HOUSE, start_program, stop_program
 from .engine_process import READY, Case, answer_path, write_case
 from .engine_sulcus import fem_of
 
@@ -237,13 +237,12 @@ class _Process:
     def __init__(self, engine: Engine, folder: Path, threads: int):
         self._complaints = folder / "complaints.txt"
         with open(self._complaints, "w") as complaints:
-            self._child = subprocess.Popen(
+            self._child = start_program(
                 [sys.executable, *engine.words, str(folder), str(threads)],
+                dict.fromkeys(THREADS, str(threads)),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=complaints,
-                text=True,
-                env=package_environment(dict.fromkeys(THREADS, str(threads))),
             )
         assert self._child.stdin is not None and self._child.stdout is not None
         self._ask, self._hear = self._child.stdin, self._child.stdout
@@ -265,5 +264,5 @@ class _Process:
         return read["seconds"], read["reason"]
 
     def close(self) -> None:
-        """Let it end."""
-        self._child.communicate()
+        """End it."""
+        stop_program(self._child)

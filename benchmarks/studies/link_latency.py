@@ -18,7 +18,7 @@ from scenes.link.outgoing import Places
 from scenes.link.session import Session
 from scenes.tracked.follower import Known, State
 from scenes.tracked.tool_motion import Motion
-from sim.runtime.processes import at_once, working
+from sim.runtime.processes import process_pool, run_on_each
 
 HOST = "127.0.0.1"
 NAME = Names().tool
@@ -87,11 +87,11 @@ def measured(points: int, rate: float, seconds: float) -> Latency:
         A process that was ended.
     """
     count = WARM_UP + max(1, round(rate * seconds))
-    with working(["cpu"], _serve, points) as server, working(["cpu"] * CLIENTS, _nothing) as clients:
-        port = at_once(server, _port, [0])[0]
+    with process_pool(["cpu"], _serve, points) as server, process_pool(["cpu"] * CLIENTS, _nothing) as clients:
+        port = run_on_each(server, _port, [0])[0]
         sender = threading.Thread(target=_send, args=(port, rate, count), daemon=True)
         sender.start()
-        found = at_once(clients, _received, [(port, count)] * CLIENTS)
+        found = run_on_each(clients, _received, [(port, count)] * CLIENTS)
     late = [[after - time_of(stamp) for stamp, after in each] for each in found]
     milliseconds = 1e3 * np.concatenate([np.array(each) for each in late])
     answered = 100.0 * len(milliseconds) / (CLIENTS * (count - WARM_UP))

@@ -5,11 +5,9 @@ from __future__ import annotations
 import resource
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +22,7 @@ from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN
+from sim.runtime.processes import LostError, map_apart
 from sim.strategy.memory_needed import foreseen
 from surrogate.data.tool_loads import draw
 
@@ -131,14 +130,13 @@ def rows(
             said(f"{size} nodes, the mesh")
             template_mesh(trial.folder, size)
             said(f"{size} nodes, batch of {batch}")
-            with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-                try:
-                    yield pool.submit(measured, trial, size, batch).result()
-                except BrokenProcessPool:
-                    raise InputError(
-                        f"{size} nodes with --batch {batch}: the process was ended, for want of memory most likely; "
-                        "leave this size out, or give a smaller batch."
-                    ) from None
+            try:
+                yield from (row for _, row in map_apart(partial(measured, trial, size), [batch]))
+            except LostError:
+                raise InputError(
+                    f"{size} nodes with --batch {batch}: the process was ended, for want of memory most likely; "
+                    "leave this size out, or give a smaller batch."
+                ) from None
 
 
 def panels(found: Sequence[Row]) -> tuple[Panel, ...]:

@@ -20,7 +20,7 @@ from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import Material
 from sim.runtime.device import find_device
-from sim.runtime.processes import at_once, working
+from sim.runtime.processes import process_pool, run_on_each
 from surrogate.data.tool_loads import TOOLS, draw
 from surrogate.data.tool_poses import draw_poses
 
@@ -156,8 +156,8 @@ def on_each(devices: Sequence[str], trial: Trial) -> Iterator[Asked]:
         own = made(devices[0], trial)
         yield lambda work, task: [work(own, task)]
         return
-    with working(devices, made, trial) as children:
-        yield lambda work, task: at_once(children, work, [task] * len(children))
+    with process_pool(devices, made, trial) as children:
+        yield lambda work, task: run_on_each(children, work, [task] * len(children))
 
 
 def made(device: str, trial: Trial) -> Made:

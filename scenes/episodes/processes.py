@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import Pipe
 from multiprocessing.process import BaseProcess
 from typing import Any
 
@@ -20,7 +18,7 @@ from dask import config
 from distributed import Security, Worker
 
 from sim.errors import InputError
-from sim.runtime.processes import VISIBLE, card_of, end_with_parent, uninterrupted
+from sim.runtime.processes import card_variables, start_process
 
 HERE = "127.0.0.1"
 """Where a scheduler and workers of our own listen: nobody outside this machine reaches them."""
@@ -50,8 +48,7 @@ def started_processes(
     InputError
         When they are tended: one that has ended `starts` times in a row without having been connected.
     """
-    shown = [_card(name) for name in devices]
-    crew = [_start(address, security, card, 1) for card in shown]
+    crew = [_start(address, security, device, 1) for device in devices]
 
     def tend() -> None:
         for place, one in enumerate(crew):
@@ -64,7 +61,7 @@ def started_processes(
                     f"(exit code {one.process.exitcode}). Give fewer --workers, or look for want of memory."
                 )
             _close(one)
-            crew[place] = _start(address, security, shown[place], times)
+            crew[place] = _start(address, security, devices[place], times)
 
     try:
         yield tend
@@ -82,19 +79,11 @@ def quiet_dask() -> None:
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
-def _card(device: str) -> str | None:
-    """The card of a device, as a process is shown it; None on the CPU."""
-    kind, _, number = device.partition(":")
-    return card_of(number or "0") if kind == "cuda" else None
-
-
-def _start(address: str, security: Security, card: str | None, times: int) -> _Started:
-    context = get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_serve, args=(address, security, card, theirs), name="worker", daemon=True)
-    more = ALONE if card is None else {**ALONE, VISIBLE: card}
-    with _environment(more), uninterrupted():
-        process.start()
+def _start(address: str, security: Security, device: str, times: int) -> _Started:
+    ours, theirs = Pipe(duplex=False)
+    card = card_variables(device)
+    resources = {CARD: 1.0} if card else None
+    process = start_process(_serve, address, security, resources, theirs, name="worker", variables={**ALONE, **card})
     theirs.close()
     return _Started(process, ours, times)
 
@@ -111,33 +100,16 @@ def _close(one: _Started) -> None:
     one.said.close()
 
 
-def _serve(address: str, security: Security, card: str | None, connected: Any) -> None:
-    threading.Thread(target=end_with_parent, daemon=True).start()
+def _serve(address: str, security: Security, resources: dict[str, float] | None, connected: Any) -> None:
     quiet_dask()
     # A profile holds on to what a task has closed, and what is served by HTTP asks for no keys.
     with config.set({"distributed.worker.profile.enabled": False, "distributed.worker.http.routes": []}):
-        asyncio.run(_work(address, security, card, connected))
+        asyncio.run(_work(address, security, resources, connected))
 
 
-async def _work(address: str, security: Security, card: str | None, connected: Any) -> None:
-    resources = None if card is None else {CARD: 1.0}
+async def _work(address: str, security: Security, resources: dict[str, float] | None, connected: Any) -> None:
     # Without a limit: a worker that is paused near its share of memory never goes on, as its memory is not Dask's.
     settings = {"nthreads": 1, "host": HERE, "memory_limit": 0, "resources": resources, "dashboard": False}
     async with Worker(address, security=security, **settings) as worker:
         connected.send_bytes(b"yes")
         await worker.finished()
-
-
-@contextmanager
-def _environment(more: Mapping[str, str]) -> Iterator[None]:
-    """Variables that a process to come finds before it imports anything."""
-    before = {name: os.environ.get(name) for name in more}
-    os.environ.update(more)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -22,12 +22,13 @@ Spec = Elements | Learner
 FAMILY = {Elements: "finite elements", Learner: "learnt"}
 
 
-def ready(on_card: bool) -> None:
+def ready(device: str, study: Study) -> Study:
     """Import all that rows need, and start Warp without its notes; on a card also PyTorch, and what draws."""
     find_device("auto", "float32")
-    if on_card:
+    if study.on_card:
         for name in ("torch", "scenes.report.picture"):
             import_module(name)
+    return study
 
 
 def measured(study: Study, spec: Spec, picture: Path) -> Row:

@@ -6,13 +6,11 @@ import json
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import chain, groupby, product, takewhile
-from multiprocessing import get_context
 from pathlib import Path
 from threading import BoundedSemaphore, Event
 
@@ -23,6 +21,7 @@ from sim.accuracy import FLOOR, Precision
 from sim.geometry.tetmesh import digest_of
 from sim.material import LAWS
 from sim.runtime.atomic_files import written_whole
+from sim.runtime.processes import LostError, process_pool, run_on_each
 from surrogate.training.train import LEARNERS
 
 from .finite_elements import HALVED, OWN, STANDARD, Elements, law_of
@@ -72,14 +71,16 @@ def learners() -> tuple[Learner, ...]:
 
 def apart(turn: AbstractContextManager[object], study: Study, spec: Spec, picture: Path) -> Row:
     """Measured in a process of its own, which starts at once and measures in its `turn`."""
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        try:
-            pool.submit(ready, study.on_card).result()
-            with turn:
-                # What the study has read already stays here.
-                return pool.submit(measured, replace(study), spec, picture).result()
-        except BrokenProcessPool:
-            return Row(spec.name, FAMILY[type(spec)], state="its process was ended, for want of memory most likely")
+    try:
+        # What the study has read already stays here.
+        with process_pool(["cpu"], ready, replace(study)) as children, turn:
+            return run_on_each(children, _measure, [(spec, picture)])[0]
+    except LostError:
+        return Row(spec.name, FAMILY[type(spec)], state="its process was ended, for want of memory most likely")
+
+
+def _measure(study: Study, task: tuple[Spec, Path]) -> Row:
+    return measured(study, *task)
 
 
 def rows(

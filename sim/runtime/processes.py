@@ -1,4 +1,4 @@
-"""One process a device: each makes what it works with once, and then does one task after another."""
+"""Spawned processes: one that runs a function, and a pool with one on each device that does task after task."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import os
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing import get_context, parent_process
+from multiprocessing import Pipe, get_context, parent_process
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
@@ -20,7 +20,7 @@ Task = TypeVar("Task")
 # How long a process that has closed its pipe may take to end [s].
 PATIENCE = 5.0
 VISIBLE = "CUDA_VISIBLE_DEVICES"
-"""Which cards a process sees."""
+"""Variable of the cards that a process sees."""
 
 
 class LostError(InputError):
@@ -36,11 +36,25 @@ class Child:
     pipe: Any  # its class is another on Windows
 
 
-@contextmanager
-def working(devices: Sequence[str], make: Callable[..., Any], *given: Any) -> Iterator[tuple[Child, ...]]:
-    """Processes, one on each of the devices, that have each made their `make(device, *given)`; killed at the end.
+def start_process(
+    target: Callable[..., object], *given: Any, name: str, variables: Mapping[str, str] | None = None
+) -> BaseProcess:
+    """Start a spawned process that calls `target(*given)`, a function of a module.
 
-    They are spawned, so that `make` is a function of a module. None outlives this process, however that ends.
+    It ends with this process, however that ends, and ignores Ctrl-C, which the terminal gives to all: this process ends
+    it. It finds the `variables` in its environment before it imports anything.
+    """
+    process = get_context("spawn").Process(target=_run, args=(target, given), name=name, daemon=True)
+    with _environment(variables or {}), _interrupts_ignored():
+        process.start()
+    return process
+
+
+@contextmanager
+def process_pool(devices: Sequence[str], make: Callable[..., Any], *given: Any) -> Iterator[tuple[Child, ...]]:
+    """Start a process on each of the devices, which calls `make(device, *given)`; all are killed at the end.
+
+    Each sees its own card alone, as "cuda:0". `make` is a function of a module.
 
     Raises
     ------
@@ -52,14 +66,26 @@ def working(devices: Sequence[str], make: Callable[..., Any], *given: Any) -> It
     with ExitStack() as closing:
         children = [_started(device, make, given, closing) for device in devices]
         for child in children:
-            received(child)
+            _receive(child)
         yield tuple(children)
 
 
-def answers(
+def map_apart(function: Callable[[Task], Any], tasks: Sequence[Task], count: int = 1) -> Iterator[tuple[Task, Any]]:
+    """Yield each task with its result, as they come, from at most `count` processes that end with the last task.
+
+    Raises
+    ------
+    InputError, LostError
+        As `map_unordered`.
+    """
+    with process_pool(["cpu"] * min(count, len(tasks)), _second, function) as children:
+        yield from map_unordered(children, _call, tasks)
+
+
+def map_unordered(
     children: Sequence[Child], work: Callable[[Any, Task], Any], tasks: Iterable[Task]
 ) -> Iterator[tuple[Task, Any]]:
-    """Each task with `work(made, task)`, as the answers come: the next task goes to the process that is free.
+    """Yield each task with `work(made, task)`, as they come: the next task goes to the process that is free.
 
     Raises
     ------
@@ -87,7 +113,7 @@ def answers(
         for pipe in ready:
             child, task = busy.pop(pipe)
             try:
-                answer = received(child)
+                answer = _receive(child)
             except Exception as error:
                 lost = lost or error
                 continue
@@ -98,13 +124,13 @@ def answers(
         raise lost
 
 
-def at_once(children: Sequence[Child], work: Callable[[Any, Task], Any], tasks: Sequence[Task]) -> list[Any]:
-    """What each process gives for its own of the tasks; all of them begin together.
+def run_on_each(children: Sequence[Child], work: Callable[[Any, Task], Any], tasks: Sequence[Task]) -> list[Any]:
+    """Result of each process for its own of the tasks; all of them begin together.
 
     Raises
     ------
     InputError, LostError
-        As `answers`.
+        As `map_unordered`.
     """
     for child, task in zip(children, tasks, strict=True):
         with suppress(BrokenPipeError, ConnectionResetError):
@@ -112,7 +138,7 @@ def at_once(children: Sequence[Child], work: Callable[[Any, Task], Any], tasks: 
     found, lost = [], None
     for child in children:
         try:
-            found.append(received(child))
+            found.append(_receive(child))
         except Exception as error:
             lost = lost or error
     if lost is not None:
@@ -120,8 +146,8 @@ def at_once(children: Sequence[Child], work: Callable[[Any, Task], Any], tasks: 
     return found
 
 
-def received(child: Child) -> Any:
-    """The next answer of a process.
+def _receive(child: Child) -> Any:
+    """Next answer of a process.
 
     Raises
     ------
@@ -146,27 +172,20 @@ def received(child: Child) -> Any:
     raise answer
 
 
-def seen_as(device: str) -> str:
-    """What a device is called by a process that from now on sees no other card."""
+def card_variables(device: str) -> dict[str, str]:
+    """Environment in which a process sees the card of a device alone, as "cuda:0"; none of another device."""
     kind, _, number = device.partition(":")
-    if kind != "cuda" or number in ("", "0"):
-        return device
-    os.environ[VISIBLE] = card_of(number)
-    return "cuda:0"
-
-
-def card_of(number: str) -> str:
-    """What a card that this process sees under a number is called in `VISIBLE`."""
+    if kind != "cuda":
+        return {}
     cards = os.environ.get(VISIBLE, "")
-    return cards.split(",")[int(number)] if cards else number
+    return {VISIBLE: cards.split(",")[int(number or 0)] if cards else number or "0"}
 
 
 def _started(device: str, make: Callable[..., Any], given: tuple[Any, ...], closing: ExitStack) -> Child:
-    context = get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_serve, args=(theirs, device, make, given), name=device, daemon=True)
-    with uninterrupted():
-        process.start()
+    ours, theirs = Pipe()
+    variables = card_variables(device)
+    own = "cuda:0" if variables else device
+    process = start_process(_serve, theirs, own, make, given, name=device, variables=variables)
     theirs.close()
     child = Child(device, process, ours)
     closing.callback(_end, child)
@@ -174,8 +193,23 @@ def _started(device: str, make: Callable[..., Any], given: tuple[Any, ...], clos
 
 
 @contextmanager
-def uninterrupted() -> Iterator[None]:
-    """What is started here does not hear Ctrl-C, which the terminal gives to all: this process ends it."""
+def _environment(more: Mapping[str, str]) -> Iterator[None]:
+    """Set variables for the time of the block."""
+    before = {name: os.environ.get(name) for name in more}
+    os.environ.update(more)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Ignore Ctrl-C for the time of the block: a process that is started there inherits that."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -194,13 +228,20 @@ def _end(child: Child) -> None:
 
 def _serve(pipe: Any, device: str, make: Callable[..., Any], given: tuple[Any, ...]) -> None:
     """Make, and do tasks until the pipe ends; errors are answers too."""
-    threading.Thread(target=end_with_parent, daemon=True).start()
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        made = _tried(make, seen_as(device), *given)
+        made = _tried(make, device, *given)
         pipe.send(made if isinstance(made, Exception) else None)
         while True:
             work, task = pipe.recv()
             pipe.send(_tried(work, made, task))
+
+
+def _second(device: str, given: Any) -> Any:
+    return given
+
+
+def _call(function: Callable[[Task], Any], task: Task) -> Any:
+    return function(task)
 
 
 def _tried(function: Callable[..., Any], *given: Any) -> Any:
@@ -212,8 +253,13 @@ def _tried(function: Callable[..., Any], *given: Any) -> Any:
         return error
 
 
-def end_with_parent() -> None:
-    """End this process when the one that started it ends; for a thread of its own."""
+def _run(target: Callable[..., object], given: tuple[Any, ...]) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    target(*given)
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it ends."""
     parent = parent_process()
     if parent is not None:
         wait([parent.sentinel])

@@ -16,7 +16,7 @@ from sim.effects import Effect
 from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.runtime.memory import check_fits
-from sim.runtime.processes import at_once, working
+from sim.runtime.processes import process_pool, run_on_each
 from sim.strategy.memory_needed import Needed, foreseen
 
 from .holding import held, series_of
@@ -94,10 +94,10 @@ def solving(asked: Asked, devices: Sequence[str], said: Callable[[str], object])
         yield Solver(own, *described(own, None))
         return
     most, own = max(devices.count(name) for name in devices), -(-asked.loads // len(devices))
-    with working(devices, placed, replace(asked, share=most, loads=own)) as children:
+    with process_pool(devices, placed, replace(asked, share=most, loads=own)) as children:
         none = [None] * len(devices)
-        _demand(at_once(children, memory_of, none), said)
-        elements, words, batches = zip(*at_once(children, described, none), strict=True)
+        _demand(run_on_each(children, memory_of, none), said)
+        elements, words, batches = zip(*run_on_each(children, described, none), strict=True)
         batch = min(batches)
         if asked.batch is None and devices[0].startswith("cuda"):
             batch = even_batch(batch // most, asked.loads, len(devices))

@@ -11,7 +11,7 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformer
 from sim.loads import Loads, Nodal, Touching
 from sim.runtime.journal import Batch
-from sim.runtime.processes import Child, answers
+from sim.runtime.processes import Child, map_unordered
 
 from .answer_rows import rows_of
 from .cortex_patch import open_patch
@@ -41,7 +41,7 @@ class Crew:
 def answered(deformer: Deformer | Crew, tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
     """Each task with its rows as `solved` has them: here one after the other, by a crew as they come."""
     if isinstance(deformer, Crew):
-        yield from answers(deformer.children, solved, tasks)
+        yield from map_unordered(deformer.children, solved, tasks)
     else:
         for task in tasks:
             yield task, solved(deformer, task)

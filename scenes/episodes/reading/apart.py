@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 
 from sim.errors import InputError
 from sim.runtime.device import find_device
 from sim.runtime.file_limits import at_most
+from sim.runtime.processes import LostError, map_apart
 
 from .validation import Report, validate_episode
 
@@ -27,31 +25,17 @@ def validated(
     What a process that was lost had begun is looked at again, each file alone.
     """
     left = list(dict.fromkeys(paths))
+    look_at = partial(_looked_at, look)
     try:
-        with _pool(workers) as pool:
-            try:
-                for done in as_completed([pool.submit(_looked_at, look, path) for path in left]):
-                    report = done.result()
-                    left.remove(report.path)
-                    yield report
-            except BaseException:  # Ctrl-C, or a reader that wants no more: what has not begun is not begun
-                pool.shutdown(cancel_futures=True)
-                raise
-    except BrokenProcessPool:
+        for path, report in map_apart(look_at, tuple(left), workers):
+            left.remove(path)
+            yield report
+    except LostError:
         for path in left:
-            yield _alone(look, path)
-
-
-def _alone(look: Callable[[Path], Report], path: Path) -> Report:
-    try:
-        with _pool(1) as pool:
-            return pool.submit(_looked_at, look, path).result()
-    except BrokenProcessPool:
-        return Report(path, ["it ends the process that reads it: it is damaged. Make it anew, or leave it out."])
-
-
-def _pool(workers: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN))
+            try:
+                yield from (report for _, report in map_apart(look_at, [path]))
+            except LostError:
+                yield Report(path, ["it ends the process that reads it: it is damaged. Make it anew, or leave it out."])
 
 
 def _looked_at(look: Callable[[Path], Report], path: Path) -> Report:
