@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ar.optics.camera import look_at
-from ar.overlay.hud import BREAK, FINE, FONT, NEAR, bearings, folded, lay, marked, millimetres, panel, towards
+from ar.overlay.hud import BREAK, FINE, FONT, NEAR, Below, bearings, folded, lay, marked, millimetres, panel, towards
 from ar.overlay.places import ASIDE, CLEAR, PAD, STEP, free_place
 from ar.overlay.refind import found_at
 
@@ -184,6 +184,6 @@ def test_words_cover_thin_lines_rather_than_stand_far_from_their_wish():
     for name, thin in (("far", None), ("near", True)):
         colour, taken = np.zeros((300, 400, 3), np.uint8), np.zeros((300, 400), np.uint8)
         taken[:200, ::20] = 1
-        lay(colour, taken, ["8.7 +- 8.0 mm"], (150, 60), thin=None if thin is None else taken > 0)
+        lay(colour, taken, ["8.7 +- 8.0 mm"], (150, 60), below=Below(thin=None if thin is None else taken > 0))
         _, rows[name], _, _ = found_at(colour, "8.7 +- 8.0 mm", FINE)
     assert rows["near"] < 60 + NEAR < 200 < rows["far"]

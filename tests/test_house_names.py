@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from sim.runtime import versions
-from sim.runtime.versions import DISTRIBUTION, install_hint, version_of
+from sim.runtime.optional_packages import install_hint
+from sim.runtime.versions import DISTRIBUTION, version_of
 
 HOUSE = Path(__file__).parents[1]
 PROJECT = tomllib.loads((HOUSE / "pyproject.toml").read_text())["project"]

@@ -42,3 +42,22 @@ def test_classes_take_at_most_eight_positional_values():
         for node in nodes_of(path):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id[:1].isupper():
                 assert len(node.args) <= 8, f"{name_of(path)}:{node.lineno}: {node.func.id}"
+
+
+def test_functions_are_short_and_take_few_arguments():
+    """Factories of kernels are as long as what they make; constructors are called by keyword."""
+    found = []
+    for path in PACKAGED:
+        for node in nodes_of(path):
+            if isinstance(node, ast.FunctionDef) and node.name not in (
+                "__init__",
+                "kernel_of",
+                "kernels_of",
+                "functions_of",
+            ):
+                arguments = [
+                    one.arg for one in (*node.args.args, *node.args.kwonlyargs) if one.arg not in ("self", "cls")
+                ]
+                if node.end_lineno - node.lineno >= 80 or len(arguments) > 8:
+                    found.append(f"{name_of(path)}:{node.lineno} {node.name}")
+    assert not found

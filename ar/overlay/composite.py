@@ -16,7 +16,7 @@ from ..rendering.rasteriser import Seen, seen
 from ..rendering.renderer import Picture
 from . import distances, window
 from .gauge import draw_line, write_gauge
-from .hud import FINE, FONT, HEAD, NARROW, ROW, folded, lay, millimetres
+from .hud import FINE, FONT, HEAD, NARROW, ROW, Below, folded, lay, millimetres
 from .legend import Entry, legend, place_sheet
 from .marks import NO_COVER, NO_MARKS, NO_WORDS, Cover, Marks, Words
 from .measured import Measure
@@ -319,7 +319,7 @@ def write_ground(
     wide = max(cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines)
     column, row = there["m10"] / there["m00"] + box[1].start, there["m01"] / there["m00"] + box[0].start
     wish = round(column - wide / 2), round(row - ROW * len(lines) / 2)
-    lay(drawn.colour, drawn.taken, lines, wish, FINE, needed=True, sights=front, lines_there=lines_there)
+    lay(drawn.colour, drawn.taken, lines, wish, FINE, needed=True, below=Below(front, lines_there))
 
 
 def ground_lines(words: str) -> list[str]:
@@ -344,7 +344,7 @@ def write_head(drawn: Overlaid, lines: Sequence[str]) -> None:
     free[:HEAD] = free[middle - HEAD // 2 : middle + HEAD // 2] = 1  # letters of sides come there
     free[below:] = 1  # rather over a line than in the midst of the picture
     before = free.copy()
-    lay(drawn.colour, free, lines, (0, HEAD), needed=True, lines_there=drawn.taken)
+    lay(drawn.colour, free, lines, (0, HEAD), needed=True, below=Below(lines=drawn.taken))
     drawn.taken[free > before] = 1
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from .hud import lay, millimetres
+from .hud import Below, lay, millimetres
 from .outlines import OPAQUE
 
 # Scale of the number, and how far from the tip it is wanted [pixel].
@@ -93,4 +93,4 @@ def write_gauge(
     if len(seen):
         column, row = np.clip(seen[0], -1e4, 1e4).round().astype(int).tolist()
         wish = column + BESIDE, row + BESIDE
-        lay(colour, taken, [str(gauge)], wish, GAUGE, needed=True, sights=covered, lines_there=lines, thin=thin)
+        lay(colour, taken, [str(gauge)], wish, GAUGE, needed=True, below=Below(covered, lines, thin))

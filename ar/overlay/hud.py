@@ -6,6 +6,7 @@ import itertools
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import cv2
@@ -70,6 +71,29 @@ def haloed(sheet: np.ndarray, text: str, at: tuple[int, int], scale: float, ink:
     cv2.putText(sheet, text, at, FONT, scale, (*ink, 255.0), 1, cv2.LINE_AA)
 
 
+@dataclass(frozen=True, eq=False)
+class Below:
+    """What words in a picture may hide.
+
+    Parameters
+    ----------
+    sights
+        (H, W) uint8: above 0 where words hide what should stay in sight, as a tool; they do where there is no other
+        space.
+    lines
+        (H, W) uint8: above 0 where no words but lines are, which words that are needed may cover.
+    thin
+        (H, W) bool: lines that words cover rather than stand farther than `NEAR` from their wish.
+    """
+
+    sights: np.ndarray | None = None
+    lines: np.ndarray | None = None
+    thin: np.ndarray | None = None
+
+
+NOTHING = Below()
+
+
 def lay(
     colour: np.ndarray,
     taken: np.ndarray,
@@ -78,9 +102,7 @@ def lay(
     scale: float = FINE,
     ink: Sequence[float] = WHITE,
     needed: bool = False,
-    sights: np.ndarray | None = None,
-    lines_there: np.ndarray | None = None,
-    thin: np.ndarray | None = None,
+    below: Below = NOTHING,
 ) -> None:
     """Write lines of ASCII text at the free place nearest to a wish, and take that place; both arrays change in place.
 
@@ -92,26 +114,22 @@ def lay(
         The picture (H, W, 3) uint8; (H, W) uint8, above 0 where lines and words are.
     wish
         Column and row where the upper left corner of the lines is wanted, as `free_place` takes it.
-    sights
-        (H, W) uint8: above 0 where words hide what should stay in sight, as a tool; they do where there is no other
-        space.
-    lines_there
-        (H, W) uint8: above 0 where no words but lines are, which words that are `needed` may cover.
-    thin
-        (H, W) bool: lines that words cover rather than stand farther than `NEAR` from their wish.
+    below
+        What the words may hide.
     """
     if not lines:
         return
     sizes = [cv2.getTextSize(line, FONT, scale, 1) for line in lines]
-    above, below = sizes[0][0][1], sizes[0][1]
-    size = max(width for (width, _), _ in sizes), above + below + ROW * (len(lines) - 1)
+    above, under = sizes[0][0][1], sizes[0][1]
+    size = max(width for (width, _), _ in sizes), above + under + ROW * (len(lines) - 1)
+    sights, thin = below.sights, below.thin
     place = None if sights is None else free_place(taken | sights, size, wish)
     place = place or free_place(taken, size, wish)
     if thin is not None and (place is None or np.hypot(place[0] - wish[0], place[1] - wish[1]) > NEAR):
         shut = taken * ~thin
         place = free_place(shut if sights is None else shut | sights, size, wish) or place
-    if place is None and needed and lines_there is not None:
-        place = free_place(taken & (1 - lines_there), size, wish)
+    if place is None and needed and below.lines is not None:
+        place = free_place(taken & (1 - below.lines), size, wish)
     if place is None and needed:
         place = free_place(np.zeros_like(taken), size, wish) or (PAD, PAD)
     if place is None:

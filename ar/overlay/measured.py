@@ -14,7 +14,7 @@ from ..rendering.renderer import Picture
 from .cut import ENDS, Plane, captioned, plane_through, profile, section
 from .distances import distance_of_seen, tree_of
 from .gauge import Gauge
-from .hud import FINE, HEAD, bound_words, folded, haloed, lay
+from .hud import FINE, HEAD, Below, bound_words, folded, haloed, lay
 from .legend import SMALL, depth_scale, paste, place_sheet
 from .outlines import OPAQUE, dash, ink_of, key_of
 from .places import PAD, free_place
@@ -135,7 +135,7 @@ class Measure:
                     paste(colour, taken, scale, place)
         if self.style == "rings":
             said = f"rings: mm to the {self.name or 'surface'}; {self.off}"
-            lay(colour, taken, folded(said, 0.3 * width), (width, HEAD), sights=sights)
+            lay(colour, taken, folded(said, 0.3 * width), (width, HEAD), below=Below(sights))
         if self.style == "cut":
             self._lay_cut(colour, taken, sights, needed)
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from scenes.options.devices_option import add_devices
-from scenes.options.shared_options import add_anatomy, add_json
+from scenes.options.shared_options import add_anatomy, add_devices, add_json
 from scenes.script.shipped_files import template_path
 from sim.accuracy import TRAIN
 from sim.arguments import at_least

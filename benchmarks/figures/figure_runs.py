@@ -16,7 +16,8 @@ import numpy as np
 from scenes.analysis.machine import machine
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
-from sim.runtime.versions import install_hint, version_of
+from sim.runtime.optional_packages import install_hint
+from sim.runtime.versions import version_of
 
 from ..peers.child_process import HOUSE, Ended, run_to_end
 from .figure_readings import number_at

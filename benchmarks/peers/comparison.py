@@ -23,7 +23,7 @@ from sim.discretisation.footprint import footprint_weights
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Pushed
 from sim.material import Material
-from sim.runtime.versions import install_hint
+from sim.runtime.optional_packages import install_hint
 from surrogate.data.tool_loads import draw
 
 from .child_process import HOUSE, start_program, stop_program

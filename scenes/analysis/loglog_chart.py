@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.runtime.versions import needed_from
+from sim.runtime.optional_packages import needed_from
 
 with needed_from("report", "a chart needs"):
     from matplotlib.axes import Axes

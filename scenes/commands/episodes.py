@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim.errors import InputError
-from sim.runtime.versions import needed_from
+from sim.runtime.optional_packages import needed_from
 
 from ..options.json_line import json_line
 from ..options.outputs import claimed_folder

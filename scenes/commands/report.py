@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 from sim.errors import InputError
 
-from ..options.devices_option import add_devices
 from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_json
+from ..options.shared_options import add_devices, add_json
 from .interrupt import INTERRUPTED
 
 if TYPE_CHECKING:

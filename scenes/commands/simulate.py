@@ -35,9 +35,8 @@ from surrogate.data.stated_tissue import stating
 from surrogate.data.tool_loads import BEYOND_TISSUE, PRESETS, draw, refused_share, refused_words
 from surrogate.data.tool_poses import draw_poses, tool_of
 
-from ..options.devices_option import add_devices
 from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_json, add_seed
+from ..options.shared_options import add_devices, add_json, add_seed
 from ..options.tissue_options import (
     add_element_argument,
     add_skull_argument,

@@ -25,9 +25,8 @@ from surrogate.model.store import save
 from surrogate.training.expansion import EXPANDED, Expansion
 from surrogate.training.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, learners_for, train
 
-from ..options.devices_option import add_devices
 from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_json
+from ..options.shared_options import add_devices, add_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

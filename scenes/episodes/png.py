@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 
-from sim.runtime.versions import needed_from
+from sim.runtime.optional_packages import needed_from
 
 with needed_from("data", "writing an episode needs"):
     from isal import isal_zlib

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,9 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(
 
 
 def opened(
-    task: str, anatomy: str | Path, observation: str, physics: str, device: str, size: tuple[int, int],
-    render_mode: str | None, model: str | Path | None, together: bool | None = None,
-) -> Setting:  # fmt: skip
-    """What environments stand on, of the arguments that they were made with.
+    task: str, observation: str, render_mode: str | None, given: Mapping[str, Any], together: bool | None = None
+) -> Setting:
+    """What environments stand on; anatomy, physics, device, size and model are `given` as to `open_setting`.
 
     Raises
     ------
@@ -36,7 +36,6 @@ def opened(
         raise InputError(f"observation is {observation!r:.80}: choose one of {', '.join(KINDS)}.")
     if render_mode is not None and render_mode not in RENDERED:
         raise InputError(f"render_mode is {render_mode!r:.80}: choose {', '.join(RENDERED)}, or None.")
-    given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size, "model": model}
     return open_setting(find_task(task), *checked(given), together)
 
 
@@ -73,7 +72,8 @@ class Operation(gymnasium.Env):
         render_mode: str | None = None,
         model: str | Path | None = None,
     ):
-        self.setting = opened(task, anatomy, observation, physics, device, size, render_mode, model)
+        given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size, "model": model}
+        self.setting = opened(task, observation, render_mode, given)
         self.observation, self.render_mode = observation, render_mode
         self.observation_space = space_of(observation, size)
         self.action_space = twists()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sim.runtime.versions import needed_from
+from sim.runtime.optional_packages import needed_from
 
 NAMESPACE = "sulcus"
 NAMES = ("Palpate", "Retract", "Debulk")

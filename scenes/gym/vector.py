@@ -64,7 +64,8 @@ class Operations(VectorEnv):
     ):
         self.num_envs = at_least("num_envs", num_envs, 1)
         self.steps = at_least("max_episode_steps", max_episode_steps, 1)
-        self.setting = opened(task, anatomy, observation, physics, device, size, render_mode, model, together)
+        given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size, "model": model}
+        self.setting = opened(task, observation, render_mode, given, together)
         self.observation, self.render_mode = observation, render_mode
         self.single_observation_space = space_of(observation, size)
         self.single_action_space = twists()

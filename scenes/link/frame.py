@@ -6,7 +6,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from sim.runtime.versions import needed_from
+from sim.runtime.optional_packages import needed_from
 
 with needed_from("slicer", "OpenIGTLink's checksums need"):
     from fastcrc import crc64

@@ -19,6 +19,17 @@ def add_device(parser: argparse.ArgumentParser, purpose: str = "") -> None:
     )
 
 
+def add_devices(parser: argparse.ArgumentParser, meant: str = "") -> None:
+    """Declare `--device` of several devices; `meant` is a sentence before, where not the whole command works there."""
+    parser.add_argument(
+        "--device",
+        default="auto",
+        metavar="DEVICES",
+        help=f"{meant}auto, cpu or cuda. Several with commas between, as in cuda:0,cuda:1, have a process each. all: "
+        "every graphics card. Default: %(default)s",
+    )
+
+
 def add_seed(
     parser: argparse.ArgumentParser, purpose: str = "the random draw", kind: Callable[[str], int] = int
 ) -> None:

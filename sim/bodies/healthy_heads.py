@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..runtime.versions import install_hint
+from ..runtime.optional_packages import install_hint
 from .enclosed_voxels import enclosed
 from .fif import read_surface
 from .head_masks import HeadMasks

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import InputError
-from ..runtime.versions import needed_from
+from ..runtime.optional_packages import needed_from
 from .intensity import Intensity
 from .placement import Piece, site_over
 from .signed_distance import Field, mask_field

@@ -123,7 +123,8 @@ def settled(
             some = np.flatnonzero(status == OPEN)[:each]
             on = columns_of(soft.device, some, len(status))
             own = here[:, on], there[:, on], known[:, on]
-            force, status[some], touched = _solved(barrier, soft, some, *own, tolerance[some], drag[some], limits, room)
+            asked = tolerance[some], drag[some]
+            force, status[some], touched = _solved(barrier, soft, some, own, asked, limits, room)
             ready = np.flatnonzero(status[some] == FOUND)
             if len(ready):
                 here_too = columns_of(soft.device, ready, len(some))
@@ -139,20 +140,20 @@ def _solved(
     barrier: Reduction,
     soft: Softness,
     columns: np.ndarray,
-    here: Any,
-    there: Any,
-    known: Any,
-    tolerance: np.ndarray,
-    drag: np.ndarray,
+    own: tuple[Any, Any, Any],
+    asked: tuple[np.ndarray, np.ndarray],
     limits: ForceLimits,
     room: int,
 ) -> tuple[Any, np.ndarray, Any]:
-    """Forces (3n, k) of some columns (k,) with room for so many touched nodes, status (k,), and places (n, k)."""
+    """Forces (3n, k) of some columns (k,) with room for so many touched nodes, status (k,), and places (n, k).
+
+    Of the columns' `own` here, there and known forces (3n, k), and tolerance and drag (k,) as `asked`.
+    """
     device, count = soft.device, len(columns)
-    nodes, functions = len(here) // 3, barrier.functions
+    nodes, functions = len(own[0]) // 3, barrier.functions
     scratch = soft.room(nodes, 1 << (count - 1).bit_length(), room)
     out, status = device.zeros(3 * nodes, count), wp.zeros(count, dtype=wp.int32, device=device.name)
-    arrays = [from_view(device, x) for x in (here, there, known)] + [device.array(x) for x in (tolerance, drag)]
+    arrays = [from_view(device, x) for x in own] + [device.array(x) for x in asked]
     touching = barrier.stage(columns)
     kernel, model, ends = kernel_of(device, functions), soft.model(columns, limits.rounded), ends_of(limits, room)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from sim.runtime.versions import needed_from
+from sim.runtime.optional_packages import needed_from
 
 from ..array_functions import Rounded, columns_in_use, product_of, squared_distances, taken
 

@@ -1,0 +1,29 @@
+"""Packages of an extra: a command that needs one says which, in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from ..errors import InputError
+
+
+def install_hint(extra: str) -> str:
+    """Sentence that says how to install an extra of this package: from its checkout, as no index has it."""
+    return f"Install it in the checkout: pip install -e '.[{extra}]'."
+
+
+@contextmanager
+def needed_from(extra: str, what: str) -> Iterator[None]:
+    """Import packages of an extra in a block, for `what` needs them: "these environments need".
+
+    Raises
+    ------
+    InputError
+        In place of ModuleNotFoundError: which package is not installed, and how to install the extra.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        raise InputError(f"{what} the package {package}, which is not installed. {install_hint(extra)}") from error
