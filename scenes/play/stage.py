@@ -34,7 +34,7 @@ NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool", COTTON: "cotton", GLOVE
 CORTEX_COLOUR = (0.86, 0.60, 0.54)
 DRAPE_COLOUR = (0.16, 0.36, 0.42)
 TOOL_COLOUR = (0.78, 0.80, 0.83)
-# Lines that eyes without red or green tell apart, and see on cortex and drape: tests/test_scenes_styles.py.
+# Lines that eyes without red or green tell apart, and see on cortex and drape: tests/test_scenes_checks.py.
 TUMOUR_COLOUR = (0.20, 0.94, 0.42)
 TRUTH_COLOUR = (0.90, 0.35, 0.78)
 """Of the tumour where the finite elements have it."""
