@@ -1,15 +1,8 @@
-"""What stands beside the 3-D view: slices of a scan, the last seconds as a chart; and who leads, and films."""
+"""What stands beside the 3-D view: slices of a scan."""
 
-import re
-
-import cv2
 import numpy as np
 import pytest
 
-from ar.page.history import SPAN, History, Line, Sample, ceiling
-from ar.page.lead import IDLE, Lead
-from ar.page.recording import LONGEST, RATE, Recording, played
-from ar.page.sight import coded
 from ar.page.slices import PLANES, REACH, SIDE, Cut, resampled, section, sliced, view, within
 from ar.rendering.layer import Layer, Solid
 from scenes.script.tool import sphere
@@ -86,84 +79,3 @@ OFF = np.array([[0, 0, 0, 5e-2], [0, 0, 0, 5e-2], [0, 0, 0, 5e-2], [0, 0, 0, 0.0
 def tinted(colour: np.ndarray) -> np.ndarray:
     """(H, W) bool: the pixels that are greener than red."""
     return colour[..., 1].astype(int) > colour[..., 0].astype(int) + 10
-
-
-class TestHistory:
-    def test_the_chart_is_of_the_last_seconds_with_the_error_as_a_band(self):
-        history = History((Line("distance", "mm", "#fff"), Line("force", "N", "#f00")))
-        for time in np.arange(0.0, 60.0, 0.1):
-            history.add(Sample(float(time), (10.0, None), (2.0 if time < 50.0 else None, None)))
-        assert history.samples[0].time >= 59.9 - SPAN - 1e-9
-        chart = history.chart()
-        (band,) = re.findall(r'<polygon points="([^"]*)"', chart)
-        heights = {float(point.split(",")[1]) for point in band.split()}
-        # Of 20 units, 8 to 12 are 4.
-        assert len(heights) == 2 and max(heights) - min(heights) == pytest.approx(69.0 * 4.0 / 20.0, abs=0.2)
-        assert chart.count("<polyline") == 2 and chart.count("stroke-dasharray") == 1
-        assert "force: not known" in chart and "distance [mm]" in chart and 'role="img"' in chart
-
-    def test_before_anything_is_read_it_is_an_empty_chart(self):
-        chart = History((Line("a<b", "mm", "#fff"),)).chart()
-        assert "<polyline" not in chart and "nothing yet" in chart
-
-    def test_a_moment_alone_is_a_dot_and_nothing_is_drawn_across_what_is_not_known(self):
-        history = History((Line("distance", "mm", "#fff"),))
-        for time, value in ((0.0, 3.0), (5.0, 4.0), (6.0, 4.0), (7.0, None), (8.0, 5.0)):
-            history.add(Sample(time, (value,), (None,)))
-        history.break_off(8.5)
-        history.add(Sample(9.0, (6.0,), (None,)))
-        lines = [line.split() for line in re.findall(r'<polyline points="([^"]*)"', history.chart())]
-        assert [len(line) for line in lines] == [2] * 4
-        widths = [float(line[1].split(",")[0]) - float(line[0].split(",")[0]) for line in lines]
-        assert widths == pytest.approx([3.3, 27.5, 3.3, 3.3], abs=0.11)
-        history.samples.clear()
-        history.add(Sample(9.0, (None,), (None,)))
-        assert ">not known<" in history.chart()
-
-    def test_scales_end_at_round_numbers(self):
-        assert [ceiling(value) for value in (0.0, 0.3, 1.0, 1.2, 9.0, 13.9)] == [1.0, 0.5, 1.0, 2.0, 10.0, 20.0]
-
-
-class TestLead:
-    def test_the_lead_passes_to_who_asked_first_and_else_to_who_is_here_longest(self):
-        lead = Lead()
-        lead.see({2, 3, 4}, 0.0)
-        assert lead.leader == 2 and lead.act(2, 1.0) and not lead.act(3, 1.0)
-        for visitor in (4, 3):
-            lead.ask(visitor, 2.0)
-        assert lead.leader == 2 and "Visitor 4 asks" in lead.words(2, {2, 3, 4}) and "asked" in lead.words(3, {2, 3, 4})
-        lead.see({3, 4}, 3.0)
-        assert lead.leader == 4 and lead.asking == (3,)
-        lead.give(4.0)
-        assert lead.leader == 3
-        lead.see({4, 5}, 5.0)
-        assert lead.leader == 4 and not lead.words(4, {4})
-
-    def test_who_does_nothing_for_long_hands_over_on_being_asked(self):
-        lead = Lead()
-        lead.see({1, 2}, 0.0)
-        lead.act(1, 10.0)
-        lead.ask(2, 10.0 + IDLE)
-        assert lead.leader == 2 and lead.asking == ()
-
-
-class TestRecording:
-    def test_a_film_shows_each_picture_as_long_as_the_page_did(self):
-        codes = [coded(np.full((48, 64, 3), grey, np.uint8)) for grey in (0, 100, 200)]
-        shown = list(played([(5.0, codes[0]), (6.0, codes[1]), (6.2, codes[2])], 7.0, 10.0))
-        assert [round(float(picture.mean()), -2) for picture in shown] == [0.0] * 10 + [100.0] * 2 + [200.0] * 8
-
-    def test_it_is_an_mp4_that_can_be_read_and_of_bounded_length(self, tmp_path):
-        recording = Recording(0.0)
-        for number in range(20):
-            recording.take(coded(np.full((48, 64, 3), 10 * number, np.uint8)), 0.1 * number)
-        recording.take(coded(np.zeros((48, 64, 3), np.uint8)), LONGEST + 1.0)
-        assert len(recording.taken) == 20 and recording.full(LONGEST)
-        (tmp_path / "film.mp4").write_bytes(recording.film(2.0))
-        film = cv2.VideoCapture(str(tmp_path / "film.mp4"))
-        assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2 * RATE
-        assert film.read()[1].shape == (48, 64, 3)
-
-    def test_of_nothing_there_is_no_film(self):
-        with pytest.raises(ValueError, match="at least one picture"):
-            Recording(0.0).film(1.0)

@@ -1,4 +1,4 @@
-"""Episodes in the formats of others: what is written is what was read, and appears whole."""
+"""Episodes in the formats of others: what is written is what was read."""
 
 import csv
 import json

@@ -8,11 +8,8 @@ from balls import ball
 
 from scenes.cli import main
 from scenes.options.placement_options import point_or_file
-from sim.bodies.markups import read_markup
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.placement import within_outline
-from sim.errors import InputError
-from surrogate.locating.observed_files import read_observation
 
 RADIUS = 55.0  # [mm] of the brain of `ball`, round the origin
 
@@ -39,22 +36,6 @@ def curve(count=9, wide=30.0, high=18.0, over=(0.0, 0.0, 1.0)):
     return np.column_stack([across, up]) @ axes
 
 
-@pytest.mark.parametrize("system", ["LPS", "RAS", None])
-def test_coordinates_are_of_the_system_that_is_stated_or_else_of_slicers(tmp_path, system):
-    found = read_markup(markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0], [1.0, 2.0, 3.0]], "Line", system))
-    np.testing.assert_allclose(found.points, [[0.01, 0.02, 0.03], [0.001, 0.002, 0.003]])
-
-
-def test_markup_and_table_that_begin_with_a_mark_are_read(tmp_path):
-    """Editors of Windows begin UTF-8 with a byte order mark; a table may name its points."""
-    path = markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0]])
-    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    table = tmp_path / "p.csv"
-    table.write_bytes(b"\xef\xbb\xbflabel,x,y,z\nF-1,10,20,30\n")
-    for points in (read_markup(path).points, read_observation(table).now):
-        np.testing.assert_allclose(points, [[0.01, 0.02, 0.03]])
-
-
 def fcsv(path, system, *rows, end="\n"):
     """A file of 3D Slicer's older fiducials; a system of None is not stated."""
     stated = "" if system is None else f"# CoordinateSystem = {system}{end}"
@@ -64,62 +45,10 @@ def fcsv(path, system, *rows, end="\n"):
     return path
 
 
-OLD = '1,{},{},30,0,0,0,1,1,1,0,"F, 1",,'
-
-
-@pytest.mark.parametrize(("system", "sign"), [("LPS", -1), ("1", -1), ("RAS", 1), ("0", 1)])
-@pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_points_of_older_files_are_of_the_system_that_is_stated(tmp_path, system, sign, end):
-    """Slicer 5 has a carriage return before the status: 2 is placed, 1 is not."""
-    rows = (OLD.format(10 * sign, 20 * sign), OLD.format(sign, 2) + "\r,2,0", OLD.format(5, 6) + "\r,1,0")
-    found = read_markup(fcsv(tmp_path / "p.fcsv", system, *rows, end=end))
-    np.testing.assert_allclose(found.points, [[0.01, 0.02, 0.03], [0.001, 0.002 * sign, 0.03]])
-    assert found.kind == "Fiducial"
-
-
-@pytest.mark.parametrize(
-    ("system", "row", "reason"),
-    [
-        (None, OLD.format(1, 2), "does not state its coordinate system"),
-        ("2", OLD.format(1, 2), "its coordinate system is '2'"),
-        ("LPS", OLD.format(1, "nan"), "coordinates are no numbers"),
-        ("LPS", "1,2", "cannot be read as markups"),
-        ("LPS", OLD.format(1, 2).replace('1",', "1,"), "cannot be read as markups"),
-        ("LPS", "", "has 0 points that are placed"),
-    ],
-)
-def test_older_files_that_do_not_say_all_are_refused(tmp_path, system, row, reason):
-    with pytest.raises(InputError, match=reason):
-        read_markup(fcsv(tmp_path / "p.fcsv", system, row))
-
-
-def test_a_curve_is_smooth_through_its_points(tmp_path):
-    smooth = read_markup(markup(tmp_path / "c.mrk.json", curve(), "ClosedCurve")).curve()
-    np.testing.assert_allclose(1e3 * np.linalg.norm(smooth, axis=1), RADIUS, atol=0.15)
-    np.testing.assert_allclose((1e3 * smooth[:, 1] / 30.0) ** 2 + (1e3 * smooth[:, 0] / 18.0) ** 2, 1.0, atol=0.04)
-
-
 def test_what_lies_within_an_outline_is_on_its_side_of_the_head():
     square = np.array([[-1.0, -1.0, 2.0], [1.0, -1.0, 2.1], [1.0, 1.0, 2.0], [-1.0, 1.0, 2.1]])
     points = np.array([[0.0, 0.0, 2.0], [0.9, -0.9, 2.5], [1.1, 0.0, 2.0], [0.0, -1.2, 2.0], [0.0, 0.0, -2.0]])
     assert within_outline(points, square).tolist() == [True, True, False, False, False]
-
-
-@pytest.mark.parametrize(
-    ("more", "reason"),
-    [
-        ({"system": "IJK"}, "its coordinate system is 'IJK': LPS and RAS are known"),
-        ({"coordinateUnits": ["m", "m", "m"]}, "and mm are read"),
-        ({"points": [[0.0, np.nan, 0.0]]}, "coordinates are no numbers"),
-        ({"points": [[0.0, 1e308, 0.0]]}, "more than 10 m away: coordinates are in mm"),
-        ({"points": []}, "has 0 points that are placed"),
-        ({"controlPoints": 3}, "cannot be read as markups"),
-    ],
-)
-def test_other_files_are_refused(tmp_path, more, reason):
-    points = more.pop("points", [[1.0, 2.0, 3.0]])
-    with pytest.raises(InputError, match=reason):
-        read_markup(markup(tmp_path / "p.mrk.json", points, **more))
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""What the page says and offers: the words of an answer, of a verdict, of a brain; sliders that the opening allows."""
+"""What the page says and offers: the words of an answer and of a brain; sliders that the opening allows."""
 
 import time
 from dataclasses import replace
@@ -13,9 +13,8 @@ from scenes.page.controls import clocked, controls
 from scenes.page.referee import Truth
 from scenes.page.requests import Wish
 from scenes.page.text import RESEARCH, about, fem_words, plan_words, report, side, trust, words
-from scenes.page.verdict import Judged, judge, verdict_words
+from scenes.page.verdict import judge, verdict_words
 from scenes.play.deformers import GUARDED, plan_of
-from scenes.play.load_text import doubt_of
 from scenes.play.player import Player
 from scenes.play.stage import Stage
 from scenes.play.waiting_notice import NOTICED, Busy
@@ -82,27 +81,6 @@ class TestTrust:
         still = replace(still, displacement=0.0 * still.displacement)
         said = trust(still, "svr")
         assert "Nothing moves the tumour." in said and "95 of 100" not in said
-
-
-class TestVerdict:
-    JUDGED = Judged(28, 0.35, "", 1e-3, 1e-4, 2e-4)
-
-    def test_of_the_present_load_it_stands_plainly(self):
-        said = verdict_words(self.JUDGED, False, "waits")
-        assert "mean 0.100, largest 0.200 mm" in said and "stale" not in said and "waits" not in said
-
-    def test_of_another_load_it_is_greyed_and_says_so(self):
-        said = verdict_words(self.JUDGED, True, "waits")
-        assert said.startswith('<p class="stale">of an earlier load') and "frame 28" in said and "waits" in said
-
-    def test_an_answer_short_of_its_tolerance_is_not_relied_on(self):
-        said = [
-            verdict_words(replace(self.JUDGED, doubt=doubt), False, "waits") for doubt in ("", doubt_of(Outcome.BUDGET))
-        ]
-        assert ["do not rely on it" in each for each in said] == [False, True]
-
-    def test_before_any_it_says_what_is_waited_for(self):
-        assert verdict_words(None, True, "waits") == '<p class="stale">waits</p>'
 
 
 class TestDigestOfLoads:

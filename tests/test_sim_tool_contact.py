@@ -13,12 +13,11 @@ from boxes import base_held, box
 from sim.accuracy import REFERENCE, Accuracy
 from sim.deformation import Deformation, Outcome
 from sim.effects import Elasticity, Held, ToolContact
-from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.material import Material
 from sim.runtime.user_script import run_script
-from sim.tools import Ball, Capsule, Core, Spatula, Tool, distances_to, foremost
+from sim.tools import Ball, Capsule, Core, Spatula, Tool, distances_to
 
 SOFT = Material("neo-hookean", 3000.0, 0.45)
 SIDE, HEIGHT = 0.08, 0.04
@@ -133,49 +132,3 @@ def test_a_tool_of_two_cores_is_two_tools_that_move_as_one() -> None:
     force = both.reaction[0, :, :3]
     moment = both.reaction[0, :, 3:].sum(axis=0) + np.cross([apart, 0.0, 0.0], force[1])
     assert np.allclose(one.reaction[0, 0], [*force.sum(axis=0), *moment], atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("cores", "words"),
-    [
-        ((), "has no cores: give at least one"),
-        ((Core(np.zeros(3), np.zeros(3), 0.0),), "not finite or has no radius"),
-        ((Core(np.array([np.nan, 0.0, 0.0]), np.zeros(3), 1e-3),), "not finite or has no radius"),
-    ],
-)
-def test_a_tool_of_no_shape_is_a_sentence(cores: tuple[Core, ...], words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        ToolContact((type("Shapeless", (), {"cores": cores})(),))
-
-
-BLADE = Spatula(0.012, 0.026, 1.5e-3)
-
-
-@pytest.mark.parametrize(
-    ("tool", "ends"),
-    [
-        (BLADE, [[0.006, 0, 1.5e-3], [0, 0.013, 1.5e-3], [0, 0, 0], [0, 0, 3e-3], [0.004, -0.01, 0]]),
-        (Capsule(3e-3, 0.02), [[0, 0, 0], [0, 0, 0.026], [3e-3, 0, 3e-3], [0, -3e-3, 0.02]]),
-        (Ball(7e-3), [[0, 0, 0], [0, 0, 0.014], [0, 7e-3, 7e-3]]),
-    ],
-)
-def test_tool_surface_lies_where_its_sizes_say(tool, ends):
-    turn = np.eye(4)
-    turn[:3, :3], turn[:3, 3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0.1, -0.2, 0.3]
-    signs = np.array([[x, y, 1.0] for x in (-1, 1) for y in (-1, 1)])
-    points = (np.array(ends)[:, None] * signs).reshape(-1, 3)
-    assert distances_to(tool, turn, points @ turn[:3, :3].T + turn[:3, 3]) == pytest.approx(0.0, abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("tool", "direction", "point"),
-    [
-        (BLADE, [1e-9, 1.0, 0.0], [0.0, 0.013, 1.5e-3]),  # the middle of an edge
-        (BLADE, [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]),  # and of a face
-        (BLADE, [0.6, -0.8, 0.0], [0.0045 + 0.6 * 1.5e-3, -0.0115 - 0.8 * 1.5e-3, 1.5e-3]),
-        (Capsule(3e-3, 0.02), [1.0, 0.0, 0.0], [3e-3, 0.0, 0.013]),
-        (Ball(7e-3), [0.0, 0.0, 1.0], [0.0, 0.0, 0.014]),
-    ],
-)
-def test_foremost_point_lies_on_the_tool_in_the_direction(tool, direction, point):
-    assert foremost(tool, np.eye(4)[None], np.array(direction))[0] == pytest.approx(point, abs=1e-10)

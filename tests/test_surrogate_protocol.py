@@ -6,12 +6,11 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scipy.spatial.distance import cdist
 
 from surrogate.model.store import REGRESSORS
 from surrogate.regressors.ann import Ann
 from surrogate.regressors.compliance_table import Linear
-from surrogate.regressors.gp import Gp, matern, negative_likelihood
+from surrogate.regressors.gp import Gp
 from surrogate.regressors.pcr import Pcr
 from surrogate.regressors.svr import Svr
 from surrogate.training.learners import SVR
@@ -114,64 +113,6 @@ def test_principal_components_of_little_variance_are_left_out():
     assert np.allclose(all_.predict(X), Y, atol=1e-5)
     assert np.allclose(few.predict(X)[:, :2], Y[:, :2], atol=0.3) and few.predict(X)[:, 2].std() < 0.3
     assert np.linalg.matrix_rank(few.map_, tol=1e-9) == 2
-
-
-def test_likelihood_is_that_of_an_independent_process():
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
-
-    x, y = RANDOM.normal(size=(40, 3)), RANDOM.normal(size=(40, 1))
-    for log in (np.log([1.0, 2.0, 0.5, 0.1]), np.log([3.0, 0.7, 1.5, 0.01])):
-        u = x / np.exp(log[:3])
-        covariance = matern(np.linalg.norm(u[:, None] - u, axis=2)) + np.exp(log[3]) * np.eye(40)
-        variance = (y.T @ np.linalg.solve(covariance, y)).item() / 40
-        kernel = ConstantKernel(variance) * (Matern(np.exp(log[:3]), nu=2.5) + WhiteKernel(np.exp(log[3])))
-        theirs = GaussianProcessRegressor(kernel, optimizer=None).fit(x, y).log_marginal_likelihood_value_
-        assert np.isclose(negative_likelihood(log, x, y)[0], -theirs - 20.0 * (1.0 + np.log(2.0 * np.pi)))
-
-
-def test_likelihood_has_its_gradient():
-    x, y, log = RANDOM.normal(size=(30, 3)), RANDOM.normal(size=(30, 4)), np.log([1.0, 2.0, 0.5, 0.1])
-    steps = 1e-5 * np.eye(4)
-    slope = [(negative_likelihood(log + h, x, y)[0] - negative_likelihood(log - h, x, y)[0]) / 2e-5 for h in steps]
-    assert np.allclose(negative_likelihood(log, x, y)[1], slope, rtol=1e-6)
-
-
-def test_the_process_finds_the_features_that_matter():
-    X, Y = rows(300, 0)
-    X[:, 4] = np.random.default_rng(6).normal(size=300)  # no output hangs on it
-    model = Gp().fit(X, Y)
-    assert model.length_[4] > 5.0 * model.length_[:4].max()
-
-
-def test_the_process_knows_how_wrong_it_is():
-    """On functions drawn from the kernel itself, errors have the deviation that is stated."""
-    x = np.random.default_rng(8).uniform(-1.0, 1.0, (300, 2))
-    covariance = matern(cdist(x / [0.8, 1.5], x / [0.8, 1.5])) + 1e-6 * np.eye(300)
-    y = 5.0 * np.linalg.cholesky(covariance) @ np.random.default_rng(9).normal(size=(300, 60))
-    model = Gp().fit(x[:150], y[:150])
-    stated = 5.0 * model.deviation(x[150:])
-    share = (model.predict(x[150:]) - y[150:]) / stated[:, None]
-    deep = stated < np.median(stated)
-    assert 0.8 < share[deep].std() < 1.25 and 0.8 < share[~deep].std() < 1.25
-    assert np.allclose(model.deviation(1e3 * x), 1.0, atol=1e-2)
-    again = Gp.restored(model.state())
-    assert np.allclose(again.deviation(x), model.deviation(x), rtol=1e-12)
-    twice = Gp().fit(x[:40], y[:40])
-    twice.deviation(x)
-    assert np.array_equal(twice.fit(x[:150], y[:150]).deviation(x), model.deviation(x))
-
-
-def test_a_subset_stands_for_too_many_rows():
-    X, Y = rows(300, 0)
-    few = Gp(rows=40, most=120).fit(X, Y)
-    assert len({*map(tuple, few.seen_)}) == 120
-    assert np.abs(few.predict(X) - Y)[:, 0].max() < 0.2 * Y[:, 0].std()
-
-
-def test_outputs_that_do_not_vary_are_predicted_exactly():
-    X, _ = rows(30, 0)
-    assert np.allclose(Gp().fit(X, np.full((30, 2), 3.0)).predict(X + 1.0), 3.0)
 
 
 def test_predicting_needs_neither_torch_nor_sklearn():

@@ -14,13 +14,11 @@ from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Deformation, Outcome
-from sim.discretisation.nearest_places import Placed
 from sim.effects import Elasticity, Held, Retraction, ToolContact, pushed_effects
-from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Retracted, Touching
 from sim.material import BRAIN, Material, tissue_to_json
-from sim.tools import Ball, BuiltIn, Capsule, Spatula, core_of, distances_to, foremost, named, tool_from_text
+from sim.tools import Ball, BuiltIn, Capsule, Spatula, core_of, distances_to
 from surrogate.data.cortex_patch import barycentric_lattice, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.encode import Basis, core_features, tool_features
@@ -59,68 +57,6 @@ def upright(box: Anatomy, tool: BuiltIn, depth: float) -> Loads:
     pose = np.eye(4)
     pose[:3, 3] = 0.5 * (points.min(axis=0) + points.max(axis=0)) - [1e-4, 2e-4, depth]
     return Loads((Touching(pose[None, None]),))
-
-
-def test_a_tool_is_read_from_what_it_prints_as_and_nothing_else_is() -> None:
-    for tool in (Ball(7e-3), ROD_OF_4, SMALL_BLADE):
-        assert tool_from_text(repr(tool)) == tool
-    assert named(ROD_OF_4) == "a rod of 2 mm radius and 20 mm length"
-    for text in ("", "Ball", "Ball(7e-3)", "Ball(radius=x)", "Ball(radius=-1.0)", "print(radius=1.0)"):
-        with pytest.raises(InputError, match="is no tool"):
-            tool_from_text(text)
-    with pytest.raises(InputError, match="is no tool"):
-        tool_from_text("(" * 100_000)
-
-
-def test_the_foremost_point_is_on_the_tool_and_nothing_of_it_is_farther() -> None:
-    rng = np.random.default_rng(0)
-    for tool in (Ball(7e-3), ROD_OF_4, SMALL_BLADE):
-        pose = np.tile(np.eye(4), (5, 1, 1))
-        pose[:, :3, :3] = np.linalg.qr(rng.normal(size=(5, 3, 3)))[0]
-        pose[:, :3, :3] *= np.linalg.det(pose[:, :3, :3])[:, None, None]
-        pose[:, :3, 3] = rng.normal(size=(5, 3))
-        way = np.array([0.6, 0.0, -0.8])
-        found = foremost(tool, pose, way)
-        core = core_of(tool)
-        for row in range(5):
-            assert distances_to(tool, pose[row], found[row][None])[0] == pytest.approx(0.0, abs=1e-9)
-            corners = core.corners @ pose[row, :3, :3].T + pose[row, :3, 3]
-            assert found[row] @ way == pytest.approx((corners @ way).max() + core.radius)
-    flat = foremost(SMALL_BLADE, np.eye(4)[None], np.array([0.0, 0.0, -1.0]))
-    np.testing.assert_allclose(flat, 0.0, atol=1e-12)  # the middle of its face
-
-
-@pytest.mark.parametrize("half", [[0.0, 0.0, 0.0], [0.0, 0.0, 0.4], [0.3, 0.5, 1e-9], [0.2, 0.3, 0.4]])
-def test_the_place_nearest_to_a_core_is_nearest(half: list[float]) -> None:
-    """Against a fine lattice on random triangles, whether or not they cut the core."""
-    rng = np.random.default_rng(1)
-    corners = rng.normal(size=(150, 3, 3)) * rng.uniform(0.3, 1.0, (150, 1, 3))
-    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    core = Placed(np.array([0.3, -0.2, 0.1]), axes, np.array(half))
-    share, far, way = core.nearest(corners)
-    assert share.min() >= 0.0
-    again, direction = core.distances(corners, share)
-    np.testing.assert_allclose(again, far, atol=1e-12)
-    np.testing.assert_allclose(direction[far > 1e-9], way[far > 1e-9], atol=1e-6)
-    lattice = np.array([(i, j, 60 - i - j) for i in range(61) for j in range(61 - i)]) / 60.0
-    best = np.min([core.distances(corners, np.tile(each, (150, 1)))[0] for each in lattice], axis=0)
-    off = np.maximum(far - best, 0.0)
-    assert off.max() < 0.02 and np.percentile(off, 90) < 1e-6 and (best - far).max() < 0.05
-    np.testing.assert_allclose(np.linalg.norm(way[far > 1e-9], axis=1), 1.0)
-
-
-def test_what_came_through_a_blade_is_pushed_down_again() -> None:
-    """The farther above, the deeper inside; beside the blade the nearest edge counts."""
-    blade = Placed(np.zeros(3), np.eye(3), np.array([4.0, 6.0, 0.0]))
-    flat = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
-    tilted = flat + [[0.0, 0.0, 0.1], [0.0, 0.0, 0.7], [0.0, 0.0, -0.2]]
-    near = blade.nearest(np.array([flat + [0.0, 0.0, 0.5], tilted, flat - [0.0, 0.0, 0.5], flat + [8.0, 0.0, 0.5]]))
-    np.testing.assert_allclose(near.distance, [-0.5, -0.7, 0.5, np.hypot(3.0, 0.5)])
-    np.testing.assert_allclose(near.normal[:3], [[0.0, 0.0, -1.0]] * 3, atol=1e-12)
-    np.testing.assert_allclose(near.share[1], [0.0, 1.0, 0.0])
-    distance, normal = blade.distances(np.array([tilted] * 2), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))
-    np.testing.assert_allclose(distance, [-0.7, 0.2])
-    np.testing.assert_allclose(normal, [[0.0, 0.0, -1.0]] * 2, atol=1e-12)
 
 
 @pytest.mark.parametrize("preset", TOOLS)

@@ -1,0 +1,44 @@
+"""The chart of the last seconds."""
+
+import re
+
+import numpy as np
+import pytest
+
+from ar.page.history import SPAN, History, Line, Sample, ceiling
+
+
+class TestHistory:
+    def test_the_chart_is_of_the_last_seconds_with_the_error_as_a_band(self):
+        history = History((Line("distance", "mm", "#fff"), Line("force", "N", "#f00")))
+        for time in np.arange(0.0, 60.0, 0.1):
+            history.add(Sample(float(time), (10.0, None), (2.0 if time < 50.0 else None, None)))
+        assert history.samples[0].time >= 59.9 - SPAN - 1e-9
+        chart = history.chart()
+        (band,) = re.findall(r'<polygon points="([^"]*)"', chart)
+        heights = {float(point.split(",")[1]) for point in band.split()}
+        # Of 20 units, 8 to 12 are 4.
+        assert len(heights) == 2 and max(heights) - min(heights) == pytest.approx(69.0 * 4.0 / 20.0, abs=0.2)
+        assert chart.count("<polyline") == 2 and chart.count("stroke-dasharray") == 1
+        assert "force: not known" in chart and "distance [mm]" in chart and 'role="img"' in chart
+
+    def test_before_anything_is_read_it_is_an_empty_chart(self):
+        chart = History((Line("a<b", "mm", "#fff"),)).chart()
+        assert "<polyline" not in chart and "nothing yet" in chart
+
+    def test_a_moment_alone_is_a_dot_and_nothing_is_drawn_across_what_is_not_known(self):
+        history = History((Line("distance", "mm", "#fff"),))
+        for time, value in ((0.0, 3.0), (5.0, 4.0), (6.0, 4.0), (7.0, None), (8.0, 5.0)):
+            history.add(Sample(time, (value,), (None,)))
+        history.break_off(8.5)
+        history.add(Sample(9.0, (6.0,), (None,)))
+        lines = [line.split() for line in re.findall(r'<polyline points="([^"]*)"', history.chart())]
+        assert [len(line) for line in lines] == [2] * 4
+        widths = [float(line[1].split(",")[0]) - float(line[0].split(",")[0]) for line in lines]
+        assert widths == pytest.approx([3.3, 27.5, 3.3, 3.3], abs=0.11)
+        history.samples.clear()
+        history.add(Sample(9.0, (None,), (None,)))
+        assert ">not known<" in history.chart()
+
+    def test_scales_end_at_round_numbers(self):
+        assert [ceiling(value) for value in (0.0, 0.3, 1.0, 1.2, 9.0, 13.9)] == [1.0, 0.5, 1.0, 2.0, 10.0, 20.0]

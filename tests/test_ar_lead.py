@@ -1,0 +1,26 @@
+"""Who leads a page."""
+
+from ar.page.lead import IDLE, Lead
+
+
+class TestLead:
+    def test_the_lead_passes_to_who_asked_first_and_else_to_who_is_here_longest(self):
+        lead = Lead()
+        lead.see({2, 3, 4}, 0.0)
+        assert lead.leader == 2 and lead.act(2, 1.0) and not lead.act(3, 1.0)
+        for visitor in (4, 3):
+            lead.ask(visitor, 2.0)
+        assert lead.leader == 2 and "Visitor 4 asks" in lead.words(2, {2, 3, 4}) and "asked" in lead.words(3, {2, 3, 4})
+        lead.see({3, 4}, 3.0)
+        assert lead.leader == 4 and lead.asking == (3,)
+        lead.give(4.0)
+        assert lead.leader == 3
+        lead.see({4, 5}, 5.0)
+        assert lead.leader == 4 and not lead.words(4, {4})
+
+    def test_who_does_nothing_for_long_hands_over_on_being_asked(self):
+        lead = Lead()
+        lead.see({1, 2}, 0.0)
+        lead.act(1, 10.0)
+        lead.ask(2, 10.0 + IDLE)
+        assert lead.leader == 2 and lead.asking == ()

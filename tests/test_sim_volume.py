@@ -1,0 +1,69 @@
+"""Volumes of voxels from outside: bounded memory, and a sentence for what is wrong."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import tracemalloc
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+
+from sim.bodies.intensity import read_intensity
+from sim.bodies.volume import read_volume
+from sim.errors import InputError
+
+
+def volume(path: Path, shape: tuple[int, ...] = (6, 6, 6), edge: float = 1.0) -> Path:
+    image = nibabel.Nifti1Image(np.ones(shape, np.uint8), np.diag([edge, edge, edge, 1.0]))
+    nibabel.save(image, path)
+    return path
+
+
+def header_with(path: Path, place: int, form: str, *values: float) -> Path:
+    """A .nii or .nii.gz with other numbers in its header."""
+    packed = path.name.endswith(".gz")
+    raw = bytearray(gzip.decompress(path.read_bytes()) if packed else path.read_bytes())
+    struct.pack_into(form, raw, place, *values)
+    path.write_bytes(gzip.compress(bytes(raw)) if packed else bytes(raw))
+    return path
+
+
+class TestVolumes:
+    @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
+    def test_voxels_that_are_not_there_take_no_memory(self, tmp_path: Path, name: str) -> None:
+        path = header_with(volume(tmp_path / name), 40, "<4h", 3, 700, 700, 700)
+        tracemalloc.start()
+        try:
+            with pytest.raises(InputError, match=r"ends after 568 of 343,000,352 bytes"):
+                read_volume(path)
+            assert tracemalloc.get_traced_memory()[1] < 2**24
+        finally:
+            tracemalloc.stop()
+
+    def test_no_volume_is_larger_than_the_limit(self, tmp_path: Path) -> None:
+        path = header_with(volume(tmp_path / "a.nii.gz"), 40, "<4h", 3, 1600, 1600, 1600)
+        with pytest.raises(InputError, match=r"4\.1e\+09 voxels, and 5\.37e\+08 are the most"):
+            read_volume(path)
+
+    @pytest.mark.parametrize("numbers", [(np.nan, 0.0), (-np.inf, 0.0)])
+    def test_a_slope_is_a_number(self, tmp_path: Path, numbers: tuple[float, float]) -> None:
+        with pytest.raises(InputError, match=r"slope .* which are no numbers"):
+            read_volume(header_with(volume(tmp_path / "a.nii"), 112, "<2f", *numbers))
+
+    def test_voxels_have_a_size(self, tmp_path: Path) -> None:
+        with pytest.raises(InputError, match=r"measure 1e-20 mm along an axis; 0\.01 mm is the least"):
+            read_volume(volume(tmp_path / "a.nii", edge=1e-20))
+        assert read_volume(volume(tmp_path / "b.nii", edge=0.1)).values.shape == (6, 6, 6)
+
+    def test_damage_is_a_sentence(self, tmp_path: Path) -> None:
+        whole = volume(tmp_path / "a.nii.gz", (20, 20, 20)).read_bytes()
+        for place in range(0, len(whole), 7):
+            path = tmp_path / "b.t1.nii.gz"
+            path.write_bytes(whole[:place] + bytes([whole[place] ^ 255]) + whole[place + 1 :])
+            try:
+                read_intensity(path)
+            except InputError as error:
+                assert str(error).startswith(str(path)) and "Error -" not in str(error)
