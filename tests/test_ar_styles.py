@@ -9,18 +9,17 @@ import trimesh
 
 from ar.optics.camera import look_at
 from ar.overlay.composite import composite, head_lines
-from ar.overlay.cut import EMPTY, Plane, plane_through, profile, section
-from ar.overlay.distances import distance_of_seen, signed_distance, tree_of
+from ar.overlay.distances import signed_distance, tree_of
 from ar.overlay.gauge import GAUGE, Gauge, gauge_words
 from ar.overlay.hud import FINE, FONT, HEAD, ROW, WHITE, folded, panel
 from ar.overlay.legend import SHEET, Names
 from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.measured import Measure
-from ar.overlay.outlines import ink_of, key_of, silhouette
+from ar.overlay.outlines import ink_of, silhouette
 from ar.overlay.refind import found_at, of_ink, outline_gap, stands
-from ar.overlay.rings import RING, RINGS, draw_rings, lines_of
+from ar.overlay.rings import RING
 from ar.overlay.styles import STYLES, Opening
-from ar.overlay.window import DARK, SHUT, Roles
+from ar.overlay.window import DARK, Roles
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Lamp, render
 
@@ -134,62 +133,6 @@ def test_depth_is_the_stronger_the_nearer_and_has_a_scale():
     assert changed[:, 480:].sum() > 1000  # the scale, on the drape
 
 
-def test_rings_lie_where_the_distance_is_what_they_say():
-    picture, at = seen(), tumour((0.0, 0.0, -0.014))
-    whole, free = np.s_[0:480, 0:640], np.ones((480, 640), bool)
-    far = distance_of_seen(tree_of(at.vertices, at.triangles), CAMERA, whole, picture.drawn.depth[0], free, 18e-3)
-    sheet = np.zeros((480, 640, 4), np.uint8)
-    assert draw_rings(sheet, far, free) == ["5", "10", "15"]
-    rows, columns = np.nonzero(sheet[..., 3] == 255)
-    points = CAMERA.unproject(np.stack([columns, rows], axis=1).astype(float), picture.depth[rows, columns])
-    distance = np.linalg.norm(points - [0.0, 0.0, -0.014], axis=1) - 0.012
-    off = np.abs(distance[:, None] - np.array(RINGS)).min(axis=1)
-    assert len(off) > 1000 and np.percentile(off, 80) < 0.5e-3  # the others are of numbers
-    shown = composite(picture, CAMERA, at, style="rings").colour
-    assert (shown != composite(picture, CAMERA, at, style="contour").colour).any(axis=2).sum() > 1000
-
-
-def test_a_cut_holds_camera_tip_and_middle():
-    middle, tip = np.array([0.0, 0.0, -0.02]), np.array([0.01, 0.004, 0.0])
-    plane = plane_through(CAMERA, middle, tip)
-    normal = np.cross(plane.across, plane.along)
-    assert np.abs([(tip - middle) @ normal, (CAMERA.centre - middle) @ normal]).max() < 1e-12
-    assert plane.across @ CAMERA.T_camera_world[0, :3] > 0.0
-    level = plane_through(CAMERA, middle, CAMERA.centre + 0.9 * (middle - CAMERA.centre))
-    np.testing.assert_allclose(level.across, plane_through(CAMERA, middle, None).across)
-    assert abs(level.across @ CAMERA.T_camera_world[1, :3]) < 1e-12
-    places = np.array([[0.002, -0.01], [0.0, 0.0]])
-    np.testing.assert_allclose(plane.coordinates(plane.points(places)), places, atol=1e-15)
-
-
-def test_a_cut_shows_the_surface_the_section_and_nothing_in_the_air():
-    picture, at = seen(0.0), tumour()
-    plane: Plane = plane_through(CAMERA, at.vertices.mean(axis=0), None)
-    roles = Roles((), (CORTEX,)).of(picture.segmentation)
-    places, what = profile(CAMERA, plane, picture.depth, roles, 0.04)
-    assert np.abs(plane.points(places)[:, 2]).max() < 2e-4  # the sheet lies at z = 0
-    right = plane.points(places)[:, 0] > 5e-4
-    assert (what[right] == SHUT).all() and not what[plane.points(places)[:, 0] < -5e-4].any()
-    ink = key_of(ink_of(GREEN))
-    inset = section(CAMERA, at, plane, (places, what), (240, 180), ink)
-    bar = np.flatnonzero((inset[-6] == np.asarray(WHITE, np.uint8)).all(axis=1))
-    scale = (np.ptp(bar) - 1) / 0.01  # the bar is 10 mm
-    assert of_ink(inset, ink).sum() == pytest.approx(np.pi * (0.012 * scale) ** 2, rel=0.1)
-    assert of_ink(inset, EMPTY)[:8].mean() > 0.8 and not of_ink(inset, EMPTY)[-60:-20].any()
-
-
-@pytest.mark.parametrize("error", [2e-3, 6e-3])
-def test_cut_draws_its_broken_line_at_the_error(error):
-    at, ink = tumour(), key_of(ink_of(GREEN))
-    plane = plane_through(CAMERA, at.vertices.mean(axis=0), None)
-    places = plane.coordinates(np.array([[-0.03, 0.0, 0.0], [0.03, 0.0, 0.0]])), np.zeros(2, int)
-    with_line, without = (section(CAMERA, at, plane, places, (240, 180), ink, error=each) for each in (error, None))
-    inside = np.argwhere(of_ink(without, ink))
-    scale = np.ptp(inside[:, 1]) / 0.024
-    away = np.linalg.norm(np.argwhere((with_line != without).any(axis=2)) - inside.mean(axis=0), axis=1) / scale
-    assert len(away) > 40 and np.median(away) == pytest.approx(0.012 + error, abs=0.4e-3)
-
-
 def test_distances_are_signed_and_end():
     surface = tumour((0.0, 0.0, 0.0), 0.01)
     turned = replace(surface, triangles=surface.triangles[:, ::-1])
@@ -253,24 +196,6 @@ def test_a_panel_moves_out_of_sight_of_what_it_would_hide():
 def test_a_mask_of_another_size_is_refused():
     with pytest.raises(ValueError, match="covered"):
         composite(seen(), CAMERA, tumour(), cover=Cover(covered=np.zeros((4, 4), bool)))
-
-
-def written(sheet, number):
-    """How often a ring's number stands in a sheet of rings."""
-    (wide, tall), _ = cv2.getTextSize(number, FONT, FINE, 1)
-    stamp = np.full((tall + 3, wide + 3, 3), np.array(DARK), np.uint8)
-    cv2.putText(stamp, number, (2, tall + 2), FONT, FINE, RING, 1, cv2.LINE_AA)
-    return int((cv2.matchTemplate(sheet[..., :3].copy(), stamp, cv2.TM_CCOEFF_NORMED) > 0.9).sum())
-
-
-def test_each_long_piece_of_a_ring_has_its_number_and_each_ring_one_at_least():
-    rows, columns = np.mgrid[:480, :640]
-    far = (0.1e-3 * np.hypot(rows - 240.0, columns - 320.0)).astype(np.float32)
-    far[:, 300:340] = np.nan  # halves of rings of 50, 100 and 150 pixels
-    for free, least in ((np.ones(far.shape, bool), 2), (np.zeros(far.shape, bool), 1)):
-        sheet = np.zeros((480, 640, 4), np.uint8)
-        assert draw_rings(sheet, far, free) == ["5", "10", "15"]
-        assert [written(sheet, number) >= least for number in ("5", "10", "15")] == [True] * 3
 
 
 def test_a_cut_has_letters_at_both_ends_also_where_a_tool_hides_one():
@@ -338,15 +263,6 @@ def test_a_ring_s_caption_stands_apart_from_the_number_beside_the_tip():
     assert number is not None and caption is not None
     left, top, right, foot = number
     assert caption[1] > foot + ROW or caption[3] < top - ROW or caption[0] > right + ROW or caption[2] < left - ROW
-
-
-def test_rings_may_be_covered_and_their_numbers_may_not():
-    drawn = np.zeros((80, 120, 4), np.uint8)
-    distance = np.repeat(np.linspace(0.0, 8e-3, 120, dtype=np.float32)[None], 80, axis=0)
-    assert draw_rings(drawn, distance, np.ones((80, 120), bool), [5e-3]) == ["5"]
-    number = cv2.erode((drawn[..., 3] > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    there = lines_of(drawn[..., 3] > 0)
-    assert number.any() and not there[number].any() and there[8:20].any() and there[60:72].any()
 
 
 def test_a_cut_leaves_the_foot_to_its_words():

@@ -5,46 +5,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from films import FILM
 
-from ar.tracking.detection import Corners
-from ar.tracking.focal_fit import focal_fit
-from ar.tracking.targets import tool_cube
 from scenes.cli import main
 from scenes.tracked.calibration_file import read_calibration, write_calibration
 from scenes.tracked.film_camera import demand_film
-
-CUBE = tool_cube()
-
-
-def corners_of(camera, noise, seed, faces=(0, 1)):
-    """What a camera sees of two faces of the cube, with errors [pixel]."""
-    middle = np.concatenate([CUBE.faces[face].corners for face in faces]).mean(axis=0)
-    normal = sum(CUBE.faces[face].T_target_face[:3, 2] for face in faces)
-    ahead = normal / np.linalg.norm(normal)
-    right = np.cross(ahead, [0.31, 0.2, 0.93])
-    right /= np.linalg.norm(right)
-    turn = np.stack([right, np.cross(ahead, right), ahead])
-    points = np.concatenate([CUBE.faces[face].corners for face in faces])
-    face = np.repeat(faces, [len(CUBE.faces[number].corners) for number in faces])
-    pixels = camera.project((points - middle) @ turn.T + [0.0, 0.0, 0.4])[0]
-    return Corners(points, pixels + noise * np.random.default_rng(seed).standard_normal(pixels.shape), face)
-
-
-def test_a_focal_length_is_found_by_the_relief_of_a_target():
-    """Of a camera that is stated a tenth too long, and of the true one; of few corners nothing is known."""
-    camera = read_calibration(FILM / "camera.yaml").camera(np.eye(4))
-    seen = [(CUBE, corners_of(camera, 0.1, seed)) for seed in range(12)]
-    for factor in (1.0, 1.1):
-        K = camera.K.copy()
-        K[[0, 1], [0, 1]] *= factor
-        fit = focal_fit(replace(camera, K=K), seen)
-        assert fit is not None and fit.differs == (factor > 1.0)
-        assert abs(fit.factor * factor - 1.0) < 4.0 * fit.deviation < 0.04
-    few = replace(seen[0][1], **{name: getattr(seen[0][1], name)[:8] for name in ("points", "pixels", "face")})
-    assert focal_fit(camera, [(CUBE, few)]) is None and focal_fit(camera, []) is None
 
 
 @pytest.mark.parametrize(("factor", "way"), [(1.15, "13% shorter"), (0.85, "18% longer")])

@@ -9,14 +9,13 @@ from itertools import islice
 import cv2
 import numpy as np
 import pytest
-from films import FILM, Plugged, Recorded, follower_of, truth_of
+from films import FILM, Recorded, follower_of, truth_of
 from theatres import template_theatre
 
 from ar.overlay.outlines import ink_of, silhouette
 from ar.overlay.refind import changed_share, of_ink, outline_gap
 from ar.rendering.layer import Layer
 from ar.rendering.real_picture import real_picture
-from ar.tracking.live_camera import camera_pictures, newest
 from ar.tracking.pictures import Named, film_of
 from scenes.cli import main
 from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
@@ -288,36 +287,3 @@ def test_what_does_not_belong_together_is_refused(tmp_path, capsys):
     assert main(["overlay", str(blank), *GIVEN, "--device", "cpu"]) == 1  # nothing is known
     with pytest.raises(InputError, match="cannot be read as what is true of a film"):
         read_truth(tmp_path / "text.mp4", "", 0)
-
-
-def test_a_camera_that_is_unplugged_is_opened_until_it_is_back():
-    cameras, moments, late = [Plugged(2), Plugged(0), Plugged(1)], iter(range(9)), []
-    first = cameras.pop(0)
-
-    def again():
-        late.append(cameras.pop(0))
-        return late[-1]
-
-    found = camera_pictures(first, "camera 0", again, lambda: next(moments))
-    seen = [next(found) for _ in range(2)]
-    assert [each.time for each in seen] == [0, 1] and seen[0].colour.shape == (720, 960, 3)
-    seen = list(islice(found, 21))
-    assert first.released and seen[:20] == [None] * 20 and seen[20].time == 2 and late[0].released
-    found.close()
-    assert late[1].released
-
-
-def test_the_newest_picture_is_had_and_a_silence_is_said():
-    def slow():
-        yield from "abc"
-        time.sleep(0.15)
-        yield "d"
-        raise ValueError("unplugged")
-
-    found = newest(slow(), 0.05)
-    time.sleep(0.02)
-    assert next(found) == "c"  # a and b are lost
-    assert next(found) is None
-    with pytest.raises(ValueError, match="unplugged"):
-        for each in found:
-            assert each in ("d", None)

@@ -22,7 +22,6 @@ from scenes.script.tool_paths import Touch
 from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import guess
 from sim.effects import Resection
-from sim.errors import InputError
 from sim.loads import Posture, Resected
 
 SURGERY = Debulking(times=(0.05, 0.1, 0.15))
@@ -60,23 +59,6 @@ def test_the_steps_are_a_corridor_and_shares_from_the_top(box, theatre):
     depth = [-middle[step] @ [0.0, 0.0, 1.0] for step in (*shares, left)]
     assert all(upper.max() <= lower.min() + 1e-4 for upper, lower in pairwise(depth))
     assert [SURGERY.done(time) for time in (0.0, 0.0499, 0.05, 0.12, 9.0)] == [0, 0, 1, 2, 3]
-
-
-@pytest.mark.parametrize(("asked", "wide"), [(1e-4, 6e-3), (9e-3, 9e-3)])
-def test_the_corridor_is_free_from_the_cortex_to_the_tumour(box, asked, wide):
-    """As wide as it is asked for, and never narrower than an edge of the mesh, which is 6 mm here."""
-    corridor = np.array(Debulking(SURGERY.times, corridor=asked).resection(box).steps[0])
-    middle = box.mesh.nodes[box.mesh.tets].mean(axis=1)
-    brain, across = box.mesh.region != TUMOUR_LABEL, np.linalg.norm(middle[:, :2], axis=1)
-    above = middle[:, 2] > middle[~brain, 2].mean() + 1e-3
-    inner, outer = (np.flatnonzero(brain & above & (across < share * wide)) for share in (0.95, 1.05))
-    assert len(inner) > 10 and np.isin(inner, corridor).all()
-    assert np.isin(corridor, np.flatnonzero(brain & (across < 1.05 * wide))).all() and len(corridor) < 1.2 * len(outer)
-
-
-def test_a_tumour_of_fewer_elements_is_a_sentence(box):
-    with pytest.raises(InputError, match="mesh finer"):
-        Debulking(times=tuple(np.arange(5000.0))).resection(box)
 
 
 def test_its_effects_and_causes_are_the_body_s(theatre, scene):

@@ -1,4 +1,4 @@
-"""Limits of Gymnasium's tasks: of force and pressure, and of where a tool may go."""
+"""Limits of Gymnasium's tasks: of force and of pressure."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -6,16 +6,12 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from theatres import template_theatre
 
 import scenes.gym  # noqa: F401
 from scenes.gym.cut_elements import CutElements
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE
-from scenes.gym.tool_motion import HIGHEST, laid, moved
 from scenes.gym.touched import Asked, Touched
-from scenes.script.site import site_of
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome
 
@@ -53,26 +49,6 @@ def test_episode_is_over_after_goals_in_a_row_or_a_bad_answer(shares, ends):
     over = [environment.step(0.0 * DOWN) for _ in shares]
     assert [terminated for _, _, terminated, _, _ in over] == [False] * (len(shares) - 1) + [True]
     assert over[-1][-1]["success"] == (ends == "success") != (over[-1][1] < -5.0)
-
-
-def test_tool_leans_and_sinks_no_farther_than_it_may(box):
-    site, tool = site_of(box), PALPATE.tool
-    hand = laid(site, tool, site.origin)
-    for angle, turned in ((0.29, True), (0.31, False)):
-        found = moved(hand, site, tool, np.array([0.0, 0.0, 0.0, 0.0, angle, 0.0]), 0.3, 5e-3)
-        assert (np.abs(found.turned - hand.turned).max() > 0.1) == turned
-    for way, depth in ((-1.0, 5e-3), (1.0, -HIGHEST)):
-        found = moved(hand, site, tool, np.array([0.0, 0.0, way, 0.0, 0.0, 0.0]), 0.3, 5e-3)
-        assert (found.place - site.origin) @ site.axis == pytest.approx(depth - tool.radius)
-
-
-def test_tool_turns_about_the_axes_of_the_open_cortex():
-    site, tool = template_theatre().site, PALPATE.tool
-    hand = laid(site, tool, site.origin)
-    for number, axis in enumerate((site.right, site.up, -site.axis)):
-        twist = 0.2 * np.eye(6)[3 + number]
-        found = moved(hand, site, tool, twist, 0.3, 5e-3)
-        np.testing.assert_allclose(found.turned, Rotation.from_rotvec(0.2 * axis).as_matrix() @ hand.turned, atol=1e-9)
 
 
 def test_cut_elements_are_reliable_where_both_levels_are(box, tmp_path):

@@ -26,7 +26,6 @@ from sim.minimisers.compact_lbfgs import Pairs, PairsOfColumns, no_pairs
 from sim.minimisers.lbfgs_kernels import PAIRS
 from sim.runtime.device import Device
 from sim.strategy.plan import Step
-from sim.terms.contact.tool_path import Touch, Way
 from sim.tools import Ball
 
 SIDE, HEIGHT, RADIUS = 0.06, 0.03, 6e-3
@@ -292,23 +291,3 @@ def test_what_was_asked_before_changes_no_bit() -> None:
     np.testing.assert_array_equal(first.reaction, again.reaction)
     for name, array in first.memory.items():
         np.testing.assert_array_equal(array, again.memory[name])
-
-
-def test_a_way_is_as_long_as_it_is_clear() -> None:
-    tool = Ball(RADIUS)
-    begin, end = at(0.0, 0.0, 0.1)[None, None], at(0.1, 0.0, 0.1)[None, None]
-    way = Way(begin, end)
-    np.testing.assert_allclose(way.stride((tool,), np.zeros((1, 1))), Touch.stride * RADIUS / 0.1)
-    np.testing.assert_allclose(way.stride((tool,), np.full((1, 1), 0.04)), (0.04 + Touch.stride * RADIUS) / 0.1)
-    np.testing.assert_allclose(way.stride((tool,), np.full((1, 1), 0.2)), 1.0)
-
-
-def test_a_tool_flies_in_few_strides() -> None:
-    """Beside the body, and away from it: from 9 cm off it, seven cm are free whichever way."""
-    fem = solver(TRAIN)
-    term = fem.problem.barriers[0]
-    poses = at(-0.09, 0.03, HEIGHT + 5e-3), at(-0.33, 0.03, HEIGHT + 5e-3)
-    there = fem.deform(touching(poses[0]))
-    cases = Cases(touching(poses[1]), np.zeros(1), there.memory, np.zeros((1, len(BODY.mesh.nodes), 3)), np.zeros(1))
-    stride = term.stride(cases, fem.problem.device.zeros(fem.problem.rows, 1))
-    assert stride[0] > 0.07 / 0.24 > 10.0 * Touch.stride * RADIUS / 0.24

@@ -19,7 +19,6 @@ from sim.bodies.fif import read_surface
 from sim.bodies.healthy_heads import INNER_SKULL
 from sim.bodies.intensity import read_intensity, sidecar
 from sim.bodies.meshfile import read_anatomy
-from sim.errors import InputError
 
 RADII = 0.080 * EGG
 BALL_ML = 4e6 / 3.0 * np.pi * RADII.prod()
@@ -67,17 +66,6 @@ def skull(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path / "packages")
     importlib.invalidate_caches()
     return path
-
-
-def test_what_a_surface_encloses_is_counted_to_a_voxel():
-    points, triangles = egg()
-    mask, affine = enclosed(points, triangles, 2e-3)
-    middles = np.argwhere(np.ones_like(mask)) @ affine[:3, :3].T + affine[:3, 3]
-    outside = np.linalg.norm(middles / RADII, axis=1).reshape(mask.shape) > 1.0
-    assert mask.sum() * 8e-3 == pytest.approx(BALL_ML, rel=0.01)
-    assert not (mask & outside).any()  # flat triangles between points of the ellipsoid lie inside
-    with pytest.raises(InputError, match="not closed"):
-        enclosed(points, triangles[1:], 2e-3)
 
 
 def test_fsaverage_is_what_its_inner_skull_holds_at_the_size_asked_for(skull, tmp_path, capsys):

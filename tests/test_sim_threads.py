@@ -1,10 +1,13 @@
-"""A limit that belongs to the whole process, entered and left by several."""
+"""Threads: a limit that belongs to the whole process, and tasks that are all done, with errors raised at the end."""
 
 from __future__ import annotations
 
+import threading
+
+import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from sim.runtime.threads import one_thread
+from sim.runtime.threads import Sharing, cores, one_thread, together
 
 
 def threads() -> set[int]:
@@ -21,3 +24,36 @@ def test_it_lasts_until_the_last_has_left_and_then_is_gone() -> None:
         assert threads() == {1}
         second.__exit__(None, None, None)
         assert threads() == {2}
+
+
+def test_every_task_is_done_when_it_returns():
+    done: list[int] = []
+    for _ in range(50):
+        together([lambda number=number: done.append(number) for number in range(3)])
+    assert sorted(done) == sorted([0, 1, 2] * 50)
+
+
+def test_tasks_run_at_the_same_time():
+    meeting = threading.Barrier(2, timeout=5.0)
+    together([meeting.wait, meeting.wait])
+
+
+@pytest.mark.parametrize("bad", [0, 1])
+def test_errors_come_out_and_the_threads_stay(bad: int):
+    def fail():
+        raise ValueError("no")
+
+    done: list[int] = []
+    tasks = [lambda: done.append(1), lambda: done.append(1)]
+    tasks[bad] = fail
+    with pytest.raises(ValueError, match="no"):
+        together(tasks)
+    assert done == [1]
+    together([lambda: done.append(2)] * 2)
+    assert done == [1, 2, 2]
+
+
+def test_one_core_at_least_and_one_for_little() -> None:
+    assert cores(10**6) >= 1
+    assert cores(Sharing().least - 1) == 1
+    assert cores(10**6, Sharing(most=1)) == 1

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from functools import partial
 
 import numpy as np
 import pytest
@@ -13,8 +12,6 @@ from surrogate.regressors.compliance_table import Linear
 from surrogate.regressors.gp import Gp
 from surrogate.regressors.pcr import Pcr
 from surrogate.regressors.svr import Svr
-from surrogate.training.learners import SVR
-from surrogate.training.tuning import Tuned, inner_discs
 
 MAKE = {"linear": Linear, "ann": lambda: Ann(hidden=12, steps=150), "svr": Svr, "gp": Gp}
 MAKE["pcr"] = lambda: Pcr(share=1.0)  # its features here have several units
@@ -123,43 +120,3 @@ def test_predicting_needs_neither_torch_nor_sklearn():
         "assert not {'torch', 'sklearn', 'warp', 'meshio'} & set(sys.modules), sys.modules.keys()\n"
     )
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
-
-
-def nearby(count, seed):
-    """Rows of `tool_features`, and outputs that bend: the published tube is as wide as what it leaves."""
-    X = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 8)) * 1e-2
-    bend = 1e2 * X @ np.random.default_rng(1).normal(size=(8, 3))
-    return X, np.sin(0.7 * bend) * [1.0, 0.3, 0.1]
-
-
-def test_tuned_settings_halve_the_error_of_the_published_ones():
-    (X, Y), (asked, truth) = nearby(600, 0), nearby(200, 2)
-    miss = [np.abs(model.predict(asked) - truth).mean() for model in (Svr().fit(X, Y), Tuned(SVR).fit(X, Y))]
-    assert miss[1] < 0.6 * miss[0]
-    again = Tuned(SVR).fit(X, Y)
-    assert np.array_equal(again.predict(asked), Tuned(SVR).fit(X, Y).predict(asked)) and isinstance(again, Svr)
-
-
-def test_settings_are_chosen_on_discs_that_the_inner_fits_are_not_trained_on():
-    """One fit for each of the settings without the discs, and one of the best to all."""
-    X, Y = nearby(100, 0)
-    seen, left_out = [], inner_discs(X[:, :3])
-    assert 0.15 < left_out.mean() < 0.25
-
-    class Off:
-        def __init__(self, by):
-            self.by = by
-
-        def fit(self, X, Y):
-            seen.append((self.by, X))
-            return self
-
-        def predict(self, asked):
-            assert np.array_equal(asked, X[left_out])
-            order = np.sort(np.argsort(-Y.std(axis=0), kind="stable")[:8])
-            return Y[left_out][:, order] + self.by
-
-    chosen = Tuned(tuple(partial(Off, by) for by in (2.0, 0.5, 1.0))).fit(X, Y)
-    assert chosen.by == 0.5 and [by for by, _ in seen] == [2.0, 0.5, 1.0, 0.5]
-    assert all(np.array_equal(rows, X[~left_out]) for _, rows in seen[:3]) and len(seen[3][1]) == 100
-    assert Tuned((partial(Off, 2.0), partial(Off, 0.5))).fit(X[:30], Y[:30]).by == 2.0

@@ -24,7 +24,6 @@ from surrogate.model import kept_arrays
 from surrogate.model.conformal import GROWTH, Bound
 from surrogate.model.kept_arrays import kept_path
 from surrogate.model.learned import Part
-from surrogate.model.npz_archive import Archive
 from surrogate.model.store import learned_tissue, load, save, stated_errors
 from surrogate.model.training_range import Outside
 from surrogate.training.train import train
@@ -320,29 +319,3 @@ def test_bad_model_files_are_sentences(box, tmp_path):
     np.savez(tmp_path / "old.npz", header=np.array(json.dumps({"format": "sulcus model 0"})))
     with pytest.raises(InputError, match="train it anew"):
         load(tmp_path / "old.npz", box)
-
-
-def test_arrays_that_are_larger_than_a_model_may_be_are_refused(tmp_path):
-    np.savez_compressed(tmp_path / "m.npz", few=np.zeros(10), many=np.zeros(1000))
-    with (tmp_path / "m.npz").open("rb") as raw:
-        for most, name, count in ((1000, "few", 10), (8200, "many", 1000)):  # less than both with their heads
-            archive = Archive(raw, largest=most)
-            assert len(archive.arrays([name])[name]) == count
-            with pytest.raises(InputError, match="MB are the most"):
-                archive.arrays(["few", "many"])
-
-
-def test_an_array_of_more_bytes_than_its_member_is_refused_before_memory_is_taken(tmp_path):
-    """As many bytes as the header has numbers, each of eight."""
-    np.savez(tmp_path / "m.npz", many=np.zeros(2**20))
-    with zipfile.ZipFile(tmp_path / "m.npz") as source:
-        raw = source.read("many.npy")
-    with zipfile.ZipFile(tmp_path / "n.npz", "w") as target:
-        target.writestr("many.npy", raw[: 128 + 2**21])
-    tracemalloc.start()
-    try:
-        with (tmp_path / "n.npz").open("rb") as file, pytest.raises(InputError, match="is not what it says"):
-            Archive(file).arrays(["many"])
-        assert tracemalloc.get_traced_memory()[1] < 2**20
-    finally:
-        tracemalloc.stop()

@@ -1,0 +1,28 @@
+"""The debulking of a tumour: its corridor, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_scenes_resection import SURGERY
+
+from scenes.script.debulking import Debulking
+from sim.anatomy import TUMOUR_LABEL
+from sim.errors import InputError
+
+
+@pytest.mark.parametrize(("asked", "wide"), [(1e-4, 6e-3), (9e-3, 9e-3)])
+def test_the_corridor_is_free_from_the_cortex_to_the_tumour(box, asked, wide):
+    """As wide as it is asked for, and never narrower than an edge of the mesh, which is 6 mm here."""
+    corridor = np.array(Debulking(SURGERY.times, corridor=asked).resection(box).steps[0])
+    middle = box.mesh.nodes[box.mesh.tets].mean(axis=1)
+    brain, across = box.mesh.region != TUMOUR_LABEL, np.linalg.norm(middle[:, :2], axis=1)
+    above = middle[:, 2] > middle[~brain, 2].mean() + 1e-3
+    inner, outer = (np.flatnonzero(brain & above & (across < share * wide)) for share in (0.95, 1.05))
+    assert len(inner) > 10 and np.isin(inner, corridor).all()
+    assert np.isin(corridor, np.flatnonzero(brain & (across < 1.05 * wide))).all() and len(corridor) < 1.2 * len(outer)
+
+
+def test_a_tumour_of_fewer_elements_is_a_sentence(box):
+    with pytest.raises(InputError, match="mesh finer"):
+        Debulking(times=tuple(np.arange(5000.0))).resection(box)

@@ -1,0 +1,46 @@
+"""What is heard from a tracker: matrices, units and frames."""
+
+import numpy as np
+import pytest
+from test_scenes_messages import STAMP, matrix
+
+from scenes.link.frame import BadMessageError
+from scenes.link.heard import Heard, Names, rigid
+
+
+def changed(row, column, value):
+    T = matrix()
+    T[row, column] = value
+    return T
+
+
+@pytest.mark.parametrize(
+    ("T", "why"),
+    [
+        (changed(0, 0, np.nan), "not finite"),
+        (changed(1, 3, np.inf), "not finite"),
+        (matrix() @ np.diag([-1.0, 1.0, 1.0, 1.0]), "mirrors"),
+        (matrix() @ np.diag([1.01, 1.01, 1.01, 1.0]), "scales"),
+        (np.zeros((4, 4)), "scales"),
+        (matrix((0.0, 2e4, 0.0)), "more than 10 m"),
+    ],
+)
+def test_a_matrix_that_moves_no_body_is_refused(T, why):
+    with pytest.raises(BadMessageError, match=why):
+        rigid(T)
+
+
+def test_a_rigid_matrix_of_single_precision_is_taken_in_metres():
+    T = rigid(matrix().astype(np.float32).astype(float))
+    assert T[:3, 3] == pytest.approx([0.01, -0.02, 0.03]) and T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3))
+
+
+def test_bodies_in_the_trackers_frame_are_brought_to_the_reference():
+    names = Names(tool="StylusTipToTracker")
+    heard = Heard(names, 0.3).hearing(names.tool, matrix(), STAMP, 1.0, 0)
+    assert heard.beside(names.tool, 1.0) == "no ReferenceToTracker yet"
+    heard = heard.hearing(names.reference, matrix((0.0, 0.0, 100.0)), STAMP, 0.9, 0)
+    found = heard.beside(names.tool, 1.0)
+    expected = np.linalg.inv(rigid(matrix((0.0, 0.0, 100.0)))) @ rigid(matrix())
+    assert pytest.approx(expected) == found.T and found.arrived == 0.9
+    assert heard.beside(names.tool, 1.25) == "no new ReferenceToTracker for 0.3 s"

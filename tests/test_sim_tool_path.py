@@ -1,0 +1,31 @@
+"""The way of a tool: how long it is, and in how few strides it is flown."""
+
+from __future__ import annotations
+
+import numpy as np
+from test_sim_contact_descent import BODY, HEIGHT, RADIUS, at, solver, touching
+
+from sim.accuracy import TRAIN
+from sim.discretisation.term import Cases
+from sim.terms.contact.tool_path import Touch, Way
+from sim.tools import Ball
+
+
+def test_a_way_is_as_long_as_it_is_clear() -> None:
+    tool = Ball(RADIUS)
+    begin, end = at(0.0, 0.0, 0.1)[None, None], at(0.1, 0.0, 0.1)[None, None]
+    way = Way(begin, end)
+    np.testing.assert_allclose(way.stride((tool,), np.zeros((1, 1))), Touch.stride * RADIUS / 0.1)
+    np.testing.assert_allclose(way.stride((tool,), np.full((1, 1), 0.04)), (0.04 + Touch.stride * RADIUS) / 0.1)
+    np.testing.assert_allclose(way.stride((tool,), np.full((1, 1), 0.2)), 1.0)
+
+
+def test_a_tool_flies_in_few_strides() -> None:
+    """Beside the body, and away from it: from 9 cm off it, seven cm are free whichever way."""
+    fem = solver(TRAIN)
+    term = fem.problem.barriers[0]
+    poses = at(-0.09, 0.03, HEIGHT + 5e-3), at(-0.33, 0.03, HEIGHT + 5e-3)
+    there = fem.deform(touching(poses[0]))
+    cases = Cases(touching(poses[1]), np.zeros(1), there.memory, np.zeros((1, len(BODY.mesh.nodes), 3)), np.zeros(1))
+    stride = term.stride(cases, fem.problem.device.zeros(fem.problem.rows, 1))
+    assert stride[0] > 0.07 / 0.24 > 10.0 * Touch.stride * RADIUS / 0.24
