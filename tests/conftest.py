@@ -137,6 +137,41 @@ def pretender(box):
 
 
 @pytest.fixture(scope="module")
+def theatre(box):
+    from theatres import theatre_of
+
+    return theatre_of(box)
+
+
+@pytest.fixture(scope="module")
+def stage():
+    from theatres import find_scene, template_theatre
+
+    return template_theatre().stage(find_scene("palpate"))
+
+
+@pytest.fixture(scope="module")
+def follower(stage):
+    from films import follower_of
+
+    return follower_of(stage)
+
+
+@pytest.fixture(scope="module")
+def patch(box):
+    from surrogate.data.cortex_patch import open_patch
+
+    return open_patch(box)
+
+
+@pytest.fixture(scope="module")
+def device():
+    from sim.runtime.device import find_device
+
+    return find_device("cpu", "float64")
+
+
+@pytest.fixture(scope="module")
 def short_fits():
     """Networks are fitted in 120 steps, not in 1000: they are less exact, and nothing else."""
     fit = Ann.fit

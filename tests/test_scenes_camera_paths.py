@@ -6,7 +6,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from theatres import player, put, small, theatre_of
+from theatres import player, put, small
 
 from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera, project_cv2
@@ -29,11 +29,6 @@ from sim.errors import InputError
 LENS = Lens(-4.0, 6.0, 0.02, -0.015, 0.0)
 REAL = Calibration((1750.0, 1740.0), (250.0, 170.0), 480, 360, LENS, "theatre")
 TIMES = np.linspace(0.0, 4.0, 41)
-
-
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
 
 
 @pytest.fixture(scope="module")

@@ -42,11 +42,6 @@ SENTENCES = {
 }
 
 
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
-
-
 by_each = pytest.mark.parametrize("play", ["linear", "fem"], indirect=True, scope="module")
 
 

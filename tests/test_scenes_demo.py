@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from theatres import small, theatre_of
+from theatres import small
 from visitor import Visitor, free_port, wait_for
 
 from ar.overlay.hud import FINE
@@ -22,11 +22,6 @@ from scenes.page.view import FEM_COLOUR, STALE_COLOUR
 from scenes.script.tool_paths import Touch, press
 from sim.fem import Fem
 from surrogate.model.learned import Learned
-
-
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
 
 
 @pytest.fixture

@@ -26,11 +26,6 @@ pytestmark = pytest.mark.usefixtures("ours_alone")
 
 
 @pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
-
-
-@pytest.fixture(scope="module")
 def small_theatre(small_box):
     return theatre_of(small_box)
 

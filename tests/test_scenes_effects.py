@@ -8,7 +8,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from theatres import coarse_brain, player, short, sinking, small, template_theatre, theatre_of
+from theatres import coarse_brain, player, short, sinking, small, template_theatre
 from visitor import Visitor, free_port, wait_for
 
 from scenes.builtin.retract import RELAXING
@@ -35,11 +35,6 @@ from surrogate.model.applicability import refusal, trained_effects
 
 EFFECTS = (Elasticity(), Held(), Slide())
 STILL = guess(np.zeros((1, 3, 3)))
-
-
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
 
 
 @pytest.fixture(scope="module")

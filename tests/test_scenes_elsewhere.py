@@ -139,11 +139,6 @@ def test_clocks_are_compared_by_motion_with_an_error_that_holds():
 
 
 @pytest.fixture(scope="module")
-def stage():
-    return template_theatre().stage(find_scene("palpate"))
-
-
-@pytest.fixture(scope="module")
 def bodies(stage):
     """Where tool and reference are in the tracker's frame at a time of the film; the head sways."""
     registration, tool = read_registration(FILM / "registration.json"), read_tool(FILM / "tool.json")

@@ -8,7 +8,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from theatres import player, put, short, theatre_of
+from theatres import player, put, short
 
 from ar.optics.camera import Camera, project_cv2
 from scenes.cli import main
@@ -26,11 +26,6 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import push
 from surrogate.data.stated_tissue import stated_tissue
-
-
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
 
 
 @pytest.fixture(scope="module")

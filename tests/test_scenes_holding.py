@@ -4,7 +4,7 @@ import threading
 from dataclasses import replace
 
 import pytest
-from theatres import Silent, small, theatre_of
+from theatres import Silent, small
 from visitor import Visitor, free_port, wait_for
 
 from scenes.page.demo import READING, SCRIPT, Demo
@@ -15,11 +15,6 @@ from scenes.play.player import Player
 from scenes.play.tool_holder import holding
 from scenes.script.tool_paths import press
 from sim.errors import InputError
-
-
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
 
 
 @pytest.fixture

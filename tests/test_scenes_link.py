@@ -8,9 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from films import FILM, follower_of, truth_of
+from films import FILM, truth_of
 from links import HOST, NAMES, Peer, corners_of, in_mm, linked, peers, played
-from theatres import template_theatre
 
 from ar.overlay.gauge import Gauge
 from scenes.link import clients as limits
@@ -19,7 +18,6 @@ from scenes.link.clients import Clients
 from scenes.link.frame import HEADER, BadMessageError, framed, stamp_of
 from scenes.link.messages import points, read_points, string, transform
 from scenes.link.outgoing import Outgoing
-from scenes.script.scene import find_scene
 from scenes.tracked.follower import Known, State
 from scenes.tracked.registration_file import read_registration
 from scenes.tracked.tool_motion import Motion
@@ -168,11 +166,6 @@ def test_a_client_that_asks_is_sent_that_and_nothing_else():
 
 
 @pytest.fixture(scope="module")
-def stage():
-    return template_theatre().stage(find_scene("palpate"))
-
-
-@pytest.fixture(scope="module")
 def truth(stage):
     return truth_of(stage)
 
@@ -180,11 +173,6 @@ def truth(stage):
 @pytest.fixture(scope="module")
 def registration():
     return read_registration(FILM / "registration.json")
-
-
-@pytest.fixture(scope="module")
-def follower(stage):
-    return follower_of(stage)
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,7 @@ from itertools import islice
 import cv2
 import numpy as np
 import pytest
-from films import FILM, Recorded, follower_of, truth_of
-from theatres import template_theatre
+from films import FILM, Recorded, truth_of
 
 from ar.overlay.outlines import ink_of, silhouette
 from ar.overlay.refind import changed_share, of_ink, outline_gap
@@ -19,7 +18,6 @@ from ar.rendering.real_picture import real_picture
 from ar.tracking.pictures import Named, film_of
 from scenes.cli import main
 from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
-from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.film_truth import read_truth
 from scenes.tracked.follower import HELD, State
@@ -41,11 +39,6 @@ INK = ink_of(TUMOUR_COLOUR)
 
 
 @pytest.fixture(scope="module")
-def stage():
-    return template_theatre().stage(find_scene("palpate"))
-
-
-@pytest.fixture(scope="module")
 def truth(stage):
     return truth_of(stage)
 
@@ -53,11 +46,6 @@ def truth(stage):
 @pytest.fixture(scope="module")
 def calibration():
     return read_calibration(FILM / "camera.yaml")
-
-
-@pytest.fixture(scope="module")
-def follower(stage):
-    return follower_of(stage)
 
 
 def pictures():

@@ -9,29 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chromium import PROGRAM, SIZES, Chromium, assert_fits, assert_in_register, box_of
-from films import FILM, follower_of
-from theatres import template_theatre
+from films import FILM
 from visitor import Visitor, free_port, wait_for
 
 from ar.page.aside import KEYS, TABS
 from ar.page.sight import HISTORY, PICTURE, SAID, SLICES
 from ar.tracking.pictures import film_of
 from scenes.cli import main
-from scenes.script.scene import find_scene
 from scenes.tracked.follower import State
 from scenes.tracked.page import OverlayPage
 from scenes.tracked.picture import Painter
 from scenes.tracked.seekable_film import SeekableFilm
-
-
-@pytest.fixture(scope="module")
-def stage():
-    return template_theatre().stage(find_scene("palpate"))
-
-
-@pytest.fixture(scope="module")
-def follower(stage):
-    return follower_of(stage)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from theatres import short, sinking, small, theatre_of
+from theatres import short, sinking, small
 
 from ar.page.parts import Choice, Fold, Slider
 from scenes.page.beside import TIP, TUMOUR_MIDDLE, lines_of, sample_of, slices_of
@@ -26,11 +26,6 @@ from sim.deformation import Outcome, guess
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.material import Material
 from surrogate.data.dataset import digest_of_loads
-
-
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
 
 
 def answer(outcome: Outcome, bound: float = 1e-3):

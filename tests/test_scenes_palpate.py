@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from theatres import player, theatre_of
+from theatres import player
 
 from scenes.episodes.episode import collect
 from scenes.play.load_text import acting
@@ -42,11 +42,6 @@ SMALL = Viewpoint(width=160, height=120)
 def small(name: str) -> Scene:
     """A built-in scene with a small picture and linear elements."""
     return replace(find_scene(name), viewpoint=SMALL, element=None)
-
-
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
 
 
 @pytest.fixture(scope="module")

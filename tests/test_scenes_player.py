@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from theatres import PUSHING, on_template, player, put, short, small, template_theatre, theatre_of
+from theatres import PUSHING, on_template, player, put, short, small, template_theatre
 
 from ar.optics.camera import project_cv2
 from ar.overlay.composite import WARNING
@@ -31,11 +31,6 @@ from sim.errors import InputError
 from sim.fem import solver_named
 from sim.material import Material, Ogden
 from surrogate.model.learned import Learned
-
-
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
 
 
 @pytest.fixture(scope="module")

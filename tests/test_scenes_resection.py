@@ -8,7 +8,7 @@ from itertools import pairwise
 import h5py
 import numpy as np
 import pytest
-from theatres import player, put, small, theatre_of
+from theatres import player, put, small
 from visitor import free_port, wait_for
 
 from ar.overlay.outlines import silhouette
@@ -25,11 +25,6 @@ from sim.effects import Resection
 from sim.loads import Posture, Resected
 
 SURGERY = Debulking(times=(0.05, 0.1, 0.15))
-
-
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
 
 
 @pytest.fixture(scope="module")

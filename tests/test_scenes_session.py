@@ -13,10 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from films import FILM, follower_of, truth_of
+from films import FILM, truth_of
 from links import HOST, NAMES, in_mm, linked, peers, played
 from programs import main
-from theatres import template_theatre
 
 from ar.overlay.outlines import ink_of, silhouette
 from ar.overlay.refind import of_ink, outline_gap
@@ -26,7 +25,6 @@ from scenes.link.heard import Names
 from scenes.link.messages import image, read_image, transform
 from scenes.link.session import Eye
 from scenes.play.stage import TUMOUR_COLOUR
-from scenes.script.scene import find_scene
 from scenes.script.shipped_files import template_path
 from scenes.tracked.picture import Painter
 from scenes.tracked.registration_file import read_registration
@@ -41,18 +39,8 @@ SELF = "localhost", "127.0.0.1", socket.gethostname()
 
 
 @pytest.fixture(scope="module")
-def stage():
-    return template_theatre().stage(find_scene("palpate"))
-
-
-@pytest.fixture(scope="module")
 def truth(stage):
     return truth_of(stage)
-
-
-@pytest.fixture(scope="module")
-def follower(stage):
-    return follower_of(stage)
 
 
 @pytest.fixture(scope="module")

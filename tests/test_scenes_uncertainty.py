@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from theatres import put, short, small, theatre_of
+from theatres import put, short, small
 
 from ar.overlay.hud import FINE, NARROW, folded, millimetres
 from ar.overlay.refind import stands
@@ -49,11 +49,6 @@ from sim.material import BRAIN
 
 SAME = Draw(1.0, BRAIN.poisson, 1.0, 0.0, (0.0, 0.0, 0.0), 0.0)
 """As the scene has it."""
-
-
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
 
 
 class Hasty:

@@ -17,7 +17,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Cause, Displaced, Loads, Nodal, Prescribed, Pushed
 from sim.material import Material
-from sim.runtime.device import Device, find_device
+from sim.runtime.device import Device
 
 MESH = box((3, 3, 3), 0.1, distortion=0.1)
 BASE = MESH.nodes[:, 2] < 1e-9
@@ -26,11 +26,6 @@ COUNT = len(MESH.nodes)
 RNG = np.random.default_rng(21)
 TIGHT = Accuracy(tolerance=1e-10)
 SOFT = Elasticity(Material("stable-neo-hookean", 3000.0, 0.45))
-
-
-@pytest.fixture(scope="module")
-def device() -> Device:
-    return find_device("cpu", "float64")
 
 
 def mixed() -> tuple[np.ndarray, np.ndarray]:

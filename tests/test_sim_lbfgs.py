@@ -30,11 +30,6 @@ TOTAL = np.array([[0.0, 0.0, -0.1], [0.2, 0.1, -0.4], [0.0, 0.0, 2.0], [0.01, 0.
 FINE = 1e-9
 
 
-@pytest.fixture(scope="module")
-def device() -> Device:
-    return find_device("cpu", "float64")
-
-
 def problem_of(device: Device, law: str = "stable-neo-hookean", total: np.ndarray = TOTAL) -> Problem:
     effects: list[Effect] = [Elasticity(tissue(law)), Held(), NodalForce()]
     problem = compile_problem(effects, ANATOMY, device)

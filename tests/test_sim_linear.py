@@ -17,7 +17,7 @@ from sim.loads import Loads, Nodal
 from sim.material import Material
 from sim.minimisers.line_search import search
 from sim.minimisers.newton_cg import Direction
-from sim.runtime.device import Device, find_device
+from sim.runtime.device import Device
 
 MESH = box((2, 2, 2), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
@@ -26,11 +26,6 @@ FREE = np.flatnonzero(~ANATOMY.held.ravel())
 FORCE = top_forces(MESH, np.array([[0.0, 0.1, -0.2], [0.3, 0.0, 0.1]]))
 CRUSHED = np.repeat((MESH.nodes * [0.15, 0.15, -0.55]).reshape(-1, 1), 2, axis=1)
 REST = np.zeros((ROWS, 2))
-
-
-@pytest.fixture(scope="module")
-def device() -> Device:
-    return find_device("cpu", "float64")
 
 
 @pytest.fixture

@@ -71,11 +71,6 @@ def solve(problem: Problem, cases: Cases, accuracy: Accuracy = TIGHT, start: np.
 
 
 @pytest.fixture(scope="module")
-def device() -> Device:
-    return find_device("cpu", "float64")
-
-
-@pytest.fixture(scope="module")
 def problem(device: Device) -> Problem:
     return problem_of(device)
 

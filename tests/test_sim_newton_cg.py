@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from boxes import base_held, box, top_forces
 from oracle import tissue
 
@@ -17,7 +16,7 @@ from sim.loads import Loads, Nodal, Prescribed
 from sim.minimisers.line_search import search
 from sim.minimisers.newton import find_equilibrium
 from sim.minimisers.newton_cg import Descent, Direction, NewtonCG
-from sim.runtime.device import Device, find_device
+from sim.runtime.device import Device
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
@@ -25,11 +24,6 @@ ROWS = MESH.nodes.size
 FREE = ~ANATOMY.held.ravel()
 TOTAL = np.array([[0.0, 0.0, -0.1], [0.2, 0.1, -0.4], [0.0, 0.0, 2.0], [0.01, 0.0, 0.0], [0.6, 0.0, -0.9]])
 LOADS = Loads((Nodal(top_forces(MESH, TOTAL)),))
-
-
-@pytest.fixture(scope="module")
-def device() -> Device:
-    return find_device("cpu", "float64")
 
 
 def problem_of(device: Device, law: str = "stable-neo-hookean") -> Problem:

@@ -23,17 +23,12 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Prescribed, Pushed
 from sim.material import BRAIN, Material
-from sim.runtime.device import Device, find_device
+from sim.runtime.device import Device
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
 COUNT, ROWS = len(MESH.nodes), MESH.nodes.size
 TIGHT = Accuracy(tolerance=1e-10)
-
-
-@pytest.fixture(scope="module")
-def device() -> Device:
-    return find_device("cpu", "float64")
 
 
 @pytest.fixture

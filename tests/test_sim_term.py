@@ -12,7 +12,7 @@ from term_examples import LOGARITHMIC, MESH, ROWS, Example
 
 from sim.discretisation.term import Term
 from sim.geometry.tetmesh import signed_volumes
-from sim.runtime.device import Device, find_device
+from sim.runtime.device import Device
 from sim.terms.contact.tool_contact import Contact
 from sim.terms.element_kernels import VOLUME_KEPT
 
@@ -22,11 +22,6 @@ EXAMPLES = OTHERS | CONTACTS
 @pytest.fixture(params=EXAMPLES, scope="module")
 def example(request: pytest.FixtureRequest) -> Example:
     return EXAMPLES[request.param]
-
-
-@pytest.fixture(scope="module")
-def device() -> Device:
-    return find_device("cpu", "float64")
 
 
 @pytest.fixture(scope="module")

@@ -31,11 +31,6 @@ from surrogate.training.train import learners_for, train
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 
 
-@pytest.fixture(scope="module")
-def patch(box):
-    return open_patch(box)
-
-
 def pushes(patch, count, seed, radius=(6e-3, 8e-3), most=0.15):
     random = np.random.default_rng(seed)
     point, normal = patch.place(random.random((count, 3)))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from theatres import player, small, theatre_of
+from theatres import player, small
 
 from scenes.options.theatre_options import add_theatre, theatre_asked
 from scenes.page.cast import ALL, Cast
@@ -18,11 +18,6 @@ from surrogate.data.tool_loads import draw
 from surrogate.model.guarded import answering, judged
 from surrogate.model.left_out import LIMIT, LeftOut, left_out_of
 from surrogate.model.store import load, save
-
-
-@pytest.fixture(scope="module")
-def theatre(box):
-    return theatre_of(box)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 
 from sim.errors import InputError
 from sim.loads import Pushed
-from surrogate.data.cortex_patch import Patch, open_patch
+from surrogate.data.cortex_patch import Patch
 from surrogate.data.disc_split import leave_discs_out
 from surrogate.data.tool_loads import (
     HARDEST,
@@ -17,11 +17,6 @@ from surrogate.data.tool_loads import (
     refused_words,
     spread,
 )
-
-
-@pytest.fixture(scope="module")
-def patch(box):
-    return open_patch(box)
 
 
 def pushes(*args):
