@@ -2,6 +2,7 @@
 
 import gc
 import os
+import sys
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -169,6 +170,13 @@ def device():
     from sim.runtime.device import find_device
 
     return find_device("cpu", "float64")
+
+
+@pytest.fixture(params=["metis", "levels"])
+def order(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every order that may be had: without pymetis there is one too."""
+    if request.param == "levels":
+        monkeypatch.setitem(sys.modules, "pymetis", None)
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,9 @@ from ar.overlay.gauge import GAUGE, Gauge
 from ar.overlay.hud import FINE, HEAD, ROW, panel, write
 from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.outlines import ink_of, iou, silhouette
-from ar.overlay.refind import outline_gap, stands
+from ar.overlay.refind import stands
 from ar.overlay.traces import BEFORE
-from ar.rendering.layer import Layer, Solid, vertex_normals
+from ar.rendering.layer import Layer, Solid
 from ar.rendering.renderer import Lamp, lamp_beside, render
 
 CORTEX, TOOL, TUMOUR = 1, 2, 3
@@ -101,44 +101,6 @@ def test_a_surface_without_casters_is_evenly_lit():
     lamp = Lamp(np.array([-0.2, 0.1, 0.3]), np.zeros(3), 0.1)
     one, other = (render(camera(), [cortex(casts_shadow=casts)], lamp).colour.astype(int) for casts in (True, False))
     assert np.abs(one - other).max() <= 1
-
-
-def test_a_solid_texture_sticks_to_the_material():
-    """Colour is read at the rest point: moving the vertices moves the stripe with them."""
-    values = np.zeros((19, 2, 2))
-    values[9] = 1.0
-    scale = np.diag([100.0, 1.0, 1.0, 1.0])
-    scale[0, 3] = 9.0
-    vertices, triangles = sheet()
-    still, moved = (
-        render(
-            camera(),
-            [
-                Layer(
-                    "cortex",
-                    CORTEX,
-                    vertices + shift,
-                    triangles,
-                    (1.0, 1.0, 1.0),
-                    solid=Solid(values, scale),
-                    rest=vertices,
-                )
-            ],
-            Lamp(EYE, np.zeros(3), 1.0),
-        ).colour.sum(axis=-1)
-        for shift in ([0.0, 0.0, 0.0], [0.02, 0.0, 0.0])
-    )
-    pixels = camera().project(np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]]))[0]
-    assert np.argmax(still[75]) == pytest.approx(pixels[0, 0], abs=2)
-    assert np.argmax(moved[75]) == pytest.approx(pixels[1, 0], abs=2)
-
-
-def test_vertex_normals_point_out_of_a_sphere():
-    vertices, triangles = ball((0.0, 0.0, 0.0), 1.0, 40)
-    normals = vertex_normals(vertices, triangles)
-    seam = np.abs(vertices[:, 1]) < 1e-9
-    assert np.abs(np.abs((normals * vertices).sum(axis=1))[~seam] - 1.0).max() < 5e-3
-    assert np.array_equal(vertex_normals(np.zeros((2, 3)), np.zeros((0, 3), int)), np.zeros((2, 3)))
 
 
 def test_iou_falls_when_the_tumour_is_moved():
@@ -345,33 +307,6 @@ def test_words_stay_inside_the_picture():
         colour = np.full((80, 200, 3), 90, np.uint8)
         write(colour, "12.3 mm", at)
         assert np.count_nonzero(colour[2:-2, 2:-2].max(axis=-1) > 200) > 20
-
-
-def test_an_outline_is_off_by_what_is_astray_and_by_what_is_missing():
-    """One that stands 12 pixels off beside the true one, and one of which the right half is not drawn."""
-    here, ink = camera(400, 300), (20.0, 240.0, 60.0)
-    true = silhouette(here, tumour().vertices, tumour().triangles)
-    nothing = np.zeros(true.shape, bool)
-
-    def gap(*masks, left=400):
-        colour = np.zeros((*true.shape, 3), np.uint8)
-        for mask in masks:
-            colour[mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3))).astype(bool)] = ink
-        colour[:, left:] = 0
-        return outline_gap(colour, ink, true, nothing)
-
-    middle = int(np.nonzero(true)[1].mean())
-    assert gap(true) <= 1.0
-    assert 9.0 < gap(true, np.roll(true, 12, axis=1)) <= 12.0
-    assert gap(true, left=middle) > 15.0
-    assert gap(nothing) == np.inf
-
-
-def test_a_line_of_text_is_found_whole():
-    colour = np.full((80, 200, 3), 90, np.uint8)
-    write(colour, "11.5 mm", (60, 40))
-    found = {text for text in ("11.5 mm", "1.5 mm", "11.6 mm", "5 mm") if stands(colour, text, 0.5)}
-    assert found == {"11.5 mm"} and not stands(colour, "11.5 mm", 0.45)
 
 
 def test_the_panel_is_a_copy_in_its_corner():

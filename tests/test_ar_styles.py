@@ -10,7 +10,7 @@ import trimesh
 from ar.optics.camera import look_at
 from ar.overlay.composite import composite, head_lines
 from ar.overlay.distances import signed_distance, tree_of
-from ar.overlay.gauge import GAUGE, Gauge, gauge_words
+from ar.overlay.gauge import GAUGE, Gauge
 from ar.overlay.hud import FINE, FONT, HEAD, ROW, WHITE, folded, panel
 from ar.overlay.legend import SHEET, Names
 from ar.overlay.marks import Cover, Marks, Words
@@ -140,28 +140,6 @@ def test_distances_are_signed_and_end():
     for each in (surface, turned):
         found = signed_distance(tree_of(each.vertices, each.triangles), points, 0.1)
         assert found[:3] == pytest.approx([-0.01, 0.01, -0.005], abs=2e-4) and np.isnan(found[3])
-
-
-@pytest.mark.parametrize("tip", [(0.0, 0.0), (0.052, 0.03), (-0.07, 0.0), (0.0, -0.09), (0.3, 0.3)])
-def test_the_number_stands_beside_the_tip_inside_the_frame(tip):
-    picture = seen()
-    gauge = Gauge(np.array([*tip, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
-    shown = composite(picture, CAMERA, tumour(), marks=Marks(gauge=gauge)).colour
-    found = found_at(shown, str(gauge), GAUGE)
-    assert found is not None
-    left, top, right, foot = found
-    assert left >= 4 and top >= 4 and right <= 636 and foot <= 476
-    pixel = np.clip(CAMERA.project(gauge.tip[None])[0][0], 0, (639, 479))
-    assert np.linalg.norm(pixel - np.clip(pixel, found[:2], found[2:])) < 110
-
-
-def test_a_tip_inside_is_said_to_be():
-    assert gauge_words(2.1e-3, None, True) == "inside, 2.1 mm from its edge"
-    assert gauge_words(2.1e-3, 1e-3, False) == "2.1 +- 1.0 mm"
-    gauge = Gauge(np.array([0.0, 0.0, -0.02]), np.array([0.0, 0.0, -0.008]), inside=True)
-    assert stands(
-        composite(seen(), CAMERA, tumour(), marks=Marks(gauge=gauge)).colour, "inside, 12.0 mm from its edge", GAUGE
-    )
 
 
 def test_the_legend_names_lines_without_their_ink_and_leaves_the_cortex_in_sight():

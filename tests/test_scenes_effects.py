@@ -11,7 +11,6 @@ import pytest
 from theatres import coarse_brain, player, short, sinking, small, template_theatre
 from visitor import Visitor, free_port, wait_for
 
-from scenes.builtin.retract import RELAXING
 from scenes.episodes.episode import UNITS, collect
 from scenes.page.demo import Demo
 from scenes.play.checks import measure
@@ -21,17 +20,14 @@ from scenes.play.label import labelled
 from scenes.play.load_text import acting
 from scenes.play.reference import truth_of
 from scenes.play.stage import CORTEX, TOOL, Stage
-from scenes.script.head_posture import SUPINE, Lying, drained_then_turned, supine
 from scenes.script.scene import Bounds, find_scene
 from scenes.script.site import HOLE
 from scenes.script.tool_paths import Touch
-from sim.accuracy import LIVE, TRAIN
+from sim.accuracy import TRAIN
 from sim.deformation import guess
-from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
+from sim.effects import Elasticity, Gravity, Held, Slide, ToolForce
 from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, posture, stacked
-from sim.material import Material, tissue_to_json
-from surrogate.model.applicability import refusal, trained_effects
 
 EFFECTS = (Elasticity(), Held(), Slide())
 STILL = guess(np.zeros((1, 3, 3)))
@@ -71,101 +67,6 @@ class TestCauses:
         lying = posture(np.array([-3.0, 0.0, 4.0]), -0.012)
         way = "gravity pulls to the crown (0.80) and the left (0.60), fluid up to "
         assert acting(lying, STILL, height) == way + "62 % of the brain's height"
-
-
-class TestLying:
-    def test_the_fluid_falls_wholly_and_then_the_head_turns(self):
-        lie, angle = drained_then_turned(2.0, 1.0, 3.0, 0.5), 0.5
-        assert lie(0.0) == Lying(SUPINE, 1.0) == supine(7.0)
-        assert lie(2.0) == Lying(SUPINE, 0.0) == lie(3.0) and 0.4 < lie(1.0).fluid < 0.6
-        for time in (6.0, 9.0):
-            assert lie(time).direction == pytest.approx((-np.sin(angle), -np.cos(angle), 0.0))
-        levels = [lie(time).fluid for time in np.linspace(0.0, 2.0, 50)]
-        assert (np.diff(levels) < 0.0).all()
-
-    @pytest.mark.parametrize("direction", [SUPINE, (0.0, 0.0, -3.0), (-1.0, -1.0, 0.2)])
-    def test_a_full_head_is_wet_and_a_drained_one_dry(self, box, direction):
-        nodes = box.mesh.nodes
-        for fluid, wet in ((1.0, len(nodes)), (0.0, 0)):
-            found = Lying(direction, fluid).posture(nodes)
-            assert np.linalg.norm(found.direction) == pytest.approx(1.0)
-            assert (-nodes @ found.direction[0] < found.csf_level[0]).sum() == wet
-
-    def test_a_head_that_lies_as_in_the_scan_is_at_rest(self, theatre):
-        frame = player(theatre, sinking(), "fem").draw(0, 0.0, Touch())
-        assert not frame.deformation.displacement.any()
-
-
-class TestLearnt:
-    def test_it_refuses_effects_that_it_was_not_trained_on(self, theatre):
-        model = theatre.models["linear"]
-        assert refusal(model, short().effects) is None
-        why = refusal(model, (*short().effects, Gravity()))
-        assert why is not None and "not under Gravity" in why
-        with pytest.raises(InputError, match=r"svr does not know the scene sinking.*but Gravity. Choose one of fem"):
-            theatre.player("svr", sinking())
-        # No force at all: it has nothing to say of that either.
-        assert "here is none" in (refusal(model, EFFECTS) or "") and theatre.names(
-            replace(short(), effects=EFFECTS)
-        ) == ("fem",)
-        assert theatre.names(short()) == ("linear", "svr", "guarded", "fem") and theatre.names(sinking()) == ("fem",)
-        assert theatre.best(sinking()) == "fem"
-
-    def test_it_refuses_causes_that_it_does_not_know(self, theatre):
-        model, scene = theatre.models["linear"], sinking()
-        with pytest.raises(InputError, match="causes Posture"):
-            model.deform(scene.loads(theatre.site, Touch(), 0.0))
-        with pytest.raises(InputError, match="causes none"):
-            model.deform(Loads((), np.zeros(2)))
-
-    def test_its_file_says_what_it_was_trained_under(self, theatre):
-        model = theatre.models["linear"]
-        assert trained_effects(model.training) == {"Elasticity", "Held", "Slide", "ToolForce"}  # its file does not say
-        effects = (Elasticity(regions={2: Elasticity().default}), Held(), ToolForce(), NodalForce())  # type: ignore
-        stated = replace(model, training={"effects": repr(effects)})
-        assert trained_effects(stated.training) == {"Elasticity", "Held", "ToolForce", "NodalForce"}
-        # Nothing slides in this body, and nodal forces act where loads hold some.
-        assert refusal(stated, short().effects) is None
-        why = refusal(stated, (Elasticity(), ToolForce()))
-        assert why is not None and "never without Held" in why
-
-    def test_where_the_skull_slides_it_matters(self, theatre, box):
-        normal = np.zeros_like(box.slide_normal)
-        normal[0, 0] = 1.0
-        model = replace(theatre.models["linear"], anatomy=replace(box, slide_normal=normal))
-        why = refusal(model, (Elasticity(), Held(), ToolForce()))
-        assert why is not None and "never without Slide" in why
-
-    def test_models_beside_an_anatomy_do_not_change_its_physics(self, theatre):
-        training = {"element": "p1", "tissue": tissue_to_json(Material("neo-hookean", 9000.0, 0.3))}
-        other = replace(theatre, models={"linear": replace(theatre.models["linear"], training=training)})
-        assert other.fem(short(), LIVE).description == "finite elements (smoothed; neo-hookean, E 3 kPa, nu 0.49)"
-        for scene in (short(), sinking()):
-            found, alone = (each.fem(scene, LIVE) for each in (other, replace(theatre, models={})))
-            assert (found.space.element, found.effects) == (alone.space.element, alone.effects)
-
-    @pytest.mark.parametrize(
-        ("training", "reason"),
-        [
-            ({"element": "p1"}, "learned from p1 elements, and here they are smoothed"),
-            ({"tissue": tissue_to_json(Material("neo-hookean", 9000.0, 0.3))}, "E 9 kPa, nu 0.3, and here it is .*E 3"),
-        ],
-    )
-    def test_a_model_of_another_body_is_refused(self, theatre, training, reason):
-        model = replace(theatre.models["linear"], training=training)
-        other = replace(theatre, models={"linear": model})
-        assert other.names(short()) == ("fem",)
-        with pytest.raises(InputError, match=reason):
-            other.deformer("linear", short())
-        tissue, element = (Material("neo-hookean", 9000.0, 0.3), None) if "tissue" in training else (None, "p1")
-        assert other.deformer("linear", short().made_of(tissue, element)) is model
-
-    def test_another_tissue_goes_on_relaxing(self):
-        scene = find_scene("retract").made_of(Material("neo-hookean", 9000.0, 0.3), "p2")
-        (effect,) = (each for each in scene.effects if isinstance(each, Elasticity))
-        assert scene.element == "p2" and effect.default == Material("neo-hookean", 9000.0, 0.3, RELAXING.prony)
-        with pytest.raises(InputError, match="cannot relax"):
-            find_scene("retract").made_of(Material("linear", 9000.0, 0.3), None)
 
 
 class TestWithoutATool:

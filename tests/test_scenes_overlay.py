@@ -3,7 +3,6 @@
 import csv
 import json
 import time
-from dataclasses import replace
 from itertools import islice
 
 import cv2
@@ -20,10 +19,9 @@ from scenes.cli import main
 from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
 from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.film_truth import read_truth
-from scenes.tracked.follower import HELD, State
+from scenes.tracked.follower import State
 from scenes.tracked.picture import Painter
-from scenes.tracked.plausible import implausible
-from scenes.tracked.run import Timed, aged, overlaid, paced, timed
+from scenes.tracked.run import Timed, overlaid, paced, timed
 from scenes.tracked.tool_motion import ToolMotion
 from scenes.tracked.truth import off, summary
 from sim.errors import InputError
@@ -102,45 +100,6 @@ def test_it_is_no_farther_off_than_it_says(shown, truth, calibration, stage):
     assert shown[4].known.band is None and errors[4] is errors[11] is None
 
 
-def test_a_registration_that_is_not_sure_is_in_the_band_and_beyond_a_limit_not_to_be_relied_on(follower):
-    first = next(iter(pictures())).picture
-    for shift, state in ((1e-3, State.REST), (3e-3, State.UNSURE)):
-        covariance = np.diag(np.repeat([shift**2, 0.0], 3))
-        other = replace(follower, registration=replace(follower.registration, covariance=covariance))
-        known = other.step(first.grey, 0.0)
-        assert known.state is state and known.parts["registration"] == pytest.approx(2.448 * shift, rel=1e-3)
-        assert known.band == pytest.approx(2.448 * shift, rel=0.02)
-        assert ("do not rely" in known.words) is (state is State.UNSURE)
-
-
-def test_a_registration_of_another_patient_is_noticed(follower, stage):
-    first = next(iter(pictures())).picture
-    T = follower.registration.T_patient_scan.copy()
-    T[:3, 3] += [0.0, 0.0, -0.4]
-    other = replace(follower, registration=replace(follower.registration, T_patient_scan=T))
-    known = other.step(first.grey, 0.0)
-    assert known.state is State.UNSURE and known.band is None and "mm from the reference" in known.words
-    painted = Painter(stage, follower.tool).paint(first.colour, known).colour
-    assert np.count_nonzero(of_ink(painted, INK)) < 5
-    near = follower.step(first.grey, 0.0)
-    behind = replace(near.camera, T_camera_world=np.diag([1.0, -1.0, -1.0, 1.0]) @ near.camera.T_camera_world)
-    assert "behind the camera" in implausible(follower.registration, stage, behind)
-    long = follower.tool.T_cube_tool @ [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.4], [0, 0, 0, 1.0]]
-    away = replace(follower, tool=replace(follower.tool, T_cube_tool=long))
-    known = away.step(first.grey, 0.0)
-    assert known.state is State.UNSURE and "never nearer than 200" in known.words and not known.near
-    assert near.near and away.step(first.grey, 0.1, near).near  # it has been there
-    assert "head" not in away.step(first.grey, 0.1, near).words
-
-
-def test_a_registration_that_does_not_say_whose_it_is_is_not_relied_on(follower):
-    first = next(iter(pictures())).picture
-    other = replace(follower, registration=replace(follower.registration, scanned=None))
-    known = other.step(first.grey, 0.0)
-    assert known.state is State.UNSURE and "not checked whose registration" in known.words
-    assert known.band == follower.step(first.grey, 0.0).band
-
-
 def test_a_tool_s_error_is_in_the_band_by_what_a_deeper_one_does(follower, truth, stage):
     class Falling(Recorded):
         def deform(self, loads, start=None, at=None):
@@ -151,42 +110,6 @@ def test_a_tool_s_error_is_in_the_band_by_what_a_deeper_one_does(follower, truth
     falling = Falling(stage.anatomy, stage.tumour_vertices, truth.T_scan_tool, truth.displacement)
     motion = ToolMotion(stage, falling).under(truth.T_scan_tool[5], np.diag([1e-8, 4e-6, 1e-8]))
     assert motion.tool == pytest.approx(0.2 * 1.96 * 2e-3, rel=0.01)
-
-
-def test_a_camera_that_repeats_a_picture_or_stops_is_stale(follower):
-    few = [each.picture for each in islice(pictures(), 2)]
-    known = follower.step(few[0].grey, 0.0)
-    assert follower.step(few[0].grey, 0.0, known).words.startswith("stale, the camera repeats a picture")
-    assert follower.step(few[1].grey, 0.5, replace(known, interval=0.1)).state is State.STALE
-    assert follower.step(few[1].grey, 0.1, known).state is State.REST
-    old = aged(known, 0.5)
-    assert old.state is State.STALE and "0.5 s old" in old.words and aged(known, 0.1) is known
-
-
-def test_a_reference_that_was_never_seen_has_no_overlay(follower, stage):
-    blank = np.full((720, 960, 3), 120, np.uint8)
-    known = follower.step(blank[..., 0], 0.0)
-    assert known.state is State.NO_REFERENCE and known.camera is None and "not seen yet" in known.words
-    painted = Painter(stage).paint(blank, known).colour
-    foot = painted[600:]
-    assert np.array_equal(painted[:600], blank[:600]) and not np.array_equal(foot, blank[600:])
-    seen = follower.step(next(iter(pictures())).picture.grey, 0.0)
-    frozen, gone = (follower.step(blank[..., 0], time, seen) for time in (HELD, HELD + 0.01))
-    assert frozen.camera is seen.camera and frozen.words == "reference lost: drawn where it was"
-    assert frozen.band is None and not frozen.relied and gone.camera is None  # a band is promised of no frozen overlay
-    with pytest.raises(ValueError, match="calibrate it at this size"):
-        follower.step(blank[::2, ::2, 0], 0.0)
-
-
-def test_a_slow_film_is_stale_where_its_own_pictures_are_missing(follower):
-    blank, known, states = np.full((720, 960), 120, np.uint8), None, []
-    first = next(iter(pictures())).picture.grey
-    for moment in (0.0, 0.3, 0.6, 0.9, 1.8, 2.1):
-        known = follower.step(first, moment, known)
-        states.append(known.state)
-    assert [each is State.STALE for each in states] == [False, False, False, False, True, False]
-    assert follower.step(blank, 2.4, known).state is State.NO_REFERENCE
-    assert follower.step(first, 1.5).interval == follower.step(first, 4.0, follower.step(first, 1.5)).interval == 1.0
 
 
 def test_a_film_that_plays_as_a_camera_loses_what_comes_too_fast():

@@ -1,6 +1,5 @@
 """What the page says and offers: the words of an answer and of a brain; sliders that the opening allows."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -10,72 +9,17 @@ from theatres import short, sinking, small
 from ar.page.parts import Choice, Fold, Slider
 from scenes.page.beside import TIP, TUMOUR_MIDDLE, lines_of, sample_of, slices_of
 from scenes.page.controls import clocked, controls
-from scenes.page.referee import Truth
 from scenes.page.requests import Wish
-from scenes.page.text import RESEARCH, about, fem_words, plan_words, report, side, trust, words
-from scenes.page.verdict import judge, verdict_words
-from scenes.play.deformers import GUARDED, plan_of
-from scenes.play.player import Player
-from scenes.play.stage import Stage
-from scenes.play.waiting_notice import NOTICED, Busy
+from scenes.page.text import report
 from scenes.script.scene import find_scene
-from scenes.script.tool_paths import Touch, press
+from scenes.script.tool_paths import Touch
 from scenes.script.uncertainty import TumourError
-from sim.accuracy import LIVE
 from sim.deformation import Outcome, guess
-from sim.effects import Elasticity, Held, Slide, ToolForce
-from sim.material import Material
 from surrogate.data.dataset import digest_of_loads
 
 
 def answer(outcome: Outcome, bound: float = 1e-3):
     return replace(guess(np.full((1, 3, 3), 1e-3)), outcome=(outcome,), bound=np.array([[bound], [2.0 * bound]]))
-
-
-class TestTrust:
-    def test_a_bound_is_reported_of_a_load_inside_the_range(self):
-        said = trust(answer(Outcome.PREDICTED), "svr")
-        assert (
-            "in 95 of 100 loads" in said and "Error of the model" in said and "1.00 mm" in said and "warn" not in said
-        )
-
-    @pytest.mark.parametrize(
-        "outcome", [Outcome.EXTRAPOLATED, Outcome.BUDGET, Outcome.STALLED, Outcome.NOT_FINITE, Outcome.PIERCED]
-    )
-    def test_nothing_is_promised_of_an_answer_that_is_not_good(self, outcome):
-        """It stands in another colour, with the reason."""
-        said = trust(answer(outcome), "svr")
-        assert "95 of 100" not in said and 'class="warn"' in said and "Do not rely on this answer" in said
-
-    def test_a_guarded_model_says_which_of_the_two_answered(self):
-        assert trust(answer(Outcome.PREDICTED), GUARDED).startswith(
-            "<p><b>trained model (guarded)</b>: inside the range"
-        )
-        assert "as the trained model is unsure of this load</b>: solved" in trust(answer(Outcome.CONVERGED), GUARDED)
-
-    def test_code_names_are_not_shown(self):
-        for outcome in Outcome:
-            said = trust(answer(outcome), "fem")
-            assert "_" not in said and outcome.name not in said
-
-    @pytest.mark.parametrize(("bound", "words"), [(1e-7, "0.01 mm"), (6e-6, "0.01 mm"), (1.231e-3, "1.24 mm")])
-    def test_a_bound_is_not_reported_too_small(self, bound, words):
-        bounded = replace(answer(Outcome.PREDICTED), bound=np.full((2, 1), bound))
-        assert f"is more than {words} from where its finite elements have it" in trust(bounded, "svr")
-
-    def test_undeformed_brain_has_no_motion_and_no_error_of_it(self, theatre):
-        scene = small(path=press(0.2), duration=1.0)
-        player = Player(theatre.stage(scene), theatre.deformer("linear", scene))
-        frames = [player.draw(0, time, player.scene.path(time)) for time in (0.0, 0.9)]
-        said = [report(frame, player.stage, "linear", "", (), 2) for frame in frames]
-        assert "tumour moved" not in said[0] and "Nothing moves the tumour" in said[0]
-        assert "tumour moved" in said[1] and "Nothing moves" not in said[1]
-
-    def test_where_nothing_moves_nothing_is_promised(self):
-        still = answer(Outcome.PREDICTED)
-        still = replace(still, displacement=0.0 * still.displacement)
-        said = trust(still, "svr")
-        assert "Nothing moves the tumour." in said and "95 of 100" not in said
 
 
 class TestDigestOfLoads:
@@ -86,47 +30,6 @@ class TestDigestOfLoads:
         others = [Touch(force=0.21), Touch(force=0.2, x=0.004), Touch(force=0.2, tilt=(0.3, 0.0))]
         assert one not in {digest_of_loads(scene.loads(site, touch, 0.1)) for touch in others}
         assert one != digest_of_loads(scene.loads(site, Touch(force=0.2), 0.2))
-
-
-class TestWords:
-    def test_it_says_what_is_seen_and_that_it_is_research(self, theatre):
-        said = words(theatre, short(), "the <default> brain")
-        assert RESEARCH in said and "&lt;default&gt;" in said and "<default>" not in said
-        assert "tumour now" in said and "tumour in the scan" in said and "tip to tumour" in said
-        assert "tip to tumour" not in words(theatre, sinking(), "brain")
-
-    def test_tissue_and_element_are_those_that_are_solved(self, theatre):
-        default = "smoothed linear tetrahedra, neo-hookean tissue of Young's modulus 3 kPa"
-        assert fem_words(theatre, short()).startswith(default)
-        stiff = Elasticity(Material("corotational", 5e3, 0.4, prony=()))
-        plain = replace(theatre, models={})
-        other = replace(short(), effects=(stiff, Held(), Slide(), ToolForce()), element="smoothed")
-        assert fem_words(plain, other) == (
-            "smoothed linear tetrahedra, corotational tissue of Young's modulus 5 kPa and Poisson's ratio 0.4"
-        )
-        assert fem_words(plain, find_scene("retract")).endswith("relaxes under a held load")
-        assert fem_words(plain, find_scene("sag")).endswith(
-            "Young's modulus 1.8 kPa and Poisson's ratio 0.45; the tumour of neo-hookean tissue of Young's modulus "
-            "3.2 kPa and Poisson's ratio 0.45"
-        )
-        assert "brain.vtu, opened" in about(theatre, short(), "brain.vtu")
-
-    def test_a_plan_is_a_list_and_only_finite_elements_have_one(self, theatre):
-        assert plan_words(("First <this>.", "Then that.")) == "<ul><li>First &lt;this&gt;.</li><li>Then that.</li></ul>"
-        assert plan_words(()) == "" == plan_words(plan_of(theatre.models["linear"]))
-        scene = small("resection")
-        assert plan_of(theatre.fem(scene, scene.accuracy)) == ()
-        assert plan_of(theatre.fem(short(), LIVE)) == theatre.fem(short(), LIVE).plan.explain()
-
-    def test_the_side_is_the_patient_s(self, theatre):
-        site = theatre.site
-        middle = 0.5 * (site.anatomy.mesh.nodes[:, 0].min() + site.anatomy.mesh.nodes[:, 0].max())
-        at = [replace(site, origin=np.array([middle + x, 0.0, 0.0])) for x in (0.02, -0.02, 0.0)]
-        assert [side(place) for place in at] == [
-            "on the patient's right",
-            "on the patient's left",
-            "near the midline",
-        ]
 
 
 class TestControls:
@@ -194,42 +97,6 @@ class TestHand:
         wish.hand(depth=1e-3)
         wish.play(True)
         assert wish.plays and wish.now()[2] == Touch(depth=1e-3)
-
-
-def test_a_long_wait_is_reported_and_a_short_one_is_not():
-    said: list[str] = []
-    busy = Busy(said.append)
-    busy.on("a quick load")
-    busy.off()
-    time.sleep(NOTICED + 0.3)
-    assert said == []
-    busy.on("solving the first half")
-    busy.on("solving the second half")
-    time.sleep(NOTICED + 0.3)
-    busy.off()
-    busy.close()
-    assert said[0].startswith("solving the second half") and said[-1] == "" and "" not in said[:-1]
-
-
-def test_a_verdict_is_the_error_in_millimetres(theatre):
-    """Of a model whose answer is 0.2 mm off everywhere, and of the finite elements' own distance."""
-    scene = short()
-    whole = Player(Stage(scene, theatre.site), theatre.fem(scene, LIVE))
-    loads = whole.loads(3)
-    answer = whole.answer(loads)
-
-    class Off:
-        def deform(self, loads, start=None, at=None):
-            found = whole.deformer.deform(loads, at=at)
-            return replace(found, displacement=found.displacement + [0.0, 0.2e-3, 0.0])
-
-    found = judge(Truth(3, loads, answer, 0.5), replace(whole, deformer=Off()), own=False)
-    said = verdict_words(found, stale=False, waits="")
-    assert "error against FEM: mean 0.200, largest 0.200 mm; tip to tumour " in said
-    tip = whole.drawn(3, whole.touch(3), loads, answer, 0.0).distance
-    assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
-    assert " by FEM, without the error of the tumour (" in said
-    assert verdict_words(found, stale=True, waits="").startswith('<p class="stale">of an earlier load: ')
 
 
 def test_the_chart_and_the_slices_are_of_the_frame_that_is_shown(theatre):

@@ -13,7 +13,6 @@ from theatres import player
 from scenes.episodes.episode import collect
 from scenes.play.load_text import acting
 from scenes.play.player import Player
-from scenes.play.reference import truth_of
 from scenes.report.picture import rested
 from scenes.script.scene import Scene, Viewpoint, find_scene
 from scenes.script.site import site_of
@@ -21,10 +20,10 @@ from scenes.script.tool_paths import AIR, Touch
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
 from sim.deformation import Outcome
-from sim.effects import Elasticity, Held, Pulsation, Slide, ToolContact
+from sim.effects import Elasticity, Held, Slide, ToolContact
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Retracted, Touching, stacked
+from sim.loads import Touching, stacked
 from sim.material import Material
 from sim.tools import Ball, distances_to
 from surrogate.data.cortex_patch import open_patch
@@ -166,46 +165,6 @@ class TestPalpate:
         with pytest.raises(InputError, match="palpate"):
             theatre.deformer("linear", small("palpate"))
         assert theatre.names(small("palpate")) == ("fem",)
-
-
-class TestRetract:
-    def test_the_blade_bears_less_and_less_while_it_is_held(self, theatre):
-        frames = list(player(theatre, small("retract"), "fem").frames(15))
-        (cause,) = frames[-1].loads.causes
-        assert isinstance(cause, Retracted)
-        reads = np.array([np.linalg.norm(frame.deformation.reaction[0, 0, :3]) for frame in frames])
-        held = np.array([frame.time for frame in frames]) >= 1.5
-        assert (np.diff(reads[held]) < 0.0).all() and reads[-1] < 0.9 * reads[held][0]
-        outcomes = [frame.deformation.outcome[0] for frame in frames]  # so small a body is strained beyond 50 %
-        assert reads[0] == 0.0 and all(one.good or one is Outcome.OVERSTRAINED for one in outcomes)
-
-    @pytest.mark.parametrize("touch", [Touch(depth=-AIR), Touch(depth=3e-3), Touch(0.0, 0.0, 0.0, (0.5, 0.0), 3e-3)])
-    def test_the_blade_is_laid_on_clear_of_the_tissue_and_moved_to_where_the_hand_is(self, theatre, touch):
-        scene, site = small("retract"), theatre.site
-        cause = scene.loads(site, touch, 0.0).of(Retracted)
-        apart = distances_to(scene.tool.shape, cause.pose[0], theatre.anatomy.mesh.nodes)
-        upright = site.direction(touch) @ site.axis
-        assert apart.min() == pytest.approx(AIR * upright, abs=0.3e-3)
-        moved = cause.pose[0].copy()
-        moved[:3, 3] += cause.displacement[0]
-        np.testing.assert_allclose(moved, scene.pose(site, touch), atol=1e-15)
-        assert cause.displacement[0] == pytest.approx((AIR + touch.depth) * site.direction(touch))
-
-
-class TestPulsation:
-    def test_the_ball_reads_the_pulse(self, theatre):
-        scene = replace(small("pulsation"), duration=3.0)
-        frames = list(player(theatre, scene, "fem").frames(3))
-        reads = np.array([-frame.deformation.reaction[0, 0, 2] for frame in frames if frame.time >= 1.0])
-        swells = Pulsation().swelling(np.array([frame.time for frame in frames if frame.time >= 1.0]))
-        assert np.corrcoef(reads, swells)[0, 1] > 0.95
-        assert reads.max() > 1.05 * reads.min() > 0.0
-
-    def test_frames_after_one_another_are_the_truth(self, theatre):
-        scene = small("pulsation")
-        loads = [scene.loads(theatre.site, scene.path(time), time) for time in (0.0, 0.8, 1.25, 1.6)]
-        truth = truth_of(theatre, scene, loads)
-        assert all(outcome.good for outcome in truth.outcome) and truth.displacement[3].any()
 
 
 def test_a_moved_tool_needs_a_hand():

@@ -9,15 +9,11 @@ import pytest
 from tiny_episodes import Wanted, write_episode
 
 from scenes.episodes.engine import still_missing
-from scenes.episodes.make import body_path, make_body
-from scenes.episodes.plan import load_plan
 from scenes.episodes.rates import written_rates
 from scenes.episodes.reading.open_files import opened
 from scenes.episodes.reading.validation import validate_episode
 from scenes.episodes.run_folder import Run, begin, episode_name, finished, read_run
-from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
 from sim.runtime.partial_files import remove_left_overs
 
 PLAN = 'title = "A box"\n[motion.press]\n[bodies]\nanatomies = "box.vtu"\n[bodies.learner]\nname = "none"\n'
@@ -26,13 +22,6 @@ DECADE = 10 * 365 * 86400.0
 
 def fails(*_, **__):
     raise OSError(errno.EPERM, os.strerror(errno.EPERM))
-
-
-@pytest.fixture
-def plan(box, tmp_path):
-    write_anatomy(tmp_path / "box.vtu", box)
-    (tmp_path / "own.toml").write_text(PLAN)
-    return load_plan(str(tmp_path / "own.toml"))
 
 
 def test_a_file_that_another_holds_is_said_to_be_locked(box, tmp_path):
@@ -44,25 +33,6 @@ def test_a_file_that_another_holds_is_said_to_be_locked(box, tmp_path):
         with pytest.raises(InputError, match=r"episode_000000.h5: is locked: another program"):
             opened(path)
     assert validate_episode(path).problems == []
-
-
-def test_where_nothing_can_be_renamed_nothing_is_left(plan, tmp_path, monkeypatch):
-    monkeypatch.setattr(Path, "rename", fails)
-    with pytest.raises(InputError, match=r"bodies/0000: cannot be written \(Operation not permitted\). Choose another"):
-        make_body(tmp_path / "set", plan, 1, 0, "cpu")
-    monkeypatch.setattr(Path, "replace", fails)
-    with (
-        pytest.raises(InputError, match=r"one.h5: cannot be written"),
-        written_whole(tmp_path / "one.h5", ".h5") as part,
-    ):
-        part.touch()
-    assert not [left for left in tmp_path.rglob("*") if left.name.startswith(".sulcus")]
-    assert not body_path(tmp_path / "set", 0).exists()
-
-
-def test_a_body_that_is_not_whole_is_named(plan, tmp_path):
-    body_path(tmp_path, 0).mkdir(parents=True)
-    assert "bodies/0000: is no whole body. Remove it" in make_body(tmp_path, plan, 1, 0, "cpu").failed
 
 
 def test_a_folder_that_takes_no_files_is_named(tmp_path, monkeypatch):

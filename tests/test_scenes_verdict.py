@@ -2,8 +2,14 @@
 
 from dataclasses import replace
 
-from scenes.page.verdict import Judged, verdict_words
+from theatres import short
+
+from scenes.page.referee import Truth
+from scenes.page.verdict import Judged, judge, verdict_words
 from scenes.play.load_text import doubt_of
+from scenes.play.player import Player
+from scenes.play.stage import Stage
+from sim.accuracy import LIVE
 from sim.deformation import Outcome
 
 
@@ -26,3 +32,24 @@ class TestVerdict:
 
     def test_before_any_it_says_what_is_waited_for(self):
         assert verdict_words(None, True, "waits") == '<p class="stale">waits</p>'
+
+
+def test_a_verdict_is_the_error_in_millimetres(theatre):
+    """Of a model whose answer is 0.2 mm off everywhere, and of the finite elements' own distance."""
+    scene = short()
+    whole = Player(Stage(scene, theatre.site), theatre.fem(scene, LIVE))
+    loads = whole.loads(3)
+    answer = whole.answer(loads)
+
+    class Off:
+        def deform(self, loads, start=None, at=None):
+            found = whole.deformer.deform(loads, at=at)
+            return replace(found, displacement=found.displacement + [0.0, 0.2e-3, 0.0])
+
+    found = judge(Truth(3, loads, answer, 0.5), replace(whole, deformer=Off()), own=False)
+    said = verdict_words(found, stale=False, waits="")
+    assert "error against FEM: mean 0.200, largest 0.200 mm; tip to tumour " in said
+    tip = whole.drawn(3, whole.touch(3), loads, answer, 0.0).distance
+    assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
+    assert " by FEM, without the error of the tumour (" in said
+    assert verdict_words(found, stale=True, waits="").startswith('<p class="stale">of an earlier load: ')

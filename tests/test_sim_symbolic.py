@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import chain
 
 import numpy as np
@@ -12,13 +11,6 @@ from test_sim_multifrontal import sliding, system
 
 from sim.linalg.multifrontal import node_of
 from sim.linalg.symbolic import dissection, fronts_of
-
-
-@pytest.fixture(params=["metis", "levels"])
-def order(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every order that may be had: without pymetis there is one too."""
-    if request.param == "levels":
-        monkeypatch.setitem(sys.modules, "pymetis", None)
 
 
 @pytest.mark.usefixtures("order")

@@ -8,25 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.builtin.retract import RELAXING
-from scenes.cli import main
 from scenes.play.deformers import GUARDED, Theatre
 from scenes.script.scene import find_scene
 from scenes.script.tool import Probe
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
-from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Deformation, Outcome, guess
 from sim.effects import Elasticity, Held, ToolContact, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed, Touching
 from sim.material import Material, tissue_to_json
-from sim.tools import Ball, Capsule
+from sim.tools import Ball
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.encode import tool_features
-from surrogate.data.holding import BROUGHT, HISTORY, drawn_times, held, stated_series, unfaded
+from surrogate.data.holding import BROUGHT, HISTORY, drawn_times, stated_series
 from surrogate.data.indentation import Relaxing, indented, posed, relaxed_of, with_relaxed
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import draw_poses
@@ -83,14 +80,6 @@ def test_what_is_gone_is_the_hereditary_integral_of_the_depth() -> None:
         assert not found[frame].strange[0]
 
 
-def test_a_history_is_what_two_steps_make_of_it() -> None:
-    for time in (0.0, 0.2, BROUGHT, 3.0, 80.0):
-        alone = followed(SERIES, pressed(2e-3), np.array([time]), None, 1e-4)
-        steps = [t for t in (min(time, BROUGHT), time) if t > 0.0]
-        np.testing.assert_allclose(alone.share, played([2e-3] * len(steps), steps)[-1].share if steps else 0.0)
-        assert alone.share[0] == pytest.approx(0.7 - unfaded(SERIES, np.array([time])).sum())
-
-
 def test_pasts_that_no_training_has_are_strange() -> None:
     """A tool that was held and goes back, or that slid far; what it does for the first time is not."""
     back = played([4e-3, 4e-3, 3e-3, 0.0], [0.5, 6.0, 6.1, 6.2])
@@ -106,25 +95,6 @@ def test_a_start_without_that_past_is_refused() -> None:
         followed(SERIES, pressed(1e-3), np.ones(1), late, 1e-4)
     with pytest.raises(InputError, match="does not say how far the tissue has relaxed"):
         followed(SERIES, pressed(1e-3), np.ones(1), replace(late, memory={}), 1e-4)
-
-
-def test_finite_elements_depend_on_the_share_alone(box: Anatomy) -> None:
-    """A tool that came in one long step, and one that stayed: of equal shares they move and press alike."""
-    fem = Fem(box, list(EFFECTS), device="cpu", batch=1, element="p1")
-    causes = draw_poses("palpation", box, 1, 5, BALL).causes
-    slow = held(fem, Loads(causes, np.array([2.0])))
-    gone = unfaded(SERIES, np.array([2.0])).sum()
-    low, high = BROUGHT, 60.0
-    for _ in range(60):  # one step of so long
-        middle = 0.5 * (low + high)
-        left = sum(g * np.exp(-middle / (2.0 * tau)) for g, tau in SERIES)
-        low, high = (middle, high) if left > gone else (low, middle)
-    fast, elastic = (fem.deform(Loads(causes, np.array([time]))) for time in (low, 0.0))
-    assert slow.time[0] == 2.0 and slow.outcome[0].good
-    size = np.abs(slow.displacement).max()
-    np.testing.assert_allclose(slow.displacement, fast.displacement, atol=2e-3 * size)
-    np.testing.assert_allclose(slow.reaction[0, 0, :3], fast.reaction[0, 0, :3], atol=5e-4)
-    assert np.linalg.norm(slow.reaction[0, 0, :3]) < 0.8 * np.linalg.norm(elastic.reaction[0, 0, :3])
 
 
 class Fading:
@@ -249,19 +219,3 @@ def test_it_plays_alone_frame_by_frame(model: Learned, box: Anatomy) -> None:
     held_there = player.loads(40)
     going_on, alone = (player.answer(held_there, start).memory[MEMORY] for start in (last, None))
     assert np.abs(going_on[0, 4:]).min() > 0.0 and not np.allclose(going_on, alone, atol=1e-5)
-
-
-def test_the_command_draws_times_where_tissue_relaxes(
-    tmp_path: Path, box: Anatomy, capsys: pytest.CaptureFixture[str]
-) -> None:
-    mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
-    write_anatomy(mesh, box)
-    wanted = ["simulate", str(mesh), "--out", str(out), "--poses", "--count", "2", "--json"]
-    wanted += ["--preset", "dissector", "--capsule", "2", "26"]
-    assert main([*wanted, "--element", "p1", "--prony", "0.45,0.5;0.365,50"]) == 0
-    found = read_dataset(out)
-    assert stated_series(found.provenance) == RELAXING.prony
-    np.testing.assert_array_equal(found.loads.times, drawn_times(2, 0))
-    assert found.good.all() and found.tool == Capsule(2e-3, 0.026)
-    assert main([*wanted, "--prony", "0.45;50", "--force"]) == 2
-    assert '--prony 0.45;50: write pairs G,TAU with ; between, as in "0.45,0.5;0.365,50"' in capsys.readouterr().err

@@ -1,0 +1,146 @@
+"""What is known of a picture: registration, tool, and what makes it stale."""
+
+from dataclasses import replace
+from itertools import islice
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from films import follower_of, truth_of
+from test_scenes_error_parts import shifted, six, turned
+from test_scenes_overlay import INK, pictures
+from theatres import template_theatre
+
+from ar.overlay.refind import of_ink
+from ar.tracking.pose import Pose
+from ar.tracking.registration import Registration
+from ar.tracking.track import Tracked
+from scenes.script.scene import find_scene
+from scenes.tracked.follower import HELD, PATIENT, State, tip_covariance
+from scenes.tracked.picture import Painter
+from scenes.tracked.plausible import implausible
+from scenes.tracked.run import aged
+from scenes.tracked.tracked_tool import TrackedTool
+from sim.tools import Ball
+
+
+def test_a_registration_that_is_not_sure_is_in_the_band_and_beyond_a_limit_not_to_be_relied_on(follower):
+    first = next(iter(pictures())).picture
+    for shift, state in ((1e-3, State.REST), (3e-3, State.UNSURE)):
+        covariance = np.diag(np.repeat([shift**2, 0.0], 3))
+        other = replace(follower, registration=replace(follower.registration, covariance=covariance))
+        known = other.step(first.grey, 0.0)
+        assert known.state is state and known.parts["registration"] == pytest.approx(2.448 * shift, rel=1e-3)
+        assert known.band == pytest.approx(2.448 * shift, rel=0.02)
+        assert ("do not rely" in known.words) is (state is State.UNSURE)
+
+
+def test_a_registration_of_another_patient_is_noticed(follower, stage):
+    first = next(iter(pictures())).picture
+    T = follower.registration.T_patient_scan.copy()
+    T[:3, 3] += [0.0, 0.0, -0.4]
+    other = replace(follower, registration=replace(follower.registration, T_patient_scan=T))
+    known = other.step(first.grey, 0.0)
+    assert known.state is State.UNSURE and known.band is None and "mm from the reference" in known.words
+    painted = Painter(stage, follower.tool).paint(first.colour, known).colour
+    assert np.count_nonzero(of_ink(painted, INK)) < 5
+    near = follower.step(first.grey, 0.0)
+    behind = replace(near.camera, T_camera_world=np.diag([1.0, -1.0, -1.0, 1.0]) @ near.camera.T_camera_world)
+    assert "behind the camera" in implausible(follower.registration, stage, behind)
+    long = follower.tool.T_cube_tool @ [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.4], [0, 0, 0, 1.0]]
+    away = replace(follower, tool=replace(follower.tool, T_cube_tool=long))
+    known = away.step(first.grey, 0.0)
+    assert known.state is State.UNSURE and "never nearer than 200" in known.words and not known.near
+    assert near.near and away.step(first.grey, 0.1, near).near  # it has been there
+    assert "head" not in away.step(first.grey, 0.1, near).words
+
+
+def test_a_registration_that_does_not_say_whose_it_is_is_not_relied_on(follower):
+    first = next(iter(pictures())).picture
+    other = replace(follower, registration=replace(follower.registration, scanned=None))
+    known = other.step(first.grey, 0.0)
+    assert known.state is State.UNSURE and "not checked whose registration" in known.words
+    assert known.band == follower.step(first.grey, 0.0).band
+
+
+def test_a_camera_that_repeats_a_picture_or_stops_is_stale(follower):
+    few = [each.picture for each in islice(pictures(), 2)]
+    known = follower.step(few[0].grey, 0.0)
+    assert follower.step(few[0].grey, 0.0, known).words.startswith("stale, the camera repeats a picture")
+    assert follower.step(few[1].grey, 0.5, replace(known, interval=0.1)).state is State.STALE
+    assert follower.step(few[1].grey, 0.1, known).state is State.REST
+    old = aged(known, 0.5)
+    assert old.state is State.STALE and "0.5 s old" in old.words and aged(known, 0.1) is known
+
+
+def test_a_reference_that_was_never_seen_has_no_overlay(follower, stage):
+    blank = np.full((720, 960, 3), 120, np.uint8)
+    known = follower.step(blank[..., 0], 0.0)
+    assert known.state is State.NO_REFERENCE and known.camera is None and "not seen yet" in known.words
+    painted = Painter(stage).paint(blank, known).colour
+    foot = painted[600:]
+    assert np.array_equal(painted[:600], blank[:600]) and not np.array_equal(foot, blank[600:])
+    seen = follower.step(next(iter(pictures())).picture.grey, 0.0)
+    frozen, gone = (follower.step(blank[..., 0], time, seen) for time in (HELD, HELD + 0.01))
+    assert frozen.camera is seen.camera and frozen.words == "reference lost: drawn where it was"
+    assert frozen.band is None and not frozen.relied and gone.camera is None  # a band is promised of no frozen overlay
+    with pytest.raises(ValueError, match="calibrate it at this size"):
+        follower.step(blank[::2, ::2, 0], 0.0)
+
+
+def test_a_slow_film_is_stale_where_its_own_pictures_are_missing(follower):
+    blank, known, states = np.full((720, 960), 120, np.uint8), None, []
+    first = next(iter(pictures())).picture.grey
+    for moment in (0.0, 0.3, 0.6, 0.9, 1.8, 2.1):
+        known = follower.step(first, moment, known)
+        states.append(known.state)
+    assert [each is State.STALE for each in states] == [False, False, False, False, True, False]
+    assert follower.step(blank, 2.4, known).state is State.NO_REFERENCE
+    assert follower.step(first, 1.5).interval == follower.step(first, 4.0, follower.step(first, 1.5)).interval == 1.0
+
+
+PARTS = np.array([1e-3, 2e-3, 3e-3])
+
+
+@pytest.mark.parametrize("source", ["tracking", "tool", "registration"])
+def test_tip_covariance_is_turned_into_the_scan(source):
+    """A quarter turn of the registration, another one of the cube; an error along (1, 2, 3) in its own frame."""
+    T_patient_scan, T_patient_cube = turned("z", 90.0), turned("x", 90.0)
+    own, none = np.outer(PARTS, PARTS), np.zeros((3, 3))
+    into_patient = T_patient_cube[:3, :3] if source == "tool" else np.eye(3)
+    expected = T_patient_scan[:3, :3].T @ into_patient @ PARTS
+    found = tip_covariance(
+        Registration(T_patient_scan, six(own if source == "registration" else none), np.zeros(3), 0.0, 8),
+        TrackedTool(Ball(7e-3), np.eye(4), own if source == "tool" else none),
+        Pose(T_patient_cube, six(own if source == "tracking" else none), 0.0, 4),
+    )
+    np.testing.assert_allclose(found, np.outer(expected, expected), atol=1e-15)
+
+
+def looking(motion, **given):
+    """Return what is known of pictures every 40 ms: `motion` moves the reference before the camera, from the first."""
+    follower = replace(follower_of(template_theatre().stage(find_scene("palpate"))), tool=None, **given)
+    first = truth_of(follower.motion.stage).T_camera_scan[0] @ np.linalg.inv(follower.registration.T_patient_scan)
+    seen = [Tracked(0, {}, {PATIENT: Pose(T @ first, np.zeros((6, 6)), 0.0, 4)}, {}) for T in motion]
+    vars(follower)["tracker"] = SimpleNamespace(track=lambda grey, before: seen[int(grey[0, 0])])
+    known = [None]
+    for number in range(len(motion)):
+        known.append(follower.step(np.full((1, 1), number, np.uint8), 0.04 * number, known[-1]))
+    return follower, known[1:]
+
+
+def test_pace_is_across_the_view_and_fades_in_seconds():
+    """10 mm along the view, then 10 mm across it, then nothing: each in 40 ms."""
+    _, known = looking([shifted(0.0), shifted(0.0, 0.01), shifted(0.01, 0.01), shifted(0.01, 0.01)])
+    assert [each.pace for each in known] == [None, *(pytest.approx(pace) for pace in (0.0, 0.25, 0.25 * 0.1**0.04))]
+
+
+def test_band_has_no_registration_error_along_the_view():
+    follower, (known,) = looking([np.eye(4)])
+    scan, view = follower.registration, known.camera.T_camera_world[:3]
+    sight = view @ [*follower.motion.stage.tumour_at_rest.vertices.mean(axis=0), 1.0]
+    sight = scan.T_patient_scan[:3, :3] @ view[:, :3].T @ sight
+    for error, expected in ((sight, 0.0), (np.cross(sight, PARTS), 2.4477e-3)):
+        own = six(1e-6 * np.outer(error, error) / (error @ error))
+        _, (known,) = looking([np.eye(4)], registration=replace(scan, covariance=own))
+        assert known.parts["registration"] == pytest.approx(expected, rel=1e-4, abs=1e-7)

@@ -1,0 +1,37 @@
+"""The built-in scene of a blade that is held."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_scenes_palpate import small
+from theatres import player
+
+from scenes.script.tool_paths import AIR, Touch
+from sim.deformation import Outcome
+from sim.loads import Retracted
+from sim.tools import distances_to
+
+
+class TestRetract:
+    def test_the_blade_bears_less_and_less_while_it_is_held(self, theatre):
+        frames = list(player(theatre, small("retract"), "fem").frames(15))
+        (cause,) = frames[-1].loads.causes
+        assert isinstance(cause, Retracted)
+        reads = np.array([np.linalg.norm(frame.deformation.reaction[0, 0, :3]) for frame in frames])
+        held = np.array([frame.time for frame in frames]) >= 1.5
+        assert (np.diff(reads[held]) < 0.0).all() and reads[-1] < 0.9 * reads[held][0]
+        outcomes = [frame.deformation.outcome[0] for frame in frames]  # so small a body is strained beyond 50 %
+        assert reads[0] == 0.0 and all(one.good or one is Outcome.OVERSTRAINED for one in outcomes)
+
+    @pytest.mark.parametrize("touch", [Touch(depth=-AIR), Touch(depth=3e-3), Touch(0.0, 0.0, 0.0, (0.5, 0.0), 3e-3)])
+    def test_the_blade_is_laid_on_clear_of_the_tissue_and_moved_to_where_the_hand_is(self, theatre, touch):
+        scene, site = small("retract"), theatre.site
+        cause = scene.loads(site, touch, 0.0).of(Retracted)
+        apart = distances_to(scene.tool.shape, cause.pose[0], theatre.anatomy.mesh.nodes)
+        upright = site.direction(touch) @ site.axis
+        assert apart.min() == pytest.approx(AIR * upright, abs=0.3e-3)
+        moved = cause.pose[0].copy()
+        moved[:3, 3] += cause.displacement[0]
+        np.testing.assert_allclose(moved, scene.pose(site, touch), atol=1e-15)
+        assert cause.displacement[0] == pytest.approx((AIR + touch.depth) * site.direction(touch))

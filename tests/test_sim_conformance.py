@@ -1,0 +1,121 @@
+"""Laws of a researcher's own: held to what every law must fulfil, and solved as built-in ones."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from oracle import EVERY_LAW, tissue
+from test_sim_own import BODY, PRESS, TWO, YEOH, answer
+
+from sim.accuracy import TRAIN
+from sim.effects import Elasticity, Held, ToolForce, remember
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads
+from sim.material import Material, Ogden
+from sim.terms.laws.conformance import check_tissue
+from sim.terms.laws.law import Law
+
+YEOHS = Ogden(((1500.0, 2.0), (500.0, 2.0)), 1e4)
+
+
+class TestLaw:
+    @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
+    def test_a_users_law_solves_as_the_built_in_one_that_it_equals(self, element):
+        """Yeoh without c2 is Ogden's law with m = 2, in as many terms as other tests compile it with."""
+        own = answer(Elasticity(YEOH.Yeoh(500.0, 0.0, 1e4)), element=element)
+        known = answer(Elasticity(YEOHS), element=element)
+        assert np.abs(known).max() > 2e-3
+        assert np.abs(own - known).max() < 1e-6 * np.abs(known).max()
+
+    def test_it_stiffens_as_it_says(self):
+        soft, stiff = (answer(Elasticity(YEOH.Yeoh(500.0, c2, 1e4))) for c2 in (0.0, 5e3))
+        ratio = np.abs(stiff).max(axis=(1, 2)) / np.abs(soft).max(axis=(1, 2))
+        assert ratio[0] < 0.95 < 0.99 < ratio[1] < 1.0  # the second load is a quarter of the first
+
+    def test_regions_mix_it_with_built_in_laws(self):
+        own, known = YEOH.Yeoh(500.0, 0.0, 1e4), YEOHS
+        other = Material("neo-hookean", 6000.0, 0.4)
+        mixed = [answer(Elasticity(law, {1: other}), body=TWO, element="smoothed") for law in (own, known)]
+        assert np.abs(mixed[0] - mixed[1]).max() < 1e-6 * np.abs(mixed[1]).max()
+
+    def test_it_relaxes_when_it_says_so(self):
+        class Relaxing(YEOH.Yeoh):
+            law = "relaxing yeoh"
+            prony = ((0.5, 1.0),)
+
+        fem = Fem(BODY, (Elasticity(Relaxing(500.0, 500.0, 1e4)), Held(), ToolForce()), TRAIN, "cpu", element="p1")
+        assert remember(fem.effects)
+        at_once = fem.deform(Loads(PRESS.causes, np.zeros(2)))
+        later = fem.deform(Loads(PRESS.causes, np.full(2, 3.0)), start=at_once)
+        assert np.abs(later.displacement).max() > 1.2 * np.abs(at_once.displacement).max()
+
+    @pytest.mark.parametrize("law", EVERY_LAW)
+    def test_every_built_in_law_passes_the_check_that_users_run(self, law):
+        found = check_tissue(tissue(law), small_strain=law == "linear")
+        assert len(found) > 12 and all(finding.kept for finding in found)
+
+    def test_the_example_passes_it_and_small_strain_is_not_for_all(self):
+        assert all(finding.kept for finding in check_tissue(YEOH.SOFT))
+        with pytest.raises(InputError, match=r"the law linear does not hold: stress turns with the tissue: off by"):
+            check_tissue(tissue("linear"))
+
+    @pytest.mark.parametrize(
+        ("broken", "words"),
+        [
+            ({"stress": "half"}, "Hooke's law at small strain.*stress is the energy's derivative"),
+            ({"stress_change": "half"}, "does not hold: stress_change is the stress's derivative: off by 1.0e"),
+            ({"needs_positive_volume": False}, "off by (nan|inf)"),
+        ],
+    )
+    def test_a_broken_law_is_refused_with_what_is_broken(self, broken, words):
+        own_stress, own_change = YEOH.stress, YEOH.stress_change
+
+        @wp.func
+        def half_stress(H: Any, c: Any):
+            return own_stress(H, c) / type(c[0])(2.0)
+
+        @wp.func
+        def half_change(H: Any, D: Any, c: Any):
+            return own_change(H, D, c) / type(c[0])(2.0)
+
+        halves = {"stress": half_stress, "stress_change": half_change}
+        made = replace(YEOH.Yeoh.functions, **{k: halves[k] if v == "half" else v for k, v in broken.items()})
+
+        class Broken(YEOH.Yeoh):
+            law = "broken"
+            functions = made
+
+        with pytest.raises(InputError, match=words):
+            check_tissue(Broken(500.0, 1500.0, 1e4))
+
+    def test_wrong_constants_and_wrong_counts_are_sentences(self):
+        class Wrong(YEOH.Yeoh):
+            def coefficients_at(self, mu, lam):
+                return mu, self.c2, lam
+
+        with pytest.raises(InputError, match=r"Hooke's law at small strain"):
+            check_tissue(Wrong(500.0, 1500.0, 1e4))
+
+        class Longer(YEOH.Yeoh):
+            @property
+            def coefficients(self):
+                return 1.0, 2.0
+
+        with pytest.raises(InputError, match=r"2 coefficients, but 3 at other Lamé constants"):
+            check_tissue(Longer(500.0, 1500.0, 1e4))
+        with pytest.raises(InputError, match=r"Lamé constants -2.0"):
+            check_tissue(YEOH.Yeoh(-1.0, 0.0, 1e4))
+
+    def test_what_is_no_tissue_is_a_sentence(self):
+        with pytest.raises(InputError, match=r"str is no tissue: it has no law, functions.*Give a Material, an Ogden"):
+            Elasticity("jelly")  # pyright: ignore[reportArgumentType]
+
+    def test_two_laws_of_one_name_are_a_sentence(self):
+        class Other(YEOH.Yeoh):
+            functions = Law("yeoh", YEOH.energy, YEOH.stress, YEOH.stress_change)
+
+        with pytest.raises(InputError, match=r"two tissue laws are called 'yeoh'"):
+            answer(Elasticity(YEOH.SOFT, {1: Other(500.0, 0.0, 1e4)}), body=TWO)

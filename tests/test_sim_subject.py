@@ -1,0 +1,135 @@
+"""Subjects from labels: meshes of tumours, components, holes and rough surfaces."""
+
+import re
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import KDTree
+from test_sim_label_volume import (
+    AFFINES,
+    AXES,
+    MIDDLE,
+    RADIUS,
+    TUMOUR,
+    ball,
+    ellipsoid,
+    grid,
+    labelled,
+    save,
+    with_plates,
+)
+
+from sim.anatomy import TUMOUR_LABEL
+from sim.bodies import mesher
+from sim.bodies.label_volume import volume_subject
+from sim.bodies.subject import MeshPlan, make_anatomy
+from sim.errors import InputError
+from sim.geometry.tetmesh import dihedral_angles
+
+
+def test_the_same_volume_gives_the_same_anatomy(tmp_path):
+    path, _, _ = labelled(tmp_path / "labels.nii", AFFINES["oblique"])
+    first, second = (make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)) for _ in range(2))
+    assert first.digest == second.digest
+
+
+@pytest.mark.parametrize("rise", [-0.001, 0.006, 0.014])
+def test_a_tumour_that_reaches_or_breaks_the_cortex_is_meshed(tmp_path, rise):
+    middle = MIDDLE + [0.0, 0.0, AXES[2] - RADIUS + rise]
+    path, labels, affine = labelled(tmp_path / "l.nii", AFFINES["straight"], lambda points: ball(points, middle))
+    voxel = 1e-9 * abs(np.linalg.det(affine[:3, :3]))
+    anatomy = make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=4000))
+    mesh = anatomy.mesh
+    assert dihedral_angles(mesh.nodes, mesh.tets).min() > 5.0
+    assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx((labels > 2).sum() * voxel, rel=0.02)
+    assert mesh.volumes.sum() == pytest.approx((labels > 0).sum() * voxel, rel=0.01)
+    touching = np.intersect1d(np.unique(mesh.surface), anatomy.tumour_nodes)
+    assert len(touching) > 3 or rise < 0.0
+
+
+def test_components_and_holes(tmp_path):
+    affine, places = grid(AFFINES["straight"])
+    labels = np.where(ellipsoid(places), 1, 0)
+    labels[ball(places)] = 3
+    second = MIDDLE - [0.018, 0.0, 0.014]
+    labels[ball(places, second, 0.007)] = 4
+    labels[ball(places, MIDDLE - [0.0, 0.025, 0.0], 0.006)] = 0  # a ventricle
+    labels[:4, :4, :4] = 1  # a speck of brain
+    labels[-4:, -4:, -4:] = 3  # a speck of tumour, outside
+    labels[tuple(np.array(labels.shape) // 2 + [0, 12, 0])] = 3  # one voxel, inside
+    subject = volume_subject(save(tmp_path / "l.nii", labels, affine), (1,), (3, 4))
+    text = " ".join(subject.notes)
+    for part in ("of brain that is not connected", "of holes", "of tumour outside", "of tumour in specks"):
+        assert part in text
+    assert subject.tumour_volume == pytest.approx(sum(piece.volume for piece in subject.pieces))
+    anatomy = make_anatomy(subject, MeshPlan(nodes=4000))
+    inside = anatomy.mesh.nodes[anatomy.tumour_nodes]
+    assert KDTree(inside).query(np.stack([TUMOUR, second]))[0].max() < 0.006
+    wanted = 4 / 3 * np.pi * (RADIUS**3 + 0.007**3)
+    mesh = anatomy.mesh
+    assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx(wanted, rel=0.02)
+    assert mesh.volumes.sum() == pytest.approx(4 / 3 * np.pi * AXES.prod(), rel=0.01)
+
+
+def roughness(shape, amount, width, seed):
+    """Random field of that standard deviation, smooth over `width` voxels."""
+    noise = gaussian_filter(np.random.default_rng(seed).standard_normal(shape), width)
+    return amount * noise / noise.std()
+
+
+def rough_tumour(amount, width, seed=1):
+    return lambda points: ball(points, radius=RADIUS * (1.2 + roughness(points.shape[:-1], amount, width, seed)))
+
+
+def test_a_rough_cortex_is_meshed(tmp_path, monkeypatch):
+    """Fitted as it is, its mesh folds, so that nodes stay where that happens."""
+    affine, places = grid(AFFINES["straight"])
+    rough = np.linalg.norm((places - MIDDLE) / AXES, axis=-1) < 0.9 + roughness(places.shape[:-1], 0.15, 2.0, 1)
+    labels = np.where(ball(places), 3, rough)
+    subject = volume_subject(save(tmp_path / "l.nii", labels, affine), (1,), (3,))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mesh = make_anatomy(subject, MeshPlan(nodes=2000)).mesh
+    assert dihedral_angles(mesh.nodes, mesh.tets).min() > 10.0
+    assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx(subject.tumour_volume, rel=0.02)
+    monkeypatch.setattr(mesher, "unfolded", lambda nodes, moved, tets: moved)
+    with pytest.raises(InputError, match="too intricate for 2000 nodes"):
+        make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(more=())))
+
+
+def test_what_is_fitted_without_folds_is_left_as_it_is(tmp_path, monkeypatch):
+    path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"])
+    monkeypatch.delattr(mesher, "unfolded")
+    assert len(make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)).mesh.nodes)
+
+
+def test_a_mesh_that_misses_much_of_the_tumour_is_refused_with_how_many_nodes_would_do(tmp_path):
+    path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], rough_tumour(0.6, 2.0))
+    subject, plan = volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)
+    with pytest.raises(InputError, match="too intricate for 2000 nodes: ask for") as caught:
+        make_anatomy(subject, plan)
+    enough = int(re.search(r"ask for (\d+)", str(caught.value))[1])
+
+    def missed(nodes, most):
+        mesh = make_anatomy(subject, replace(plan, nodes=nodes, meshing=mesher.Meshing(largest_error=most))).mesh
+        return 1.0 - mesh.volumes[mesh.region == TUMOUR_LABEL].sum() / subject.tumour_volume
+
+    assert missed(2000, 1.0) > 0.1 > abs(missed(enough, 0.1))
+
+
+def test_small_pieces_are_another_reason_than_intricate_surfaces(tmp_path):
+    subject = volume_subject(with_plates(tmp_path / "l.nii", 12), (1,), (3,))
+    with pytest.raises(
+        InputError, match=r"12 of the tumour's 13 pieces, 1.\d ml in all, are too small for 2000 nodes: "
+    ):
+        make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(more=())))
+
+
+def test_labels_as_rough_as_their_voxels_are_to_be_smoothed(tmp_path):
+    path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], rough_tumour(1.5, 1.2))
+    plan = MeshPlan(nodes=2000, meshing=mesher.Meshing(more=(1.25,)))
+    with pytest.raises(InputError, match="too intricate for 2000 nodes: smooth the labels"):
+        make_anatomy(volume_subject(path, (1, 2), (3, 4)), plan)

@@ -1,0 +1,92 @@
+"""What a learnt model may be asked: effects, causes, bodies and tissue that it was trained on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_scenes_effects import EFFECTS
+from theatres import short, sinking
+
+from scenes.builtin.retract import RELAXING
+from scenes.script.scene import find_scene
+from scenes.script.tool_paths import Touch
+from sim.accuracy import LIVE
+from sim.effects import Elasticity, Gravity, Held, NodalForce, ToolForce
+from sim.errors import InputError
+from sim.loads import Loads
+from sim.material import Material, tissue_to_json
+from surrogate.model.applicability import refusal, trained_effects
+
+
+class TestLearnt:
+    def test_it_refuses_effects_that_it_was_not_trained_on(self, theatre):
+        model = theatre.models["linear"]
+        assert refusal(model, short().effects) is None
+        why = refusal(model, (*short().effects, Gravity()))
+        assert why is not None and "not under Gravity" in why
+        with pytest.raises(InputError, match=r"svr does not know the scene sinking.*but Gravity. Choose one of fem"):
+            theatre.player("svr", sinking())
+        # No force at all: it has nothing to say of that either.
+        assert "here is none" in (refusal(model, EFFECTS) or "") and theatre.names(
+            replace(short(), effects=EFFECTS)
+        ) == ("fem",)
+        assert theatre.names(short()) == ("linear", "svr", "guarded", "fem") and theatre.names(sinking()) == ("fem",)
+        assert theatre.best(sinking()) == "fem"
+
+    def test_it_refuses_causes_that_it_does_not_know(self, theatre):
+        model, scene = theatre.models["linear"], sinking()
+        with pytest.raises(InputError, match="causes Posture"):
+            model.deform(scene.loads(theatre.site, Touch(), 0.0))
+        with pytest.raises(InputError, match="causes none"):
+            model.deform(Loads((), np.zeros(2)))
+
+    def test_its_file_says_what_it_was_trained_under(self, theatre):
+        model = theatre.models["linear"]
+        assert trained_effects(model.training) == {"Elasticity", "Held", "Slide", "ToolForce"}  # its file does not say
+        effects = (Elasticity(regions={2: Elasticity().default}), Held(), ToolForce(), NodalForce())  # type: ignore
+        stated = replace(model, training={"effects": repr(effects)})
+        assert trained_effects(stated.training) == {"Elasticity", "Held", "ToolForce", "NodalForce"}
+        # Nothing slides in this body, and nodal forces act where loads hold some.
+        assert refusal(stated, short().effects) is None
+        why = refusal(stated, (Elasticity(), ToolForce()))
+        assert why is not None and "never without Held" in why
+
+    def test_where_the_skull_slides_it_matters(self, theatre, box):
+        normal = np.zeros_like(box.slide_normal)
+        normal[0, 0] = 1.0
+        model = replace(theatre.models["linear"], anatomy=replace(box, slide_normal=normal))
+        why = refusal(model, (Elasticity(), Held(), ToolForce()))
+        assert why is not None and "never without Slide" in why
+
+    def test_models_beside_an_anatomy_do_not_change_its_physics(self, theatre):
+        training = {"element": "p1", "tissue": tissue_to_json(Material("neo-hookean", 9000.0, 0.3))}
+        other = replace(theatre, models={"linear": replace(theatre.models["linear"], training=training)})
+        assert other.fem(short(), LIVE).description == "finite elements (smoothed; neo-hookean, E 3 kPa, nu 0.49)"
+        for scene in (short(), sinking()):
+            found, alone = (each.fem(scene, LIVE) for each in (other, replace(theatre, models={})))
+            assert (found.space.element, found.effects) == (alone.space.element, alone.effects)
+
+    @pytest.mark.parametrize(
+        ("training", "reason"),
+        [
+            ({"element": "p1"}, "learned from p1 elements, and here they are smoothed"),
+            ({"tissue": tissue_to_json(Material("neo-hookean", 9000.0, 0.3))}, "E 9 kPa, nu 0.3, and here it is .*E 3"),
+        ],
+    )
+    def test_a_model_of_another_body_is_refused(self, theatre, training, reason):
+        model = replace(theatre.models["linear"], training=training)
+        other = replace(theatre, models={"linear": model})
+        assert other.names(short()) == ("fem",)
+        with pytest.raises(InputError, match=reason):
+            other.deformer("linear", short())
+        tissue, element = (Material("neo-hookean", 9000.0, 0.3), None) if "tissue" in training else (None, "p1")
+        assert other.deformer("linear", short().made_of(tissue, element)) is model
+
+    def test_another_tissue_goes_on_relaxing(self):
+        scene = find_scene("retract").made_of(Material("neo-hookean", 9000.0, 0.3), "p2")
+        (effect,) = (each for each in scene.effects if isinstance(each, Elasticity))
+        assert scene.element == "p2" and effect.default == Material("neo-hookean", 9000.0, 0.3, RELAXING.prony)
+        with pytest.raises(InputError, match="cannot relax"):
+            find_scene("retract").made_of(Material("linear", 9000.0, 0.3), None)
