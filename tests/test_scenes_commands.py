@@ -1,7 +1,6 @@
 """Every scenes command from the outside: a patient in one go, and bad input as one sentence with nothing written."""
 
 import json
-import math
 from dataclasses import replace
 
 import pytest
@@ -13,7 +12,6 @@ from theatres import put, theatre_of
 
 from benchmarks.__main__ import BENCHMARKS
 from scenes.cli import COMMANDS
-from scenes.options.json_line import json_line
 from scenes.play.deformers import model_path
 from sim.bodies.intensity import sidecar
 from sim.bodies.meshfile import read_anatomy, write_anatomy, write_mesh
@@ -185,12 +183,6 @@ def test_words_that_are_no_command_are_refused(words, capsys):
     with pytest.raises(SystemExit) as end:
         main(words)
     assert end.value.code == 2 and "usage: sulcus" in capsys.readouterr().err
-
-
-def test_numbers_that_are_not_finite_are_null_in_json():
-    """NaN and Infinity are no JSON, though Python writes them."""
-    said = {"rows": [{"bond": math.nan, "worst": (1.5, -math.inf)}], "good": True, "name": "nan"}
-    assert json.loads(json_line(said)) == {"rows": [{"bond": None, "worst": [1.5, None]}], "good": True, "name": "nan"}
 
 
 @pytest.mark.parametrize("words", [[], ["throughput", "--count", "4"], ["--help"]])

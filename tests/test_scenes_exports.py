@@ -20,9 +20,7 @@ from scenes import read_episodes, write_card
 from scenes.cli import main
 from scenes.episodes.exports.card import keep_card
 from scenes.episodes.exports.columns import rate_of
-from scenes.episodes.exports.datasheet import listed
 from scenes.episodes.exports.motion import states, twists
-from scenes.episodes.exports.statistics import Spread
 from scenes.episodes.exports.tasks import TASKS, held_out
 from scenes.episodes.reading.contents import read_contents
 from scenes.episodes.run_folder import finished
@@ -72,15 +70,6 @@ def test_twists_lead_from_pose_to_pose(folder):
         turning[number, :2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     around = states(turning)[:, 3:]
     assert (np.einsum("ij,ij->i", around[1:], around[:-1]) > -1e-6).all()
-
-
-def test_statistics_of_parts_are_those_of_the_whole():
-    rows = np.random.default_rng(0).normal(size=(20, 3))
-    rows[3, 1] = np.nan
-    said = (Spread.of(rows[:7]) + Spread.of(rows[7:])).said()
-    for name, of in (("min", np.nanmin), ("max", np.nanmax), ("mean", np.nanmean), ("std", np.nanstd)):
-        assert np.allclose(said[name], of(rows, axis=0))
-    assert said["count"] == [20] and Spread.of(np.full((2, 1), np.nan)).said()["mean"] == [0.0]
 
 
 @pytest.mark.parametrize("off", [2e-3, 2e-4, 5e-5])
@@ -265,12 +254,6 @@ def test_a_card_says_whose_brain_it_is_and_what_played(box, tmp_path):
         assert main(["convert", *map(str, given), "--to", "folder", "--out", str(tmp_path / name)]) == 0
     assert (tmp_path / "one/DATASHEET.md").read_text() == sheet and (tmp_path / "two/DATASHEET_0.md").is_file()
     assert (tmp_path / "two/LICENSE_1.md").read_text() == "mine"
-
-
-def test_a_sheet_names_what_is_there_most_often():
-    lines = list(listed("tool", ["a", "b", "b", *map(str, range(20))]))
-    assert lines[:2] == ["- tool: b (in 2)", "- tool: a (in 1)"] and lines[-1] == "- tool: 10 others (in 10)"
-    assert list(listed("tool", ["a"])) == ["- tool: a (in 1)"]
 
 
 def test_a_card_is_kept_as_episodes_come(box, tmp_path, monkeypatch):

@@ -10,7 +10,6 @@ from PIL import Image
 from scipy import ndimage
 
 from scenes.cli import main
-from scenes.commands.inspection import axes_of
 from scenes.commands.inspection_sheet import COLOURS, SIDE
 
 RED, GREEN = COLOURS["tumour"], COLOURS["opening"]
@@ -141,9 +140,3 @@ def test_the_side_of_a_tumour_is_stated_where_nothing_else_tells_it(tmp_path, ca
         found, _ = inspected(capsys, tmp_path, labels, "--brain", 1, "--tumour-in", marked, "--tumour", 2)
         notes = [one for one in found["warnings"] if one.startswith(f"{marked}: has a grid of its own")]
         assert len(notes) == count and all(note.endswith("tumour lies right superior") for note in notes)
-
-
-def test_axes_are_named_as_they_point():
-    turned = np.eye(4)
-    turned[:3, :3] = np.array([[0.0, 0.2, 1.0], [-1.0, 0.1, 0.0], [0.1, -1.0, 0.2]])
-    assert axes_of(turned) == "PIR"

@@ -25,7 +25,6 @@ from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal, Touching
 from sim.material import Material
 from sim.runtime.device import find_device
-from sim.strategy.time_steps import alike
 from sim.terms.inertia import lumped_mass
 from sim.tools import Ball, distances_to
 
@@ -197,12 +196,6 @@ def test_where_no_time_passes_a_body_stays_as_it_is() -> None:
     np.testing.assert_array_equal(paused.memory["inertia"], moving.memory["inertia"])
     ahead, on = after(fem, moving, 1, 0.01, force), after(fem, paused, 1, 0.01, force)
     np.testing.assert_allclose(on.displacement, ahead.displacement, atol=1e-12)
-
-
-def test_steps_alike_share_a_batch() -> None:
-    steps = np.array([0.01, 1e3, 0.0101, 1e-4, 0.009, 0.0])
-    found = [(step, rows.tolist()) for step, rows in alike(steps, 2)]
-    assert found == [(0.0, [5]), (2.0**-13, [3]), (2.0**-7, [0, 2]), (2.0**-7, [4]), (np.inf, [1])]
 
 
 @pytest.mark.parametrize("element", ELEMENTS)

@@ -9,7 +9,6 @@ import warp as wp
 from sim.minimisers import lbfgs_trial_kernels
 from sim.minimisers.lbfgs_kernels import PAIRS, PRODUCTS, SOME, SUMS, kernels_of
 from sim.minimisers.lbfgs_trial_kernels import multiply_of, spread_of
-from sim.runtime.columns import add_dots
 from sim.runtime.device import find_device
 
 NODES = 1500
@@ -59,10 +58,3 @@ def test_products_with_the_pairs_that_are_known(count):
     DEVICE.launch(kernels_of(DEVICE, PAIRS).multiply, (-(-ROWS // SOME), 1), inputs, [many])
     np.testing.assert_allclose(one.numpy(), many.numpy(), rtol=1e-9, atol=1e-9)
     assert np.count_nonzero(one.numpy()) == 2 * count + PRODUCTS
-
-
-def test_a_dot_adds_to_what_is_there():
-    x, y, out = column(ROWS), column(ROWS), double(1)
-    out.fill_(2.0)
-    add_dots(DEVICE, x, y, out)
-    np.testing.assert_allclose(out.numpy(), 2.0 + (x.numpy() * y.numpy()).sum())

@@ -1,0 +1,15 @@
+"""Kernels over columns."""
+
+from __future__ import annotations
+
+import numpy as np
+from test_sim_lbfgs_trial_kernels import DEVICE, ROWS, column, double
+
+from sim.runtime.columns import add_dots
+
+
+def test_a_dot_adds_to_what_is_there():
+    x, y, out = column(ROWS), column(ROWS), double(1)
+    out.fill_(2.0)
+    add_dots(DEVICE, x, y, out)
+    np.testing.assert_allclose(out.numpy(), 2.0 + (x.numpy() * y.numpy()).sum())
