@@ -102,8 +102,6 @@ def compile_problem(
         match effect:
             case Elasticity():
                 terms += _elasticity(effect, space, device, pulsation=pulsation)
-            case Pulsation():
-                pass  # elasticity swells
             case Held():
                 held = held | anatomy.held
             case Bonded():
@@ -135,8 +133,8 @@ def compile_problem(
                 from .terms.contact.skull_contact import skull_of
 
                 barriers.append(skull_of(effect, anatomy, space, _shear(effects), device))
-            case ToolDisplacement():
-                pass  # a constraint: `_impose` reads the loads
+            case Pulsation() | ToolDisplacement():
+                pass  # elasticity swells; a constraint: `_impose` reads the loads
             case Resection():
                 raise InputError("Resection changes the body: make its solver with `sim.finite_elements`.")
             case OwnEffect():

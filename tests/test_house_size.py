@@ -7,7 +7,7 @@ from test_house import FILES, HOUSE, PACKAGED, name_of, nodes_of
 
 # Lines of the packages and of their tests. Nobody reads more than this: a feature that exceeds it deletes something.
 # Lower a number when lines have gone. Raise it only with the reason in the commit.
-MOST = {"packages": 80_300, "tests": 50_100}
+MOST = {"packages": 79_700, "tests": 50_200}
 
 
 def lines(paths):
@@ -44,20 +44,18 @@ def test_classes_take_at_most_eight_positional_values():
                 assert len(node.args) <= 8, f"{name_of(path)}:{node.lineno}: {node.func.id}"
 
 
+FACTORIES = ("kernel_of", "kernels_of", "functions_of")
+
+
 def test_functions_are_short_and_take_few_arguments():
-    """Factories of kernels are as long as what they make; constructors are called by keyword."""
+    """But kernels, and their factories, which are as long as what they make; constructors are called by keyword."""
     found = []
     for path in PACKAGED:
         for node in nodes_of(path):
-            if isinstance(node, ast.FunctionDef) and node.name not in (
-                "__init__",
-                "kernel_of",
-                "kernels_of",
-                "functions_of",
-            ):
-                arguments = [
-                    one.arg for one in (*node.args.args, *node.args.kwonlyargs) if one.arg not in ("self", "cls")
-                ]
-                if node.end_lineno - node.lineno >= 80 or len(arguments) > 8:
-                    found.append(f"{name_of(path)}:{node.lineno} {node.name}")
+            if not isinstance(node, ast.FunctionDef) or node.name in ("__init__", *FACTORIES):
+                continue
+            arguments = [one.arg for one in (*node.args.args, *node.args.kwonlyargs) if one.arg not in ("self", "cls")]
+            of_warp = any(re.search(r"kernel|^wp\.", ast.unparse(each)) for each in node.decorator_list)
+            if not of_warp and (node.end_lineno - node.lineno >= 80 or len(arguments) > 8):
+                found.append(f"{name_of(path)}:{node.lineno} {node.name}")
     assert not found
