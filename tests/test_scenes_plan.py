@@ -178,7 +178,7 @@ def test_what_cannot_be_meshed_fails_with_its_reason(tmp_path):
     plan = plan_from(f"{TINY}[bodies]\nanatomies = 'drawn'\n[bodies.tumour]\nradius_mm = 35\ncover_mm = 1\n", "big")
     body = make_body(tmp_path, plan, 1, 0, "cpu")
     assert "none of 6 anatomies that were drawn can be meshed; the last: a " in body.failed
-    assert not list(body_path(tmp_path, 0).parent.iterdir())
+    assert not list(tmp_path.glob("bodies/*"))
     with pytest.raises(InputError, match="is no body of a data set"):
         make_episode(tmp_path, plan, 1, 0, "cpu")
 
