@@ -10,7 +10,7 @@ from conftest import make_box
 
 from scenes.episodes.checksums import broken
 from scenes.episodes.families import FAMILIES, Motions
-from scenes.episodes.make import body_of, body_path, episode_path, make_body, make_episode
+from scenes.episodes.make import body_of, episode_path, make_body, make_episode
 from scenes.episodes.plan import load_plan, plan_from, shipped
 from scenes.episodes.scripted import drawn_episode
 from scenes.play.deformers import open_theatre

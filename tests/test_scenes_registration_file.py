@@ -74,8 +74,8 @@ def test_the_command_writes_it_and_tells_the_error_at_the_tumour(tmp_path, capsy
     assert "give it by --anatomy" in capsys.readouterr().err
     table[4, 3] += 5.0
     np.savetxt(pairs, table, delimiter=",", header="x,y,z,px,py,pz", comments="")
-    assert main(["register", str(pairs), "--out", str(out)]) == 0
+    assert main(["register", str(pairs), "--out", str(out), "--force"]) == 0
     assert "pair 5 is suspect: it lies" in capsys.readouterr().out
     np.savetxt(pairs, table[:3], delimiter=",", header="x,y,z,px,py,pz", comments="")
-    assert main(["register", str(pairs), "--out", str(out)]) == 0
+    assert main(["register", str(pairs), "--out", str(out), "--force"]) == 0
     assert "three pairs do not tell a wrong one" in capsys.readouterr().out
