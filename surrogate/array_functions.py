@@ -62,9 +62,9 @@ def taken(index: np.ndarray, table: np.ndarray | Rounded) -> np.ndarray:
 
 
 @singledispatch
-def product_of(rows: np.ndarray, table: Rounded, taken: np.ndarray) -> np.ndarray:
-    """rows (B, k) @ table (n, r), of which rows (k,) are taken."""
-    return rows @ table.values[taken]
+def product_of(rows: np.ndarray, table: Rounded, index: np.ndarray) -> np.ndarray:
+    """rows (B, k) @ the rows of a table (n, r) at an index (k,)."""
+    return rows @ table.values[index]
 
 
 @singledispatch

@@ -205,7 +205,7 @@ def _sketched(
 
 
 def _motion(hidden: Layer, before: Layer, words: Words) -> str:
-    """How far the surface has moved, in words."""
+    """Mean motion of the surface, or the one that is given, in words."""
     mean = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
     return f"{words.names.motion} {millimetres(mean) if words.moved is None else millimetres(*words.moved)}"
 

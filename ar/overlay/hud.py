@@ -73,7 +73,7 @@ def haloed(sheet: np.ndarray, text: str, at: tuple[int, int], scale: float, ink:
 
 @dataclass(frozen=True, eq=False)
 class Below:
-    """What words in a picture may hide.
+    """Parts of a picture that words may hide.
 
     Parameters
     ----------

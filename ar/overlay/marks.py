@@ -1,4 +1,4 @@
-"""What is drawn and written beside a hidden surface, and what lies over it."""
+"""Arguments of `composite`: marks and words beside a hidden surface, and the cover over it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNNAMED = Names()
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """What lies over the hidden surface.
+    """Layers and ground over the hidden surface.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class Marks:
 
 @dataclass(frozen=True, eq=False)
 class Words:
-    """What is written into the picture.
+    """Words in the picture.
 
     Parameters
     ----------

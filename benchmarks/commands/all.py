@@ -97,7 +97,7 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
     out = args.json or OUT
     found: dict[str, Entry] = {}
     if not args.quick:
-        out = claimed(out, ".json", True, [args.anatomy, args.against, *args.tables])
+        out = claimed(out, ".json", inputs=[args.anatomy, args.against, *args.tables], resumed=True)
         found = {entry.name: entry for entry in _begun(out, args.force)}
     body = read_anatomy(args.anatomy or template_path()).digest
     run = Run(version_here(), body, args.anatomy, args.quick)

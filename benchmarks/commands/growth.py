@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     find_device(args.device, "float32")
     where, record, kept = machine(args.device), args.out.with_suffix(".csv"), args.out.with_suffix(".rows")
     for path, suffix in ((args.out, ".png"), (record, ".csv")):
-        claimed(path, suffix, args.force or kept.exists())
+        claimed(path, suffix, args.force, resumed=kept.exists())
     if args.force:
         kept.unlink(missing_ok=True)
     trial = Trial(args.element, args.device, args.out.parent)

@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     stated |= {"count": str(args.count), "seed": str(args.seed)}
     kept = args.out and args.out.with_suffix(".rows")
     if kept:
-        claimed(args.out, ".csv", args.force or kept.exists())
+        claimed(args.out, ".csv", args.force, resumed=kept.exists())
         if args.force:
             kept.unlink(missing_ok=True)
     with (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Set
@@ -142,6 +141,8 @@ def _card(out: Path, numbers: Set[int], changed: bool) -> str | None:
 
 
 def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Workers]:
+    from dask.system import CPU_COUNT
+
     from ..episodes.workers import own_workers, scheduled_workers
 
     if args.scheduler:
@@ -152,7 +153,7 @@ def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Wo
         cards = device_names("all")
         count = args.workers or len(cards)
         return own_workers([cards[number % len(cards)] for number in range(count)])
-    return own_workers(["cpu"] * (args.workers or (os.cpu_count() or 1)))
+    return own_workers(["cpu"] * (args.workers or CPU_COUNT))
 
 
 @contextmanager

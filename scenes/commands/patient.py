@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     args.regions = (*args.regions, *(name for name, label in PART_LABELS.items() if label in regions))
     note = unfinished_path(args.out)
     resumed = note.exists() and not args.force
-    claimed(args.out, ".vtu", args.force or args.inspect or resumed, _inputs(args))
+    claimed(args.out, ".vtu", args.force, _inputs(args), resumed or args.inspect)
     if args.inspect:
         return _inspect(args, plan, regions)
     from sim.runtime.device import device_names
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
 
     data, model = args.out.with_suffix(".h5"), model_path(args.out)
     for path, suffix in ((data, ".h5"), (model, ".npz")):
-        claimed(path, suffix, args.force or resumed, _inputs(args))
+        claimed(path, suffix, args.force, _inputs(args), resumed)
     device_names(args.device)
     check_learners(asked_learners(args.learners), of_poses=False, where=str(data))
     if args.count - args.count // APART < FEWEST + 1:

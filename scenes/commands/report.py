@@ -84,7 +84,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
 
     several = device_names(args.device)
     device = args.device if len(several) == 1 else several[0]
-    claimed(args.out / "index.html", ".html", args.force or (args.out / "rows").is_dir())
+    claimed(args.out / "index.html", ".html", args.force, resumed=(args.out / "rows").is_dir())
     count, loads, beyond = QUICK if args.quick else WHOLE
     if args.loads is not None and args.loads < 1:
         raise InputError(f"--loads {args.loads} plays nothing: give at least 1.")

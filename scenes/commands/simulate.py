@@ -101,7 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Returns 0: the file is complete, whether or not every case converged; it says which did."""
-    out = claimed(args.out, ".h5", args.force or "anatomy" in stated(Path(args.out)))
+    out = claimed(args.out, ".h5", args.force, resumed="anatomy" in stated(Path(args.out)))
     with stage("draw"):
         anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
         if not len(anatomy.tumour_nodes):

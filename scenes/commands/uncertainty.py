@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     # Before hours are spent: tissue must be one that is drawn. A file that is there is read, and scenes are added.
     for scene in scenes:
         tissue_of(scene)
-    claimed(out, ".json", force=True)
+    claimed(out, ".json", resumed=True)
     read_uncertainties(out)
     fitted = fitted_beside(args.tissue, args.anatomy or template_path(), theatre.anatomy.digest)
 

@@ -25,7 +25,7 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(
 def opened(
     task: str, observation: str, render_mode: str | None, given: Mapping[str, Any], together: bool | None = None
 ) -> Setting:
-    """What environments stand on; anatomy, physics, device, size and model are `given` as to `open_setting`.
+    """Open the setting of environments; anatomy, physics, device, size and model are `given` as to `open_setting`.
 
     Raises
     ------

@@ -21,10 +21,16 @@ def add_force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace files that are there")
 
 
-def claimed(path: str | Path, suffix: str, force: bool = False, inputs: Sequence[str | Path | None] = ()) -> Path:
+def claimed(
+    path: str | Path,
+    suffix: str,
+    force: bool = False,
+    inputs: Sequence[str | Path | None] = (),
+    resumed: bool = False,
+) -> Path:
     """Path of a file that can be written, and is not there unless by `force`; nothing is left behind by asking.
 
-    What the command reads, its `inputs`, is never replaced.
+    What the command reads, its `inputs`, is never replaced. A file that it goes on with, `resumed`, may be there.
 
     Raises
     ------
@@ -37,7 +43,7 @@ def claimed(path: str | Path, suffix: str, force: bool = False, inputs: Sequence
         return path
     if any(one is not None and Path(one).exists() and path.samefile(one) for one in inputs):
         raise InputError(f"{path}: is what this command reads, and would be lost. Choose another name.")
-    if not force:
+    if not (force or resumed):
         raise InputError(f"{path}: exists. Give --force to replace it, or choose another name.")
     return path
 

@@ -88,8 +88,8 @@ class Journal:
 
     def append(self, row: Any) -> None:
         """Add a dataclass of plain numbers and texts as the next row; InputError as `add`."""
-        number = 1 + max((first for _, first in self._places), default=-1)
-        self.add(("row", number), json.dumps(asdict(row)).encode())
+        _, last = next(reversed(self._places), ("row", -1))
+        self.add(("row", last + 1), json.dumps(asdict(row)).encode())
 
     def rows(self, kind: type[R]) -> list[R]:
         """Rows that were appended, as dataclasses of one kind; InputError as `read`."""
@@ -147,8 +147,8 @@ def _taken_up(
         raise InputError(foreign)
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as held:
         whole = held[: len(opening)] == opening
-        if not whole:
-            _demand_same(path, held, stated)
+        if not whole and _proved(held, 0, b"") == (RUN, 0):
+            demand_same(path, json.loads(_payload(held)), stated)
         places, damaged = _records(held, len(opening), key)
     if not whole and not places:
         raise InputError(foreign)
@@ -167,17 +167,22 @@ def _taken_up(
     return places
 
 
-def _demand_same(path: Path, held: Held, stated: Mapping[str, str]) -> None:
-    """Raise where the file's beginning is whole and states something else."""
-    if _proved(held, 0, b"") != (RUN, 0):
-        return
-    before = json.loads(_payload(held))
+def demand_same(
+    path: Path, before: Mapping[str, str], stated: Mapping[str, str], verb: str = "begun", remedy: str = "delete it, "
+) -> None:
+    """Reject a file whose description `before` differs from what is `stated` now.
+
+    Raises
+    ------
+    InputError
+        The first name whose text differs; a finished file says "made" in place of the `verb`, and has no `remedy`.
+    """
     for name, wanted in stated.items():
         found = before.get(name, "nothing")
         if found != wanted:
             raise InputError(
-                f"{path}: was begun with {name} {found}, but now {name} is {wanted}: repeat the first command, delete "
-                "it, or choose another --out."
+                f"{path}: was {verb} with {name} {found}, but now {name} is {wanted}: repeat the first command, "
+                f"{remedy}or choose another --out."
             )
 
 

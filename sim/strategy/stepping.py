@@ -93,8 +93,11 @@ class Shares:
         aim = np.minimum(self.reached[rows] + self.step[rows], 1.0)
         return aim, float(((aim - self.reached[rows]) * self.gaps[rows]).max())
 
-    def take(self, rows: np.ndarray, aim: np.ndarray, good: np.ndarray, growth: np.ndarray, cut: float) -> None:
-        """Take the steps of rows (k,) that are `good`, and let these grow; the others are `cut`, from a wider gap."""
+    def take(self, rows: np.ndarray, aim: np.ndarray, good: np.ndarray) -> None:
+        """Take the steps of those rows (k,) that are `good`: they reach their aim (k,)."""
         self.reached[rows[good]] = aim[good]
-        self.gaps[rows] *= np.where(good, 1.0, GAPS.wider)
+
+    def resize(self, rows: np.ndarray, good: np.ndarray, growth: np.ndarray, cut: float, wider: float) -> None:
+        """Let steps of rows (k,) that are `good` grow; the others are `cut`, and begin from a gap so much `wider`."""
+        self.gaps[rows] *= np.where(good, 1.0, wider)
         self.step[rows] *= np.where(good, np.clip(growth, 0.5, 2.0), cut)

@@ -374,7 +374,9 @@ class Strategy:
             found = self._touching(aimed(cases.rows(rows), aim), gathered(device, u, rows), outer, gone)
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
-            shares.take(rows, aim, good, wanted / np.maximum(found.iterations, 1), self.stepping.cut)
+            shares.take(rows, aim, good)
+            growth = wanted / np.maximum(found.iterations, 1)
+            shares.resize(rows, good, growth, self.stepping.cut, self.gaps.wider)
             scattered(device, found.u, rows[good], u, np.flatnonzero(good))
             answer.iterations[rows] += found.iterations
             answer.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome

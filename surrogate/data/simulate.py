@@ -18,7 +18,7 @@ from sim.deformation import Deformer
 from sim.errors import InputError
 from sim.loads import Loads, Touching
 from sim.runtime.atomic_files import check_output, demand_space, written_stream
-from sim.runtime.journal import Batch, DamageWarning, Journal, opened
+from sim.runtime.journal import Batch, DamageWarning, Journal, demand_same, opened
 from sim.runtime.outside_files import read_as
 from sim.runtime.partial_files import unfinished_path
 from sim.runtime.processes import LostError
@@ -314,13 +314,7 @@ def _earlier(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
         recorded = provenance_of(file)
         if recorded.get("format") == UNCHECKED:
             raise InputError(f"{path}: is of an earlier version, whose files do not go on: choose another --out.")
-        for name, wanted in stated.items():
-            found = recorded.get(name, "nothing")
-            if found != wanted:
-                raise InputError(
-                    f"{path}: was made with {name} {found}, but now {name} is {wanted}: repeat the first command, or "
-                    "choose another --out."
-                )
+        demand_same(path, recorded, stated, "made", "")
         before = read_loads(file)
     shared = np.arange(min(len(before), len(loads)))
     if digest_of_loads(before.rows(shared)) != digest_of_loads(loads.rows(shared)):

@@ -297,8 +297,8 @@ def _(index: Wire, table: np.ndarray | Rounded) -> Any:
 
 
 @product_of.register
-def _(rows: Wire, table: Rounded, taken: np.ndarray) -> Any:
-    return (rows @ rows.sheet.constant(table.whole[taken]).astype(np.float32)) * table.step
+def _(rows: Wire, table: Rounded, index: np.ndarray) -> Any:
+    return (rows @ rows.sheet.constant(table.whole[index]).astype(np.float32)) * table.step
 
 
 @columns_in_use.register
