@@ -7,10 +7,8 @@ from .data.tool_poses import draw_poses
 from .evaluation.coverage import Coverage, coverage
 from .evaluation.score import Score, score
 from .fitting.fit import fit_tissue
-from .fitting.frame import Frame, Tool
-from .fitting.tissue import FittedTissue
-from .fitting.tissue_files import load_tissue, save_tissue
-from .fitting.tool_table import read_tools
+from .fitting.frame import Frame, Tool, read_tools
+from .fitting.tissue import FittedTissue, load_tissue, save_tissue
 from .locating.locator import Location, Locator
 from .locating.locator_files import load_locator, save_locator
 from .locating.observation import Observation

@@ -8,11 +8,11 @@ import numpy as np
 
 from ar.tracking.pictures import film_of
 from scenes.tracked.calibration_file import read_calibration
-from scenes.tracked.film_truth import read_truth
 from scenes.tracked.follower import Follower
 from scenes.tracked.registration_file import read_registration
 from scenes.tracked.tool_motion import ToolMotion
 from scenes.tracked.tracked_tool import read_tool
+from scenes.tracked.truth import read_truth
 from sim.loads import Touching
 from surrogate.model.learned import predicted
 

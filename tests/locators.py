@@ -9,9 +9,9 @@ from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.runtime.threads import one_thread
 from surrogate.locating.calibration import trials
+from surrogate.locating.causes import Presses, pressed
 from surrogate.locating.ensemble import Ensemble
 from surrogate.locating.locator import Locator
-from surrogate.locating.presses import Presses, pressed
 from surrogate.locating.prior import prior_of
 
 

@@ -13,7 +13,7 @@ from ar.page.aside import STYLE
 from ar.page.browser import Browser
 from ar.page.guard import LIMITS, Limits
 from ar.page.parts import Body, Choice, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
-from ar.page.recorder import RECORDS, STOPS
+from ar.page.recording import RECORDS, STOPS
 from ar.page.sight import PICTURE, SAID, SLICES, coded, unparted
 from ar.page.style import NOTE, PAGE, STATUS, style
 

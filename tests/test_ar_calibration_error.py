@@ -6,7 +6,7 @@ import pytest
 from test_scenes_error_parts import turned
 
 from ar.optics.camera import Camera
-from ar.tracking.calibration_error import calibration_error
+from ar.tracking.intrinsics import calibration_error
 from ar.tracking.targets import patient_reference
 
 

@@ -41,7 +41,7 @@ def test_every_kernel_of_a_picture_is_loaded_ahead(loading):
     paths = (path.relative_to(house) for path in Path(ar.__file__).parent.rglob("*.py") if of_kernels(path))
     names = {".".join(path.with_suffix("").parts) for path in paths}
     # The tests' own, and those of cameras with a lens.
-    later = {f"ar.rendering.{name}" for name in ("raycast", "lens_rasteriser", "unbent")}
+    later = {f"ar.rendering.{name}" for name in ("raycast", "lens_rasteriser")}
     assert len(names) > 5 and sorted(loading[0]) == sorted(names - later)
 
 

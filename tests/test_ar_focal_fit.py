@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 from films import FILM
 
-from ar.tracking.detection import Corners
 from ar.tracking.focal_fit import focal_fit
-from ar.tracking.targets import tool_cube
+from ar.tracking.targets import Corners, tool_cube
 from scenes.tracked.calibration_file import read_calibration
 
 CUBE = tool_cube()

@@ -8,9 +8,8 @@ import pytest
 from board_scenes import CAMERA, HEIGHT, WIDTH, K, picture, poses, views
 
 from ar.tracking.board_views import find_board
-from ar.tracking.detection import Detector
 from ar.tracking.intrinsics import calibrated
-from ar.tracking.targets import calibration_board
+from ar.tracking.targets import Detector, calibration_board
 
 BOARD = Detector([calibration_board()])
 TRUTH = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *CAMERA.lens.coefficients[:5]])

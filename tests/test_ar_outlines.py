@@ -10,10 +10,9 @@ from ar.optics.camera import look_at
 from ar.overlay.composite import DOUBTFUL, WARNING, composite, doubt_lines
 from ar.overlay.gauge import GAUGE, Gauge
 from ar.overlay.hud import FINE, HEAD, ROW, panel, write
-from ar.overlay.marks import Cover, Marks, Words
+from ar.overlay.marks import BEFORE, Cover, Marks, Words
 from ar.overlay.outlines import ink_of, iou, silhouette
 from ar.overlay.refind import stands
-from ar.overlay.traces import BEFORE
 from ar.rendering.layer import Layer, Solid
 from ar.rendering.renderer import Lamp, lamp_beside, render
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ar.tracking.clocks import Clock
-from ar.tracking.pose_stream import stream_of
+from ar.tracking.pose_stream import Clock, stream_of
 from scenes.tracked.elsewhere import Elsewhere
 
 

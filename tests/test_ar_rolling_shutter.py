@@ -16,9 +16,8 @@ from ar.rendering.renderer import Lamp, Renderer
 from scenes.play.player import Player
 from scenes.script.camera_paths import HandHeld
 from scenes.script.scene import find_scene
-from scenes.tracked.filming import Taking, mounted, registered, shots_of
+from scenes.tracked.filming import USUAL, VIEW, Taking, mounted, registered, shots_of
 from scenes.tracked.follower import Follower, State
-from scenes.tracked.reference_place import USUAL, VIEW
 from scenes.tracked.tool_motion import ToolMotion
 from sim.anatomy import Anatomy
 from surrogate.model.learned import predicted

@@ -9,10 +9,9 @@ import trimesh
 from ar.optics.camera import Camera, look_at
 from ar.overlay.composite import SEEN, composite, draw_points
 from ar.overlay.hud import FINE
-from ar.overlay.marks import Marks, Words
+from ar.overlay.marks import Marks, Trace, Words
 from ar.overlay.outlines import ink_of, silhouette
 from ar.overlay.refind import of_ink, outline_gap, stands
-from ar.overlay.traces import Trace
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Lamp, Picture, render
 

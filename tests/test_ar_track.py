@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.detection import Corners, Detector
 from ar.tracking.drawn import drawn
 from ar.tracking.pose import Verdict, pose_of
-from ar.tracking.targets import BORDER, TIP, Target, calibration_board, patient_reference, tool_cube
+from ar.tracking.targets import BORDER, TIP, Corners, Detector, Target, calibration_board, patient_reference, tool_cube
 from ar.tracking.track import Tracker
 
 CUBE, PLATE = tool_cube(), patient_reference()

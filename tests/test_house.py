@@ -66,8 +66,10 @@ OWNERS = {
     "trimesh": {"scenes/script/tool.py"},
     "isal": {"scenes/episodes/png.py"},
     "meshio": {"sim/bodies/meshfile.py"},
-    "gymnasium": {f"scenes/gym/{of}.py" for of in ["environment", "observation", "registration", "vector"]},
-    "viser": {f"ar/page/{of}.py" for of in ["browser", "crowd", "guard", "inputs", "messages", "recorder", "scene"]},
+    "gymnasium": {f"scenes/gym/{of}.py" for of in ["environment", "observation", "registration"]},
+    "viser": {
+        f"ar/page/{of}.py" for of in ["browser", "control_lock", "guard", "inputs", "messages", "parts", "recording"]
+    },
     "nilearn": {"sim/bodies/template.py"},
     "pyarrow": {"scenes/episodes/exports/lerobot.py"},
     "matplotlib": {"scenes/analysis/loglog_chart.py"},

@@ -25,7 +25,7 @@ from scenes.cli import main
 from scenes.script.priors import OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION
 from scenes.script.site import site_of
 from scenes.script.uncertainty import SURROGATE
-from scenes.tracked.reference_place import USUAL, VIEW, reference_beside
+from scenes.tracked.filming import USUAL, VIEW, reference_beside
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
 

@@ -9,11 +9,10 @@ import pytest
 from ar.overlay.composite import DOUBTFUL, composite
 from ar.overlay.gauge import GAUGE, Gauge
 from ar.overlay.legend import SHEET
-from ar.overlay.marks import Cover, Marks
+from ar.overlay.marks import BEFORE, Cover, Marks
 from ar.overlay.outlines import ink_of
 from ar.overlay.refind import found_at
 from ar.overlay.styles import STYLES
-from ar.overlay.traces import BEFORE
 from scenes.cli import main
 from scenes.play.checks import measure
 from scenes.play.deformers import open_theatre

@@ -12,27 +12,24 @@ from scipy.stats import chi2
 from theatres import template_theatre
 
 from ar.optics.lens import Lens
-from ar.tracking.clocks import Clock, clock_by_motion
 from ar.tracking.pictures import film_of
-from ar.tracking.pose import Pose, Verdict
-from ar.tracking.pose_stream import AHEAD, DAY, LONGEST, stream_of
-from ar.tracking.rigid import moved_about
+from ar.tracking.pose import Pose, Verdict, moved_about
+from ar.tracking.pose_stream import AHEAD, DAY, LONGEST, Clock, clock_by_motion, stream_of
 from ar.tracking.targets import patient_reference
 from scenes.cli import main
 from scenes.script.scene import find_scene
-from scenes.tracked.agreement import Agreement
+from scenes.tracked.agreement import Agreement, buried
 from scenes.tracked.calibration_file import read_calibration, read_intrinsic_covariance, write_exactly_known
 from scenes.tracked.elsewhere import Elsewhere, Eye
-from scenes.tracked.film_truth import read_truth
 from scenes.tracked.follower import Follower, State
 from scenes.tracked.hand_eye_file import read_hand_eye
 from scenes.tracked.picture import head_lines
-from scenes.tracked.plausible import buried
 from scenes.tracked.pose_file import TrackedRow, read_stream, write_poses
 from scenes.tracked.registration_file import read_registration
 from scenes.tracked.run import timed
 from scenes.tracked.tool_motion import ToolMotion
 from scenes.tracked.tracked_tool import read_tool
+from scenes.tracked.truth import read_truth
 from scenes.tracked.words import overlay_error
 from sim.errors import InputError
 

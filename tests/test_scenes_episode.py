@@ -15,8 +15,7 @@ from scenes.cli import main
 from scenes.episodes.episode import DEPTH_SCALE, collect
 from scenes.episodes.reading.contents import read_contents
 from scenes.episodes.reading.schema import ARRAYS, PICTURES
-from scenes.episodes.reading.silhouettes import mask_findings
-from scenes.episodes.reading.validation import validate_episode
+from scenes.episodes.reading.validation import mask_findings, validate_episode
 from scenes.play.player import STAGES
 from scenes.play.stage import CORTEX, DRAPE, TOOL
 from scenes.script.tool_paths import press
@@ -25,7 +24,7 @@ from sim.effects import Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import push
-from surrogate.data.stated_tissue import stated_tissue
+from surrogate.data.answer_rows import stated_tissue
 
 
 @pytest.fixture(scope="module")

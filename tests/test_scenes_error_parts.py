@@ -10,15 +10,14 @@ from links import in_mm
 from scipy.spatial.transform import Rotation
 from theatres import template_theatre
 
+from ar.tracking.pose import moved_about
 from ar.tracking.pose_stream import stream_of
-from ar.tracking.rigid import moved_about
 from scenes.link.answer import Answering
 from scenes.link.heard import Heard, Names
 from scenes.script.scene import find_scene
 from scenes.tracked.elsewhere import Elsewhere, Eye
 from scenes.tracked.follower import State
-from scenes.tracked.rows import write_rows
-from scenes.tracked.run import Shown
+from scenes.tracked.run import Shown, write_rows
 from scenes.tracked.tool_motion import UNBOUND, Motion, ToolMotion
 from scenes.tracked.truth import Off
 from sim.loads import Touching

@@ -9,21 +9,19 @@ import numpy as np
 import pytest
 from theatres import template_theatre
 
-from ar.tracking.detection import Detector
 from ar.tracking.pictures import film_of
 from ar.tracking.stamp import CELL, WIDTH, read_stamp, stamped
-from ar.tracking.targets import patient_reference, tool_cube
+from ar.tracking.targets import Detector, patient_reference, tool_cube
 from ar.tracking.track import Tracker
 from scenes.cli import main
 from scenes.play.deformers import AtRest
 from scenes.play.player import Player
 from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import read_intrinsic_covariance, write_calibration
-from scenes.tracked.film_truth import read_truth
-from scenes.tracked.filming import Taking, Trouble, mounted, registered, shots_of
-from scenes.tracked.reference_place import USUAL, VIEW
+from scenes.tracked.filming import USUAL, VIEW, Taking, Trouble, mounted, registered, shots_of
 from scenes.tracked.registration_file import read_registration
 from scenes.tracked.tracked_tool import read_tool
+from scenes.tracked.truth import read_truth
 from sim.errors import InputError
 from sim.tools import Ball
 

@@ -15,7 +15,7 @@ from scenes.tracked.film_camera import demand_film
 
 @pytest.mark.parametrize(("factor", "way"), [(1.15, "13% shorter"), (0.85, "18% longer")])
 def test_a_film_of_another_zoom_is_refused_before_it_is_followed(factor, way, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("scenes.tracked.followed.followed", lambda *given: pytest.fail("the whole film is followed"))
+    monkeypatch.setattr("scenes.tracked.elsewhere.followed", lambda *given: pytest.fail("the whole film is followed"))
     calibration = read_calibration(FILM / "camera.yaml")
     path = tmp_path / "camera.yaml"
     write_calibration(path, replace(calibration, focal=tuple(factor * each for each in calibration.focal)))

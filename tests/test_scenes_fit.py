@@ -15,8 +15,7 @@ from sim.errors import InputError
 from sim.loads import Pushed
 from surrogate.fitting import fit
 from surrogate.fitting.responses import LINEAR, Responses
-from surrogate.fitting.tissue import FittedTissue
-from surrogate.fitting.tissue_files import load_tissue, save_tissue
+from surrogate.fitting.tissue import FittedTissue, load_tissue, save_tissue
 from surrogate.locating.locator import telling_nodes
 from surrogate.locating.locator_files import save_locator
 

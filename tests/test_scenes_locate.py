@@ -14,7 +14,7 @@ from sim.bodies.meshfile import read_mesh, write_anatomy
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import Material
-from surrogate.data.stated_tissue import stating
+from surrogate.data.answer_rows import stating
 from surrogate.locating.causes import KINDS
 from surrogate.locating.locator_files import load_locator, save_locator
 from surrogate.locating.observation import MOST, Observation, looked_at, placed

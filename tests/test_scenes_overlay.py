@@ -18,12 +18,11 @@ from ar.tracking.pictures import Named, film_of
 from scenes.cli import main
 from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
 from scenes.tracked.calibration_file import read_calibration
-from scenes.tracked.film_truth import read_truth
 from scenes.tracked.follower import State
 from scenes.tracked.picture import Painter
 from scenes.tracked.run import Timed, overlaid, paced, timed
 from scenes.tracked.tool_motion import ToolMotion
-from scenes.tracked.truth import off, summary
+from scenes.tracked.truth import off, read_truth, summary
 from sim.errors import InputError
 from sim.loads import Touching
 from surrogate.model.learned import predicted

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenes.commands.link import address_of
+from scenes.link.answer import placed_at
 from scenes.link.console import address_words
 from scenes.link.frame import stamp_of
 from scenes.link.heard import Heard, Names
-from scenes.link.picture_time import placed_at
 from sim.errors import InputError
 
 BEGUN, STEP = 1e9, 1.0 / 30.0

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from scenes.cli import main
-from scenes.warp.causes import Cause
-from scenes.warp.landmarks import landmarks_of
-from scenes.warp.moment import Moment
-from scenes.warp.places import folds_of, places_of
-from scenes.warp.spacing import ENOUGH, FINEST, fields_of, finer_spacing
+from scenes.warp.markups import landmarks_of
+from scenes.warp.moment import Cause, Moment
+from scenes.warp.places import ENOUGH, FINEST, fields_of, finer_spacing, folds_of, places_of
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.errors import InputError

@@ -21,7 +21,7 @@ from sim.errors import InputError
 from sim.material import BRAIN, Material
 from sim.runtime.device import find_device
 from sim.runtime.memory import check_fits
-from surrogate.data.stated_tissue import stated_tissue, stating
+from surrogate.data.answer_rows import stated_tissue, stating
 from surrogate.model.applicability import refusal
 
 TINY = """

@@ -27,8 +27,8 @@ from sim.effects import Elasticity, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN, MATERIALS, Material
+from surrogate.data.answer_rows import stated_tissue, stating
 from surrogate.data.dataset import read_dataset
-from surrogate.data.stated_tissue import stated_tissue, stating
 from surrogate.training.expansion import Expansion
 
 STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=500.0)

@@ -30,13 +30,12 @@ from sim.fem import Fem
 from sim.loads import Pushed
 from sim.runtime.threads import one_thread
 from surrogate.data.dataset import read_dataset
-from surrogate.data.direction_split import leave_sectors_out
 from surrogate.data.encode import directions, reduce, tool_features
+from surrogate.data.splits import leave_sectors_out
 from surrogate.model.training_range import envelope_of
 from surrogate.training.expansion import COARSE, EXPANDED
-from surrogate.training.learners import SVR
+from surrogate.training.learners import SVR, Tuned
 from surrogate.training.train import train
-from surrogate.training.tuning import Tuned
 
 SPECS = (Elements("FEM"), Elements("linear law", law="linear"), Learner("linear"))
 

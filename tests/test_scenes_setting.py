@@ -13,23 +13,21 @@ from programs import main
 from theatres import put, theatre_of
 
 import scenes.gym
-from scenes.gym.hertz import Hertz
-from scenes.gym.observation import FELT, TRACKED
-from scenes.gym.pressed_model import PressedModel
+from scenes.gym.environment import many as made_apart
+from scenes.gym.episode import ENDED, FAR, OVER_LIMIT, SHARE, STEP, Judged, earned
+from scenes.gym.observation import FELT, TRACKED, scripted
+from scenes.gym.pressed_model import Hertz, PressedModel
 from scenes.gym.registration import NAMES, register_environments
-from scenes.gym.reward import ENDED, FAR, OVER_LIMIT, SHARE, STEP, Judged, earned
-from scenes.gym.scripted import scripted
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT, TASKS
 from scenes.gym.touched import Asked
-from scenes.gym.vector import many as made_apart
 from scenes.play.deformers import model_path
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import BRAIN, MATERIALS
-from surrogate.data.stated_tissue import stating
+from surrogate.data.answer_rows import stating
 
 SIZE = (48, 36)
 STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: replace(BRAIN, young=9000.0)})

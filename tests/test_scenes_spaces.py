@@ -26,11 +26,11 @@ from scenes.episodes.episode import Recording, collect
 from scenes.play.deformers import Theatre
 from scenes.play.player import Player
 from scenes.play.stage import Stage
-from scenes.tracked.film_truth import Truth, write_table, write_truth
 from scenes.tracked.pose_file import TrackedRow, write_poses
 from scenes.tracked.registration_file import scanned_of, write_registration
-from scenes.tracked.rows import write_rows
+from scenes.tracked.run import write_rows
 from scenes.tracked.tracked_tool import TrackedTool, read_tool, write_tool
+from scenes.tracked.truth import Truth, write_table, write_truth
 from sim.bodies.meshfile import read_anatomy, write_mesh
 from sim.tools import Ball
 from surrogate.data.simulate import simulate

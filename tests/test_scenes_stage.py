@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from ar.rendering.vignette import vignetted
+from ar.rendering.real_picture import vignetted
 from scenes.play.player import Player
 from scenes.play.stage import CORTEX, Stage
 from scenes.script.viewpoint import Viewpoint

@@ -13,8 +13,7 @@ from tiny_episodes import Wanted, packed, write_episode
 from scenes import write_card
 from scenes.cli import main
 from scenes.episodes.checksums import seal
-from scenes.episodes.reading.again import solved_again
-from scenes.episodes.reading.apart import validated
+from scenes.episodes.reading.again import solved_again, validated
 from scenes.episodes.reading.validation import Report, validate_episode
 
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from surrogate.array_functions import Rounded, half_precision, product_of, taken
-from surrogate.regressors.force_pairs import Pairs
-from surrogate.regressors.force_series import Series
+from surrogate.regressors.force_series import Pairs, Series
 from surrogate.regressors.gp import Gp
 
 TABLE = np.random.default_rng(0).normal(size=(50, 4)) * [1.0, 10.0, 1e-3, 0.0]

@@ -25,8 +25,7 @@ from surrogate.data.encode import Basis, tool_features
 from surrogate.data.indentation import indented, posed
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import draw_poses, poses_at, tool_of
-from surrogate.evaluation.force_score import judged_force
-from surrogate.evaluation.score import errors
+from surrogate.evaluation.score import errors, judged_force
 from surrogate.model.store import load, save
 from surrogate.model.tool_force import wrench
 from surrogate.regressors.rigid_contact import THICKER, Contact

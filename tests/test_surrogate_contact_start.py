@@ -22,10 +22,10 @@ from sim.tools import Spatula
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.indentation import indented
 from surrogate.model.contact_start import HELD
+from surrogate.model.guarded import knows_pressure, tool_pressure
 from surrogate.model.learned import Learned, Part
 from surrogate.model.store import load
 from surrogate.model.tool_force import ForceModel
-from surrogate.model.tool_pressure import knows_pressure, tool_pressure
 from surrogate.model.training_range import envelope_of
 from surrogate.training.condense_contact import condensed, side_by_side
 

@@ -11,14 +11,11 @@ from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
 from surrogate.fitting import fit
-from surrogate.fitting.fit import probability_of, weighed
-from surrogate.fitting.frame import Frame, Tool, check_frames, foot
+from surrogate.fitting.fit import SOFT, probability_of, weighed, young_moduli
+from surrogate.fitting.frame import Frame, Tool, check_frames, foot, read_tools
 from surrogate.fitting.responses import POISSONS, RATIOS, drained_loads, force_loads, responses
-from surrogate.fitting.stiffness import SOFT, young_moduli
-from surrogate.fitting.support import unsupported
-from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
-from surrogate.fitting.tissue_files import load_tissue, save_tissue
-from surrogate.fitting.tool_table import read_tools
+from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue, load_tissue, save_tissue
+from surrogate.fitting.weighing import unsupported
 from surrogate.locating.calibration import seen_patch
 from surrogate.locating.causes import YOUNG, Group
 from surrogate.locating.observation import Observation

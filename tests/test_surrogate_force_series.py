@@ -17,12 +17,11 @@ from sim.runtime.journal import opened
 from surrogate.array_functions import Rounded
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
-from surrogate.data.disc_split import Split
 from surrogate.data.encode import ENCODERS, directions, tool_features
 from surrogate.data.simulate import simulate
+from surrogate.data.splits import Split
 from surrogate.model.store import load, save
-from surrogate.regressors.force_series import ORDERS, SPANS, Series, forms
-from surrogate.regressors.left_out_tables import filled
+from surrogate.regressors.force_series import ORDERS, SPANS, Series, filled, forms
 from surrogate.training.examples import Examples
 from surrogate.training.expansion import ADDED, COARSE, EXPANDED, Expansion
 from surrogate.training.tabulate_series import radii_between, tabulated, with_middles

@@ -16,8 +16,8 @@ from sim.errors import InputError
 from sim.loads import Displaced, Loads, Nodal, Posture, Pushed, push, stacked
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
-from surrogate.data.disc_split import APART
 from surrogate.data.simulate import simulate
+from surrogate.data.splits import APART
 from surrogate.data.tool_loads import draw
 from surrogate.evaluation.coverage import coverage, covered, held_by
 from surrogate.evaluation.score import errors

@@ -8,9 +8,9 @@ import pytest
 
 from surrogate.model.store import REGRESSORS
 from surrogate.regressors.ann import Ann
-from surrogate.regressors.compliance_table import Linear
 from surrogate.regressors.gp import Gp
 from surrogate.regressors.pcr import Pcr
+from surrogate.regressors.protocol import Linear
 from surrogate.regressors.svr import Svr
 
 MAKE = {"linear": Linear, "ann": lambda: Ann(hidden=12, steps=150), "svr": Svr, "gp": Gp}
@@ -104,7 +104,7 @@ def test_svr_has_the_published_settings():
 def test_predicting_needs_neither_torch_nor_sklearn():
     script = (
         "import sys, numpy as np, surrogate.model.store\n"
-        "from surrogate.regressors.compliance_table import Linear\n"
+        "from surrogate.regressors.protocol import Linear\n"
         "Linear().fit(np.eye(2), np.eye(2)).predict(np.eye(2))\n"
         "assert not {'torch', 'sklearn', 'warp', 'meshio'} & set(sys.modules), sys.modules.keys()\n"
     )

@@ -20,16 +20,15 @@ from sim.loads import Loads, Pushed, Touching
 from sim.tools import Ball
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
-from surrogate.data.disc_split import APART
 from surrogate.data.simulate import simulate
+from surrogate.data.splits import APART
 from surrogate.data.tool_loads import draw
 from surrogate.data.tool_poses import draw_poses
 from surrogate.evaluation.coverage import distance_coverage
 from surrogate.model.learned import only_pushed
 from surrogate.model.store import load, save
 from surrogate.model.tip_distance import TipModel
-from surrogate.training.bounds import ENOUGH, TIP, TUMOUR, bound_by, growth_by, missed
-from surrogate.training.tip_distance import Measured, distance_errors
+from surrogate.training.bounds import ENOUGH, TIP, TUMOUR, KnownDistances, bound_by, distance_errors, growth_by, missed
 from surrogate.training.train import train
 
 
@@ -140,7 +139,7 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
     def known(count, seed):
         loads = draw("palpation", pretender.anatomy, count, seed)
         answer = pretender.deform(loads)
-        return Measured(loads, gauge.distances(loads, answer.displacement, answer.nodes))
+        return KnownDistances(loads, gauge.distances(loads, answer.displacement, answer.nodes))
 
     def seen(some):
         return missed(model, open_patch(model.anatomy), model.asked(some.loads), distance_errors(model, some))

@@ -34,7 +34,7 @@ from surrogate.data.tool_loads import draw
 from surrogate.model.learned import Learned, Part
 from surrogate.model.store import load, save
 from surrogate.model.training_range import envelope_of
-from surrogate.regressors.compliance_table import Linear
+from surrogate.regressors.protocol import Linear
 from surrogate.training.train import train
 
 SIGHTED = tuple(name for name in SCENES if find_scene(name).sight is not None)

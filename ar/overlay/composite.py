@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from ..rendering import place, rasteriser, shade, vignette
+from ..rendering import rasteriser, real_picture, shade, surfaces
 from ..rendering.layer import Layer, vertex_normals
 from ..rendering.parallel import load
 from ..rendering.rasteriser import Seen, seen
@@ -18,13 +18,12 @@ from . import distances, window
 from .gauge import draw_line, write_gauge
 from .hud import FINE, FONT, HEAD, NARROW, ROW, Below, folded, lay, millimetres
 from .legend import Entry, legend, place_sheet
-from .marks import NO_COVER, NO_MARKS, NO_WORDS, Cover, Marks, Words
+from .marks import BEFORE, DOTTED, NO_COVER, NO_MARKS, NO_WORDS, Cover, Marks, Words, draw_before, draw_trace
 from .measured import Measure
 from .outlines import blank, box_around, dash, ink_of, joined, key_of, outlines, pieces
 from .places import CLEAR, PAD
 from .rings import lines_of
 from .styles import STYLES, Opening, Style
-from .traces import BEFORE, DOTTED, draw_before, draw_trace
 from .window import DARK, FRONT, SHUT, Lines, Roles, overlaid
 
 # What may not be relied on is drawn in amber, and broken, with words in a paler one, so that pixels of the outline are
@@ -80,7 +79,7 @@ class Ground:
 
 def load_kernels(device: str = "cpu") -> None:
     """Load all kernels that draw a picture with its overlay, so that the first does not wait for them."""
-    load(device, place, rasteriser, shade, vignette, window, distances)
+    load(device, surfaces, rasteriser, shade, real_picture, window, distances)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,11 +11,11 @@ import warp as wp
 
 from ..optics.camera import Camera
 from ..rendering.layer import Layer, vertex_normals
+from ..rendering.lens_rasteriser import pixel_at
 from ..rendering.parallel import forward_kernel, launch_in_bands, load
 from ..rendering.rasteriser import NOTHING, Seen, depth_of, face_of
 from ..rendering.renderer import Pictures
 from ..rendering.triangle import weights_of
-from ..rendering.unbent import pixel_at
 
 # Light that falls to 1 / e over this depth under the surface [m]: the deeper, the darker.
 FADE = wp.constant(0.03)

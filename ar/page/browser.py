@@ -16,12 +16,11 @@ import numpy as np
 import viser
 
 from .aside import BACK, KEYS, LIVE_KEYS, ON, RECORD, SPACE, aside
-from .crowd import Crowd
+from .control_lock import Crowd
 from .guard import LIMITS, Limits, bracketed, check_address, open_server
 from .inputs import Inputs, noted
-from .parts import Body, Control, Deed, Fold, Note, Playback, Sign, Viewpoint
-from .recorder import Recorder
-from .scene import add_body, dress
+from .parts import Body, Control, Deed, Fold, Note, Playback, Sign, Viewpoint, add_body, dress
+from .recording import Recorder
 from .sight import ASIDE, PICTURE, SAID, coded, sight, unparted
 from .style import PAGE, STATUS, style
 

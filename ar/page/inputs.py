@@ -8,7 +8,7 @@ from typing import Any
 
 import viser
 
-from .crowd import Crowd
+from .control_lock import Crowd
 from .parts import Choice, Control, Deed, Fold, Key, Note, Slider, Toggle
 from .style import NOTE
 

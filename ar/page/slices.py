@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 
 from ..overlay.composite import BROKEN, DASHED, DOUBTFUL
 from ..overlay.hud import FINE, WHITE, bound_words, towards, write
+from ..overlay.marks import BEFORE, DOTTED
 from ..overlay.outlines import dash, ink_of
-from ..overlay.traces import BEFORE, DOTTED
 from ..rendering.layer import Layer, Solid
 
 # Of a view: half of its side [m], its side [pixel], and how far apart the scan is read [m]: finer adds nothing.

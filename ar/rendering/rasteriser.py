@@ -19,10 +19,9 @@ import numpy as np
 import warp as wp
 
 from ..optics.camera import Camera
-from .lens_rasteriser import keep_nearest_through_lens
+from .lens_rasteriser import Unbent, keep_nearest_through_lens, pixel_at, unbent
 from .parallel import forward_kernel, in_bands, launch_in_bands, load, run_length
 from .triangle import box_of, edge, first_row, weights_of
-from .unbent import Unbent, pixel_at, unbent
 
 NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 """Of a z-buffer where nothing is seen."""

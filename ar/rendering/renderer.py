@@ -11,13 +11,12 @@ import warp as wp
 
 from ..optics.camera import Camera, look_at
 from .layer import Layer
+from .lens_rasteriser import Unbent, unbent
 from .parallel import launch_in_bands, load
-from .place import place
 from .rasteriser import NEAR, draw, empty_buffer, rows_reached
 from .shade import BRIGHTEST, SOFT, TILE, bound, remember, shade
 from .shade_structs import Light, Placed, Shadow
-from .surfaces import Stack
-from .unbent import Unbent, unbent
+from .surfaces import Stack, place
 
 DRAPE = (0.13, 0.30, 0.36)
 SHADOW_PIXELS = 384

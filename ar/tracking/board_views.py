@@ -9,8 +9,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from .detection import Detector
-from .targets import Face
+from .targets import Detector, Face
 
 # Corners that a view needs, and how many rows and columns of the board they stand in at least.
 FEWEST_CORNERS, FEWEST_LINES = 8, 3

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from .detection import window_round
-from .targets import BORDER, Face, Target, seen_from_front
+from .targets import BORDER, Face, Target, seen_from_front, window_round
 
 # Texture pixels along a square, and how many samples of the picture lie along a pixel.
 TEXTURE, SAMPLES = 48, 4

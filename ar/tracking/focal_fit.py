@@ -9,9 +9,8 @@ import numpy as np
 from scipy.optimize import OptimizeResult, minimize_scalar
 
 from ..optics.camera import Camera
-from .detection import Corners
 from .pose import LEAST, squares_of
-from .targets import Target
+from .targets import Corners, Target
 
 # Views with fewer corners say little. Where it is looked for, as a factor, and how exactly.
 FEWEST, BOUNDS, EXACT = 12, (0.5, 2.0), 1e-3

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..optics.camera import Camera
-from .detection import Corners, Detector, window_round
 from .pose import FEWEST, Pose, Verdict, pose_of
-from .targets import Target
+from .targets import Corners, Detector, Target, window_round
 
 # Round what a target covered, such a share of its size is looked at, and so many pixels at least.
 AROUND, MARGIN = 0.4, 32.0

@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from scenes.analysis.machine import machine
-    from scenes.gym.vector import many
+    from scenes.gym.environment import many
 
     from ..studies.frame import size_of
     from ..studies.gym_rates import rate_of

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.analysis.stopwatch import timed
-from scenes.gym.scripted import scripted
-from scenes.gym.vector import VectorEnv
+from scenes.gym.environment import VectorEnv
+from scenes.gym.observation import scripted
 
 
 @dataclass(frozen=True)

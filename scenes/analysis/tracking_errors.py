@@ -12,9 +12,8 @@ from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
 from ar.tracking.board_views import View
-from ar.tracking.detection import Corners
 from ar.tracking.intrinsics import covariance_of
-from ar.tracking.targets import Target, calibration_board, seen_from_front
+from ar.tracking.targets import Corners, Target, calibration_board, seen_from_front
 
 CORNER = 0.1
 """Deviation of a corner along each axis [pixel], by default: twice that of sharp pictures (`benchmarks track`)."""

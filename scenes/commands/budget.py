@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     from ..analysis.uncertainty import mesh_errors, nominal, parts
     from ..play.deformers import open_theatre
     from ..play.stage import Stage
-    from ..tracked.reference_place import reference_beside
+    from ..tracked.filming import reference_beside
     from ..tracked.registration_file import other_mesh, read_registration
 
     at_least("--draws", args.draws, FEWEST)

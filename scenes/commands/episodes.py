@@ -234,8 +234,7 @@ def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, w
 
 
 def _print_estimate(args: argparse.Namespace, plan: Plan, out: Path) -> int:
-    from ..episodes.estimate import estimated, lines
-    from ..episodes.rates import read_rates
+    from ..episodes.rates import estimated, lines, read_rates
     from ..episodes.run_folder import read_run
 
     found = read_run(out)
@@ -253,7 +252,7 @@ def _print_estimate(args: argparse.Namespace, plan: Plan, out: Path) -> int:
 
 
 def _print_script(args: argparse.Namespace, out: Path) -> int:
-    from ..episodes.slurm import sbatch_script
+    from ..episodes.engine import sbatch_script
 
     if args.device == "auto":
         raise InputError("--slurm needs to know what its machines have: give --device cpu, or --device cuda.")

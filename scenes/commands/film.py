@@ -85,10 +85,10 @@ def run(args: argparse.Namespace) -> int:
         What cannot be read, written or filmed; numbers that are out of range.
     """
     from ..tracked.calibration_file import write_calibration, write_exactly_known
-    from ..tracked.film_truth import Truth, write_table, write_truth
     from ..tracked.filming import Taking, Trouble, mounted, registered, shots_of
     from ..tracked.registration_file import write_registration
     from ..tracked.tracked_tool import write_tool
+    from ..tracked.truth import Truth, write_table, write_truth
 
     at_least("--every", args.every, 1)
     for name, value in (

@@ -66,8 +66,8 @@ def run(args: argparse.Namespace) -> int:
     from sim.runtime.device import find_device
     from surrogate.fitting.fit import fit_tissue
     from surrogate.fitting.frame import check_frames
-    from surrogate.fitting.support import unsupported
-    from surrogate.fitting.tissue_files import save_tissue, tissue_path
+    from surrogate.fitting.tissue import save_tissue, tissue_path
+    from surrogate.fitting.weighing import unsupported
 
     out = claimed(args.out or tissue_path(args.anatomy), ".json", args.force, [args.anatomy, *args.frames])
     find_device(args.device, "float32")
@@ -97,8 +97,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _frames(args: argparse.Namespace) -> list[Frame]:
-    from surrogate.fitting.frame import Frame
-    from surrogate.fitting.tool_table import read_tools
+    from surrogate.fitting.frame import Frame, read_tools
     from surrogate.locating.observed_files import read_observation
 
     tools = ((),) * len(args.frames) if args.tool is None else read_tools(args.tool, len(args.frames))
@@ -145,7 +144,7 @@ def fitted_beside(path: Path | None, anatomy: Path, digest: str) -> FittedTissue
     InputError
         As `load_tissue`; a file that was asked for and is missing.
     """
-    from surrogate.fitting.tissue_files import load_tissue, tissue_path
+    from surrogate.fitting.tissue import load_tissue, tissue_path
 
     if path is not None and not path.is_file():
         raise InputError(f"{path}: no such file: make it by `sulcus fit`, or leave --tissue out.")

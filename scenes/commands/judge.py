@@ -33,8 +33,7 @@ def run(args: argparse.Namespace) -> int:
     from surrogate.data.dataset import read_dataset
     from surrogate.data.tool_loads import refused_share, refused_words
     from surrogate.evaluation.coverage import coverage, distance_coverage
-    from surrogate.evaluation.force_score import judged_force
-    from surrogate.evaluation.score import score, table
+    from surrogate.evaluation.score import judged_force, score, table
     from surrogate.model.store import load
 
     data = read_dataset(args.data)
@@ -91,6 +90,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _physics(stated: Mapping[str, str]) -> dict[str, object]:
     """What bodies must share to be compared, as a file states it: tissue, with that of regions, and element."""
-    from surrogate.data.stated_tissue import BRAIN, stated_tissue
+    from surrogate.data.answer_rows import BRAIN, stated_tissue
 
     return {"tissue": stated_tissue(stated) if BRAIN in stated else None, "element": stated.get("element")}

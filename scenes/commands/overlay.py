@@ -25,7 +25,7 @@ from ..options.shared_options import add_device, add_json
 from ..options.style_option import add_style
 from ..options.theatre_options import add_bodies
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
-from ..tracked.tracked_scene import REST, mover, tracked_scene
+from ..tracked.tool_motion import REST, mover, tracked_scene
 from .interrupt import until_ended
 
 if TYPE_CHECKING:
@@ -105,9 +105,8 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Files that cannot be read, written, or do not belong together; pictures of another size than the camera's.
     """
-    from ..tracked.film_truth import read_truth
-    from ..tracked.rows import write_rows
-    from ..tracked.truth import off, summary
+    from ..tracked.run import write_rows
+    from ..tracked.truth import off, read_truth, summary
 
     camera = args.pictures.isdecimal() and not Path(args.pictures).exists()
     if not 0.0 < args.rate < np.inf:
@@ -138,7 +137,7 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
     """Show a film, or what a camera sees, on a page, until the time is over or a signal comes."""
     from ar.page.guard import UnguardedError, check_address
 
-    from ..tracked.rows import write_rows
+    from ..tracked.run import write_rows
 
     films = {"--out": args.out, "--truth": args.truth, "--covered": args.covered, "--poses": args.poses}
     given = [name for name, value in (films | {"--live": args.live or None}).items() if value is not None]
@@ -174,7 +173,7 @@ def _camera_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) ->
 
 
 def _film_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
-    from ..tracked.seekable_film import SeekableFilm
+    from ..tracked.film_camera import SeekableFilm
 
     film = SeekableFilm(Path(args.pictures), args.rate)
     return _page(args, parts, closing, film.path.name, film.count).play(film, args.seconds)

@@ -22,7 +22,7 @@ from sim.runtime.atomic_files import written_whole
 from sim.runtime.journal import opened as opened_journal
 from sim.runtime.partial_files import unfinished_path
 from sim.runtime.timing import listened
-from surrogate.data.disc_split import APART, FEWEST
+from surrogate.data.splits import APART, FEWEST
 from surrogate.data.tool_loads import PRESETS
 
 from ..options.label_options import add_label_arguments, label_words, regions_asked, sources_of

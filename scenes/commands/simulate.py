@@ -27,11 +27,11 @@ from sim.runtime.partial_files import unfinished_path
 from sim.runtime.timing import stage
 from sim.runtime.versions import version_of
 from sim.tools import Ball, BuiltIn, Capsule, Spatula
+from surrogate.data.answer_rows import stating
 from surrogate.data.crew import Asked, solving
 from surrogate.data.dataset import read_outcomes
 from surrogate.data.holding import HISTORY, drawn_times
 from surrogate.data.simulate import Solved, simulate
-from surrogate.data.stated_tissue import stating
 from surrogate.data.tool_loads import BEYOND_TISSUE, PRESETS, draw, refused_share, refused_words
 from surrogate.data.tool_poses import draw_poses, tool_of
 

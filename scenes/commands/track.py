@@ -52,8 +52,8 @@ def run(args: argparse.Namespace) -> int:
     from ar.tracking.targets import TIP
 
     from ..tracked.calibration_file import read_calibration
+    from ..tracked.elsewhere import followed
     from ..tracked.film_camera import demand_film
-    from ..tracked.followed import followed
     from ..tracked.pose_file import write_poses
 
     if not 0.0 < args.rate < np.inf:

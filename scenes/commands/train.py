@@ -16,7 +16,7 @@ from sim.runtime.device import device_names
 from sim.runtime.partial_files import unfinished_path
 from sim.runtime.timing import stage
 from surrogate.data.dataset import Dataset, read_dataset
-from surrogate.data.disc_split import APART
+from surrogate.data.splits import APART
 from surrogate.data.tool_loads import refused_share, refused_words
 from surrogate.evaluation.score import table, winner
 from surrogate.model.guarded import judged, off_by

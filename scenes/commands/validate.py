@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 
     from sim.errors import InputError
 
-    from ..episodes.reading.apart import validated
+    from ..episodes.reading.again import validated
     from ..episodes.reading.windows import episode_paths
     from ..episodes.weak_bodies import models_of, said_of_weak, weak_as_json
 

@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     from ..script.shipped_files import template_path
     from ..warp.export import Asked, write_warp
     from ..warp.images import read_picture
-    from ..warp.spacing import steps_of
+    from ..warp.places import steps_of
 
     demand_options(args)
     if args.scene is not None:
@@ -134,7 +134,7 @@ def demand_options(args: argparse.Namespace) -> None:
         One that is missing, is no use, or has such a value; two images whose names would be one.
     """
     from ..warp.images import warped_name
-    from ..warp.spacing import COARSEST, FINEST
+    from ..warp.places import COARSEST, FINEST
 
     if args.spacing is not None and not 1e3 * FINEST <= args.spacing <= 1e3 * COARSEST:
         raise InputError(f"--spacing {args.spacing:g}: give {1e3 * FINEST:g} to {1e3 * COARSEST:g} mm.")

@@ -19,9 +19,9 @@ from sim.effects import SKULLS, Effect, Elasticity, Held, NodalForce, pushed_eff
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import Material
+from surrogate.data.answer_rows import stating
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import OF_ITS_MAKING, simulate
-from surrogate.data.stated_tissue import stating
 from surrogate.data.tool_loads import draw as draw_loads
 from surrogate.model.applicability import refusal
 from surrogate.model.learned import Learned

@@ -28,7 +28,7 @@ from sim.loads import Loads, Posture, Pushed, Resected, Retracted, Touching
 from sim.resected_fem import Operated
 from sim.runtime.atomic_files import demand_space, written_stream
 from sim.runtime.versions import version_of
-from surrogate.data.stated_tissue import stating
+from surrogate.data.answer_rows import stating
 from surrogate.model.guarded import model_of
 from surrogate.model.learned import Learned
 

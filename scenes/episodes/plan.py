@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
@@ -21,10 +22,14 @@ from sim.runtime.outside_files import read_as
 from surrogate.training.train import LEARNERS, check_learners
 
 from ..script.camera_paths import PATHS
-from .decoding import said_plainly
 from .draws import Limits, Number, Spread, Word, check_spread
 from .families import Motions
 
+KINDS = {
+    "object": "a table", "array": "a list", "str": "text in quotation marks", "float": "a number",
+    "int": "a whole number", "bool": "true or false", "null": "nothing",
+}  # fmt: skip
+"""Kinds of values, by the names that msgspec has for them."""
 SHIPPED = Path(__file__).parent.parent / "data" / "plans"
 """Plans that ship, by the names of their files."""
 NO_LEARNER = "none"
@@ -33,6 +38,35 @@ MOST_BYTES = 200_000
 """Of a plan's text: every episode holds it."""
 FIXED = "fixed"
 """The path of a camera that stays."""
+
+
+def said_plainly(error: str) -> str:
+    """An error of msgspec as a sentence that begins with the key in question; what else it says stays as it is."""
+    words, _, place = error.partition(" - at `$.")
+    table = place.rstrip("`")
+    strange, missing = (re.search(rf"{kind} field `(.*?)`", words) for kind in ("unknown", "required"))
+    if strange is not None:
+        return f"{_within(table, strange[1])}: there is no such key: look how it is spelled."
+    if missing is not None:
+        return f"{_within(table, missing[1])}: is missing. Give it."
+    if table and words.startswith("Expected"):
+        return f"{table}: {_named(words)}."
+    return f"{table and f'{table}: '}{words}."
+
+
+def _within(table: str, key: str) -> str:
+    return f"{table}.{key}" if table else key
+
+
+def _named(words: str) -> str:
+    """What was expected, with kinds by their names."""
+
+    def kinds(found: re.Match) -> str:
+        names = [one.strip() for one in str(found[1]).split("|")]
+        return " or ".join(KINDS.get(name, name) for name in names)
+
+    plain = re.sub(r"`(.*?)`", kinds, words)
+    return plain.replace("Expected ", "give ").replace(", got ", ", and not ")
 
 
 class Tumour(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -17,7 +17,7 @@ from sim.resected_fem import Operated
 
 from ..script.head_posture import Lying
 from ..script.site import Site
-from .hertz import Hertz
+from .pressed_model import Hertz
 from .touched import Asked, Touched
 
 # Levels of the fluid that are solved, as a share of its height; between them answers are interpolated.

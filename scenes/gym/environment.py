@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import make_vec
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 
+from sim.arguments import at_least
 from sim.errors import InputError
 
 from .episode import Episode, Step
-from .observation import KINDS, space_of, twists
-from .pictures import Pictures
+from .observation import KINDS, Pictures, space_of, twists
+from .registration import NAMESPACE, STEPS
 from .setting import Setting, checked, open_setting
 from .tasks import SECONDS, find_task
+from .touched import Asked
 
 RENDERED = ("rgb_array",)
 METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(1.0 / SECONDS)}
@@ -121,3 +127,146 @@ class Operation(gymnasium.Env):
             return step.states
         colour, depth = self.pictures.drawn([self.episode.seen])
         return {"rgb": colour[0], "depth": depth[0], "states": step.states}
+
+
+class Operations(VectorEnv):
+    """Many environments: `gymnasium.make_vec("sulcus/Palpate-v0", num_envs=64)`.
+
+    One whose episode is over begins the next in its next step, whatever the action; the reward is 0 then.
+
+    Parameters
+    ----------
+    num_envs
+        How many.
+    max_episode_steps
+        After so many steps an episode is cut short.
+    task, anatomy, observation, physics, device, size, render_mode
+        As of `Operation`.
+    together
+        As `open_setting`.
+
+    Raises
+    ------
+    InputError
+        As `Operation`; a number of environments or steps below 1.
+    """
+
+    metadata = METADATA | {"autoreset_mode": AutoresetMode.NEXT_STEP}
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        max_episode_steps: int = STEPS,
+        task: str = "palpate",
+        anatomy: str | Path = "template",
+        observation: str = "states",
+        physics: str = "auto",
+        device: str = "auto",
+        size: tuple[int, int] = (160, 120),
+        render_mode: str | None = None,
+        model: str | Path | None = None,
+        together: bool | None = None,
+    ):
+        self.num_envs = at_least("num_envs", num_envs, 1)
+        self.steps = at_least("max_episode_steps", max_episode_steps, 1)
+        given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size, "model": model}
+        self.setting = opened(task, observation, render_mode, given, together)
+        self.observation, self.render_mode = observation, render_mode
+        self.single_observation_space = space_of(observation, size)
+        self.single_action_space = twists()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.episodes = [Episode(self.setting) for _ in range(num_envs)]
+        self.pictures = Pictures(self.setting)
+        self.randoms = [np.random.default_rng() for _ in range(num_envs)]
+
+    def reset(
+        self, *, seed: int | np.integer | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin all episodes; a seed s is s, s + 1, ... of the environments. `options` are none.
+
+        Raises
+        ------
+        InputError
+            Options; another number of seeds than environments.
+        """
+        if options:
+            raise InputError(f"options are {options!r:.80}: there are none; give them to gymnasium.make_vec.")
+        seeds = [int(seed) + row for row in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
+        seeds = [None] * self.num_envs if seeds is None else list(seeds)
+        if len(seeds) != self.num_envs:
+            raise InputError(f"{len(seeds)} seeds for {self.num_envs} environments: give one for each, or one for all.")
+        for row, each in enumerate(seeds):
+            if each is not None or self.episodes[row].drawn is None:
+                self.randoms[row] = seeding.np_random(each)[0]
+        steps = self._taken([episode.begin(self.randoms[row]) for row, episode in enumerate(self.episodes)])
+        return self._observed(steps), self._infos(steps)
+
+    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Move all tools: as `Operation.step`, a row for each environment.
+
+        Raises
+        ------
+        InputError
+            Actions of another shape than (num_envs, 6), or not finite; no call of `reset` before.
+        """
+        twists = np.array(actions, np.float64)
+        if twists.shape != (self.num_envs, 6):
+            raise InputError(f"the actions have the shape {twists.shape}: give ({self.num_envs}, 6).")
+        begins = [episode.over and episode.drawn is not None for episode in self.episodes]
+        steps = self._taken(
+            [
+                episode.begin(self.randoms[row]) if begins[row] else episode.ask(twists[row])
+                for row, episode in enumerate(self.episodes)
+            ]
+        )
+        terminated = np.array([step.terminated for step in steps])
+        truncated = np.array([episode.step >= self.steps for episode in self.episodes])
+        for episode, late in zip(self.episodes, truncated.tolist(), strict=True):
+            episode.over = episode.over or late
+        rewards = np.array([step.reward for step in steps])
+        return self._observed(steps), rewards, terminated, truncated, self._infos(steps)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """What each camera sees (H, W, 3) uint8; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        return tuple(self.pictures.drawn([episode.seen for episode in self.episodes])[0])
+
+    def _taken(self, asked: list[Asked]) -> list[Step]:
+        answers = self.setting.answers.answer(asked)
+        return [episode.take(touched) for episode, touched in zip(self.episodes, answers, strict=True)]
+
+    def _observed(self, steps: Sequence[Step]) -> Any:
+        states = np.stack([step.states for step in steps])
+        if self.observation == "states":
+            return states
+        colour, depth = self.pictures.drawn([episode.seen for episode in self.episodes])
+        return {"rgb": colour, "depth": depth, "states": states}
+
+    def _infos(self, steps: Sequence[Step]) -> dict[str, Any]:
+        """The truth as arrays with a row for each environment, and Gymnasium's masks of who has it: all."""
+        infos = {name: np.stack([step.info[name] for step in steps]) for name in steps[0].info}
+        return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
+
+
+def many(task: str, count: int, processes: bool = False, **given: Any) -> VectorEnv:
+    """So many environments of a task, as `gymnasium.make_vec` makes them.
+
+    Parameters
+    ----------
+    processes
+        Whether each has a process of its own. Children begin anew, for what holds a card cannot be forked: a script
+        that asks for them needs `if __name__ == "__main__":`.
+    given
+        Other arguments of `Operation`.
+
+    Raises
+    ------
+    InputError
+        As `Operation`.
+    """
+    name = f"{NAMESPACE}/{find_task(task).name.capitalize()}-v0"
+    if processes:
+        return make_vec(name, count, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **given)
+    return make_vec(name, count, **given)

@@ -11,18 +11,57 @@ from sim.errors import InputError
 
 from ..script.camera_paths import wandering
 from ..script.tool_paths import smooth
-from .observation import FELT, SEEN, TRACKED, states
-from .pictures import Seen
-from .reward import Judged, earned
+from .observation import FELT, SEEN, TRACKED, Seen, states
 from .setting import Setting
 from .tasks import OVER, SECONDS, Goal
 from .tool_motion import Hand, frame_of, laid, lever_of, moved, trembling
 from .touched import Asked, Touched
 
+STEP, OVER_LIMIT, DONE, ENDED = 0.01, 0.5, 10.0, -10.0
+"""A step costs, a step over a limit costs, success brings, and the end at a limit brings so much."""
+SHARE = 3.0
+"""What each share that is cut brings."""
+FAR, NEAR = 0.03, 0.01
+"""Distances [m] beyond which all count alike, and that count 1."""
 # A hand trembles by up to so much [m, standard deviation]; tools begin so far above the cortex, and so far aside [m].
 TREMOR, ABOVE, ASIDE = 1e-4, (5e-3, 8e-3), (3e-3, 8e-3)
 # The fluid falls within so many steps.
 DRAINS = 60
+
+
+@dataclass(frozen=True)
+class Judged:
+    """How far an episode is from its goal.
+
+    Parameters
+    ----------
+    away
+        Of the tool from its place [m].
+    off
+        Of what is reached from what is asked for, as a share of that.
+    cut
+        Shares of the tumour that are cut.
+    load
+        The force, or the pressure, as a share of its limit: the greater of both.
+    """
+
+    away: float
+    off: float
+    cut: int
+    load: float
+
+    @property
+    def potential(self) -> float:
+        """What a policy climbs: its differences are rewarded."""
+        return SHARE * self.cut - min(self.away, FAR) / NEAR - min(self.off, 1.0)
+
+
+def earned(before: Judged, now: Judged, success: bool, ended: bool) -> float:
+    """The reward of a step from one state to the next; `ended`: at a limit, without success."""
+    reward = now.potential - before.potential - STEP
+    if now.load > 1.0:
+        reward -= OVER_LIMIT
+    return float(reward + (DONE if success else ENDED if ended else 0.0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,5 +28,5 @@ def register_environments() -> None:
                 "scenes.gym.environment:Operation",
                 max_episode_steps=STEPS,
                 kwargs={"task": name.lower()},
-                vector_entry_point="scenes.gym.vector:Operations",
+                vector_entry_point="scenes.gym.environment:Operations",
             )

@@ -19,7 +19,7 @@ from sim.fem import Fem
 from sim.loads import Loads, Resected
 from sim.material import Tissue
 from sim.runtime.device import find_device
-from surrogate.model.tool_pressure import knows_pressure
+from surrogate.model.guarded import knows_pressure
 
 from ..play.deformers import Theatre, open_theatre
 from ..play.learned_regions import learned_regions
@@ -29,10 +29,8 @@ from ..script.shipped_files import spatula_model_path
 from ..script.site import Site
 from ..script.tool import Blade, Probe
 from .cut_elements import CutElements
-from .hertz import Hertz
-from .posed_elements import PosedElements
-from .posed_model import PosedModel
-from .pressed_model import PressedModel
+from .posed_model import PosedElements, PosedModel
+from .pressed_model import Hertz, PressedModel
 from .tasks import Goal, Task
 from .touched import Answers
 

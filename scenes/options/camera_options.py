@@ -78,7 +78,7 @@ def filmed_with_targets(args: argparse.Namespace, scene: Scene) -> Scene:
     InputError
         As `filmed`; a camera that zooms.
     """
-    from ..tracked.reference_place import VIEW, from_where_it_sees_all
+    from ..tracked.filming import VIEW, from_where_it_sees_all
 
     if args.path == "microscope":
         raise InputError("--path microscope zooms, and a tracked camera has one calibration: choose another path.")

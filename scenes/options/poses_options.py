@@ -13,8 +13,7 @@ from sim.errors import InputError
 
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
-    from ar.tracking.clocks import Clock
-    from ar.tracking.pose_stream import PoseStream
+    from ar.tracking.pose_stream import Clock, PoseStream
 
     from ..tracked.elsewhere import Elsewhere
 
@@ -120,8 +119,8 @@ def _say_apart(args: argparse.Namespace, elsewhere: Elsewhere) -> None:
 
 def _clock_of(args: argparse.Namespace, calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:
     """The clock that is stated, or that the film's own markers tell."""
-    from ar.tracking.clocks import Clock
     from ar.tracking.pictures import film_of
+    from ar.tracking.pose_stream import Clock
 
     from ..tracked.elsewhere import clock_of_film
     from ..tracked.run import timed

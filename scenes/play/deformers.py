@@ -21,7 +21,7 @@ from sim.fem import Fem, solver_named
 from sim.loads import Loads
 from sim.resected_fem import Operated, finite_elements
 from sim.runtime.device import find_device
-from surrogate.data.stated_tissue import first_stated
+from surrogate.data.answer_rows import first_stated
 from surrogate.locating.locator import Locator
 from surrogate.locating.locator_files import load_locator, locator_path
 from surrogate.locating.regions import differing

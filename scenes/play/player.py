@@ -14,12 +14,11 @@ from ar.overlay.composite import Overlaid, composite, draw_points, head_lines
 from ar.overlay.gauge import Gauge
 from ar.overlay.hud import NARROW, folded, lay
 from ar.overlay.legend import Names
-from ar.overlay.marks import Cover, Marks, Words
+from ar.overlay.marks import Cover, Marks, Trace, Words
 from ar.overlay.styles import Style
-from ar.overlay.traces import Trace
 from ar.rendering.layer import Layer
+from ar.rendering.real_picture import vignetted
 from ar.rendering.renderer import Picture
-from ar.rendering.vignette import vignetted
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
 from sim.geometry.ball_at_rest import resting_tip

@@ -8,8 +8,7 @@ import numpy as np
 
 from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
-from surrogate.data.direction_split import leave_sectors_out
-from surrogate.data.disc_split import Split
+from surrogate.data.splits import Split, leave_sectors_out
 from surrogate.evaluation.coverage import TENTHS, coverage
 from surrogate.evaluation.score import bare_microseconds, single_seconds
 from surrogate.evaluation.solve_counts import SolveCounts

@@ -17,11 +17,11 @@ from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Pushed
 from sim.runtime.device import find_device
 from sim.runtime.versions import version_of
+from surrogate.data.answer_rows import BRAIN, stated_tissue
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
-from surrogate.data.disc_split import Split, leave_discs_out
 from surrogate.data.encode import directions
-from surrogate.data.stated_tissue import BRAIN, stated_tissue
+from surrogate.data.splits import Split, leave_discs_out
 from surrogate.training.expansion import Expansion
 
 from ..script.shipped_files import template_path

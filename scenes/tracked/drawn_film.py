@@ -20,8 +20,7 @@ from ..play.stage import Stage
 from ..script.camera_paths import HandHeld
 from ..script.scene import find_scene
 from ..script.site import Site
-from .filming import Mounted, Shot, Taking, Trouble, mounted, shots_of
-from .reference_place import USUAL, VIEW, from_where_it_sees_all
+from .filming import USUAL, VIEW, Mounted, Shot, Taking, Trouble, from_where_it_sees_all, mounted, shots_of
 
 SCENE = "palpate"
 """The scene that is filmed."""

@@ -10,26 +10,33 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
+from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera
+from ar.optics.lens import Lens
 from ar.optics.rolling_shutter import row_bands, time_of_point
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Renderer
-from ar.tracking.detection import window_round
 from ar.tracking.drawn import drawn
+from ar.tracking.pose import moved_about
 from ar.tracking.registration import Registration
-from ar.tracking.rigid import moved_about
 from ar.tracking.stamp import stamped
-from ar.tracking.targets import Target, patient_reference, tool_cube
+from ar.tracking.targets import Target, patient_reference, tool_cube, window_round
 from sim.errors import InputError
 from sim.tools import BuiltIn
 
 from ..play.player import Player
 from ..play.stage import TOOL, TOOL_COLOUR
 from ..script.site import Site
-from .reference_place import reference_beside
+from ..script.viewpoint import Viewpoint
 from .registration_file import scanned_of
 from .tracked_tool import TrackedTool
 
+USUAL = Calibration((1400.0, 1400.0), (620.0, 540.0), 1280, 960, Lens(-0.1, 0.02, 5e-4, -3e-4), "sulcus film")
+"""The camera of a film that says nothing else."""
+VIEW = Viewpoint(distance=0.32).calibrated(USUAL)
+"""At arm's length: it sees the opening, the reference beside it and the tool's cube."""
+# The reference's middle from the site, to the right, up and outwards [m]; turned from the line of sight [degree].
+BESIDE, TURNED = (-0.078, 0.010, 0.022), (28.0, -24.0)
 # From the tool's tip up its shaft to the middle of its cube [m].
 MOUNT = 0.09
 # Of a hand that covers a target; by what an over-exposed picture is brighter; pixels of a smear.
@@ -42,6 +49,23 @@ KINDS = {
     "gap": "there are no pictures",
 }
 """What may go wrong in a film, and how it is called."""
+
+
+def from_where_it_sees_all(view: Viewpoint) -> Viewpoint:
+    """The same camera, from where its picture shows as much as that of `VIEW` does."""
+    assert view.calibration is not None
+    longer = (view.calibration.focal[1] / view.height) / (USUAL.focal[1] / USUAL.height)
+    return replace(view, distance=longer * VIEW.distance)
+
+
+def reference_beside(site: Site, camera: Camera) -> np.ndarray:
+    """T_scan_patient (4, 4) of the reference beside a site, as `camera` sees it from in front."""
+    right, up, outwards = BESIDE
+    middle = site.origin + right * site.right + up * site.up - outwards * site.axis
+    T = np.eye(4)
+    T[:3, :3] = camera.T_camera_world[:3, :3].T @ Rotation.from_euler("xy", TURNED, degrees=True).as_matrix()
+    T[:3, 3] = middle - T[:3, :3] @ [*(0.5 * patient_reference().faces[0].size), 0.0]
+    return T
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,15 @@ from scipy.stats import chi2
 
 from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera
-from ar.tracking.calibration_error import calibration_error
+from ar.tracking.intrinsics import calibration_error
 from ar.tracking.pose import Pose
 from ar.tracking.registration import Registration
 from ar.tracking.targets import patient_reference, tool_cube
 from ar.tracking.track import Tracked, Tracker
 
 from ..script.uncertainty import DEVIATIONS, LEVEL
-from .agreement import Agreement
+from .agreement import Agreement, implausible, misplaced_tool
 from .elsewhere import Elsewhere
-from .plausible import implausible, misplaced_tool
 from .tool_motion import Motion, ToolMotion
 from .tracked_tool import TrackedTool
 

@@ -11,10 +11,9 @@ from ar.optics.camera import Camera
 from ar.overlay.composite import HEAD_WIDTHS, Overlaid, composite, write_doubt, write_head
 from ar.overlay.gauge import Gauge
 from ar.overlay.hud import bound_words, folded
-from ar.overlay.marks import Cover, Marks, Words
+from ar.overlay.marks import BEFORE, DOTTED, Cover, Marks, Words
 from ar.overlay.outlines import box_around, dash, ink_of, joined, outlines, silhouette
 from ar.overlay.styles import NOTICED, Opening, Style
-from ar.overlay.traces import BEFORE, DOTTED
 from ar.rendering.layer import Layer
 from ar.rendering.real_picture import real_picture
 

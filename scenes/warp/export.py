@@ -16,15 +16,12 @@ from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, faded, faint_of, forward_on, warp_grid
 
 from .images import Picture, Warped, write_field_nifti, write_warped
-from .landmarks import CENTROID, Landmark, centroid_now
-from .markups import write_markups
+from .markups import CENTROID, Landmark, centroid_now, write_markups
 from .meshes import mesh_of, write_glb, write_stl, write_vtp
 from .moment import Moment
-from .nrrd_files import write_field_nrrd, write_field_sequence
-from .places import Folded, Places, folds_of, places_of
+from .nrrd_files import write_field_nrrd, write_field_sequence, write_segmentation
+from .places import ENOUGH, Folded, Places, fields_of, folds_of, places_of
 from .readme import page
-from .segmentation import write_segmentation
-from .spacing import ENOUGH, fields_of
 
 LOOKS = {
     "brain": (0.86, 0.72, 0.66, 0.35),

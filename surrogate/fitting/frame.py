@@ -1,10 +1,11 @@
-"""What is seen in one frame: the open cortex, and where a tool presses on it, how hard if that is known."""
+"""Frames with observed points and tools, and the CSV table of those tools."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from sim.errors import InputError
 from sim.geometry.closest_point import closest
 
 from ..locating.observation import FAR_NOW, Observation, placed
+from ..locating.observed_files import PLACE, SIGMA, read_columns
 
 RADIUS = 6e-3
 """Of the disc on which a tool presses, if nothing else is known [m]."""
@@ -21,6 +23,12 @@ RADIUS = 6e-3
 RADII, HARDEST = (0.5e-3, 30e-3), 10.0
 FORCE_SIGMA = 0.1
 """Standard deviation of a force that is read, as a share of it, if nothing else is known."""
+FRAME, WIDE, FORCE = "frame", "radius", "force"
+# What may follow the place, and which columns cells may be empty of.
+ALLOWED = {
+    (FRAME, *PLACE, *more) for more in ((), (WIDE,), (FORCE,), (WIDE, FORCE), (FORCE, SIGMA), (WIDE, FORCE, SIGMA))
+}
+EMPTY = (WIDE, FORCE, SIGMA)
 
 
 @dataclass(frozen=True)
@@ -104,3 +112,28 @@ def _check(anatomy: Anatomy, tool: Tool) -> None:
         raise InputError(f"a force of {tool.force:g} N is none of a tool on a brain: give newtons, up to {HARDEST:g}.")
     if tool.sigma is not None and (tool.force is None or not tool.sigma > 0.0):
         raise InputError("a force's sigma needs a force, and is positive: give both in newtons, or neither.")
+
+
+def read_tools(path: str | Path, frames: int) -> tuple[tuple[Tool, ...], ...]:
+    """Read `frame,x,y,z[,radius][,force[,sigma]]`: the tools of each of so many frames, which count from 1.
+
+    Cells of radius, force and sigma may be empty: the usual radius, and a force that nobody read.
+
+    Raises
+    ------
+    InputError
+        A file that is missing or no such table; a frame that there is not.
+    """
+    columns = read_columns(path, ALLOWED, EMPTY)
+    found: list[list[Tool]] = [[] for _ in range(frames)]
+    for row, number in enumerate(columns[FRAME]):
+        if number not in range(1, frames + 1):
+            raise InputError(
+                f"{path}: row {row + 2} is of frame {number:g}, but there are {frames}: they count from 1."
+            )
+        radius, force, sigma = (
+            None if name not in columns or np.isnan(columns[name][row]) else float(columns[name][row]) for name in EMPTY
+        )
+        x, y, z = (1e-3 * float(columns[name][row]) for name in PLACE)
+        found[int(number) - 1].append(Tool((x, y, z), RADIUS if radius is None else 1e-3 * radius, force, sigma))
+    return tuple(map(tuple, found))

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.special import logsumexp
 
 from sim.effects import SKULLS
+from sim.errors import InputError
 
 from ..array_functions import squared_distances
 from ..locating.causes import DRAINAGE
 from ..locating.evidence import Evidence, alike
+from ..locating.locator import Locator
 from ..locating.prior import Prior
+from .frame import Frame
 from .responses import LINEAR, Responses
 
 LACK, LACK_LENGTH = 0.05, 10e-3
@@ -101,3 +107,35 @@ def _weighed(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: floa
         half = np.linalg.solve(root, times * pull[..., None])[..., 0]
         logs.append(0.5 * (half**2).sum(axis=-1) - np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1))
     return logsumexp(logs, axis=0) - np.log(len(SIZES))
+
+
+def unsupported(locator: Locator, frames: Sequence[Frame]) -> tuple[np.ndarray, ...]:
+    """Of each frame the numbers (k,) of points, from 0, that `Locator.locate` leaves out.
+
+    Raises
+    ------
+    InputError
+        A frame that no cause explains, or of which more than a third is left out.
+    """
+    found = []
+    for number, frame in enumerate(frames, start=1):
+        try:
+            found.append(locator.locate(frame.observation).outliers)
+        except InputError as error:
+            raise InputError(f"frame {number}: {error}") from error
+    return tuple(found)
+
+
+def without(frames: Sequence[Frame], left_out: Sequence[np.ndarray]) -> list[Frame]:
+    """Frames of points that have names, without those of some numbers (k,) in each."""
+    return [
+        _without(frame, numbers) if len(numbers) else frame for frame, numbers in zip(frames, left_out, strict=True)
+    ]
+
+
+def _without(frame: Frame, numbers: np.ndarray) -> Frame:
+    seen = frame.observation
+    assert seen.rest is not None
+    kept = np.delete(np.arange(len(seen.now)), numbers)
+    sigma = None if seen.sigma is None else seen.sigma[kept]
+    return replace(frame, observation=replace(seen, now=seen.now[kept], rest=seen.rest[kept], sigma=sigma))

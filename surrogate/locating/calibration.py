@@ -12,12 +12,11 @@ from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.geometry.locate import Located
 
-from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL
+from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, Presses
 from .ensemble import Ensemble, surface_size
 from .evidence import SIGMA, Evidence, of_motions
 from .observation import Observation
 from .posterior import Posterior
-from .presses import Presses
 from .prior import Prior, middle_of, prior_of
 from .rounds import settled
 

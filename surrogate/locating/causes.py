@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
+from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.bodies.fluid_level import fluid_level
 from sim.bodies.open_cortex import open_cortex
 from sim.effects import SKULLS, Effect, Gravity, Held, Pulsation, ToolForce, Wave
+from sim.fem import Fem
 from sim.loads import Loads, Posture, Pushed
 from sim.material import Material, Ogden
 
@@ -21,6 +24,9 @@ KINDS = ("tool", "drainage", "swelling", "tumour swelling", "oedema")
 TOOL, DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA = range(len(KINDS))
 # Swelling is one rising wave, and another that does nothing.
 RISE = Wave(0.25, 0.0)
+# Points of the open cortex, and tissues: Poisson's ratio of the brain, tumour stiffness over the brain's.
+POINTS, TISSUES = 70, ((0.45, 2.0), (0.49, 0.7))
+ACCURACY = Accuracy(tolerance=1e-3)
 
 
 @dataclass(frozen=True)
@@ -192,3 +198,45 @@ def directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) ->
     side /= np.linalg.norm(side)
     other, sine = np.cross(axis, side), np.sqrt(1.0 - cosine**2)
     return cosine[:, None] * axis + (sine * np.cos(angle))[:, None] * side + (sine * np.sin(angle))[:, None] * other
+
+
+@dataclass(frozen=True, eq=False)
+class Presses:
+    """Motions by forces of one size.
+
+    Parameters
+    ----------
+    points
+        (p, 3) [m] of the open cortex.
+    motion
+        By name of the skull: (tissues, p, 3, V, 3) float32 [m], by a force along each axis.
+    """
+
+    points: np.ndarray
+    motion: dict[str, np.ndarray]
+
+
+def pressed(
+    anatomy: Anatomy, skulls: tuple[str, ...], device: str = "auto", regions: tuple[Region, ...] = ()
+) -> Presses:
+    """Solve linear tissue under forces of 0.01 N, spread over 7 mm, in each of some skulls, with known `regions`."""
+    nodes = anatomy.mesh.nodes[np.unique(anatomy.open_surface)]
+    points = nodes[spaced(nodes, POINTS)]
+    force = np.tile(0.01 * np.eye(3), (len(points), 1))
+    loads = Loads((Pushed(np.repeat(points, 3, axis=0), force, np.full(len(force), SPREAD)),))
+    found: dict[str, list[np.ndarray]] = {name: [] for name in skulls}
+    for name, (poisson, ratio) in product(skulls, TISSUES):
+        effects = (beside(linear, poisson, ratio, regions), Held(), SKULLS[name], ToolForce())
+        motion = Fem(anatomy, effects, ACCURACY, device).deform(loads).displacement
+        found[name].append(motion.reshape(len(points), 3, -1, 3).astype(np.float32))
+    return Presses(points, {name: np.stack(parts) for name, parts in found.items()})
+
+
+def spaced(points: np.ndarray, count: int) -> np.ndarray:
+    """Numbers of `count` of the points (n, 3), each as far as can be from those before."""
+    found = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmin())]
+    away = np.full(len(points), np.inf)
+    while len(found) < min(count, len(points)):
+        away = np.minimum(away, ((points - points[found[-1]]) ** 2).sum(axis=1))
+        found.append(int(away.argmax()))
+    return np.array(found)

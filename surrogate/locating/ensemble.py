@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from sim.accuracy import Accuracy
-from sim.anatomy import Anatomy
+from sim.anatomy import BRAIN_LABEL, PART_LABELS, Anatomy
 from sim.deformation import Deformation
 from sim.discretisation.space import recommended
 from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
 
-from ..model.kept_arrays import kept_arrays, kept_path
+from ..model.npz_archive import kept_arrays, kept_path
 from .causes import (
     DRAINAGE,
     OEDEMA,
@@ -30,13 +31,27 @@ from .causes import (
     groups,
     pushes,
     swellings,
-)  # fmt: skip
-from .oedema import round_tumour
+)
 
 # Thousandths of the motion: far below what is seen.
 ACCURACY = Accuracy(tolerance=3e-3)
 # A member that moves the open cortex by less than this [m] tells shapes of rounding.
 LEAST_MOTION = 2e-5
+
+
+def round_tumour(anatomy: Anatomy, reach: float) -> tuple[Anatomy, tuple[int, ...]]:
+    """The body with brain that lies within `reach` [m] of its tumour as a region of its own, and labels of what swells.
+
+    These are that region's, and that of oedema which the anatomy marks, as far as they are there. Tissue stays as it
+    is where laws name no region but those of the anatomy.
+    """
+    mesh = anatomy.mesh
+    tumour = KDTree(mesh.nodes[anatomy.tumour_nodes])
+    away, _ = tumour.query(mesh.nodes[mesh.tets].mean(axis=1))
+    own = int(mesh.region.max()) + 1
+    region = np.where((mesh.region == BRAIN_LABEL) & (away < reach), own, mesh.region)
+    swells = np.intersect1d(region, [own, PART_LABELS["oedema"]])
+    return replace(anatomy, mesh=replace(mesh, region=region)), tuple(swells.tolist())
 
 
 @dataclass(frozen=True, eq=False)

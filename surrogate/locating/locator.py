@@ -17,11 +17,10 @@ from .calibration import covering_factor, was_tried
 from .cause_shares import CauseShare, cause_shares, drawn_shares
 from .causes import KINDS
 from .observation import Observation, looked_at
-from .posterior import Posterior
+from .posterior import Posterior, within_errors
 from .prior import Prior
 from .regions import Region
 from .rounds import settled
-from .stillness import within_errors
 
 # More points than this share are no outliers, and no cause of the ensemble moves what this is more surprised by.
 MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5

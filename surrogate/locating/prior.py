@@ -16,9 +16,8 @@ from sim.anatomy import Anatomy
 from sim.effects import SKULLS
 from sim.errors import InputError
 
-from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, TUMOUR_SWELLING
+from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, TUMOUR_SWELLING, Presses, spaced
 from .ensemble import Ensemble, surface_size
-from .presses import Presses, spaced
 
 # Shapes of each kind in each skull, at most; the least share of the variance that one of them has.
 MOST = {DRAINAGE: 12, SWELLING: 12, TUMOUR_SWELLING: 4, OEDEMA: 8, TOOL: 40}

@@ -9,10 +9,9 @@ from sim.anatomy import Anatomy
 from sim.runtime.threads import one_thread
 
 from .calibration import TRIALS, trials
-from .causes import USUAL, Causes
+from .causes import USUAL, Causes, pressed
 from .ensemble import solved
 from .locator import Locator
-from .presses import pressed
 from .prior import PRESSED, prior_of
 from .regions import check_regions
 

@@ -26,8 +26,8 @@ from sim.effects import (
 from sim.material import Pairs
 from sim.tools import BuiltIn, Tool, named
 
+from ..data.answer_rows import stated_tissue
 from ..data.holding import series_of
-from ..data.stated_tissue import stated_tissue
 from .learned import Learned
 
 # Effects that do nothing until a load calls for them: a model's training may have more of them than a scene.

@@ -21,11 +21,11 @@ from sim.material import Pairs
 from sim.runtime.threads import one_thread
 from sim.tools import BuiltIn
 
+from ..data.answer_rows import stated_tissue
 from ..data.cortex_patch import Patch, nearest, open_patch
 from ..data.encode import ENCODERS, Basis, Encoder, directions
 from ..data.holding import stated_series
 from ..data.indentation import indented, posed, with_relaxed
-from ..data.stated_tissue import stated_tissue
 from ..regressors.protocol import Fitted
 from ..regressors.rigid_contact import Contact
 from .conformal import LEVELS, Bound, features_of

@@ -20,17 +20,14 @@ from sim.runtime.outside_files import path_of, read_as
 from sim.runtime.versions import version_of
 from sim.tools import stated_tool
 
+from ..data.answer_rows import first_stated
 from ..data.encode import Basis
-from ..data.stated_tissue import first_stated
 from ..regressors.ann import Ann
-from ..regressors.compliance_table import Linear
-from ..regressors.force_pairs import Pairs
-from ..regressors.force_series import Series
+from ..regressors.force_series import Pairs, Remainder, Series
 from ..regressors.gp import Gp
 from ..regressors.pcr import Pcr
-from ..regressors.protocol import Fitted, Regressor
+from ..regressors.protocol import Fitted, Linear, Regressor
 from ..regressors.rigid_contact import Contact
-from ..regressors.series_residual import Remainder
 from ..regressors.svr import Svr
 from .conformal import GROWTH, Bound
 from .learned import Learned, Part

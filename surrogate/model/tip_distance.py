@@ -10,8 +10,8 @@ from sim.loads import Pushed
 
 from ..data.cortex_patch import Patch
 from ..data.encode import directions, tool_features
+from ..regressors.force_series import with_pressing
 from ..regressors.gp import Gp
-from ..regressors.series_residual import with_pressing
 from .conformal import Bound
 
 # Training loads at most: those that fit the process's lengths, and those that it is conditioned on.

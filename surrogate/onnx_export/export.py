@@ -22,12 +22,10 @@ from ..model.conformal import LEVELS
 from ..model.learned import Learned
 from ..model.training_range import measured
 from ..regressors.ann import Ann
-from ..regressors.compliance_table import Linear
-from ..regressors.force_pairs import Pairs
-from ..regressors.force_series import Series
+from ..regressors.force_series import Pairs, Remainder, Series
 from ..regressors.gp import Gp
 from ..regressors.pcr import Pcr
-from ..regressors.series_residual import Remainder
+from ..regressors.protocol import Linear
 from ..regressors.svr import Svr
 from .graph import Port, Sheet
 

@@ -1,4 +1,4 @@
-"""The finite elements' power series in the force, tabulated over the open cortex: what needs no learning."""
+"""Power series of the force: single forces, pairs of forces, and a Gaussian process for the remainder."""
 
 from __future__ import annotations
 
@@ -9,8 +9,12 @@ from itertools import combinations_with_replacement
 from typing import Self
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
-from ..array_functions import Rounded, in_chunks, taken
+from sim.errors import InputError
+
+from ..array_functions import Rounded, columns_in_use, in_chunks, product_of, taken
+from .gp import Gp
 
 ORDERS = 3
 # Which components of the direction are multiplied, order by order: 3, 6 and 10 products.
@@ -22,6 +26,14 @@ TERMS = SPANS[-1].stop
 STENCIL = 3
 # What a share of -1 counts for, as a height [m].
 BESIDE = 1e-2
+# Share of the largest training force, below which the remainder is smaller than the table's own errors.
+FAINT = 0.4
+# What the process's dual coefficients are rounded to [m], at the largest force: a file then takes a third of the bytes.
+DUAL_STEP = 2e-6
+# Those of `tool_features`, and force over radius.
+FEATURES = 9
+# Axes along which places spread by less than this share of the widest are none: a flat cortex has two.
+FLAT = 1e-6
 
 
 def forms(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -131,3 +143,136 @@ class Series:
             beside = at[:, np.roll(np.arange(width), other)]
             weight = weight * (x - beside) / (at - beside)
         return index, weight
+
+
+class Remainder:
+    """A Gaussian process of the response's remainder in units of force^3 + faint^3.
+
+    The first neglected order goes with force^3, so that the rows of strong loads weigh no more than those of weak ones.
+    Its features are `tool_features` and force over radius, to which indentation is in proportion.
+    """
+
+    gp_: Gp
+    faint_: np.ndarray
+
+    def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
+        """Learn from `tool_features` X (n, 8) and remainders Y (n, r)."""
+        self.faint_ = np.array(FAINT * X[:, 6].max())
+        self.gp_ = Gp().fit(with_pressing(X), Y / self._unit(X))
+        strongest = X[[X[:, 6].argmax()]]
+        step = np.exp2(np.floor(np.log2(DUAL_STEP / (strongest[0, 6] * self._unit(strongest).item()))))
+        self.gp_.dual_ = (np.rint(self.gp_.dual_ / step) * step).astype(np.float32)
+        return self
+
+    def predict(self, X: np.ndarray) -> np.ndarray:
+        """Coefficients (B, r) float32 of `tool_features` (B, 8)."""
+        return (self.gp_.predict(with_pressing(X)) * self._unit(X)).astype(np.float32)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The process's, and `faint` [N]."""
+        return {**self.gp_.state(), "faint": self.faint_}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
+        """From `state`."""
+        model = cls()
+        model.faint_ = state["faint"]
+        model.gp_ = Gp.restored({name: array for name, array in state.items() if name != "faint"})
+        return model
+
+    def _unit(self, X: np.ndarray) -> np.ndarray:
+        """(n, 1) [N^3]."""
+        return X[:, 6:7] ** ORDERS + self.faint_**ORDERS
+
+
+def with_pressing(X: np.ndarray) -> np.ndarray:
+    """`tool_features` (n, 8), and force over radius: (n, 9)."""
+    return np.column_stack([X, X[:, 6] / X[:, 7]])
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """A regressor that predicts what the second order adds to the response, from `rooted_shares`.
+
+    Parameters
+    ----------
+    pairs
+        (P, 2): two force components, of the nodes of the open cortex.
+    table
+        (P, r): coefficients of the basis's modes for each pair's product [1/N^2].
+    """
+
+    pairs: np.ndarray
+    table: Rounded
+
+    def predict(self, X: np.ndarray) -> np.ndarray:
+        """Coefficients (B, r) float32 of `rooted_shares` (B, 3 m)."""
+        return in_chunks(self._predicted, X)
+
+    def _predicted(self, X: np.ndarray) -> np.ndarray:
+        used = columns_in_use(X)
+        row = self._rows[used[:, None], used]
+        row = row[row >= 0]
+        first, second = self.pairs[row].T
+        return product_of((X[:, first] * X[:, second]).astype(np.float32), self.table, row)
+
+    @cached_property
+    def _rows(self) -> np.ndarray:
+        """The row (n, n) int32 of each pair of components, or -1."""
+        out = np.full((self.pairs.max(initial=-1) + 1,) * 2, -1, np.int32)
+        out[self.pairs[:, 0], self.pairs[:, 1]] = np.arange(len(self.pairs))
+        return out
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Pairs, and the table: whole numbers of steps, `share`, and the step of each mode, `unit`."""
+        return {"pairs": self.pairs.astype(np.int32), "unit": self.table.step, "share": self.table.whole}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
+        """From `state`; files of earlier versions have float16 in place of whole numbers."""
+        return cls(state["pairs"], Rounded(state["share"], state["unit"]))
+
+
+def filled(points: np.ndarray, table: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+    """A table without the rows of the places that are `left_out`: there the others are interpolated.
+
+    By cubic radial basis functions with a linear polynomial (Duchon 1977, "Splines minimizing rotation-invariant
+    semi-norms"), which reproduce fields that are linear in the place.
+
+    Parameters
+    ----------
+    points
+        (P, 3) [m].
+    table
+        (P, ...) of any unit.
+    left_out
+        (P,) bool.
+
+    Raises
+    ------
+    InputError
+        Every place is left out.
+    """
+    if not left_out.any():
+        return table
+    if left_out.all():
+        raise InputError(
+            "the discs left out hold all places of the cortex at which the finite elements were asked, so that nothing "
+            "is known outside: leave out fewer or smaller discs."
+        )
+    known = points[~left_out]
+    middle, length = known.mean(axis=0), np.ptp(points, axis=0).max()
+    _, size, axes = np.linalg.svd(known - middle, full_matrices=False)
+    axes = axes[size > FLAT * max(size[0], np.finfo(float).tiny)]
+
+    def at(where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        tail = np.column_stack([np.ones(len(where)), (where - middle) @ axes.T / length])
+        return (cdist(where, known) / length) ** 3, tail
+
+    kernel, tail = at(known)
+    corner = np.zeros((tail.shape[1], tail.shape[1]))
+    matrix = np.block([[kernel, tail], [tail.T, corner]])
+    weights = np.linalg.solve(matrix, np.hstack(at(points[left_out])).T)[: len(known)].T
+    out = table.copy()
+    out[left_out] = (weights @ table[~left_out].reshape(len(known), -1)).reshape(-1, *table.shape[1:])
+    return out

@@ -14,14 +14,12 @@ from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
 from ..data.holding import stated_series
 from ..data.indentation import indented, with_relaxed
-from ..evaluation.force_score import force_errors
-from ..evaluation.score import errors
+from ..evaluation.score import errors, force_errors
 from ..model.learned import Learned, only_pushed
 from ..model.relaxation import followed
-from .bounds import Missed, missed
+from .bounds import KnownDistances, Missed, distance_errors, missed
 from .examples import Examples
 from .expansion import Expansion
-from .tip_distance import Measured, distance_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +63,7 @@ class Answers:
     nodes: np.ndarray
     tumour: np.ndarray
     cortex: np.ndarray
-    distances: Measured
+    distances: KnownDistances
     force: np.ndarray | None
 
     def examples(self, rows: np.ndarray) -> Examples:
@@ -114,7 +112,7 @@ def answers_of(data: Dataset, shared: Expansion) -> Answers:
     tumour = data.displacement(nodes)[data.good]
     cortex = data.displacement(shared.cortex)[data.good]
     at, both = np.concatenate([nodes, shared.cortex]), np.concatenate([tumour, cortex], axis=1)
-    distances = Measured(loads, tip_gauge(data.anatomy).distances(loads, both, at, data.tool))
+    distances = KnownDistances(loads, tip_gauge(data.anatomy).distances(loads, both, at, data.tool))
     reaction = None if data.tool is None else data.reaction()
     force = None if reaction is None else reaction[data.good, 0, :3]
     return Answers(loads, pushed, shared.patch, nodes, tumour, cortex, distances, force)

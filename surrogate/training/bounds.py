@@ -2,20 +2,55 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim.loads import Pushed, rows_of
+from sim.loads import Loads, Pushed, rows_of
 
 from ..data.cortex_patch import Patch
-from ..data.disc_split import Split
+from ..data.splits import Split
 from ..evaluation.coverage import Coverage, covered
 from ..model.conformal import CLASS, Bound, features_of, fitted_bound, fitted_growth
 from ..model.learned import Learned
+from ..model.tip_distance import MOST, TipModel, fitted_correction
 from ..model.training_range import Measured, Outside, measured
 
 SCALE, ENOUGH = 3, CLASS
+
+
+@dataclass(frozen=True, eq=False)
+class KnownDistances:
+    """Loads, and the finite elements' distances (B,) [m] from tip to tumour under them."""
+
+    loads: Loads
+    distance: np.ndarray
+
+    def rows(self, index: np.ndarray | slice) -> KnownDistances:
+        """Some of them: numbers, a slice, or (B,) bool."""
+        return KnownDistances(self.loads.rows(index), self.distance[index])
+
+
+def distance_errors(model: Learned, known: KnownDistances) -> np.ndarray:
+    """How far (B,) [m] a model's distances are from the finite elements'."""
+    return np.abs(model.distance(known.loads).value - known.distance)
+
+
+def with_correction(model: Learned, patch: Patch, known: KnownDistances) -> Learned:
+    """The model with a correction of its distances, learned from its training loads or some of them."""
+    plain, some = replace(model, tip=TipModel()), known.rows(slice(None, None, -(-len(known.loads) // MOST)))
+    off = some.distance - plain.distance(some.loads).value
+    return replace(model, tip=TipModel(fitted_correction(patch, model.asked(some.loads), off)))
+
+
+def corrected_if_better(
+    model: Learned, patch: Patch, trained: KnownDistances, held_out: KnownDistances
+) -> tuple[Learned, np.ndarray]:
+    """The model with a correction, if that brings held-out distances nearer on average; and their errors (B,) [m]."""
+    candidates = [replace(model, tip=TipModel()), with_correction(model, patch, trained)]
+    error = [distance_errors(each, held_out) for each in candidates]
+    best = int(error[1].mean() < error[0].mean())
+    return candidates[best], error[best]
 
 
 @dataclass(frozen=True)

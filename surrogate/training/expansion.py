@@ -24,19 +24,16 @@ from sim.runtime.outside_files import read_as
 from sim.runtime.versions import version_of
 
 from ..array_functions import Rounded, half_precision
+from ..data.answer_rows import stated_tissue
 from ..data.cortex_patch import Patch, open_patch
 from ..data.dataset import Dataset
 from ..data.encode import Basis, directions, nodal_shares, reduce
-from ..data.stated_tissue import stated_tissue
 from ..data.tool_loads import spread
 from ..model.applicability import trained_skull
-from ..model.kept_arrays import REMADE
 from ..model.learned import Part, only_pushed
-from ..model.npz_archive import Archive
-from ..regressors.compliance_table import Linear
-from ..regressors.force_pairs import Pairs
-from ..regressors.force_series import FACTORS, SPANS, Series
-from ..regressors.left_out_tables import filled
+from ..model.npz_archive import REMADE, Archive
+from ..regressors.force_series import FACTORS, SPANS, Pairs, Series, filled
+from ..regressors.protocol import Linear
 from ..regressors.rigid_contact import Contact
 from .condense_contact import condensed, side_by_side
 from .examples import Examples, left_by

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -10,23 +11,67 @@ import numpy as np
 from sim.errors import InputError
 from sim.loads import Pushed
 
-from ..data.cortex_patch import Patch
+from ..data.cortex_patch import Patch, nearest
 from ..data.encode import ENCODERS, Basis, directions, reduce
+from ..data.tool_loads import spread
 from ..model.learned import Part
 from ..model.own_learners import find_own, name_of
 from ..model.tool_force import ForceModel
 from ..regressors.ann import Ann
+from ..regressors.force_series import Remainder
 from ..regressors.gp import Gp
 from ..regressors.pcr import Pcr
 from ..regressors.protocol import Fitted, Teachable
 from ..regressors.rigid_contact import Contact
-from ..regressors.series_residual import Remainder
 from ..regressors.svr import Svr
 from .condense_contact import side_by_side
 from .examples import Examples, left_by
 from .expansion import COARSE, EXPANDED, TOUCHED, Expansion
 from .shared_inputs import SharedInputs
-from .tuning import Tuned
+
+# The loads nearest to so many places far apart are left out of the inner fits: about this share of all.
+CENTRES, SHARE = 6, 0.2
+# Fewer loads choose nothing: the first settings are taken. So many choose, and of the outputs the strongest decide.
+FEWEST, MOST, STRONGEST = 40, 600, 8
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Settings of a regressor, of which those are taken that are nearest on discs left out of the training rows.
+
+    One fit for each of the settings, to the strongest outputs of four fifths of the first rows, then one to all rows.
+
+    Parameters
+    ----------
+    settings
+        Regressors to choose from; the first is taken where there are few rows.
+    """
+
+    settings: tuple[Callable[[], Teachable], ...]
+
+    def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:
+        """The best of the regressors, trained on rows X (n, f) of `tool_features`, Y (n, r)."""
+        return self.settings[self.best(X, Y)]().fit(X, Y)
+
+    def best(self, X: np.ndarray, Y: np.ndarray) -> int:
+        """Which of the settings has the least squared error on the discs; the same rows choose the same."""
+        if len(X) < FEWEST or len(self.settings) == 1:
+            return 0
+        X, Y = X[:MOST], Y[:MOST]
+        left_out = inner_discs(X[:, :3])
+        strongest = Y[:, np.sort(np.argsort(-Y.std(axis=0), kind="stable")[:STRONGEST])]
+        errors = []
+        for make in self.settings:
+            model = make().fit(X[~left_out], strongest[~left_out])
+            errors.append(float(np.square(model.predict(X[left_out]) - strongest[left_out]).sum()))
+        return int(np.argmin(errors))
+
+
+def inner_discs(points: np.ndarray) -> np.ndarray:
+    """Which rows (n,) bool lie in discs round `CENTRES` of the points (n, 3) far from each other."""
+    distance = nearest(points, points[spread(points, CENTRES)])[1]
+    return distance <= np.quantile(distance, SHARE)
+
 
 # Settings to choose from, the usual ones first: units in a layer and weight decay; C and epsilon in quartile ranges.
 ANN = tuple(partial(Ann, hidden, decay) for hidden in (64, 128) for decay in (1e-2, 3e-3))

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..data.disc_split import Split
+from ..data.splits import Split
 from ..evaluation.solve_counts import SolveCounts
 from ..model.learned import Part
 from ..regressors.force_series import TERMS

@@ -12,10 +12,9 @@ from sim.runtime.timing import stage
 
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
-from ..data.disc_split import APART, MOST_APART, Split, leave_discs_out
+from ..data.splits import APART, MOST_APART, Split, leave_discs_out
 from ..evaluation.coverage import TENTHS, Coverage
-from ..evaluation.force_score import ForceScore, force_score
-from ..evaluation.score import Score, score
+from ..evaluation.score import ForceScore, Score, force_score, score
 from ..model.conformal import LEVELS, USUAL_GROWTH, conformal
 from ..model.learned import Learned, Part
 from ..model.left_out import left_out_of
@@ -24,12 +23,11 @@ from ..model.tip_distance import TipModel
 from ..model.tool_force import ForceModel
 from ..model.training_range import Envelope, envelope_of
 from .answers import Answers, Errors, answers_of
-from .bounds import WAYS, bound_by, bounds_on_discs, covered_by, growth_by
+from .bounds import WAYS, bound_by, bounds_on_discs, corrected_if_better, covered_by, growth_by, with_correction
 from .examples import Examples
 from .expansion import EXPANDED, TOUCHED, Expansion
 from .learners import LEARNT, POSED, force_of, parts_of
 from .shared_inputs import SharedInputs
-from .tip_distance import corrected_if_better, with_correction
 
 # Of pushes, and of poses.
 LEARNERS = ("linear", *LEARNT, *EXPANDED)

@@ -21,12 +21,12 @@ from ..reading.validation import solved_figures
 from ..reading.windows import episode_paths
 from ..run_folder import Run, episode_name, failed, read_run
 from ..weak_bodies import models_of, said_of_weak
-from .along import LICENCE as LICENCE_NAME
-from .along import SHEET
+from .columns import LICENCE as LICENCE_NAME
+from .columns import SHEET
 from .croissant import COLUMNS, croissant
 from .datasheet import MARK, NAME, datasheet
 from .origin import notice_of_template, of_template
-from .tasks import task_of
+from .statistics import task_of
 
 TABLE = "episodes.csv"
 NAMES = (TABLE, "croissant.json", SHEET, LICENCE_NAME)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
+from pathlib import Path
 
 import h5py
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sim.errors import InputError
 
-from ..reading.contents import Contents
+from ..reading.contents import LONGEST_TEXT, Contents
 from ..reading.rows import numbers_in
 from ..reading.schema import PICTURES
-from .motion import ACTION, STATE, states, twists
 
 # From one frame to the next, against the mean of all [s].
 UNEVEN = 1e-4
@@ -26,6 +27,10 @@ NUMBERS = (
 """Arrays that go into other formats as they are, a row for each frame, beside the tool's pose."""
 SPACE = "world: RAS [m]; camera: x right, y down, z forward [m]"
 """Where all places are."""
+STATE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+ACTION = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
+SHEET, LICENCE = "DATASHEET.md", "LICENSE.md"
+"""Their names."""
 
 
 def shared_pictures(episodes: Sequence[Contents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:
@@ -119,3 +124,45 @@ def file_names(episodes: Sequence[Contents]) -> Mapping[Contents, str]:
         found[one] = next(name for name in names if name not in taken)
         taken.add(found[one])
     return found
+
+
+def states(poses: np.ndarray) -> np.ndarray:
+    """(T, 7) float32 of `T_world_tool` (T, 4, 4): origin [m], and quaternion x, y, z, w that does not jump in sign."""
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    flips = np.sign(np.einsum("ij,ij->i", turns[1:], turns[:-1]))
+    turns[1:] *= np.cumprod(np.where(flips < 0.0, -1.0, 1.0))[:, None]
+    return np.concatenate([poses[:, :3, 3], turns], axis=1).astype(np.float32)
+
+
+def twists(poses: np.ndarray) -> np.ndarray:
+    """(T, 6) float32: shift of the tool's origin [m] and its turn [rad], both in world axes, to the next frame.
+
+    The last is zero.
+    """
+    shifts = np.diff(poses[:, :3, 3], axis=0)
+    turns = Rotation.from_matrix(poses[1:, :3, :3]) * Rotation.from_matrix(poses[:-1, :3, :3]).inv()
+    found = np.concatenate([shifts, turns.as_rotvec().reshape(-1, 3)], axis=1)
+    return np.concatenate([found, np.zeros((1, 6))]).astype(np.float32)
+
+
+def texts_along(episodes: Sequence[Contents]) -> Mapping[str, str]:
+    """The texts by the names that they go by; those of several folders are numbered. None where there are none."""
+    homes = dict.fromkeys(home_of(one.path.resolve().parent) for one in episodes)
+    found = {}
+    for number, home in enumerate(homes):
+        for path in (home / SHEET, home / LICENCE):
+            if path.is_file() and not path.is_symlink() and path.stat().st_size <= LONGEST_TEXT:
+                name = path.name if len(homes) == 1 else f"{path.stem}_{number}{path.suffix}"
+                found[name] = path.read_text(encoding="utf-8", errors="replace")
+    return found
+
+
+def write_along(episodes: Sequence[Contents], folder: Path) -> None:
+    """Write the texts into a folder."""
+    for name, text in texts_along(episodes).items():
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def home_of(folder: Path) -> Path:
+    """The data set's folder, of that which its episodes lie in."""
+    return folder.parent if folder.name == "episodes" and not (folder / LICENCE).exists() else folder

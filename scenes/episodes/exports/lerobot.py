@@ -23,10 +23,18 @@ from ..reading.contents import Contents
 from ..reading.open_files import opened
 from ..reading.rows import code_of, picture_of
 from ..reading.schema import COLOUR, DEPTH, PICTURES, suffix_of
-from .along import write_along
-from .columns import SPACE, blocks, named_axes, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size
-from .statistics import Spread
-from .tasks import task_of
+from .columns import (
+    SPACE,
+    blocks,
+    named_axes,
+    numbers_of,
+    rate_of,
+    shared_numbers,
+    shared_pictures,
+    stored_size,
+    write_along,
+)
+from .statistics import Spread, task_of
 
 VERSION = "v3.0"
 DEPTH_RANGE = (0.1, 0.6)

@@ -6,8 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from ...script.shipped_files import template_path
-from ..reading.bodies import is_template
-from ..reading.contents import Contents
+from ..reading.contents import Contents, is_template
 from .drawn import parameters_of
 
 TEMPLATE, DRAWN, UNKNOWN = "template", "drawn", ""

@@ -17,8 +17,7 @@ from ..reading.contents import Contents
 from ..reading.open_files import opened
 from ..reading.rows import code_of, numbers_in, rows_of
 from ..reading.schema import ARRAYS, PICTURES, SOLVED, suffix_of
-from .along import write_along
-from .columns import file_names, stored_size
+from .columns import file_names, stored_size, write_along
 
 WIDE = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")
 """Arrays with many numbers a frame, each in a table of its own."""

@@ -17,9 +17,8 @@ from ..reading.contents import Contents
 from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from ..reading.schema import COLOUR, PICTURES
-from .along import texts_along
-from .columns import SPACE, blocks, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size
-from .tasks import held_out, task_of
+from .columns import SPACE, blocks, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size, texts_along
+from .statistics import held_out, task_of
 
 EXPORTED = ("colour", "colour_right", "depth", "segmentation")
 # Decoded pictures, packed by gzip, against the episodes' JPEG and PNG.

@@ -13,12 +13,10 @@ import numpy as np
 
 from sim.runtime.atomic_files import written_folder, written_stream
 
-from ..reading.bodies import anatomy_of, surface_rows
-from ..reading.contents import Contents, array_in
+from ..reading.contents import Contents, anatomy_of, array_in, surface_rows
 from ..reading.open_files import opened
 from ..reading.rows import numbers_in
-from .along import write_along
-from .columns import SPACE, file_names, stored_size
+from .columns import SPACE, file_names, stored_size, write_along
 
 SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
 """What is written, and the surface of the anatomy that it is of."""

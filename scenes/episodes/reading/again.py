@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,10 @@ import h5py
 import numpy as np
 
 from sim.errors import InputError
+from sim.runtime.device import find_device
+from sim.runtime.file_limits import at_most
 from sim.runtime.outside_files import read_as
+from sim.runtime.processes import LostError, map_apart
 
 from ...play.reference import following, past_matters, truth_of
 from ..make import Opened, body_path, opened_body
@@ -20,10 +24,12 @@ from ..scripted import drawn_episode, scene_of
 from .contents import contents_of
 from .open_files import REMEDY, said_by_validate
 from .rows import numbers_in
-from .validation import Report
+from .validation import Report, validate_episode
 
 # How far two answers may be apart [mm]: at training accuracy; of frames that were played, at the live one.
 SAME_MM, LIVE_MM = 0.02, 0.2
+# Bytes that looking at one file may take.
+MOST_BYTES = 8 * 1024**3
 
 
 def solved_again(report: Report, count: int, device: str = "auto") -> Report:
@@ -69,3 +75,33 @@ def _answers(said: Mapping[str, Any], opened: Opened, solved: np.ndarray, count:
     loads = [scene.loads(theatre.site, scene.path(time), time) for time in map(float, scene.times[solved[asked]])]
     answer = truth_of(theatre, scene, loads, fem=fem).at(theatre.anatomy.tumour_nodes)
     return solved[rows], answer.displacement[np.searchsorted(asked, rows)]
+
+
+def validated(
+    paths: Sequence[Path], workers: int, look: Callable[[Path], Report] = validate_episode
+) -> Iterator[Report]:
+    """A report of each file, as they come; `workers` processes at a time.
+
+    What a process that was lost had begun is looked at again, each file alone.
+    """
+    left = list(dict.fromkeys(paths))
+    look_at = partial(_looked_at, look)
+    try:
+        for path, report in map_apart(look_at, tuple(left), workers):
+            left.remove(path)
+            yield report
+    except LostError:
+        for path in left:
+            try:
+                yield from (report for _, report in map_apart(look_at, [path]))
+            except LostError:
+                yield Report(path, ["it ends the process that reads it: it is damaged. Make it anew, or leave it out."])
+
+
+def _looked_at(look: Callable[[Path], Report], path: Path) -> Report:
+    find_device("cpu", "float32")  # which keeps Warp's notes out of what is reported
+    try:
+        with at_most(MOST_BYTES):
+            return look(path)
+    except InputError as error:
+        return Report(path, [str(error)])

@@ -1,6 +1,6 @@
 """Who leads a page."""
 
-from ar.page.lead import IDLE, Lead
+from ar.page.control_lock import IDLE, Lead
 
 
 class TestLead:

@@ -5,8 +5,7 @@ from functools import partial
 import numpy as np
 
 from surrogate.regressors.svr import Svr
-from surrogate.training.learners import SVR
-from surrogate.training.tuning import Tuned, inner_discs
+from surrogate.training.learners import SVR, Tuned, inner_discs
 
 
 def nearby(count, seed):

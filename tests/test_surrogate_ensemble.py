@@ -9,9 +9,8 @@ from locators import in_a_skull, locator_of
 from sim import fem
 from sim.anatomy import BRAIN_LABEL, PART_LABELS
 from surrogate.locating.causes import OEDEMA, SWELLING, Causes, groups, swellings
-from surrogate.locating.ensemble import ACCURACY, members
+from surrogate.locating.ensemble import ACCURACY, members, round_tumour
 from surrogate.locating.observation import Observation, placed
-from surrogate.locating.oedema import round_tumour
 from surrogate.locating.posterior import conditioned
 
 FEW = Causes(
