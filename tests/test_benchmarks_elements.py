@@ -13,7 +13,7 @@ from benchmarks.__main__ import main
 from benchmarks.studies import contact_mesh, stages
 from benchmarks.studies.elements import Press, Row, limits, rows
 from benchmarks.studies.robustness import SETS, Record, Trial, records, shares, tallies
-from scenes.analysis import stopwatch
+from scenes.analysis import measurement
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.refine import refined
 from sim.deformation import Outcome
@@ -30,7 +30,7 @@ def anatomy():
 def test_medians_leave_the_warm_up_aside(monkeypatch):
     """By a clock of its own: calls take 100 s while they warm up, and 1, 2, ... 20 s afterwards."""
     now, calls = [0.0], []
-    monkeypatch.setattr(stopwatch.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(measurement.time, "perf_counter", lambda: now[0])
 
     def work(run):
         now[0] += 100.0 if len(calls) < stages.WARM_UP else run + 1.0

@@ -33,7 +33,7 @@ def test_shared_options_are_declared_in_one_file():
     usual = "|".join(re.escape(f'"--{name}", {rest}') for name, rest in shared.items())
     files = [*PACKAGED, *HOUSE.glob("benchmarks/commands/*.py")]
     found = [path.name for path in files if re.search(usual, path.read_text())]
-    assert found == ["drawn_options.py", "shared_options.py"]  # the latter: of a group of its own
+    assert found == ["shared_options.py", "subject_options.py"]  # the latter: of a group of its own
 
 
 def test_classes_take_at_most_eight_positional_values():

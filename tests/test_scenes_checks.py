@@ -16,9 +16,9 @@ from ar.overlay.styles import STYLES
 from scenes.cli import main
 from scenes.play.checks import measure
 from scenes.play.deformers import open_theatre
-from scenes.play.label import labelled
 from scenes.play.observer import ELLIPSOID_COLOUR
 from scenes.play.player import annotate, gauged
+from scenes.play.scene_costs import labelled
 from scenes.play.stage import CORTEX_COLOUR, DRAPE, DRAPE_COLOUR, OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.scene import Bounds, find_scene
 from sim.geometry.surface import encloses

@@ -12,9 +12,9 @@ from visitor import Visitor, free_port, wait_for
 from ar.overlay.hud import FINE
 from ar.overlay.refind import stands
 from ar.page.browser import Browser
+from scenes.page.comparison import Moment
 from scenes.page.controls import PLAN
 from scenes.page.demo import Demo
-from scenes.page.moment import Moment
 from scenes.page.referee import Referee
 from scenes.page.requests import HAND, SCRIPT
 from scenes.page.text import plan_words

@@ -15,8 +15,8 @@ from theatres import PUSHING, put, short, sinking, theatre_of
 
 from ar.screen import shrunk
 from scenes.cli import main
-from scenes.play.contact_sheet import sheet, thumbnail
 from scenes.play.effect_ablation import ALL, device_arrays, rows, run, without
+from scenes.play.scene_costs import sheet, thumbnail
 from scenes.script.scene import SCENES, find_scene
 from sim.bodies.meshfile import write_anatomy
 from sim.effects import Gravity, Held, ToolForce

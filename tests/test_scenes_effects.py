@@ -16,9 +16,9 @@ from scenes.page.demo import Demo
 from scenes.play.checks import measure
 from scenes.play.deformers import Theatre
 from scenes.play.effect_ablation import without
-from scenes.play.label import labelled
-from scenes.play.load_text import acting
+from scenes.play.frame_text import acting
 from scenes.play.reference import truth_of
+from scenes.play.scene_costs import labelled
 from scenes.play.stage import CORTEX, TOOL, Stage
 from scenes.script.scene import Bounds, find_scene
 from scenes.script.site import HOLE
@@ -76,7 +76,7 @@ class TestWithoutATool:
             assert not (frame.picture.segmentation == TOOL).any()
             assert (frame.shown != frame.picture.colour).any()
         lines = []
-        monkeypatch.setattr("scenes.play.label.panel", lambda colour, text, **given: lines.extend(text) or colour)
+        monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, text, **given: lines.extend(text) or colour)
         labelled(frames[-1], "fem")
         assert any(
             re.search(r"to the left \(0.87\) and the back \(0.50\), fluid up to \d+ % of the brain's height", line)

@@ -10,8 +10,7 @@ from boxes import base_held, top_forces
 from boxes import box as cube
 from programs import main
 
-from scenes.commands.companion_files import demand_no_strangers, remove_data, strangers
-from scenes.options.outputs import claimed, claimed_frames
+from scenes.options.outputs import claimed, claimed_frames, demand_no_strangers, remove_data, strangers
 from sim.bodies.intensity import sidecar
 from sim.bodies.meshfile import read_mesh, write_mesh
 from sim.errors import InputError

@@ -11,7 +11,7 @@ import trimesh
 from theatres import player
 
 from scenes.episodes.episode import collect
-from scenes.play.load_text import acting
+from scenes.play.frame_text import acting
 from scenes.play.player import Player
 from scenes.report.picture import rested
 from scenes.script.scene import Scene, Viewpoint, find_scene

@@ -16,9 +16,9 @@ from ar.overlay.outlines import ink_of
 from ar.overlay.refind import stands
 from scenes.cli import main
 from scenes.play.deformers import model_path, open_theatre
-from scenes.play.label import labelled
-from scenes.play.load_text import shortened
+from scenes.play.frame_text import shortened
 from scenes.play.player import CARRIED, IN_BONE, STAGES
+from scenes.play.scene_costs import labelled
 from scenes.play.stage import CORTEX, TOOL
 from scenes.script.scene import Viewpoint, find_scene
 from scenes.script.shipped_files import template_path
@@ -239,7 +239,7 @@ def test_the_label_is_drawn_above_the_picture(play):
 
 def test_the_label_tells_source_time_and_motion(play, monkeypatch):
     said = []
-    monkeypatch.setattr("scenes.play.label.panel", lambda colour, lines, **more: said.extend(lines) or colour)
+    monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, lines, **more: said.extend(lines) or colour)
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     labelled(frame, "linear")
     assert said[:2] == [f"linear: tumour moved {1e3 * frame.moved:.2f} mm", f"t 1.70 s, {frame.acts}"]
@@ -258,7 +258,9 @@ def test_regions_of_a_tissue_of_their_own_are_named_in_short():
 
 def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch):
     shown = []
-    monkeypatch.setattr("scenes.play.label.panel", lambda colour, lines, **more: shown.append(list(lines)) or colour)
+    monkeypatch.setattr(
+        "scenes.play.scene_costs.panel", lambda colour, lines, **more: shown.append(list(lines)) or colour
+    )
     play = player(theatre, short(), "linear")
     for force in (0.2, 0.6):
         labelled(play.draw(0, 0.0, Touch(force=force)), "linear")

@@ -12,17 +12,16 @@ from poison import poisoned
 from studies import TISSUE, nothing, read_back, study_of
 
 from ar.screen import read_png
-from scenes.analysis.process_memory import peak_memory
+from scenes.analysis.measurement import peak_memory
 from scenes.cli import main
 from scenes.report.adaptation import debulked, debulked_study, simulate_debulked, simulating_seconds
-from scenes.report.artefact_time import series_seconds, tabulate_series
 from scenes.report.finite_elements import HALVED, OWN, Elements, against
 from scenes.report.learner import Learner, counts, measure_learner
-from scenes.report.measure import measured
 from scenes.report.page import Section, write_report
 from scenes.report.reference import Truth, beyond_of, reference_of, solve_reference
 from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference
-from scenes.report.rows import every, learners, rows, star
+from scenes.report.rows import every, learners, measured, rows, star
+from scenes.report.study import series_seconds, tabulate_series
 from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import pushed_effects
 from sim.errors import InputError

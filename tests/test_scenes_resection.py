@@ -15,7 +15,7 @@ from ar.overlay.outlines import silhouette
 from scenes.cli import main
 from scenes.episodes.episode import collect
 from scenes.page.demo import Demo
-from scenes.play.load_text import acting
+from scenes.play.frame_text import acting
 from scenes.script.debulking import Debulking
 from scenes.script.head_posture import drained
 from scenes.script.tool_paths import Touch

@@ -11,8 +11,7 @@ from studies import read_back
 
 from scenes.cli import main
 from scenes.commands.report import QUICK
-from scenes.report.page import Section, write_report
-from scenes.report.plots import against_time, front
+from scenes.report.page import Section, against_time, front, write_report
 from scenes.report.row import Row, figures_of, of_times
 from sim.bodies.meshfile import write_anatomy
 from surrogate.data.dataset import read_dataset

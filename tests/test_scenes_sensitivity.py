@@ -11,8 +11,7 @@ import pytest
 from conftest import make_box
 from theatres import knowing_nothing
 
-from scenes.analysis.sensitivity import Study, change, moved_alike, rows
-from scenes.analysis.sensitivity_variants import Aim, Body, aimed, variants
+from scenes.analysis.sensitivity import Aim, Body, Study, aimed, change, moved_alike, rows, variants
 from scenes.cli import main
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL

@@ -15,10 +15,10 @@ from scenes.cli import main
 from scenes.page.text import estimated, legend, report
 from scenes.play.checks import measure, objections, within
 from scenes.play.deformers import Theatre, open_theatre
-from scenes.play.label import labelled
 from scenes.play.observer import ELLIPSOID_COLOUR, Observer
 from scenes.play.player import REFUSED
 from scenes.play.reference import truth_of
+from scenes.play.scene_costs import labelled
 from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.scene import Bounds, find_scene
 from scenes.script.shipped_files import template_path
@@ -208,7 +208,7 @@ def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
     assert np.array_equal(play.believed(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
     assert not of_ink(frame.shown, ink_of(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
     assert np.count_nonzero(of_ink(frame.shown, ink_of(TRUTH_COLOUR))) > 10
-    monkeypatch.setattr("scenes.play.label.panel", lambda colour, lines, **more: said.extend(lines) or colour)
+    monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, lines, **more: said.extend(lines) or colour)
     labelled(frame, "fem")
     assert any(line == f"estimate: refused, {found.refusal}" for line in said)
     assert "What is seen was refused" in report(frame, play.stage, "fem", "", (), 100)
@@ -231,7 +231,7 @@ def test_check_says_what_the_locator_holds_against_its_answers(refused, frames):
 def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
     frame, said = frames[1], []
     found = frame.estimate
-    monkeypatch.setattr("scenes.play.label.panel", lambda colour, lines, **more: said.extend(lines) or colour)
+    monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, lines, **more: said.extend(lines) or colour)
     labelled(replace(frame, named=False), "fem")
     truth = 1e3 * np.linalg.norm(found.true)
     off = bound_words(found.location.p95, 1)

@@ -27,8 +27,8 @@ from scenes.analysis.uncertainty import (
     uncertainty,
 )
 from scenes.cli import main
-from scenes.play.error_text import NOT_KNOWN_WORDS, error_lines, worst
-from scenes.play.label import labelled
+from scenes.play.frame_text import NOT_KNOWN_WORDS, error_lines, worst
+from scenes.play.scene_costs import labelled
 from scenes.script.priors import POISSON, PRIORS, SKULL, STIFFNESS, TOOL, Draw, drawn
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.tool_paths import Touch

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from scenes.commands.companion_files import stated as stated_beside
+from scenes.options.outputs import stated as stated_beside
 from scenes.tracked.truth import read_truth
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of

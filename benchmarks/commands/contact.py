@@ -8,8 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from scenes.options.json_line import json_line
-from scenes.options.shared_options import add_anatomy, add_device, add_json
+from scenes.options.shared_options import add_anatomy, add_device, add_json, json_line
 from scenes.options.tissue_options import add_tissue_arguments, tissue_of
 from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy
@@ -49,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if an answer is not good."""
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine
 
     from ..studies.contact_mesh import rows
 

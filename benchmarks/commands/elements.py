@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a solve did not converge."""
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine
 
     from ..studies.elements import Press, limits, rows
 

@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     """Play the scene to a page that nobody looks at."""
     from tqdm import tqdm
 
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine
 
     from ..studies.frame import batch_rate, frames_of, size_of, table
 

@@ -40,9 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a load did not converge."""
     from ar.screen import write_png
-    from scenes.analysis.csv_tables import write_table
     from scenes.analysis.loglog_chart import drawn
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine, write_table
     from sim.bodies.subject import MeshPlan
     from sim.runtime.device import find_device
     from sim.runtime.journal import opened

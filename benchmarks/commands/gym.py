@@ -6,8 +6,7 @@ import argparse
 import sys
 from dataclasses import asdict
 
-from scenes.options.json_line import json_line
-from scenes.options.shared_options import add_device, add_json
+from scenes.options.shared_options import add_device, add_json, json_line
 from sim.arguments import at_least
 
 # The tasks of scenes.gym, which loads Gymnasium and is imported only as this runs.
@@ -43,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Step the environments under their scripted policies."""
     from tqdm import tqdm
 
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine
     from scenes.gym.environment import many
 
     from ..studies.frame import size_of

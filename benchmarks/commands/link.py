@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure. Returns 0."""
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine
 
     from ..studies.link_latency import CLIENTS, measured
 

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Play every tool; 1 if a frame did not converge, or was farther off than promised."""
     from scenes.analysis.budget import PROMISED
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine
     from scenes.script.scene import find_scene
     from scenes.script.site import site_of
 

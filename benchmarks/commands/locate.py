@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if of some twin no equilibrium was found."""
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine
     from scenes.script.shipped_files import template_path
     from sim.bodies.meshfile import read_anatomy
 

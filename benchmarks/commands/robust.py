@@ -42,8 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
-    from scenes.analysis.csv_tables import write_table
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine, write_table
     from sim.runtime.journal import opened
 
     from ..studies.robustness import Record, Trial, records, tallies

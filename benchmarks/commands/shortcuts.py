@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine
     from scenes.script.site import site_of
     from sim.runtime.device import find_device
 

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from scenes.options.json_line import json_line
-from scenes.options.shared_options import add_json, add_seed
+from scenes.options.shared_options import add_json, add_seed, json_line
 from scenes.script.shipped_files import template_path
 from sim.arguments import at_least
 from sim.bodies.meshfile import read_anatomy
@@ -63,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare; 1 if one of our answers is off."""
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine
     from sim.runtime.device import find_device
 
     from ..peers.comparison import LEAST, OWN, PEERS, case_of, compare, judge_of

@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine
     from scenes.play.deformers import plan_of
     from scenes.script.scene import SCENES, find_scene
     from sim.effects import ToolForce

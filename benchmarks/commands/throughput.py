@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a load did not converge."""
-    from scenes.analysis.machine import machine
+    from scenes.analysis.measurement import machine
     from sim.effects import ToolContact
     from sim.runtime.device import device_names
     from surrogate.data.tool_poses import ROUND, tool_of

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from scenes.analysis.machine import machine
+from scenes.analysis.measurement import machine
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from sim.runtime.optional_packages import install_hint

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.analysis.stopwatch import timed
+from scenes.analysis.measurement import timed
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.discretisation.footprint import nearest_on

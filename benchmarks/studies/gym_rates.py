@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.analysis.stopwatch import timed
+from scenes.analysis.measurement import timed
 from scenes.gym.environment import VectorEnv
 from scenes.gym.observation import scripted
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes.analysis.stopwatch import timed
+from scenes.analysis.measurement import timed
 from scenes.script.scene import Scene
 from scenes.script.site import Site
 from scenes.script.tool import Probe

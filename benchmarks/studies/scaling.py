@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.analysis.loglog_chart import Curve, Panel
-from scenes.analysis.process_memory import watched_card
-from scenes.analysis.stopwatch import timed
+from scenes.analysis.measurement import timed, watched_card
 from scenes.report.finite_elements import template_mesh
 from sim.accuracy import TRAIN
 from sim.bodies.meshfile import read_anatomy

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes.analysis.stopwatch import timed
+from scenes.analysis.measurement import timed
 from scenes.script.scene import find_scene
 from scenes.script.site import Site
 from sim.accuracy import LIVE, TRAIN, Accuracy

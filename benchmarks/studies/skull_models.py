@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.analysis.stopwatch import timed
+from scenes.analysis.measurement import timed
 from sim.accuracy import STRAINED
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, joined

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.analysis.stopwatch import timed
+from scenes.analysis.measurement import timed
 from scenes.play.deformers import Theatre
 from scenes.play.player import Player
 from sim.accuracy import LIVE, TRAIN

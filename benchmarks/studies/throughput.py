@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from scenes.analysis.stopwatch import timed
+from scenes.analysis.measurement import timed
 from sim.accuracy import REFERENCE, STRAINED
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation

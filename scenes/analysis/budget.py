@@ -11,7 +11,7 @@ from surrogate.model.learned import Learned
 
 from ..play.deformers import Theatre
 from ..script.scene import Scene
-from .stopwatch import timed
+from .measurement import timed
 
 # Frames that are timed, after one that is not.
 TIMED = 24

@@ -17,8 +17,7 @@ from sim.loads import Loads, push, stacked
 from sim.material import BRAIN
 
 from .loglog_chart import Curve, Panel
-from .sensitivity import Study, moved_alike
-from .sensitivity_variants import Body
+from .sensitivity import Body, Study, moved_alike
 
 Levels = Mapping[str, Sequence[str | float]]
 LEVELS: Levels = {

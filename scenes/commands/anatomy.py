@@ -24,12 +24,18 @@ from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh, dihedral_angles
 from sim.runtime.timing import stage
 
-from ..options.drawn_options import add_drawn_arguments, demand_no_drawn, drawn, source
-from ..options.label_options import add_label_arguments, regions_asked, sources_of
-from ..options.outputs import add_force, claimed
+from ..options.outputs import add_force, claimed, demand_no_strangers
 from ..options.placement_options import add_opening_arguments, opened, opened_over
 from ..options.shared_options import add_json
-from .companion_files import demand_no_strangers
+from ..options.subject_options import (
+    add_drawn_arguments,
+    add_label_arguments,
+    demand_no_drawn,
+    drawn,
+    regions_asked,
+    source,
+    sources_of,
+)
 
 # Lengths in millimetres, as on the command line.
 DEFAULTS = {

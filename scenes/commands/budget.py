@@ -18,8 +18,7 @@ from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
 from ..options.camera_options import add_camera, filmed_with_targets
-from ..options.json_line import json_line
-from ..options.shared_options import add_device, add_json, add_seed
+from ..options.shared_options import add_device, add_json, add_seed, json_line
 from ..options.theatre_options import add_bodies, scene_asked
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, TextIO
 from sim.arguments import at_least
 
 from ..options.camera_options import add_camera, filmed
-from ..options.shared_options import add_json
-from ..options.style_option import add_style
+from ..options.shared_options import add_json, add_style
 from ..options.theatre_options import add_theatre, deformer_name, playable, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..play.checks import measure, objections
-    from ..play.error_text import error_lines
+    from ..play.frame_text import error_lines
     from ..play.reference import truth_of
     from ..script.scene import SCENES
 
@@ -122,7 +121,7 @@ def _tracking(args: argparse.Namespace, theatre: Theatre, table: TextIO) -> dict
 
 def _errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:
     """The largest of a scene's frames: what the model promises [m], and how far the tumour may be off."""
-    from ..play.error_text import worst
+    from ..play.frame_text import worst
 
     promised = [frame.model_error for frame in frames if frame.model_error is not None]
     return max(promised, default=None), worst([frame.tumour_error for frame in frames])

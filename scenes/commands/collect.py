@@ -11,8 +11,7 @@ from pathlib import Path
 
 from ..options.camera_options import add_camera, filmed
 from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_json
-from ..options.style_option import add_style
+from ..options.shared_options import add_json, add_style
 from ..options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 
 

@@ -12,9 +12,8 @@ from typing import Any
 from sim.errors import InputError
 from sim.runtime.optional_packages import needed_from
 
-from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_json
+from ..options.shared_options import add_json, json_line
 
 FORMATS = ("lerobot", "robomimic", "folder", "xdmf", "card")
 

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
-from ..options.address_option import add_address, addresses_of, say_addresses
 from ..options.camera_options import add_camera, filmed
-from ..options.style_option import add_style
+from ..options.shared_options import add_address, add_style, addresses_of, say_addresses
 from ..options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
 
 if TYPE_CHECKING:

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING
 from sim.errors import InputError
 from sim.runtime.optional_packages import needed_from
 
-from ..options.json_line import json_line
 from ..options.outputs import claimed_folder
-from ..options.shared_options import add_json, add_seed
+from ..options.shared_options import add_json, add_seed, json_line
 from .interrupt import INTERRUPTED, terminated_as_interrupted
 
 if TYPE_CHECKING:

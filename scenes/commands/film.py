@@ -17,9 +17,8 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
 from ..options.camera_options import add_camera, filmed_with_targets
-from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed, claimed_folder, claimed_frames
-from ..options.shared_options import add_json, add_seed
+from ..options.shared_options import add_json, add_seed, json_line
 from ..options.theatre_options import add_theatre, scene_asked, theatre_asked
 
 if TYPE_CHECKING:

@@ -13,9 +13,8 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.errors import InputError
 from sim.material import BRAIN
 
-from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_device, add_json, add_seed
+from ..options.shared_options import add_device, add_json, add_seed, json_line
 from ..options.tissue_options import add_region_argument, regions_of
 from .locate import rows_left_out
 from .locator import REGIONS, located_by

@@ -12,9 +12,8 @@ import numpy as np
 from sim.anatomy import region_name
 from sim.arguments import at_least
 
-from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_device, add_json, add_seed
+from ..options.shared_options import add_device, add_json, add_seed, json_line
 from ..options.tissue_options import add_region_argument
 from .locator import REGIONS, located_by
 

@@ -17,12 +17,17 @@ import numpy as np
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
-from ..options.address_option import add_address, addresses_of, say_addresses
-from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
 from ..options.poses_options import add_poses, demand_poses, elsewhere_of
-from ..options.shared_options import add_device, add_json
-from ..options.style_option import add_style
+from ..options.shared_options import (
+    add_address,
+    add_device,
+    add_json,
+    add_style,
+    addresses_of,
+    json_line,
+    say_addresses,
+)
 from ..options.theatre_options import add_bodies
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
 from ..tracked.tool_motion import REST, mover, tracked_scene

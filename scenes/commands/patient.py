@@ -25,10 +25,10 @@ from sim.runtime.timing import listened
 from surrogate.data.splits import APART, FEWEST
 from surrogate.data.tool_loads import PRESETS
 
-from ..options.label_options import add_label_arguments, label_words, regions_asked, sources_of
 from ..options.outputs import add_force, claimed
 from ..options.placement_options import add_opening_arguments, opened, opening_words, trajectory_given
 from ..options.shared_options import add_devices, add_json
+from ..options.subject_options import add_label_arguments, label_words, regions_asked, sources_of
 from ..options.tissue_options import OWN, add_element_argument, add_region_argument, regions_of
 
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from sim.errors import InputError
 
-from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_json
+from ..options.shared_options import add_json, json_line
 
 if TYPE_CHECKING:
     from ar.tracking.pair_residuals import PairResiduals

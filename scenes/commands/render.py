@@ -7,7 +7,6 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ar.screen import Film, read_png, write_film
 from sim.arguments import at_least
@@ -16,12 +15,8 @@ from sim.runtime.atomic_files import REMEDY, why
 
 from ..options.camera_options import add_camera, filmed
 from ..options.outputs import add_force, claimed, claimed_folder, claimed_frames
-from ..options.shared_options import add_json
-from ..options.style_option import add_style
+from ..options.shared_options import add_json, add_style
 from ..options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
-
-if TYPE_CHECKING:
-    pass
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     """Draw, frame by frame. 1: a frame was answered badly."""
     from tqdm import tqdm
 
-    from ..play.label import labelled
+    from ..play.scene_costs import labelled
 
     at_least("--every", args.every, 1)
     claimed_folder(args.out, "frames")

@@ -75,7 +75,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     """The rows of each data set; the page is written anew after each."""
     from sim.runtime.device import device_names
 
-    from ..analysis.machine import machine
+    from ..analysis.measurement import machine
     from ..report.adaptation import debulked_study, simulate_debulked
     from ..report.page import Section, write_report
     from ..report.reference import solve_beyond, solve_reference
@@ -119,7 +119,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
 
 
 def _tabulate(study: Study, bar: tqdm) -> None:
-    from ..report.artefact_time import tabulate_series
+    from ..report.study import tabulate_series
 
     tabulate_series(study, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"))
     bar.set_postfix_str("")
@@ -139,8 +139,8 @@ def _simulated(path: Path, args: argparse.Namespace, count: int) -> None:
 
 
 def _about(study: Study) -> tuple[str, ...]:
-    from ..report.extrapolated_loads import KINDS
     from ..report.reference import reference_of
+    from ..report.study import KINDS
 
     truth, said = reference_of(study), study.dataset.provenance
     mesh = "the same mesh with every edge halved" if study.fine else "the same mesh"

@@ -33,8 +33,8 @@ def run(args: argparse.Namespace) -> int:
 
     from ar.screen import write_png
 
-    from ..play.contact_sheet import sheet, thumbnail
     from ..play.deformers import open_theatre
+    from ..play.scene_costs import sheet, thumbnail
     from ..script.scene import SCENES, find_scene
 
     scenes = {scene.name: scene for scene in map(find_scene, args.scenes or SCENES)}

@@ -16,9 +16,8 @@ from sim.elements import ELEMENTS
 from sim.errors import InputError
 from surrogate.data.tool_loads import PRESETS, draw
 
-from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_device, add_json, add_seed
+from ..options.shared_options import add_device, add_json, add_seed, json_line
 from ..options.theatre_options import add_bodies
 
 if TYPE_CHECKING:
@@ -77,10 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
-    from ..analysis.csv_tables import write_table
-    from ..analysis.machine import machine
-    from ..analysis.sensitivity import Study, rows
-    from ..analysis.sensitivity_variants import Body, variants
+    from ..analysis.measurement import machine, write_table
+    from ..analysis.sensitivity import Body, Study, rows, variants
     from ..play.deformers import open_theatre
 
     if args.out:
@@ -129,9 +126,9 @@ def _factorial(args: argparse.Namespace) -> int:
 
     from ar.screen import write_png
 
-    from ..analysis.csv_tables import write_table
     from ..analysis.factorial import LEVELS, cells, panels, shares
     from ..analysis.loglog_chart import drawn
+    from ..analysis.measurement import write_table
 
     if args.anatomy:
         raise InputError("--factorial makes its bodies of the template: leave --anatomy out.")

@@ -35,7 +35,7 @@ from surrogate.data.simulate import Solved, simulate
 from surrogate.data.tool_loads import BEYOND_TISSUE, PRESETS, draw, refused_share, refused_words
 from surrogate.data.tool_poses import draw_poses, tool_of
 
-from ..options.outputs import add_force, claimed
+from ..options.outputs import add_force, batch_begun, claimed, remove_data, stated
 from ..options.shared_options import add_devices, add_json, add_seed
 from ..options.tissue_options import (
     add_element_argument,
@@ -45,7 +45,6 @@ from ..options.tissue_options import (
     tissue_of,
 )
 from ..script.shipped_files import template_path
-from .companion_files import batch_begun, remove_data, stated
 from .interrupt import INTERRUPTED, terminated_as_interrupted
 
 # Sizes [mm] of tools that press on a brain.

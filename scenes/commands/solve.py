@@ -18,9 +18,8 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Cause, Loads, Nodal, Prescribed
 
-from ..options.json_line import json_line
 from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_device, add_json
+from ..options.shared_options import add_device, add_json, json_line
 from ..options.tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, elasticity_of
 
 

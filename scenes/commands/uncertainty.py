@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 from sim.arguments import at_least
 
-from ..options.json_line import json_line
 from ..options.outputs import claimed
-from ..options.shared_options import add_device, add_json, add_seed
+from ..options.shared_options import add_device, add_json, add_seed, json_line
 from ..options.theatre_options import add_bodies, scene_asked
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 from .fit import fitted_beside
@@ -118,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _flat(theatre: Theatre, scene: Scene, found: Uncertainty) -> dict[str, Any]:
     """Figures of a scene, at the moment when the tumour may be farthest off [mm]."""
-    from ..play.error_text import error_lines
+    from ..play.frame_text import error_lines
 
     model = theatre.models.get(theatre.best(scene))
     promised = None if model is None or not np.isfinite(model.bound) else float(model.bound)

@@ -9,8 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..options.json_line import json_line
-from ..options.shared_options import add_device, add_json
+from ..options.shared_options import add_device, add_json, json_line
 
 if TYPE_CHECKING:
     from ..episodes.reading.validation import Report

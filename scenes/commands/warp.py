@@ -12,9 +12,8 @@ import numpy as np
 
 from sim.errors import InputError
 
-from ..options.json_line import json_line
-from ..options.label_options import add_axes
-from ..options.shared_options import add_device, add_json
+from ..options.shared_options import add_device, add_json, json_line
+from ..options.subject_options import add_axes
 from ..options.theatre_options import add_trajectory, scene_asked
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
 

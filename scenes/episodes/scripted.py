@@ -14,10 +14,9 @@ from sim.effects import Elasticity
 from sim.errors import InputError
 
 from ..script.camera_paths import PATHS
-from ..script.look import Cottonoid, Look
 from ..script.scene import Scene
 from ..script.site import Site
-from ..script.viewpoint import Viewpoint
+from ..script.viewpoint import Cottonoid, Look, Viewpoint
 from .bodies import Body
 from .draws import drawn, random_of
 from .families import FAMILIES, PRONY, Chance, trembling

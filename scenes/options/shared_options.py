@@ -1,10 +1,19 @@
-"""Options that most commands have: `--anatomy`, `--device`, `--seed` and `--json`."""
+"""Options that most commands have, from `--anatomy` to `--style` and `--address`, and their output as JSON."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import json
+import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sim.errors import InputError
+
+if TYPE_CHECKING:
+    from ar.overlay.styles import Style
+    from ar.page.browser import Browser
 
 
 def add_anatomy(parser: argparse.ArgumentParser) -> None:
@@ -40,3 +49,59 @@ def add_seed(
 def add_json(parser: argparse.ArgumentParser, meaning: str = "print one JSON line in place of the text") -> None:
     """Declare `--json`."""
     parser.add_argument("--json", action="store_true", help=meaning)
+
+
+def json_line(value: Any) -> str:
+    """One line of JSON: null stands for numbers that are not finite, which JSON does not have."""
+    return json.dumps(_finite(value), allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def add_style(parser: argparse.ArgumentParser, without: tuple[Style, ...] = ()) -> None:
+    """Declare the overlay's style: shared by every command that draws a scene; some are of no use to some commands."""
+    from ar.overlay.styles import STYLES
+
+    styles: list[Style] = [style for style in STYLES if style not in without]
+    said = ". ".join(f"{style}: {STYLES[style]}" for style in styles if style != "none")
+    parser.add_argument(
+        "--style", choices=styles, default="window", help=f"how the overlay is drawn (default %(default)s). {said}"
+    )
+
+
+def add_address(parser: argparse.ArgumentParser) -> None:
+    """Declare --address."""
+    parser.add_argument(
+        "--address", action="append", default=[], metavar="https://NAME[:PORT]",
+        help="address of the page behind a proxy, a tunnel or another port, which then asks for a token; repeatable",
+    )  # fmt: skip
+
+
+def addresses_of(args: argparse.Namespace) -> tuple[str, ...]:
+    """Addresses as browsers write them.
+
+    Raises
+    ------
+    InputError
+        A text that is no such address.
+    """
+    from ar.page.guard import origin_of
+
+    try:
+        return tuple(map(origin_of, args.address))
+    except ValueError as error:
+        raise InputError(f"--address {error}") from error
+
+
+def say_addresses(browser: Browser) -> None:
+    """Print where else the page is, if a token is needed there."""
+    for address in browser.addresses:
+        print(f"sulcus: behind the proxy or the forwarded port, open {address}", flush=True)
+    if browser.token is not None and not browser.addresses:
+        print("others than this machine reach the page by its name or address in place of localhost, with this token")

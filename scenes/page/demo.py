@@ -21,19 +21,16 @@ from surrogate.data.dataset import digest_of_loads
 from ..play.deformers import AtRest, Theatre
 from ..play.player import Frame, Player
 from ..play.stage import Stage
-from ..play.tool_holder import holding
 from ..play.waiting_notice import Busy
 from ..script.scene import Scene, find_scene
 from ..script.tool_paths import Touch
 from .beside import lines_of, sample_of, slices_of
 from .cast import Cast
+from .comparison import OWN, TRUTH, Moment, Tally, changed, judge, verdict_words
 from .controls import PLAN, clocked, controls, slider_values
-from .moment import Moment
 from .referee import Referee, Truth
-from .requests import HAND, SCRIPT, Wish
-from .tally import Tally
+from .requests import HAND, SCRIPT, Wish, holding
 from .text import effect_words, pending_words, plan_words, report, words, work_words
-from .verdict import OWN, TRUTH, changed, judge, verdict_words
 from .view import (
     FEM_COLOUR,
     STALE_COLOUR,

@@ -1,8 +1,9 @@
-"""What the visitors of a page ask for."""
+"""Requests of a page's visitors, and the line that says who of them has the tool."""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 from ar.overlay.styles import Style
@@ -75,3 +76,27 @@ class Wish:
         with self.lock:
             if self.plays and self.number == number:
                 self.number = (number + 1) % frames
+
+
+def holding(visitor: int, holder: int | None, here: Collection[int]) -> str:
+    """Return the line that a visitor reads.
+
+    Parameters
+    ----------
+    visitor
+        Whose line it is.
+    holder
+        Who took the tool last; None where the script has it.
+    here
+        Who looks at the page.
+    """
+    if holder is None:
+        held = "the script moves the tool"
+    elif holder == visitor:
+        held = "**you hold the tool**"
+    elif holder in here:
+        held = f"another visitor (number {holder}) holds the tool"
+    else:
+        held = f"visitor {holder} held the tool and has left: it stays where it was put"
+    many = len(here)
+    return held if many < 2 else f"{held}; {many} visitors look, you are number {visitor}"

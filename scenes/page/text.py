@@ -20,7 +20,7 @@ from ..script.scene import Scene
 from ..script.site import Site
 from ..script.tool_paths import Touch
 from ..script.uncertainty import TumourError
-from .tally import Row
+from .comparison import Row
 
 SEEN = (
     "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; "

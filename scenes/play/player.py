@@ -33,9 +33,8 @@ from ..script.site import Site
 from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, lifted
 from ..script.uncertainty import NOT_KNOWN, TumourError, Uncertainty
-from .covers import COTTON, GLOVE
-from .error_text import error_lines
-from .load_text import acting, doubt_of
+from .cortex_layers import COTTON, GLOVE
+from .frame_text import acting, doubt_of, error_lines
 from .observer import Estimate
 from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, TOOL, Stage
 from .tip_reading import reading

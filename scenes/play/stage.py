@@ -22,9 +22,8 @@ from sim.loads import Loads, Resected
 from ..script.scene import Scene
 from ..script.sight import StereoSight
 from ..script.site import HOLE, Site
-from .covers import COTTON, GLOVE, Squares, finger, squares
+from .cortex_layers import COTTON, GLOVE, Squares, finger, squares, with_vessels
 from .observer import Sees
-from .vessels import with_vessels
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
 """Segmentation ids."""

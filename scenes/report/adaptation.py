@@ -17,8 +17,7 @@ from sim.geometry.tetmesh import TetMesh
 from sim.runtime.partial_files import unfinished_path
 from surrogate.data.simulate import simulate
 
-from .artefact_time import note_seconds, noted_seconds
-from .study import Study
+from .study import Study, note_seconds, noted_seconds
 
 # Of the tumour's volume.
 SHARE = 0.2

@@ -21,7 +21,7 @@ from sim.geometry.locate import locate
 from sim.loads import Loads, Pushed
 from sim.material import Material, Tissue
 
-from ..analysis.stopwatch import timed
+from ..analysis.measurement import timed
 from .adaptation import debulked
 from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, of_times
 from .study import Study

@@ -14,12 +14,11 @@ from surrogate.evaluation.score import bare_microseconds, single_seconds
 from surrogate.evaluation.solve_counts import SolveCounts
 from surrogate.training.train import train
 
-from ..analysis.stopwatch import timed
+from ..analysis.measurement import timed
 from .adaptation import debulked_study, simulating_seconds
-from .artefact_time import series_seconds
 from .reference import beyond_of
 from .row import Figures, Row, against_reference, figures_between, of_times
-from .study import Study
+from .study import Study, series_seconds
 
 FEWEST_LOADS = 64
 

@@ -1,8 +1,10 @@
-"""What a report plays: loads of the discs of cortex that no learner saw, and loads beyond the training range."""
+"""Study of a report: the played loads, inside and beyond the training range, and the seconds that its files took."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Pushed
+from sim.runtime.atomic_files import written_whole
 from sim.runtime.device import find_device
 from sim.runtime.versions import version_of
 from surrogate.data.answer_rows import BRAIN, stated_tissue
@@ -22,10 +25,9 @@ from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.encode import directions
 from surrogate.data.splits import Split, leave_discs_out
-from surrogate.training.expansion import Expansion
+from surrogate.training.expansion import EXPANDED, Expansion
 
 from ..script.shipped_files import template_path
-from .extrapolated_loads import loads_beyond
 
 
 @dataclass(frozen=True)
@@ -157,3 +159,77 @@ class Study:
         on = "cuda" if self.on_card else "cpu"
         stated = repr((sorted(data.provenance.items()), self.loads, self.beyond, self.fine, on, version_of("sulcus")))
         return digest_of(np.frombuffer(stated.encode(), np.uint8), data.good, *vars(self.pushed).values())
+
+
+# Times the greatest force; degrees more than the greatest angle; of the radius, how near to the rim a centre comes.
+STRONGER, MORE_OBLIQUE, NEARER = (1.2, 1.6), (5.0, 15.0), (0.5, 0.9)
+KINDS = ("stronger", "more oblique", "nearer to the rim")
+
+
+def loads_beyond(patch: Patch, training: Pushed, like: Pushed, count: int) -> Loads:
+    """`count` loads, every third of one of `KINDS`, otherwise as those of `like` are; always the same ones."""
+    random = np.random.default_rng(0)
+    rows = random.integers(len(like.point), size=count)
+    kind = np.arange(count) % len(KINDS)
+    size, direction = directions(replace(like, force=like.force[rows]))
+    point, footprint = like.point[rows], like.footprint[rows]
+    size = np.where(kind == 0, directions(training)[0].max() * random.uniform(*STRONGER, count), size)
+    oblique = _tilted(
+        direction, patch.normal_near(point), _angle(patch, training), random.uniform(*MORE_OBLIQUE, count)
+    )
+    direction = np.where((kind == 1)[:, None], oblique, direction)
+    point = np.where((kind == 2)[:, None], _near_rim(patch, footprint, random), point)
+    return Loads((Pushed(point, size[:, None] * direction, footprint),))
+
+
+def _angle(patch: Patch, pushed: Pushed) -> float:
+    """Greatest angle between force and inward normal [rad]."""
+    cosine = np.einsum("bi,bi->b", directions(pushed)[1], patch.normal_near(pushed.point))
+    return float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
+
+
+def _tilted(direction: np.ndarray, normal: np.ndarray, angle: float, more: np.ndarray) -> np.ndarray:
+    """Unit directions (B, 3) turned off `normal` (B, 3) by `angle` [rad] and `more` (B,) [degrees], at most 85."""
+    along = direction - np.einsum("bi,bi->b", direction, normal)[:, None] * normal
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+    along = np.where(length > 1e-9, along / np.maximum(length, 1e-9), across / np.linalg.norm(across, axis=1)[:, None])
+    turn = np.minimum(angle + np.radians(more), np.radians(85.0))[:, None]
+    return np.cos(turn) * normal + np.sin(turn) * along
+
+
+def _near_rim(patch: Patch, footprint: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Points (B, 3) [m] whose footprints (B,) [m] hang over the rim by a tenth to half of their radius."""
+    points = patch.place(random.random((4096, 3)))[0]
+    ratio = patch.rim_distance(points)[None] / footprint[:, None]
+    wanted = random.uniform(*NEARER, len(footprint))[:, None]
+    return points[np.abs(ratio - wanted).argmin(axis=1)]
+
+
+def note_seconds(made: Path, seconds: float) -> None:
+    """Keep the seconds that a file took to make, in a JSON file of its name."""
+    with written_whole(_beside(made), ".json") as partial:
+        partial.write_text(json.dumps({"seconds": seconds}))
+
+
+def noted_seconds(made: Path) -> float | None:
+    """What was kept; None where nothing was, or nothing whole."""
+    try:
+        return float(json.loads(_beside(made).read_text())["seconds"])
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return None
+
+
+def _beside(made: Path) -> Path:
+    return made.with_suffix(".json")
+
+
+def tabulate_series(study: Study, progress: Callable[[int, int], object]) -> None:
+    """Make the table, if the data says of what tissue; `progress` hears the places that are done, and their number."""
+    if "tissue" in study.dataset.provenance:
+        replace(study.expansion, progress=progress).tabulated  # noqa: B018 (asking makes it)
+
+
+def series_seconds(study: Study, learner: str) -> float:
+    """What the table took, if this learner is made of it [s]."""
+    return study.expansion.tabulated.seconds if learner in EXPANDED else 0.0

@@ -34,12 +34,11 @@ from sim.runtime.user_script import error_text, run_script
 
 from .debulking import Debulking
 from .head_posture import Lie, supine
-from .look import PLAIN, Look
 from .sight import Sight, StereoSight
 from .site import Site
 from .tool import Instrument, Probe
 from .tool_paths import AIR, Path, Touch, idle
-from .viewpoint import USUAL, Viewpoint
+from .viewpoint import PLAIN, USUAL, Look, Viewpoint
 
 # Of a scene: an hour at 30 a second.
 MOST_FRAMES = 108_000

@@ -1,4 +1,4 @@
-"""Where a scene's camera is, what it is, and how it moves."""
+"""Camera and look of a scene: the camera's place and motion, lamp, colour of the cortex, and what covers it."""
 
 from __future__ import annotations
 
@@ -14,6 +14,60 @@ from sim.errors import InputError
 
 from .camera_paths import CameraPath
 from .site import Site
+
+
+@dataclass(frozen=True)
+class Cottonoid:
+    """A square of wet cotton on the cortex, which moves with it.
+
+    Parameters
+    ----------
+    x, y
+        Its middle in the tangent plane of the open cortex [m].
+    side
+        [m].
+    angle
+        By which it is turned in that plane [rad].
+    """
+
+    x: float
+    y: float
+    side: float = 12e-3
+    angle: float = 0.0
+
+
+@dataclass(frozen=True)
+class Look:
+    """Light, colour and what covers the cortex.
+
+    Parameters
+    ----------
+    lamp, ambient
+        Strengths of the lamp, and of the light from all sides, scene-linear.
+    turn
+        Angle by which the lamp is turned about the axis of the opening [rad].
+    tint
+        Multiplies the cortex's red, green and blue.
+    vessels
+        Seed of vessels that are drawn on the cortex; None: none but the scan's.
+    cottonoids
+        What lies on the cortex.
+    finger
+        Direction in the tangent plane from which a gloved finger reaches over the opening's edge [rad]; None: none.
+    """
+
+    lamp: float = 1.0
+    ambient: float = 0.16
+    turn: float = 0.0
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    vessels: int | None = None
+    cottonoids: tuple[Cottonoid, ...] = ()
+    finger: float | None = None
+
+
+PLAIN = Look()
+"""That of scenes that say nothing else."""
+
 
 # So far under the cortex a camera looks: between the tool and the tumour [m].
 UNDER = 10e-3

@@ -15,7 +15,7 @@ from sim.loads import Loads, Touching
 from surrogate.model.guarded import answering
 from surrogate.model.learned import Learned
 
-from ..play.load_text import doubt_of
+from ..play.frame_text import doubt_of
 from ..play.stage import Stage
 from ..script.uncertainty import DEVIATIONS
 

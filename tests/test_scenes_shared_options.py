@@ -3,7 +3,7 @@
 import json
 import math
 
-from scenes.options.json_line import json_line
+from scenes.options.shared_options import json_line
 
 
 def test_numbers_that_are_not_finite_are_null_in_json():

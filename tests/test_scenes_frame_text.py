@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from scenes.page.text import tumour_trust
-from scenes.play.error_text import error_lines, tumour_words
+from scenes.play.frame_text import error_lines, tumour_words
 from scenes.script.uncertainty import TumourError, Uncertainty
 
 LISTS = {"times": (0.0, 1.0), "worst": (2e-3, 4e-3), "middle": (1e-3, 1e-3), "moved": (1e-3, 1e-3)}

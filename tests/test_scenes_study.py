@@ -2,7 +2,7 @@
 
 import pytest
 
-from scenes.report.artefact_time import note_seconds, noted_seconds
+from scenes.report.study import note_seconds, noted_seconds
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"seconds": "many"}', b"\xff"])

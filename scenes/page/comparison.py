@@ -1,4 +1,4 @@
-"""The finite elements' verdict on what is shown, as HTML, and whether it is on the load that acts now."""
+"""Comparison of a page's deformers with the finite elements: of what is shown, and of time against accuracy."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from html import escape
 import numpy as np
 
 from ar.overlay.hud import millimetres
+from ar.overlay.styles import Style
 from sim.deformation import Deformation
 from sim.loads import Pushed
+from surrogate.evaluation.choose import unbeaten
 
-from ..play.load_text import doubt_of
-from ..play.player import Player
+from ..play.frame_text import doubt_of
+from ..play.player import Frame, Player
 from ..play.tip_reading import measured
 from ..script.tool_paths import lifted
 from .referee import Truth
@@ -85,3 +87,86 @@ def changed(truth: Truth, player: Player, shown: Deformation, off: Sequence[str]
     return (
         f"<p>without {escape(', '.join(off))} the tumour is {mean:.2f} mm from where all effects together have it</p>"
     )
+
+
+@dataclass
+class Moment:
+    """What the page shows now: the wish, its answer, the frame, and what the finite elements said of it.
+
+    `goal` is the wish that the frame is on the way to, `asked` the one that it answers, `look` how that is shown.
+    """
+
+    goal: tuple | None = None
+    asked: tuple | None = None
+    shown: Truth | None = None
+    rests: bool = False
+    look: tuple[Style, str, str] | None = None
+    load: str = ""
+    frame: Frame | None = None
+    picture: np.ndarray | None = None
+    truth: Truth | None = None
+    own: Truth | None = None
+    by: tuple | None = None
+    judged: Judged | None = None
+    stale: bool | None = None
+    plan: tuple[str, ...] | None = None
+
+
+# Loads that are kept of each deformer, the last ones.
+RECENT = 120
+
+
+@dataclass(frozen=True)
+class Row:
+    """A deformer's medians over `loads` loads; `best` where no other equals or beats it in both. None: no ranking."""
+
+    name: str
+    milliseconds: float
+    millimetres: float
+    loads: int
+    best: bool | None
+
+
+class Tally:
+    """Milliseconds and mean distance from the finite elements, by deformer and load."""
+
+    def __init__(self) -> None:
+        self._took: dict[str, dict[str, float]] = {}
+        self._missed: dict[str, dict[str, float]] = {}
+
+    def took(self, name: str, load: str, seconds: float) -> None:
+        """A deformer answered a load, named by its stamp."""
+        _keep(self._took.setdefault(name, {}), load, 1e3 * seconds)
+
+    def missed(self, name: str, load: str, metres: float) -> None:
+        """The finite elements, solved to the end, say how far off a deformer was under a load."""
+        _keep(self._missed.setdefault(name, {}), load, 1e3 * metres)
+
+    @property
+    def rows(self) -> list[Row]:
+        """The deformers of which both are known, fastest first.
+
+        Where all of them were shown some of the same loads, those alone count, and the rows are ranked. Otherwise each
+        counts its own, and there is no ranking: a median over other loads is no comparison.
+        """
+        known = {name: self._took.get(name, {}).keys() & missed.keys() for name, missed in self._missed.items()}
+        known = {name: loads for name, loads in known.items() if loads}
+        common = set.intersection(*map(set, known.values())) if len(known) > 1 else set()
+        places = {name: self._place(name, common or loads) for name, loads in known.items()}
+        best = unbeaten(places) if common else None
+        return [
+            Row(name, *place, len(common or known[name]), None if best is None else name in best)
+            for name, place in sorted(places.items(), key=lambda item: item[1])
+        ]
+
+    def _place(self, name: str, loads: set[str]) -> tuple[float, float]:
+        took, missed = self._took[name], self._missed[name]
+        return float(np.median([took[load] for load in loads])), float(np.median([missed[load] for load in loads]))
+
+
+def _keep(numbers: dict[str, float], load: str, value: float) -> None:
+    """Note the newest value of a load, and forget the load that was noted longest ago."""
+    numbers.pop(load, None)
+    numbers[load] = value
+    if len(numbers) > RECENT:
+        del numbers[next(iter(numbers))]

@@ -1,0 +1,94 @@
+"""Measurement of wall time and memory, with the machine that it was done on; tables of figures as CSV."""
+
+from __future__ import annotations
+
+import csv
+import os
+import platform
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import date
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import warp as wp
+
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.device import find_device
+from sim.runtime.versions import version_of
+
+
+def machine(device: str) -> str:
+    """Hardware, versions and date, in one line.
+
+    Raises
+    ------
+    InputError
+        A device that this machine does not have.
+    """
+    names = [wp.get_device(find_device(device, "float32").name).name]
+    try:
+        with open("/proc/cpuinfo") as file:
+            names += [line.split(":")[1].strip() for line in file if line.startswith("model name")][:1]
+    except OSError:
+        names.append(platform.processor())
+    versions = ", ".join(f"{name} {version_of(name)}" for name in ("sulcus", "warp-lang", "torch", "numpy"))
+    return (
+        f"{' / '.join(names)}, {os.cpu_count()} cores; Python {platform.python_version()}, {versions}; {date.today()}"
+    )
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a line for each row, and a column for each name that one has, whole or not at all."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    with written_whole(path, ".csv") as partial, partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(names))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def peak_memory() -> float | None:
+    """The largest resident size of this process so far [GiB], as Linux reports it."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) / 2**20 for line in lines if line.startswith("VmHWM:")), None)
+
+
+@contextmanager
+def watched_card(device: str) -> Iterator[list[int]]:
+    """The bytes of the card that are taken while the block runs, beyond those taken before; zero without a card."""
+    where = wp.get_device(None if device == "auto" else device)
+    taken = [0]
+    if not where.is_cuda:
+        yield taken
+        return
+    before, ended = where.free_memory, threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(0.02):
+            taken.append(before - where.free_memory)
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield taken
+    finally:
+        ended.set()
+        watcher.join()
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def timed(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> tuple[T, float]:
+    """What `work` returns, and the wall seconds that it took; the device is waited for at both readings."""
+    wp.synchronize()
+    begun = time.perf_counter()
+    found = work(*args, **kwargs)
+    wp.synchronize()
+    return found, time.perf_counter() - begun

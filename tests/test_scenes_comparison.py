@@ -1,0 +1,104 @@
+"""Verdict on the present load, and accuracy against time on the page."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from theatres import short
+
+from scenes.page.comparison import RECENT, Judged, Row, Tally, judge, verdict_words
+from scenes.page.referee import Truth
+from scenes.page.text import table
+from scenes.play.frame_text import doubt_of
+from scenes.play.player import Player
+from scenes.play.stage import Stage
+from sim.accuracy import LIVE
+from sim.deformation import Outcome
+
+
+def shown(tally: Tally, name: str, loads: Iterable[str], milliseconds: float, millimetres: float) -> None:
+    for load in loads:
+        tally.took(name, load, 1e-3 * milliseconds)
+        tally.missed(name, load, 1e-3 * millimetres)
+
+
+def test_deformers_are_ranked_over_the_loads_that_all_of_them_had():
+    tally = Tally()
+    assert tally.rows == [] and table(tally.rows) == ""
+    shown(tally, "quick", "abc", 1.0, 0.2)
+    shown(tally, "quick", "z", 90.0, 90.0)  # a load that nobody else had does not count against it
+    shown(tally, "slow", "abc", 4.0, 0.03)
+    shown(tally, "lost", "bcd", 5.0, 0.2)
+    tally.took("unjudged", "a", 1e-3)
+    rows = [(row.name, round(row.milliseconds, 9), round(row.millimetres, 9), row.loads) for row in tally.rows]
+    assert rows == [("quick", 1.0, 0.2, 2), ("slow", 4.0, 0.03, 2), ("lost", 5.0, 0.2, 2)]
+    assert [row.best for row in tally.rows] == [True, True, False]
+    words = table(tally.rows)
+    assert "over the same 2 loads" in words and words.count("best") == 2
+
+
+def test_without_a_common_load_nobody_is_ranked():
+    """One on frames without force, the other at full force: the medians are no comparison."""
+    tally = Tally()
+    shown(tally, "resting", "ab", 1.0, 0.002)
+    assert [row.best for row in tally.rows] == [None]
+    shown(tally, "pressing", "c", 1.0, 0.2)
+    assert [row.best for row in tally.rows] == [None, None]
+    words = table(tally.rows)
+    assert "not to be compared" in words and "best" not in words
+
+
+def test_a_load_shown_again_counts_once_and_old_loads_are_forgotten():
+    tally = Tally()
+    for load in range(RECENT):
+        shown(tally, "a", [str(load)], 9.0, 9.0)
+    for load in (*range(1000, 1000 + RECENT - 1), 1000, 1000):
+        shown(tally, "a", [str(load)], 4.0, 1.0)
+    assert tally.rows == [Row("a", 4.0, 1.0, RECENT, None)]
+
+
+def test_an_error_too_small_to_print_is_not_reported_as_none():
+    rows = [Row("a", 1.0, 4e-4, 3, None), Row("b", 1.0, 1.234e-3, 3, None)]
+    assert "under 0.001 mm off" in table(rows) and "0.001 mm off</td><td>3 loads" in table(rows)
+    assert "0.000" not in table(rows)
+
+
+class TestVerdict:
+    JUDGED = Judged(28, 0.35, "", 1e-3, 1e-4, 2e-4)
+
+    def test_of_the_present_load_it_stands_plainly(self):
+        said = verdict_words(self.JUDGED, False, "waits")
+        assert "mean 0.100, largest 0.200 mm" in said and "stale" not in said and "waits" not in said
+
+    def test_of_another_load_it_is_greyed_and_says_so(self):
+        said = verdict_words(self.JUDGED, True, "waits")
+        assert said.startswith('<p class="stale">of an earlier load') and "frame 28" in said and "waits" in said
+
+    def test_an_answer_short_of_its_tolerance_is_not_relied_on(self):
+        said = [
+            verdict_words(replace(self.JUDGED, doubt=doubt), False, "waits") for doubt in ("", doubt_of(Outcome.BUDGET))
+        ]
+        assert ["do not rely on it" in each for each in said] == [False, True]
+
+    def test_before_any_it_says_what_is_waited_for(self):
+        assert verdict_words(None, True, "waits") == '<p class="stale">waits</p>'
+
+
+def test_a_verdict_is_the_error_in_millimetres(theatre):
+    """Of a model whose answer is 0.2 mm off everywhere, and of the finite elements' own distance."""
+    scene = short()
+    whole = Player(Stage(scene, theatre.site), theatre.fem(scene, LIVE))
+    loads = whole.loads(3)
+    answer = whole.answer(loads)
+
+    class Off:
+        def deform(self, loads, start=None, at=None):
+            found = whole.deformer.deform(loads, at=at)
+            return replace(found, displacement=found.displacement + [0.0, 0.2e-3, 0.0])
+
+    found = judge(Truth(3, loads, answer, 0.5), replace(whole, deformer=Off()), own=False)
+    said = verdict_words(found, stale=False, waits="")
+    assert "error against FEM: mean 0.200, largest 0.200 mm; tip to tumour " in said
+    tip = whole.drawn(3, whole.touch(3), loads, answer, 0.0).distance
+    assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
+    assert " by FEM, without the error of the tumour (" in said
+    assert verdict_words(found, stale=True, waits="").startswith('<p class="stale">of an earlier load: ')
