@@ -31,10 +31,8 @@ def kernel_of(device: Device) -> wp.Kernel:
         table: wp.array2d(dtype=wp.int32),
         gradient: wp.array3d(dtype=vec),
         weight: wp.array2d(dtype=wp.float64),
-        # outputs
-        least: wp.array(dtype=wp.float64),
-        most: wp.array(dtype=wp.float64),
-        volume: wp.array(dtype=wp.float64),
+        # outputs: least and most square stretch, volume
+        found: wp.array2d(dtype=wp.float64),
     ):
         """Extreme eigenvalues of C = F^T F: q + 2 p cos(phi), q + 2 p cos(phi + 2 pi / 3).
 
@@ -53,15 +51,15 @@ def kernel_of(device: Device) -> wp.Kernel:
             B = C - q * wp.identity(n=3, dtype=wp.float64)
             p = wp.sqrt(wp.ddot(B, B) / wp.float64(6.0))
             above, below = q + wp.float64(2.0) * p, q - wp.float64(2.0) * p
-            if above > most[c] or below < least[c] or above > high or below < low:
+            if above > found[1, c] or below < found[0, c] or above > high or below < low:
                 phi = wp.acos(wp.clamp(wp.determinant(B / p) / wp.float64(2.0), wp.float64(-1.0), wp.float64(1.0)))
                 phi /= wp.float64(3.0)
                 above = q + wp.float64(2.0) * p * wp.cos(phi)
                 below = q + wp.float64(2.0) * p * wp.cos(phi + wp.float64(2.0 * wp.pi / 3.0))
-                wp.atomic_max(most, c, above)
-                wp.atomic_min(least, c, below)
+                wp.atomic_max(found, 1, c, above)
+                wp.atomic_min(found, 0, c, below)
                 if above > high or below < low:
-                    wp.atomic_add(volume, c, weight[e, k])
+                    wp.atomic_add(found, 2, c, weight[e, k])
 
     return measure
 
@@ -83,10 +81,9 @@ class Stretch:
 
     def measure(self, u: wp.array) -> dict[str, np.ndarray]:
         """Fields `stretch` and `strained` of a `Deformation` at u (3N, B) [m] on the device."""
-        start = (1.0, 1.0, 0.0)
-        out = [wp.full(u.shape[1], value, dtype=wp.float64, device=self._device.name) for value in start]
-        self._device.launch(kernel_of(self._device), (len(self._shape[1]), u.shape[1]), [u, *self._shape], out)
-        least, most, volume = (array.numpy() for array in out)
+        found = self._device.array(np.repeat([[1.0], [1.0], [0.0]], u.shape[1], axis=1), wp.float64)
+        self._device.launch(kernel_of(self._device), (len(self._shape[1]), u.shape[1]), [u, *self._shape], [found])
+        least, most, volume = found.numpy()
         return {"stretch": np.sqrt(np.stack([least.clip(0.0), most])), "strained": volume}
 
     def exceeds(self, volume: np.ndarray) -> np.ndarray:
