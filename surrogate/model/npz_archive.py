@@ -15,7 +15,6 @@ from numpy.lib import format as npy
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from sim.runtime.atomic_files import written_whole
-from sim.runtime.device import find_device
 from sim.runtime.file_limits import LARGEST_HEADER, LARGEST_MODEL
 from sim.runtime.outside_files import read_as
 from sim.runtime.versions import version_of
@@ -135,6 +134,8 @@ def kept_path(folder: Path | None, stem: str, device: str, *stated: object) -> P
     """
     if folder is None:
         return None
+    from sim.runtime.device import find_device  # Warp, which reading a model does not need
+
     on = "cuda" if find_device(device, "float32").on_cuda else "cpu"
     key = repr((version_of("sulcus"), on, *stated))
     return folder / f"{stem}{digest_of(np.frombuffer(key.encode(), np.uint8))}.npz"
