@@ -1,10 +1,20 @@
-"""Wishes of visitors: who plays, seeks and holds the tool."""
+"""Wishes of visitors: who plays, seeks and holds the tool; what one of them asks ends the page for nobody."""
 
 import threading
 import time
+from dataclasses import replace
 
-from scenes.page.requests import SCRIPT, Wish
-from scenes.script.tool_paths import Touch
+import pytest
+from theatres import Silent, small
+from visitor import Visitor, free_port, wait_for
+
+from scenes.page.demo import READING, Demo
+from scenes.page.referee import Referee
+from scenes.page.requests import HAND, SCRIPT, Wish, holding
+from scenes.play.deformers import Theatre
+from scenes.play.player import Player
+from scenes.script.tool_paths import Touch, press
+from sim.errors import InputError
 
 
 class TestWish:
@@ -48,3 +58,147 @@ class TestWish:
         for hand in hands:
             hand.join()
         assert wish.now()[2] == Touch(force=0.1, tilt=(0.2, -0.3))
+
+
+@pytest.fixture
+def scene():
+    return small(path=press(0.3, rise=1.0, hold=1.0), duration=2.0, frames_per_second=60.0)
+
+
+@pytest.fixture
+def demo(theatre, scene, monkeypatch):
+    monkeypatch.setattr("scenes.page.cast.Referee", Silent)
+    demo = Demo(theatre, scene, "linear", "127.0.0.1", free_port())
+    demo.wish.set(plays=False)
+    yield demo
+    demo.close()
+
+
+@pytest.fixture
+def running(demo):
+    """The loop on a thread of its own, for a test's time; what it raises fails the test."""
+    done = threading.Event()
+    failed = []
+
+    def play():
+        while not done.is_set():
+            try:
+                demo.run(0.3)
+            except Exception as error:
+                failed.append(error)
+                return
+
+    loop = threading.Thread(target=play)
+    loop.start()
+    yield demo
+    done.set()
+    loop.join()
+    assert not failed
+
+
+def report(demo):
+    return demo.browser.shown[2]
+
+
+def refuse(monkeypatch, refused, error):
+    """Have loads refused that `refused` says, by frame number and touch."""
+    loads = Player.loads
+
+    def refusing(player, number, touch=None):
+        if refused(number, touch):
+            raise error
+        return loads(player, number, touch)
+
+    monkeypatch.setattr(Player, "loads", refusing)
+
+
+def test_a_load_that_is_refused_is_said_on_the_page_which_goes_on(running, monkeypatch):
+    refuse(monkeypatch, lambda number, touch: touch and touch.force > 0.3, InputError("0.35 N is too much: push less."))
+    one, other = Visitor(running.browser, 1200), Visitor(running.browser, 1200)
+    assert wait_for(lambda: running.browser.visitors == 2)
+    one.set(running.browser.inputs["force [N]"], 0.35)
+    assert wait_for(lambda: "error: this frame is left out (0.35 N is too much: push less.)" in report(running))
+    one.wire.close()
+    assert wait_for(lambda: running.browser.visitors == 1)
+    other.set(running.browser.inputs["force [N]"], 0.21)
+    assert wait_for(lambda: "force 0.21 N" in report(running))
+    other.wire.close()
+
+
+def test_a_defect_is_said_in_a_line_and_playing_goes_on(demo, monkeypatch, capfd):
+    refuse(monkeypatch, lambda number, touch: number == 5, IndexError("none such"))
+    demo.wish.set(plays=True, number=4)
+    assert demo.run(READING + 1.5) > 1
+    assert demo.wish.number > 5
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1 and "sulcus demo: a defect: IndexError, none such (line" in said
+
+
+def test_loads_that_the_finite_elements_refuse_are_left_out_alone(theatre, scene, monkeypatch):
+    refuse(monkeypatch, lambda number, touch: number == 7, InputError("7 is refused."))
+    player = theatre.player("linear", scene)  # as quick to have, and asked the same way
+    monkeypatch.setattr(Theatre, "player", lambda *words: player)
+    referee = Referee(theatre, scene, threading.Lock())
+    referee.ask(7, None)
+    assert wait_for(lambda: str(referee.failure) == "7 is refused.")
+    referee.ask(8, None)
+    assert wait_for(lambda: referee.truth is not None and referee.truth.number == 8)
+    assert referee.failure is None and referee.thread.is_alive()
+    referee.close()
+
+
+def test_each_visitor_reads_who_has_the_tool(running):
+    page = running.browser
+    one = Visitor(page, 1200)
+    assert wait_for(lambda: page.visitors == 1)
+    other = Visitor(page, 1200)
+    assert wait_for(lambda: page.here == {1, 2})
+
+    def read():
+        return [row.line.content for _, row in sorted(page.crowd.rows.items())]
+
+    assert wait_for(lambda: len(read()) == 2 and all("script moves the tool; 2 visitors" in line for line in read()))
+    one.set(page.inputs["force [N]"], 0.31)
+    assert wait_for(lambda: "**you hold the tool**" in read()[0] and "another visitor (number 1) holds" in read()[1])
+    other.set(page.crowd.rows[1].ask, True)
+    assert wait_for(lambda: page.crowd.rows[0].give.visible)
+    one.set(page.crowd.rows[0].give, True)
+    assert wait_for(lambda: "You lead" in read()[1])
+    other.set(page.inputs["place up [mm]"], 3.0)
+    assert wait_for(lambda: "another visitor (number 2) holds" in read()[0] and "**you hold" in read()[1])
+    other.wire.close()
+    assert wait_for(lambda: read() == [holding(1, 2, {1})])
+    assert "visitor 2 held the tool and has left" in read()[0]
+    one.set(page.inputs["tool"], SCRIPT)
+    assert wait_for(lambda: read() == ["the script moves the tool"])
+    one.wire.close()
+
+
+def test_hand_starts_where_the_script_has_the_tool(demo, monkeypatch):
+    """By a slider and by the menu; the sliders follow the script."""
+    demo.wish.set(plays=False, number=100)
+    path = demo.stage.scene.path
+
+    def moved(time):
+        return replace(path(time), x=3e-3, y=-2e-3, force=0.25, tilt=(0.1, -0.05))
+
+    monkeypatch.setitem(vars(demo.stage.scene), "path", moved)
+    visitor, inputs = Visitor(demo.browser, 1200), demo.browser.inputs
+    labels = ("force [N]", "place right [mm]", "place up [mm]", "direction right [deg]", "direction up [deg]")
+
+    def shown():
+        return [inputs[label].value for label in labels]
+
+    assert wait_for(lambda: demo.run(0.2) and shown() == [0.25, 3.0, -2.0, 5.73, -2.86])
+    visitor.set(inputs["tool"], HAND)
+    assert wait_for(lambda: demo.wish.tool == HAND) and demo.wish.touch == moved(0.0)
+    visitor.set(inputs["force [N]"], 0.1)
+    assert wait_for(lambda: demo.wish.touch.force == 0.1)
+    demo.run(0.2)
+    assert shown()[0] == 0.1
+    visitor.set(inputs["tool"], SCRIPT)
+    assert wait_for(lambda: demo.run(0.2) and demo.wish.tool == SCRIPT and shown()[0] == 0.25)
+    visitor.set(inputs["place up [mm]"], 1.0)
+    assert wait_for(lambda: demo.wish.tool == HAND)
+    assert demo.wish.touch == replace(moved(0.0), y=1e-3)
+    visitor.wire.close()
