@@ -20,10 +20,10 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import Basis
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.model import npz_archive
+from surrogate.model import kept_arrays
 from surrogate.model.conformal import GROWTH, Bound
+from surrogate.model.kept_arrays import kept_path
 from surrogate.model.learned import Part
-from surrogate.model.npz_archive import kept_path
 from surrogate.model.store import learned_tissue, load, save, stated_errors
 from surrogate.model.training_range import Outside
 from surrogate.training.train import train
@@ -199,9 +199,9 @@ def test_kept_path_states_version_device_and_the_rest(tmp_path, monkeypatch):
     first = kept_path(tmp_path, "a-", "cpu", "digest", "smoothed")
     assert first == kept_path(tmp_path, "a-", "cpu", "digest", "smoothed") and kept_path(None, "a-", "cpu") is None
     others = [kept_path(tmp_path, "a-", "cpu", "digest", "p2")]
-    monkeypatch.setattr(npz_archive, "version_of", lambda name: "9.9")
+    monkeypatch.setattr(kept_arrays, "version_of", lambda name: "9.9")
     others.append(kept_path(tmp_path, "a-", "cpu", "digest", "smoothed"))
-    monkeypatch.setattr(npz_archive, "find_device", lambda name, precision: SimpleNamespace(on_cuda=True))
+    monkeypatch.setattr(kept_arrays, "find_device", lambda name, precision: SimpleNamespace(on_cuda=True))
     others.append(kept_path(tmp_path, "a-", "cuda", "digest", "smoothed"))
     assert len({first, *others}) == 4
 

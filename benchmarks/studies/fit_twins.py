@@ -18,7 +18,7 @@ from sim.fem import Fem
 from sim.geometry.locate import locate
 from sim.loads import Loads, Posture, Pushed
 from surrogate.data.tool_loads import draw as drawn_loads
-from surrogate.model.npz_archive import kept_arrays, kept_path
+from surrogate.model.kept_arrays import kept_arrays, kept_path
 
 from .locate_twins import LEFT, PROBABLE, RATIO, SKULLS, STIFFNESS, TILT, check_same, ogden
 

@@ -20,7 +20,7 @@ from sim.geometry.locate import locate
 from sim.loads import Loads, Posture, Pushed
 from sim.material import MATERIALS, Ogden
 from surrogate.data.tool_loads import draw as drawn_loads
-from surrogate.model.npz_archive import kept_arrays, kept_path
+from surrogate.model.kept_arrays import kept_arrays, kept_path
 
 CAUSES = ("tool", "drainage", "swelling", "drainage and tool")
 """What moves twins, one after the other: each takes part in a quarter of them, or in half."""

@@ -16,7 +16,8 @@ from sim.geometry.locate import Located, locate
 from sim.loads import Loads
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
-from surrogate.model.npz_archive import REMADE, Archive
+from surrogate.model.kept_arrays import REMADE
+from surrogate.model.npz_archive import Archive
 
 from .study import Study
 

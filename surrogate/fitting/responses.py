@@ -22,7 +22,7 @@ from sim.loads import Loads, Posture, Pushed
 from ..locating.causes import SPREAD, SUPINE, USUAL, directions, linear
 from ..locating.locator import telling_nodes
 from ..locating.regions import Region, beside
-from ..model.npz_archive import kept_arrays, kept_path
+from ..model.kept_arrays import kept_arrays, kept_path
 
 RATIOS = np.geomspace(0.4, 3.2, 4)
 """Stiffness of the tumour over the brain's, in the tissues that are solved."""

@@ -17,7 +17,7 @@ from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
 
-from ..model.npz_archive import kept_arrays, kept_path
+from ..model.kept_arrays import kept_arrays, kept_path
 from .causes import (
     DRAINAGE,
     OEDEMA,

@@ -30,8 +30,9 @@ from ..data.dataset import Dataset
 from ..data.encode import Basis, directions, nodal_shares, reduce
 from ..data.tool_loads import spread
 from ..model.applicability import trained_skull
+from ..model.kept_arrays import REMADE
 from ..model.learned import Part, only_pushed
-from ..model.npz_archive import REMADE, Archive
+from ..model.npz_archive import Archive
 from ..regressors.force_series import FACTORS, SPANS, Pairs, Series, filled
 from ..regressors.protocol import Linear
 from ..regressors.rigid_contact import Contact
