@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 import scenes.gym  # registers the environments
-from scenes.gym.observation import scripted
+from scenes.gym.scripted import scripted
 
 ROUNDS, DRAWN, KEPT, STEPS = 7, 32, 5, 40
 scenes.gym.register_environments()

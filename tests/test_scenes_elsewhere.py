@@ -13,17 +13,19 @@ from theatres import template_theatre
 
 from ar.optics.lens import Lens
 from ar.tracking.pictures import film_of
-from ar.tracking.pose import Pose, Verdict, moved_about
+from ar.tracking.pose import Pose, Verdict
 from ar.tracking.pose_stream import AHEAD, DAY, LONGEST, Clock, clock_by_motion, stream_of
+from ar.tracking.rigid import moved_about
 from ar.tracking.targets import patient_reference
 from scenes.cli import main
 from scenes.script.scene import find_scene
-from scenes.tracked.agreement import Agreement, buried
+from scenes.tracked.agreement import Agreement
 from scenes.tracked.calibration_file import read_calibration, read_intrinsic_covariance, write_exactly_known
 from scenes.tracked.elsewhere import Elsewhere, Eye
 from scenes.tracked.follower import Follower, State
 from scenes.tracked.hand_eye_file import read_hand_eye
 from scenes.tracked.picture import head_lines
+from scenes.tracked.plausible import buried
 from scenes.tracked.pose_file import TrackedRow, read_stream, write_poses
 from scenes.tracked.registration_file import read_registration
 from scenes.tracked.run import timed

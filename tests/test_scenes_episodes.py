@@ -14,8 +14,9 @@ from tiny_work import tiny_run
 
 from scenes.cli import main
 from scenes.episodes.engine import sbatch_script
+from scenes.episodes.estimate import estimated, lines
 from scenes.episodes.plan import load_plan
-from scenes.episodes.rates import Rate, estimated, lines, read_rates, written_rates
+from scenes.episodes.rates import Rate, read_rates, written_rates
 from scenes.episodes.run_folder import Failure, begin, mark_failed, unmark
 from scenes.episodes.tasks import Outcome
 from sim.errors import InputError

@@ -10,8 +10,8 @@ from links import in_mm
 from scipy.spatial.transform import Rotation
 from theatres import template_theatre
 
-from ar.tracking.pose import moved_about
 from ar.tracking.pose_stream import stream_of
+from ar.tracking.rigid import moved_about
 from scenes.link.answer import Answering
 from scenes.link.heard import Heard, Names
 from scenes.script.scene import find_scene

@@ -20,7 +20,7 @@ from scenes import read_episodes, write_card
 from scenes.cli import main
 from scenes.episodes.exports.card import keep_card
 from scenes.episodes.exports.columns import rate_of, states, twists
-from scenes.episodes.exports.statistics import TASKS, held_out
+from scenes.episodes.exports.tasks import TASKS, held_out
 from scenes.episodes.reading.contents import read_contents
 from scenes.episodes.run_folder import finished
 from sim.errors import InputError

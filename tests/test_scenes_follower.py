@@ -16,9 +16,9 @@ from ar.tracking.pose import Pose
 from ar.tracking.registration import Registration
 from ar.tracking.track import Tracked
 from scenes.script.scene import find_scene
-from scenes.tracked.agreement import implausible
 from scenes.tracked.follower import HELD, PATIENT, State, tip_covariance
 from scenes.tracked.picture import Painter
+from scenes.tracked.plausible import implausible
 from scenes.tracked.run import aged
 from scenes.tracked.tracked_tool import TrackedTool
 from sim.tools import Ball

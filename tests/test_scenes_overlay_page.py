@@ -16,10 +16,10 @@ from ar.page.aside import KEYS, TABS
 from ar.page.sight import HISTORY, PICTURE, SAID, SLICES
 from ar.tracking.pictures import film_of
 from scenes.cli import main
-from scenes.tracked.film_camera import SeekableFilm
 from scenes.tracked.follower import State
 from scenes.tracked.page import OverlayPage
 from scenes.tracked.picture import Painter
+from scenes.tracked.seekable_film import SeekableFilm
 
 
 @contextmanager

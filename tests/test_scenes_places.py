@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from scenes.cli import main
-from scenes.warp.markups import landmarks_of
+from scenes.warp.landmarks import landmarks_of
 from scenes.warp.moment import Cause, Moment
 from scenes.warp.places import ENOUGH, FINEST, fields_of, finer_spacing, folds_of, places_of
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenes.episodes.draws import noisy, sensed
+from scenes.episodes.sensing import noisy, sensed
 
 
 def test_noise_has_its_deviation_and_no_mean():

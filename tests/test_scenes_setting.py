@@ -15,9 +15,10 @@ from theatres import put, theatre_of
 import scenes.gym
 from scenes.gym.environment import many as made_apart
 from scenes.gym.episode import ENDED, FAR, OVER_LIMIT, SHARE, STEP, Judged, earned
-from scenes.gym.observation import FELT, TRACKED, scripted
+from scenes.gym.observation import FELT, TRACKED
 from scenes.gym.pressed_model import Hertz, PressedModel
 from scenes.gym.registration import NAMES, register_environments
+from scenes.gym.scripted import scripted
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT, TASKS
 from scenes.gym.touched import Asked

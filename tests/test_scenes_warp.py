@@ -14,7 +14,7 @@ import slicerio
 import trimesh
 
 from scenes.cli import main
-from scenes.warp.markups import NEAREST, landmarks_of
+from scenes.warp.landmarks import NEAREST, landmarks_of
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.geometry.locate import locate
 from sim.geometry.tetmesh import signed_volumes

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ar.optics.camera import Camera
 from ar.overlay.outlines import silhouette
-from scenes.episodes.reading.contents import surface_rows
+from scenes.episodes.reading.bodies import surface_rows
 from scenes.episodes.reading.schema import ARRAYS
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy

@@ -19,8 +19,9 @@ from .aside import BACK, KEYS, LIVE_KEYS, ON, RECORD, SPACE, aside
 from .control_lock import Crowd
 from .guard import LIMITS, Limits, bracketed, check_address, open_server
 from .inputs import Inputs, noted
-from .parts import Body, Control, Deed, Fold, Note, Playback, Sign, Viewpoint, add_body, dress
+from .parts import Body, Control, Deed, Fold, Note, Playback, Sign, Viewpoint
 from .recording import Recorder
+from .scene import add_body, dress
 from .sight import ASIDE, PICTURE, SAID, coded, sight, unparted
 from .style import PAGE, STATUS, style
 

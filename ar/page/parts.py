@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import viser
-
-# Width of the docked panel where a browser does not know the page's own rules [CSS pixel].
-PANEL = 676.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,36 +130,3 @@ class Viewpoint:
     target: np.ndarray
     up: np.ndarray
     fov: float = np.radians(50.0)
-
-
-def dress(server: viser.ViserServer, viewpoint: Viewpoint, signs: Sequence[Sign]) -> None:
-    """Colours, light, signs, the panel's place and the first view of the 3-D scene."""
-    gui, scene = server.gui, server.scene
-    gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
-    gui.main_panel.dock_left()
-    gui.main_panel.set_width(PANEL)
-    # Two soft lights from the first viewpoint's sides: the page's own four wash the colours out.
-    scene.configure_default_lights(enabled=False)
-    scene.add_light_ambient("/light/ambient", intensity=2.0)
-    across = np.cross(np.asarray(viewpoint.target) - viewpoint.eye, viewpoint.up)
-    for name, side, strength in (("left", -1.0, 2.2), ("right", 1.0, 1.0)):
-        place = np.asarray(viewpoint.eye) + side * across / np.linalg.norm(across)
-        scene.add_light_directional(f"/light/{name}", intensity=strength, position=tuple(place))
-    for sign in signs:
-        scene.add_label(f"/sign/{sign.word}", sign.word, position=np.asarray(sign.place), anchor="center-center")
-    start = server.initial_camera
-    start.position, start.look_at = tuple(viewpoint.eye), tuple(viewpoint.target)
-    start.up, start.fov = tuple(viewpoint.up), viewpoint.fov
-
-
-def add_body(server: viser.ViserServer, body: Body) -> viser.MeshHandle:
-    """A surface in the 3-D view, seen from both sides."""
-    return server.scene.add_mesh_simple(
-        f"/{body.name}",
-        np.asarray(body.vertices, np.float32),
-        np.asarray(body.triangles, np.uint32),
-        color=np.asarray(body.colour, np.float64),
-        opacity=None if body.opacity >= 1.0 else body.opacity,
-        wireframe=body.wireframe,
-        side="double",
-    )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .pose import angles_of, cross_matrices
+from .rigid import angles_of, cross_matrices
 
 FEWEST_POSES = 4
 # Motions turn by such angles [rad]: of smaller ones the axis is unsure, and near half a turn its sign is.

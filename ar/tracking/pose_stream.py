@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .pose import Pose, turn_vectors
+from .pose import Pose
+from .rigid import turn_vectors
 
 # Two samples that are farther apart have none between them; nobody knows a pose so long after the last one [s].
 LONGEST, AHEAD = 0.1, 0.05

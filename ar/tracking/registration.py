@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from scipy.stats import chi2, f
 
-from .pose import cross_matrices, moved_about
+from .rigid import cross_matrices, moved_about
 
 FEWEST_PAIRS, FEWEST_SURFACE = 3, 20
 # Nobody touches a point more exactly [m]; pairs that fit no better than this fit no rigid motion [m].

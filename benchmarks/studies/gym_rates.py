@@ -9,7 +9,7 @@ import numpy as np
 
 from scenes.analysis.measurement import timed
 from scenes.gym.environment import VectorEnv
-from scenes.gym.observation import scripted
+from scenes.gym.scripted import scripted
 
 
 @dataclass(frozen=True)

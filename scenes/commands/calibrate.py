@@ -84,8 +84,8 @@ def _camera(args: argparse.Namespace) -> int:
     from ar.tracking.intrinsics import calibrated
     from ar.tracking.targets import calibration_board
 
+    from ..tracked.board_pictures import seen_views
     from ..tracked.calibration_file import SUFFIXES, intrinsics_header, write_calibration
-    from ..tracked.film_camera import seen_views
 
     if not args.out:
         raise InputError("give --out K.yaml for the camera.")
@@ -179,7 +179,7 @@ def _said(values: np.ndarray, deviations: np.ndarray) -> str:
 
 def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray], rows: np.ndarray) -> Found:
     """Calibration by `fit` from poses of files; InputError if it fails, or if its residuals exceed its limits."""
-    from ar.tracking.pose import reread
+    from ar.tracking.rigid import reread
 
     names = " and ".join(map(str, files))
     try:

@@ -233,7 +233,8 @@ def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, w
 
 
 def _print_estimate(args: argparse.Namespace, plan: Plan, out: Path) -> int:
-    from ..episodes.rates import estimated, lines, read_rates
+    from ..episodes.estimate import estimated, lines
+    from ..episodes.rates import read_rates
     from ..episodes.run_folder import read_run
 
     found = read_run(out)

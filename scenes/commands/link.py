@@ -19,7 +19,7 @@ from sim.errors import InputError
 
 from ..options.shared_options import add_device
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
-from ..tracked.tool_motion import mover, tracked_scene
+from ..tracked.tracked_scene import mover, tracked_scene
 from .interrupt import until_ended
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from ..options.shared_options import (
 )
 from ..options.theatre_options import add_bodies
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
-from ..tracked.tool_motion import REST, mover, tracked_scene
+from ..tracked.tracked_scene import REST, mover, tracked_scene
 from .interrupt import until_ended
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ def _camera_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) ->
 
 
 def _film_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
-    from ..tracked.film_camera import SeekableFilm
+    from ..tracked.seekable_film import SeekableFilm
 
     film = SeekableFilm(Path(args.pictures), args.rate)
     return _page(args, parts, closing, film.path.name, film.count).play(film, args.seconds)

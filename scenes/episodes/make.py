@@ -22,12 +22,13 @@ from ..play.deformers import Theatre
 from ..play.reference import following
 from ..script.scene import Scene
 from .bodies import ABOUT, Body, read_body, write_body
-from .draws import noisy, random_of, sensed
+from .draws import random_of
 from .episode import Recording, collect
 from .half_made import begun, emptied
 from .plan import NO_LEARNER, Plan
 from .run_folder import BODIES, episode_name
 from .scripted import drawn_body_of, drawn_episode, scene_of
+from .sensing import noisy, sensed
 from .tasks import Made
 
 KEPT = 2

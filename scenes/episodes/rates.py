@@ -5,26 +5,18 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from sim.errors import InputError
 from sim.runtime.atomic_files import why
 
-from .engine import BODY, EPISODE
 from .run_folder import RATES
-from .tasks import FIRST, LATER, OF_BODY, OF_PROCESS, Outcome
+from .tasks import Outcome
 
 COLUMNS = "kind,number,frames,bytes,seconds,first"
-DAY = 86400.0
-UNITS = (DAY, "days"), (3600.0, "h"), (60.0, "min")
-"""In which times are printed [s], where they are twice as long or longer."""
-PROCESSES = (1, 8, 64, 512)
-"""For how many the time is printed."""
 
 
 @dataclass(frozen=True)
@@ -80,148 +72,3 @@ def read_rates(folder: Path) -> list[Rate]:
             except ValueError:
                 continue
     return found
-
-
-@dataclass(frozen=True)
-class Amount:
-    """A sum that is expected, and its standard error; the latter NaN where one was measured and no more."""
-
-    mean: float
-    error: float
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What episodes will take.
-
-    Parameters
-    ----------
-    episodes, bodies
-        That are asked for.
-    measured, measured_bodies
-        From which that is known.
-    seconds, frames, bytes
-        Of one process that has started [s], frames, and bytes, of all episodes and their bodies.
-    start, opening
-        How much longer than others its first episode takes a process, which loads and compiles; and the first of them
-        on each further body [s]. NaN: not known.
-    apart
-        Whether `seconds` are those of others; if not, they hold both.
-    """
-
-    episodes: int
-    bodies: int
-    measured: int
-    measured_bodies: int
-    seconds: Amount
-    frames: Amount
-    bytes: Amount
-    start: Amount
-    opening: Amount
-    apart: bool
-
-    def lasts(self, processes: int) -> Amount:
-        """How long so many processes take [s]."""
-        each = self.episodes / processes
-        further = self.bodies * -np.expm1(-each / self.bodies) - 1.0  # bodies that so many episodes of one meet
-        parts = (self.start, 1.0), (self.opening, max(0.0, further)), (self.seconds, 1.0 / processes)
-        return _added([Amount(part.mean * by, part.error * by) for part, by in parts if np.isfinite(part.mean)])
-
-
-def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
-    """What a number of episodes on a number of bodies will take, as those that were measured.
-
-    Raises
-    ------
-    InputError
-        Nothing that was measured.
-    """
-    own = {kind: [rate for rate in rates if rate.kind == kind] for kind in (EPISODE, BODY)}
-    if not own[EPISODE]:
-        raise InputError(
-            "no episode was measured there: make some first, by the same command with --count 8 and without --estimate."
-        )
-    counts = {EPISODE: episodes, BODY: bodies}
-    by = {first: [rate for rate in own[EPISODE] if rate.first == first] for first in FIRST}
-    apart = len(by[LATER]) > 1
-
-    def amount(what: str, those: Mapping[str, Sequence[Rate]]) -> Amount:
-        return _added(
-            [_sum([getattr(one, what) for one in those[kind]], counts[kind]) for kind in those if those[kind]]
-        )
-
-    return Estimate(
-        episodes=episodes, bodies=bodies, measured=len(own[EPISODE]), measured_bodies=len(own[BODY]),
-        seconds=amount("seconds", {**own, EPISODE: by[LATER] if apart else own[EPISODE]}),
-        frames=amount("frames", {EPISODE: own[EPISODE]}),
-        bytes=amount("bytes", own),
-        start=_longer(by[OF_PROCESS], by[LATER] if apart else []),
-        opening=_longer(by[OF_BODY], by[LATER] if apart else []),
-        apart=apart,
-    )  # fmt: skip
-
-
-def _longer(first: Sequence[Rate], others: Sequence[Rate]) -> Amount:
-    """How much longer the one take than the others, in the mean [s]; of one alone, all of that may be an error."""
-    if not (first and others):
-        return Amount(np.nan, np.nan)
-    one, other = (_mean([rate.seconds for rate in those]) for those in (first, others))
-    longer, error = max(0.0, one.mean - other.mean), float(np.hypot(one.error, other.error))
-    return Amount(longer, error if np.isfinite(error) else longer)
-
-
-def _mean(values: Sequence[float]) -> Amount:
-    """A mean and its standard error."""
-    error = float(np.std(values, ddof=1)) / np.sqrt(len(values)) if len(values) > 1 else np.nan
-    return Amount(float(np.mean(values)), error)
-
-
-def _sum(values: Sequence[float], count: int) -> Amount:
-    """Of `count` as these, whose mean is known to its standard error only; exactly where all were measured."""
-    mean = _mean(values)
-    return Amount(count * mean.mean, 0.0 if len(values) >= count else count * mean.error)
-
-
-def _added(amounts: Sequence[Amount]) -> Amount:
-    """A sum of independent amounts."""
-    return Amount(sum(one.mean for one in amounts), float(np.hypot.reduce([one.error for one in amounts])))
-
-
-def lines(estimate: Estimate) -> list[str]:
-    """A table of it."""
-    found = estimate
-    rows = [
-        ("disk", _plus_minus(found.bytes, 1e9, "GB")),
-        ("frames", _plus_minus(found.frames, 1e6, "million")),
-        ("work of one process", _time(found.seconds)),
-        ("start of a process", _time(found.start)),
-        ("its first on a body", _time(found.opening)),
-        *((f"time of {count} process{'es' * (count > 1)}", _time(found.lasts(count))) for count in PROCESSES),
-        ("processes for one day", f"{int(np.ceil(found.seconds.mean / DAY))}"),
-    ]
-    width = max(len(name) for name, _ in rows)
-    bodies = f" and {found.measured_bodies} bodies" if found.measured_bodies else ", and no body"
-    said = [
-        f"{found.episodes} episodes on {found.bodies} bodies, as measured of {found.measured} episodes{bodies}:",
-        *(f"  {name:{width}}  {value}" for name, value in rows),
-        "The margin is the standard error of the mean, times the count. Processes are taken to be as fast as those "
-        "that were measured.",
-    ]
-    if not found.apart:
-        said.append(
-            "Nearly all of these were their process's first on their body, which take longer: the times are too long. "
-            f"Make {2 * found.measured} or more for better ones."
-        )
-    return said
-
-
-def _time(amount: Amount) -> str:
-    unit, word = next((each for each in UNITS if amount.mean >= 2.0 * each[0]), (1.0, "s"))
-    return _plus_minus(amount, unit, word)
-
-
-def _plus_minus(amount: Amount, unit: float, word: str) -> str:
-    if not np.isfinite(amount.mean):
-        return "not known"
-    margin = f"{amount.error / unit:.2g}" if np.isfinite(amount.error) else "not known"
-    return f"{amount.mean / unit:.3g} ± {margin} {word}"

@@ -17,7 +17,8 @@ from sim.arguments import at_least
 from sim.errors import InputError
 
 from .episode import Episode, Step
-from .observation import KINDS, Pictures, space_of, twists
+from .observation import KINDS, space_of, twists
+from .pictures import Pictures
 from .registration import NAMESPACE, STEPS
 from .setting import Setting, checked, open_setting
 from .tasks import SECONDS, find_task

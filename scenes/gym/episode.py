@@ -11,7 +11,8 @@ from sim.errors import InputError
 
 from ..script.camera_paths import wandering
 from ..script.tool_paths import smooth
-from .observation import FELT, SEEN, TRACKED, Seen, states
+from .observation import FELT, SEEN, TRACKED, states
+from .pictures import Seen
 from .setting import Setting
 from .tasks import OVER, SECONDS, Goal
 from .tool_motion import Hand, frame_of, laid, lever_of, moved, trembling

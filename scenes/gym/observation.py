@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
-
 import numpy as np
 from gymnasium import spaces
 
-from ar.optics.camera import Camera
-from ar.rendering.renderer import Renderer
-
-from .setting import Setting
-from .tasks import DEBULK, RETRACT, Goal, Task, find_task
+from .tasks import Goal, Task
 from .tool_motion import Hand
-from .touched import Touched
 
 KINDS = ("states", "rgbd")
 """What observations may be."""
@@ -30,15 +22,6 @@ COUNT = 24
 """Numbers of a state."""
 FARTHEST = 2.0
 """Depths of pictures are less [m]."""
-# A tool goes down when it is so near over its place [m]; a force above this is contact [N]: three of its deviations.
-OVER, TOUCHES = 1.5e-3, 6e-3
-# Of the tissue under a tool [N/m].
-STIFFNESS = 60.0
-# A blade goes so many times as far as the cortex shall, and by so much farther in an episode: it does not see how far
-# that is under it.
-FOLLOWS, CREEPS = 1.0, 2.0
-Seen = tuple[Touched, np.ndarray, int]
-"""What is drawn: the tissue's answer, T_world_tool (4, 4), and how many steps of a resection are done."""
 
 
 def twists() -> spaces.Box:
@@ -90,71 +73,3 @@ def states(
         sensed[1] @ frame / LENGTH,
     )
     return np.clip(np.concatenate(parts), -BOUND, BOUND).astype(np.float32)
-
-
-def scripted(task: str, states: np.ndarray) -> np.ndarray:
-    """Actions (..., 6) float32 for states (..., 24) of a task by name.
-
-    Raises
-    ------
-    InputError
-        There is no such task.
-    """
-    known = find_task(task)
-    states = np.asarray(states, np.float64)
-    place, goal, cortex = (LENGTH * states[..., first : first + 3] for first in (0, 13, 21))
-    off = goal - place
-    force = np.linalg.norm(known.force * states[..., 9:12], axis=-1)
-    asked, touches = known.unit * states[..., 19], force > TOUCHES
-    if known == DEBULK:
-        off = off + cortex
-        down = off[..., 2]
-    elif known == RETRACT:
-        direction = states[..., 16:19]
-        beyond = (FOLLOWS + CREEPS * states[..., 12]) * asked - np.einsum("...i,...i->...", -off, direction)
-        off = np.where(touches[..., None], beyond[..., None] * direction, off)
-        down = np.where(touches, off[..., 2], -known.step)
-    else:
-        down = np.where(touches, -(asked - force) / STIFFNESS, -0.6 * known.step)
-    near = np.linalg.norm(off[..., :2], axis=-1) < OVER
-    waits = ~near if known != RETRACT else ~near & ~touches
-    off[..., 2] = np.where(waits, 0.0, down)
-    return _action(known, off)
-
-
-def _action(task: Task, way: np.ndarray) -> np.ndarray:
-    turn = np.zeros_like(way)
-    return np.clip(np.concatenate([way / task.step, turn], axis=-1), -1.0, 1.0).astype(np.float32)
-
-
-class Pictures:
-    """Draws what the camera of a setting sees."""
-
-    def __init__(self, setting: Setting):
-        self.setting = setting
-        self._renderers: dict[int, Renderer] = {}
-
-    @cached_property
-    def camera(self) -> Camera:
-        """It stays where it is."""
-        return self.setting.scene.viewpoint.camera(self.setting.site)
-
-    def drawn(self, seen: Sequence[Seen]) -> tuple[np.ndarray, np.ndarray]:
-        """Colours (B, H, W, 3) uint8 and depths (B, H, W) float32 [m], 0 where nothing is."""
-        shape = len(seen), self.camera.height, self.camera.width
-        colour, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
-        for done in sorted({each[2] for each in seen}):
-            rows = [row for row, each in enumerate(seen) if each[2] == done]
-            stage = self.setting.after(done)
-            scenes = [stage.layers(self._positions(touched), pose) for touched, pose, _ in (seen[row] for row in rows)]
-            if done not in self._renderers:
-                self._renderers[done] = Renderer(scenes[0], stage.lamp, stage.device)
-            moved = [np.concatenate([each.vertices for each in layers if not each.still]) for layers in scenes]
-            pictures = self._renderers[done].pictures(np.stack(moved), [self.camera])
-            colour[rows], depth[rows] = pictures.colour.numpy(), pictures.depth.numpy()
-        return colour, depth
-
-    def _positions(self, touched: Touched) -> np.ndarray:
-        positions = self.setting.site.anatomy.mesh.nodes.copy()
-        positions[touched.nodes] += touched.motion
-        return positions

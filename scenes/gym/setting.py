@@ -13,12 +13,13 @@ import numpy as np
 
 from sim.accuracy import LIVE
 from sim.anatomy import TUMOUR_LABEL
-from sim.effects import Bonded, Held, ToolForce
+from sim.effects import Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Resected
 from sim.material import Tissue
 from sim.runtime.device import find_device
+from sim.skulls import Bonded
 from surrogate.model.guarded import knows_pressure
 
 from ..play.deformers import Theatre, open_theatre
@@ -29,7 +30,8 @@ from ..script.shipped_files import spatula_model_path
 from ..script.site import Site
 from ..script.tool import Blade, Probe
 from .cut_elements import CutElements
-from .posed_model import PosedElements, PosedModel
+from .posed_elements import PosedElements
+from .posed_model import PosedModel
 from .pressed_model import Hertz, PressedModel
 from .tasks import Goal, Task
 from .touched import Answers

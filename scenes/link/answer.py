@@ -16,9 +16,9 @@ from ar.tracking.registration import Registration
 from ar.tracking.track import Tracked
 
 from ..script.uncertainty import LEVEL
-from ..tracked.agreement import misplaced_tool
 from ..tracked.follower import LIMIT, UNCHECKED, UNKNOWN, Known, State, tip_covariance, wide_words
 from ..tracked.picture import Painter
+from ..tracked.plausible import misplaced_tool
 from ..tracked.tool_motion import ToolMotion
 from ..tracked.tracked_tool import TrackedTool
 from .frame import stamp_of, time_of

@@ -17,8 +17,8 @@ from ar.optics.rolling_shutter import row_bands, time_of_point
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Renderer
 from ar.tracking.drawn import drawn
-from ar.tracking.pose import moved_about
 from ar.tracking.registration import Registration
+from ar.tracking.rigid import moved_about
 from ar.tracking.stamp import stamped
 from ar.tracking.targets import Target, patient_reference, tool_cube, window_round
 from sim.errors import InputError

@@ -19,8 +19,9 @@ from ar.tracking.targets import patient_reference, tool_cube
 from ar.tracking.track import Tracked, Tracker
 
 from ..script.uncertainty import DEVIATIONS, LEVEL
-from .agreement import Agreement, implausible, misplaced_tool
+from .agreement import Agreement
 from .elsewhere import Elsewhere
+from .plausible import implausible, misplaced_tool
 from .tool_motion import Motion, ToolMotion
 from .tracked_tool import TrackedTool
 

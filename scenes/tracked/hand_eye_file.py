@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ar.tracking.pose import is_rigid
+from ar.tracking.rigid import is_rigid
 from sim.errors import InputError
 from sim.runtime.outside_files import path_of, read_as
 

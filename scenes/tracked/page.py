@@ -24,10 +24,10 @@ from ..page.view import STALE_COLOUR, brain_of, signs_of, viewpoint_of
 from ..play.stage import TOOL_COLOUR, TUMOUR_COLOUR
 from ..play.waiting_notice import Busy
 from .beside import lines_of, sample_of, slices_of
-from .film_camera import SeekableFilm
 from .follower import GAP, SLOWEST, Follower, Known, State
 from .picture import IN_GREY, Painter
 from .run import Shown, Timed, overlaid_one
+from .seekable_film import SeekableFilm
 from .words import about, report
 
 # Of a picture's brightness, what is left of one that is old; how long the page stays when it cannot go on [s].

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ar.tracking.pose import is_rigid
 from ar.tracking.registration import Registration, Scanned
+from ar.tracking.rigid import is_rigid
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole

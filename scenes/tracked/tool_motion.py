@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,15 +18,6 @@ from ..script.uncertainty import DEVIATIONS
 
 UNBOUND = "the model states no error: do not rely on it"
 REFUSED = "the tool is farther inside the brain than the model knows: do not rely on it"
-if TYPE_CHECKING:
-    from sim.deformation import Deformer
-    from sim.tools import BuiltIn
-
-    from ..play.deformers import Theatre
-    from ..script.scene import Scene
-
-REST = "rest"
-"""The deformer that lets the brain stay as in the scan."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,42 +109,3 @@ class ToolMotion:
             return both.rows(np.array([0])), both.rows(np.array([1]))
         first = self.deformer.deform(Loads((Touching(pose[None, None]),)), start=start)
         return first, self.deformer.deform(Loads((Touching(deeper[None, None]),)), start=first)
-
-
-def tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
-    """What acts on the brain: the tool, moved by pose, and the skull."""
-    from sim.effects import SKULLS, Elasticity, Held, ToolContact
-
-    from ..script.scene import Scene
-
-    touched = () if shape is None else (ToolContact((shape,)),)
-    effects = (Elasticity(), Held(), SKULLS[args.skull], *touched)
-    return Scene(args.command, "A tracked tool.", effects=effects)
-
-
-def mover(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool) -> tuple[Deformer | None, str]:
-    """Who says how the brain lies under a tracked tool, if there is one, and that in words.
-
-    Raises
-    ------
-    InputError
-        A deformer that is not there, or does not know the scene.
-    """
-    from ..play.deformers import GUARDED
-
-    still = "nobody: the brain stays as in the scan"
-    if not tooled:
-        return None, still
-    name = args.deformer
-    if name is None and not theatre.knowing(scene):
-        refused = next(iter(theatre.refusals(scene).values()), "there is none")
-        said = f"no model says how the brain moves: {refused}. Give --deformer fem, or a model of the tool's poses"
-        print(f"{args.program}: {said}", file=sys.stderr)
-        name = REST
-    if name == REST:
-        return None, still
-    name = name or theatre.usual(scene)
-    names = (*theatre.names(scene), REST)
-    if name not in (*names, *theatre.models, GUARDED):
-        raise InputError(f"no deformer is called {name!r} here: choose one of {', '.join(names)}.")
-    return theatre.deformer(name, scene), theatre.described(name, scene)

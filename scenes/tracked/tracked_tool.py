@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ar.tracking.pose import is_rigid
+from ar.tracking.rigid import is_rigid
 from ar.tracking.targets import TIP, tool_cube
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole

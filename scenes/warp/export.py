@@ -16,7 +16,8 @@ from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, faded, faint_of, forward_on, warp_grid
 
 from .images import Picture, Warped, write_field_nifti, write_warped
-from .markups import CENTROID, Landmark, centroid_now, write_markups
+from .landmarks import CENTROID, Landmark, centroid_now
+from .markups import write_markups
 from .meshes import mesh_of, write_glb, write_stl, write_vtp
 from .moment import Moment
 from .nrrd_files import write_field_nrrd, write_field_sequence, write_segmentation

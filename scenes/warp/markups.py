@@ -1,38 +1,19 @@
-"""Landmarks of an anatomy, and points as 3D Slicer's markups."""
+"""Points and lines as 3D Slicer's markups: JSON in millimetres, LPS."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from sim.anatomy import Anatomy
-from sim.bodies.open_cortex import open_cortex
 from sim.bodies.voxels import LPS
-from sim.geometry.closest_point import closest
-from sim.geometry.locate import locate
-from sim.geometry.tetmesh import signed_volumes
-from surrogate.locating.prior import tumour_share
 
 SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
     "markups-schema-v1.0.3.json#"
 )
-TUMOUR, NEAREST, CORTEX = "tumour", "tumour, nearest to its centroid", "open cortex"
-CENTROID = "centroid of the tumour now"
-"""Names of the points, as Slicer shows them."""
-SAID = {
-    TUMOUR: "tissue at the centroid of the tumour's volume in the scan, as `sulcus locate` has it.",
-    NEAREST: "that centroid lies outside the tissue; this is the tumour's point nearest to it.",
-    CORTEX: "tissue on the surface, nearest to the middle of the open cortex in the scan.",
-    CENTROID: "of the displaced tumour's volume. The tissue there may be another than in the scan.",
-}
-"""What each of them is."""
-# A place that a tetrahedron leads back to within so much [m] lies in it.
-ROUNDING = 1e-9
 
 
 def write_markups(path: Path, kind: str, points: Mapping[str, np.ndarray]) -> None:
@@ -63,43 +44,3 @@ def write_markups(path: Path, kind: str, points: Mapping[str, np.ndarray]) -> No
             {"name": "length", "enabled": True, "value": length, "units": "mm", "printFormat": "%-#4.4g%s"}
         ]
     path.write_text(json.dumps({"@schema": SCHEMA, "markups": [markup]}, indent=1) + "\n")
-
-
-@dataclass(frozen=True, eq=False)
-class Landmark:
-    """A point of tissue: its name, where it is in the scan (3,) [m], and where it is now (3,) [m]."""
-
-    name: str
-    rest: np.ndarray
-    now: np.ndarray
-
-
-def landmarks_of(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, ...]:
-    """Points of tissue of the tumour and of the open cortex, where a body has them, as (V, 3) [m] displaces them.
-
-    They move linearly in their tetrahedron or triangle, as the fields do.
-    """
-    mesh, found = body.mesh, []
-    if body.in_tumour.any():
-        point = tumour_share(body) @ mesh.nodes
-        at = locate(mesh, point[None])
-        if np.linalg.norm(at.read(mesh.nodes[None])[0, 0] - point) < ROUNDING:
-            found.append(Landmark(TUMOUR, point, point + at.read(displacement[None])[0, 0]))
-        else:
-            triangles = body.tumour_surface
-            (rest,), (triangle,), (weights,) = closest(point[None], mesh.nodes[triangles])
-            found.append(Landmark(NEAREST, rest, rest + weights @ displacement[triangles[triangle]]))
-    if len(body.open_surface):
-        cortex = open_cortex(body)
-        place = cortex.nearest(cortex.origin)
-        found.append(Landmark(CORTEX, place.point, place.point + place.weights @ displacement[place.vertices]))
-    return tuple(found)
-
-
-def centroid_now(body: Anatomy, displacement: np.ndarray) -> np.ndarray | None:
-    """The centroid (3,) [m] of the tumour's volume as it is now; None without a tumour."""
-    tumour = body.mesh.tets[body.in_tumour]
-    if not len(tumour):
-        return None
-    now = body.mesh.nodes + displacement
-    return np.average(now[tumour].mean(axis=1), axis=0, weights=signed_volumes(now, tumour))

@@ -14,7 +14,7 @@ from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, warp_fields, warp_grid
 from sim.geometry.tetmesh import signed_volumes
 
-from .markups import Landmark, landmarks_of
+from .landmarks import Landmark, landmarks_of
 from .moment import Moment
 
 # Weights of corners at the places between vertices: of a tetrahedron, of a triangle. No field is fitted there.

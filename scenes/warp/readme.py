@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from .images import Warped
-from .markups import CENTROID, NEAREST, SAID, TUMOUR
+from .landmarks import CENTROID, NEAREST, SAID, TUMOUR
 from .places import WITHIN
 
 INTRODUCTION = """sulcus warp: a deformed brain, for other programs

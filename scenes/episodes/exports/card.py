@@ -26,7 +26,7 @@ from .columns import SHEET
 from .croissant import COLUMNS, croissant
 from .datasheet import MARK, NAME, datasheet
 from .origin import notice_of_template, of_template
-from .statistics import task_of
+from .tasks import task_of
 
 TABLE = "episodes.csv"
 NAMES = (TABLE, "croissant.json", SHEET, LICENCE_NAME)

@@ -34,7 +34,8 @@ from .columns import (
     stored_size,
     write_along,
 )
-from .statistics import Spread, task_of
+from .statistics import Spread
+from .tasks import task_of
 
 VERSION = "v3.0"
 DEPTH_RANGE = (0.1, 0.6)

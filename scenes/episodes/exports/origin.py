@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from ...script.shipped_files import template_path
-from ..reading.contents import Contents, is_template
+from ..reading.bodies import is_template
+from ..reading.contents import Contents
 from .drawn import parameters_of
 
 TEMPLATE, DRAWN, UNKNOWN = "template", "drawn", ""

@@ -18,7 +18,7 @@ from ..reading.open_files import opened
 from ..reading.rows import numbers_in
 from ..reading.schema import COLOUR, PICTURES
 from .columns import SPACE, blocks, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size, texts_along
-from .statistics import held_out, task_of
+from .tasks import held_out, task_of
 
 EXPORTED = ("colour", "colour_right", "depth", "segmentation")
 # Decoded pictures, packed by gzip, against the episodes' JPEG and PNG.

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from sim.anatomy import Anatomy
-from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 from sim.runtime.file_limits import INFLATION, LARGEST_ARRAY
 from sim.runtime.outside_files import path_of, read_as
 
-from ...script.shipped_files import template_path
 from .open_files import REMEDY
 from .schema import ARRAYS, FORMATS, FRAMES, NEEDED, PICTURES, SOLVED, Array
 
@@ -212,42 +208,3 @@ def _solved(arrays: Mapping[str, h5py.Dataset], shapes: Mapping[str, tuple[int, 
     if len(frames) and (frames[0] < 0 or frames[-1] >= count or (np.diff(frames) < 1).any()):
         raise InputError(f"'fem_frames' are not sorted numbers of its {count} frames. {REMEDY}")
     return frames
-
-
-def anatomy_of(contents: Contents) -> Anatomy | None:
-    """The anatomy whose digest an episode has; None where it is neither the template nor in a folder beside.
-
-    It is looked for in `bodies/*/anatomy.vtu` of the episode's folder, and of the folder above.
-    """
-    return _known(str(contents.said.get("anatomy")), contents.path.resolve().parent)
-
-
-def is_template(digest: str) -> bool:
-    """Whether an anatomy's digest is that of the template."""
-    template = _read(template_path())
-    return template is not None and template.digest == digest
-
-
-def surface_rows(surface: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Those triangles (S, 3) of mesh vertices whose corners are all among sorted `nodes` (n,), as numbers of these."""
-    places = np.searchsorted(nodes, surface).clip(max=len(nodes) - 1)
-    return places[(nodes[places] == surface).all(axis=1)]
-
-
-@cache
-def _known(digest: str, folder: Path) -> Anatomy | None:
-    places = [path for above in (folder, folder.parent) for path in sorted(above.glob("bodies/*/anatomy.vtu"))]
-    for path in (template_path(), *places):
-        anatomy = _read(path)
-        if anatomy is not None and anatomy.digest == digest:
-            return anatomy
-    return None
-
-
-@cache
-def _read(path: Path) -> Anatomy | None:
-    """An anatomy that can be read."""
-    try:
-        return read_anatomy(path)
-    except InputError:
-        return None

@@ -17,7 +17,8 @@ from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
 from ..checksums import SUM, broken
-from .contents import Contents, anatomy_of, array_in, attributes_of, contents_of, surface_rows
+from .bodies import anatomy_of, surface_rows
+from .contents import Contents, array_in, attributes_of, contents_of
 from .open_files import REMEDY, said_by_validate
 from .rows import numbers_in, picture_of
 from .schema import ARRAYS, LABELS, PICTURES

@@ -1,0 +1,51 @@
+"""A policy of each task that needs no training: it goes by what a robot observes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .observation import LENGTH
+from .tasks import DEBULK, RETRACT, Task, find_task
+
+# A tool goes down when it is so near over its place [m]; a force above this is contact [N]: three of its deviations.
+OVER, TOUCHES = 1.5e-3, 6e-3
+# Of the tissue under a tool [N/m].
+STIFFNESS = 60.0
+# A blade goes so many times as far as the cortex shall, and by so much farther in an episode: it does not see how far
+# that is under it.
+FOLLOWS, CREEPS = 1.0, 2.0
+
+
+def scripted(task: str, states: np.ndarray) -> np.ndarray:
+    """Actions (..., 6) float32 for states (..., 24) of a task by name.
+
+    Raises
+    ------
+    InputError
+        There is no such task.
+    """
+    known = find_task(task)
+    states = np.asarray(states, np.float64)
+    place, goal, cortex = (LENGTH * states[..., first : first + 3] for first in (0, 13, 21))
+    off = goal - place
+    force = np.linalg.norm(known.force * states[..., 9:12], axis=-1)
+    asked, touches = known.unit * states[..., 19], force > TOUCHES
+    if known == DEBULK:
+        off = off + cortex
+        down = off[..., 2]
+    elif known == RETRACT:
+        direction = states[..., 16:19]
+        beyond = (FOLLOWS + CREEPS * states[..., 12]) * asked - np.einsum("...i,...i->...", -off, direction)
+        off = np.where(touches[..., None], beyond[..., None] * direction, off)
+        down = np.where(touches, off[..., 2], -known.step)
+    else:
+        down = np.where(touches, -(asked - force) / STIFFNESS, -0.6 * known.step)
+    near = np.linalg.norm(off[..., :2], axis=-1) < OVER
+    waits = ~near if known != RETRACT else ~near & ~touches
+    off[..., 2] = np.where(waits, 0.0, down)
+    return _action(known, off)
+
+
+def _action(task: Task, way: np.ndarray) -> np.ndarray:
+    turn = np.zeros_like(way)
+    return np.clip(np.concatenate([way / task.step, turn], axis=-1), -1.0, 1.0).astype(np.float32)

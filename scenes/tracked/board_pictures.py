@@ -1,0 +1,66 @@
+"""Views of the calibration board in a folder of pictures or a video."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ar.tracking.board_views import View, find_board
+from ar.tracking.pictures import GIVE, pictures_of
+from ar.tracking.targets import Detector, Target
+from sim.errors import InputError
+from sim.runtime.outside_files import read_as
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was seen of the board.
+
+    Parameters
+    ----------
+    views
+        Of the pictures that show it.
+    width, height
+        Of all pictures [pixel].
+    looked_at
+        How many pictures there were.
+    """
+
+    views: tuple[View, ...]
+    width: int
+    height: int
+    looked_at: int
+
+
+def seen_views(path: Path, board: Target, size: tuple[int, int] | None = None) -> Seen:
+    """The board in each picture of a folder or a video; `size` is the width and height that they must have.
+
+    Raises
+    ------
+    InputError
+        What cannot be read, pictures of different sizes or of another one than stated, or a board that is not seen.
+    """
+    views, count, first, detector = [], 0, "", Detector([board])
+    with read_as(path, "pictures of a board", GIVE):
+        try:
+            for picture in pictures_of(path):
+                count += 1
+                found = (picture.grey.shape[1], picture.grey.shape[0])
+                if size is not None and found != size:
+                    than = f"{first} {size[0]} x {size[1]}" if first else f"{size[0]} x {size[1]} was stated"
+                    raise InputError(
+                        f"{picture.name} has {found[0]} x {found[1]} pixels, but {than}: "
+                        "calibrate with pictures of one size, which is that of later use."
+                    )
+                size, first = found, first or f"{picture.name} has"
+                view = find_board(detector, picture.name, picture.grey)
+                views += [] if view is None else [view]
+        except ValueError as error:
+            raise InputError(str(error)) from error
+    if size is None or not count:
+        raise InputError(f"{path}: holds no pictures. {GIVE}")
+    if not views:
+        raise InputError(
+            f"{path}: the board is in none of {count} pictures: print it by `sulcus markers`, and show most of it."
+        )
+    return Seen(tuple(views), *size, count)

@@ -1,0 +1,58 @@
+"""What acts on the brain under a tracked tool, and who says how it lies then."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING
+
+from sim.errors import InputError
+
+if TYPE_CHECKING:
+    from sim.deformation import Deformer
+    from sim.tools import BuiltIn
+
+    from ..play.deformers import Theatre
+    from ..script.scene import Scene
+
+REST = "rest"
+"""The deformer that lets the brain stay as in the scan."""
+
+
+def tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
+    """What acts on the brain: the tool, moved by pose, and the skull."""
+    from sim.effects import SKULLS, Elasticity, Held, ToolContact
+
+    from ..script.scene import Scene
+
+    touched = () if shape is None else (ToolContact((shape,)),)
+    effects = (Elasticity(), Held(), SKULLS[args.skull], *touched)
+    return Scene(args.command, "A tracked tool.", effects=effects)
+
+
+def mover(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool) -> tuple[Deformer | None, str]:
+    """Who says how the brain lies under a tracked tool, if there is one, and that in words.
+
+    Raises
+    ------
+    InputError
+        A deformer that is not there, or does not know the scene.
+    """
+    from ..play.deformers import GUARDED
+
+    still = "nobody: the brain stays as in the scan"
+    if not tooled:
+        return None, still
+    name = args.deformer
+    if name is None and not theatre.knowing(scene):
+        refused = next(iter(theatre.refusals(scene).values()), "there is none")
+        said = f"no model says how the brain moves: {refused}. Give --deformer fem, or a model of the tool's poses"
+        print(f"{args.program}: {said}", file=sys.stderr)
+        name = REST
+    if name == REST:
+        return None, still
+    name = name or theatre.usual(scene)
+    names = (*theatre.names(scene), REST)
+    if name not in (*names, *theatre.models, GUARDED):
+        raise InputError(f"no deformer is called {name!r} here: choose one of {', '.join(names)}.")
+    return theatre.deformer(name, scene), theatre.described(name, scene)
