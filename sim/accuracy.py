@@ -79,7 +79,7 @@ LIVE = Accuracy(tolerance=4e-3, outer=30, precision="float32", steps=8)
 """For frames that start from the one before: the default of scenes.
 
 Of 60 such frames the worst was 0.026 mm off while palpating, and 0.019 mm under a spatula
-(`python -m benchmarks live --frames 1000 --checked 60` on one H100, default tissue; `docs/figures.md`).
+(`python -m benchmarks live --frames 1000 --checked 60` on one H100, default tissue; `docs/notes/figures.md`).
 """
 TRAIN = Accuracy(tolerance=1e-4, precision="float32")
 """For data sets that models learn from: the default of `Fem`."""

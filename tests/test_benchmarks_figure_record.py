@@ -381,10 +381,10 @@ def test_only_figures_that_there_are(capsys):
 
 
 def test_the_tables_of_the_page_are_marked_as_they_are_written(tmp_path):
-    page = shutil.copy(HOUSE / "docs/figures.md", tmp_path)
+    page = shutil.copy(HOUSE / "docs/notes/figures.md", tmp_path)
     words = ["--from", put(tmp_path / "new.json", entry(a=1.0))]
     assert main(["all", "--tables", page, *words]) == 0
-    before, after = (HOUSE / "docs/figures.md").read_text(), Path(page).read_text()
+    before, after = (HOUSE / "docs/notes/figures.md").read_text(), Path(page).read_text()
     outside = [re.sub(r"(<!-- bench.*?-->).*?<!-- end -->", r"\1", text, flags=re.DOTALL) for text in (before, after)]
     assert outside[0] == outside[1] and before != after
 

@@ -24,7 +24,8 @@ from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 
 HOUSE = Path(__file__).parents[1]
-FORMATS = (HOUSE / "docs/formats.md").read_text()
+FORMATS = (HOUSE / "docs/reference/formats.md").read_text()
+DOCS = [path for path in (HOUSE / "docs").rglob("*.md") if "generated" not in path.parts]
 LINKS = {"a": "href"}
 LOADED = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src"}
 
@@ -76,7 +77,7 @@ def pages(site):
 
 
 def test_every_source_is_a_page_and_every_example_too(pages):
-    wanted = {path.stem for path in (HOUSE / "docs").glob("*.md")}
+    wanted = {path.relative_to(HOUSE / "docs").with_suffix("").as_posix() for path in DOCS}
     wanted |= {f"generated/examples/{path.stem}" for path in (HOUSE / "examples").glob("*.py")}
     assert len(wanted) > 20 and wanted <= set(pages)
     assert not {"generated/examples/gone", "generated/sim/gone"} & set(pages)
@@ -123,12 +124,12 @@ def test_every_command_and_public_name_is_in_the_reference(site, pages):
 
 
 def test_formulas_are_drawn_by_the_browser_itself(site, pages):
-    assert "math" in pages["physics"].names
-    assert "MathJax" not in (site / "physics.html").read_text()
+    assert "math" in pages["concepts/physics"].names
+    assert "MathJax" not in (site / "concepts/physics.html").read_text()
 
 
 def test_files_are_described_array_by_array(site):
-    text = re.sub(r"<[^>]+>", "", (site / "formats.html").read_text())
+    text = re.sub(r"<[^>]+>", "", (site / "reference/formats.html").read_text())
     assert not [name for name in (*DATASET, *EPISODE) if name not in text]
 
 

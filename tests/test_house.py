@@ -87,7 +87,8 @@ JOBS = {
     "numpy": {"sim/loads.py", "sim/deformation.py", "ar/optics/camera.py", "surrogate/data/dataset.py"},  # the borders
 }
 """Libraries with several jobs: these files, at least, must import them."""
-PAGES = sorted(name.relative_to(HOUSE).as_posix() for name in (*HOUSE.glob("*.md"), *HOUSE.glob("docs/*.md")))
+DOCS = [path for path in (HOUSE / "docs").rglob("*.md") if "generated" not in path.parts]
+PAGES = sorted(name.relative_to(HOUSE).as_posix() for name in (*HOUSE.glob("*.md"), *DOCS))
 OURS = re.compile(r"\b(?:(?:un)?taught|teach(?:es|ing)?|told|vicinit(?:y|ies)|lanes?|rungs?)\b", re.IGNORECASE)
 """Words of our own, for which the field has others: trained, given or stated, local problem, columns, steps."""
 IMPORT_NAMES = {"opencv-python-headless": "cv2", "pillow": "PIL", "scikit-learn": "sklearn", "warp-lang": "warp"}
@@ -372,7 +373,7 @@ def test_files_that_are_named_are_there():
     alone = re.compile(r"`([A-Za-z_]+\.py)`")
     readers = {"my_scene.py", "MY_SCENE.py", "NAME.py", "nearest.py"}  # files that a reader writes
     known = readers | {path.name for path in [*FILES, *(HOUSE / "tests").glob("*.py")]}
-    for path in [*FILES, *HOUSE.glob("*.md"), *(HOUSE / "docs").glob("*.md")]:
+    for path in [*FILES, *HOUSE.glob("*.md"), *DOCS]:
         text = path.read_text()
         missing = [name for name in named.findall(text) if not (HOUSE / name).exists()]
         missing += [name for name in alone.findall(text) if name not in known]

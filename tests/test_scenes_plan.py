@@ -90,7 +90,7 @@ def test_an_episode_is_drawn_by_itself_and_each_value_by_its_name():
         ("[motion.press]\nweight = inf", "motion.press.weight: inf is outside 0 to 100,000"),
         ("[motion.press]\n[hand]\ntremor_mm = nan", "hand.tremor_mm: nan may be drawn"),
         (f"seconds = {'[' * 5000}", "recursion"),
-        ("[motion.press", "docs/episodes.md says"),
+        ("[motion.press", "docs/datasets_make.md says"),
         ("", "motion"),
     ],
 )

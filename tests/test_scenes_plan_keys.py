@@ -13,7 +13,7 @@ from scenes.episodes.families import Motions
 from scenes.episodes.plan import Contents, plan_from
 from sim.errors import InputError
 
-PAGE = Path(__file__).parents[1] / "docs/plan_keys.md"
+PAGE = Path(__file__).parents[1] / "docs/reference/plan_keys.md"
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ def read_page(path: Path) -> str:
     InputError
         A page without marks, with a mark that has no end, or of figures that are none.
     """
-    with read_as(path, "a page in Markdown", "Give a page of the documentation, such as docs/figures.md."):
+    with read_as(path, "a page in Markdown", "Give a page of the documentation, such as docs/notes/figures.md."):
         text = path.read_bytes().decode()
         if path.suffix != ".md":
             raise InputError("is no page in Markdown: give a name that ends in .md.")

@@ -182,7 +182,7 @@ FIGURES = (
     ),
     Figure("elements-limit-cpu", "elements --poisson 0.495", "cpu", LIMIT, body=""),
 )
-"""Every figure of docs/figures.md and docs/floor.md that a bench gives."""
+"""Every figure of docs/notes/figures.md and docs/notes/solver_speed.md that a bench gives."""
 NAMED = {figure.name: figure for figure in FIGURES}
 
 

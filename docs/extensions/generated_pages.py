@@ -18,9 +18,9 @@ Scripts from the folder ``examples/``. Each is short, and runs by ``python examp
 """
 # Links that hold beside the repository's files, and what they become among the pages.
 IN_PAGES = (
-    (re.compile(r"\]\(\.\./examples/(\w+)\.py\)"), r"](generated/examples/\1.rst)"),
-    (re.compile(r"\]\(\.\./examples/?\)"), r"](generated/examples/index.rst)"),
-    (re.compile(r"\]\(\.\./CONTRIBUTING\.md\)"), r"](generated/contributing.md)"),
+    (re.compile(r"\]\(\.\./((?:\.\./)*)examples/(\w+)\.py\)"), r"](\1generated/examples/\2.rst)"),
+    (re.compile(r"\]\(\.\./((?:\.\./)*)examples/?\)"), r"](\1generated/examples/index.rst)"),
+    (re.compile(r"\]\(\.\./((?:\.\./)*)CONTRIBUTING\.md\)"), r"](\1generated/contributing.md)"),
 )
 
 

@@ -97,7 +97,7 @@ next: look at the film that it wrote""",
   sulcus link patient.vtu --model poses.model.npz --registration registration.json
   sulcus link patient.vtu --model poses.model.npz --client localhost --port 18945
 
-next: add a client of localhost in 3D Slicer's OpenIGTLinkIF; docs/openigtlink.md names what comes""",
+next: add a client of localhost in 3D Slicer's OpenIGTLinkIF; docs/external_tracker.md names what comes""",
     "calibrate": """examples:
   sulcus calibrate board.mp4 --out camera.yaml
   sulcus calibrate pictures --size 1280x960 --out camera.yaml --json

@@ -250,7 +250,7 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> Plan:
         contents = msgspec.toml.decode(text, type=Contents)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         said = said_plainly(str(error))
-        raise InputError(f"the plan {name}: {said} docs/episodes.md says what a plan holds.") from error
+        raise InputError(f"the plan {name}: {said} docs/datasets_make.md says what a plan holds.") from error
     plan = Plan(name, text, contents, folder)
     try:
         _check(contents)
