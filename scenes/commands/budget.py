@@ -287,4 +287,5 @@ def _lines(report: dict[str, Any]) -> list[str]:
         about = "" if off is None else f" (+- {off:.1%}, as these bodies differ)"
         lines.append(f"On other bodies, with other errors, that held for {report['held_twins']:.1%}{about}.")
     low, high = report["published_mm"]
-    return [*lines, f"Published errors of overlays, in the mean: {low:g} to {high:g} mm (docs/concepts/errors.md)."]
+    place = "docs/notes/uncertainty_experiments.md"
+    return [*lines, f"Published errors of overlays, in the mean: {low:g} to {high:g} mm ({place})."]

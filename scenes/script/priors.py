@@ -85,15 +85,16 @@ SKULL_HOLDS = Prior(
 )  # fmt: skip
 OF_MESH = Prior(
     MESH, "normal", (0.05, 0.05), "share of the tumour's motion, where the skull holds the brain",
-    "smoothed elements are 5.2 % off quadratic ones: docs/concepts/surrogates.md",
+    "smoothed elements are 5.2 % off quadratic ones: docs/notes/surrogate_experiments.md",
 )  # fmt: skip
 OF_MESH_SLIDING = Prior(
     "mesh of a sliding brain", "normal", (0.12, 0.12), "share of the tumour's motion, where the brain slides",
-    "smoothed elements are 8 to 17 % off quadratic ones under tools: docs/concepts/errors.md",
+    "smoothed elements are 8 to 17 % off quadratic ones under tools: docs/notes/uncertainty_experiments.md",
 )  # fmt: skip
 OF_MESH_SINKING = Prior(
     "mesh of a sinking brain", "normal", (0.25, 0.25), "share of the tumour's motion, where it slides under weight",
-    "smoothed elements are 16 to 22 % off quadratic ones, and these go down on finer meshes: docs/concepts/errors.md",
+    "smoothed elements are 16 to 22 % off quadratic ones, and these go down on finer meshes: "
+    "docs/notes/uncertainty_experiments.md",
 )  # fmt: skip
 OF_REGISTRATION = Prior(
     REGISTRATION, "normal", (1.56e-3, 1.56e-3), "shift of the whole scan, along each axis [m]",
