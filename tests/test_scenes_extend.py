@@ -21,7 +21,7 @@ from surrogate.model.own_learners import GROUP
 
 HOUSE = Path(__file__).parents[1]
 PAGE = (HOUSE / "docs/extend.md").read_text()
-PATIENT = (HOUSE / "docs/patient.md").read_text()
+PATIENT = (HOUSE / "docs/own_mesh.md").read_text()
 
 
 def blocks_of(text):
@@ -72,7 +72,7 @@ def test_the_package_of_a_learner_has_a_whole_project_file():
 
 
 def test_a_mesh_from_elsewhere_becomes_an_anatomy(tmp_path, monkeypatch, box):
-    """The code of docs/patient.md, on a file in millimetres."""
+    """The code of docs/own_mesh.md, on a file in millimetres."""
     (code,) = blocks_of(PATIENT)
     mesh = box.mesh
     cells, region = [("tetra", mesh.tets)], [mesh.region]

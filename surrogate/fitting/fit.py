@@ -35,7 +35,7 @@ YOUNGS = np.geomspace(300.0, 12000.0, 300)
 # Forces that are solved, over what linear tissue would need.
 TIMES = (0.6, 1.2, 2.2, 3.6, 5.5)
 # A command's mesh and elements are dented as deep as finer or quadratic ones by a force that is so many times less: on
-# the template 1.08 to 1.16 times (docs/fit.md).
+# the template 1.08 to 1.16 times (docs/notes/fit_experiments.md).
 SOFT = 1.11
 # What the logarithm of a modulus is off by beside that.
 OFF = 0.45

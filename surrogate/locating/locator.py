@@ -25,10 +25,10 @@ from .rounds import settled
 # More points than this share are no outliers, and no cause of the ensemble moves what this is more surprised by.
 MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
 # The registration may have slipped where that makes what is seen so many times as probable, as a logarithm. On twins it
-# does so for one of 432 motions, and for all slips of 8 to 20 mm along the cortex (docs/locate.md).
+# does so for one of 432 motions, and for all slips of 8 to 20 mm along the cortex (docs/notes/locate_experiments.md).
 DOUBTFUL = -2.0
 # Least logarithm of a slip's probability over that of a motion for which a warning names the slip. True motions have
-# -7 in the median (docs/locate.md).
+# -7 in the median (docs/notes/locate_experiments.md).
 ALIKE = -2.5
 # A rigid error is wide if it exceeds the reported one by this factor.
 WIDE = 2.0
