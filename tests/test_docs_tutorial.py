@@ -1,0 +1,46 @@
+"""The page docs/tutorial.md: its Python and commands run, on the template that ships instead of a trained patient."""
+
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenes.cli import main, make_parsers
+from scenes.script.shipped_files import template_path
+
+PAGE = (Path(__file__).parents[1] / "docs/tutorial.md").read_text()
+LABELS, OBSERVE = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+LINES = [shlex.split(line) for line in re.findall(r"^sulcus .*$", PAGE.replace("$TEMPLATE", str(template_path())), re.M)]
+DEMO, INSPECT, PATIENT, RENDER, LOCATE, LOCATOR = (line[1:] for line in LINES)
+
+
+@pytest.mark.parametrize("command", [DEMO, INSPECT, PATIENT, RENDER, LOCATE, LOCATOR], ids=lambda line: line[0])
+def test_tutorial_command_is_parsed(command):
+    assert make_parsers(command[0])[0].parse_args(command).command == command[0]
+
+
+def test_tutorial_label_map_gives_the_output_shown(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    exec(LABELS, {})
+    assert main(INSPECT) == 0 and Path("patient.inspect.png").exists()
+    shown = PAGE.partition("--inspect\n```\n\n```text\n")[2].partition("```")[0]
+    assert shown.count("\n") >= 6 and shown in capsys.readouterr().out
+    assert main(["anatomy", "--labels", *PATIENT[1:8], "--out", "mesh.vtu"]) == 0
+    assert re.search(r"^\d+ nodes, \d+ tetrahedra", PAGE, re.MULTILINE)[0] in capsys.readouterr().out
+
+
+def test_tutorial_tumour_is_located(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for suffix in (".vtu", ".model.npz"):
+        shutil.copy(template_path().with_suffix(suffix), f"patient{suffix}")
+    assert main(RENDER) == 0 and Path("frames/frame_0060.png").exists()
+    names = {}
+    exec(OBSERVE, names)
+    capsys.readouterr()
+    assert names["result"].outcome[0].good and main([*LOCATE, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert np.linalg.norm(found["centroid_mm"] - 1e3 * names["tumour"].mean(axis=0)) < found["p95_mm"]
