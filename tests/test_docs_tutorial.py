@@ -14,7 +14,9 @@ from scenes.script.shipped_files import template_path
 
 PAGE = (Path(__file__).parents[1] / "docs/tutorial.md").read_text()
 LABELS, OBSERVE = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-LINES = [shlex.split(line) for line in re.findall(r"^sulcus .*$", PAGE.replace("$TEMPLATE", str(template_path())), re.M)]
+LINES = [
+    shlex.split(line) for line in re.findall(r"^sulcus .*$", PAGE.replace("$TEMPLATE", str(template_path())), re.M)
+]
 DEMO, INSPECT, PATIENT, RENDER, LOCATE, LOCATOR = (line[1:] for line in LINES)
 
 
