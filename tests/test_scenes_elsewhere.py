@@ -20,10 +20,14 @@ from ar.tracking.targets import patient_reference
 from scenes.cli import main
 from scenes.script.scene import find_scene
 from scenes.tracked.agreement import Agreement
-from scenes.tracked.calibration_file import read_calibration, read_intrinsic_covariance, write_exactly_known
+from scenes.tracked.calibration_file import (
+    read_calibration,
+    read_hand_eye,
+    read_intrinsic_covariance,
+    write_exactly_known,
+)
 from scenes.tracked.elsewhere import Elsewhere, Eye
 from scenes.tracked.follower import Follower, State
-from scenes.tracked.hand_eye_file import read_hand_eye
 from scenes.tracked.picture import head_lines
 from scenes.tracked.plausible import buried
 from scenes.tracked.pose_file import TrackedRow, read_stream, write_poses

@@ -82,8 +82,8 @@ def elsewhere_of(args: argparse.Namespace, calibration: Calibration) -> Elsewher
     InputError
         Files that cannot be read; clocks that cannot be compared.
     """
+    from ..tracked.calibration_file import read_hand_eye
     from ..tracked.elsewhere import Elsewhere, Eye
-    from ..tracked.hand_eye_file import read_hand_eye
     from ..tracked.pose_file import read_stream
 
     if args.poses is None:

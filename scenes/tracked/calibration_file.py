@@ -1,4 +1,4 @@
-"""Calibrations of real cameras as files: those of OpenCV and ROS are read, and written."""
+"""Calibrations of real cameras as files: those of OpenCV and ROS, and how a camera lies in what it is fixed to."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ SUFFIXES = (".yaml", ".yml")
 INTRINSICS = "sulcus intrinsics"
 """The format of the covariance beside a calibration."""
 FORMATS = {"opencv": opencv_text, "ros": ros_text}
+GIVE_HAND_EYE = "Give what `sulcus calibrate --hand-eye A.csv B.csv --json` prints, B being the camera."
+LARGEST_HAND_EYE, RIGID = 1 << 16, 1e-4
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -105,3 +107,29 @@ def write_calibration(path: str | Path, calibration: Calibration, form: Literal[
         raise InputError(f"{path}: calibrations are written as {' or '.join(SUFFIXES)}; give a name that ends so.")
     with written_whole(path, path.suffix) as partial:
         partial.write_text(FORMATS[form](calibration), encoding="utf-8")
+
+
+def read_hand_eye(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """X (4, 4) [m] with x_body = X x_camera, and a covariance (6, 6) of the camera's place [m] and turn [rad] about it.
+
+    The residuals of the motions stand for deviations along and about each axis.
+
+    Raises
+    ------
+    InputError
+        A file that is missing or none such; a transform that is not rigid, or residuals that are none.
+    """
+    from ar.tracking.rigid import is_rigid
+
+    path = path_of(path)
+    with read_as(path, "a hand-eye calibration", GIVE_HAND_EYE):
+        with path.open("rb") as file:
+            stored = json.loads(file.read(LARGEST_HAND_EYE))
+        X = np.eye(4)
+        X[:3, :3], X[:3, 3] = np.array(stored["rotation"], float), 1e-3 * np.array(stored["shift_mm"], float)
+        off = np.array([1e-3 * float(stored["rms_mm"]), np.radians(float(stored["rms_degrees"]))])
+        if not is_rigid(X, RIGID):
+            raise InputError(f"its rotation is none. {GIVE_HAND_EYE}")
+        if not np.isfinite(off).all() or (off < 0.0).any():
+            raise InputError(f"its residuals are no lengths. {GIVE_HAND_EYE}")
+        return X, np.diag(np.repeat(off**2, 3))
