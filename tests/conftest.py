@@ -3,6 +3,7 @@
 import gc
 import os
 import sys
+import threading
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -186,3 +187,126 @@ def short_fits():
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(Ann, "fit", lambda ann, X, Y: fit(replace(ann, steps=min(ann.steps, 120)), X, Y))
         yield
+
+
+@pytest.fixture(scope="module")
+def truth(stage):
+    from films import truth_of
+
+    return truth_of(stage)
+
+
+@pytest.fixture(scope="module")
+def registration():
+    from films import FILM
+
+    from scenes.tracked.registration_file import read_registration
+
+    return read_registration(FILM / "registration.json")
+
+
+@pytest.fixture(scope="module")
+def beside(follower, truth):
+    """T_reference_cube (4, 4) [mm] of the film's poses, as a tracker would send it."""
+    from links import in_mm
+
+    return in_mm(follower.registration.T_patient_scan @ truth.T_scan_tool @ np.linalg.inv(follower.tool.T_cube_tool))
+
+
+@pytest.fixture
+def scene():
+    """Two seconds, of which the first half presses harder and harder; cheap frames, quickly."""
+    from theatres import small
+
+    from scenes.script.tool_paths import press
+
+    return small(path=press(0.3, rise=1.0, hold=1.0), duration=2.0, frames_per_second=60.0)
+
+
+@pytest.fixture
+def demo(theatre, scene):
+    from visitor import free_port, wait_for
+
+    from scenes.page.demo import Demo
+
+    before = set(threading.enumerate())
+    demo = Demo(theatre, scene, "linear", "127.0.0.1", free_port())
+    yield demo
+    demo.close()
+    assert wait_for(lambda: not [t for t in set(threading.enumerate()) - before if t.name in ("page", "fem", "busy")])
+
+
+@pytest.fixture(scope="session")
+def study_box():
+    return make_box((6, 6, 4), tumour=9e-3, depth=14e-3, opening=20e-3)
+
+
+@pytest.fixture(scope="session")
+def study(tmp_path_factory, study_box):
+    from studies import study_of
+
+    return study_of(tmp_path_factory.mktemp("report"), study_box, 280)
+
+
+@pytest.fixture(scope="session")
+def study_rows(study):
+    from studies import SPECS
+
+    from scenes.report.rows import measured, rows
+
+    return tuple(rows(study, SPECS, measured))
+
+
+@pytest.fixture(scope="module")
+def site(box):
+    from scenes.script.site import site_of
+
+    return site_of(box)
+
+
+@pytest.fixture(scope="module")
+def box_folder(box, tmp_path_factory):
+    """A folder of box.vtu and its models."""
+    from theatres import put, theatre_of
+
+    folder = tmp_path_factory.mktemp("box")
+    put(theatre_of(box), folder / "box.vtu")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def template():
+    from theatres import template_theatre
+
+    return template_theatre()
+
+
+@pytest.fixture(scope="module", params=["linear", "svr", "fem"])
+def play(request, theatre):
+    from theatres import player, small
+
+    return player(theatre, small(), request.param)
+
+
+@pytest.fixture(scope="module")
+def still(box):
+    """An observer and the body at rest, with errors as they are by default, and many points."""
+    from scenes.play.deformers import Theatre
+    from scenes.play.observer import Observer
+    from scenes.script.sight import Sight
+
+    return Observer(Theatre(box, None, {}, "cpu").site, None, Sight(points=400)), box.mesh.nodes
+
+
+@pytest.fixture(scope="session")
+def warp_folder(tmp_path_factory, box):
+    from warped import write_warp
+
+    folder = tmp_path_factory.mktemp("warp")
+    write_warp(folder, box)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def warp_out(warp_folder):
+    return warp_folder / "out"

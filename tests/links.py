@@ -2,18 +2,20 @@
 
 import asyncio
 import struct
+import time
 from contextlib import asynccontextmanager
 
 import numpy as np
 
 from scenes.link.answer import Answering
-from scenes.link.frame import HEADER, framed, read_header
+from scenes.link.frame import HEADER, framed, read_header, stamp_of
 from scenes.link.heard import Heard, Names
 from scenes.link.outgoing import Outgoing
 from scenes.link.session import Session
 
 HOST = "127.0.0.1"
 NAMES = Names()
+NOW = stamp_of(time.time())
 
 
 def played(scene):

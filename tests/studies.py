@@ -6,6 +6,8 @@ from dataclasses import asdict
 import msgspec
 
 from scenes.commands.report import QUICK
+from scenes.report.finite_elements import Elements
+from scenes.report.learner import Learner
 from scenes.report.reference import solve_beyond, solve_reference
 from scenes.report.row import Row
 from scenes.report.study import Study
@@ -17,6 +19,7 @@ from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
+SPECS = (Elements("FEM"), Elements("linear law", law="linear"), Learner("linear"))
 
 
 def nothing(count):

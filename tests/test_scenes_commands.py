@@ -1,10 +1,8 @@
-"""Every scenes command from the outside: a patient in one go, and bad input as one sentence with nothing written."""
+"""Every command from the outside: help, and bad input as one sentence with nothing written."""
 
-import json
 from dataclasses import replace
 
 import pytest
-from balls import EGG, ball
 from boxes import base_held
 from boxes import box as cube
 from programs import main
@@ -12,38 +10,7 @@ from theatres import put, theatre_of
 
 from benchmarks.__main__ import BENCHMARKS
 from scenes.cli import COMMANDS
-from scenes.play.deformers import model_path
-from sim.bodies.intensity import sidecar
-from sim.bodies.meshfile import read_anatomy, write_anatomy, write_mesh
-from sim.runtime.timing import stage
-from surrogate.model.store import load
-
-
-def test_a_patient_in_one_go(tmp_path, capsys, short_fits):
-    ball(tmp_path, EGG)
-    out = tmp_path / "me" / "brain.vtu"
-    volumes = [str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--t1", str(tmp_path / "t1.nii.gz")]
-    size = ["--nodes", "2000", "--count", "80", "--device", "cpu", "--element", "p1", "--learners", "linear,residual"]
-    assert main(["patient", *volumes, *size, "--out", str(out)]) == 0
-    text = capsys.readouterr().out
-    for step in ("sulcus anatomy --labels", "sulcus simulate", "sulcus train", "wins", "ready: sulcus demo --anatomy"):
-        assert step in text
-    for part in ("labels", "mesh", "set-up", "unit responses", "loads", "learn residual", "score", "save", "rest"):
-        assert f"\n  {part} " in text
-    anatomy = read_anatomy(out)
-    models = load(model_path(out), anatomy)
-    assert set(models) == {"linear", "residual"} and sidecar(out).is_file()
-    assert f"ready: sulcus demo --anatomy {out} --element p1" in text
-    assert f"sulcus uncertainty press --anatomy {out} --element p1" in text
-    here = ["--anatomy", str(out), "--element", "p1"]
-    assert main(["check", "slide", "draw", *here, "--every", "30", "--json"]) in (0, 1)  # of eighty loads
-    report = json.loads(capsys.readouterr().out)
-    best = min(models, key=lambda name: models[name].bound)
-    assert all(row["deformer"] == best for row in report["scenes"])
-    assert all(row["overlap"] > 0.98 and row["drawn"] < 4.0 and row["printed"] for row in report["scenes"])
-    assert all(row["motion_mm"] > 0.3 for row in report["scenes"])
-    assert main(["render", "slide", *here, "--every", "60", "--out", str(tmp_path / "frames")]) == 0
-    assert len(list((tmp_path / "frames").iterdir())) == 3
+from sim.bodies.meshfile import write_anatomy, write_mesh
 
 
 @pytest.mark.parametrize(
@@ -57,45 +24,6 @@ def test_a_wrong_name_of_a_scene_is_refused_before_an_anatomy_is_opened(words, t
     assert "no scene is called 'x'" in capsys.readouterr().err
     assert main(["warp", "no.vtu", "--scene", "x", "--frame", "1", "--out", "o"]) == 2
     assert "no scene is called 'x'" in capsys.readouterr().err and not list(tmp_path.iterdir())
-
-
-def test_a_patient_says_in_json_where_the_time_went(tmp_path, monkeypatch, capsys):
-    def step(words):
-        assert words[-1] == "--json"
-        with stage(words[0]):
-            return 0
-
-    monkeypatch.setattr("scenes.cli.main", step)
-    words = ["labels.nii.gz", "--brain", "1", "--tumour", "2", "--device", "cpu", "--json"]
-    assert main(["patient", *words, "--out", str(tmp_path / "me.vtu")]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert list(said["seconds"]) == ["anatomy", "simulate", "train", "rest"]
-    assert sum(said["seconds"].values()) == pytest.approx(said["total"]) and min(said["seconds"].values()) >= 0.0
-
-
-@pytest.mark.parametrize(
-    ("words", "reason"),
-    [
-        (["none.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu"], "no such file"),
-        (["labels.nii.gz", "--brain", "1", "--tumour", "7", "--out", "a.vtu"], "no label 7"),
-        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.stl"], ".vtu"),
-        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "labels.nii.gz/a.vtu"], "folder"),
-        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--count", "3"], "--count 3"),
-        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--device", "abacus"], "abacus"),
-        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--learners", "ann,owl"], "called owl"),
-        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--learners", "contact"], "contact"),
-        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--learners", "ann,"], "--learners"),
-        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--nodes", "3"], "3 nodes"),
-    ],
-)
-def test_a_patient_that_cannot_be_is_a_sentence(tmp_path, monkeypatch, capsys, words, reason):
-    ball(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.iterdir())
-    assert main(["patient", *words]) == 2
-    error = capsys.readouterr().err
-    assert reason in error.splitlines()[-1] and "Traceback" not in error
-    assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,11 @@
 """The page alive, without a browser: it plays, listens, is refereed, and goes away."""
 
-import re
 import threading
 import time
 
 import numpy as np
 import pytest
-from theatres import small
-from visitor import Visitor, free_port, wait_for
+from visitor import Visitor, report, run_until, wait_for
 
 from ar.overlay.hud import FINE
 from ar.overlay.refind import stands
@@ -15,28 +13,11 @@ from ar.page.browser import Browser
 from scenes.page.comparison import Moment
 from scenes.page.controls import PLAN
 from scenes.page.demo import Demo
-from scenes.page.referee import Referee
 from scenes.page.requests import HAND, SCRIPT
 from scenes.page.text import plan_words
-from scenes.page.view import FEM_COLOUR, STALE_COLOUR
-from scenes.script.tool_paths import Touch, press
+from scenes.script.tool_paths import Touch
 from sim.fem import Fem
 from surrogate.model.learned import Learned
-
-
-@pytest.fixture
-def scene():
-    """Two seconds, of which the first half presses harder and harder; cheap frames, quickly."""
-    return small(path=press(0.3, rise=1.0, hold=1.0), duration=2.0, frames_per_second=60.0)
-
-
-@pytest.fixture
-def demo(theatre, scene):
-    before = set(threading.enumerate())
-    demo = Demo(theatre, scene, "linear", "127.0.0.1", free_port())
-    yield demo
-    demo.close()
-    assert wait_for(lambda: not [t for t in set(threading.enumerate()) - before if t.name in ("page", "fem", "busy")])
 
 
 @pytest.fixture
@@ -57,25 +38,6 @@ def running(demo):
     loop.join()
     visitor.wire.close()
     assert sum(drawn) > 5
-
-
-def run_until(demo, monkeypatch, reached):
-    """Let the loop run, once, until it has come to something."""
-    show = demo.browser.show
-
-    def shown(*known):
-        show(*known)
-        if reached():
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(demo.browser, "show", shown)
-        demo.run(60.0)
-
-
-def report(demo):
-    """The words of the report, without their marks."""
-    return re.sub("<[^>]*>", "|", demo.browser.shown[2])
 
 
 def test_it_plays_by_itself_and_is_refereed(demo, theatre):
@@ -123,26 +85,6 @@ def test_the_words_beside_a_picture_are_of_its_frame(demo, monkeypatch):
         assert pictures.setdefault(number, colour) is colour
 
 
-def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypatch):
-    """The frame was drawn before the finite elements answered it: no further one brings their tumour along."""
-    asked = []
-    monkeypatch.setattr(demo.referee, "ask", lambda number, touch: asked.append((number, touch)))
-    demo.wish.set(plays=False, number=90)
-    fem = demo.browser.meshes["finite elements"]
-    rest = np.array(fem.vertices)
-
-    seen = []
-
-    def moved():
-        seen.append(demo.referee.truth)
-        if len(seen) == 5:
-            Referee.ask(demo.referee, *asked[0])
-        return np.linalg.norm(fem.vertices - rest, axis=1).max() > 5e-4
-
-    run_until(demo, monkeypatch, moved)
-    assert len(asked) == 1 and seen[:5] == [None] * 5
-
-
 def test_playing_goes_on_after_a_pause(demo, monkeypatch):
     """In the middle of a run: the frame that it paused at is shown already, and so nothing new is asked for."""
     demo.wish.set(plays=False, number=20)
@@ -178,22 +120,6 @@ def test_the_error_is_found_once_for_each_answer(demo, monkeypatch):
     monkeypatch.setattr(Learned, "deform", counted)
     run_until(demo, monkeypatch, lambda: "error against FEM: mean" in report(demo))
     assert len(asked) == 2  # for the picture, and for the error
-
-
-def test_the_3d_view_follows(demo, theatre):
-    demo.wish.set(plays=False, number=30)
-    assert demo.run(1.0) >= 1
-    tumour = np.asarray(demo.browser.meshes["tumour"].vertices)
-    rest = demo.stage.tumour(theatre.anatomy.mesh.nodes).vertices
-    assert wait_for(lambda: np.linalg.norm(demo.browser.meshes["tumour"].vertices - rest, axis=1).max() > 5e-4)
-    meshes = demo.browser.meshes
-    assert wait_for(
-        lambda: (
-            demo.run(0.3)
-            and np.linalg.norm(meshes["finite elements"].vertices - meshes["tumour"].vertices, axis=1).max() < 3e-4
-        )
-    )
-    assert tumour.shape == rest.shape
 
 
 def test_visitors_take_over_scrub_and_switch(running):
@@ -232,18 +158,6 @@ def test_the_menu_says_who_has_the_tool(demo):
     visitor.wire.close()
 
 
-def test_the_referee_answers_the_newest_question(theatre, scene):
-    referee = Referee(theatre, scene, threading.Lock())
-    for number in range(60):
-        referee.ask(number, None)
-    assert wait_for(lambda: referee.truth is not None and referee.truth.number == 59)
-    truth = referee.truth
-    assert truth is not None and truth.deformation.time[0] == truth.loads.times[0] == scene.times[59]
-    assert truth.deformation.outcome[0].good and truth.seconds > 0.0
-    referee.close()
-    assert not referee.thread.is_alive()
-
-
 def test_a_page_that_cannot_be_served_leaves_nothing_behind(theatre, scene):
     before = set(threading.enumerate())
     for host, port, kind in (("127.0.0.1", 70000, ValueError), ("no.such.host.invalid", 8080, OSError)):
@@ -252,26 +166,6 @@ def test_a_page_that_cannot_be_served_leaves_nothing_behind(theatre, scene):
         with pytest.raises(kind):
             Browser([], None, None, host=host, port=port)  # type: ignore[arg-type]
     assert set(threading.enumerate()) <= before
-
-
-def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
-    """A hand moves the tool: what the finite elements said of the load before it is greyed until they answer anew."""
-    demo.wish.set(plays=False, number=60)
-    assert wait_for(lambda: demo.run(0.3) and "|error against FEM: mean" in report(demo))
-    assert "earlier load" not in report(demo)
-    tints = []
-    monkeypatch.setattr(demo.browser, "tint", lambda name, colour: tints.append(colour))
-    asked = []
-    monkeypatch.setattr(demo.referee, "ask", lambda number, touch: asked.append((number, touch)))
-    demo.wish.hand(x=0.004, force=0.25)
-    demo.run(0.5)
-    assert wait_for(lambda: "force 0.25 N" in report(demo))
-    said = demo.browser.shown[2]
-    assert '<p class="stale">of an earlier load: error against FEM' in said and "<p>error against FEM" not in said
-    assert tints[-1] == STALE_COLOUR and len(asked) == 1
-    Referee.ask(demo.referee, *asked[0])
-    assert wait_for(lambda: demo.run(0.3) and "<p>error against FEM" in demo.browser.shown[2])
-    assert "earlier load" not in report(demo) and tints[-1] == FEM_COLOUR
 
 
 def test_the_scene_changes_without_a_new_server(demo):

@@ -7,19 +7,16 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
 
-import cv2
 import numpy as np
 import pytest
 import warp as wp
-from theatres import PUSHING, put, short, sinking, theatre_of
+from theatres import short, sinking, theatre_of
 
-from ar.screen import shrunk
 from scenes.cli import main
 from scenes.play.effect_ablation import ALL, device_arrays, rows, run, without
-from scenes.play.scene_costs import sheet, thumbnail
-from scenes.script.scene import SCENES, find_scene
+from scenes.script.scene import find_scene
 from sim.bodies.meshfile import write_anatomy
-from sim.effects import Gravity, Held, ToolForce
+from sim.effects import Gravity, Held
 from sim.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("ours_alone")
@@ -31,8 +28,8 @@ def small_theatre(small_box):
 
 
 @pytest.fixture(scope="module")
-def anatomy(theatre, tmp_path_factory):
-    return str(put(theatre, tmp_path_factory.mktemp("ablation") / "box.vtu"))
+def anatomy(box_folder):
+    return str(box_folder / "box.vtu")
 
 
 @pytest.fixture(scope="module")
@@ -136,46 +133,3 @@ def test_the_command_tells_rows(theatre, anatomy, printed, capsys):
     assert "| effect | ms a frame | MB on the device | tumour mm | cortex mm |" in error
     assert main(["effects", "brain_shift", "--anatomy", anatomy, "--every", "0"]) == 2
     assert "give a whole number" in capsys.readouterr().err
-
-
-class TestScenes:
-    def test_they_are_listed_with_who_can_play_them(self, anatomy, capsys):
-        assert main(["scenes", "--anatomy", anatomy, "--device", "cpu", "--json"]) == 0
-        reported = {row["scene"]: row for row in json.loads(capsys.readouterr().out)["scenes"]}
-        assert tuple(reported) == SCENES
-        for name, row in reported.items():
-            assert row["deformers"] == (["linear", "svr", "guarded", "fem"] if name in PUSHING else ["fem"])
-            assert ("ToolForce" in row["effects"]) == (ToolForce() in find_scene(name).effects)
-        assert "Resection" in reported["resection"]["effects"] and "milliseconds" not in reported["press"]
-
-    def test_pictures_and_a_sheet(self, anatomy, tmp_path, capsys):
-        out = tmp_path / "new" / "sheet"
-        assert main(["scenes", "press", "brain_shift", "--anatomy", anatomy, "--device", "cpu", "--out", str(out)]) == 0
-        assert "ms a frame by guarded; the tumour moves" in capsys.readouterr().out
-        assert sorted(path.name for path in out.iterdir()) == ["brain_shift.png", "press.png", "sheet.png"]
-        whole, one = (cv2.imread(str(out / name)) for name in ("sheet.png", "press.png"))
-        assert one.shape == (360, 480, 3) and whole.shape == (360, 1440, 3)
-        assert np.array_equal(whole[:, :480], one) and (whole[:, 960:] == 12).all()
-
-    def test_a_scene_s_name_covers_no_words_at_the_foot(self, theatre):
-        scene = short()
-        wide = replace(scene, viewpoint=replace(scene.viewpoint, width=480, height=360))
-        player = theatre.player("linear", wide)
-        foot, kept = thumbnail(player, "linear").colour[-40:], []
-        for frame in player.frames():
-            words = frame.taken[-40:] > 0
-            kept.append(words.any() and np.array_equal(foot[words], frame.shown[-40:][words]))
-        assert any(kept)
-
-    def test_a_file_is_no_folder(self, anatomy, tmp_path, capsys):
-        (tmp_path / "file").touch()
-        assert main(["scenes", "--anatomy", anatomy, "--out", str(tmp_path / "file")]) == 2
-        assert "need a folder" in capsys.readouterr().err
-
-
-def test_half_a_picture_keeps_its_light():
-    colour = np.random.default_rng(0).integers(0, 256, (8, 10, 3), dtype=np.uint8)
-    small = shrunk(colour, colour.shape[1] // 2, colour.shape[0] // 2)
-    assert small.shape == (4, 5, 3)
-    np.testing.assert_allclose(small[1, 2], colour[2:4, 4:6].reshape(4, 3).mean(axis=0), atol=0.51)
-    assert sheet([small] * 4).shape == (8, 15, 3) and (sheet([small] * 4)[4:, 5:] == 12).all()

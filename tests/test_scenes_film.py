@@ -1,8 +1,7 @@
-"""Films of a scene as a camera takes them: what is true of them, what goes wrong in them, and their files."""
+"""Films of a scene as files: time stamps in their pixels, and all that belongs to a film."""
 
 import csv
 import json
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,14 +10,10 @@ from theatres import template_theatre
 
 from ar.tracking.pictures import film_of
 from ar.tracking.stamp import CELL, WIDTH, read_stamp, stamped
-from ar.tracking.targets import Detector, patient_reference, tool_cube
-from ar.tracking.track import Tracker
 from scenes.cli import main
-from scenes.play.deformers import AtRest
-from scenes.play.player import Player
 from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import read_intrinsic_covariance, write_calibration
-from scenes.tracked.filming import USUAL, VIEW, Taking, Trouble, mounted, registered, shots_of
+from scenes.tracked.filming import USUAL
 from scenes.tracked.registration_file import read_registration
 from scenes.tracked.tracked_tool import read_tool
 from scenes.tracked.truth import read_truth
@@ -26,58 +21,6 @@ from sim.errors import InputError
 from sim.tools import Ball
 
 SMALL = USUAL.sized(800, 600, scale=True)
-TARGETS = (tool_cube(), patient_reference())
-
-
-@pytest.fixture(scope="module")
-def player():
-    """The scene palpate on a brain that stays at rest."""
-    theatre = template_theatre()
-    scene = replace(find_scene("palpate"), viewpoint=VIEW.calibrated(SMALL), duration=0.7)
-    return Player(theatre.stage(scene), AtRest(theatre.anatomy))
-
-
-@pytest.fixture(scope="module")
-def shots(player):
-    """Seven pictures, with a trouble of each kind but the first and the last."""
-    kinds = ("reference", "tool", "bright", "smear", "gap")
-    troubles = tuple(Trouble(kind, 0.1 * n + 0.05, 0.1 * n + 0.15) for n, kind in enumerate(kinds))
-    return list(shots_of(player, mounted(player), Taking(troubles=troubles), every=3))
-
-
-def grey(shot):
-    return cv2.cvtColor(shot.colour, cv2.COLOR_RGB2GRAY)
-
-
-def test_both_targets_are_seen_where_they_are(player, shots):
-    mounts = mounted(player)
-    seen = Tracker(SMALL.camera(np.eye(4)), TARGETS).track(grey(shots[0]))
-    wanted = {
-        "tool": shots[0].T_scan_tool @ np.linalg.inv(mounts.tool.T_cube_tool),
-        "patient": mounts.T_scan_patient,
-    }
-    assert set(seen.poses) == set(wanted)
-    for name, T_scan_target in wanted.items():
-        off = seen.poses[name].T_camera_target - shots[0].T_camera_scan @ T_scan_target
-        assert np.abs(off[:3, 3]).max() < 0.5e-3 and np.abs(off[:3, :3]).max() < 0.01
-    assert len(np.unique(Detector(TARGETS).seen(grey(shots[0]))["tool"].face)) >= 2
-
-
-def test_what_goes_wrong_does_and_nothing_else(shots):
-    detector = Detector(TARGETS)
-    found = [set(detector.seen(grey(shot))) for shot in shots]
-    both = {"tool", "patient"}
-    assert found[0] == found[-1] == both  # before and after
-    assert found[1:5] == [{"tool"}, {"patient"}, set(), set()]
-    assert [shot.time for shot in shots] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.7])  # 0.5 is left out
-    assert [read_stamp(grey(shot)) for shot in shots] == pytest.approx([shot.time for shot in shots])
-
-
-def test_a_trouble_that_is_none_is_refused():
-    with pytest.raises(InputError, match="no trouble is called 'fog'"):
-        Trouble("fog", 0.0, 1.0)
-    with pytest.raises(InputError, match="two times in order"):
-        Trouble("gap", 1.0, 0.5)
 
 
 def test_a_stamp_outlives_blur_and_noise_and_none_is_read_where_none_is():
@@ -98,20 +41,6 @@ def test_a_stamp_outlives_blur_and_noise_and_none_is_read_where_none_is():
         stamped(picture, -1.0)
     with pytest.raises(ValueError, match="a time needs"):
         stamped(picture[:, :100], 1.0)
-
-
-def test_a_registration_is_off_as_it_says(player):
-    mounts, found = mounted(player), []
-    for seed in range(200):
-        one = registered(player.site, mounts, 0.5, 0.4, seed)
-        off = one.T_patient_scan @ mounts.T_scan_patient
-        place, covariance = one.point(player.site.origin + [0.02, 0.0, 0.0])
-        true = np.linalg.inv(mounts.T_scan_patient) @ [*(player.site.origin + [0.02, 0.0, 0.0]), 1.0]
-        found.append((place - true[:3]) @ np.linalg.solve(covariance, place - true[:3]))
-        assert not np.allclose(off, np.eye(4), atol=1e-6)
-    assert np.mean(found) == pytest.approx(3.0, rel=0.2)
-    exact = registered(player.site, mounts, 0.0, 0.0, 0).T_patient_scan
-    np.testing.assert_allclose(exact, np.linalg.inv(mounts.T_scan_patient), atol=1e-12)
 
 
 def test_a_film_and_all_that_belongs_to_it_are_written(tmp_path, capsys):

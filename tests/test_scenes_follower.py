@@ -8,17 +8,15 @@ import numpy as np
 import pytest
 from films import follower_of, truth_of
 from test_scenes_error_parts import shifted, six, turned
-from test_scenes_overlay import INK, pictures
+from test_scenes_overlay import pictures
 from theatres import template_theatre
 
-from ar.overlay.refind import of_ink
 from ar.tracking.pose import Pose
 from ar.tracking.registration import Registration
 from ar.tracking.track import Tracked
 from scenes.script.scene import find_scene
 from scenes.tracked.follower import HELD, PATIENT, State, tip_covariance
 from scenes.tracked.picture import Painter
-from scenes.tracked.plausible import implausible
 from scenes.tracked.run import aged
 from scenes.tracked.tracked_tool import TrackedTool
 from sim.tools import Ball
@@ -33,26 +31,6 @@ def test_a_registration_that_is_not_sure_is_in_the_band_and_beyond_a_limit_not_t
         assert known.state is state and known.parts["registration"] == pytest.approx(2.448 * shift, rel=1e-3)
         assert known.band == pytest.approx(2.448 * shift, rel=0.02)
         assert ("do not rely" in known.words) is (state is State.UNSURE)
-
-
-def test_a_registration_of_another_patient_is_noticed(follower, stage):
-    first = next(iter(pictures())).picture
-    T = follower.registration.T_patient_scan.copy()
-    T[:3, 3] += [0.0, 0.0, -0.4]
-    other = replace(follower, registration=replace(follower.registration, T_patient_scan=T))
-    known = other.step(first.grey, 0.0)
-    assert known.state is State.UNSURE and known.band is None and "mm from the reference" in known.words
-    painted = Painter(stage, follower.tool).paint(first.colour, known).colour
-    assert np.count_nonzero(of_ink(painted, INK)) < 5
-    near = follower.step(first.grey, 0.0)
-    behind = replace(near.camera, T_camera_world=np.diag([1.0, -1.0, -1.0, 1.0]) @ near.camera.T_camera_world)
-    assert "behind the camera" in implausible(follower.registration, stage, behind)
-    long = follower.tool.T_cube_tool @ [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.4], [0, 0, 0, 1.0]]
-    away = replace(follower, tool=replace(follower.tool, T_cube_tool=long))
-    known = away.step(first.grey, 0.0)
-    assert known.state is State.UNSURE and "never nearer than 200" in known.words and not known.near
-    assert near.near and away.step(first.grey, 0.1, near).near  # it has been there
-    assert "head" not in away.step(first.grey, 0.1, near).words
 
 
 def test_a_registration_that_does_not_say_whose_it_is_is_not_relied_on(follower):

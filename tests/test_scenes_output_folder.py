@@ -2,18 +2,14 @@
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import nibabel
 import nrrd
 import numpy as np
 import pytest
-from theatres import small, theatre_of
 
 from scenes.cli import main
-from scenes.play.deformers import Theatre
 from scenes.warp.images import read_picture, warped_values, write_warped
-from scenes.warp.moment import Played
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.fields.warp_fields import warp_fields
 
@@ -84,14 +80,6 @@ def test_a_scene_is_a_sequence_in_time(folder, capsys):
     assert header["displacement field type"] == "modeling" and header["intent_code"] == "1006"
     largest = np.linalg.norm(values, axis=0).max(axis=(0, 1, 2))
     assert largest[1] > 5 * largest[0]
-
-
-def test_warp_bound_is_that_of_the_frame_in_time(box, monkeypatch):
-    grows = SimpleNamespace(at=lambda time: SimpleNamespace(prior=1e-3 * (1.0 + time)))
-    monkeypatch.setattr(Theatre, "uncertainty", lambda theatre, scene: grows)
-    scene = small()
-    found = Played(theatre_of(box), scene).moments([0, 12, len(scene.times) - 1])
-    assert [one.bound for one in found] == pytest.approx([1e-3 * (1.0 + scene.times[k]) for k in (0, 12, -1)])
 
 
 def test_a_grid_that_is_coarse_for_the_tumour_is_said(folder, box, capsys):

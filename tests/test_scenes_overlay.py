@@ -8,7 +8,7 @@ from itertools import islice
 import cv2
 import numpy as np
 import pytest
-from films import FILM, Recorded, truth_of
+from films import FILM, Recorded
 
 from ar.overlay.outlines import ink_of, silhouette
 from ar.overlay.refind import changed_share, of_ink, outline_gap
@@ -33,11 +33,6 @@ GOOD, REST, LOST, TOOL, STALE = State.GOOD, State.REST, State.NO_REFERENCE, Stat
 # 1.33 to 1.73 s, and lacks a picture at 2 s. The ball lies on the cortex from 0.4 s on.
 STATES = [REST, REST, REST, GOOD, LOST, GOOD, GOOD, TOOL, TOOL, GOOD, LOST, LOST, LOST, LOST, GOOD, STALE, GOOD]
 INK = ink_of(TUMOUR_COLOUR)
-
-
-@pytest.fixture(scope="module")
-def truth(stage):
-    return truth_of(stage)
 
 
 @pytest.fixture(scope="module")

@@ -57,17 +57,6 @@ def seek(page, number):
     return wait_for(lambda: page.browser.shown[0] == number and f"picture {number} of" in page.browser.shown[2])
 
 
-def test_a_film_is_gone_to_and_fro_in(tmp_path):
-    film, pictures = SeekableFilm(FILM / "film.mp4", 30.0), list(film_of(FILM / "film.mp4", 30.0, colour=True))
-    assert film.count == len(pictures) == 17
-    for number in (3, 4, 16, 0):
-        found = film.at(number)
-        assert found.stamped and np.array_equal(found.picture.colour, pictures[number].colour)
-    film.count = 40  # as a file may say
-    assert film.at(20) is None and film.count == 20 and film.at(17) is None and film.count == 17
-    assert film.at(16).picture.name == "frame 16"
-
-
 @pytest.mark.parametrize(
     ("number", "state", "words"),
     [

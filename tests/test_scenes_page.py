@@ -3,15 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from theatres import short, sinking, small
+from theatres import short
 
-from ar.page.parts import Choice, Fold, Slider
-from scenes.page.beside import TIP, TUMOUR_MIDDLE, lines_of, sample_of, slices_of
-from scenes.page.controls import clocked, controls
-from scenes.page.requests import Wish
 from scenes.page.text import report
-from scenes.script.scene import find_scene
 from scenes.script.tool_paths import Touch
 from scenes.script.uncertainty import TumourError
 from sim.deformation import Outcome, guess
@@ -30,91 +24,6 @@ class TestDigestOfLoads:
         others = [Touch(force=0.21), Touch(force=0.2, x=0.004), Touch(force=0.2, tilt=(0.3, 0.0))]
         assert one not in {digest_of_loads(scene.loads(site, touch, 0.1)) for touch in others}
         assert one != digest_of_loads(scene.loads(site, Touch(force=0.2), 0.2))
-
-
-class TestControls:
-    def test_the_sliders_end_where_the_bone_stops_the_tool(self, theatre):
-        scene, site = short(), theatre.site
-        assert scene.tool is not None
-        found = controls(scene, site, ("svr", "fem"), Wish("svr", Touch()), print, print)
-        places = [control for control in found if isinstance(control, Slider) and control.label.startswith("place")]
-        room = site.clearance - scene.tool.radius
-        assert len(places) == 2 and all(0.5 <= control.high <= max(0.5, 1e3 * room) for control in places)
-        assert all(control.low == -control.high and control.hint for control in places)
-        assert all(any(f"to {letter}" in control.words for letter in "LRAPSI") for control in places)
-
-    def test_no_code_name_is_shown(self, theatre):
-        for name in ("press", "palpate", "retract", "brain_shift", "pulsation"):
-            found = controls(small(name), theatre.site, ("fem",), Wish("fem", Touch()), print, print)
-            switches = [inner for control in found if isinstance(control, Fold) for inner in control.controls]
-            assert switches and all(inner.words and inner.words != inner.label for inner in switches)
-
-    def test_the_overlay_comes_before_the_tool_s_sliders(self, theatre):
-        labels = [
-            control.label for control in controls(short(), theatre.site, ("fem",), Wish("fem", Touch()), print, print)
-        ]
-        assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-4] == "slices"
-
-    def test_every_overlay_style_is_offered(self, theatre):
-        wish = Wish("fem", Touch())
-        found = controls(short(), theatre.site, ("fem",), wish, print, print)
-        overlay = next(control for control in found if isinstance(control, Choice) and control.label == "overlay")
-        seen = []
-        for option in overlay.options:
-            overlay.changed(option)
-            seen.append(wish.style)
-        assert seen[:3] == ["window", "contour", "fill"] and overlay.start == overlay.options[0]
-
-    def test_each_way_of_the_camera_and_each_place_of_the_slices_is_offered(self, theatre):
-        wish = Wish("fem", Touch())
-        found = {control.label: control for control in controls(short(), theatre.site, ("fem",), wish, print, print)}
-        camera, slices = found["camera"], found["slices"]
-        assert isinstance(camera, Choice) and isinstance(slices, Choice)
-        seen = []
-        for option in camera.options:
-            camera.changed(option)
-            seen.append(wish.path)
-        assert seen == ["", "stays", "hand-held", "microscope", "orbit"]
-        slices.changed(TIP)
-        assert wish.look == ("window", "orbit", TIP)
-        assert "slices" not in {each.label for each in controls(sinking(), theatre.site, ("fem",), wish, print, print)}
-
-    def test_which_scenes_go_on_by_themselves(self, theatre):
-        found = {name: clocked(find_scene(name), theatre.site) for name in ("press", "palpate", "retract", "pulsation")}
-        assert found == {"press": False, "palpate": False, "retract": True, "pulsation": True}
-
-
-class TestHand:
-    def test_a_still_hand_pauses_the_script_and_play_takes_the_tool_back(self):
-        wish = Wish("svr", Touch())
-        wish.hand(force=0.2)
-        assert not wish.plays and wish.now()[2] == Touch(force=0.2)
-        wish.play(True)
-        assert wish.plays and wish.now()[2] is None
-
-    def test_where_time_goes_on_the_hand_keeps_the_tool(self):
-        wish = Wish("fem", Touch(), clocked=True)
-        wish.hand(depth=1e-3)
-        wish.play(True)
-        assert wish.plays and wish.now()[2] == Touch(depth=1e-3)
-
-
-def test_the_chart_and_the_slices_are_of_the_frame_that_is_shown(theatre):
-    player = theatre.player("linear", short())
-    frame = player.draw(3, 0.1, Touch(force=0.25))
-    read = sample_of(replace(frame, distance=12e-3, distance_error=np.inf), player.scene, 5.0)
-    assert read.values == pytest.approx((12.0, 0.25)) and read.errors == (None, 0.0) and read.time == 5.0
-    assert sample_of(replace(frame, distance_error=2e-3), player.scene, 0.0).errors[0] == pytest.approx(2.0)
-    middle, tip = (slices_of(frame, player, place) for place in (TUMOUR_MIDDLE, TIP))
-    assert middle.shape == tip.shape and (middle != tip).any()
-    known = slices_of(replace(frame, tumour_error=TumourError(4e-3)), player, TUMOUR_MIDDLE)
-    doubtful = slices_of(replace(frame, tumour_error=TumourError(4e-3), doubt="why"), player, TUMOUR_MIDDLE)
-    green = [np.count_nonzero(each[..., 1] > each[..., 0] + 10.0) for each in (known, middle, doubtful)]
-    assert green[0] > 1.5 * green[1] > 0 == green[2]
-    still = theatre.player("fem", sinking())
-    assert [line.name for line in lines_of(still.scene)] == ["tumour moved"]
-    moved = sample_of(replace(frame, moved=3e-3, tumour_error=TumourError(4e-3)), still.scene, 0.0)
-    assert moved.values == (3.0,) and moved.errors == (4.0,)
 
 
 def test_the_page_reads_what_the_frame_holds(theatre):

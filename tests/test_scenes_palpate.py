@@ -7,15 +7,12 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-import trimesh
 from theatres import player
 
 from scenes.episodes.episode import collect
 from scenes.play.frame_text import acting
 from scenes.play.player import Player
-from scenes.report.picture import rested
 from scenes.script.scene import Scene, Viewpoint, find_scene
-from scenes.script.site import site_of
 from scenes.script.tool_paths import AIR, Touch
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
@@ -178,15 +175,3 @@ def test_a_tool_in_the_air_touches_nothing(theatre):
     loads = scene.loads(theatre.site, Touch(depth=-1e-3), 0.0)
     np.testing.assert_array_equal(fem.deform(loads).displacement, 0.0)
     assert Held() in fem.effects
-
-
-def test_the_tool_of_a_report_s_picture_rests_on_the_cortex_and_pierces_it_nowhere(box):
-    site, radius = site_of(box), 5e-3
-    nodes = box.mesh.nodes.copy()
-    top = site.contact(0.0, 0.0, radius).point
-    away = np.linalg.norm(nodes - top, axis=1)
-    # A dent that is deepest under the tool, and narrower than the ball.
-    nodes += 2e-3 * np.exp(-((away / 4e-3) ** 2))[:, None] * site.axis
-    middle = rested(site, top, nodes, radius) - radius * site.axis
-    surface = trimesh.Trimesh(nodes, box.open_surface, process=False)
-    assert trimesh.proximity.closest_point_naive(surface, middle[None])[1][0] == pytest.approx(radius, abs=1e-8)

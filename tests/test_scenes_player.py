@@ -1,46 +1,27 @@
 """The loop: a tool that rests on the tissue, one picture a moment, and a picture that is a function of its moment."""
 
 import importlib
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
-from theatres import PUSHING, on_template, player, put, short, small, template_theatre
+from theatres import PUSHING, on_template, player, short, small
 
 from ar.optics.camera import project_cv2
 from ar.overlay.composite import WARNING
 from ar.overlay.hud import FINE, NARROW, WHITE, folded
 from ar.overlay.outlines import ink_of
 from ar.overlay.refind import stands
-from scenes.cli import main
-from scenes.play.deformers import model_path, open_theatre
 from scenes.play.frame_text import shortened
 from scenes.play.player import CARRIED, IN_BONE, STAGES
-from scenes.play.scene_costs import labelled
 from scenes.play.stage import CORTEX, TOOL
-from scenes.script.scene import Viewpoint, find_scene
-from scenes.script.shipped_files import template_path
+from scenes.script.scene import Viewpoint
 from scenes.script.tool_paths import Touch
-from sim.bodies.intensity import sidecar
-from sim.bodies.meshfile import write_anatomy
-from sim.deformation import Outcome
 from sim.effects import Elasticity
-from sim.errors import InputError
 from sim.fem import solver_named
 from sim.material import Material, Ogden
 from surrogate.model.learned import Learned
-
-
-@pytest.fixture(scope="module")
-def template():
-    return template_theatre()
-
-
-@pytest.fixture(scope="module", params=["linear", "svr", "fem"])
-def play(request, theatre):
-    return player(theatre, small(), request.param)
 
 
 def heights(play, frame, points):
@@ -229,86 +210,9 @@ def test_learnt_and_finite_elements_are_interchangeable(theatre):
     assert np.linalg.norm(fem - learnt, axis=2).mean() < 0.1 * np.linalg.norm(fem, axis=2).mean()
 
 
-def test_the_label_is_drawn_above_the_picture(play):
-    frame = play.draw(51, 1.7, play.scene.path(1.7))
-    plain = labelled(frame, "linear")
-    assert plain.shape == frame.shown.shape
-    changed, tool = (plain != frame.shown).any(axis=2), frame.picture.segmentation == TOOL
-    assert changed.any() and tool.any() and not changed[tool].any()
-
-
-def test_the_label_tells_source_time_and_motion(play, monkeypatch):
-    said = []
-    monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, lines, **more: said.extend(lines) or colour)
-    frame = play.draw(51, 1.7, play.scene.path(1.7))
-    labelled(frame, "linear")
-    assert said[:2] == [f"linear: tumour moved {1e3 * frame.moved:.2f} mm", f"t 1.70 s, {frame.acts}"]
-    assert said[-1] == frame.deformation.source
-    labelled(replace(frame, moved=1.33e-3, moved_error=5.31e-3), "linear")
-    assert "linear: tumour moved 1.33 +- 5.4 mm" in said
-
-
 def test_regions_of_a_tissue_of_their_own_are_named_in_short():
     own = Elasticity(regions={2: Material("neo-hookean", 9e3, 0.49), 3: Ogden(((1.0, 2.0), (3.0, 4.0)), 1e5)})
     whole = solver_named("p1", [replace(own, regions=own.regions | {7: Material("linear", 1e3, 0.4)})])
     brief = solver_named("p1", [Elasticity()]).removesuffix(")")
     assert shortened(f"linear, from {whole}") == f"linear, from {brief}; own tissue: tumour, oedema, region 7)"
     assert shortened(f"{brief})") == f"{brief})"
-
-
-def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch):
-    shown = []
-    monkeypatch.setattr(
-        "scenes.play.scene_costs.panel", lambda colour, lines, **more: shown.append(list(lines)) or colour
-    )
-    play = player(theatre, short(), "linear")
-    for force in (0.2, 0.6):
-        labelled(play.draw(0, 0.0, Touch(force=force)), "linear")
-    within, beyond = shown
-    assert beyond[1] == Outcome.EXTRAPOLATED.value and len(beyond) == len(within) + 1
-
-
-def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
-
-    again = open_theatre(put(theatre, tmp_path / "box.vtu"), device="cpu")
-    assert again.anatomy.digest == theatre.anatomy.digest and again.names(short()) == (
-        "linear",
-        "svr",
-        "guarded",
-        "fem",
-    )
-    assert again.intensity is not None and theatre.intensity is not None
-    assert np.array_equal(again.intensity.values, theatre.intensity.values)
-    assert again.best(short()) == min(theatre.models, key=lambda name: theatre.models[name].bound)
-    touch = Touch(force=0.2)
-    pictures = [player(each, short(), "linear").draw(0, 0.0, touch).shown for each in (theatre, again)]
-    assert np.array_equal(pictures[0], pictures[1])
-    sidecar(tmp_path / "box.vtu").unlink()
-    model_path(tmp_path / "box.vtu").unlink()
-    bare = open_theatre(tmp_path / "box.vtu", device="cpu")
-    assert bare.intensity is None and bare.names(short()) == ("fem",) and bare.best(short()) == "fem"
-    with pytest.raises(InputError, match=r"'linear'.*fem; `sulcus train`"):
-        bare.deformer("linear", short())
-
-
-def test_files_that_do_not_belong_together_are_refused(theatre, template, tmp_path):
-
-    put(theatre, tmp_path / "box.vtu")
-    write_anatomy(tmp_path / "box.vtu", template.anatomy)
-    with pytest.raises(InputError, match=f"{theatre.anatomy.digest}.*{template.anatomy.digest}"):
-        open_theatre(tmp_path / "box.vtu", device="cpu")
-    with pytest.raises(InputError, match=r"none\.npz: no such file"):
-        open_theatre(tmp_path / "box.vtu", tmp_path / "none.npz", "cpu")
-    with pytest.raises(InputError, match="no device 'abacus'"):
-        open_theatre(device="abacus")
-
-
-def test_what_ships_fits_together_and_passes_its_own_checks(capsys):
-    assert model_path(template_path()).stat().st_size <= 40_000_000 and sidecar(template_path()).is_file()
-    theatre = open_theatre(device="cpu")
-    assert {"linear", "ann", "svr"} <= set(theatre.models) and theatre.intensity is not None
-    assert all(model.bound < 1e-3 for model in theatre.models.values()) and theatre.best(find_scene("press")) != "fem"
-    assert main(["check", *PUSHING, "--every", "60", "--device", "cpu", "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["passed"] and [row["scene"] for row in report["scenes"]] == list(PUSHING)
-    assert "fem" not in [row["deformer"] for row in report["scenes"]]

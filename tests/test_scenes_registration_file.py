@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_ar_registration import SCAN, TRUE, moved
+from test_ar_registration import SCAN, moved
 
 from ar.tracking.registration import registered
-from scenes.cli import main
 from scenes.script.shipped_files import template_path
 from scenes.tracked.registration_file import other_mesh, read_registration, scanned_of, write_registration
 from sim.bodies.meshfile import read_anatomy
@@ -57,25 +56,3 @@ def test_it_is_refused_for_another_body_and_not_for_another_mesh(tmp_path):
     path.write_text(json.dumps(stored | {"scanned": stored["scanned"] | {"tumour_mm": [1, 2]}}))
     with pytest.raises(InputError, match="a tumour's middle of 3"):
         read_registration(path)
-
-
-def test_the_command_writes_it_and_tells_the_error_at_the_tumour(tmp_path, capsys):
-    pairs, out = tmp_path / "pairs.csv", tmp_path / "r.json"
-    rng = np.random.default_rng(0)
-    table = 1e3 * np.hstack([SCAN, moved(SCAN) + 5e-4 * rng.normal(size=SCAN.shape)])
-    np.savetxt(pairs, table, delimiter=",", header="x,y,z,px,py,pz", comments="")
-    assert main(["register", str(pairs), "--out", str(out), "--anatomy", str(template_path()), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert 0.1 < said["tumour_p95_mm"] < 5.0 and said["rms_mm"] < 1.0
-    np.testing.assert_allclose(read_registration(out).T_patient_scan, TRUE, atol=5e-3)
-    assert read_registration(out).scanned.digest == read_anatomy(template_path()).digest
-    assert len(said["residuals_mm"]) == len(said["left_out_mm"]) == 7 and not said["suspect"]
-    assert main(["register", str(pairs), "--out", str(out), "--surface", str(pairs)]) == 2
-    assert "give it by --anatomy" in capsys.readouterr().err
-    table[4, 3] += 5.0
-    np.savetxt(pairs, table, delimiter=",", header="x,y,z,px,py,pz", comments="")
-    assert main(["register", str(pairs), "--out", str(out), "--force"]) == 0
-    assert "pair 5 is suspect: it lies" in capsys.readouterr().out
-    np.savetxt(pairs, table[:3], delimiter=",", header="x,y,z,px,py,pz", comments="")
-    assert main(["register", str(pairs), "--out", str(out), "--force"]) == 0
-    assert "three pairs do not tell a wrong one" in capsys.readouterr().out

@@ -5,15 +5,15 @@ import time
 from dataclasses import replace
 
 import pytest
-from theatres import Silent, small
-from visitor import Visitor, free_port, wait_for
+from theatres import Silent
+from visitor import Visitor, report, wait_for
 
-from scenes.page.demo import READING, Demo
+from scenes.page.demo import READING
 from scenes.page.referee import Referee
 from scenes.page.requests import HAND, SCRIPT, Wish, holding
 from scenes.play.deformers import Theatre
 from scenes.play.player import Player
-from scenes.script.tool_paths import Touch, press
+from scenes.script.tool_paths import Touch
 from sim.errors import InputError
 
 
@@ -61,17 +61,14 @@ class TestWish:
 
 
 @pytest.fixture
-def scene():
-    return small(path=press(0.3, rise=1.0, hold=1.0), duration=2.0, frames_per_second=60.0)
+def silent(monkeypatch):
+    monkeypatch.setattr("scenes.page.cast.Referee", Silent)
 
 
 @pytest.fixture
-def demo(theatre, scene, monkeypatch):
-    monkeypatch.setattr("scenes.page.cast.Referee", Silent)
-    demo = Demo(theatre, scene, "linear", "127.0.0.1", free_port())
+def demo(silent, demo):
     demo.wish.set(plays=False)
-    yield demo
-    demo.close()
+    return demo
 
 
 @pytest.fixture
@@ -94,10 +91,6 @@ def running(demo):
     done.set()
     loop.join()
     assert not failed
-
-
-def report(demo):
-    return demo.browser.shown[2]
 
 
 def refuse(monkeypatch, refused, error):

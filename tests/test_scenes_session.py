@@ -2,10 +2,8 @@
 
 import asyncio
 import shutil
-import signal
 import socket
 import subprocess
-import sys
 import time
 import warnings
 from contextlib import asynccontextmanager
@@ -13,21 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from films import FILM, truth_of
+from films import FILM
 from links import HOST, NAMES, in_mm, linked, peers, played
-from programs import main
 
 from ar.overlay.outlines import ink_of, silhouette
 from ar.overlay.refind import of_ink, outline_gap
 from ar.tracking.pictures import film_of
-from scenes.link.frame import HEADER, read_header, stamp_of
+from scenes.link.frame import stamp_of
 from scenes.link.heard import Names
 from scenes.link.messages import image, read_image, transform
 from scenes.link.session import Eye
 from scenes.play.stage import TUMOUR_COLOUR
-from scenes.script.shipped_files import template_path
 from scenes.tracked.picture import Painter
-from scenes.tracked.registration_file import read_registration
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -35,24 +30,12 @@ with warnings.catch_warnings():
 
 EXAMPLES = Path("/usr/share/doc/openigtlink-examples/examples")
 ROW = 10
-SELF = "localhost", "127.0.0.1", socket.gethostname()
 
 
 @pytest.fixture(scope="module")
-def truth(stage):
-    return truth_of(stage)
-
-
-@pytest.fixture(scope="module")
-def registration():
-    return read_registration(FILM / "registration.json")
-
-
-@pytest.fixture(scope="module")
-def beside(follower, truth):
+def beside(beside):
     """T_reference_cube (4, 4) [mm] of one of the film's poses."""
-    T = follower.registration.T_patient_scan @ truth.T_scan_tool[ROW] @ np.linalg.inv(follower.tool.T_cube_tool)
-    return in_mm(T)
+    return beside[ROW]
 
 
 @pytest.fixture(scope="module")
@@ -222,67 +205,3 @@ def test_a_cameras_picture_comes_back_with_the_tumour_in_it(follower, registrati
 def found(drawn):
     """Whether a tumour is drawn as known."""
     return np.count_nonzero(of_ink(drawn, ink_of(TUMOUR_COLOUR))) > 5
-
-
-def test_the_command_serves_this_machine_alone_and_ends_at_a_signal():
-    words = ["link", template_path(), "--tool", FILM / "tool.json", "--deformer", "rest", "--port", "0"]
-    command = [sys.executable, "-m", "scenes.cli", *map(str, words), "--device", "cpu"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        address = next(line for line in process.stdout if "serves" in line).split()[2]
-        assert address.startswith("127.0.0.1:")
-        with socket.create_connection(address.split(":"), timeout=10) as one:
-            assert read_header(one.recv(HEADER.size, socket.MSG_WAITALL)).name == "TumourInScan"
-            process.send_signal(signal.SIGINT)
-            _, error = process.communicate(timeout=20)
-            said = b""
-            while some := one.recv(1 << 16):
-                said += some
-        assert b"the server ends" in said
-    finally:
-        process.kill()
-    assert process.returncode == 0 and "Traceback" not in error, error
-
-
-@pytest.mark.parametrize(("delay", "said"), [(0.0, ""), (0.1, "--stale 0.3 is too short for solutions that take 0.2")])
-def test_link_command_measures_one_solution(follower, monkeypatch, capsys, delay, said):
-    class Slow:
-        def deform(self, loads, start=None, at=None):
-            time.sleep(delay)
-            return follower.motion.deformer.deform(loads)
-
-    monkeypatch.setattr("scenes.commands.link.mover", lambda *words: (Slow(), "a slow one"))
-    words = ["--tool", FILM / "tool.json", "--port", "0", "--device", "cpu", "--seconds", "0.1"]
-    assert main(["link", str(template_path()), *map(str, words)]) == 0
-    out, error = capsys.readouterr()
-    assert "one solution takes" in out and said in error and ("too short" in error) == bool(said)
-
-
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        (["--port", "70000"], "--port 70000"),
-        (["--stale", "0"], "--stale 0"),
-        (["--tool-name", "N\u00e4del"], "--tool-name 'N\u00e4del': must be of printable"),
-        (["--camera-name", " "], "--camera-name ' '"),
-        (["--tool-name", "StylusTipToReferenceA", "--camera-name", "StylusTipToReferenceB"], "their first 20"),
-        (["--tracking-mm", "-1"], "--tracking-mm -1"),
-        (["--client", ":18944"], "--client :18944"),
-        *((["--client", host], f"--client {host}: port 18944 of this machine") for host in SELF),
-        (["--registration", "none.json"], "none.json: no such file"),
-        ([], "no model beside"),
-        (
-            ["--host", "198.51.100.1", "--tool", str(FILM / "tool.json"), "--deformer", "rest"],
-            "no server on 198.51.100.1",
-        ),
-    ],
-)
-def test_what_cannot_be_served_is_refused(words, why, capsys):
-    assert main(["link", str(template_path()), "--device", "cpu", *words]) == 2
-    assert why in capsys.readouterr().err
-
-
-def test_a_bench_of_no_poses_is_refused(capsys):
-    assert main(["benchmarks", "link", "--rate", "0"]) == 2
-    assert "--rate and --seconds" in capsys.readouterr().err

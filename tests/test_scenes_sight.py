@@ -1,4 +1,4 @@
-"""Scenes in which the tumour is located: what is seen, what is drawn of an estimate, and what the checks hold it to."""
+"""Locating a tumour in scenes: what an image and the page show of it, and how it is checked."""
 
 import json
 from dataclasses import replace
@@ -15,7 +15,7 @@ from scenes.cli import main
 from scenes.page.text import estimated, legend, report
 from scenes.play.checks import measure, objections, within
 from scenes.play.deformers import Theatre, open_theatre
-from scenes.play.observer import ELLIPSOID_COLOUR, Observer
+from scenes.play.observer import ELLIPSOID_COLOUR
 from scenes.play.player import REFUSED
 from scenes.play.reference import truth_of
 from scenes.play.scene_costs import labelled
@@ -62,41 +62,6 @@ def frames(play):
 @pytest.fixture(scope="module")
 def truth(theatre, scene, frames):
     return truth_of(theatre, scene, [frame.loads for frame in frames])
-
-
-@pytest.fixture(scope="module")
-def still(box):
-    """An observer and the body at rest, with errors as they are by default, and many points."""
-    return Observer(Theatre(box, None, {}, "cpu").site, None, Sight(points=400)), box.mesh.nodes
-
-
-def test_what_is_seen_has_the_errors_that_are_stated(still):
-    observer, rest = still
-    seen = np.array([observer.seen(number, rest).now - observer.seen(number, rest).rest for number in range(40)])
-    steady = seen.mean(axis=0)
-    assert (seen - steady).std() == pytest.approx(0.3e-3, rel=0.05)
-    assert np.linalg.norm(steady.mean(axis=0)) == pytest.approx(0.7e-3, abs=0.5e-3)  # the smooth one is in it
-    bare = replace(observer, sight=replace(observer.sight, white=0.0, smooth=0.0))
-    rigid = bare.seen(0, rest).now - bare.seen(0, rest).rest
-    assert np.linalg.norm(rigid.mean(axis=0)) == pytest.approx(0.7e-3, rel=1e-6)
-    turned = rigid - rigid.mean(axis=0)
-    assert 0.0 < np.abs(turned).max() < 1.01 * np.radians(0.3) * np.ptp(bare.seen(0, rest).rest, axis=0).max()
-    smooth = replace(observer, sight=replace(observer.sight, white=0.0, shift=0.0, turn=0.0)).seen(3, rest)
-    off = smooth.now - smooth.rest
-    assert np.sqrt((off**2).mean()) == pytest.approx(0.5e-3, rel=0.5)
-    apart = np.linalg.norm(smooth.rest[:, None] - smooth.rest, axis=2)
-    near = (apart > 0.0) & (apart < 2e-3)
-    assert np.linalg.norm(off[:, None] - off, axis=2)[near].mean() < 0.3e-3
-    assert smooth.sigmas == pytest.approx(0.5e-3)
-
-
-def test_the_same_seed_sees_the_same_and_another_does_not(still):
-    observer, rest = still
-    again = replace(observer)
-    other = replace(observer, sight=replace(observer.sight, seed=1))
-    assert np.array_equal(observer.seen(7, rest).now, again.seen(7, rest).now)
-    assert not np.array_equal(observer.seen(7, rest).now, observer.seen(8, rest).now)
-    assert not np.array_equal(observer.seen(7, rest).rest, other.seen(7, rest).rest)
 
 
 def test_what_the_tool_hides_is_not_seen_and_where_it_touches_is(still, play):

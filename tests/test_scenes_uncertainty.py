@@ -16,20 +16,15 @@ from scenes.analysis.uncertainty import (
     changed,
     coverage,
     distances,
-    mesh_errors,
-    mesh_prior,
     nominal,
-    off_by,
     parts,
-    skull_of,
-    skulls_of,
     solved,
     uncertainty,
 )
 from scenes.cli import main
 from scenes.play.frame_text import NOT_KNOWN_WORDS, error_lines, worst
 from scenes.play.scene_costs import labelled
-from scenes.script.priors import POISSON, PRIORS, SKULL, STIFFNESS, TOOL, Draw, drawn
+from scenes.script.priors import POISSON, SKULL, STIFFNESS, TOOL, Draw, drawn
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.tool_paths import Touch
 from scenes.script.uncertainty import (
@@ -76,43 +71,6 @@ def stated(scene, theatre, worst=(2e-3, 4e-3), **values):
     return Uncertainty(
         scene.name, mark, 8, 0, **(lists | values), parts={"E": (0.0, 3e-3), "registration": (2e-3, 2e-3)}
     )
-
-
-class TestPriors:
-    def test_each_says_what_it_is_and_where_it_is_from(self):
-        assert len({prior.name for prior in PRIORS}) == len(PRIORS)
-        assert all(prior.what and prior.source for prior in PRIORS)
-
-    def test_draws_cover_each_prior_evenly(self):
-        """One draw in each of so many parts of equal probability."""
-        found = drawn(20, 3)
-        stiffness = np.sort([one.stiffness for one in found])
-        edges = STIFFNESS.at(np.arange(21) / 20.0)
-        assert (stiffness > edges[:-1]).all() and (stiffness < edges[1:]).all()
-        poisson = np.sort([one.poisson for one in found])
-        assert np.diff(POISSON.range)[0] > np.ptp(poisson) > 0.9 * np.diff(POISSON.range)[0]
-        assert np.std([one.tip for one in found]) == pytest.approx(1.06e-3, rel=0.15)
-        assert found == drawn(20, 3) != drawn(20, 4)
-
-    def test_each_skull_is_as_probable(self):
-        names = [changed(short(), one).effects[2] for one in drawn(30, 0)]
-        assert [names.count(skull) for skull in SKULLS.values()] == [10, 10, 10]
-
-    def test_from_a_skull_that_lets_go_nothing_is_bonded(self):
-        assert skulls_of(find_scene("brain_shift")) == ("slide", "contact")
-
-    def test_meshes_are_farther_off_where_the_brain_slides_and_the_farthest_under_weight(self):
-        press, sinking = find_scene("press"), find_scene("brain_shift")
-        assert skull_of(press) == "bonded" and skull_of(sinking) == "contact"
-        draws = [replace(SAME, skull=share, mesh=1.0) for share in (0.1, 0.5, 0.9)]
-        np.testing.assert_allclose(mesh_errors(press, draws), [0.05, 0.12, 0.12])
-        np.testing.assert_allclose(mesh_errors(sinking, draws), 0.25)
-        loose = replace(press, effects=tuple(one for one in press.effects if one not in SKULLS.values()))
-        assert skull_of(loose) is None
-        np.testing.assert_allclose(mesh_errors(loose, draws), 0.05)
-        assert mesh_prior(sinking, "bonded").range[1] == 0.05
-        motion = np.ones((3, 2, 3))
-        np.testing.assert_allclose(off_by(motion, motion[0], mesh_errors(press, draws))[:, 0, 0], [0.05, 0.12, 0.12])
 
 
 class TestEnsemble:

@@ -10,6 +10,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from ar.optics.calibration import Calibration
+from ar.optics.lens import Lens
 from scenes.play.deformers import Theatre, model_path
 from scenes.play.player import Player
 from scenes.play.stage import Stage
@@ -37,6 +39,9 @@ from surrogate.model.training_range import envelope_of
 from surrogate.regressors.protocol import Linear
 from surrogate.training.train import train
 
+LENS = Lens(-4.0, 6.0, 0.02, -0.015, 0.0)
+REAL = Calibration((1750.0, 1740.0), (250.0, 170.0), 480, 360, LENS, "theatre")
+"""The calibrated camera that looks at a theatre."""
 SIGHTED = tuple(name for name in SCENES if find_scene(name).sight is not None)
 """The built-in scenes in which a tumour is located."""
 PUSHING = tuple(name for name in SCENES if ToolForce() in find_scene(name).effects and name not in SIGHTED)

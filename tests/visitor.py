@@ -1,5 +1,6 @@
 """A browser as the page's server sees one, without a browser: a bare web socket."""
 
+import re
 import socket
 import threading
 import time
@@ -7,6 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 import msgspec
+import pytest
 import viser
 import zstandard
 from viser import _messages
@@ -64,3 +66,22 @@ class Visitor:
     def hit(self, command: viser.CommandHandle) -> None:
         """Hit a command's key."""
         self.say(_messages.CommandTriggerMessage(command._impl.uuid))
+
+
+def run_until(demo, monkeypatch, reached):
+    """Let the loop run, once, until it has come to something."""
+    show = demo.browser.show
+
+    def shown(*known):
+        show(*known)
+        if reached():
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(demo.browser, "show", shown)
+        demo.run(60.0)
+
+
+def report(demo):
+    """The words of the report, without their marks."""
+    return re.sub("<[^>]*>", "|", demo.browser.shown[2])

@@ -1,0 +1,35 @@
+"""Options of a scene's camera: a calibration, a path, an eye."""
+
+from theatres import REAL, put
+
+from ar.screen import read_png
+from scenes.cli import main
+from scenes.options.camera_options import PATHS as NAMES
+from scenes.script.camera_paths import PATHS
+from scenes.tracked.calibration_file import write_calibration
+
+
+def test_names_on_the_command_line_are_those_of_paths():
+    assert tuple(PATHS) == NAMES
+
+
+def test_a_calibrated_camera_renders_checks_and_collects(theatre, tmp_path, capsys):
+    path, out, body = tmp_path / "camera.yaml", tmp_path / "frames", put(theatre, tmp_path / "box.vtu")
+    write_calibration(path, REAL, "ros")
+    seen = ["--camera", str(path), "--path", "microscope", "--eye", "right", "--device", "cpu", "--anatomy", str(body)]
+    assert main(["render", "press", "--out", str(out), "--every", "60", "--plain", *seen]) == 0
+    pictures = sorted(out.iterdir())
+    assert len(pictures) == 3 and read_png(pictures[0]).shape == (360, 480, 3)
+    # Another camera's frames are another run's.
+    assert main(["render", "press", "--out", str(out), "--every", "60", "--plain", *seen, "--size", "240x180"]) == 2
+    assert main(["check", "press", "--every", "60", "--json", *seen]) == 0
+    capsys.readouterr()
+    for words, reason in (
+        (["--size", "240x180"], "give both, or neither"),
+        (["--camera", str(path), "--size", "240x240"], "another shape"),
+        (["--camera", str(out)], "is no file"),
+        (["--path", "hand-held", "--path-seed", "-1"], "not below 0"),
+    ):
+        assert main(["render", "press", "--out", str(tmp_path / "none"), *words]) == 2
+        assert reason in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()

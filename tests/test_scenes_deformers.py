@@ -1,0 +1,62 @@
+"""Theatres read from their files, and the models in them."""
+
+import json
+
+import numpy as np
+import pytest
+from theatres import PUSHING, player, put, short
+
+from scenes.cli import main
+from scenes.play.deformers import model_path, open_theatre
+from scenes.script.scene import find_scene
+from scenes.script.shipped_files import template_path
+from scenes.script.tool_paths import Touch
+from sim.bodies.intensity import sidecar
+from sim.bodies.meshfile import write_anatomy
+from sim.errors import InputError
+
+
+def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
+
+    again = open_theatre(put(theatre, tmp_path / "box.vtu"), device="cpu")
+    assert again.anatomy.digest == theatre.anatomy.digest and again.names(short()) == (
+        "linear",
+        "svr",
+        "guarded",
+        "fem",
+    )
+    assert again.intensity is not None and theatre.intensity is not None
+    assert np.array_equal(again.intensity.values, theatre.intensity.values)
+    assert again.best(short()) == min(theatre.models, key=lambda name: theatre.models[name].bound)
+    touch = Touch(force=0.2)
+    pictures = [player(each, short(), "linear").draw(0, 0.0, touch).shown for each in (theatre, again)]
+    assert np.array_equal(pictures[0], pictures[1])
+    sidecar(tmp_path / "box.vtu").unlink()
+    model_path(tmp_path / "box.vtu").unlink()
+    bare = open_theatre(tmp_path / "box.vtu", device="cpu")
+    assert bare.intensity is None and bare.names(short()) == ("fem",) and bare.best(short()) == "fem"
+    with pytest.raises(InputError, match=r"'linear'.*fem; `sulcus train`"):
+        bare.deformer("linear", short())
+
+
+def test_files_that_do_not_belong_together_are_refused(theatre, template, tmp_path):
+
+    put(theatre, tmp_path / "box.vtu")
+    write_anatomy(tmp_path / "box.vtu", template.anatomy)
+    with pytest.raises(InputError, match=f"{theatre.anatomy.digest}.*{template.anatomy.digest}"):
+        open_theatre(tmp_path / "box.vtu", device="cpu")
+    with pytest.raises(InputError, match=r"none\.npz: no such file"):
+        open_theatre(tmp_path / "box.vtu", tmp_path / "none.npz", "cpu")
+    with pytest.raises(InputError, match="no device 'abacus'"):
+        open_theatre(device="abacus")
+
+
+def test_what_ships_fits_together_and_passes_its_own_checks(capsys):
+    assert model_path(template_path()).stat().st_size <= 40_000_000 and sidecar(template_path()).is_file()
+    theatre = open_theatre(device="cpu")
+    assert {"linear", "ann", "svr"} <= set(theatre.models) and theatre.intensity is not None
+    assert all(model.bound < 1e-3 for model in theatre.models.values()) and theatre.best(find_scene("press")) != "fem"
+    assert main(["check", *PUSHING, "--every", "60", "--device", "cpu", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["passed"] and [row["scene"] for row in report["scenes"]] == list(PUSHING)
+    assert "fem" not in [row["deformer"] for row in report["scenes"]]

@@ -1,0 +1,35 @@
+"""Landmarks of a warp: places in tissue, or of a hollow tumour the nearest."""
+
+import json
+
+import numpy as np
+import SimpleITK as sitk  # noqa: N813
+from warped import bump
+
+from scenes.warp.landmarks import NEAREST, landmarks_of
+from sim.geometry.locate import locate
+
+
+def test_each_landmark_is_a_place_in_tissue_that_the_field_for_points_carries(warp_out):
+    field = sitk.ReadImage(str(warp_out / "field_modeling.nrrd"), sitk.sitkVectorFloat64)
+    transform = sitk.DisplacementFieldTransform(field)
+    controls = json.loads((warp_out / "landmarks.mrk.json").read_text())["markups"][0]["controlPoints"]
+    points = {point["label"]: np.array(point["position"]) for point in controls}
+    stated = json.loads((warp_out / "warp.json").read_text())["grid_error_mm"]["landmarks_worst"]
+    for name in ("tumour", "open cortex"):
+        now = points[f"{name}, now"]
+        carried = transform.TransformPoint(points[f"{name}, in the scan"].tolist())
+        assert np.linalg.norm(carried - now) < stated + 0.05 and stated < 0.1
+        assert np.linalg.norm(points[f"{name}, in the scan"] - now) > 1.0
+
+
+def test_the_landmarks_of_a_tumour_that_is_hollow_say_so(box):
+    middles = box.mesh.nodes[box.mesh.tets].mean(axis=1)
+    tumour = np.flatnonzero(box.mesh.region == 2)
+    hollow = box.without(tumour[np.linalg.norm(middles[tumour] + [0.0, 0.0, 22e-3], axis=1) < 5e-3])
+    moved = bump(box.mesh.nodes)
+    nearest, cortex = landmarks_of(hollow, moved)
+    assert nearest.name == NEAREST and cortex.name == "open cortex"
+    np.testing.assert_allclose(
+        nearest.now, nearest.rest + locate(hollow.mesh, nearest.rest[None]).read(moved[None])[0, 0]
+    )

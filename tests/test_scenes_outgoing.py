@@ -1,0 +1,64 @@
+"""Places on and inside the tumour that a live link sends."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from links import NAMES, NOW, linked, peers, played
+
+from scenes.link.answer import NOT_SEEN, Answer
+from scenes.link.frame import HEADER
+from scenes.link.messages import points, read_points, transform
+from scenes.link.outgoing import Outgoing
+from scenes.tracked.follower import Known, State
+from scenes.tracked.tool_motion import Motion
+from sim.loads import Loads, Touching
+from surrogate.model.learned import predicted
+
+
+def test_places_inside_the_tumour_move_with_its_volume(stage):
+    anatomy, outgoing = stage.anatomy, Outgoing(stage)
+    rest = anatomy.mesh.nodes
+    inner = np.setdiff1d(anatomy.tumour_nodes, anatomy.tumour_surface)
+    tets = anatomy.mesh.tets[np.isin(anatomy.mesh.tets, anatomy.tumour_nodes).all(axis=1)]
+    at = rest[tets[np.isin(tets, inner).any(axis=1)][:3]].mean(axis=1)
+    # A stretch is no rigid motion and is linear: the volume's interpolation is exact, a surface point's is not.
+    stretched = stage.nodes, 0.3 * (rest[stage.nodes] - rest[stage.nodes].mean(axis=0))
+    moved = Known(0.0, State.GOOD, "", NOT_SEEN, motion_of(rest, *stretched), band=1e-3)
+    assert len(at) == 3
+    body = outgoing.messages(Answer(NOW, moved), outgoing.placed(["a", "b", "c"], at))[-2]
+    found = 1e-3 * read_points(body[HEADER.size :])[1]
+    assert found == pytest.approx(at + 0.3 * (at - rest[stage.nodes].mean(axis=0)), abs=1e-6)
+    # A place on the cortex is not sent for a model that knows the tumour alone.
+    tumour = replace(moved, motion=motion_of(rest, anatomy.tumour_nodes, 0.0 * rest[anatomy.tumour_nodes]))
+    both = outgoing.placed(["a", "c"], np.vstack([at[:1], rest[anatomy.open_surface[:1, 0]]]))
+    assert read_points(outgoing.messages(Answer(NOW, tumour), both)[-2][HEADER.size :])[0] == ["a"]
+
+
+def motion_of(rest, nodes, displacement):
+    positions = rest.copy()
+    positions[nodes] += displacement
+    nothing = Loads((Touching(np.eye(4)[None, None]),))
+    answer = predicted(displacement[None], nodes, nothing, [False], 0.0, np.full((2, 1), np.nan), "")
+    return Motion(positions, True, answer=answer)
+
+
+def test_places_on_the_tumour_move_with_it_and_a_million_points_are_passed_over(follower, registration, truth, beside):
+    rest = 1e3 * follower.motion.stage.tumour_at_rest.vertices
+
+    async def scene():
+        async with linked(follower, registration) as port, peers(port, 1) as (tracker,):
+            tracker.send("POINT", "P", bytes(136 * 10**6))
+            assert "too long" in await tracker.said()
+            tracker.send("POINT", "P", points(["a"], rest[:1] + 100.0))
+            assert "nor on open cortex" in (said := await tracker.said()) and ": a 1" in said
+            mixed = np.vstack([rest[:1], rest[:2] + 100.0, rest[1:2]])
+            tracker.send("POINT", "P", points(["a", "", "far", "b"], mixed))
+            assert "number 2 1" in (said := await tracker.said()) and "far 1" in said and "others are followed" in said
+            tracker.send("TRANSFORM", NAMES.tool, transform(beside[10]), NOW)
+            while not len(body := (await tracker.next("POINT", "PointsNow"))[1]):
+                pass
+            names, found = read_points(body)
+            assert names == ["a", "b"] and found == pytest.approx(rest[:2] + 1e3 * truth.displacement[10, :2], abs=1e-2)
+
+    played(scene())

@@ -1,0 +1,134 @@
+"""Command that takes a patient from scan to models: in one go, after a stop, and what cannot be."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from balls import EGG, ball
+from programs import main
+
+from scenes.play.deformers import model_path
+from sim.bodies.intensity import sidecar
+from sim.bodies.meshfile import read_anatomy
+from sim.material import BRAIN
+from sim.runtime.timing import stage
+from surrogate.model.store import load
+
+
+def test_a_patient_hands_force_and_opening_on_and_begins_nothing_that_it_cannot_end(tmp_path, monkeypatch, capsys):
+    steps = []
+    monkeypatch.setattr("scenes.cli.main", lambda words: steps.append(words) or 0)
+    words = ["patient", "labels.nii.gz", "--brain", "1", "--tumour", "2", "--device", "cpu"]
+    words += ["--out", str(tmp_path / "me.vtu")]
+    assert main([*words, "--force", "--opening-at", "-30,1.5,60"]) == 0
+    assert all("--force" in step for step in steps) and "--opening-at=-30.0,1.5,60.0" in steps[0]
+    steps.clear()
+    (tmp_path / "me.model.npz").write_bytes(b"mine")
+    assert main(words) == 2 and not steps
+    assert "me.model.npz" in capsys.readouterr().err and not (tmp_path / "me.vtu.partial").exists()
+
+
+def test_a_stopped_patient_goes_on_after_the_steps_that_are_done(tmp_path, monkeypatch, capsys):
+    steps, codes = [], {"anatomy": 2, "simulate": 130, "train": 0}
+    made = {"anatomy": "me.vtu", "simulate": "me.h5", "train": "me.model.npz"}
+
+    def step(words):
+        steps.append(words[0])
+        if codes[words[0]] == 0:
+            (tmp_path / made[words[0]]).write_bytes(b"made")
+        return codes[words[0]]
+
+    monkeypatch.setattr("scenes.cli.main", step)
+    words = ["patient", "labels.nii.gz", "--brain", "1", "--tumour", "2", "--device", "cpu"]
+    words += ["--out", str(tmp_path / "me.vtu")]
+    assert main(words) == 2 and not list(tmp_path.iterdir())
+    codes["anatomy"] = 0
+    assert main(words) == 130 and (tmp_path / "me.vtu.partial").exists()
+    assert main([*words, "--nodes", "2000"]) == 2 and "was begun with anatomy" in capsys.readouterr().err
+    codes["simulate"] = 0
+    assert main(words) == 0
+    assert steps == ["anatomy", "anatomy", "simulate", "simulate", "train"]
+    assert {path.name for path in tmp_path.iterdir()} == set(made.values())
+    assert main(words) == 2 and "me.vtu: exists. Give --force" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [((), (BRAIN.law, None)), (("--element", "p2", "--material", "corotational"), ("corotational", "p2"))],
+)
+def test_a_patient_hands_tissue_and_element_on(tmp_path, monkeypatch, words, expected) -> None:
+    steps: list[list[str]] = []
+    monkeypatch.setattr("scenes.cli.main", lambda step: steps.append(step) or 0)
+    labels = ["labels.nii.gz", "--brain", "1", "--tumour", "2"]
+    assert main(["patient", *labels, "--out", str(tmp_path / "me.vtu"), "--device", "cpu", *words]) == 0
+    assert [step[0] for step in steps] == ["anatomy", "simulate", "train"]
+    element = [] if expected[1] is None else ["--element", expected[1]]
+    assert steps[1][steps[1].index("--material") :] == ["--material", expected[0], *element]
+    assert steps[2][-4:] == ["--learners", "linear,series,series-gp", "--device", "cpu"]
+
+
+def test_a_patient_in_one_go(tmp_path, capsys, short_fits):
+    ball(tmp_path, EGG)
+    out = tmp_path / "me" / "brain.vtu"
+    volumes = [str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--t1", str(tmp_path / "t1.nii.gz")]
+    size = ["--nodes", "2000", "--count", "80", "--device", "cpu", "--element", "p1", "--learners", "linear,residual"]
+    assert main(["patient", *volumes, *size, "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    for step in ("sulcus anatomy --labels", "sulcus simulate", "sulcus train", "wins", "ready: sulcus demo --anatomy"):
+        assert step in text
+    for part in ("labels", "mesh", "set-up", "unit responses", "loads", "learn residual", "score", "save", "rest"):
+        assert f"\n  {part} " in text
+    anatomy = read_anatomy(out)
+    models = load(model_path(out), anatomy)
+    assert set(models) == {"linear", "residual"} and sidecar(out).is_file()
+    assert f"ready: sulcus demo --anatomy {out} --element p1" in text
+    assert f"sulcus uncertainty press --anatomy {out} --element p1" in text
+    here = ["--anatomy", str(out), "--element", "p1"]
+    assert main(["check", "slide", "draw", *here, "--every", "30", "--json"]) in (0, 1)  # of eighty loads
+    report = json.loads(capsys.readouterr().out)
+    best = min(models, key=lambda name: models[name].bound)
+    assert all(row["deformer"] == best for row in report["scenes"])
+    assert all(row["overlap"] > 0.98 and row["drawn"] < 4.0 and row["printed"] for row in report["scenes"])
+    assert all(row["motion_mm"] > 0.3 for row in report["scenes"])
+    assert main(["render", "slide", *here, "--every", "60", "--out", str(tmp_path / "frames")]) == 0
+    assert len(list((tmp_path / "frames").iterdir())) == 3
+
+
+def test_a_patient_says_in_json_where_the_time_went(tmp_path, monkeypatch, capsys):
+    def step(words):
+        assert words[-1] == "--json"
+        with stage(words[0]):
+            return 0
+
+    monkeypatch.setattr("scenes.cli.main", step)
+    words = ["labels.nii.gz", "--brain", "1", "--tumour", "2", "--device", "cpu", "--json"]
+    assert main(["patient", *words, "--out", str(tmp_path / "me.vtu")]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert list(said["seconds"]) == ["anatomy", "simulate", "train", "rest"]
+    assert sum(said["seconds"].values()) == pytest.approx(said["total"]) and min(said["seconds"].values()) >= 0.0
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["none.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu"], "no such file"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "7", "--out", "a.vtu"], "no label 7"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.stl"], ".vtu"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "labels.nii.gz/a.vtu"], "folder"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--count", "3"], "--count 3"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--device", "abacus"], "abacus"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--learners", "ann,owl"], "called owl"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--learners", "contact"], "contact"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--learners", "ann,"], "--learners"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--nodes", "3"], "3 nodes"),
+    ],
+)
+def test_a_patient_that_cannot_be_is_a_sentence(tmp_path, monkeypatch, capsys, words, reason):
+    ball(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    assert main(["patient", *words]) == 2
+    error = capsys.readouterr().err
+    assert reason in error.splitlines()[-1] and "Traceback" not in error
+    assert sorted(tmp_path.iterdir()) == before

@@ -1,0 +1,22 @@
+"""Command that trains models: notes on time and on too few loads."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from scenes.cli import main
+from scenes.commands.train import notes_on
+
+
+def test_training_says_what_takes_long_and_what_too_few_loads_cannot_give():
+    few, many = (SimpleNamespace(good=np.ones(count, bool)) for count in (20, 76))
+    series, bounds = notes_on(few, ["linear", "series-gp"])
+    assert "minutes on a CPU" in series and "of 20 loads 5 are kept" in bounds and "--count 76" in bounds
+    assert notes_on(many, ["linear"]) == []
+
+
+@pytest.mark.parametrize("learners", ["", "linear,,svr", " "])
+def test_learners_without_a_name_are_a_sentence(learners, tmp_path, capsys):
+    assert main(["train", "none.h5", "--out", str(tmp_path / "m.npz"), "--learners", learners]) == 2
+    assert "name each learner" in capsys.readouterr().err

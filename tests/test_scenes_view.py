@@ -1,0 +1,43 @@
+"""3-D view of the page: it follows the frame, and an old comparison is marked as such."""
+
+import numpy as np
+from visitor import report, wait_for
+
+from scenes.page.referee import Referee
+from scenes.page.view import FEM_COLOUR, STALE_COLOUR
+
+
+def test_the_3d_view_follows(demo, theatre):
+    demo.wish.set(plays=False, number=30)
+    assert demo.run(1.0) >= 1
+    tumour = np.asarray(demo.browser.meshes["tumour"].vertices)
+    rest = demo.stage.tumour(theatre.anatomy.mesh.nodes).vertices
+    assert wait_for(lambda: np.linalg.norm(demo.browser.meshes["tumour"].vertices - rest, axis=1).max() > 5e-4)
+    meshes = demo.browser.meshes
+    assert wait_for(
+        lambda: (
+            demo.run(0.3)
+            and np.linalg.norm(meshes["finite elements"].vertices - meshes["tumour"].vertices, axis=1).max() < 3e-4
+        )
+    )
+    assert tumour.shape == rest.shape
+
+
+def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
+    """A hand moves the tool: what the finite elements said of the load before it is greyed until they answer anew."""
+    demo.wish.set(plays=False, number=60)
+    assert wait_for(lambda: demo.run(0.3) and "|error against FEM: mean" in report(demo))
+    assert "earlier load" not in report(demo)
+    tints = []
+    monkeypatch.setattr(demo.browser, "tint", lambda name, colour: tints.append(colour))
+    asked = []
+    monkeypatch.setattr(demo.referee, "ask", lambda number, touch: asked.append((number, touch)))
+    demo.wish.hand(x=0.004, force=0.25)
+    demo.run(0.5)
+    assert wait_for(lambda: "force 0.25 N" in report(demo))
+    said = demo.browser.shown[2]
+    assert '<p class="stale">of an earlier load: error against FEM' in said and "<p>error against FEM" not in said
+    assert tints[-1] == STALE_COLOUR and len(asked) == 1
+    Referee.ask(demo.referee, *asked[0])
+    assert wait_for(lambda: demo.run(0.3) and "<p>error against FEM" in demo.browser.shown[2])
+    assert "earlier load" not in report(demo) and tints[-1] == FEM_COLOUR
