@@ -310,3 +310,20 @@ def warp_folder(tmp_path_factory, box):
 @pytest.fixture(scope="session")
 def warp_out(warp_folder):
     return warp_folder / "out"
+
+
+def boxed(box, tmp_path_factory):
+    """The box as a file."""
+    from sim.bodies.meshfile import write_anatomy
+
+    path = tmp_path_factory.mktemp("box") / "box.vtu"
+    write_anatomy(path, box)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def body():
+    """A small box in a skull."""
+    from locators import in_a_skull
+
+    return in_a_skull()

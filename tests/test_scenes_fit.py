@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from locators import dent, in_a_skull, locator_of
+from locators import dent, locator_of
 
 from benchmarks.studies.fit_study import row
 from benchmarks.studies.fit_twins import loads_of, patient, places
@@ -18,11 +18,6 @@ from surrogate.fitting.responses import LINEAR, Responses
 from surrogate.fitting.tissue import FittedTissue, load_tissue, save_tissue
 from surrogate.locating.locator import telling_nodes
 from surrogate.locating.locator_files import save_locator
-
-
-@pytest.fixture(scope="module")
-def body():
-    return in_a_skull()
 
 
 @pytest.fixture(scope="module")

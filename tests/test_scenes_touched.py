@@ -8,12 +8,8 @@ import numpy as np
 import pytest
 
 import scenes.gym  # noqa: F401
-from scenes.gym.cut_elements import CutElements
-from scenes.gym.setting import open_setting
-from scenes.gym.tasks import DEBULK, PALPATE
-from scenes.gym.touched import Asked, Touched
-from sim.bodies.meshfile import write_anatomy
-from sim.deformation import Outcome
+from scenes.gym.tasks import PALPATE
+from scenes.gym.touched import Touched
 
 DOWN = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0], np.float32)
 
@@ -49,21 +45,3 @@ def test_episode_is_over_after_goals_in_a_row_or_a_bad_answer(shares, ends):
     over = [environment.step(0.0 * DOWN) for _ in shares]
     assert [terminated for _, _, terminated, _, _ in over] == [False] * (len(shares) - 1) + [True]
     assert over[-1][-1]["success"] == (ends == "success") != (over[-1][1] < -5.0)
-
-
-def test_cut_elements_are_reliable_where_both_levels_are(box, tmp_path):
-    """Half way between two levels of the fluid, of which the lower one finds no equilibrium."""
-    write_anatomy(tmp_path / "box.vtu", box)
-    setting, solved = open_setting(DEBULK, str(tmp_path / "box.vtu"), "auto", "cpu", (48, 36)), []
-
-    def deform(loads, start):
-        answer = setting.answers.fem.deform(loads, start)
-        solved.append(answer if not solved else replace(answer, outcome=(Outcome.BUDGET,)))
-        return solved[-1]
-
-    fem = SimpleNamespace(deform=deform, remains=setting.answers.fem.remains)
-    pose = DEBULK.tool.pose(setting.site.origin, setting.site.axis, setting.site.right)
-    for fluid, good in ((1.0, True), (0.95, False)):
-        answers = CutElements(setting.site, fem, setting.answers.ball)
-        assert answers.answer([Asked(pose, fluid=fluid, done=1)])[0].good == good
-        solved.clear()

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from locators import in_a_skull, locator_of
+from locators import locator_of
 
 from sim import fem
 from sim.anatomy import BRAIN_LABEL, PART_LABELS
@@ -17,11 +17,6 @@ FEW = Causes(
     poisson=(0.45,), tools=(1, 1), drainages=1, levels=(0.5,), swellings=(0.02,), tumour_swellings=(0.1,),
     oedema=(0.1, -0.05), reach=(8e-3, 16e-3), reaches=(2, 1),
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def body():
-    return in_a_skull()
 
 
 def test_brain_within_reach_of_the_tumour_swells_and_oedema_that_is_marked(body):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from locators import dent, in_a_skull, locator_of
+from locators import dent, locator_of
 
 from scenes.script.priors import drawn_from
 from sim.effects import SKULLS
@@ -19,11 +19,6 @@ from surrogate.fitting.weighing import unsupported
 from surrogate.locating.calibration import seen_patch
 from surrogate.locating.causes import YOUNG, Group
 from surrogate.locating.observation import Observation
-
-
-@pytest.fixture(scope="module")
-def body():
-    return in_a_skull()
 
 
 @pytest.fixture(scope="module")

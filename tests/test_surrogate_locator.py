@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import make_box
-from locators import in_a_skull
 
 from sim.errors import InputError
 from surrogate.locating import ensemble as ensembles
@@ -21,11 +20,6 @@ FEW = Causes(
     poisson=(0.45, 0.485), tools=(8, 3), drainages=3, levels=(0.6, 0.3), swellings=(0.04, 0.02, -0.02),
     tumour_swellings=(0.2, -0.1), oedema=(0.1,), reach=(8e-3, 16e-3), reaches=(1, 1),
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def body():
-    return in_a_skull()
 
 
 @pytest.fixture(scope="module")

@@ -29,10 +29,8 @@ from ..script.scene import Scene
 from ..script.shipped_files import spatula_model_path
 from ..script.site import Site
 from ..script.tool import Blade, Probe
-from .cut_elements import CutElements
-from .posed_elements import PosedElements
-from .posed_model import PosedModel
-from .pressed_model import Hertz, PressedModel
+from .fem_answers import CutElements, PosedElements
+from .model_answers import Hertz, PosedModel, PressedModel
 from .tasks import Goal, Task
 from .touched import Answers
 

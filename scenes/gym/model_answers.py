@@ -1,19 +1,21 @@
-"""A ball that is moved, as a model that was trained on forces answers it."""
+"""A tool that is moved, as models that were trained on forces or on its poses answer it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from sim.errors import InputError
 from sim.geometry.closest_point import closest
 from sim.loads import Loads, Pushed, Touching
 from sim.material import Tissue
 from sim.tools import Ball
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.indentation import indented
+from surrogate.model.guarded import tool_pressure
 from surrogate.model.learned import Learned
 
 from ..script.site import Site
@@ -152,3 +154,43 @@ class PressedModel:
             # What is found stays: what is answered beside it changes nothing.
             before, short, size = size, now, np.where(near, size, np.clip(size - now / slope, 0.0, most))
         return size, np.abs(off(size)) < NEAR
+
+
+@dataclass(frozen=True, eq=False)
+class PosedModel:
+    """Asks a model of the tool's poses for motion, force and bound; a blade goes on from where it was.
+
+    The pressure under a ball is that of Hertz under its force; under a blade it is the highest of `tool_pressure`.
+
+    Parameters
+    ----------
+    model
+        Trained on poses of the tool.
+    ball
+        The tool, if it is one.
+    """
+
+    model: Learned
+    ball: Hertz | None
+
+    def answer(self, asked: Sequence[Asked]) -> list[Touched]:
+        """As `Answers.answer`, one after the other. Where the model refuses a pose, tissue stays, and is not good."""
+        return [self._answered(each.pose, each.last) for each in asked]
+
+    def _answered(self, pose: np.ndarray, last: Touched | None) -> Touched:
+        loads = Loads((Touching(pose[None, None]),))
+        try:
+            answer = self.model.deform(loads, None if last is None else last.memory)
+        except InputError:
+            nodes = self.model.nodes
+            rest = Touched(np.zeros((len(nodes), 3)), nodes, np.zeros(3), 0.0) if last is None else last
+            return replace(rest, good=False, error=float("inf"))
+        force = answer.reaction[0, 0, :3]
+        if self.ball is None:
+            highest = float(tool_pressure(self.model, loads, answer).max())
+        else:
+            highest = self.ball.pressure(float(np.linalg.norm(force)))
+        error = float(answer.bound[0, 0])
+        if not np.isfinite(error):
+            error = self.model.bound
+        return Touched(answer.displacement[0], answer.nodes, force, highest, error=error, memory=answer)

@@ -1,0 +1,25 @@
+"""Observations of the environments: tracked, felt and seen with noise."""
+
+import numpy as np
+import pytest
+from gym_examples import DOWN, made
+
+from scenes.gym.observation import FELT, TRACKED
+from scenes.gym.tasks import PALPATE
+
+
+def test_what_is_observed_is_the_truth_with_its_noise():
+    """In the axes of the twists."""
+    environment = made()
+    environment.reset(seed=3)
+    episode, off = environment.unwrapped.episode, []
+    for step in range(60):
+        states, _, _, _, truth = environment.step(DOWN if step < 12 else 0.0 * DOWN)
+        place = episode.frame.T @ (episode.actual.place - episode.setting.site.origin)
+        force = episode.frame.T @ truth["force"]
+        off.append((*(1e-2 * states[:3] - place), *(PALPATE.force * states[9:12] - force)))
+    assert np.linalg.norm(force) > 0.05
+    deviation = np.std(off, axis=0)
+    assert deviation[:3] == pytest.approx(np.full(3, TRACKED), rel=0.35)
+    assert deviation[3:] == pytest.approx(np.full(3, FELT), rel=0.35)
+    assert np.abs(np.mean(off, axis=0)[3:]).max() < FELT
