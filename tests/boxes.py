@@ -1,7 +1,5 @@
 """Small bodies to test the solver on: structured boxes, distorted if wanted, and how they are held."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import erf
 

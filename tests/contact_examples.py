@@ -1,7 +1,5 @@
 """Tools in a block, for the conformance suite of terms."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 from term_examples import ANATOMY, MESH, Example

@@ -1,7 +1,5 @@
 """Printed targets: drawn as a camera sees them, found again, and where they are, with what is not known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

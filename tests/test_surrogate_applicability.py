@@ -1,7 +1,5 @@
 """What a learnt model may be asked: effects, causes, bodies and tissue that it was trained on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A ball on condensed linear tissue: what it must obey, whatever else answers the same, and what is learnt on top."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Blades that go on from where an answer had them, how hard they press, and the spatula's model that ships."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

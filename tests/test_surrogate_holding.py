@@ -1,7 +1,5 @@
 """How long a tool is held: histories, and finite elements of the same share."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

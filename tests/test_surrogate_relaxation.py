@@ -1,7 +1,5 @@
 """Models of poses in tissue that relaxes: the past that they carry, what they learn of it, and where they play."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

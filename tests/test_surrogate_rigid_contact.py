@@ -1,7 +1,5 @@
 """Rods and blades moved by pose: how they are drawn, what contact says of them, and models that learn them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Models that are given where the tool is: poses as indentations, how they are drawn, learnt, stored and refused."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A small theatre: the shared box, models trained on finite elements in a second, and short scenes to play in it."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Episodes of a few small frames, written by code: a box with a tumour, a tool that turns, and a camera."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path
