@@ -15,7 +15,7 @@ from sim.deformation import Deformation, Outcome
 from sim.discretisation.footprint import footprint_weights
 from sim.geometry.tetmesh import TetMesh, oriented
 from sim.loads import Nodal, Pushed
-from surrogate.regressors.ann import Ann
+from surrogate.regressors.baselines import Ann
 
 pytest_plugins = ["empty_comparisons", "expected_skips"]
 # Files that take longest on two cores, with a few long tests each: begun last, they would leave a core idle at the end.

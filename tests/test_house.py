@@ -60,9 +60,9 @@ TOGETHER = {"scenes.cli": "scenes.commands", "benchmarks.__main__": "benchmarks.
 OWNERS = {
     "torch": {
         *(f"sim/{of}.py" for of in ["linalg/dense_inverse", "linalg/block_inverse", "runtime/dense_product"]),
-        *["sim/runtime/views.py", "surrogate/regressors/ann.py", "scenes/episodes/reading/torch_dataset.py"],
+        *["sim/runtime/views.py", "surrogate/regressors/baselines.py", "scenes/episodes/reading/torch_dataset.py"],
     },
-    "sklearn": {"surrogate/regressors/svr.py"},
+    "sklearn": {"surrogate/regressors/baselines.py"},
     "trimesh": {"scenes/script/tool.py"},
     "isal": {"scenes/episodes/png.py"},
     "meshio": {"sim/bodies/meshfile.py"},
@@ -147,7 +147,7 @@ def importers(library):
 def test_the_reader_of_imports_reads():
     """What all other tests here stand on."""
     assert "sim.errors.InputError" in imports(HOUSE / "sim/geometry/tetmesh.py")
-    assert "surrogate.regressors.ann.Ann" in imports(HOUSE / "surrogate/training/learners.py")
+    assert "surrogate.regressors.baselines.Ann" in imports(HOUSE / "surrogate/training/learners.py")
     assert "sim.terms.dead_force.DeadForce" in imports(HOUSE / "sim/compile.py")
     assert "sim.terms.dead_force.DeadForce" not in imports(HOUSE / "sim/compile.py", everywhere=False)
     assert "scenes.play.checks.measure" in imports(HOUSE / "scenes/commands/check.py") and len(FILES) > 80

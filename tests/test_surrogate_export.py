@@ -28,7 +28,7 @@ from surrogate.data.tool_loads import draw
 from surrogate.model.conformal import LEVELS
 from surrogate.model.store import load, save
 from surrogate.onnx_export.export import onnx_model
-from surrogate.regressors.ann import Ann
+from surrogate.regressors.baselines import Ann
 from surrogate.regressors.force_series import Series
 from surrogate.training.expansion import EXPANDED, Expansion
 from surrogate.training.train import LEARNERS, train

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 
-from surrogate.regressors.svr import Svr
+from surrogate.regressors.baselines import Svr
 from surrogate.training.learners import SVR, Tuned, inner_discs
 
 

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from surrogate.model.store import REGRESSORS
-from surrogate.regressors.ann import Ann
+from surrogate.regressors.baselines import Ann, Pcr, Svr
 from surrogate.regressors.gp import Gp
-from surrogate.regressors.pcr import Pcr
 from surrogate.regressors.protocol import Linear
-from surrogate.regressors.svr import Svr
 
 MAKE = {"linear": Linear, "ann": lambda: Ann(hidden=12, steps=150), "svr": Svr, "gp": Gp}
 MAKE["pcr"] = lambda: Pcr(share=1.0)  # its features here have several units
@@ -87,18 +85,6 @@ def test_the_table_is_exact_from_unit_rows():
     C = RANDOM.normal(size=(9, 3))
     X = RANDOM.normal(size=(4, 9))
     assert np.allclose(Linear().fit(np.eye(9), C).predict(X), X @ C, atol=1e-5)
-
-
-def test_svr_has_the_published_settings():
-    """The same machine as scikit-learn's with MATLAB's defaults, in the output's own units."""
-    from sklearn.svm import SVR
-
-    X, Y = rows(300, 0)
-    y, iqr = Y[:, 0], np.subtract(*np.percentile(Y[:, 0], [75, 25]))
-    mean, deviation = X.mean(axis=0), np.where(X.std(axis=0) > 1e-9, X.std(axis=0), 1.0)
-    machine = SVR(C=iqr / 1.349, epsilon=iqr / 13.49, gamma=1.0 / 5.0, tol=1e-4 * iqr).fit((X - mean) / deviation, y)
-    test, _ = rows(50, 1)
-    assert np.allclose(Svr().fit(X, Y).predict(test)[:, 0], machine.predict((test - mean) / deviation), atol=0.01 * iqr)
 
 
 def test_predicting_needs_neither_torch_nor_sklearn():

@@ -15,8 +15,7 @@ from .lens_rasteriser import Unbent, unbent
 from .parallel import launch_in_bands, load
 from .rasteriser import NEAR, draw, empty_buffer, rows_reached
 from .shade import BRIGHTEST, SOFT, TILE, bound, remember, shade
-from .shade_structs import Light, Placed, Shadow
-from .surfaces import Stack, place
+from .surfaces import Light, Placed, Shadow, Stack, place
 
 DRAPE = (0.13, 0.30, 0.36)
 SHADOW_PIXELS = 384

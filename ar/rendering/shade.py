@@ -7,7 +7,7 @@ import warp as wp
 from .lens_rasteriser import pixel_at
 from .parallel import forward_kernel
 from .rasteriser import NOTHING, depth_of, face_of
-from .shade_structs import Corners, Light, Look, Placed, Point, Shadow, Surfaces
+from .surfaces import Corners, Light, Look, Placed, Point, Shadow, Surfaces
 from .triangle import weights_at
 
 # A caster must be this much nearer to the lamp [m] than what it shades.

@@ -26,8 +26,8 @@ from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.encode import directions
 from surrogate.model.learned import only_pushed, predicted
 from surrogate.model.training_range import Envelope, envelope_of
+from surrogate.regressors.baselines import Svr
 from surrogate.regressors.protocol import Regressor
-from surrogate.regressors.svr import Svr
 
 from .bayesian import Bayesian
 

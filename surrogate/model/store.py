@@ -22,13 +22,11 @@ from sim.tools import stated_tool
 
 from ..data.answer_rows import first_stated
 from ..data.encode import Basis
-from ..regressors.ann import Ann
+from ..regressors.baselines import Ann, Pcr, Svr
 from ..regressors.force_series import Pairs, Remainder, Series
 from ..regressors.gp import Gp
-from ..regressors.pcr import Pcr
 from ..regressors.protocol import Fitted, Linear, Regressor
 from ..regressors.rigid_contact import Contact
-from ..regressors.svr import Svr
 from .conformal import GROWTH, Bound
 from .learned import Learned, Part
 from .left_out import LeftOut, OffBy

@@ -21,12 +21,10 @@ from ..data.encode import rooted, shared_out, tool_features
 from ..model.conformal import LEVELS
 from ..model.learned import Learned
 from ..model.training_range import measured
-from ..regressors.ann import Ann
+from ..regressors.baselines import Ann, Pcr, Svr
 from ..regressors.force_series import Pairs, Remainder, Series
 from ..regressors.gp import Gp
-from ..regressors.pcr import Pcr
 from ..regressors.protocol import Linear
-from ..regressors.svr import Svr
 from .graph import Port, Sheet
 
 if TYPE_CHECKING:

@@ -17,13 +17,11 @@ from ..data.tool_loads import spread
 from ..model.learned import Part
 from ..model.own_learners import find_own, name_of
 from ..model.tool_force import ForceModel
-from ..regressors.ann import Ann
+from ..regressors.baselines import Ann, Pcr, Svr
 from ..regressors.force_series import Remainder
 from ..regressors.gp import Gp
-from ..regressors.pcr import Pcr
 from ..regressors.protocol import Fitted, Teachable
 from ..regressors.rigid_contact import Contact
-from ..regressors.svr import Svr
 from .condense_contact import side_by_side
 from .examples import Examples, left_by
 from .expansion import COARSE, EXPANDED, TOUCHED, Expansion

@@ -22,8 +22,18 @@ from ..model.own_learners import OWN, find_own
 from ..model.tip_distance import TipModel
 from ..model.tool_force import ForceModel
 from ..model.training_range import Envelope, envelope_of
-from .answers import Answers, Errors, answers_of
-from .bounds import WAYS, bound_by, bounds_on_discs, corrected_if_better, covered_by, growth_by, with_correction
+from .bounds import (
+    WAYS,
+    Answers,
+    Errors,
+    answers_of,
+    bound_by,
+    bounds_on_discs,
+    corrected_if_better,
+    covered_by,
+    growth_by,
+    with_correction,
+)
 from .examples import Examples
 from .expansion import EXPANDED, TOUCHED, Expansion
 from .learners import LEARNT, POSED, force_of, parts_of

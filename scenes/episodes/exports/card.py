@@ -25,7 +25,7 @@ from .columns import LICENCE as LICENCE_NAME
 from .columns import SHEET
 from .croissant import COLUMNS, croissant
 from .datasheet import MARK, NAME, datasheet
-from .origin import notice_of_template, of_template
+from .provenance import notice_of_template, of_template
 from .tasks import task_of
 
 TABLE = "episodes.csv"

@@ -9,8 +9,7 @@ from typing import Any
 from ..reading.contents import Contents
 from ..reading.schema import ARRAYS, PICTURES
 from ..run_folder import RUN, Run
-from .drawn import drawn_tables
-from .origin import origins
+from .provenance import drawn_tables, origins
 
 MARK = "<!-- sulcus card 1 -->"
 NAME = "with sulcus"
