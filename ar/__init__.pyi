@@ -1,8 +1,7 @@
 """What the surgeon sees: triangles and cameras in, pixels out. Knows no brain."""
 
-from .optics.camera import Camera, look_at
+from .optics.camera import Camera, look_at, stereo_pair
 from .optics.lens import Lens
-from .optics.stereo_pair import stereo_pair
 from .overlay.composite import Overlaid, composite
 from .page.browser import Browser
 from .rendering.layer import Layer, Solid

@@ -10,10 +10,9 @@ from .fitting.fit import fit_tissue
 from .fitting.frame import Frame, Tool, read_tools
 from .fitting.tissue import FittedTissue, load_tissue, save_tissue
 from .locating.locator import Location, Locator
-from .locating.locator_files import load_locator, save_locator
+from .locating.locator_store import load_locator, make_locator, save_locator
 from .locating.observation import Observation
 from .locating.observed_files import read_observation
-from .locating.setup import make_locator
 from .model.guarded import Guarded
 from .model.learned import Learned
 from .model.own_learners import learner

@@ -7,7 +7,7 @@ import numpy as np
 
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.board_views import View
+from ar.tracking.intrinsics import View
 from ar.tracking.targets import calibration_board
 
 FACE = calibration_board().faces[0]

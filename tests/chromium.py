@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from websockets.sync.client import connect
 
-from ar.page.sight import PICTURE, SAID
+from ar.page.elements import PICTURE, SAID
 from ar.page.style import PAGE
 
 PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -327,3 +327,21 @@ def body():
     from locators import in_a_skull
 
     return in_a_skull()
+
+
+@pytest.fixture(scope="module")
+def folder(box, tmp_path_factory):
+    """Episodes of 7 and 9 frames; of the second every third frame was solved."""
+    from tiny_episodes import Wanted, write_episode
+
+    folder = tmp_path_factory.mktemp("set")
+    write_episode(folder / "episode_000000.h5", box, Wanted(7))
+    write_episode(folder / "episode_000001.h5", box, Wanted(9, every=3, seed=1, family="slide"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(box, tmp_path_factory):
+    from tiny_episodes import Wanted, write_episode
+
+    return write_episode(tmp_path_factory.mktemp("whole") / "episode_000000.h5", box, Wanted(7, every=2))

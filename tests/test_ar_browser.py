@@ -9,19 +9,18 @@ import numpy as np
 import pytest
 from visitor import Visitor, free_port, wait_for
 
-from ar.page.aside import STYLE
 from ar.page.browser import Browser
+from ar.page.elements import PICTURE, SAID, SLICES, STYLE, coded, unparted
 from ar.page.guard import LIMITS, Limits
 from ar.page.parts import Body, Choice, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
 from ar.page.recording import RECORDS, STOPS
-from ar.page.sight import PICTURE, SAID, SLICES, coded, unparted
 from ar.page.style import NOTE, PAGE, STATUS, style
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 
 
 @pytest.fixture
-def heard() -> dict[str, list]:
+def heard():
     return {"force": [], "deformer": [], "play": [], "frame": []}
 
 

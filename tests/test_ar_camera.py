@@ -1,11 +1,32 @@
 """The pinhole model: against OpenCV, and against what a picture must do."""
 
+from dataclasses import dataclass, replace
+
+import cv2
 import numpy as np
 import pytest
+from test_ar_lens import SOME, scene, seen_by
+from test_ar_renderer import LAMP
+from theatres import template_theatre
 
-from ar.optics.camera import Camera, look_at, project_cv2
+from ar.optics.calibration import opencv_text, parsed, ros_text
+from ar.optics.camera import BASELINE, Camera, look_at, project_cv2, row_bands, row_time, stereo_pair, time_of_point
+from ar.rendering.layer import Layer
+from ar.rendering.renderer import Lamp, Renderer, render
+from scenes.play.player import Player
+from scenes.script.camera_paths import HandHeld
+from scenes.script.scene import find_scene
+from scenes.tracked.filming import USUAL, VIEW, Taking, mounted, registered, shots_of
+from scenes.tracked.follower import Follower, State
+from scenes.tracked.tool_motion import ToolMotion
+from sim.anatomy import Anatomy
+from surrogate.model.learned import predicted
 
 EYE, TARGET, UP = np.array([0.1, -0.3, 0.2]), np.array([0.02, 0.01, 0.05]), np.array([0.0, 0.0, 1.0])
+CAMERA = look_at(np.array([0.0, 0.0, -0.4]), np.zeros(3), np.array([0.0, -1.0, 0.0]), np.radians(16.0), 400, 300)
+READOUT = 0.03
+HAND = HandHeld(seed=3, turn=float(np.radians(0.5)))
+GRID = np.array([[x, y, 0.0] for x in (-0.05, 0.0, 0.05) for y in (-0.04, -0.02, 0.0, 0.02, 0.04)])
 
 
 def some_camera() -> Camera:
@@ -100,3 +121,185 @@ def test_a_view_without_direction_is_refused():
         look_at(EYE, EYE, UP)
     with pytest.raises(ValueError, match="undefined"):
         look_at(EYE, EYE + UP, UP)
+
+
+def near_points() -> np.ndarray:
+    """In view of every camera here."""
+    return 0.3 * points_in_front()
+
+
+def test_a_camera_is_moved_along_its_own_axes():
+    camera, shift = some_camera(), np.array([0.01, -0.02, 0.03])
+    moved = camera.moved(shift)
+    assert np.allclose(moved.in_frame(points_in_front()), camera.in_frame(points_in_front()) - shift)
+    assert moved.centre == pytest.approx(EYE + shift @ camera.T_camera_world[:3, :3])
+
+
+def test_a_zoom_draws_larger_about_the_principal_point():
+    for camera in (some_camera(), seen_by()):
+        middle = camera.K[:2, 2]
+        near = camera.zoomed(2.0)
+        ways = [one.project(near_points())[0] - middle for one in (camera, near)]
+        assert np.allclose(ways[1], 2.0 * ways[0])
+        assert np.abs(project_cv2(near, near_points()) - near.project(near_points())[0]).max() < 1e-8
+    for factor in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="above 0"):
+            some_camera().zoomed(factor)
+
+
+def test_focus_changes_the_size_as_a_thin_lens_does():
+    """1 / f = 1 / d + 1 / b, and what is drawn is as large as b."""
+    camera = some_camera()
+    for d in (0.2, 0.3, 1e9):
+        b = 1.0 / (1.0 / 50e-3 - 1.0 / d)
+        start = 1.0 / (1.0 / 50e-3 - 1.0 / 0.25)
+        assert camera.refocused(50e-3, 0.25, d).K[0, 0] == pytest.approx(camera.K[0, 0] * b / start)
+    for wrong in ((50e-3, 0.25, 0.04), (0.0, 0.25, 0.3), (50e-3, np.nan, 0.3), (50e-3, 0.05, 0.3)):
+        with pytest.raises(ValueError, match="focus farther"):
+            camera.refocused(*wrong)
+
+
+def test_parallel_eyes_see_the_same_rows_and_depth_by_disparity():
+    camera = some_camera()
+    left, right = stereo_pair(camera)
+    assert np.linalg.norm(left.centre - right.centre) == pytest.approx(BASELINE) == pytest.approx(24e-3)
+    (u, depth), (v, _) = (one.project(points_in_front()) for one in (left, right))
+    assert np.allclose(u[:, 1], v[:, 1])
+    assert np.allclose(u[:, 0] - v[:, 0], camera.K[0, 0] * BASELINE / depth)
+
+
+def test_converging_eyes_meet_at_the_working_distance():
+    camera = some_camera()
+    distance = float(np.linalg.norm(TARGET - EYE))
+    left, right = stereo_pair(camera, 30e-3, distance)
+    for one in (left, right):
+        assert one.project(TARGET)[0] == pytest.approx([159.5, 99.5], abs=1e-9)
+    assert left.in_frame(right.centre)[0] > 0.0 and np.linalg.norm(left.centre - right.centre) == pytest.approx(30e-3)
+    assert left.T_camera_world[2, :3] @ right.T_camera_world[2, :3] == pytest.approx(
+        np.cos(2.0 * np.arctan(15e-3 / distance))
+    )
+
+
+def test_points_are_found_again_from_both_pictures_of_eyes_with_a_lens():
+    """By OpenCV: undistorted and triangulated."""
+    for pair in (stereo_pair(seen_by(SOME)), stereo_pair(seen_by(SOME), working_distance=0.14)):
+        seen = []
+        for one in pair:
+            pixels = np.ascontiguousarray(one.project(near_points()[:50])[0])[:, None]
+            seen.append(cv2.undistortPoints(pixels, one.K, SOME.coefficients).reshape(-1, 2).T)
+        found = cv2.triangulatePoints(*(one.T_camera_world[:3] for one in pair), *seen)
+        assert np.abs((found[:3] / found[3]).T - near_points()[:50]).max() < 1e-4
+    pictures = [render(one, scene(), LAMP).colour for one in stereo_pair(seen_by(SOME))]
+    assert (pictures[0] != pictures[1]).mean() > 0.1
+
+
+def test_a_pair_that_cannot_be_is_refused():
+    for wrong in ((0.0, None), (np.nan, None), (24e-3, 0.0), (24e-3, -1.0)):
+        with pytest.raises(ValueError, match="above 0"):
+            stereo_pair(some_camera(), *wrong)
+
+
+@dataclass(frozen=True)
+class Still:
+    """A brain that is known not to move."""
+
+    anatomy: Anatomy
+
+    def deform(self, loads, start=None, at=None):
+        every = np.arange(len(self.anatomy.mesh.nodes))
+        none = np.full((2, len(loads)), np.nan)
+        return predicted(np.zeros((len(loads), len(every), 3)), every, loads, [False] * len(loads), 0.0, none, "")
+
+
+def camera_at(after):
+    return HAND(CAMERA, np.zeros(3), 1.0 + after)
+
+
+def discs(radius=3e-3, corners=48):
+    """Small discs about the places of a grid, of which each has its own id."""
+    angles = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
+    rim = radius * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles])
+    ends = np.arange(corners)
+    triangles = np.column_stack([0 * ends, 1 + ends, 1 + np.roll(ends, -1)])
+    return [Layer(str(n), n + 1, place + np.vstack([np.zeros(3), rim]), triangles) for n, place in enumerate(GRID)]
+
+
+def test_each_row_is_drawn_where_the_camera_is_when_it_is_taken():
+    layers = discs()
+    renderer = Renderer(layers, Lamp(np.array([0.0, 0.0, -0.4]), np.zeros(3), 0.2))
+    bands = row_bands(camera_at, READOUT, GRID)
+    vertices = [layer.vertices for layer in layers]
+    drawn = np.concatenate([renderer.picture(camera, vertices).segmentation for _, camera in bands])
+    assert drawn.shape == (300, 400) and len(bands) > 5
+    still = CAMERA.project(GRID)[0]
+    apart = []
+    for number, place in enumerate(GRID):
+        middle = np.argwhere(drawn == number + 1).mean(axis=0)[::-1]
+        # By single rows: the row in which the place is seen is that which has the camera there.
+        row = still[number, 1]
+        for _ in range(20):
+            pixel = camera_at(READOUT * (row / 299.0 - 0.5)).project(place[None])[0][0]
+            row = pixel[1]
+        apart.append(np.linalg.norm(middle - pixel))
+        assert np.linalg.norm(camera_at(0.0).project(place[None])[0][0] - pixel) < 20.0
+        assert time_of_point(camera_at, READOUT, place) == pytest.approx(row_time(row, 300, READOUT), abs=1e-6)
+    assert max(apart) < 0.3
+    moved = [np.linalg.norm(camera_at(0.0).project(place[None])[0][0] - still[n]) for n, place in enumerate(GRID)]
+    assert max(moved) > 1.0  # the test would see a shutter that does not roll
+
+
+def test_a_camera_that_stays_has_one_band_and_rows_beyond_the_picture_are_its_borders():
+    ((rows, camera),) = row_bands(lambda after: CAMERA, READOUT, GRID)
+    assert rows == slice(0, 300) and (camera.width, camera.height) == (400, 300)
+    np.testing.assert_allclose(row_time(np.array([-5, 0, 299, 400]), 300, 0.03), [-0.015, -0.015, 0.015, 0.015])
+    assert time_of_point(camera_at, READOUT, np.array([0.0, 0.0, -1.0])) == 0.0  # behind it
+
+
+def test_files_have_the_readout_and_others_stay_as_they_were():
+    for text in (opencv_text, ros_text):
+        assert parsed(text(replace(USUAL, readout=0.0125))).readout == 0.0125
+        assert "readout" not in text(USUAL) and parsed(text(USUAL)).readout == 0.0
+        with pytest.raises(ValueError, match="readout_time must be a number"):
+            parsed(text(USUAL) + 'readout_time: "fast"\n')
+        with pytest.raises(ValueError, match="read in 0 to 1 s"):
+            parsed(text(USUAL) + "readout_time: -1\n")
+    assert replace(USUAL, readout=0.02).sized(640, 480, scale=True).readout == 0.02
+
+
+@pytest.fixture(scope="module")
+def player():
+    theatre = template_theatre()
+    small = replace(USUAL.sized(800, 600, scale=True), readout=READOUT)
+    view = replace(VIEW.calibrated(small), path=HandHeld(0))
+    return Player(theatre.stage(replace(find_scene("palpate"), viewpoint=view, duration=0.1)), Still(theatre.anatomy))
+
+
+def test_a_film_rolls_and_what_is_drawn_into_it_says_how_far_off_that_makes_it(player):
+    mounts = mounted(player)
+    shots = list(shots_of(player, mounts, Taking(noise=0.0)))
+    calibration = player.scene.viewpoint.calibration
+    assert calibration is not None
+    still = replace(player.scene.viewpoint, calibration=replace(calibration, readout=0.0))
+    other = replace(player, stage=replace(player.stage, scene=replace(player.scene, viewpoint=still)))
+    plain = next(iter(shots_of(other, mounts, Taking(noise=0.0))))
+    rows = np.abs(plain.colour.astype(int) - shots[0].colour).mean(axis=(1, 2))
+    assert rows[290:310].mean() < 0.4 * max(rows[:100].mean(), rows[500:].mean())  # the middle row has its time
+    follower = Follower(
+        calibration,
+        registered(player.site, mounts, 0.0, 0.0, 0),
+        mounts.tool,
+        ToolMotion(player.stage, player.deformer),
+    )
+    known, all_known = None, []
+    for shot in shots:
+        known = follower.step(cv2.cvtColor(shot.colour, cv2.COLOR_RGB2GRAY), shot.time, known)
+        all_known.append(known)
+    # How the camera moves is not known from one picture.
+    assert all_known[0].state is State.UNSURE and "rolling shutter" in all_known[0].words
+    assert all(each.relied and each.parts["shutter"] > 0.0 for each in all_known[1:])
+    at_once = replace(follower, calibration=replace(calibration, readout=0.0))
+    alike = at_once.step(cv2.cvtColor(shots[1].colour, cv2.COLOR_RGB2GRAY), shots[1].time)
+    assert alike.relied and "shutter" not in alike.parts
+    assert all_known[1].band > 1.5 * alike.band
+    # A hand that was fast a moment ago may be again.
+    assert all_known[-1].pace >= 0.5 * max(each.pace for each in all_known[1:])

@@ -6,8 +6,7 @@ from test_ar_styles import CAMERA, CORTEX, GREEN, seen, tumour
 
 from ar.overlay.cut import EMPTY, Plane, plane_through, profile, section
 from ar.overlay.hud import WHITE
-from ar.overlay.outlines import ink_of, key_of
-from ar.overlay.refind import of_ink
+from ar.overlay.outlines import ink_of, key_of, of_ink
 from ar.overlay.window import SHUT, Roles
 
 

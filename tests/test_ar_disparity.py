@@ -7,12 +7,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from test_ar_lens import SOME
 
-from ar.optics.camera import Camera, look_at
-from ar.optics.stereo_pair import stereo_pair
+from ar.optics.camera import Camera, look_at, stereo_pair
 from ar.rendering.layer import Layer, Solid
 from ar.rendering.renderer import Lamp, Picture, Renderer
-from ar.stereo.disparity import Cloud, StereoView, cloud, viewed
-from ar.stereo.point_flow import followed, supported
+from ar.stereo.disparity import Cloud, cloud, followed, supported, viewed
 from ar.stereo.rectified import Rectified, rectified
 
 TARGET, REACH, FINE = np.array([0.04, 0.03, 0.02]), 15e-3, 6000.0
@@ -89,7 +87,7 @@ def pictures(pair):
 
 
 @pytest.fixture(scope="module")
-def view(geometry, pictures) -> StereoView:
+def view(geometry, pictures):
     return viewed(geometry, *(taken(picture, seed) for seed, picture in enumerate(pictures)))
 
 

@@ -7,7 +7,7 @@ from test_ar_styles import CAMERA, seen, tumour
 from ar.overlay.composite import composite
 from ar.overlay.gauge import GAUGE, Gauge, gauge_words
 from ar.overlay.marks import Marks
-from ar.overlay.refind import found_at, stands
+from ar.overlay.outlines import found_at, stands
 
 
 @pytest.mark.parametrize("tip", [(0.0, 0.0), (0.052, 0.03), (-0.07, 0.0), (0.0, -0.09), (0.3, 0.3)])

@@ -6,8 +6,8 @@ import pytest
 
 from ar.optics.camera import look_at
 from ar.overlay.hud import BREAK, FINE, FONT, NEAR, Below, bearings, folded, lay, marked, millimetres, panel, towards
+from ar.overlay.outlines import found_at
 from ar.overlay.places import PAD
-from ar.overlay.refind import found_at
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,8 @@ from ar.optics.lens import Lens
 from ar.overlay.composite import composite
 from ar.overlay.gauge import Gauge
 from ar.overlay.marks import Marks
-from ar.overlay.outlines import box_around, silhouette
-from ar.overlay.refind import of_ink, outline_gap
+from ar.overlay.outlines import of_ink, outline_gap, silhouette
 from ar.rendering.layer import Layer
-from ar.rendering.rasteriser import rasterise
 from ar.rendering.raycast import raycast
 from ar.rendering.renderer import Renderer, render
 
@@ -121,20 +119,6 @@ def test_straight_pixels_are_bent_back_to_their_own(lens):
     assert np.allclose(part.straight, again.straight, atol=1e-6, equal_nan=True)
 
 
-@each_lens
-def test_the_rasteriser_sees_what_rays_see(lens):
-    """Of triangles as large as the picture, which reach behind the camera and beyond the lens, and of small ones."""
-    camera, (vertices, triangles) = seen_by(lens), sphere(20, 30, 0.02)
-    vertices = np.concatenate([vertices + [0.01, 0.0, 0.03], [[-9.0, -9, -0.3], [9, -8, -0.3], [0, 9, 0.3]]])
-    triangles = np.concatenate([triangles, [[600, 601, 602]] + np.array(len(vertices) - 603)])
-    drawn, cast = rasterise(camera, vertices, triangles), raycast(camera, vertices, triangles)
-    same = drawn.face == cast.face
-    assert same.mean() > 0.998 and len(np.unique(cast.face)) > 200 and (cast.face == len(triangles) - 1).mean() > 0.2
-    assert np.abs(drawn.depth - cast.depth)[same].max() < 1e-5
-    assert np.abs(drawn.weights - cast.weights)[same].max() < 1e-2
-    assert (drawn.face[np.isnan(camera.straight[..., 0])] == -1).all()
-
-
 def test_small_balls_are_drawn_where_opencv_has_them():
     camera = seen_by(SOME, 640, 480, 75.0)
     spread = np.linspace(-0.105, 0.11, 4)
@@ -196,18 +180,6 @@ def test_the_overlay_is_in_register_through_a_lens(lens):
     assert of_ink(shown, ink).sum() > 200 and outline_gap(shown, ink, mask, clear) < 1.5
     off = raycast(replace(camera, lens=None), hidden.vertices, hidden.triangles).mask
     assert outline_gap(shown, ink, off, clear) > 2.0
-
-
-@each_lens
-def test_a_box_holds_what_a_lens_bends_out_of_the_corners(lens):
-    """A triangle as large as the picture: its edges are no lines."""
-    camera = seen_by(lens)
-    points = np.array([[-0.08, -0.05, 0.0], [0.08, -0.05, 0.0], [0.0, 0.08, 0.0]])
-    mask = silhouette(camera, points, np.array([[0, 1, 2]]))
-    rows, columns = box_around(camera, points)
-    outside = mask.copy()
-    outside[rows, columns] = False
-    assert mask.sum() > 5000 and not outside.any()
 
 
 def test_what_lies_beyond_the_lens_is_not_drawn():

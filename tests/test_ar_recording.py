@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from ar.page.elements import coded
 from ar.page.recording import LONGEST, RATE, Recording, played
-from ar.page.sight import coded
 
 
 class TestRecording:

@@ -141,15 +141,6 @@ def test_pictures_together_are_those_alone():
     assert not np.array_equal(together.colour.numpy()[0], together.colour.numpy()[1])
 
 
-def test_two_solid_textures_are_kept_apart():
-    other = replace(ball(), solid=Solid(np.eye(4)[:, None].repeat(3, 1), 50.0 * np.eye(4)), rest=ball().vertices)
-    both = render(camera(), [striped(), other], LAMP)
-    for layer in (striped(), other):
-        alone = render(camera(), [layer], LAMP)
-        here = both.segmentation == layer.id
-        assert here.sum() > 500 and np.array_equal(both.colour[here], alone.colour[here])
-
-
 def test_rows_shared_by_threads_give_the_same_depths():
     """As on a card, where several threads draw each triangle."""
     here, layer = camera(), scene()[0]

@@ -9,15 +9,13 @@ import trimesh
 
 from ar.optics.camera import look_at
 from ar.overlay.composite import composite, head_lines
-from ar.overlay.distances import signed_distance, tree_of
+from ar.overlay.distances import RING, signed_distance, tree_of
 from ar.overlay.gauge import GAUGE, Gauge
-from ar.overlay.hud import FINE, FONT, HEAD, ROW, WHITE, folded, panel
-from ar.overlay.legend import SHEET, Names
+from ar.overlay.hud import FINE, FONT, ROW, WHITE, folded, panel
+from ar.overlay.legend import SHEET
 from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.measured import Measure
-from ar.overlay.outlines import ink_of, silhouette
-from ar.overlay.refind import found_at, of_ink, outline_gap, stands
-from ar.overlay.rings import RING
+from ar.overlay.outlines import found_at, ink_of, of_ink, outline_gap, silhouette, stands
 from ar.overlay.styles import STYLES, Opening
 from ar.overlay.window import DARK, Roles
 from ar.rendering.layer import Layer
@@ -142,25 +140,6 @@ def test_distances_are_signed_and_end():
         assert found[:3] == pytest.approx([-0.01, 0.01, -0.005], abs=2e-4) and np.isnan(found[3])
 
 
-def test_the_legend_names_lines_without_their_ink_and_leaves_the_cortex_in_sight():
-    picture, at = seen(0.0), tumour()
-    names = Names("it", "its error", "before")
-    plain, named = (
-        composite(
-            picture, CAMERA, at, cover=Cover(opening=OPENING), marks=Marks(0.003, before=at), words=Words(names=each)
-        ).colour
-        for each in (Names(), names)
-    )
-    changed = (plain != named).any(axis=2)
-    assert changed.sum() > 500 and (picture.segmentation[changed] == DRAPE).all()
-    assert not of_ink(named, ink_of(GREEN))[changed].any()
-    crowded = composite(
-        seen(), CAMERA, at, cover=Cover(opening=OPENING), marks=Marks(0.003, before=at), words=Words(names=names)
-    ).colour
-    without = composite(seen(), CAMERA, at, cover=Cover(opening=OPENING), marks=Marks(0.003, before=at)).colour
-    assert np.array_equal(crowded, without)  # there is cortex everywhere: no room
-
-
 def test_a_panel_moves_out_of_sight_of_what_it_would_hide():
     colour, hidden = np.full((360, 640, 3), 90, np.uint8), np.zeros((360, 640), np.uint8)
     hidden[:, :400] = 1
@@ -241,15 +220,6 @@ def test_a_ring_s_caption_stands_apart_from_the_number_beside_the_tip():
     assert number is not None and caption is not None
     left, top, right, foot = number
     assert caption[1] > foot + ROW or caption[3] < top - ROW or caption[0] > right + ROW or caption[2] < left - ROW
-
-
-def test_a_cut_leaves_the_foot_to_its_words():
-    covered = np.zeros((480, 640), bool)
-    covered[:270, 400:] = True  # the inset stands low
-    over = composite(
-        seen(0.01), CAMERA, tumour((0.0, 0.0, -0.014)), style="cut", cover=Cover(opening=OPENING, covered=covered)
-    )
-    assert (over.taken == SHEET).any() and not (over.taken[-HEAD:] == SHEET).any()
 
 
 @pytest.mark.parametrize(("covered", "middle"), [(460, -0.014), (640, -0.014), (0, 0.3)])

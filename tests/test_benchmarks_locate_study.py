@@ -35,7 +35,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Posture, Pushed
 from sim.material import Material
-from surrogate.locating import setup
+from surrogate.locating import locator_store
 from surrogate.locating.locator import Locator
 from surrogate.locating.prior import NOWHERE, Prior, middle_of
 
@@ -346,7 +346,7 @@ def test_the_command_prints_a_row_for_each_estimator_and_goes_on(body, locator, 
         return None if draw.number == 2 else some_motion(locator, draw.number)
 
     monkeypatch.setattr(locate_twins, "solved", some)
-    monkeypatch.setattr(setup, "make_locator", lambda *each, **named: made.append("locator") or locator)
+    monkeypatch.setattr(locator_store, "make_locator", lambda *each, **named: made.append("locator") or locator)
     path, folder = tmp_path / "body.vtu", tmp_path / "kept"
     write_anatomy(path, body)
     words = ["locate", "--anatomy", str(path), "--finer", str(path), "--twins", "4", "--points", "60", "80"]

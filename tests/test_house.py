@@ -36,7 +36,7 @@ ORDER = (
     {"surrogate.model"},
     {"surrogate.evaluation", "surrogate.locating", "surrogate.onnx_export"},
     {"surrogate.training", "surrogate.fitting"},
-    {"ar.optics", "ar.screen", "ar.picture_bytes"},
+    {"ar.optics", "ar.screen"},
     {"ar.rendering", "ar.stereo"},
     {"ar.overlay", "ar.tracking"},
     {"ar.page"},

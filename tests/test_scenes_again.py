@@ -1,12 +1,16 @@
 """Frames of an episode solved again: those whose past matters after their past, and any that is wrong is named."""
 
+import os
+import signal
+import time
+
 import h5py
 import pytest
 
 from scenes.episodes.make import make_body, make_episode
 from scenes.episodes.plan import load_plan
-from scenes.episodes.reading.again import solved_again
-from scenes.episodes.reading.validation import Report
+from scenes.episodes.reading.again import solved_again, validated
+from scenes.episodes.reading.validation import Report, validate_episode
 from sim.bodies.meshfile import write_anatomy
 
 PLAN = """
@@ -21,11 +25,7 @@ anatomies = "box.vtu"
 [bodies.learner]
 name = "none"
 """
-FAMILIES = {
-    "palpate": "depth_mm = 5",
-    "retract": "depth_mm = 5",
-    "debulk": "fluid = 0.2\nsteps = 2",
-}
+FAMILIES = {"palpate": "depth_mm = 5", "retract": "depth_mm = 5", "debulk": "fluid = 0.2\nsteps = 2"}
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
@@ -48,3 +48,32 @@ def test_a_frame_is_solved_again_after_its_past(episode):
         file["tumour_fem"][2, 0, 2] += 4e-4
     (said,) = solved_again(Report(episode), 3, "cpu").problems
     assert said.startswith("frame 2, solved again, is 0.")
+
+
+def slow(path):
+    """What takes long."""
+    time.sleep(0.5)
+    return Report(path)
+
+
+def test_who_wants_no_more_waits_for_what_has_begun_alone(tmp_path):
+    reports = validated([tmp_path / f"{number}.h5" for number in range(200)], 1, slow)
+    assert next(reports).problems == []
+    began = time.perf_counter()
+    reports.close()
+    assert time.perf_counter() - began < 20.0  # of a hundred seconds
+
+
+def end(path):
+    """What a damaged file may do to the library that reads it."""
+    if "broken" in path.name:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return validate_episode(path)
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_a_file_that_ends_its_reader_ends_no_other(whole, tmp_path):
+    broken = tmp_path / "broken.h5"
+    broken.write_bytes(whole.read_bytes())
+    reports = {report.path: report for report in validated([broken, whole], 1, end)}
+    assert "ends the process that reads it" in reports[broken].problems[0] and not reports[whole].problems

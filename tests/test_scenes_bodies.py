@@ -1,15 +1,23 @@
 """Regions of an own anatomy in a plan: they are drawn as so many times as stiff, and what is not there is not said."""
 
+import json
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import make_box
+from tiny_episodes import write_episode
 
-from scenes.episodes.bodies import read_body, tissue_of, write_body
+from scenes import write_card
+from scenes.cli import main
+from scenes.episodes.bodies import models_of, read_body, said_of_weak, tissue_of, weak_as_json, write_body
+from scenes.episodes.make import body_path, make_body
 from scenes.episodes.plan import load_plan
 from sim.anatomy import PART_LABELS, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
+from surrogate.model.left_out import LIMIT, LeftOut, OffBy
+from surrogate.model.store import load, stated_errors
 
 PLAN = """title = "A box"
 [motion.press]
@@ -23,6 +31,21 @@ tumour_ratio = 3
 oedema_ratio = [0.4, 0.6]
 ventricles_ratio = 0.1
 necrosis_ratio = 0.5
+"""
+TWO_BODIES = """
+title = "A box"
+seconds = 0.2
+frames_per_second = 10.0
+size = [32, 32]
+[motion.press]
+force_n = [0.01, 0.02]
+[bodies]
+anatomies = "box.vtu"
+[bodies.tissue]
+young_pa = 1500
+[bodies.learner]
+name = "linear"
+loads = 60
 """
 
 
@@ -52,3 +75,61 @@ def test_a_body_that_was_made_before_has_no_such_regions(plan, tmp_path):
     write_body(tmp_path / "made", plan, 1, 0, "cpu")
     older = {name: value for name, value in read_body(tmp_path / "made").drawn.items() if "oedema" not in name}
     assert PART_LABELS["oedema"] not in tissue_of(older).regions
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with a body whose learner knows no more than linear tissue, and its anatomy."""
+    above, anatomy = tmp_path_factory.mktemp("weak"), make_box(cells=(6, 6, 4), spacing=12e-3)
+    write_anatomy(above / "box.vtu", anatomy)
+    (above / "own.toml").write_text(TWO_BODIES)
+    assert not make_body(above / "set", load_plan(str(above / "own.toml")), 1, 0, "cpu").failed
+    return above / "set", anatomy
+
+
+def test_a_model_is_weak_by_what_it_states():
+    def left_out(mean, p999=None):
+        return OffBy(1.0, LeftOut(mean, 0.0, p999, 0.0))
+
+    assert not OffBy(LIMIT, None).weak and OffBy(1.1 * LIMIT, None).weak and OffBy(math.nan, None).weak
+    assert not left_out(0.01).weak and left_out(0.02).weak and left_out(0.01, 3e-4).weak
+    assert str(OffBy(4e-4, None)) == "0.4 mm off at most in 95 of 100 loads, where 0.2 mm are enough"
+    assert str(left_out(0.042)) == "4.2 % of the motion off in the mean, where 1 % are enough"
+    assert str(left_out(0.042, 3e-4)).endswith("enough; 0.3 mm off at 99.9 %, where 0.2 mm are enough")
+
+
+def test_the_worst_are_named_first_and_not_all_of_many():
+    many = {number: OffBy(1e-5 * number, None) for number in range(35)}
+    first, *named = said_of_weak(many)
+    assert first.startswith("14 of 35 bodies with a model have a weak one")
+    assert named[0] == f"- body 34: {many[34]}" and len(named) == 11 and named[-1] == "- and 4 more"
+    assert said_of_weak({0: OffBy(0.0, None)}) == [] == weak_as_json({0: OffBy(0.0, None)})
+
+
+def test_files_say_what_their_models_state(made):
+    folder, anatomy = made
+    path = body_path(folder, 0) / "anatomy.model.npz"
+    (model,) = load(path, anatomy).values()
+    (body_path(folder, 1)).mkdir()  # of a body that plays by another's model there is none
+    assert stated_errors(path) == {"linear": OffBy(model.bound, model.left_out)} and model.bound > LIMIT
+    assert models_of(folder) == {0: OffBy(model.bound, None)}
+    body_path(folder, 1).rmdir()
+
+
+def test_the_run_the_card_and_validate_name_them(made, capsys):
+    folder, _ = made
+    write_episode(folder / "episode_000000.h5", made[1])
+    bound = f"- body 0: {models_of(folder)[0]}"
+    write_card(folder)
+    assert bound in (folder / "DATASHEET.md").read_text()
+    assert main(["validate", str(folder), "--workers", "1"]) == 0
+    assert (
+        f"{folder}: 1 of 1 bodies with a model have a weak one" in (said := capsys.readouterr().out) and bound in said
+    )
+    assert main(["validate", str(folder), "--workers", "1", "--json"]) == 0
+    (weak,) = json.loads(capsys.readouterr().out)["weak_bodies"][str(folder)]
+    assert weak["body"] == 0 and weak["bound_mm"] == pytest.approx(1e3 * models_of(folder)[0].bound)
+    words = ["episodes", str(folder.parent / "own.toml"), "--count", "1", "--seed", "1", "--out", str(folder)]
+    words += ["--workers", "1", "--device", "cpu", "--force"]
+    assert main(words) == 0 and bound in capsys.readouterr().out
+    assert main([*words, "--json"]) == 0 and json.loads(capsys.readouterr().out)["weak_bodies"] == [weak]

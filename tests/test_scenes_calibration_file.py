@@ -4,8 +4,7 @@ import os
 
 import pytest
 
-from ar.optics.calibration import Calibration
-from ar.optics.calibration_text import LONGEST_TEXT
+from ar.optics.calibration import LONGEST_TEXT, Calibration
 from ar.optics.lens import Lens
 from scenes.tracked.calibration_file import read_calibration, write_calibration
 from sim.errors import InputError

@@ -10,8 +10,7 @@ from ar.overlay.composite import DOUBTFUL, composite
 from ar.overlay.gauge import GAUGE, Gauge
 from ar.overlay.legend import SHEET
 from ar.overlay.marks import BEFORE, Cover, Marks
-from ar.overlay.outlines import ink_of
-from ar.overlay.refind import found_at
+from ar.overlay.outlines import found_at, ink_of
 from ar.overlay.styles import STYLES
 from scenes.cli import main
 from scenes.play.checks import measure

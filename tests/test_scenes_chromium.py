@@ -7,8 +7,7 @@ from chromium import PROGRAM, SIZES, Chromium, assert_fits, assert_in_register, 
 from theatres import Silent, small, theatre_of
 from visitor import free_port, wait_for
 
-from ar.page.aside import HELP, TABS
-from ar.page.sight import HISTORY, PICTURE, SAID, SLICES
+from ar.page.elements import HELP, HISTORY, PICTURE, SAID, SLICES, TABS
 from scenes.page.demo import Demo
 from scenes.script.tool_paths import press
 

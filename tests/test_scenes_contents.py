@@ -2,7 +2,7 @@
 
 import h5py
 import pytest
-from test_scenes_open_files import spoil
+from test_scenes_windows import spoil
 from tiny_episodes import write_episode
 
 from scenes.episodes.reading.contents import read_contents

@@ -8,7 +8,7 @@ import pytest
 from visitor import Visitor, report, run_until, wait_for
 
 from ar.overlay.hud import FINE
-from ar.overlay.refind import stands
+from ar.overlay.outlines import stands
 from ar.page.browser import Browser
 from scenes.page.comparison import Moment
 from scenes.page.controls import PLAN

@@ -12,7 +12,7 @@ from urllib.request import urlopen
 
 import pytest
 from distributed import Client, Scheduler, Security, SpecCluster
-from tiny_work import Made, Trouble, body_path, held, played, tiny_run, tried
+from tiny_work import Trouble, body_path, held, played, tiny_run, tried
 
 from scenes.episodes.engine import Tally, still_missing
 from scenes.episodes.run_folder import (
@@ -24,9 +24,7 @@ from scenes.episodes.run_folder import (
     finished,
     mark_failed,
     read_run,
-    unlike,
 )
-from scenes.episodes.tasks import attempted
 from scenes.episodes.workers import own_workers, scheduled_workers
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
@@ -181,19 +179,6 @@ def test_a_folder_is_one_runs_own(tmp_path):
     (tmp_path / "run.json").write_text("mine")
     with pytest.raises(InputError, match="is not what `sulcus episodes` writes"):
         begin(tmp_path, tiny_run(), PLAN)
-
-
-def test_a_worker_that_does_not_fit_makes_nothing(tmp_path):
-    def make(number):
-        raise AssertionError
-
-    assert f"does not see {tmp_path}" in attempted(make, 0, tmp_path, tiny_run()).halt
-    begin(tmp_path, tiny_run(), PLAN)
-    newer = tiny_run(versions={**tiny_run().versions, "sulcus": "9"})
-    assert "and not 9. Install the same there" in attempted(make, 0, tmp_path, newer).halt
-    assert "of another plan or seed" in attempted(make, 0, tmp_path, tiny_run(seed=2)).halt
-    assert attempted(lambda number: Made(tmp_path, 7), 0, tmp_path, tiny_run()).frames == 7
-    assert unlike({"a": "1"}, {"a": "1", "b": "2"}) == "b none and not 2" and not unlike({"a": "1"}, {"a": "1"})
 
 
 def test_left_overs_of_dead_processes_are_removed_and_others_are_not(tmp_path):

@@ -239,15 +239,7 @@ RENDER = ("render", "press", "--deformer", "linear", "--anatomy")
 class TestRender:
     def test_frames_and_film(self, brief, anatomy, tmp_path, capsys):
         frames, film = tmp_path / "a" / "frames", tmp_path / "film.mp4"
-        words = [
-            *RENDER,
-            str(anatomy),
-            "--out",
-            str(frames),
-            "--every",
-            "2",
-            "--json",
-        ]
+        words = [*RENDER, str(anatomy), "--out", str(frames), "--every", "2", "--json"]
         assert main([*words, "--film", str(film)]) == 0
         report = json.loads(capsys.readouterr().out)
         assert report["frames"] == 4 and report["not_good"] == 0 and report["deformer"] == "linear"
@@ -262,15 +254,7 @@ class TestRender:
         assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "film.mp4"]
 
     def test_plain_frames_have_no_panel(self, brief, anatomy, theatre, tmp_path, capsys):
-        words = [
-            *RENDER,
-            str(anatomy),
-            "--every",
-            "3",
-            "--plain",
-            "--out",
-            str(tmp_path),
-        ]
+        words = [*RENDER, str(anatomy), "--every", "3", "--plain", "--out", str(tmp_path)]
         assert main(words) == 0
         assert "3 frames by linear" in capsys.readouterr().out
         shown = [frame.shown for frame in player(theatre, short(), "linear").frames(every=3)]

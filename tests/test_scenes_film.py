@@ -6,10 +6,11 @@ import json
 import cv2
 import numpy as np
 import pytest
+from ar.tracking.stamp import CELL, WIDTH, read_stamp, stamped
 from theatres import template_theatre
 
+from ar.tracking.drawn import CELL, WIDTH, read_stamp, stamped
 from ar.tracking.pictures import film_of
-from ar.tracking.stamp import CELL, WIDTH, read_stamp, stamped
 from scenes.cli import main
 from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import read_intrinsic_covariance, write_calibration

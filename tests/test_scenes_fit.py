@@ -17,7 +17,7 @@ from surrogate.fitting import fit
 from surrogate.fitting.responses import LINEAR, Responses
 from surrogate.fitting.tissue import FittedTissue, load_tissue, save_tissue
 from surrogate.locating.locator import telling_nodes
-from surrogate.locating.locator_files import save_locator
+from surrogate.locating.locator_store import save_locator
 
 
 @pytest.fixture(scope="module")

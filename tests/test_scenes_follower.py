@@ -11,9 +11,8 @@ from test_scenes_error_parts import shifted, six, turned
 from test_scenes_overlay import pictures
 from theatres import template_theatre
 
-from ar.tracking.pose import Pose
+from ar.tracking.pose import Pose, Tracked
 from ar.tracking.registration import Registration
-from ar.tracking.track import Tracked
 from scenes.script.scene import find_scene
 from scenes.tracked.follower import HELD, PATIENT, State, tip_covariance
 from scenes.tracked.picture import Painter

@@ -16,7 +16,7 @@ from sim.errors import InputError
 from sim.material import Material
 from surrogate.data.answer_rows import stating
 from surrogate.locating.causes import KINDS
-from surrogate.locating.locator_files import load_locator, save_locator
+from surrogate.locating.locator_store import load_locator, save_locator
 from surrogate.locating.observation import MOST, Observation, looked_at, placed
 from surrogate.locating.regions import Region
 from surrogate.model.store import save
@@ -271,7 +271,7 @@ def test_a_locator_is_made_beside_its_anatomy(files, body, tmp_path, capsys, mon
         asked.append((anatomy.digest, seed, device))
         return replace(whole, regions=causes.regions)
 
-    monkeypatch.setattr("surrogate.locating.setup.make_locator", make)
+    monkeypatch.setattr("surrogate.locating.locator_store.make_locator", make)
     path = tmp_path / "box.vtu"
     write_anatomy(path, body)
     assert main(["locator", str(path), "--device", "cpu", "--seed", "3"]) == 0
@@ -309,7 +309,7 @@ def test_regions_are_those_that_the_models_beside_learned(body, tmp_path, capsys
         asked.append(causes.regions)
         return locator_of(body)
 
-    monkeypatch.setattr("surrogate.locating.setup.make_locator", make)
+    monkeypatch.setattr("surrogate.locating.locator_store.make_locator", make)
     path = tmp_path / "box.vtu"
     write_anatomy(path, body)
     learned = Elasticity(Material("neo-hookean", 2000.0, 0.49), {2: Material("neo-hookean", 6000.0, 0.49)})

@@ -12,8 +12,7 @@ from chromium import PROGRAM, SIZES, Chromium, assert_fits, assert_in_register, 
 from films import FILM
 from visitor import Visitor, free_port, wait_for
 
-from ar.page.aside import KEYS, TABS
-from ar.page.sight import HISTORY, PICTURE, SAID, SLICES
+from ar.page.elements import HISTORY, KEYS, PICTURE, SAID, SLICES, TABS
 from ar.tracking.pictures import film_of
 from scenes.cli import main
 from scenes.tracked.follower import State

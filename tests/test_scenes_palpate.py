@@ -27,9 +27,9 @@ from surrogate.data.cortex_patch import open_patch
 from surrogate.model.applicability import refusal
 from surrogate.model.guarded import answering
 from surrogate.model.learned import Learned, Part
-from surrogate.model.tool_force import ForceModel
+from surrogate.model.tool_contact import ForceModel
 from surrogate.model.training_range import Envelope
-from surrogate.training.condense_contact import condensed, side_by_side
+from surrogate.training.fem_tables import condensed, side_by_side
 
 NODES = np.zeros((1, 3))
 SMALL = Viewpoint(width=160, height=120)

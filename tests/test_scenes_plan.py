@@ -9,9 +9,8 @@ import pytest
 from conftest import make_box
 
 from scenes.episodes.checksums import broken
-from scenes.episodes.families import FAMILIES, Motions
-from scenes.episodes.make import body_of, episode_path, make_body, make_episode
-from scenes.episodes.plan import load_plan, plan_from, shipped
+from scenes.episodes.make import episode_path, make_body, make_episode
+from scenes.episodes.plan import load_plan, plan_from
 from scenes.episodes.scripted import drawn_episode
 from scenes.play.deformers import open_theatre
 from sim.anatomy import TUMOUR_LABEL
@@ -42,27 +41,6 @@ grey_levels = 4
 force_n = 0.01
 tool_mm = 1
 """
-
-
-def test_the_plans_that_ship_can_be_drawn_from():
-    assert shipped() == ["hard", "small", "standard"]
-    families = set()
-    for name in shipped():
-        plan = load_plan(name)
-        drawn = [drawn_episode(plan.contents, 0, number) for number in range(60)]
-        assert {each.body for each in drawn} == set(range(plan.contents.bodies.count))
-        families |= {each.family for each in drawn}
-    assert families == set(FAMILIES) == set(Motions.__struct_fields__)
-
-
-def test_an_episode_is_drawn_by_itself_and_each_value_by_its_name():
-    plain, more = plan_from(TINY, "a"), plan_from(f"{TINY}tool_deg = [0, 1]\n[hand]\ntremor_mm = [0, 1]\n", "b")
-    first, again = drawn_episode(plain.contents, 4, 7), drawn_episode(plain.contents, 4, 7)
-    assert first == again and body_of(plain, 4, 7) == first.body
-    other = drawn_episode(more.contents, 4, 7)
-    same = {name: value for name, value in other.values.items() if name not in ("noise.tool_deg", "hand.tremor_mm")}
-    assert same == {name: first.values[name] for name in same}
-    assert drawn_episode(plain.contents, 4, 8).values != first.values != drawn_episode(plain.contents, 5, 7).values
 
 
 @pytest.mark.parametrize(

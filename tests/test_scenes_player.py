@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from ar.overlay.refind import stands
 from theatres import PUSHING, on_template, player, short, small
 
 from ar.optics.camera import project_cv2
 from ar.overlay.composite import WARNING
 from ar.overlay.hud import FINE, NARROW, WHITE, folded
-from ar.overlay.outlines import ink_of
-from ar.overlay.refind import stands
+from ar.overlay.outlines import ink_of, stands
 from scenes.play.frame_text import shortened
 from scenes.play.player import CARRIED, IN_BONE, STAGES
 from scenes.play.stage import CORTEX, TOOL

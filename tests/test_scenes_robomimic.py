@@ -1,14 +1,17 @@
 """What `sulcus convert --to robomimic` writes is read by robomimic itself, which trains on it."""
 
+import json
 import os
 import subprocess
 
+import h5py
 import numpy as np
 import pytest
 from tiny_episodes import HEIGHT, WIDTH, Wanted, write_episode
 
 from scenes import read_episodes
 from scenes.cli import main
+from scenes.episodes.exports.columns import twists
 
 ROBOMIMIC = os.environ.get("SULCUS_ROBOMIMIC_PYTHON")
 """A Python that has robomimic."""
@@ -69,3 +72,23 @@ def test_robomimics_own_reader_reads_what_ours_reads_and_trains_on_it(box, tmp_p
         assert np.allclose(read["depth_image"][..., 0], ours["depth"])
         assert np.allclose(read["tool_position"], ours["T_world_tool"][:, :3, 3]) and read["actions"].shape == (1, 6)
         assert np.allclose(read["force"], ours["force"])
+
+
+def test_robomimic_has_demonstrations_and_holds_one_out(folder, tmp_path, capsys):
+    out = tmp_path / "set.hdf5"
+    words = ["convert", str(folder), "--to", "robomimic", "--out", str(out), "--json"]
+    assert main(words) == 0 and main(words) == 2 and main([*words, "--force"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["held_out"] == 1
+    ours = read_episodes(folder, ["depth", "colour", "T_world_tool"], window=7).at(0, 0)
+    with h5py.File(out) as file:
+        demo = file["data/demo_0"]
+        assert "RAS [m]" in file["data"].attrs["space"]
+        assert file["data"].attrs["total"] == 16 and "env_name" in json.loads(file["data"].attrs["env_args"])
+        assert list(file["mask/train"]) == [b"demo_0"] and list(file["mask/valid"]) == [b"demo_1"]
+        assert demo.attrs["num_samples"] == 7 and demo["dones"][:].tolist() == [0] * 6 + [1]
+        assert np.array_equal(demo["obs/colour_image"], ours["colour"])
+        assert np.array_equal(demo["obs/depth_image"][..., 0], ours["depth"])
+        assert np.allclose(demo["actions"], twists(ours["T_world_tool"]))
+        assert {len(demo[name]) for name in ("states", "rewards", "obs/tip", "obs/tumour_predicted")} == {7}
+    out.write_text("mine")
+    assert main(words) == 2 and out.read_text() == "mine"

@@ -9,8 +9,7 @@ import pytest
 from theatres import template_theatre
 
 from ar.overlay.hud import FINE
-from ar.overlay.outlines import ink_of, silhouette
-from ar.overlay.refind import of_ink, stands
+from ar.overlay.outlines import ink_of, of_ink, silhouette, stands
 from ar.screen import write_film
 from ar.tracking.pictures import Named, film_of
 from scenes.cli import main

@@ -10,7 +10,7 @@ from tiny_episodes import Wanted, write_episode
 
 from scenes.episodes.engine import still_missing
 from scenes.episodes.rates import written_rates
-from scenes.episodes.reading.open_files import opened
+from scenes.episodes.reading.contents import opened
 from scenes.episodes.reading.validation import validate_episode
 from scenes.episodes.run_folder import Run, begin, episode_name, finished, read_run
 from sim.errors import InputError

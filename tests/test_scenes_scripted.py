@@ -1,8 +1,12 @@
-"""The scripted policy of the environments."""
+"""Scripts: what an episode of a data set draws, and the policy of the environments."""
 
 import pytest
 from gym_examples import DOWN, made, played
+from test_scenes_plan import TINY
 
+from scenes.episodes.make import body_of
+from scenes.episodes.plan import plan_from
+from scenes.episodes.scripted import drawn_episode
 from scenes.gym.episode import ENDED
 from scenes.gym.tasks import PALPATE
 from sim.errors import InputError
@@ -23,3 +27,13 @@ def test_the_scripted_policy_palpates_and_pushing_on_ends_at_the_limit():
     assert truth["load"] > 1.25 and truth["violations"] > 0 and rewards[-1] < ENDED + 1.0
     with pytest.raises(InputError, match=r"call reset\(\)"):
         environment.unwrapped.step(DOWN)
+
+
+def test_an_episode_is_drawn_by_itself_and_each_value_by_its_name():
+    plain, more = plan_from(TINY, "a"), plan_from(f"{TINY}tool_deg = [0, 1]\n[hand]\ntremor_mm = [0, 1]\n", "b")
+    first, again = drawn_episode(plain.contents, 4, 7), drawn_episode(plain.contents, 4, 7)
+    assert first == again and body_of(plain, 4, 7) == first.body
+    other = drawn_episode(more.contents, 4, 7)
+    same = {name: value for name, value in other.values.items() if name not in ("noise.tool_deg", "hand.tremor_mm")}
+    assert same == {name: first.values[name] for name in same}
+    assert drawn_episode(plain.contents, 4, 8).values != first.values != drawn_episode(plain.contents, 5, 7).values

@@ -14,8 +14,7 @@ import pytest
 from films import FILM
 from links import HOST, NAMES, in_mm, linked, peers, played
 
-from ar.overlay.outlines import ink_of, silhouette
-from ar.overlay.refind import of_ink, outline_gap
+from ar.overlay.outlines import ink_of, of_ink, outline_gap, silhouette
 from ar.tracking.pictures import film_of
 from scenes.link.frame import stamp_of
 from scenes.link.heard import Names

@@ -9,8 +9,7 @@ from locators import locator_of
 from theatres import SIGHTED, short, small
 
 from ar.overlay.hud import FINE, NARROW, bound_words, folded, millimetres
-from ar.overlay.outlines import ink_of
-from ar.overlay.refind import of_ink, stands
+from ar.overlay.outlines import ink_of, of_ink, stands
 from scenes.cli import main
 from scenes.page.text import estimated, legend, report
 from scenes.play.checks import measure, objections, within
@@ -28,7 +27,7 @@ from scenes.script.uncertainty import TumourError, Uncertainty
 from sim.anatomy import PART_LABELS
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
-from surrogate.locating.locator_files import locator_path, save_locator
+from surrogate.locating.locator_store import locator_path, save_locator
 from surrogate.locating.prior import middle_of
 from surrogate.locating.regions import Region
 

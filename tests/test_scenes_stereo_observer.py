@@ -18,7 +18,7 @@ from scenes.script.sight import StereoSight
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.geometry.closest_point import closest
-from surrogate.locating.locator_files import locator_path
+from surrogate.locating.locator_store import locator_path
 
 EXACT = StereoSight(shift=0.0, turn=0.0)
 MICROSCOPE = find_scene("microscope")

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_ar_track import CAMERA, CUBE, PLATE, flat, looking, taken
+from test_ar_pose import CAMERA, CUBE, PLATE, flat, looking, taken
 
 from ar.optics.calibration import Calibration
 from ar.tracking.targets import TIP

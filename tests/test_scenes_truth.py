@@ -8,7 +8,7 @@ import pytest
 from films import follower_of, truth_of
 from theatres import template_theatre
 
-from ar.tracking.track import Tracked
+from ar.tracking.pose import Tracked
 from scenes.script.scene import find_scene
 from scenes.tracked.follower import Known, State
 from scenes.tracked.tool_motion import Motion

@@ -8,7 +8,7 @@ import pytest
 from theatres import put, short, small
 
 from ar.overlay.hud import FINE, NARROW, folded, millimetres
-from ar.overlay.refind import stands
+from ar.overlay.outlines import stands
 from scenes.analysis.uncertainty import (
     Motions,
     Solved,

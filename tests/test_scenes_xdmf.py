@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+from xml.etree import ElementTree
 
 import h5py
 import numpy as np
@@ -12,7 +13,6 @@ from scenes.cli import main
 
 PVPYTHON = os.environ.get("SULCUS_PVPYTHON")
 """ParaView's own Python."""
-pytestmark = pytest.mark.skipif(PVPYTHON is None, reason="needs SULCUS_PVPYTHON, ParaView's pvpython")
 READ = """
 import sys
 import numpy as np
@@ -52,6 +52,7 @@ def converted(box, tmp_path_factory):
     return folder
 
 
+@pytest.mark.skipif(PVPYTHON is None, reason="needs SULCUS_PVPYTHON, ParaView's pvpython")
 @pytest.mark.parametrize(("reader", "given"), [("XDMFReader", "FileNames"), ("Xdmf3ReaderS", "FileName")])
 @pytest.mark.parametrize("name", ["in/known", "other/bare"])
 def test_paraview_reads_what_the_episodes_hold(reader, given, name, converted, tmp_path):
@@ -72,3 +73,19 @@ def test_paraview_reads_what_the_episodes_hold(reader, given, name, converted, t
             assert len(cells) == len(rest) if name == "other/bare" else len(cells) % 3 == 0 and cells.max() < len(rest)
             off = read.get(f"0/{frame}/from_finite_elements [m]")
             assert (off is not None) == (frame % 3 == 0) and (off is None or np.allclose(off, 1e-4, atol=1e-7))
+
+
+def test_xdmf_refers_to_numbers_that_are_there(folder, tmp_path):
+    out = tmp_path / "paraview"
+    assert main(["convert", str(folder), "--to", "xdmf", "--out", str(out)]) == 0
+    tree = ElementTree.parse(out / "episode_000001.xdmf")
+    assert "RAS [m]" in tree.find("Domain/Information[@Name='space']").get("Value")
+    grids = tree.findall(".//Grid[@GridType='Uniform']")
+    assert len(grids) == 9 and float(grids[3].find("Time").get("Value")) == pytest.approx(0.1)
+    assert len(grids[3].findall("Attribute")) == 2 and len(grids[4].findall("Attribute")) == 1  # solved, and not
+    for item in (found for grid in grids for found in grid.iter("DataItem")):
+        name, place = item.text.split(":")
+        with h5py.File(out / name) as file:
+            assert " ".join(map(str, file[place].shape)) == item.get("Dimensions")
+            if place.endswith("cells"):
+                assert file[place].shape[1] == 3 and file[place][:].max() < len(file["tumour/positions/000000"])

@@ -9,15 +9,7 @@ from scipy.stats import chi2
 
 from sim.errors import InputError
 from surrogate.locating import calibration
-from surrogate.locating.calibration import (
-    NEAREST,
-    covering_factor,
-    left_out,
-    likeness,
-    seen_patch,
-    trials,
-    was_tried,
-)
+from surrogate.locating.calibration import NEAREST, covering_factor, left_out, likeness, seen_patch, trials, was_tried
 from surrogate.locating.ensemble import Ensemble
 from surrogate.locating.prior import middle_of
 

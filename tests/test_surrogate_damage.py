@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from boxes import base_held
 from boxes import box as cube
+from test_surrogate_dataset import SAID
+from test_surrogate_dataset import unfinished as stopped
 
 from scenes.cli import main
 from sim.anatomy import Anatomy
@@ -28,12 +30,6 @@ from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.training.train import train
 
-SAID = {"preset": "palpation", "seed": "0"}
-
-
-class StopError(Exception):
-    """A run is stopped."""
-
 
 @pytest.fixture(scope="module")
 def loads(box):
@@ -50,14 +46,7 @@ def whole(tmp_path_factory, pretender, loads):
 @pytest.fixture(scope="module")
 def unfinished(tmp_path_factory, pretender, loads):
     """The bytes of a run that was stopped before its last batch."""
-    path = tmp_path_factory.mktemp("unfinished") / "data.h5"
-
-    def stop(done, total):
-        if done > total - 8:
-            raise StopError
-
-    with pytest.raises(StopError):
-        simulate(path, pretender, loads, SAID, 8, stop)
+    path = stopped(tmp_path_factory.mktemp("unfinished"), pretender, loads)
     return path.with_name("data.h5.partial").read_bytes()
 
 

@@ -17,9 +17,8 @@ from sim.bodies.open_cortex import open_cortex
 from sim.effects import SKULLS
 from sim.errors import InputError
 from surrogate.locating.calibration import seen_patch
-from surrogate.locating.cause_shares import cause_shares
 from surrogate.locating.causes import DRAINAGE, KINDS, OEDEMA, SWELLING, TOOL
-from surrogate.locating.locator_files import load_locator, locator_path
+from surrogate.locating.locator_store import load_locator, locator_path
 from surrogate.locating.observation import Observation
 from surrogate.locating.prior import middle_of
 
@@ -170,19 +169,6 @@ def test_a_dent_is_seen_by_its_form_though_it_is_no_larger_than_errors(locator):
     white = 0.2e-3 * random.standard_normal((60, 3))
     dented, still = (locator.locate(Observation(rest + white + moved, rest)) for moved in (dent, 0.0))
     assert not dented.within_errors and dented.cause_shares and still.within_errors
-
-
-def test_causes_are_grouped_as_finely_as_their_shares_are_known():
-    """Two that trade places are named together; one that is always the same, alone; one of nothing, not at all."""
-    first = np.random.default_rng(0).uniform(0.0, 0.8, 2000)
-    drawn = np.stack([np.full(2000, 0.2), first, 0.8 - first, np.zeros(2000)], axis=1)
-    both, alone = cause_shares(drawn)
-    assert both.causes == KINDS[1:3] and (both.share, both.low, both.high) == pytest.approx((0.8, 0.8, 0.8))
-    assert str(alone) == "tool 20% (20% to 20%)"
-    assert str(both) == "drainage or swelling or shrinking (not separable) 80% (80% to 80%)"
-    narrow = cause_shares(np.stack([first / 4.0, 1.0 - first / 4.0, 0.0 * first, 0.0 * first], axis=1))
-    assert [each.causes for each in narrow] == [("drainage",), ("tool",)]
-    assert narrow[1].low == pytest.approx(0.01, abs=0.003) and narrow[1].high == pytest.approx(0.19, abs=0.003)
 
 
 def test_a_locator_of_trials_without_the_size_of_patches_is_refused(locator, tmp_path):

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from locators import dent, locator_of
 
-from scenes.script.priors import drawn_from
 from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
 from surrogate.fitting import fit
 from surrogate.fitting.fit import SOFT, probability_of, weighed, young_moduli
-from surrogate.fitting.frame import Frame, Tool, check_frames, foot, read_tools
+from surrogate.fitting.frame import Frame, Tool, foot
 from surrogate.fitting.responses import POISSONS, RATIOS, drained_loads, force_loads, responses
-from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue, load_tissue, save_tissue
+from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
 from surrogate.fitting.weighing import unsupported
 from surrogate.locating.calibration import seen_patch
 from surrogate.locating.causes import YOUNG, Group
@@ -104,35 +103,6 @@ def test_solved_tissues_are_read_again(body, parts, drained, monkeypatch):
     assert all(np.array_equal(again.motion[name], drained.motion[name]) for name in ("bonded", "slide"))
 
 
-def test_what_is_drawn_is_what_was_fitted():
-    share = np.zeros((3, 13, 33))
-    share[0, 3, 20], share[1, 3, 20], share[1, 9, 30] = 0.25, 0.25, 0.5
-    tissue = FittedTissue("", 4, share, np.array([1500.0]))
-    names, poisson, ratio = tissue.drawn(400, 1)
-    assert names.count("bonded") == 100 and (ratio == FINE_RATIOS[30]).sum() == 200
-    assert ((poisson == FINE_POISSONS[9]) == (ratio == FINE_RATIOS[30])).all()
-    draws = drawn_from(tissue, 3000.0, ("slide", "contact"), 30, 2)
-    assert {draw.stiffness for draw in draws} == {0.5} and all(draw.skull == 0.25 for draw in draws)
-    stiff = drawn_from(tissue, 3000.0, ("slide", "contact"), 30, 2, ratio=2.0)
-    assert [draw.ratio for draw in stiff] == [draw.ratio / 2.0 for draw in draws]  # of a tumour that is stated as such
-    with pytest.raises(InputError, match="cannot have"):
-        drawn_from(tissue, 3000.0, ("contact",), 8)
-
-
-def test_a_file_keeps_the_tissue_and_refuses_others(tmp_path):
-    share = np.random.default_rng(0).uniform(size=(3, 13, 33))
-    tissue = FittedTissue("abc", 4, share / share.sum(), np.array([1500.0, 2000.0]))
-    path = tmp_path / "brain.tissue.json"
-    save_tissue(path, tissue)
-    again = load_tissue(path, "abc")
-    assert again.ratio == tissue.ratio and again.stiffness == tissue.stiffness and again.frames == 4
-    with pytest.raises(InputError, match="another anatomy"):
-        load_tissue(path, "abd")
-    path.write_text(path.read_text().replace("[[[", "[[[-", 1))
-    with pytest.raises(InputError, match="no probabilities"):
-        load_tissue(path, "abc")
-
-
 def test_points_that_no_other_supports_are_left_out(body, locator, monkeypatch):
     """They are those that `locate` leaves out, and nothing is fitted to them; more than a third is refused."""
     clean = frame_of(body, dent(body, np.random.default_rng(1)))
@@ -152,43 +122,3 @@ def test_points_that_no_other_supports_are_left_out(body, locator, monkeypatch):
     torn = replace(clean.observation, now=clean.observation.now + np.where(np.arange(60)[:, None] % 2, 0.012, 0.0))
     with pytest.raises(InputError, match=r"frame 2: .* of 60 points"):
         unsupported(locator, [clean, replace(clean, observation=torn)])
-
-
-def test_bad_frames_are_refused(body):
-    motion = np.zeros_like(body.mesh.nodes) + [0.0, 0.0, 1e-3]
-    good = frame_of(body, motion)
-    tip = tuple((np.array(good.observation.rest)[0]).tolist())
-    cases = {
-        "no frame": [],
-        "frames 1 and 2 are the same": [good, good],
-        "frame 1: is a cloud": [replace(good, observation=replace(good.observation, rest=None))],
-        "frame 1: half of the points lie": [
-            replace(good, observation=replace(good.observation, rest=1e3 * good.observation.rest))
-        ],
-        "mm off the open cortex": [replace(good, tools=(Tool((1e3, 0.0, 0.0)),))],
-        "not finite": [replace(good, tools=(Tool((np.nan, 0.0, 0.0)),))],
-        "give newtons": [replace(good, tools=(Tool(tip, force=50.0),))],
-        "needs a force": [replace(good, tools=(Tool(tip, sigma=0.1),))],
-        "several tools": [replace(good, tools=(Tool(tip, force=0.1), Tool(tip)))],
-        "presses on no disc": [replace(good, tools=(Tool(tip, radius=6.0),))],
-    }
-    for words, frames in cases.items():
-        with pytest.raises(InputError, match=words):
-            check_frames(body, frames)
-    check_frames(body, [good])
-
-
-def test_a_table_of_tools_is_read(tmp_path):
-    path = tmp_path / "tools.csv"
-    path.write_text("frame,x,y,z,radius,force,sigma\n2,10,20,30,,0.2,\n2,11,20,30,5,,\n")
-    first, second = read_tools(path, 2)
-    assert first == () and second[0] == Tool((0.01, 0.02, 0.03), force=0.2) and second[1].radius == 5e-3
-    for text, words in (
-        ("frame,x,y,z\n3,1,2,3\n", "there are 2"),
-        ("frame,x,y,z\n1,1,2,\n", "not 4 numbers"),
-        ("frame,x,y,z,force\n1,1,2,3,nan\n", "not finite"),
-        ("x,y,z\n1,2,3\n", "header"),
-    ):
-        path.write_text(text)
-        with pytest.raises(InputError, match=words):
-            read_tools(path, 2)

@@ -1,40 +1,14 @@
-"""The tabulated series, and what is learnt of its remainder."""
-
-from dataclasses import replace
+"""The power series of a force: its forms, and what lies between its places."""
 
 import numpy as np
 import pytest
-from conftest import make_box
-from poison import poisoned
+from test_surrogate_expansion import pushes, unrounded
 
-from sim.accuracy import REFERENCE, TRAIN
-from sim.effects import NodalForce, pushed_effects
 from sim.errors import InputError
-from sim.fem import Fem
-from sim.loads import Loads, Pushed
-from sim.material import Material, tissue_to_json
-from sim.runtime.journal import opened
-from surrogate.array_functions import Rounded
-from surrogate.data.cortex_patch import open_patch
-from surrogate.data.dataset import read_dataset
-from surrogate.data.encode import ENCODERS, directions, tool_features
-from surrogate.data.simulate import simulate
-from surrogate.data.splits import Split
-from surrogate.model.store import load, save
-from surrogate.regressors.force_series import ORDERS, SPANS, Series, filled, forms
-from surrogate.training.examples import Examples
-from surrogate.training.expansion import ADDED, COARSE, EXPANDED, Expansion
-from surrogate.training.tabulate_series import radii_between, tabulated, with_middles
-from surrogate.training.train import learners_for, train
-
-TISSUE = Material("neo-hookean", 3000.0, 0.45)
-
-
-def pushes(patch, count, seed, radius=(6e-3, 8e-3), most=0.15):
-    random = np.random.default_rng(seed)
-    point, normal = patch.place(random.random((count, 3)))
-    force = random.uniform(0.02, most, (count, 1)) * (normal + 0.3 * random.normal(size=(count, 3)))
-    return Pushed(point, force, random.uniform(*radius, count))
+from sim.loads import Pushed
+from surrogate.data.encode import directions, tool_features
+from surrogate.regressors.force_series import Series, filled, forms
+from surrogate.training.fem_tables import radii_between, with_middles
 
 
 def test_fields_of_second_degree_are_met_between_the_places(patch):
@@ -67,12 +41,6 @@ def test_of_no_loads_there_are_no_responses(patch):
     assert series.predict(none).shape == (0, 2)
 
 
-def unrounded(table):
-    """A table (places, radii, 19, r) that is not rounded."""
-    columns = table.reshape(-1, 19 * table.shape[-1]).astype(np.float32)
-    return Rounded(columns, np.ones(columns.shape[1], np.float32))
-
-
 def _row(loads, k):
     return Pushed(loads.point[k : k + 1], loads.force[k : k + 1], loads.footprint[k : k + 1])
 
@@ -88,187 +56,6 @@ def test_forms_are_those_of_their_degree():
         assert np.allclose(values[:, columns] @ found, wanted)
 
 
-def every_motion(fem, nodes):
-    return fem.reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
-
-
-def test_the_table_is_the_finite_elements_series(box, patch, tmp_path):
-    fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", batch=200, element="p1")
-    nodes = box.tumour_nodes
-    loads = pushes(patch, 30, 3, (7e-3, 7e-3))
-    reading = every_motion(fem, nodes)
-    exact = fem.series(Loads((loads,)), ORDERS, reading)
-    (triangles, places), radii = with_middles(patch), np.array([7e-3])
-    heard = []
-    table = tabulated(fem, places, radii, reading, lambda done, total: heard.append((done, total)))
-    series = Series(patch.points, triangles, radii, unrounded(table))
-    assert heard[-1] == (len(places), len(places))
-
-    # Stopped at its second step, it goes on there, and comes to the same.
-    def stop(done, total):
-        if done > step:
-            raise KeyboardInterrupt
-
-    step, last = heard[0][0], []
-    with pytest.raises(KeyboardInterrupt), opened(tmp_path / "rows", {}) as journal:
-        tabulated(fem, places, radii, reading, stop, journal)
-    with opened(tmp_path / "rows", {}) as journal:
-        again = tabulated(fem, places, radii, reading, lambda done, total: last.append(done), journal)
-    assert np.array_equal(again, table) and last == [done for done, _ in heard[2:]]
-    size, _ = directions(loads)
-    predicted = series.predict(tool_features(patch, loads)) * size[:, None]
-    wanted = exact.sum(axis=1)
-    # The box's triangles are as long as the tool is wide.
-    assert np.linalg.norm(predicted - wanted) < 0.02 * np.linalg.norm(wanted)
-    linear = exact[:, 0]
-    assert np.linalg.norm(predicted - wanted) < 0.25 * np.linalg.norm(linear - wanted)
-
-
-def simulated(path, box, count=160):
-    """Pushes of one width on a box."""
-    fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
-    loads = Loads((pushes(open_patch(box), count, 5, (7e-3, 7e-3), 0.25),))
-    simulate(path, fem, loads, {"tissue": tissue_to_json(TISSUE), "element": "p1"})
-    return read_dataset(path)
-
-
-@pytest.fixture(scope="module")
-def data(box, tmp_path_factory):
-    return simulated(tmp_path_factory.mktemp("series") / "data.h5", box)
-
-
-@pytest.fixture(scope="module")
-def expansion(data):
-    """What all may read: nobody writes into its table."""
-    found = Expansion(data, "cpu")
-    found.tabulated.table.setflags(write=False)
-    return found
-
-
-@pytest.fixture(scope="module")
-def trained(data, expansion):
-    return train(data, ["linear", *EXPANDED], expansion=expansion)
-
-
-def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, patch):
-    pushed = data.loads.of(Pushed)
-    some = np.flatnonzero(data.good)[:90]
-    loads = Pushed(pushed.point[some], pushed.force[some], pushed.footprint[some])
-    nodes = (expansion.tumour, expansion.cortex)
-    bases = expansion.bases(Examples(loads, *(data.displacement(at)[some] for at in nodes)), ADDED, COARSE)
-    fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
-    places = np.array([0, 17, 60, 120, 198])
-    point = np.repeat(with_middles(patch)[1][places], 3, axis=0)
-    units = Loads((Pushed(point, np.tile(np.eye(3), (len(places), 1)), np.full(len(point), 7e-3)),))
-    predicted = expansion.on(bases, np.zeros(len(expansion.places), bool))
-    for at, basis, found, exact in zip(nodes, bases, predicted, expansion.exact, strict=True):
-        wanted = fem.series(units, ORDERS, every_motion(fem, at), 3) @ basis.modes.T
-        for terms in SPANS[len(exact) :]:
-            table = found.table.values.reshape(len(expansion.places), *wanted.shape[1:])
-            miss = np.linalg.norm((table[places] - wanted)[:, terms])
-            assert miss < 0.06 * np.linalg.norm(wanted[:, terms])  # rounded to 1 in 500 of the largest
-
-
-def test_two_orders_of_the_tumour_are_exact_wherever_a_tool_presses(expansion, box):
-    """Of loads inside the rim nothing is left of them; over it the table holds what is missing."""
-    fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
-    loads = pushes(expansion.patch, 40, 8, (7e-3, 7e-3))
-    inside = expansion.patch.rim_distance(loads.point) > loads.footprint
-    assert 10 < inside.sum() < 40
-    exact = fem.series(Loads((loads,)), 2, every_motion(fem, expansion.tumour))
-    size = directions(loads)[0][:, None, None]
-    found = [size * part.response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
-    for order, (motion, limit) in enumerate(zip(found, (1e-3, 3e-2), strict=True)):
-        off = np.linalg.norm(motion.reshape(40, -1) - exact[:, order], axis=1) / np.linalg.norm(exact[:, order], axis=1)
-        assert off[inside].max() < limit
-    many = [part.response(ENCODERS[part.encoder](expansion.patch, replaced(loads, 3))) for part in expansion.exact[0]]
-    some = [part.response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
-    for few, more in zip(some, many, strict=True):  # more than are answered at once
-        np.testing.assert_allclose(more, np.tile(few, (3, 1, 1)), rtol=1e-4, atol=1e-6)
-
-
-def test_a_run_that_went_on_has_the_same_table_and_states_no_seconds(tmp_path):
-    small = make_box(cells=(8, 8, 4), spacing=8e-3, tumour=12e-3, depth=20e-3, opening=22e-3)
-    data = simulated(tmp_path / "data.h5", small, 100)
-    whole, later = (Expansion(data, "cpu", begun=tmp_path / "rows", most_pairs=0) for _ in range(2))
-    assert whole.tabulated.seconds > 0.0 and np.isnan(later.tabulated.seconds)
-    assert np.array_equal(whole.tabulated.table, later.tabulated.table)
-    took = [train(data, ["series"], expansion=each).scores[0].solves.seconds for each in (whole, later)]
-    assert took[0] > 0.0 and took[1] is None
-
-
-def test_of_too_many_pairs_the_second_order_is_interpolated(data, trained):
-    known = Expansion(data, "cpu", most_pairs=100)
-    assert [len(parts) for parts in known.exact] == [1, 1]
-    again = train(data, ["series"], expansion=known)
-    kinds = [type(part.regressor).__name__ for part in again.models["series"].parts]
-    assert kinds == ["Linear", "Linear", "Series", "Series"]
-    assert again.scores[0].mean_mm < 0.2 * trained.scores[0].mean_mm
-
-
-def replaced(loads, times):
-    """The same loads, so many times."""
-    return Pushed(*(np.concatenate([each] * times) for each in (loads.point, loads.force, loads.footprint)))
-
-
-def test_a_series_beats_the_table_of_first_order(trained):
-    linear, series, learnt = trained.scores
-    # A hundred loads are nothing to the process yet: it must do no harm.
-    assert series.mean_mm < 0.2 * linear.mean_mm and learnt.mean_mm < 1.5 * series.mean_mm
-
-
-def test_on_known_cortex_the_process_beats_the_series_by_a_factor_of_two(tmp_path):
-    """What `series-gp` is there for: nine open nodes, 300 loads among them, every fourth tested wherever it lies.
-
-    A process that has lost its units leaves the series as it is.
-    """
-    small = make_box(cells=(6, 6, 4), spacing=9e-3, tumour=12e-3, depth=20e-3, opening=15e-3)
-    data = simulated(tmp_path / "data.h5", small, 300)
-    fourth = np.where(np.arange(data.good.sum()) % 4 == 3, 0, -1)
-    nowhere = Split(np.full((1, 3), 1.0), 1e-3, fourth, 1.0)
-    series, learnt = train(data, EXPANDED, split=nowhere, expansion=Expansion(data, "cpu")).scores
-    assert learnt.mean_percent < 0.5 * series.mean_percent and learnt.mean_mm < 0.5 * series.mean_mm
-
-
-def test_nothing_inside_the_discs_left_out_is_known_of_the_series(trained, data, expansion, tmp_path):
-    """Bit for bit: wild answers to all loads that were not trained on, and wild series at all places of the discs."""
-    split = trained.split
-    rows = np.flatnonzero(data.good)[~split.train]
-    wild = read_dataset(poisoned(data.path, tmp_path / "wild.h5", rows)[0])
-    again = Expansion(wild, "cpu")
-    inside = split.covers(again.places)
-    assert 0 < inside.sum() < len(inside)
-    again.tabulated.table[inside] = np.random.default_rng(0).normal(size=again.tabulated.table[inside].shape)
-    before, after = (train(each.data, EXPANDED, split=split, expansion=each) for each in (expansion, again))
-    for name in EXPANDED:
-        for one, other in zip(before.models[name].parts, after.models[name].parts, strict=True):
-            assert np.array_equal(one.basis.modes, other.basis.modes)
-            states = one.regressor.state(), other.regressor.state()
-            assert all(np.array_equal(states[0][key], states[1][key]) for key in states[0])
-    assert [row.mean_mm for row in before.scores] == [row.mean_mm for row in trained.scores[1:]]
-    assert min(row.mean_mm for row in after.scores) > 1.0
-
-
-def test_every_solve_is_counted(trained, data):
-    """By hand: 19 terms at each place and radius outside the discs, 3 unit forces a node, and the loads.
-
-    Unit forces on nodes inside the discs are counted once more.
-    """
-    linear, series, learnt = (row.solves for row in trained.scores)
-    loads_given, units = int(trained.split.train.sum()), len(data.unit_good)
-    outside = int((~trained.split.covers(with_middles(open_patch(data.anatomy))[1])).sum())
-    inside = 3 * int(trained.split.covers(open_patch(data.anatomy).points).sum())
-    assert (linear.loads, linear.units, linear.series, linear.inside) == (loads_given, units, 0, inside) and inside
-    assert series == learnt and (series.loads, series.units, series.inside) == (loads_given, units, inside)
-    assert series.series == outside * 19 and series.total == loads_given + units + outside * 19
-    rates = [float(data.provenance[f"seconds a {each}"]) for each in ("load", "unit response")]
-    assert linear.seconds == pytest.approx(loads_given * rates[0] + units * rates[1]) and min(rates) > 0.0
-    assert series.seconds > linear.seconds
-    said = {name: text for name, text in data.provenance.items() if not name.startswith("seconds")}
-    silent = train(replace(data, provenance=said), ["linear"])
-    assert silent.scores[0].solves == replace(linear, seconds=None)
-
-
 def test_what_is_left_out_is_interpolated(patch):
     """Fields that are linear in the place are met, on a flat cortex too; what is left out has no say."""
     places = with_middles(patch)[1]
@@ -279,26 +66,3 @@ def test_what_is_left_out_is_interpolated(patch):
     np.testing.assert_allclose(filled(places, wild, left_out), wanted, rtol=1e-9)
     with pytest.raises(InputError, match="hold all places"):
         filled(places, wild, np.ones(len(places), bool))
-
-
-def test_the_cortex_moves_as_the_finite_elements_say(trained, data, box, patch):
-    cortex = np.setdiff1d(patch.nodes, box.tumour_nodes)
-    truth = data.displacement(cortex)
-    miss = {name: np.linalg.norm(model.deform(data.loads, at=cortex).displacement - truth, axis=2).mean()
-            for name, model in trained.models.items()}  # fmt: skip
-    assert miss["series"] < 0.7 * miss["linear"] and miss["series-gp"] < 0.7 * miss["linear"]
-
-
-def test_stored_series_answer_alike(trained, data, box, tmp_path):
-    save(tmp_path / "model.npz", trained.models)
-    again = load(tmp_path / "model.npz", box)
-    for name in EXPANDED:
-        before, after = trained.models[name].deform(data.loads), again[name].deform(data.loads)
-        assert np.array_equal(before.displacement, after.displacement) and np.array_equal(before.bound, after.bound)
-
-
-def test_series_need_a_tissue(data):
-    untold = replace(data, provenance={})
-    assert not set(EXPANDED) & set(learners_for(untold)) and set(EXPANDED) < set(learners_for(data))
-    with pytest.raises(InputError, match="does not state its tissue"):
-        train(untold, ["series"])

@@ -1,14 +1,11 @@
 """How long a tool is held: histories, and finite elements of the same share."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from test_surrogate_relaxation import BALL, EFFECTS, SERIES, played, pressed
 
 from scenes.builtin.retract import RELAXING
 from scenes.cli import main
-from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy
 from sim.fem import Fem
 from sim.loads import Loads
@@ -19,7 +16,7 @@ from surrogate.data.tool_poses import draw_poses
 from surrogate.model.relaxation import followed
 
 
-def test_a_history_is_what_two_steps_make_of_it() -> None:
+def test_a_history_is_what_two_steps_make_of_it():
     for time in (0.0, 0.2, BROUGHT, 3.0, 80.0):
         alone = followed(SERIES, pressed(2e-3), np.array([time]), None, 1e-4)
         steps = [t for t in (min(time, BROUGHT), time) if t > 0.0]
@@ -27,7 +24,7 @@ def test_a_history_is_what_two_steps_make_of_it() -> None:
         assert alone.share[0] == pytest.approx(0.7 - unfaded(SERIES, np.array([time])).sum())
 
 
-def test_finite_elements_depend_on_the_share_alone(box: Anatomy) -> None:
+def test_finite_elements_depend_on_the_share_alone(box):
     """A tool that came in one long step, and one that stayed: of equal shares they move and press alike."""
     fem = Fem(box, list(EFFECTS), device="cpu", batch=1, element="p1")
     causes = draw_poses("palpation", box, 1, 5, BALL).causes
@@ -46,9 +43,7 @@ def test_finite_elements_depend_on_the_share_alone(box: Anatomy) -> None:
     assert np.linalg.norm(slow.reaction[0, 0, :3]) < 0.8 * np.linalg.norm(elastic.reaction[0, 0, :3])
 
 
-def test_the_command_draws_times_where_tissue_relaxes(
-    tmp_path: Path, box: Anatomy, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_draws_times_where_tissue_relaxes(tmp_path, box, capsys):
     mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
     write_anatomy(mesh, box)
     wanted = ["simulate", str(mesh), "--out", str(out), "--poses", "--count", "2", "--json"]

@@ -4,17 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import make_box
 
 from sim.errors import InputError
 from surrogate.locating import ensemble as ensembles
-from surrogate.locating.causes import KINDS, LETS_GO, Causes, drainages, groups, pushes
+from surrogate.locating.causes import KINDS, Causes, groups
 from surrogate.locating.ensemble import members, solved, surface_size
 from surrogate.locating.locator import Locator
-from surrogate.locating.locator_files import load_locator, save_locator
+from surrogate.locating.locator_store import load_locator, make_locator, save_locator
 from surrogate.locating.observation import Observation, placed
 from surrogate.locating.prior import NOWHERE, PLACES, middle_of
-from surrogate.locating.setup import make_locator
 
 FEW = Causes(
     poisson=(0.45, 0.485), tools=(8, 3), drainages=3, levels=(0.6, 0.3), swellings=(0.04, 0.02, -0.02),
@@ -62,38 +60,6 @@ def observed(body, motion, seed=0, count=60, bias=0.0, noise=1.0):
     return Observation(
         rest + moved + noise * (0.3e-3 * random.standard_normal((count, 3)) + 0.5e-3 * smooth) + off, rest
     )
-
-
-def test_draws_depend_on_the_seed_and_the_group_alone(body):
-    first, second = groups(body, 0, FEW)[:2]
-    draws = [(first, 0), (first, 0), (second, 0), (first, 1)]
-    force, again, other, later = (pushes(group, body, seed, FEW).causes[0].force for group, seed in draws)
-    assert np.array_equal(force, again) and not np.array_equal(force, other) and not np.array_equal(force, later)
-    falling = drainages(first, body, 0, FEW)
-    assert [len(level) for level in falling] == [3, 3]
-    down = [level.causes[1].direction for level in falling]
-    assert np.array_equal(*down) and (falling[1].causes[1].csf_level < falling[0].causes[1].csf_level).all()
-
-
-def test_a_skull_that_lets_go_is_not_asked_for_swollen_fluid_tissue(body):
-    made = {(group.skull, group.poisson) for group in groups(body, 0, FEW)}
-    assert (LETS_GO, 0.45) in made and (LETS_GO, 0.485) not in made and ("slide", 0.485) in made
-
-
-def test_each_skull_has_soft_and_stiff_tumours_and_tissue_that_stiffens_little_and_much(body):
-    """One in each part of the range, for every seed; at small strain all have what their group says."""
-    for seed in range(20):
-        for skull in ("bonded", "slide"):
-            some = [
-                group for group in groups(body, seed, replace(FEW, poisson=(0.45, 0.47, 0.49))) if group.skull == skull
-            ]
-            for name, (low, high) in (("ratio", FEW.stiffness), ("exponent", FEW.exponent)):
-                share = [np.log(getattr(group, name) / low) / np.log(high / low) for group in some]
-                assert np.floor(3.0 * np.sort(share)).tolist() == [0.0, 1.0, 2.0], (seed, skull, name)
-    elasticity = some[0].effects(FEW.swellings)[0]
-    (mu, lam), (hard, _) = elasticity.default.lame, elasticity.regions[2].lame
-    assert lam / (2.0 * (lam + mu)) == pytest.approx(0.45) and hard / mu == pytest.approx(some[0].ratio)
-    assert elasticity.default.terms[0][1] == -some[0].exponent
 
 
 def test_an_ensemble_has_every_cause_in_every_skull(ensemble, body):
@@ -294,18 +260,6 @@ def test_points_off_the_cortex_are_left_out_and_named(locator, body, truth):
     assert found.centroid == pytest.approx(without.centroid) and found.p95 == pytest.approx(without.p95)
     with pytest.raises(InputError, match="24 of 60 points lie off the open cortex"):
         locator.locate(spoilt[1])
-
-
-def test_points_far_from_vertices_lie_on_the_cortex_all_the_same():
-    """In the middle of triangles of 40 mm, and as far above them as may be; farther ones are left out."""
-    body = make_box(cells=(4, 4, 2), spacing=40e-3, tumour=60e-3, depth=40e-3, opening=70e-3)
-    middle = body.mesh.nodes[body.open_surface].mean(axis=1)
-    for above, kept in ((0.0, len(middle)), (11e-3, len(middle)), (13e-3, len(middle) - 3)):
-        rest = middle + np.where(np.arange(len(middle)) < 3, above, 0.0)[:, None] * [0.0, 0.0, 1.0]
-        evidence = placed(body, Observation(rest + 1e-3, rest))
-        assert len(np.unique(evidence.point)) == kept
-    with pytest.raises(InputError, match="half of the points lie more than 7 mm off the open cortex"):
-        placed(body, Observation(middle + [0.0, 0.0, 7e-3], middle + [0.0, 0.0, 7e-3]))
 
 
 def test_a_tip_without_support_is_left_out_and_says_nothing_of_the_tool(locator, body, truth):

@@ -14,10 +14,9 @@ from surrogate.fitting.fit import beside_tumour
 from surrogate.fitting.responses import force_loads, responses
 from surrogate.locating.causes import Causes, groups
 from surrogate.locating.ensemble import members, surface_size
-from surrogate.locating.locator_files import load_locator, save_locator
+from surrogate.locating.locator_store import load_locator, make_locator, save_locator
 from surrogate.locating.observation import Observation
 from surrogate.locating.regions import Region, check_regions, differing, known_regions, regions_words
-from surrogate.locating.setup import make_locator
 
 OEDEMA = PART_LABELS["oedema"]
 STIFF = Region(OEDEMA, 20.0)

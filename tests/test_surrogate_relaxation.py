@@ -1,7 +1,6 @@
 """Models of poses in tissue that relaxes: the past that they carry, what they learn of it, and where they play."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from sim.loads import Loads, Pushed, Touching
 from sim.material import Material, tissue_to_json
 from sim.tools import Ball
 from surrogate.data.cortex_patch import open_patch
-from surrogate.data.dataset import Dataset, read_dataset
+from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import tool_features
 from surrogate.data.holding import BROUGHT, HISTORY, drawn_times, stated_series
 from surrogate.data.indentation import Relaxing, indented, posed, relaxed_of, with_relaxed
@@ -28,12 +27,11 @@ from surrogate.data.tool_poses import draw_poses
 from surrogate.evaluation.score import errors
 from surrogate.model.applicability import refusal
 from surrogate.model.guarded import Guarded, judged
-from surrogate.model.learned import Learned
 from surrogate.model.relaxation import MEMORY, Relaxed, followed
 from surrogate.model.store import load, save
-from surrogate.model.tool_force import wrench
+from surrogate.model.tool_contact import wrench
 from surrogate.onnx_export.export import onnx_model
-from surrogate.training.condense_contact import condensed
+from surrogate.training.fem_tables import condensed
 from surrogate.training.train import train
 
 SERIES = ((0.4, 0.5), (0.3, 20.0))
@@ -66,7 +64,7 @@ def played(depths: list[float], times: list[float], x: list[float] | None = None
     return found[1:]
 
 
-def test_what_is_gone_is_the_hereditary_integral_of_the_depth() -> None:
+def test_what_is_gone_is_the_hereditary_integral_of_the_depth():
     """Of a tool that comes evenly within a second and stays, against its closed form; a frame is 30 ms."""
     times = list(np.arange(1, 91) / 30.0)
     found = played([4e-3 * min(t, 1.0) for t in times], times)
@@ -78,7 +76,7 @@ def test_what_is_gone_is_the_hereditary_integral_of_the_depth() -> None:
         assert not found[frame].strange[0]
 
 
-def test_pasts_that_no_training_has_are_strange() -> None:
+def test_pasts_that_no_training_has_are_strange():
     """A tool that was held and goes back, or that slid far; what it does for the first time is not."""
     back = played([4e-3, 4e-3, 3e-3, 0.0], [0.5, 6.0, 6.1, 6.2])
     assert [bool(each.strange[0]) for each in back] == [False, False, True, True]
@@ -87,7 +85,7 @@ def test_pasts_that_no_training_has_are_strange() -> None:
     assert [bool(each.strange[0]) for each in slid] == [False, False, True]
 
 
-def test_a_start_without_that_past_is_refused() -> None:
+def test_a_start_without_that_past_is_refused():
     late = start_of(played([1e-3], [2.0])[0], 2.0)
     with pytest.raises(InputError, match=r"the start is 1 s later than the loads"):
         followed(SERIES, pressed(1e-3), np.ones(1), late, 1e-4)
@@ -120,7 +118,7 @@ class Fading:
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory, box: Anatomy) -> Dataset:
+def data(tmp_path_factory, box):
     path = tmp_path_factory.mktemp("relaxing") / "data.h5"
     causes = draw_poses("palpation", box, 80, 0, BALL).causes
     simulate(path, Fading(box), Loads(causes, drawn_times(80, 0)), SAID)
@@ -128,11 +126,11 @@ def data(tmp_path_factory: pytest.TempPathFactory, box: Anatomy) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def model(data: Dataset) -> Learned:
+def model(data):
     return train(data, ["contact"]).models["contact"]
 
 
-def test_a_model_learns_what_time_does_and_keeps_it(tmp_path: Path, model: Learned, box: Anatomy) -> None:
+def test_a_model_learns_what_time_does_and_keeps_it(tmp_path, model, box):
     """Motion and force at fresh places and times, from a file too; `train` cannot know this without the times."""
     assert model.series == SERIES
     causes, nodes = draw_poses("palpation", box, 30, 77, BALL).causes, box.tumour_nodes
@@ -149,7 +147,7 @@ def test_a_model_learns_what_time_does_and_keeps_it(tmp_path: Path, model: Learn
     np.testing.assert_array_equal(again.deform(fresh).displacement, answer.displacement)
 
 
-def test_answers_follow_from_the_ones_before(model: Learned, box: Anatomy) -> None:
+def test_answers_follow_from_the_ones_before(model, box):
     """A tool that is held: its force goes on falling, as its own history has it; lifted off it is not relied on."""
     loads = draw_poses("palpation", box, 3, 5, BALL)
     touching = loads.of(Touching)
@@ -169,7 +167,7 @@ def test_answers_follow_from_the_ones_before(model: Learned, box: Anatomy) -> No
     assert lifted.outcome == (Outcome.EXTRAPOLATED,) * 3 and np.abs(lifted.displacement).max() == 0.0
 
 
-def test_features_end_with_what_is_gone(box: Anatomy) -> None:
+def test_features_end_with_what_is_gone(box):
     pushed = indented(draw_poses("palpation", box, 2, 0, BALL), BALL, open_patch(box))
     assert relaxed_of(pushed) is None
     known = with_relaxed(pushed, np.array([0.1, 0.2]))
@@ -177,7 +175,7 @@ def test_features_end_with_what_is_gone(box: Anatomy) -> None:
     np.testing.assert_array_equal(relaxed_of(known), [0.1, 0.2])
 
 
-def test_a_model_plays_the_series_that_it_learned_and_no_other(model: Learned, box: Anatomy) -> None:
+def test_a_model_plays_the_series_that_it_learned_and_no_other(model, box):
     assert refusal(model, EFFECTS) is None
 
     def under(series: tuple) -> str:
@@ -195,7 +193,7 @@ def test_a_model_plays_the_series_that_it_learned_and_no_other(model: Learned, b
         stated_series({**SAID, "history": "the tool fell"})
 
 
-def test_it_plays_alone_frame_by_frame(model: Learned, box: Anatomy) -> None:
+def test_it_plays_alone_frame_by_frame(model, box):
     """Finite elements cannot stand behind it, and a frame of a straight run depends on those before."""
     scene = replace(find_scene("palpate"), effects=EFFECTS, tool=Probe(BALL.radius))
     theatre = Theatre(box, None, {"contact": model}, "cpu")

@@ -1,7 +1,6 @@
 """Rods and blades moved by pose: how they are drawn, what contact says of them, and models that learn them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,18 +17,17 @@ from sim.loads import Loads, Retracted, Touching
 from sim.material import BRAIN, Material, tissue_to_json
 from sim.tools import Ball, BuiltIn, Capsule, Spatula, core_of, distances_to
 from surrogate.data.cortex_patch import barycentric_lattice, open_patch
-from surrogate.data.dataset import Dataset, read_dataset
+from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import Basis, core_features, tool_features
 from surrogate.data.indentation import Indented, indented, posed
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import BLADE, LEAN, ROD, SHALLOW, draw_poses
 from surrogate.evaluation.score import errors
 from surrogate.model.applicability import refusal
-from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
-from surrogate.model.tool_force import wrench
+from surrogate.model.tool_contact import wrench
 from surrogate.regressors.rigid_contact import THICKER, Contact
-from surrogate.training.condense_contact import condensed
+from surrogate.training.fem_tables import condensed
 from surrogate.training.train import train
 
 ROD_OF_4 = Capsule(2e-3, 0.02)
@@ -58,7 +56,7 @@ def upright(box: Anatomy, tool: BuiltIn, depth: float) -> Loads:
 
 
 @pytest.mark.parametrize("preset", TOOLS)
-def test_drawn_poses_go_in_from_where_they_touch_first(box: Anatomy, preset: str) -> None:
+def test_drawn_poses_go_in_from_where_they_touch_first(box, preset):
     tool, patch = TOOLS[preset], open_patch(box)
     loads = draw_poses(preset, box, 40, 3, tool)
     pose = posed(loads, tool)
@@ -78,7 +76,7 @@ def test_drawn_poses_go_in_from_where_they_touch_first(box: Anatomy, preset: str
         assert cosine >= np.cos(LEAN if isinstance(tool, Spatula) else np.pi / 4.0) - 1e-9
 
 
-def test_a_rod_that_stands_upright_is_the_ball_at_its_end(box: Anatomy) -> None:
+def test_a_rod_that_stands_upright_is_the_ball_at_its_end(box):
     """Where its side touches nothing: the same indentation, the same forces, and how it is turned does not matter."""
     loads, ball = upright(box, ROD_OF_4, 1.2e-3), Ball(ROD_OF_4.radius)
     rod, round_ = asked(box, loads, ROD_OF_4), indented(loads, ball, open_patch(box))
@@ -95,7 +93,7 @@ def test_a_rod_that_stands_upright_is_the_ball_at_its_end(box: Anatomy) -> None:
     np.testing.assert_array_equal(asked(box, Loads((Touching(pose),)), ROD_OF_4).axes, rod.axes)
 
 
-def test_a_blade_may_be_laid_on_and_moved(box: Anatomy) -> None:
+def test_a_blade_may_be_laid_on_and_moved(box):
     """`Retracted` loads are the pose that they end in; either way round the blade is the same to a learner."""
     there = upright(box, SMALL_BLADE, 2e-3)
     pose = posed(there, SMALL_BLADE)
@@ -113,7 +111,7 @@ def test_a_blade_may_be_laid_on_and_moved(box: Anatomy) -> None:
 
 
 @pytest.mark.parametrize("preset", TOOLS)
-def test_no_facet_is_entered_and_finite_elements_answer_so(box: Anatomy, preset: str) -> None:
+def test_no_facet_is_entered_and_finite_elements_answer_so(box, preset):
     """Signorini's conditions on a dense lattice of every facet; and against the barrier of the finite elements."""
     tool, patch = TOOLS[preset], open_patch(box)
     contact, bases = condensed_box(box, tool)
@@ -159,12 +157,12 @@ class Stiffening:
 
 
 @pytest.fixture(scope="module")
-def elements(box: Anatomy) -> Stiffening:
+def elements(box):
     return Stiffening(box)
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory, elements: Stiffening) -> Dataset:
+def data(tmp_path_factory, elements):
     path = tmp_path_factory.mktemp("rod") / "data.h5"
     effects = repr((Elasticity(), Held(), ToolContact((ROD_OF_4,))))
     said = {"shape": repr(ROD_OF_4), "tissue": tissue_to_json(SOFT), "effects": effects, "element": "p1"}
@@ -173,13 +171,11 @@ def data(tmp_path_factory: pytest.TempPathFactory, elements: Stiffening) -> Data
 
 
 @pytest.fixture(scope="module")
-def model(data: Dataset) -> Learned:
+def model(data):
     return train(data, ["contact"]).models["contact"]
 
 
-def test_a_model_learns_a_rod_and_keeps_it(
-    tmp_path: Path, data: Dataset, model: Learned, elements: Stiffening, box: Anatomy
-) -> None:
+def test_a_model_learns_a_rod_and_keeps_it(tmp_path, data, model, elements, box):
     assert data.tool == model.tool == ROD_OF_4
     fresh, nodes = draw_poses("dissector", box, 30, 77, ROD_OF_4), box.tumour_nodes
     truth, found = elements.deform(fresh), model.deform(fresh)
@@ -194,7 +190,7 @@ def test_a_model_learns_a_rod_and_keeps_it(
     np.testing.assert_array_equal(again.deform(fresh).displacement, found.displacement)
 
 
-def test_a_rod_that_leans_more_than_any_in_training_is_extrapolated(model: Learned, box: Anatomy) -> None:
+def test_a_rod_that_leans_more_than_any_in_training_is_extrapolated(model, box):
     pose = posed(upright(box, ROD_OF_4, 1e-3), ROD_OF_4)
     angle = np.radians(70.0)
     pose[0, :3, :3] = [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]
@@ -202,7 +198,7 @@ def test_a_rod_that_leans_more_than_any_in_training_is_extrapolated(model: Learn
     assert model.deform(Loads((Touching(pose[:, None]),))).outcome == (Outcome.EXTRAPOLATED,)
 
 
-def test_models_of_blades_play_retraction_on_tissue_that_does_not_relax(model: Learned) -> None:
+def test_models_of_blades_play_retraction_on_tissue_that_does_not_relax(model):
     blade = SMALL_BLADE
     tissue = tissue_to_json(BRAIN)
     effects = (Elasticity(), Held(), ToolContact((blade,)))
@@ -216,7 +212,7 @@ def test_models_of_blades_play_retraction_on_tissue_that_does_not_relax(model: L
     assert refusal(known, (relaxing, Held(), Retraction(blade))) == words
 
 
-def test_the_command_presses_rods_and_blades(tmp_path: Path, box: Anatomy, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_presses_rods_and_blades(tmp_path, box, capsys):
     mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
     write_anatomy(mesh, box)
     wanted = ["simulate", str(mesh), "--out", str(out), "--count", "2", "--preset", "dissector", "--poses", "--json"]

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from surrogate.data.tool_loads import draw
-from surrogate.evaluation.score import force_score, score, spread, table, winner
-from surrogate.evaluation.solve_counts import SolveCounts
+from surrogate.evaluation.score import SolveCounts, force_score, score, spread, table, winner
 
 
 @pytest.fixture(scope="module")

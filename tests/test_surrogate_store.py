@@ -7,7 +7,6 @@ import zipfile
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,9 +19,7 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import Basis
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.model import kept_arrays
 from surrogate.model.conformal import GROWTH, Bound
-from surrogate.model.kept_arrays import kept_path
 from surrogate.model.learned import Part
 from surrogate.model.store import learned_tissue, load, save, stated_errors
 from surrogate.model.training_range import Outside
@@ -172,10 +169,7 @@ def test_model_with_another_array_than_named_is_rejected(stored, models, box, tm
         load(tmp_path / "model.npz", box)
 
 
-READERS = {
-    "truth": lambda path: read_truth(path, "digest", 3, 2**20),
-    "stated": stated_beside,
-}
+READERS = {"truth": lambda path: read_truth(path, "digest", 3, 2**20), "stated": stated_beside}
 
 
 @pytest.mark.parametrize("name", READERS)
@@ -193,17 +187,6 @@ def test_npz_that_inflates_beyond_its_limit_is_not_read(name, tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 2**21
     finally:
         tracemalloc.stop()
-
-
-def test_kept_path_states_version_device_and_the_rest(tmp_path, monkeypatch):
-    first = kept_path(tmp_path, "a-", "cpu", "digest", "smoothed")
-    assert first == kept_path(tmp_path, "a-", "cpu", "digest", "smoothed") and kept_path(None, "a-", "cpu") is None
-    others = [kept_path(tmp_path, "a-", "cpu", "digest", "p2")]
-    monkeypatch.setattr(kept_arrays, "version_of", lambda name: "9.9")
-    others.append(kept_path(tmp_path, "a-", "cpu", "digest", "smoothed"))
-    monkeypatch.setattr(kept_arrays, "find_device", lambda name, precision: SimpleNamespace(on_cuda=True))
-    others.append(kept_path(tmp_path, "a-", "cuda", "digest", "smoothed"))
-    assert len({first, *others}) == 4
 
 
 def test_archives_are_opened_by_the_reader_with_limits_alone():

@@ -1,7 +1,6 @@
 """Models that are given where the tool is: poses as indentations, how they are drawn, learnt, stored and refused."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,10 +13,10 @@ from sim.deformation import Deformation, Deformer, Outcome
 from sim.effects import Elasticity, Held, NodalForce, ToolContact, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Loads, Pushed, Touching
+from sim.loads import Loads, Touching
 from sim.tools import Ball, Capsule
-from surrogate.data.cortex_patch import Patch, open_patch
-from surrogate.data.dataset import Dataset, read_dataset
+from surrogate.data.cortex_patch import open_patch
+from surrogate.data.dataset import read_dataset
 from surrogate.data.indentation import indented
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import TOOLS, draw
@@ -28,80 +27,14 @@ from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
 from surrogate.model.training_range import envelope_of
 from surrogate.training.learners import POSED
-from surrogate.training.train import Trained, learners_for, train
+from surrogate.training.train import learners_for, train
 
 BALL = tool_of("palpation")
 EFFECTS = (Elasticity(), Held(), ToolContact((BALL,)))
 SAID = {"shape": repr(BALL), "effects": repr(EFFECTS)}
 
 
-def domed(points: np.ndarray) -> np.ndarray:
-    """A cortex that is not flat: edges and corners are touched, too."""
-    out = points.copy()
-    out[:, 2] += 3e-3 * np.sin(90.0 * points[:, 0]) * np.cos(110.0 * points[:, 1])
-    return out
-
-
-def samples(patch: Patch) -> np.ndarray:
-    share = np.array([(i, j, 24 - i - j) for i in range(25) for j in range(25 - i)]) / 24.0
-    return np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)
-
-
-def test_a_pose_is_where_the_ball_is_deepest(box: Anatomy) -> None:
-    """Its point is on the surface, nowhere else is nearer to its middle, and depth is what is left of the radius."""
-    patch = open_patch(box)
-    bumpy = replace(patch, points=domed(patch.points))
-    loads = draw_poses("palpation", box, 60, 3)
-    pushed = indented(loads, BALL, bumpy)
-    cause = loads.of(Touching)
-    assert cause is not None
-    pose = cause.pose[:, 0]
-    middle = pose[:, :3, 3] + BALL.radius * pose[:, :3, 2]
-    depth = np.linalg.norm(pushed.force, axis=1)
-    assert (depth > 0.0).sum() > 50
-    surface = samples(bumpy)
-    nearest = np.array([np.linalg.norm(surface - one, axis=1).min() for one in middle])
-    distance = np.linalg.norm(pushed.point - middle, axis=1)
-    assert (distance <= nearest + 1e-12).all()
-    assert (nearest - distance).max() < 3e-5
-    outside = depth < BALL.radius
-    np.testing.assert_allclose(depth[outside], np.maximum(BALL.radius - distance, 0.0)[outside], atol=1e-12)
-    # The way in: from the middle to the point.
-    on = depth > 0.0
-    reached = middle[on] + (BALL.radius - depth[on])[:, None] * unit(pushed.force[on])
-    np.testing.assert_allclose(reached, pushed.point[on], atol=1e-9)
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-def test_how_a_ball_came_there_is_nothing(box: Anatomy) -> None:
-    """On a flat cortex an oblique way is a straight one to beside it; a ball sunk to its middle has the normal."""
-    patch = open_patch(box)
-    forces = draw("palpation", box, 40, 0).of(Pushed)
-    assert forces is not None
-    normal = patch.normal_near(forces.point)
-    motion = 3e-3 * unit(forces.force)
-    straight = np.einsum("bi,bi->b", motion, normal)[:, None] * normal
-    found = indented(Loads((poses_at(BALL, forces.point, normal, motion),)), BALL, patch)
-    np.testing.assert_allclose(found.point, forces.point + motion - straight, atol=1e-9)
-    np.testing.assert_allclose(found.force, straight, atol=1e-9)
-    sunk = indented(Loads((poses_at(BALL, forces.point, normal, BALL.radius * normal),)), BALL, patch)
-    np.testing.assert_allclose(sunk.force, BALL.radius * normal, atol=1e-9)
-
-
-def test_a_ball_in_the_air_or_beside_the_cortex_has_no_depth(box: Anatomy) -> None:
-    patch = open_patch(box)
-    point = patch.points[[3, 3]] + [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
-    away = poses_at(BALL, point, np.array([[0.0, 0.0, -1.0]] * 2), np.array([[0.0, 0.0, -1e-3]] * 2))
-    away.pose[0, 0, 2, 3] += 2e-3
-    found = indented(Loads((away,)), BALL, patch)
-    assert not found.force.any()
-    assert np.isfinite(found.point).all()
-
-
-def test_draws_are_each_of_their_own_number(box: Anatomy) -> None:
+def test_draws_are_each_of_their_own_number(box):
     few, many = draw_poses("palpation", box, 10, 4), draw_poses("palpation", box, 30, 4)
     some, all_of = few.of(Touching), many.of(Touching)
     assert some is not None
@@ -133,7 +66,7 @@ class PosedPretender:
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory, pretender: Deformer) -> Dataset:
+def data(tmp_path_factory, pretender):
     path = tmp_path_factory.mktemp("poses") / "data.h5"
     counted = simulate(path, PosedPretender(pretender), draw_poses("palpation", pretender.anatomy, 360, 0), SAID)
     assert (counted.loads, counted.units) == (360, 0)
@@ -141,13 +74,11 @@ def data(tmp_path_factory: pytest.TempPathFactory, pretender: Deformer) -> Datas
 
 
 @pytest.fixture(scope="module")
-def trained(data: Dataset) -> Trained:
+def trained(data):
     return train(data, ["gp"])
 
 
-def test_poses_train_where_there_is_no_force(
-    data: Dataset, trained: Trained, pretender: Deformer, box: Anatomy
-) -> None:
+def test_poses_train_where_there_is_no_force(data, trained, pretender, box):
     """Fresh poses, as drawn: learnt to a few per cent, and bounds hold about as often as they say."""
     assert learners_for(data) == POSED
     model, fresh = trained.models["gp"], draw_poses("palpation", box, 100, 77)
@@ -164,7 +95,7 @@ def test_poses_train_where_there_is_no_force(
     assert np.linalg.norm(model.deform(fresh, at=cortex).displacement - exact) < 0.2 * np.linalg.norm(exact)
 
 
-def test_deeper_or_elsewhere_than_in_training_is_said(trained: Trained, box: Anatomy) -> None:
+def test_deeper_or_elsewhere_than_in_training_is_said(trained, box):
     model, patch = trained.models["gp"], open_patch(box)
     middle = patch.points.mean(axis=0, keepdims=True)
     way = patch.normal_near(middle)
@@ -177,14 +108,14 @@ def test_deeper_or_elsewhere_than_in_training_is_said(trained: Trained, box: Ana
     assert model.deform(air).outcome == (Outcome.PREDICTED,)
 
 
-def test_a_stored_model_knows_its_tool(tmp_path: Path, trained: Trained, box: Anatomy) -> None:
+def test_a_stored_model_knows_its_tool(tmp_path, trained, box):
     save(tmp_path / "model.npz", trained.models)
     again, fresh = load(tmp_path / "model.npz", box)["gp"], draw_poses("palpation", box, 5, 1)
     assert again.tool == BALL
     np.testing.assert_array_equal(again.deform(fresh).displacement, trained.models["gp"].deform(fresh).displacement)
 
 
-def test_poses_nearest_to_the_same_corner_are_not_taken_for_the_same_poses() -> None:
+def test_poses_nearest_to_the_same_corner_are_not_taken_for_the_same_poses():
     """A data set to judge by is told apart from the training's own by what is not a vertex of the cortex."""
     template = read_anatomy(template_path())
     patch, corners = open_patch(template), template.mesh.nodes
@@ -197,7 +128,7 @@ def test_poses_nearest_to_the_same_corner_are_not_taken_for_the_same_poses() -> 
     assert known.repeats(same.point, corners)
 
 
-def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(trained: Trained, box: Anatomy) -> None:
+def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(trained, box):
     model = trained.models["gp"]
     with pytest.raises(InputError, match="causes Pushed, but this model was trained on the poses of a ball"):
         model.deform(draw("palpation", box, 2, 0))
@@ -217,7 +148,7 @@ def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(train
     assert "here is none, but ToolContact" in str(refusal(forces, EFFECTS))
 
 
-def test_what_poses_cannot_train_is_refused(data: Dataset, box: Anatomy) -> None:
+def test_what_poses_cannot_train_is_refused(data, box):
     with pytest.raises(
         InputError, match="poses, of which linear, series cannot be had: choose from contact, contact-gp, gp"
     ):
@@ -230,9 +161,7 @@ def test_what_poses_cannot_train_is_refused(data: Dataset, box: Anatomy) -> None
         train(replace(data, provenance={}), ["gp"])
 
 
-def test_the_command_makes_poses_that_finite_elements_answer(
-    tmp_path: Path, box: Anatomy, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_makes_poses_that_finite_elements_answer(tmp_path, box, capsys):
     mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
     write_anatomy(mesh, box)
     wanted = ["simulate", str(mesh), "--out", str(out), "--count", "3", "--json"]
@@ -255,10 +184,3 @@ def test_the_command_makes_poses_that_finite_elements_answer(
     shaft = data.loads.of(Touching).pose[:, 0, :3, 2]  # pyright: ignore[reportOptionalMemberAccess]
     assert (np.einsum("bi,bi->b", force, shaft) < 0.0).all()
     assert NodalForce not in {type(effect) for effect in fem.effects}
-
-
-def test_a_ball_half_in_the_tissue_presses_inward(box: Anatomy) -> None:
-    pose = np.eye(4)
-    pose[:3, 3] = [0.0, 0.0, -BALL.radius]  # its middle is on the box's top
-    pushed = indented(Loads((Touching(pose[None, None]),)), BALL, open_patch(box))
-    np.testing.assert_allclose(pushed.force[0], [0.0, 0.0, -BALL.radius], atol=1e-9)

@@ -6,6 +6,7 @@ OpenCV: `cv2.FileStorage` with the names of its calibration sample. ROS: the cam
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, field
 
 import cv2
@@ -150,3 +151,154 @@ def _matrix(name: str, values: np.ndarray) -> list[str]:
     rows, columns = values.shape
     numbers = ", ".join(repr(value) for value in values.ravel().tolist())
     return [f"{name}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{numbers}]"]
+
+
+# Characters: a calibration has some thousand.
+LONGEST_TEXT = 64 * 1024
+# Brackets in brackets, and dashes in a line: OpenCV's parser calls itself for each, and a calibration needs two.
+DEEPEST = 4
+# Of models that ROS names: how many coefficients they have at least.
+MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
+# Coefficients that OpenCV takes; those after the eighth are of thin prisms and tilted sensors.
+COUNTS = (4, 5, 8, 12, 14)
+KEYS = (
+    "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model", "distortion_coefficients",
+    "rectification_matrix", "projection_matrix", "fisheye_model", READOUT,
+)  # fmt: skip
+"""Keys of a calibration that are read."""
+BLOCK_LIST = re.compile(r"^(( *)data: *)\n((?:\2 *- *[-+.\w]+ *\n)+)", re.MULTILINE)
+ITEM = re.compile(r"^ *- *([-+.\w]+)", re.MULTILINE)
+"""A list of numbers, one on a line, and one of them."""
+NAME_LINE = re.compile(r"^(camera_name:[ \t]+)([^\s\"'\[{][^\n\"#]*?)[ \t]*$", re.MULTILINE)
+OTHER_LINE = re.compile(rf"^(?!(?:{'|'.join(KEYS)})\b)\w+:[ \t]+[^\s\[{{|>&!][^\n]*\n", re.MULTILINE)
+"""A name without quotes, and a value on one line whose key is not read."""
+WANTED = (
+    "Give YAML with image_width, image_height, camera_matrix and distortion_coefficients, as OpenCV or ROS writes it."
+)
+
+
+def parsed(text: str) -> Calibration:
+    """The calibration in a YAML text of `cv2.FileStorage`, or of ROS's camera_info.
+
+    Four coefficients (k1 k2 p1 p2) are taken as five. More than eight are taken if those after the eighth are 0.
+
+    Raises
+    ------
+    ValueError
+        A text that is too long or no such YAML. A part that is missing, is given twice, has another shape or is not
+        finite. A lens or a model of distortion that this program does not have. What `Calibration` refuses.
+    """
+    storage = _opened(text)
+    root = storage.root()
+    keys = [] if root.empty() or not root.isMap() else list(root.keys())
+    twice = sorted({key for key in keys if keys.count(key) > 1})
+    if twice:
+        raise ValueError(f"{twice[0][:40]} is given twice: leave one out.")
+    missing = [key for key in ("image_width", "image_height", "camera_matrix") if key not in keys]
+    if missing:
+        raise ValueError(f"{missing[0]} is missing. {WANTED}")
+    if "fisheye_model" in keys and not (root.getNode("fisheye_model").isInt() and not _int(root, "fisheye_model")):
+        raise ValueError("the camera was calibrated as a fisheye: calibrate it without CALIB_FISHEYE.")
+    K = _read_matrix(root, "camera_matrix", (3, 3))
+    if not K.any():
+        raise ValueError("camera_matrix is all 0, as of a camera that is not calibrated: calibrate it first.")
+    if K[0, 1] or K[1, 0] or not np.array_equal(K[2], [0.0, 0.0, 1.0]):
+        raise ValueError("camera_matrix must be (fx 0 cx; 0 fy cy; 0 0 1): calibrate without skew.")
+    for key, shape in (("rectification_matrix", (3, 3)), ("projection_matrix", (3, 4))):
+        if key in keys:
+            _read_matrix(root, key, shape)  # of rectified pictures, which are not made here
+    (fx, _, cx), (_, fy, cy) = K[:2].tolist()
+    width, height = (_int(root, key) for key in ("image_width", "image_height"))
+    lens, name = _lens(root, keys), _name(root, keys)
+    return Calibration((fx, fy), (cx, cy), width, height, lens, name, _readout(root, keys))
+
+
+def _opened(text: str) -> cv2.FileStorage:
+    """The text as OpenCV reads it."""
+    if len(text) > LONGEST_TEXT:
+        raise ValueError(f"it has more than {LONGEST_TEXT} characters, and a calibration some thousand. {WANTED}")
+    text = text.removeprefix("\ufeff").replace("\r\n", "\n")
+    if not text.replace("\n", "").replace("\t", "").isprintable() or text.lstrip().startswith("<"):
+        raise ValueError(f"it is no YAML. {WANTED}")
+    deep = np.cumsum([(sign in "[{") - (sign in "]}") for sign in text])
+    if deep.max(initial=0) > DEEPEST or re.search(r"^[ \t]*(?:[^\n]*:)?(?:[ \t]*-[ \t]){2}", text, re.MULTILINE):
+        raise ValueError(f"its lists are nested too deeply. {WANTED}")
+    text = _needed(text)
+    if not text.startswith("%YAML"):
+        text = "%YAML:1.0\n---\n" + re.sub(r"\A\s*---[ \t]*\n", "", text)
+    try:
+        return cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    except (cv2.error, SystemError) as error:  # the second is how a failing constructor shows
+        raise ValueError(f"it is no YAML that OpenCV reads: set lists in brackets, or indent them. {WANTED}") from error
+
+
+def _needed(text: str) -> str:
+    """The text as OpenCV's parser takes it: lists in brackets, names in quotes, and no key that is not read."""
+    text = BLOCK_LIST.sub(lambda found: f"{found[1]}[{', '.join(ITEM.findall(found[3]))}]\n", text)
+    return OTHER_LINE.sub("", NAME_LINE.sub(r'\1"\2"', text))
+
+
+def _int(root: cv2.FileNode, key: str) -> int:
+    node = root.getNode(key)
+    if not node.isInt():
+        raise ValueError(f"{key} must be a whole number. {WANTED}")
+    return int(node.real())
+
+
+def _read_matrix(root: cv2.FileNode, key: str, shape: tuple[int, int] | None = None) -> np.ndarray:
+    """A matrix of finite numbers; nothing of the size that it says it has is made room for."""
+    node = root.getNode(key)
+    if not node.isMap() or not {"rows", "cols", "data"} <= set(node.keys()):
+        raise ValueError(f"{key} must have rows, cols and data. {WANTED}")
+    rows, columns, data = _int(node, "rows"), _int(node, "cols"), node.getNode("data")
+    found = [data.at(index) for index in range(data.size())] if data.isSeq() else []
+    wanted = "" if shape is None else f", which must be {shape[0]} x {shape[1]}"
+    if rows * columns != len(found) or rows < 0 or (shape is not None and (rows, columns) != shape):
+        raise ValueError(f"{key} says {rows} x {columns}{wanted}, and has {len(found)} numbers. {WANTED}")
+    if not all(each.isReal() or each.isInt() for each in found):
+        raise ValueError(f"{key} holds what is no number. {WANTED}")
+    values = np.array([each.real() for each in found], np.float64).reshape(rows, columns)
+    if not np.isfinite(values).all():
+        raise ValueError(f"{key} holds a number that is not finite: calibrate again.")
+    return values
+
+
+def _lens(root: cv2.FileNode, keys: list[str]) -> Lens:
+    """How the lens distorts."""
+    if "distortion_coefficients" not in keys:
+        raise ValueError(f"distortion_coefficients is missing; five times 0 for no distortion. {WANTED}")
+    values = _read_matrix(root, "distortion_coefficients")
+    count = values.size
+    if min(values.shape) != 1 or count not in COUNTS:
+        raise ValueError(f"distortion_coefficients has {count} numbers in {values.shape}: give a row of 4, 5 or 8.")
+    if "distortion_model" in keys:
+        node = root.getNode("distortion_model")
+        model = node.string() if node.isString() else ""
+        if model not in MODELS:
+            raise ValueError(f"the distortion_model {model[:40]!r} is not known: choose one of {', '.join(MODELS)}.")
+        if count < MODELS[model] or (model == "plumb_bob" and count != 5):
+            raise ValueError(f"the distortion_model {model} has {MODELS[model]} coefficients, not {count}: give those.")
+    numbers = values.ravel().tolist()
+    if any(numbers[8:]):
+        raise ValueError("a thin prism or a tilted sensor is not drawn: calibrate with at most 8 coefficients.")
+    return Lens(*numbers[:8])
+
+
+def _readout(root: cv2.FileNode, keys: list[str]) -> float:
+    """The readout of a rolling shutter [s]; 0 where the text has none."""
+    if READOUT not in keys:
+        return 0.0
+    node = root.getNode(READOUT)
+    if not (node.isReal() or node.isInt()):
+        raise ValueError(f"{READOUT} must be a number of seconds, such as 0.02.")
+    return float(node.real())
+
+
+def _name(root: cv2.FileNode, keys: list[str]) -> str:
+    """The camera's name."""
+    if "camera_name" not in keys:
+        return ""
+    node = root.getNode("camera_name")
+    if not node.isString():
+        raise ValueError("camera_name must be text: put it into quotes.")
+    return node.string()

@@ -1,13 +1,18 @@
-"""A camera: where a world point lands in the picture.
+"""Cameras: where a world point lands in the picture, pairs of them, and those with a rolling shutter.
 
 OpenCV's convention throughout: camera frame x right, y down, z forward; pixel (u, v) = (column, row) with whole numbers
 at pixel centres, so that the picture spans -0.5 .. width - 0.5. World points are in metres (RAS in this project).
+
+The rows of a rolling shutter are taken one after the other: a camera that moves is elsewhere in each. A picture's time
+is that of its middle row, from which times are counted.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -226,3 +231,71 @@ def project_cv2(camera: Camera, points: np.ndarray) -> np.ndarray:
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 1, 3)
     pixels, _ = cv2.projectPoints(points, rotation, camera.T_camera_world[:3, 3], camera.K, camera.distortion)
     return pixels.reshape(-1, 2)
+
+
+BASELINE = 24e-3
+"""Between the two ways of light of an operating microscope [m]."""
+
+
+def stereo_pair(
+    camera: Camera, baseline: float = BASELINE, working_distance: float | None = None
+) -> tuple[Camera, Camera]:
+    """The left and the right camera about one in the middle, `baseline` [m] apart along its rows.
+
+    Parameters
+    ----------
+    working_distance
+        How far ahead of the middle the two axes meet [m]; None: they are parallel, and rows of both pictures show the
+        same.
+
+    Raises
+    ------
+    ValueError
+        A baseline or a distance that is not a number above 0.
+    """
+    if not 0.0 < baseline < np.inf or (working_distance is not None and not 0.0 < working_distance < np.inf):
+        raise ValueError(f"a baseline of {baseline} m, a distance of {working_distance} m: give numbers above 0.")
+    inwards = 0.0 if working_distance is None else float(np.degrees(np.arctan2(0.5 * baseline, working_distance)))
+    half = np.array([0.5 * baseline, 0.0, 0.0])
+    return camera.moved(-half).perturbed(-inwards), camera.moved(half).perturbed(inwards)
+
+
+# What is seen moves by so many pixels at most while a band of rows is taken: then no row is off by half as much.
+STEP = 0.4
+# Moments of a picture in which motion is looked at; a band's fewest rows; steps to the row in which a point is seen.
+MOMENTS, FEWEST, STEPS = 33, 4, 6
+
+
+def row_time(row: np.ndarray | float, height: int, readout: float) -> np.ndarray | float:
+    """When a row of a picture of so many is taken [s]; rows beyond the picture as its first or last one."""
+    return readout * (np.clip(np.asarray(row) / max(height - 1, 1), 0.0, 1.0) - 0.5)
+
+
+def row_bands(camera_at: Callable[[float], Camera], readout: float, points: np.ndarray) -> list[tuple[slice, Camera]]:
+    """Bands of rows from top to bottom, each with the camera at its time, of these rows alone.
+
+    There are so many that points (n, 3) [m] move by at most `STEP` pixels in each.
+    """
+    middle = camera_at(0.0)
+    moments = readout * np.linspace(-0.5, 0.5, MOMENTS)
+    pixels = np.stack([camera_at(float(moment)).project(points)[0] for moment in moments])
+    fastest = float(np.nan_to_num(np.linalg.norm(np.diff(pixels, axis=0), axis=2)).max()) * (MOMENTS - 1)
+    count = int(np.clip(np.ceil(fastest / STEP), 1, max(middle.height // FEWEST, 1)))
+    edges = np.linspace(0, middle.height, count + 1).round().astype(int).tolist()
+    bands = []
+    for top, low in pairwise(edges):
+        camera = camera_at(float(row_time(0.5 * (top + low - 1), middle.height, readout)))
+        bands.append((slice(top, low), camera.cropped(slice(top, low), slice(0, middle.width))))
+    return bands
+
+
+def time_of_point(camera_at: Callable[[float], Camera], readout: float, point: np.ndarray) -> float:
+    """When the row is taken in which a point (3,) [m] is seen [s]; 0 where it has no pixel."""
+    time = 0.0
+    for _ in range(STEPS):
+        camera = camera_at(time)
+        (pixel,), _ = camera.project(point[None])
+        if not np.isfinite(pixel).all():
+            return 0.0
+        time = float(row_time(float(pixel[1]), camera.height, readout))
+    return time

@@ -15,6 +15,7 @@ from ..rendering.parallel import load
 from ..rendering.rasteriser import Seen, seen
 from ..rendering.renderer import Picture
 from . import distances, window
+from .distances import lines_of
 from .gauge import draw_line, write_gauge
 from .hud import FINE, FONT, HEAD, NARROW, ROW, Below, folded, lay, millimetres
 from .legend import Entry, legend, place_sheet
@@ -22,7 +23,6 @@ from .marks import BEFORE, DOTTED, NO_COVER, NO_MARKS, NO_WORDS, Cover, Marks, W
 from .measured import Measure
 from .outlines import blank, box_around, dash, ink_of, joined, key_of, outlines, pieces
 from .places import CLEAR, PAD
-from .rings import lines_of
 from .styles import STYLES, Opening, Style
 from .window import DARK, FRONT, SHUT, Lines, Roles, overlaid
 
@@ -127,7 +127,7 @@ def composite(
         "contour": the outline. "window": besides, the ground is dimmed round the outline and the surface shows through,
         shaded, and darker the deeper it lies. "fill": besides the outline, a flat tint. "depth": one that is the
         stronger the nearer the surface lies to the ground, with its scale. "rings": lines on the ground along which it
-        is equally far from the surface (`rings.py`). "cut": an inset (`cut.py`). "none": nothing but a doubt.
+        is equally far from the surface (`distances.py`). "cut": an inset (`cut.py`). "none": nothing but a doubt.
     cover, marks, words
         What lies over the surface, and what is drawn and written besides its outline.
 

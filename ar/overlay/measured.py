@@ -12,13 +12,12 @@ from ..optics.camera import Camera
 from ..rendering.layer import Layer
 from ..rendering.renderer import Picture
 from .cut import ENDS, Plane, captioned, plane_through, profile, section
-from .distances import distance_of_seen, tree_of
+from .distances import RING, RINGS, distance_of_seen, draw_rings, tree_of
 from .gauge import Gauge
 from .hud import FINE, HEAD, Below, bound_words, folded, haloed, lay
 from .legend import SMALL, depth_scale, paste, place_sheet
 from .outlines import OPAQUE, dash, ink_of, key_of
 from .places import PAD, free_place
-from .rings import RING, RINGS, draw_rings
 from .styles import Style
 from .window import FRONT, Roles
 

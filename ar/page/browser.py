@@ -15,14 +15,12 @@ import cv2
 import numpy as np
 import viser
 
-from .aside import BACK, KEYS, LIVE_KEYS, ON, RECORD, SPACE, aside
-from .control_lock import Crowd
+from .control_lock import Crowd, Inputs, noted
+from .elements import ASIDE_SPOT, BACK, KEYS, LIVE_KEYS, ON, PICTURE, RECORD, SAID, SPACE, aside, coded, sight, unparted
 from .guard import LIMITS, Limits, bracketed, check_address, open_server
-from .inputs import Inputs, noted
 from .parts import Body, Control, Deed, Fold, Note, Playback, Sign, Viewpoint
 from .recording import Recorder
 from .scene import add_body, dress
-from .sight import ASIDE, PICTURE, SAID, coded, sight, unparted
 from .style import PAGE, STATUS, style
 
 # Behind all that is added later.
@@ -222,7 +220,7 @@ class Browser:
             self.drawn, self.due = None, clock.monotonic() + 1.0 / self.limits.asides
         colour, words = drawn()
         self.sent += 1
-        self.beside.content = sight(self.sent, coded(colour), words, ASIDE)
+        self.beside.content = sight(self.sent, coded(colour), words, ASIDE_SPOT)
 
     def move(self, name: str, vertices: np.ndarray, triangles: np.ndarray | None = None) -> None:
         """Put the vertices (V, 3) [m] of a body in the 3-D view elsewhere; triangles (F, 3) where they are others."""

@@ -7,9 +7,8 @@ leaves the rules aside and shows picture and controls in one docked panel.
 
 from __future__ import annotations
 
-from .aside import ASIDE, HELP, TABS
 from .client_page import WITHOUT
-from .sight import HISTORY, PICTURE, SAID, SLICES
+from .elements import ASIDE, HELP, HISTORY, PICTURE, SAID, SLICES, TABS
 
 PAGE, STATUS = "sulcus", "sulcus-status"
 """Names of the elements that hold the words under the picture, and the line over it."""

@@ -101,10 +101,7 @@ class Layer:
         if (self.solid is None) != (self.rest is None):
             raise ValueError(f"layer {self.name!r} needs both a solid texture and its rest points, or neither.")
         colour = np.asarray(self.colour, np.float32)
-        for what, array, shapes in (
-            ("colour", colour, ((3,), vertices.shape)),
-            ("rest", self.rest, (vertices.shape,)),
-        ):
+        for what, array, shapes in (("colour", colour, ((3,), vertices.shape)), ("rest", self.rest, (vertices.shape,))):
             if array is not None and np.shape(array) not in shapes:
                 raise ValueError(f"layer {self.name!r}: {what} has shape {np.shape(array)}, not one of {shapes}.")
         object.__setattr__(self, "vertices", vertices)

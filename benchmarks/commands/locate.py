@@ -161,8 +161,7 @@ def finer_of(args: argparse.Namespace) -> Anatomy:
 
 def locator_of(args: argparse.Namespace, body: Anatomy) -> Locator:
     """Read the locator that is given, or the one that the folder keeps, or make a new one."""
-    from surrogate.locating.locator_files import load_locator, save_locator
-    from surrogate.locating.setup import make_locator
+    from surrogate.locating.locator_store import load_locator, make_locator, save_locator
 
     path = args.locator or (args.folder and args.folder / f"{body.digest}.locator.npz")
     if args.locator or (path and path.is_file()):

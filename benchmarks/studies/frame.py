@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from ar.page.browser import Browser
+from ar.page.elements import coded
 from ar.page.parts import Body, Playback, Viewpoint
-from ar.page.sight import coded
 from ar.rendering.renderer import Renderer
 from scenes.page.demo import pictured
 from scenes.play.player import Player

@@ -18,9 +18,8 @@ from scipy.stats import chi2, qmc
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
 from ar.tracking.drawn import drawn
-from ar.tracking.pose import Pose, Verdict
+from ar.tracking.pose import Pose, Tracker, Verdict
 from ar.tracking.targets import MARKER, TIP, tool_cube
-from ar.tracking.track import Tracker
 
 # The camera of the published trials: pixels, focal length [pixel], how far its targets are [m], and a usual lens.
 WIDTH, HEIGHT, FOCAL, AWAY = 1280, 960, 1400.0, 0.4

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.board_views import View
-from ar.tracking.intrinsics import covariance_of
+from ar.tracking.intrinsics import View, covariance_of
 from ar.tracking.targets import Corners, Target, calibration_board, seen_from_front
 
 CORNER = 0.1

@@ -19,8 +19,7 @@ from ..options.outputs import add_force, claimed
 from ..options.shared_options import add_json, json_line
 
 if TYPE_CHECKING:
-    from ar.tracking.hand_eye import HandEye
-    from ar.tracking.pivot import Pivot
+    from ar.tracking.tracker_calibration import HandEye, Pivot
 
 Found = TypeVar("Found", "Pivot", "HandEye")
 MOST_VIEWS = 40
@@ -80,8 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _camera(args: argparse.Namespace) -> int:
     """The camera, from pictures of the board."""
-    from ar.tracking.board_views import chosen
-    from ar.tracking.intrinsics import calibrated
+    from ar.tracking.intrinsics import calibrated, chosen
     from ar.tracking.targets import calibration_board
 
     from ..tracked.board_pictures import seen_views
@@ -148,7 +146,7 @@ def _size(text: str) -> tuple[int, int]:
 
 def _tip(args: argparse.Namespace) -> int:
     """A tool's tip, from its poses while it pivots."""
-    from ar.tracking.pivot import pivoted
+    from ar.tracking.tracker_calibration import pivoted
 
     from ..tracked.pose_file import read_numbered_poses
 
@@ -208,7 +206,7 @@ def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray
 
 def _bodies(args: argparse.Namespace) -> int:
     """How one body lies in another, from poses of both."""
-    from ar.tracking.hand_eye import hand_eye
+    from ar.tracking.tracker_calibration import hand_eye
 
     from ..tracked.pose_file import read_numbered_poses
 

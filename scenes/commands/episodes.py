@@ -192,8 +192,8 @@ def _progress(out: Path, there: Tally, total: int, stop_if_asked: Callable[[], N
 
 
 def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, where: str, card: bool) -> None:
+    from ..episodes.bodies import models_of, said_of_weak, weak_as_json
     from ..episodes.run_folder import failed, failure_of
-    from ..episodes.weak_bodies import models_of, said_of_weak, weak_as_json
 
     count, models = tally.failed + tally.lost, models_of(out)
     if args.json:

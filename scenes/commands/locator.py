@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     """Make the locator. 0: done."""
     from sim.bodies.meshfile import read_anatomy
     from sim.runtime.device import find_device
-    from surrogate.locating.locator_files import locator_path, save_locator
+    from surrogate.locating.locator_store import locator_path, save_locator
     from surrogate.locating.regions import regions_words
 
     path = claimed(args.out or locator_path(args.anatomy), ".npz", args.force, [args.anatomy])
@@ -72,7 +72,7 @@ def made(path: Path, anatomy: Anatomy, seed: int, device: str, regions: tuple[Re
     from tqdm import tqdm
 
     from surrogate.locating.causes import Causes
-    from surrogate.locating.setup import make_locator
+    from surrogate.locating.locator_store import make_locator
 
     print(f"sulcus: {path} takes minutes to make; if it is stopped, the same command goes on", file=sys.stderr)
     with tqdm(file=sys.stderr) as bar:
@@ -92,7 +92,7 @@ def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) 
     InputError
         As `load_locator`; a small one; one that knows other regions than those that are asked for.
     """
-    from surrogate.locating.locator_files import load_locator, locator_path, save_locator
+    from surrogate.locating.locator_store import load_locator, locator_path, save_locator
     from surrogate.locating.regions import regions_words
 
     path = args.locator or locator_path(args.anatomy)

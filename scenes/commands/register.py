@@ -15,8 +15,7 @@ from ..options.outputs import add_force, claimed
 from ..options.shared_options import add_json, json_line
 
 if TYPE_CHECKING:
-    from ar.tracking.pair_residuals import PairResiduals
-    from ar.tracking.registration import Nearest, Registration
+    from ar.tracking.registration import Nearest, PairResiduals, Registration
     from sim.anatomy import Anatomy
 
 
@@ -45,8 +44,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Files that cannot be read or written, a surface without anatomy, or points that determine no registration.
     """
-    from ar.tracking.pair_residuals import pair_residuals
-    from ar.tracking.registration import refined, registered
+    from ar.tracking.registration import pair_residuals, refined, registered
     from sim import read_anatomy
     from surrogate.locating.observed_files import read_columns
 

@@ -39,9 +39,9 @@ def run(args: argparse.Namespace) -> int:
 
     from sim.errors import InputError
 
+    from ..episodes.bodies import models_of, said_of_weak, weak_as_json
     from ..episodes.reading.again import validated
     from ..episodes.reading.windows import episode_paths
-    from ..episodes.weak_bodies import models_of, said_of_weak, weak_as_json
 
     if args.workers < 1:
         raise InputError(f"--workers {args.workers}: at least one process must look.")

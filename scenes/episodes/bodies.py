@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,8 @@ from surrogate.data.simulate import OF_ITS_MAKING, simulate
 from surrogate.data.tool_loads import draw as draw_loads
 from surrogate.model.applicability import refusal
 from surrogate.model.learned import Learned
-from surrogate.model.store import load, save
+from surrogate.model.left_out import OffBy
+from surrogate.model.store import load, save, stated_errors
 from surrogate.training.expansion import Expansion
 from surrogate.training.train import train
 
@@ -34,7 +36,7 @@ from ..script.shipped_files import template_path
 from .draws import drawn, random_of
 from .half_made import DATA, TABLE, forget, gone_on
 from .plan import NO_LEARNER, Bodies, Plan, digest_beside, fields_of, ratio_of
-from .run_folder import versions_here
+from .run_folder import BODIES, versions_here
 
 # Drawn tumours may reach out of the brain, or an opening have too few nodes: so many are tried.
 TRIES = 6
@@ -221,3 +223,46 @@ def _train(
 def _undated(model: Learned) -> Learned:
     """A model that says of its training nothing but what is the same whenever it is trained."""
     return replace(model, training={key: text for key, text in model.training.items() if key not in OF_ITS_MAKING})
+
+
+MOST_SAID = 10
+"""Bodies that are named one by one."""
+
+
+def models_of(folder: Path) -> dict[int, OffBy]:
+    """How far off the models of a folder's bodies are, by number; bodies without a model of their own are left out."""
+    found = {}
+    for path in sorted((folder / BODIES).glob("[0-9]*")):
+        with suppress(InputError, ValueError):  # what has no model, or none that can be read, plays nothing
+            found[int(path.name)] = min(stated_errors(model_path(path / ANATOMY)).values(), key=lambda one: one.bound)
+    return found
+
+
+def weak_of(models: Mapping[int, OffBy]) -> dict[int, OffBy]:
+    """Those that are weak, the worst first."""
+    return dict(sorted(((number, one) for number, one in models.items() if one.weak), key=lambda each: -each[1].bound))
+
+
+def said_of_weak(models: Mapping[int, OffBy]) -> list[str]:
+    """Which models are weak, and by how much, in sentences; none where none is."""
+    weak = weak_of(models)
+    if not weak:
+        return []
+    return [
+        f"{len(weak)} of {len(models)} bodies with a model have a weak one, by loads on cortex that it was not trained "
+        "on. More `bodies.learner.loads`, or another learner, make better ones: in a new plan and folder.",
+        *(f"- body {number}: {one}" for number, one in list(weak.items())[:MOST_SAID]),
+        *([f"- and {len(weak) - MOST_SAID} more"] if len(weak) > MOST_SAID else []),
+    ]
+
+
+def weak_as_json(models: Mapping[int, OffBy]) -> list[dict[str, float | int | None]]:
+    """The weak ones as numbers."""
+    return [
+        {
+            "body": number,
+            "bound_mm": 1e3 * one.bound,
+            "mean_share_of_motion": None if one.left_out is None else one.left_out.mean,
+        }
+        for number, one in weak_of(models).items()
+    ]

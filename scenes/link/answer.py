@@ -10,10 +10,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from ar.overlay.gauge import Gauge
-from ar.tracking.pose import Pose
+from ar.tracking.pose import Pose, Tracked
 from ar.tracking.pose_stream import LONGEST, PoseStream
 from ar.tracking.registration import Registration
-from ar.tracking.track import Tracked
 
 from ..script.uncertainty import LEVEL
 from ..tracked.follower import LIMIT, UNCHECKED, UNKNOWN, Known, State, tip_covariance, wide_words

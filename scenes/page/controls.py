@@ -9,7 +9,7 @@ import numpy as np
 
 from ar.overlay.hud import bearings
 from ar.overlay.styles import STYLES, Style
-from ar.page.aside import STYLE
+from ar.page.elements import STYLE
 from ar.page.parts import Choice, Fold, Note, Slider, Toggle
 from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, Resection, Slide, remember
 

@@ -23,7 +23,7 @@ from sim.resected_fem import Operated, finite_elements
 from sim.runtime.device import find_device
 from surrogate.data.answer_rows import first_stated
 from surrogate.locating.locator import Locator
-from surrogate.locating.locator_files import load_locator, locator_path
+from surrogate.locating.locator_store import load_locator, locator_path
 from surrogate.locating.regions import differing
 from surrogate.model.applicability import refusal
 from surrogate.model.guarded import Guarded, off_by

@@ -8,8 +8,7 @@ from ar.optics.camera import Camera
 from ar.overlay.composite import BROKEN, DOUBTFUL, HIDDEN, ground_lines
 from ar.overlay.gauge import GAUGE, gauge_words
 from ar.overlay.hud import FINE, NARROW, WHITE, folded, millimetres
-from ar.overlay.outlines import ink_of
-from ar.overlay.refind import changed_share, found_at, inked_share, of_ink, outline_gap, stands
+from ar.overlay.outlines import changed_share, found_at, ink_of, inked_share, of_ink, outline_gap, stands
 from ar.overlay.styles import NOTICED, WHOLE
 from ar.rendering.layer import Layer
 from ar.rendering.raycast import raycast

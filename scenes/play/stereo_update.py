@@ -10,8 +10,7 @@ import numpy as np
 
 from ar.optics.camera import Camera
 from ar.overlay.outlines import silhouette
-from ar.stereo.disparity import Cloud, StereoView, cloud, viewed
-from ar.stereo.point_flow import followed, supported
+from ar.stereo.disparity import Cloud, StereoView, cloud, followed, supported, viewed
 from ar.stereo.rectified import rectified
 from sim.errors import InputError
 from sim.geometry.closest_point import closest

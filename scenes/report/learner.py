@@ -10,8 +10,7 @@ from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
 from surrogate.data.splits import Split, leave_sectors_out
 from surrogate.evaluation.coverage import TENTHS, coverage
-from surrogate.evaluation.score import bare_microseconds, single_seconds
-from surrogate.evaluation.solve_counts import SolveCounts
+from surrogate.evaluation.score import SolveCounts, bare_microseconds, single_seconds
 from surrogate.training.train import train
 
 from ..analysis.measurement import timed

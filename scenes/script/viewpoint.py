@@ -8,8 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ar.optics.calibration import Calibration
-from ar.optics.camera import Camera, look_at
-from ar.optics.stereo_pair import stereo_pair
+from ar.optics.camera import Camera, look_at, stereo_pair
 from sim.errors import InputError
 
 from .camera_paths import CameraPath

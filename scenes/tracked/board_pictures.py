@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ar.tracking.board_views import View, find_board
+from ar.tracking.intrinsics import View, find_board
 from ar.tracking.pictures import GIVE, pictures_of
 from ar.tracking.targets import Detector, Target
 from sim.errors import InputError

@@ -8,8 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ar.optics.calibration import Calibration, opencv_text, ros_text
-from ar.optics.calibration_text import LONGEST_TEXT, WANTED, parsed
+from ar.optics.calibration import LONGEST_TEXT, WANTED, Calibration, opencv_text, parsed, ros_text
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import path_of, read_as
@@ -30,7 +29,7 @@ def read_calibration(path: str | Path) -> Calibration:
     Raises
     ------
     InputError
-        No such file, one that is too large or of another kind, or what `ar.optics.calibration_text.parsed` refuses.
+        No such file, one that is too large or of another kind, or what `ar.optics.calibration.parsed` refuses.
     """
     path = path_of(path)
     with read_as(path, "a camera's calibration", WANTED):

@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from ar.optics.calibration import Calibration
+from ar.tracking.drawn import read_stamp
 from ar.tracking.pictures import GIVE, Named, film_of
-from ar.tracking.pose import Pose, Verdict
+from ar.tracking.pose import Pose, Tracked, Tracker, Verdict
 from ar.tracking.pose_stream import Clock, PoseStream, clock_by_motion
 from ar.tracking.rigid import cross_matrices, turn_vectors
-from ar.tracking.stamp import read_stamp
 from ar.tracking.targets import all_targets, patient_reference, tool_cube
-from ar.tracking.track import Tracked, Tracker
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 

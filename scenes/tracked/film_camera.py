@@ -10,8 +10,8 @@ import numpy as np
 from ar.optics.calibration import Calibration
 from ar.tracking.focal_fit import focal_fit
 from ar.tracking.pictures import GIVE, film_of
+from ar.tracking.pose import demand_picture
 from ar.tracking.targets import Detector, all_targets
-from ar.tracking.track import demand_picture
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 

@@ -11,15 +11,13 @@ from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from ar.optics.calibration import Calibration
-from ar.optics.camera import Camera
+from ar.optics.camera import Camera, row_bands, time_of_point
 from ar.optics.lens import Lens
-from ar.optics.rolling_shutter import row_bands, time_of_point
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Renderer
-from ar.tracking.drawn import drawn
+from ar.tracking.drawn import drawn, stamped
 from ar.tracking.registration import Registration
 from ar.tracking.rigid import moved_about
-from ar.tracking.stamp import stamped
 from ar.tracking.targets import Target, patient_reference, tool_cube, window_round
 from sim.errors import InputError
 from sim.tools import BuiltIn

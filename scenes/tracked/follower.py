@@ -13,10 +13,9 @@ from scipy.stats import chi2
 from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera
 from ar.tracking.intrinsics import calibration_error
-from ar.tracking.pose import Pose
+from ar.tracking.pose import Pose, Tracked, Tracker
 from ar.tracking.registration import Registration
 from ar.tracking.targets import patient_reference, tool_cube
-from ar.tracking.track import Tracked, Tracker
 
 from ..script.uncertainty import DEVIATIONS, LEVEL
 from .agreement import Agreement

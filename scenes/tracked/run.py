@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ar.tracking.drawn import read_stamp
 from ar.tracking.pictures import Named
 from ar.tracking.pose_stream import DAY
-from ar.tracking.stamp import read_stamp
 from sim.runtime.atomic_files import written_whole
 
 from .follower import Follower, Known, State

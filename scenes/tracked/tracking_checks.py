@@ -10,8 +10,7 @@ import numpy as np
 
 from ar.overlay.composite import HIDDEN, WARNING, doubt_lines
 from ar.overlay.hud import FINE, WHITE
-from ar.overlay.outlines import ink_of, silhouette
-from ar.overlay.refind import of_ink, outline_gap, stands
+from ar.overlay.outlines import ink_of, of_ink, outline_gap, silhouette, stands
 from ar.overlay.styles import Style
 
 from ..play.picture_checks import SOFT

@@ -84,9 +84,7 @@ MEANINGS = {
         "what each tool exerts on the body",
     ),
     "unit/displacement": Meaning(
-        "m/N",
-        f"node and axis of the force, as in unit/node; {VERTEX}; {RAS}",
-        "response per newton",
+        "m/N", f"node and axis of the force, as in unit/node; {VERTEX}; {RAS}", "response per newton"
     ),
     "unit/node": Meaning(
         "1", "row of the responses", "the vertex that the unit force acts on; rows 3 k, 3 k + 1, 3 k + 2 along x, y, z"

@@ -359,11 +359,7 @@ def read_outcomes(file: h5py.File, group: str) -> tuple[Outcome, ...]:
 
 
 def stored(
-    file: h5py.File,
-    name: str,
-    kinds: str,
-    shape: tuple[int | None, ...] | None = None,
-    largest: int = LARGEST_ARRAY,
+    file: h5py.File, name: str, kinds: str, shape: tuple[int | None, ...] | None = None, largest: int = LARGEST_ARRAY
 ) -> h5py.Dataset:
     """An array in the file, of one of the NumPy `kinds`, and of a shape where it is given (None: any length).
 

@@ -171,11 +171,7 @@ def simulate(
     size = sum(work.row(group).itemsize * rows for group, rows in work.counts.items())
     held = partial.stat().st_size if partial.exists() else 0
     demand_space(path, max(size - held, 0) + size, size)
-    run = {
-        **stated,
-        "number of loads": str(len(work.loads)),
-        "hash of the loads": digest_of_loads(work.loads),
-    }
+    run = {**stated, "number of loads": str(len(work.loads)), "hash of the loads": digest_of_loads(work.loads)}
     with listened() as seconds, opened(partial, run) as journal:
         try:
             solved = _fill(journal, work, deformer, finished, progress)
@@ -188,11 +184,7 @@ def simulate(
 
 
 def _fill(
-    journal: Journal,
-    work: Work,
-    deformer: Deformer | Crew,
-    finished: set[Batch],
-    progress: Callable[[int, int], None],
+    journal: Journal, work: Work, deformer: Deformer | Crew, finished: set[Batch], progress: Callable[[int, int], None]
 ) -> dict[str, int]:
     """Solve what is in neither file. A second thread writes a batch while the next is solved, one ahead."""
     known = [batch for batch in work.batches if batch in finished or batch in journal]

@@ -140,11 +140,7 @@ def placed_anew(
     if observation.rest is not None:
         here = observation.rest[near]
         moved = of_motions(
-            locate(anatomy.mesh, here),
-            here,
-            observation.now[near] - here,
-            observation.sigmas[near],
-            observation.rigid,
+            locate(anatomy.mesh, here), here, observation.now[near] - here, observation.sigmas[near], observation.rigid
         )
         parts.append(replace(moved, point=near[moved.point]))
     else:

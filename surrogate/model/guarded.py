@@ -15,9 +15,9 @@ from sim.loads import Loads
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS
 from ..regressors.rigid_contact import Contact
-from .contact_start import HELD
 from .learned import Learned, Part
 from .left_out import LIMIT, OffBy, handed_over
+from .tool_contact import HELD
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,11 +29,10 @@ from ..data.indentation import indented, posed, with_relaxed
 from ..regressors.protocol import Fitted
 from ..regressors.rigid_contact import Contact
 from .conformal import LEVELS, Bound, features_of
-from .contact_start import going_on, held_of
 from .left_out import LeftOut
 from .relaxation import MEMORY, Relaxed, followed
 from .tip_distance import Distance, TipModel
-from .tool_force import ForceModel, wrench
+from .tool_contact import ForceModel, going_on, held_of, wrench
 from .training_range import Envelope, Measured, Outside, measured
 
 # Times the strongest force, or the widest footprint, of the training. Of three loads so strong on the template's brain

@@ -33,19 +33,13 @@ from .left_out import LeftOut, OffBy
 from .npz_archive import Archive, seal_of, write_archive
 from .own_learners import find_own, name_of
 from .tip_distance import TipModel
-from .tool_force import ForceModel
+from .tool_contact import ForceModel
 from .training_range import Envelope
 from .vetting import demand_finite, demand_sound
 
 FORMAT = "sulcus model 2"
 REMEDY = "Make one with `sulcus train`."
-REGRESSORS: dict[str, type[Regressor]] = {
-    "linear": Linear,
-    "pcr": Pcr,
-    "ann": Ann,
-    "svr": Svr,
-    "gp": Gp,
-}
+REGRESSORS: dict[str, type[Regressor]] = {"linear": Linear, "pcr": Pcr, "ann": Ann, "svr": Svr, "gp": Gp}
 # These know the tool's features, and their meaning.
 FITTED: dict[str, type[Fitted]] = {
     **REGRESSORS,

@@ -36,9 +36,8 @@ from ..model.npz_archive import Archive
 from ..regressors.force_series import FACTORS, SPANS, Pairs, Series, filled
 from ..regressors.protocol import Linear
 from ..regressors.rigid_contact import Contact
-from .condense_contact import condensed, side_by_side
 from .examples import Examples, left_by
-from .tabulate_series import in_one_disc, radii_between, tabulated, with_middles
+from .fem_tables import condensed, in_one_disc, radii_between, side_by_side, tabulated, with_middles
 
 # Share of the responses that a learner's basis may lose, and its most modes; the same of what the series adds to the
 # exact orders, a fiftieth of the motion, and of compliance.
@@ -225,10 +224,7 @@ class Expansion:
             Data that do not state what tissue they are of.
         """
         if self.kept is not None and self.kept.exists():
-            with (
-                read_as(self.kept, "a table of the series", REMADE),
-                self.kept.open("rb") as raw,
-            ):
+            with read_as(self.kept, "a table of the series", REMADE), self.kept.open("rb") as raw:
                 modes = [f"modes{k}" for k in range(len(self._known))]
                 file = Archive(raw, REMADE).arrays([*modes, "pairs", "second", "second_modes", "table", "seconds"])
                 bases = [Basis(nodes, file[name]) for name, nodes in zip(modes, self._known, strict=True)]

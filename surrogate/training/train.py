@@ -20,7 +20,7 @@ from ..model.learned import Learned, Part
 from ..model.left_out import left_out_of
 from ..model.own_learners import OWN, find_own
 from ..model.tip_distance import TipModel
-from ..model.tool_force import ForceModel
+from ..model.tool_contact import ForceModel
 from ..model.training_range import Envelope, envelope_of
 from .bounds import (
     WAYS,
@@ -36,8 +36,7 @@ from .bounds import (
 )
 from .examples import Examples
 from .expansion import EXPANDED, TOUCHED, Expansion
-from .learners import LEARNT, POSED, force_of, parts_of
-from .shared_inputs import SharedInputs
+from .learners import LEARNT, POSED, SharedInputs, force_of, parts_of
 
 # Of pushes, and of poses.
 LEARNERS = ("linear", *LEARNT, *EXPANDED)

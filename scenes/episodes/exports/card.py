@@ -14,19 +14,15 @@ from typing import Any
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 
-from ..reading.contents import Contents, read_contents
-from ..reading.open_files import opened
-from ..reading.rows import numbers_in
+from ..bodies import models_of, said_of_weak
+from ..reading.contents import Contents, opened, read_contents
 from ..reading.validation import solved_figures
-from ..reading.windows import episode_paths
+from ..reading.windows import episode_paths, numbers_in
 from ..run_folder import Run, episode_name, failed, read_run
-from ..weak_bodies import models_of, said_of_weak
 from .columns import LICENCE as LICENCE_NAME
-from .columns import SHEET
+from .columns import SHEET, task_of
 from .croissant import COLUMNS, croissant
-from .datasheet import MARK, NAME, datasheet
-from .provenance import notice_of_template, of_template
-from .tasks import task_of
+from .datasheet import MARK, NAME, datasheet, notice_of_template, of_template
 
 TABLE = "episodes.csv"
 NAMES = (TABLE, "croissant.json", SHEET, LICENCE_NAME)
@@ -91,12 +87,7 @@ def write_card(
     for name, text in zip(NAMES, texts, strict=True):
         with written_whole(folder / name, Path(name).suffix) as partial:
             partial.write_text(text, encoding="utf-8")
-    return {
-        "out": str(folder),
-        "episodes": len(rows),
-        "frames": sum(one.frames for one in episodes),
-        "files": NAMES,
-    }
+    return {"out": str(folder), "episodes": len(rows), "frames": sum(one.frames for one in episodes), "files": NAMES}
 
 
 def keep_card(

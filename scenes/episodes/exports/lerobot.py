@@ -19,10 +19,9 @@ import pyarrow.parquet as pq
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_folder
 
-from ..reading.contents import Contents
-from ..reading.open_files import opened
-from ..reading.rows import code_of, picture_of
+from ..reading.contents import Contents, opened
 from ..reading.schema import COLOUR, DEPTH, PICTURES, suffix_of
+from ..reading.windows import code_of, picture_of
 from .columns import (
     SPACE,
     blocks,
@@ -32,10 +31,57 @@ from .columns import (
     shared_numbers,
     shared_pictures,
     stored_size,
+    task_of,
     write_along,
 )
-from .statistics import Spread
-from .tasks import task_of
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Of `count` rows: each a float64 array of one row's shape. What is not known, NaN, counts nowhere."""
+
+    least: np.ndarray
+    greatest: np.ndarray
+    total: np.ndarray
+    squares: np.ndarray
+    known: np.ndarray
+    count: int
+
+    @classmethod
+    def of(cls, rows: np.ndarray) -> Spread:
+        """Of rows (T, ...)."""
+        rows = np.asarray(rows, np.float64)
+        known = ~np.isnan(rows)
+        filled = np.where(known, rows, 0.0)
+        return cls(
+            np.where(known, rows, np.inf).min(axis=0),
+            np.where(known, rows, -np.inf).max(axis=0),
+            filled.sum(axis=0),
+            np.square(filled).sum(axis=0),
+            known.sum(axis=0),
+            len(rows),
+        )
+
+    def __add__(self, other: Spread) -> Spread:
+        """Of both."""
+        return Spread(
+            np.minimum(self.least, other.least),
+            np.maximum(self.greatest, other.greatest),
+            self.total + other.total,
+            self.squares + other.squares,
+            self.known + other.known,
+            self.count + other.count,
+        )
+
+    def said(self) -> dict[str, list]:
+        """As lists: min, max, mean, std and count; zeros where nothing is known."""
+        known = np.maximum(self.known, 1)
+        mean = self.total / known
+        deviation = np.sqrt(np.maximum(self.squares / known - np.square(mean), 0.0))
+        arrays = {"min": self.least, "max": self.greatest, "mean": mean, "std": deviation}
+        lists = {name: np.where(self.known, array, 0.0) for name, array in arrays.items()}
+        return {**{name: np.atleast_1d(array).tolist() for name, array in lists.items()}, "count": [self.count]}
+
 
 VERSION = "v3.0"
 DEPTH_RANGE = (0.1, 0.6)

@@ -13,10 +13,9 @@ import numpy as np
 
 from sim.runtime.atomic_files import written_folder
 
-from ..reading.contents import Contents
-from ..reading.open_files import opened
-from ..reading.rows import code_of, numbers_in, rows_of
+from ..reading.contents import Contents, opened
 from ..reading.schema import ARRAYS, PICTURES, SOLVED, suffix_of
+from ..reading.windows import code_of, numbers_in, rows_of
 from .columns import file_names, stored_size, write_along
 
 WIDE = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")

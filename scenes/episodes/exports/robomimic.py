@@ -13,12 +13,21 @@ import numpy as np
 from sim.runtime.atomic_files import Stream, demand_space, written_stream
 from sim.runtime.versions import version_of
 
-from ..reading.contents import Contents
-from ..reading.open_files import opened
-from ..reading.rows import numbers_in
+from ..reading.contents import Contents, opened
 from ..reading.schema import COLOUR, PICTURES
-from .columns import SPACE, blocks, numbers_of, rate_of, shared_numbers, shared_pictures, stored_size, texts_along
-from .tasks import held_out, task_of
+from ..reading.windows import numbers_in
+from .columns import (
+    SPACE,
+    blocks,
+    held_out,
+    numbers_of,
+    rate_of,
+    shared_numbers,
+    shared_pictures,
+    stored_size,
+    task_of,
+    texts_along,
+)
 
 EXPORTED = ("colour", "colour_right", "depth", "segmentation")
 # Decoded pictures, packed by gzip, against the episodes' JPEG and PNG.

@@ -14,9 +14,8 @@ import numpy as np
 from sim.runtime.atomic_files import written_folder, written_stream
 
 from ..reading.bodies import anatomy_of, surface_rows
-from ..reading.contents import Contents, array_in
-from ..reading.open_files import opened
-from ..reading.rows import numbers_in
+from ..reading.contents import Contents, array_in, opened
+from ..reading.windows import numbers_in
 from .columns import SPACE, file_names, stored_size, write_along
 
 SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}

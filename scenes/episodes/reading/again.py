@@ -21,10 +21,9 @@ from ...play.reference import following, past_matters, truth_of
 from ..make import Opened, body_path, opened_body
 from ..plan import plan_from
 from ..scripted import drawn_episode, scene_of
-from .contents import contents_of
-from .open_files import REMEDY, said_by_validate
-from .rows import numbers_in
+from .contents import REMEDY, contents_of, said_by_validate
 from .validation import Report, validate_episode
+from .windows import numbers_in
 
 # How far two answers may be apart [mm]: at training accuracy; of frames that were played, at the live one.
 SAME_MM, LIVE_MM = 0.02, 0.2

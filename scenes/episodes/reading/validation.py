@@ -18,10 +18,9 @@ from sim.runtime.outside_files import read_as
 
 from ..checksums import SUM, broken
 from .bodies import anatomy_of, surface_rows
-from .contents import Contents, array_in, attributes_of, contents_of
-from .open_files import REMEDY, said_by_validate
-from .rows import numbers_in, picture_of
+from .contents import REMEDY, Contents, array_in, attributes_of, contents_of, said_by_validate
 from .schema import ARRAYS, LABELS, PICTURES
+from .windows import numbers_in, picture_of
 
 # Frames that are drawn again, spread evenly.
 LOOKED_AT = 12

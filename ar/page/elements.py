@@ -1,0 +1,150 @@
+"""Elements of the page in HTML: a picture with its words as one message; tabs for slices and the last seconds; keys.
+
+A browser loads pictures later than it sets words, and drops a picture that is replaced before it is loaded. A slow
+browser would show new words beside an old picture. So both wait, out of sight, until the picture is loaded.
+
+Tabs, keys and names of controls are of the visitor's own browser: the server hears of none of them.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import cv2
+import numpy as np
+
+from ..overlay.hud import BREAK
+from .parts import Key
+
+QUALITY = 88
+PICTURE, SAID, NEXT = "sulcus-picture", "sulcus-said", "sulcus-next"
+"""Names of the elements that hold the picture, the words beside it, and what waits to take their places."""
+SLICES, HISTORY = "sulcus-slices", "sulcus-history"
+"""Names of the elements that hold slices of the scan, and the last seconds."""
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Where a picture and its words go, and where they wait: names of elements; `alt` says what the picture is."""
+
+    picture: str
+    words: str
+    waits: str
+    alt: str
+
+
+MAIN = Spot(PICTURE, SAID, NEXT, "what the camera sees")
+ASIDE_SPOT = Spot(SLICES, HISTORY, "sulcus-next-aside", "axial, coronal and sagittal slices of the scan")
+# Of pictures that are loaded in another order than they came, an older one is left out.
+SWAP = """
+const words = this.parentNode.querySelector('template').content, number = Number(this.dataset.number);
+const picture = document.getElementById('PICTURE'), said = document.getElementById('SAID');
+if (number >= Number(picture.dataset.number || 0)) {
+  picture.dataset.number = number;
+  this.onload = null;
+  picture.replaceChildren(this);
+  said.replaceChildren(words.cloneNode(true));
+}
+"""
+
+
+def unparted(words: str) -> str:
+    """Words, HTML, in which no new line parts a number from its name, its error and its unit: as in a picture."""
+    return re.sub(
+        r"<[^>]*>|\s+",
+        lambda part: part[0] if part[0][0] == "<" or BREAK.match(words, part.start()) else "&nbsp;",
+        words,
+    )
+
+
+def coded(colour: np.ndarray) -> str:
+    """A picture (H, W, 3) uint8 as an address that holds it."""
+    written = cv2.imencode(".jpg", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    return f"data:image/jpeg;base64,{base64.b64encode(written.tobytes()).decode()}"
+
+
+def sight(number: int, picture: str, words: str, spot: Spot = MAIN) -> str:
+    """An element that puts a `coded` picture and words, HTML, into their places; `number` counts them."""
+    swap = escape(" ".join(SWAP.replace("PICTURE", spot.picture).replace("SAID", spot.words).split()))
+    # Decoded with the rest of the page: else the words are painted first.
+    image = f'<img alt="{spot.alt}" decoding="sync" data-number="{number}" onload="{swap}" src="{picture}">'
+    return f'<div id="{spot.waits}" hidden>{image}<template>{words}</template></div>'
+
+
+ASIDE, HELP = "sulcus-aside", "sulcus-keys"
+"""Names of the elements that hold the tabs with what they show, and the list of keys."""
+TABS = (("3-D view", "sulcus-tab-view"), ("slices", "sulcus-tab-slices"), ("last 20 s", "sulcus-tab-history"))
+"""What the tabs are called, and the names of their buttons."""
+CAPTION = (
+    "The scan as it was taken. Dotted: the tumour in the scan; green: now; band: where its outline is, 95 of 100 times "
+    "by the error that is named (none: not known). White: the tool; a ring: its tip, beside the slice."
+)
+# An image of one pixel: loading it runs the script, which an element's HTML alone would not.
+PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
+
+
+SPACE = Key(" ", "space", "space", "play or pause")
+BACK, ON = (
+    Key("ArrowLeft", "arrowleft", "\N{LEFTWARDS ARROW}", "one frame back"),
+    Key("ArrowRight", "arrowright", "\N{RIGHTWARDS ARROW}", "one frame on"),
+)
+STYLE = Key("s", "S", "s", "next overlay")
+RECORD = Key("r", "R", "r", "start or stop recording")
+LIVE_KEYS = (SPACE, STYLE, RECORD)
+KEYS = (SPACE, BACK, ON, STYLE, RECORD)
+"""The keys that the server hears of: of a page without frames to go to, and of any other."""
+# In the 3-D view arrows and letters move the camera: a key of ours goes to viser's own commands alone, which listen on
+# the document's element. What is being typed into, or is moved by arrows, keeps its keys.
+SCRIPT = """
+if (!window.sulcusKeys) {
+  window.sulcusKeys = [KEYS];
+  const help = () => document.getElementById('HELP');
+  document.body.addEventListener('keydown', event => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const typed = event.target.closest('input:not([type=radio]), textarea, select, [role=slider], dialog[open]');
+    if (event.key === '?' && !(typed && typed.matches('input, textarea, dialog'))) { help().showModal(); return; }
+    const key = event.key.length > 1 ? event.key : event.key.toLowerCase();
+    if (!window.sulcusKeys.includes(key)) return;
+    event.stopPropagation();
+    if (typed || (key === ' ' && event.target.closest('button, summary, a'))) return;
+    event.preventDefault();
+    document.documentElement.dispatchEvent(new KeyboardEvent('keydown', {key: key, code: event.code}));
+  });
+  const named = () => {
+    for (const field of document.querySelectorAll('[role=slider], input:not([type=hidden])')) {
+      const row = field.closest('.mantine-Flex-root:has(label), .mantine-InputWrapper-root:has(label)');
+      const label = row && row.querySelector('label');
+      if (label && !field.getAttribute('aria-label')) field.setAttribute('aria-label', label.textContent);
+    }
+    const view = document.querySelector('canvas');
+    if (view) view.setAttribute('aria-label', '3-D view of the brain, the tumour and the tool');
+  };
+  setInterval(named, 1000);
+}
+"""
+
+
+def aside(keys: Sequence[Key] = KEYS) -> str:
+    """An element with the tabs, empty places for slices and for the last seconds, and the list of keys."""
+    tabs = "".join(
+        f'<input type="radio" name="{ASIDE}" id="{name}"{" checked" if number == 0 else ""}>'
+        f'<label for="{name}">{words}</label>'
+        for number, (words, name) in enumerate(TABS)
+    )
+    rows = "".join(f"<tr><td><kbd>{key.shown}</kbd></td><td>{key.does}</td></tr>" for key in keys)
+    rows += "<tr><td><kbd>?</kbd></td><td>this list</td></tr><tr><td><kbd>Enter</kbd></td><td>press a button</td></tr>"
+    listed = ", ".join(f"'{key.name}'" for key in keys)
+    script = escape(" ".join(SCRIPT.replace("KEYS", listed, 1).replace("HELP", HELP).split()))
+    opens = f"document.getElementById('{HELP}').showModal()"
+    return (
+        f'<div id="{ASIDE}">{tabs}<button type="button" aria-label="list of keys" onclick="{opens}">keys</button>'
+        f'<div class="shown"><div id="{SLICES}"></div><p>{CAPTION}</p></div>'
+        f'<div class="shown"><div id="{HISTORY}"></div></div>'
+        f'<dialog id="{HELP}" aria-label="keys"><table>{rows}</table>'
+        f'<form method="dialog"><button>close</button></form></dialog>'
+        f'<img alt="" hidden src="{PIXEL}" onload="{script}"></div>'
+    )

@@ -1,0 +1,238 @@
+"""Calibration of a tracker: the camera on it by hand and eye, and the tip of a tool by pivoting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .rigid import angles_of, cross_matrices
+
+FEWEST_POSES = 4
+# Motions turn by such angles [rad]: of smaller ones the axis is unsure, and near half a turn its sign is.
+LEAST_TURN, MOST_TURN = np.radians(8.0), np.radians(170.0)
+# Root mean square angle [rad] of the axes from the one that they are nearest to.
+LEAST_SPREAD = np.radians(8.0)
+# Motions that are used, the largest first.
+MOST_MOTIONS = 2000
+# Poses of which every pair is looked at, spread evenly over all.
+MOST_POSES = 300
+# Root mean square residual angle of motions [rad]: two trackers with noise of 0.5 degrees give 1 degree.
+LARGEST_TURN = np.radians(2.0)
+# Root mean square residual distance of motions [m]: two trackers with noise of 0.5 degrees give 7 mm over 0.7 m.
+LARGEST_SHIFT = 10e-3
+TURN = "Turn the bodies by 30 degrees or more, about at least two different axes."
+
+
+@dataclass(frozen=True, eq=False)
+class HandEye:
+    """How the second body lies in the first.
+
+    Parameters
+    ----------
+    X
+        (4, 4): x_first = X x_second [m].
+    turn, shift
+        Root mean square residuals of the motions: angle [rad] and distance [m] between A X and X B.
+    motions
+        How many were used.
+    spread
+        Root mean square angle [rad] of the motions' axes from the one that they are nearest to.
+    distances
+        (n,) root mean square `shift` of the motions from and to each pose [m]; 0 for poses without any.
+    """
+
+    X: np.ndarray
+    turn: float
+    shift: float
+    motions: int
+    spread: float
+    distances: np.ndarray
+
+    @property
+    def misfit(self) -> str:
+        """Residuals and their limits in words; empty within the limits."""
+        if self.turn <= LARGEST_TURN and self.shift <= LARGEST_SHIFT:
+            return ""
+        found = (
+            f"motions of the bodies differ by {np.degrees(self.turn):.1f} degrees and {1e3 * self.shift:.1f} mm (rms)"
+        )
+        return f"{found}: at most {np.degrees(LARGEST_TURN):.0f} and {1e3 * LARGEST_SHIFT:.0f} are required"
+
+
+def hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
+    """X with A X = X B for all motions A and B of two bodies, each given by poses (n, 4, 4) [m] in its tracker's frame.
+
+    Motions lead from pose i to pose j: A = P_i^-1 P_j of the first, B = Q_i^-1 Q_j of the second. Daniilidis (1999),
+    "Hand-eye calibration using dual quaternions", equations 31 to 38: X is in the null space of a 6 m x 8 matrix.
+
+    Raises
+    ------
+    ValueError
+        Different numbers of poses, too few, too small rotations, or axes that are all parallel.
+    """
+    if len(first) != len(second):
+        raise ValueError(f"{len(first)} and {len(second)} poses: give both bodies' poses at the same times.")
+    if len(first) < FEWEST_POSES:
+        raise ValueError(f"{len(first)} poses are too few: record {FEWEST_POSES} or more. {TURN}")
+    A, B, ends = _motions(first, second)
+    (a, a_dual), (b, b_dual) = dual_quaternions(A), dual_quaternions(B)
+    axes = a[:, 1:] / np.linalg.norm(a[:, 1:], axis=1, keepdims=True)
+    across = 1.0 - np.linalg.eigvalsh(axes.T @ axes / len(axes))[-1]
+    spread = float(np.arcsin(np.sqrt(np.clip(across, 0.0, 1.0))))
+    if spread < LEAST_SPREAD:
+        raise ValueError(
+            f"the axes of all {len(A)} motions are parallel, to {np.degrees(spread):.1f} degrees: they leave open "
+            f"where along the axis one body lies in the other. {TURN}"
+        )
+    X = _solved(a, a_dual, b, b_dual)
+    left, right = A @ X, X @ B
+    turns = angles_of(left[:, :3, :3] @ right[:, :3, :3].transpose(0, 2, 1))
+    shifts = np.linalg.norm(left[:, :3, 3] - right[:, :3, 3], axis=1)
+    squares, counts = (np.bincount(ends.ravel(), each, len(first)) for each in (np.tile(shifts**2, 2), None))
+    return HandEye(X, _rms(turns), _rms(shifts), len(A), spread, np.sqrt(squares / np.maximum(counts, 1)))
+
+
+def _motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Motions of both bodies (m, 4, 4) that turn most, and the poses (2, m) that they lead from and to."""
+    kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), MOST_POSES)).round().astype(int))
+    start, end = np.triu_indices(len(kept), 1)
+    A, B = (np.linalg.inv(poses[kept])[start] @ poses[kept][end] for poses in (first, second))
+    angles = np.array([angles_of(M[:, :3, :3]) for M in (A, B)])
+    good = np.flatnonzero((angles.min(axis=0) > LEAST_TURN) & (angles.max(axis=0) < MOST_TURN))
+    if len(good) < FEWEST_POSES:
+        raise ValueError(
+            f"{len(good)} motions turn the bodies by more than {np.degrees(LEAST_TURN):.0f} degrees, and "
+            f"{FEWEST_POSES} are needed. {TURN}"
+        )
+    best = good[np.argsort(-angles[0, good], kind="stable")[:MOST_MOTIONS]]
+    return A[best], B[best], kept[[start[best], end[best]]]
+
+
+def dual_quaternions(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rigid motions (n, 4, 4) as real and dual parts (n, 4), scalars first and not negative; the dual is t q / 2."""
+    R = T[:, :3, :3]
+    # Bar-Itzhack (2000), "New method for extracting the quaternion": an eigenvector, whatever the angle.
+    N = np.empty((len(T), 4, 4))
+    N[:, 0, 0] = np.trace(R, 0, 1, 2)
+    N[:, 0, 1:] = N[:, 1:, 0] = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1)
+    N[:, 1:, 1:] = R + R.transpose(0, 2, 1) - np.eye(3) * N[:, 0, 0, None, None]
+    real = np.linalg.eigh(N)[1][:, :, -1]
+    real *= np.where(real[:, :1] < 0.0, -1.0, 1.0)
+    shift = np.concatenate([np.zeros((len(T), 1)), T[:, :3, 3]], axis=1)
+    return real, 0.5 * _product(shift, real)
+
+
+def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Of quaternions (..., 4), scalars first."""
+    scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(axis=-1, keepdims=True)
+    vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])
+    return np.concatenate([scalar, vector], axis=-1)
+
+
+def _solved(a: np.ndarray, a_dual: np.ndarray, b: np.ndarray, b_dual: np.ndarray) -> np.ndarray:
+    """X (4, 4) from real and dual parts (m, 4) of motions."""
+    rows = np.zeros((len(a), 6, 8))
+    for place, one, other in ((0, a, b), (3, a_dual, b_dual)):
+        rows[:, place : place + 3, 0] = (one - other)[:, 1:]
+        rows[:, place : place + 3, 1:4] = cross_matrices((one + other)[:, 1:])
+    rows[:, 3:, 4] = (a - b)[:, 1:]
+    rows[:, 3:, 5:] = cross_matrices((a + b)[:, 1:])
+    one, other = np.linalg.svd(rows.reshape(-1, 8), full_matrices=False)[2][-2:]
+    u, v, w, z = one[:4], one[4:], other[:4], other[4:]
+    # (k u + m w, k v + m z) is a unit dual quaternion: its parts are at right angles, and the real one has length 1.
+    # With (k, m) = (cos t, sin t), the first is c + d cos 2t + e sin 2t = 0.
+    c, d, e = u @ v + w @ z, u @ v - w @ z, u @ z + w @ v
+    angles = 0.5 * (
+        np.arctan2(e, d) + np.arccos(np.clip(-c / max(np.hypot(d, e), 1e-300), -1.0, 1.0)) * np.array([1.0, -1.0])
+    )
+    pairs = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    reals, duals = pairs @ [u, w], pairs @ [v, z]
+    lengths = np.linalg.norm(reals, axis=1)
+    best = lengths.argmax()
+    real, dual = reals[best] / lengths[best], duals[best] / lengths[best]
+    X = np.eye(4)
+    x, y = real[0], real[1:]
+    X[:3, :3] = (x * x - y @ y) * np.eye(3) + 2.0 * np.outer(y, y) + 2.0 * x * cross_matrices(y[None])[0]
+    X[:3, 3] = 2.0 * _product(dual, real * [1.0, -1.0, -1.0, -1.0])[1:]
+    return X
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.square(values).mean()))
+
+
+FEWEST_PIVOT_POSES = 10
+# Root mean square angle [rad] by which every direction in the tool must turn.
+LEAST_TILT = np.radians(5.0)
+# Root mean square distance [m]: 0.5 mm and 0.5 degrees of a tracker's noise, at a tip 300 mm away, give 2.7 mm.
+LARGEST_RMS = 3e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Pivot:
+    """A calibrated tip.
+
+    Parameters
+    ----------
+    tip
+        (3,) in the tool's frame [m].
+    centre
+        (3,) where it stood, in the frame of the poses [m].
+    covariance
+        (6, 6) of tip and centre [m^2].
+    rms
+        Root mean square distance [m] between the centre and the tip at each pose.
+    tilt
+        Root mean square angle [rad] by which that direction in the tool turned that turned least.
+    distances
+        (n,) between the centre and the tip at each pose [m].
+    """
+
+    tip: np.ndarray
+    centre: np.ndarray
+    covariance: np.ndarray
+    rms: float
+    tilt: float
+    distances: np.ndarray
+
+    @property
+    def misfit(self) -> str:
+        """Residual and its limit in words; empty within the limit."""
+        if self.rms <= LARGEST_RMS:
+            return ""
+        return f"the tip moves by {1e3 * self.rms:.1f} mm (rms): at most {1e3 * LARGEST_RMS:.0f} mm are required"
+
+
+def pivoted(poses: np.ndarray) -> Pivot:
+    """The tip from poses of the tool (n, 4, 4) [m], x_world = T x_tool: all R_i tip + p_i are one place.
+
+    Algebraic least squares. Yaniv (2015), "Which pivot calibration?", the one-step method: R_i tip - centre = -p_i.
+
+    Raises
+    ------
+    ValueError
+        Too few poses, or too little rotation.
+    """
+    count = len(poses)
+    if count < FEWEST_PIVOT_POSES:
+        raise ValueError(
+            f"{count} poses are too few: hold the tip in one place, and record {FEWEST_PIVOT_POSES} or more."
+        )
+    turns, places = poses[:, :3, :3], poses[:, :3, 3]
+    mean = turns.mean(axis=0)
+    # The tip's normal matrix over n, after the centre is eliminated: how far each direction in the tool turns.
+    tilt = float(np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0)))
+    if tilt < LEAST_TILT:
+        raise ValueError(
+            f"a direction in the tool turns by {np.degrees(tilt):.1f} degrees only (rms), and "
+            f"{np.degrees(LEAST_TILT):.0f} are needed: tilt the tool by 30 degrees to all sides while its tip stays."
+        )
+    system = np.concatenate([turns, np.broadcast_to(-np.eye(3), (count, 3, 3))], axis=2).reshape(-1, 6)
+    solution = np.linalg.lstsq(system, -places.ravel(), rcond=None)[0]
+    residuals = system @ solution + places.ravel()
+    variance = residuals @ residuals / (3 * count - 6)
+    covariance = variance * np.linalg.inv(system.T @ system)
+    distances = np.linalg.norm(residuals.reshape(-1, 3), axis=1)
+    rms = float(np.sqrt(distances @ distances / count))
+    return Pivot(solution[:3], solution[3:], 0.5 * (covariance + covariance.T), rms, tilt, distances)

@@ -1,0 +1,128 @@
+"""Locators of patients: made once before anything is seen, kept in files, and read in a second."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.effects import SKULLS
+from sim.errors import InputError
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import read_as
+from sim.runtime.threads import one_thread
+from sim.runtime.versions import version_of
+
+from ..model.npz_archive import Archive, seal_of
+from .calibration import TRIALS, trials
+from .causes import KINDS, USUAL, Causes, pressed
+from .ensemble import solved
+from .locator import Locator
+from .prior import NOWHERE, PRESSED, Prior, prior_of
+from .regions import Region, check_regions
+
+FORMAT = "sulcus locator 6"
+REMEDY = "Move it away, and `sulcus locate` makes it anew."
+LABELS = ("kind", "skull", "place")
+ARRAYS = ("shape", *LABELS, "centre")
+
+
+def locator_path(anatomy: str | Path) -> Path:
+    """Where the locator of an anatomy file is looked for: MESH.locator.npz beside MESH.vtu."""
+    return Path(anatomy).with_suffix(".locator.npz")
+
+
+def save_locator(path: str | Path, locator: Locator) -> None:
+    """Write a locator; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        A name that does not end in .npz, or a folder that cannot be written to.
+    """
+    prior = locator.prior
+    header = {
+        "format": FORMAT, "anatomy": prior.anatomy.digest, "version": version_of("sulcus"), "kinds": KINDS,
+        "whole": prior.nodes is None, "space": "RAS [m]", "regions": [asdict(one) for one in locator.regions],
+    }  # fmt: skip
+    arrays = {name: getattr(prior, name) for name in _names(header)} | {"tried": locator.tried}
+    header["seal"] = seal_of(header, arrays)
+    with written_whole(path, ".npz") as unfinished:
+        np.savez(unfinished, header=np.array(json.dumps(header)), **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
+    """Read the locator of an anatomy.
+
+    Raises
+    ------
+    InputError
+        A file that is missing, no locator of this version, damaged, or of another anatomy.
+    """
+    with read_as(path, "a locator", REMEDY), Path(path).open("rb") as raw:
+        archive = Archive(raw, REMEDY)
+        header = json.loads(archive.text("header"))
+        if header["format"] != FORMAT or tuple(header["kinds"]) != KINDS:
+            raise InputError(f"{path}: is no locator of this version. {REMEDY}")
+        if header["anatomy"] != anatomy.digest:
+            raise InputError(f"{path}: was made for another anatomy: give that one, or another locator.")
+        regions = tuple(Region(**one) for one in header.get("regions", ()))
+        check_regions(regions, anatomy)
+        arrays = archive.sealed(header, [*_names(header), "tried"])
+        _check(path, anatomy, arrays)
+        tried = arrays.pop("tried")
+        return Locator(Prior(anatomy, **arrays), tried, regions)
+
+
+def _names(header: dict[str, Any]) -> tuple[str, ...]:
+    """The arrays of a prior that is whole, or known at some vertices."""
+    return ARRAYS if header.get("whole", True) else (*ARRAYS, "nodes")
+
+
+def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) -> None:
+    """Raise InputError where arrays do not fit the anatomy or each other."""
+    shape, tried, every = arrays["shape"], arrays["tried"], np.arange(len(anatomy.mesh.nodes))
+    nodes = arrays.get("nodes", every)
+    fits = nodes.dtype.kind == "i" and np.array_equal(nodes, np.intersect1d(nodes, every))
+    fits = fits and shape.ndim == 3 and shape.shape[1:] == (len(nodes), 3) and tried.ndim == 2 and tried.shape[1] == 5
+    fits = fits and all(arrays[name].shape == (len(shape),) for name in LABELS) and len(shape) and len(tried)
+    fits = fits and arrays["centre"].ndim == 2 and arrays["centre"].shape[1] == 3
+    limits = ((0, len(KINDS)), (0, len(SKULLS)), (NOWHERE, len(arrays["centre"])))
+    for name, (low, high) in zip(LABELS, limits, strict=True):
+        fits = fits and arrays[name].dtype.kind == "i" and arrays[name].min() >= low and arrays[name].max() < high
+    if not fits or not all(np.isfinite(arrays[name]).all() for name in ("shape", "centre", "tried")):
+        raise InputError(f"{path}: has arrays that do not fit the anatomy. {REMEDY}")
+
+
+def make_locator(
+    anatomy: Anatomy,
+    seed: int = 0,
+    device: str = "auto",
+    causes: Causes = USUAL,
+    folder: Path | None = None,
+    progress: Callable[[str, int, int], object] = lambda stage, done, total: None,
+    count: int = TRIALS,
+) -> Locator:
+    """A locator of one anatomy. Groups that a `folder` keeps from a run that was stopped are read.
+
+    Regions that the `causes` know belong to the locator. `progress` hears a stage, how many of its parts are done, and
+    of how many. `count` trials calibrate it.
+
+    Raises
+    ------
+    InputError
+        An anatomy without open cortex, tumour or skull, or without a region that the causes know; causes of which
+        nothing converged.
+    """
+    check_regions(causes.regions, anatomy)
+    ensemble = solved(anatomy, seed, device, causes, folder, lambda done, total: progress("causes", done, total))
+    progress("forces on the cortex", 0, 1)
+    presses = pressed(anatomy, tuple(dict.fromkeys(PRESSED.values())), device, causes.regions)
+    with one_thread():  # products are small
+        tried = trials(ensemble, presses, lambda done, total: progress("trials", done, total), count)
+    return Locator(prior_of(ensemble, presses), tried, causes.regions)

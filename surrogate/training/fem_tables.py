@@ -1,0 +1,136 @@
+"""Tables of finite elements: a body condensed to what a tool may touch, and the series at places of the cortex."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from sim.fem import Fem
+from sim.geometry.surface import edge_lengths
+from sim.loads import Loads, Pushed
+from sim.minimisers.power_series import Reading
+from sim.runtime.journal import Journal
+from sim.tools import Ball, BuiltIn, core_of
+
+from ..array_functions import squared_distances
+from ..data.cortex_patch import Patch
+from ..data.encode import Basis, reduce
+from ..regressors.force_series import FACTORS, ORDERS, STENCIL, TERMS
+from ..regressors.rigid_contact import Contact
+
+# Nodes whose unit responses are asked for together: bounds the memory that they take.
+STRIP = 64
+# Share of the unit responses that a basis may lose.
+TOLERANCE = 1e-4
+
+
+def condensed(fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None) -> tuple[Contact, list[Basis]]:
+    """Contact of a tool with a body at rest, answered for `parts` of its vertices, and a basis of each of them.
+
+    Without a `tool` it is a ball of the radius that features have. The answers are coefficients of the bases, one after
+    the other.
+    """
+    surface = fem.anatomy.mesh.surface[fem.anatomy.bare]
+    nodes, triangles = np.unique(surface, return_inverse=True)
+    response = unit_responses(fem, nodes, np.concatenate([nodes, *parts]))
+    compliance, *answers = np.split(response, np.cumsum([len(nodes), *map(len, parts[:-1])]), axis=1)
+    bases = [reduce(some, each, TOLERANCE, len(each)) for some, each in zip(parts, answers, strict=True)]
+    coefficients = np.hstack([basis.encode(each) for basis, each in zip(bases, answers, strict=True)])
+    rows = 3 * len(nodes)
+    contact = Contact(
+        fem.anatomy.mesh.nodes[nodes],
+        triangles,
+        compliance.reshape(rows, rows),
+        coefficients,
+        np.repeat([[1.0], [0.0]], coefficients.shape[1], axis=1),
+        core=np.zeros(0) if tool is None or isinstance(tool, Ball) else _sizes(tool),
+    )
+    return contact, bases
+
+
+def _sizes(tool: BuiltIn) -> np.ndarray:
+    """Half sizes of what a tool lies round, and its radius (4,) [m]."""
+    core = core_of(tool)
+    return np.append(core.half, core.radius)
+
+
+def side_by_side(bases: list[Basis]) -> Basis:
+    """One basis of the vertices of all of them."""
+    modes = np.asarray(block_diag(*(basis.modes for basis in bases)))
+    return Basis(np.concatenate([basis.nodes for basis in bases]), modes)
+
+
+def unit_responses(fem: Fem, nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Motions (3 n, k, 3) float32 [m/N] of the vertices `at` (k,) of unit forces on `nodes` (n,) at rest."""
+    found = []
+    for first in range(0, len(nodes), STRIP):
+        some = nodes[first : first + STRIP]
+        answers = fem.reading(some, np.eye(3 * len(some)).reshape(-1, len(some), 3)).answers
+        found.append(answers.reshape(len(answers), -1, 3)[:, at].astype(np.float32))
+    return np.concatenate(found)
+
+
+# Neighbouring radii differ by this factor at most.
+RATIO = 1.5
+
+
+def radii_between(least: float, greatest: float) -> np.ndarray:
+    """Radii [m] at which to tabulate footprints from `least` to `greatest`: one, or at least three."""
+    if greatest <= least * (1.0 + 1e-9):
+        return np.array([least])
+    steps = int(np.ceil(np.log(greatest / least) / np.log(RATIO)))
+    return np.geomspace(least, greatest, max(STENCIL, steps + 1))
+
+
+def tabulated(
+    fem: Fem,
+    places: np.ndarray,
+    radii: np.ndarray,
+    reading: Reading,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+    journal: Journal | None = None,
+) -> np.ndarray:
+    """What `forms` are multiplied by at each of the places (P, 3) [m] and each radius: (P, R, 19, r) float32.
+
+    Of the r shares that a `reading` takes of the answers; `progress` hears places done and all. Places that the
+    `journal` has are not asked again.
+    """
+    table = np.empty((len(places), len(radii), TERMS, reading.count), np.float32)
+    some = max(1, fem.batch // (len(radii) * FACTORS[-1].shape[1]))
+    left = []
+    for number, row in enumerate(table):
+        if journal is None or ("row", number) not in journal:
+            left.append(number)
+        else:
+            row[:] = np.frombuffer(journal.read(("row", number)), table.dtype).reshape(row.shape)
+    for first in range(0, len(left), some):
+        rows = left[first : first + some]
+        here = places[rows]
+        point = np.repeat(here, 3 * len(radii), axis=0)
+        force = np.tile(np.eye(3), (len(here) * len(radii), 1))
+        loads = Loads((Pushed(point, force, np.tile(np.repeat(radii, 3), len(here))),))
+        table[rows] = fem.series(loads, ORDERS, reading, 3).reshape(len(here), *table.shape[1:])
+        if journal is not None:
+            for number in rows:
+                journal.add(("row", number), table[number].tobytes())
+        progress(len(places) - len(left) + first + len(here), len(places))
+    return table
+
+
+def in_one_disc(patch: Patch, radius: float) -> np.ndarray:
+    """Which nodes (m, m) bool a disc of a radius [m], or a triangle and its neighbours, may bear at once.
+
+    Triangles reach into a disc from nodes that are farther apart, but of the tumour's motion these do 1 in 100,000.
+    """
+    longest = edge_lengths(patch.points[patch.triangles]).max()
+    return squared_distances(patch.points, patch.points) <= (2.0 * max(radius, longest)) ** 2
+
+
+def with_middles(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles (S, 6) with the middle of the edge opposite each corner, and the places (P, 3) [m] that they number."""
+    edges = np.sort(patch.triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
+    ends, middle = np.unique(edges, axis=0, return_inverse=True)
+    triangles = np.column_stack([patch.triangles, len(patch.points) + middle.reshape(-1, 3)])
+    return triangles, np.concatenate([patch.points, patch.points[ends].mean(axis=1)])

@@ -1,0 +1,38 @@
+"""The legend: it names lines and leaves the cortex in sight."""
+
+import numpy as np
+from test_ar_styles import CAMERA, DRAPE, GREEN, OPENING, seen, tumour
+
+from ar.overlay.composite import composite
+from ar.overlay.hud import HEAD
+from ar.overlay.legend import SHEET, Names
+from ar.overlay.marks import Cover, Marks, Words
+from ar.overlay.outlines import ink_of, of_ink
+
+
+def test_the_legend_names_lines_without_their_ink_and_leaves_the_cortex_in_sight():
+    picture, at = seen(0.0), tumour()
+    names = Names("it", "its error", "before")
+    plain, named = (
+        composite(
+            picture, CAMERA, at, cover=Cover(opening=OPENING), marks=Marks(0.003, before=at), words=Words(names=each)
+        ).colour
+        for each in (Names(), names)
+    )
+    changed = (plain != named).any(axis=2)
+    assert changed.sum() > 500 and (picture.segmentation[changed] == DRAPE).all()
+    assert not of_ink(named, ink_of(GREEN))[changed].any()
+    crowded = composite(
+        seen(), CAMERA, at, cover=Cover(opening=OPENING), marks=Marks(0.003, before=at), words=Words(names=names)
+    ).colour
+    without = composite(seen(), CAMERA, at, cover=Cover(opening=OPENING), marks=Marks(0.003, before=at)).colour
+    assert np.array_equal(crowded, without)  # there is cortex everywhere: no room
+
+
+def test_a_cut_leaves_the_foot_to_its_words():
+    covered = np.zeros((480, 640), bool)
+    covered[:270, 400:] = True  # the inset stands low
+    over = composite(
+        seen(0.01), CAMERA, tumour((0.0, 0.0, -0.014)), style="cut", cover=Cover(opening=OPENING, covered=covered)
+    )
+    assert (over.taken == SHEET).any() and not (over.taken[-HEAD:] == SHEET).any()

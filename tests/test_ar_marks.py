@@ -1,0 +1,76 @@
+"""What is drawn beside a hidden surface: outlines of others with their dots, and points that are seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from ar.optics.camera import Camera, look_at
+from ar.overlay.composite import SEEN, composite, draw_points
+from ar.overlay.hud import FINE
+from ar.overlay.marks import Marks, Trace, Words
+from ar.overlay.outlines import ink_of, of_ink, outline_gap, silhouette, stands
+from ar.rendering.layer import Layer
+from ar.rendering.renderer import Lamp, Picture, render
+
+
+def camera(width: int, height: int) -> Camera:
+    eye = np.array([0.0, -0.05, 0.25])
+    return look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]), np.radians(25.0), width, height)
+
+
+def ground(here: Camera) -> Picture:
+    corners = 0.09 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    sheet = Layer("cortex", 1, corners, np.array([[0, 1, 2], [0, 2, 3]]), (0.9, 0.6, 0.6))
+    return render(here, [sheet], Lamp(np.array([0.05, 0.0, 0.3]), np.zeros(3), 0.1))
+
+
+def tumour(centre=(0.0, 0.0, -0.02)) -> Layer:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.012)
+    return Layer("tumour", 3, ball.vertices + np.array(centre), ball.faces, (0.2, 0.9, 0.3))
+
+
+def test_traces_are_drawn_under_the_outline_and_the_motion_may_be_given():
+    here, at = camera(640, 480), tumour()
+    picture = ground(here)
+    blue = replace(tumour((0.004, 0.0, -0.02)), colour=np.array((0.2, 0.4, 1.0)))
+    trace = Trace(blue, (12, 4), np.array([0.004, 0.0, -0.02]))
+    ink = ink_of(blue.colour)
+    plain = composite(picture, here, at, style="contour", marks=Marks(before=at)).colour
+    shown = composite(
+        picture, here, at, style="contour", marks=Marks(before=at, traces=[trace]), words=Words(moved=(2e-3, 1.24e-3))
+    ).colour
+    assert not of_ink(plain, ink).any() and of_ink(shown, ink).sum() > 100
+    own = of_ink(plain, ink_of(at.colour))
+    assert own.sum() > 100 and of_ink(shown, ink_of(at.colour))[own].all()
+    mask = silhouette(here, blue.vertices, blue.triangles)
+    assert outline_gap(shown, ink, mask, own, 32) < 2.5 < outline_gap(plain, ink, mask, own, 32)
+    wrong = silhouette(here, at.vertices + [0.0, 0.003, 0.0], at.triangles)
+    assert outline_gap(shown, ink, wrong, own, 32) > 5.0
+    column, row = here.project(trace.dot[None])[0][0].round().astype(int)
+    assert shown[row, column] == pytest.approx([153, 178, 255], abs=1)  # paler than the ink
+    assert stands(shown, "moved 2.0 +- 1.3 mm", FINE) and stands(plain, "moved 0.0 mm", FINE)
+
+
+def test_fewer_pixels_than_are_asked_for_are_no_outline():
+    picture, mask = np.zeros((60, 60, 3), np.uint8), np.zeros((60, 60), bool)
+    mask[20:40, 20:40] = True
+    covered = np.ones((60, 60), bool)
+    covered[:, 15:18] = False
+    assert outline_gap(picture, (9, 9, 9), mask, covered, 32) == 0.0
+    assert outline_gap(picture, (9, 9, 9), mask, np.zeros_like(mask), 32) == np.inf
+
+
+def test_points_are_drawn_where_they_are_in_sight_and_on_no_line():
+    here = camera(640, 480)
+    over = composite(ground(here), here, tumour(), style="contour")
+    points = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.0, 9.0], [9.0, 0.0, 0.0]])
+    pixels = here.project(points)[0].round()[:3].astype(int)
+    where = np.ones(over.taken.shape, bool)
+    where[pixels[1, 1], pixels[1, 0]] = False
+    over.taken[pixels[2, 1], pixels[2, 0]] = 1
+    before = over.colour.copy()
+    draw_points(over, here, points, where)
+    dotted = [(over.colour[row, column] == SEEN).all() for column, row in pixels]
+    assert dotted == [True, False, False] and 0 < (over.colour != before).any(axis=2).sum() < 30

@@ -1,0 +1,39 @@
+"""Checksums of an episode: what is changed, gone or came later is named."""
+
+import h5py
+
+from scenes.episodes.checksums import seal
+from scenes.episodes.reading.validation import validate_episode
+
+
+def test_content_that_is_not_what_was_written_is_named(whole, tmp_path):
+    path = tmp_path / whole.name
+    path.write_bytes(whole.read_bytes())
+    with h5py.File(path, "a") as file:
+        seal(file)
+    assert validate_episode(path).problems == [] and "checksums: it states none" not in validate_episode(path).skipped
+    with h5py.File(path, "a") as file:
+        file["force"][2, 1] += 1e-9
+    assert validate_episode(path).problems == ["/force: is not as it was written."]
+
+
+def test_arrays_that_are_gone_or_came_later_are_named(whole, tmp_path):
+    path = tmp_path / whole.name
+    path.write_bytes(whole.read_bytes())
+    with h5py.File(path, "a") as file:
+        seal(file)
+        del file["force"], file["pictures/depth"]
+        file["tip"][2, 1] += 1e-9
+        file["late"] = [1.0]
+    gone = "is gone; it was there when the file was written."
+    assert validate_episode(path).problems == [
+        f"/force: {gone}",
+        f"/pictures/depth: {gone}",
+        "/late: was not there when the file was written.",
+        "/tip: is not as it was written.",
+    ]
+    path.write_bytes(whole.read_bytes())
+    with h5py.File(path, "a") as file:
+        seal(file)
+        file["force"].attrs["note"] = "mine"
+    assert validate_episode(path).problems == ["attributes are not as they were written."]

@@ -1,0 +1,41 @@
+"""Causes of an ensemble: draws of them, and the skulls that they are solved in."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_surrogate_locator import FEW
+
+from surrogate.locating.causes import LETS_GO, drainages, groups, pushes
+
+
+def test_draws_depend_on_the_seed_and_the_group_alone(body):
+    first, second = groups(body, 0, FEW)[:2]
+    draws = [(first, 0), (first, 0), (second, 0), (first, 1)]
+    force, again, other, later = (pushes(group, body, seed, FEW).causes[0].force for group, seed in draws)
+    assert np.array_equal(force, again) and not np.array_equal(force, other) and not np.array_equal(force, later)
+    falling = drainages(first, body, 0, FEW)
+    assert [len(level) for level in falling] == [3, 3]
+    down = [level.causes[1].direction for level in falling]
+    assert np.array_equal(*down) and (falling[1].causes[1].csf_level < falling[0].causes[1].csf_level).all()
+
+
+def test_a_skull_that_lets_go_is_not_asked_for_swollen_fluid_tissue(body):
+    made = {(group.skull, group.poisson) for group in groups(body, 0, FEW)}
+    assert (LETS_GO, 0.45) in made and (LETS_GO, 0.485) not in made and ("slide", 0.485) in made
+
+
+def test_each_skull_has_soft_and_stiff_tumours_and_tissue_that_stiffens_little_and_much(body):
+    """One in each part of the range, for every seed; at small strain all have what their group says."""
+    for seed in range(20):
+        for skull in ("bonded", "slide"):
+            some = [
+                group for group in groups(body, seed, replace(FEW, poisson=(0.45, 0.47, 0.49))) if group.skull == skull
+            ]
+            for name, (low, high) in (("ratio", FEW.stiffness), ("exponent", FEW.exponent)):
+                share = [np.log(getattr(group, name) / low) / np.log(high / low) for group in some]
+                assert np.floor(3.0 * np.sort(share)).tolist() == [0.0, 1.0, 2.0], (seed, skull, name)
+    elasticity = some[0].effects(FEW.swellings)[0]
+    (mu, lam), (hard, _) = elasticity.default.lame, elasticity.regions[2].lame
+    assert lam / (2.0 * (lam + mu)) == pytest.approx(0.45) and hard / mu == pytest.approx(some[0].ratio)
+    assert elasticity.default.terms[0][1] == -some[0].exponent

@@ -1,0 +1,271 @@
+"""A ball on condensed linear tissue: what it must obey, whatever else answers the same, and what is learnt on top."""
+
+import shutil
+from dataclasses import dataclass, replace
+
+import h5py
+import numpy as np
+import pytest
+
+from sim.accuracy import REFERENCE
+from sim.anatomy import Anatomy
+from sim.deformation import Deformation, Outcome
+from sim.effects import Elasticity, Held, NodalForce, ToolContact, pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Nodal, Touching
+from sim.material import Material, tissue_to_json
+from surrogate.data.answer_rows import checksums, row_type
+from surrogate.data.cortex_patch import barycentric_lattice, open_patch
+from surrogate.data.dataset import read_dataset
+from surrogate.data.encode import Basis, tool_features
+from surrogate.data.indentation import indented, posed
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_poses import draw_poses, poses_at, tool_of
+from surrogate.evaluation.score import errors, judged_force
+from surrogate.model.store import load, save
+from surrogate.model.tool_contact import wrench
+from surrogate.regressors.rigid_contact import THICKER, Contact
+from surrogate.training.expansion import TOUCHED
+from surrogate.training.fem_tables import condensed, unit_responses
+from surrogate.training.train import learners_for, train
+
+BALL = tool_of("palpation")
+SOFT = Material("linear", 3000.0, 0.45)
+# What the pretender's forces do far away: at no depth, and more by so much a radius of depth.
+LINE = (0.97, 0.3)
+# The same of the force that the tool exerts.
+GRIP = (1.05, 0.5)
+
+
+def features(anatomy: Anatomy, loads: Loads) -> np.ndarray:
+    patch = open_patch(anatomy)
+    return tool_features(patch, indented(loads, BALL, patch))
+
+
+def bodily(anatomy: Anatomy, tissue: Material) -> Fem:
+    return Fem(anatomy, pushed_effects(anatomy, tissue), REFERENCE, "cpu", element="p1")
+
+
+@pytest.fixture(scope="module")
+def pressed(box):
+    return condensed(bodily(box, SOFT), [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)])
+
+
+def test_the_ball_enters_no_facet_and_pulls_nothing(box, pressed):
+    """Signorini's conditions: a dense lattice of every facet is outside, and every force goes away from the middle.
+
+    Forces through the middle have no moment about it; those of bent facets alone are at their nodes, which are given
+    apart by it.
+    """
+    contact, loads = pressed[0], draw_poses("palpation", box, 30, 2)
+    X = features(box, loads)
+    force = contact.force(X)
+    moved = contact.points + (force @ contact.compliance.astype(np.float64).T).reshape(len(X), -1, 3)
+    middle = X[:, :3] + (X[:, 6] - X[:, 7])[:, None] * X[:, 3:6]
+    arm, force = moved - middle[:, None], force.reshape(moved.shape)
+    facets = np.einsum("qc,bsci->bsqi", barycentric_lattice(12), arm[:, contact.triangles])
+    nearest = np.linalg.norm(facets, axis=3).min(axis=(1, 2))
+    assert (nearest > BALL.radius + THICKER - 2e-6).all()
+    assert (nearest < BALL.radius + THICKER + 1e-4).all()
+    assert (np.einsum("bi,bi->b", force.sum(axis=1), X[:, 3:6]) > 0.0).all()
+    moment = np.linalg.norm(np.cross(arm, force).sum(axis=1), axis=1)
+    size = np.linalg.norm(force.sum(axis=1), axis=1) * BALL.radius
+    assert (moment < 1e-3 * size).all()
+    # What is far from the ball bears nothing.
+    idle = np.linalg.norm(arm, axis=2) > BALL.radius + 9e-3
+    assert not force[idle].any()
+
+
+def test_it_answers_as_finite_elements_of_linear_tissue_do(box, pressed):
+    """The same body, condensed or not, deep and oblique: what differs is how the barrier keeps its gap."""
+    contact, bases = pressed
+    fem = Fem(box, [Elasticity(SOFT), Held(), ToolContact((BALL,))], device="cpu", batch=1, element="p1")
+    loads, cortex = draw_poses("palpation", box, 8, 5), bases[1].nodes
+    truth, X = fem.deform(loads), features(box, loads)
+    assert all(outcome.good for outcome in truth.outcome)
+    answered = contact.predict(X) * X[:, 6:7]
+    split = len(bases[0].modes)
+    found = bases[0].decode(answered[:, :split]), bases[1].decode(answered[:, split:])
+    for nodes, ours in ((box.tumour_nodes, found[0]), (cortex, found[1])):
+        theirs = truth.at(nodes).displacement
+        off = np.linalg.norm(ours - theirs, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
+        assert off.mean() < 0.03
+        assert off.max() < 0.06
+    bears = contact.force(X).reshape(len(X), -1, 3).sum(axis=1)
+    reads = truth.reaction[:, 0, :3]
+    assert (np.linalg.norm(bears - reads, axis=1) < 0.05 * np.linalg.norm(reads, axis=1)).all()
+
+
+def test_bone_under_the_ball_bears_nothing(box, pressed):
+    """Over the rim the ball is in what cannot give: what can is pushed away, and no force grows beyond all bounds."""
+    contact, rim = pressed[0], open_patch(box).points
+    middle, pose = 0.5 * (rim.min(axis=0) + rim.max(axis=0)), np.tile(np.eye(4), (8, 1, 1, 1))
+    pose[:, 0, :3, 3] = middle + np.linspace([0.0, 0.0, -4e-3], [1.25 * (rim[:, 0].max() - middle[0]), 0.0, -4e-3], 8)
+    force = contact.force(features(box, Loads((Touching(pose),)))).reshape(8, -1, 3)
+    stiff = np.einsum("nini->n", contact.compliance.reshape(force.shape[1], 3, -1, 3)) == 0.0
+    assert stiff.any() and np.abs(force[-2:]).max() > 0.0
+    assert np.linalg.norm(force.sum(axis=1), axis=1).max() < 20.0
+
+
+def test_how_stiff_tissue_is_does_not_matter(box, pressed):
+    soft = pressed[0]
+    stiff = condensed(bodily(box, replace(SOFT, young=7500.0)), [box.tumour_nodes])[0]
+    X = features(box, draw_poses("palpation", box, 10, 3))
+    force, more = soft.force(X), stiff.force(X)
+    np.testing.assert_allclose(2.5 * force, more, atol=1e-3 * np.abs(more).max())
+    moved, again = force @ soft.compliance.T, more @ stiff.compliance.T
+    np.testing.assert_allclose(moved, again, atol=2e-6)
+    air = X.copy()
+    air[:, 6] = 0.0
+    assert not soft.predict(air).any()
+
+
+def test_unit_responses_are_those_of_small_forces(box):
+    """Against solves under nodal forces."""
+    nodes, at = open_patch(box).nodes[[3, 20]], box.tumour_nodes[:9]
+    found = unit_responses(bodily(box, SOFT), nodes, at)
+    force = np.zeros((6, len(box.mesh.nodes), 3))
+    force[np.arange(6), np.repeat(nodes, 3), np.tile(np.arange(3), 2)] = 1e-4
+    truth = Fem(box, [Elasticity(SOFT), Held(), NodalForce()], REFERENCE, "cpu", element="p1").deform(
+        Loads((Nodal(force),))
+    )
+    np.testing.assert_allclose(found, 1e4 * truth.at(at).displacement, atol=1e-5 * np.abs(found).max())
+
+
+@dataclass(frozen=True)
+class Stiffening:
+    """Answers poses as the ball on linear tissue does, whose forces grow with depth, and with place a little."""
+
+    anatomy: Anatomy
+    contact: Contact
+    bases: list[Basis]
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        X = features(self.anatomy, loads)
+        answered = self.contact.linear(X) * X[:, 6:7]
+        answered *= (LINE[0] + LINE[1] * X[:, 6:7] / X[:, 7:8]) * (1.0 + 0.1 * np.sin(100.0 * X[:, :1]))
+        split, displacement = len(self.bases[0].modes), np.zeros((len(loads), len(self.anatomy.mesh.nodes), 3))
+        for basis, coefficients in zip(self.bases, (answered[:, :split], answered[:, split:]), strict=True):
+            displacement[:, basis.nodes] = basis.decode(coefficients)
+        count, depth = len(loads), X[:, 6:7] / X[:, 7:8]
+        force = self.contact.force(X).reshape(count, -1, 3).sum(axis=1)
+        force *= (GRIP[0] + GRIP[1] * depth) * (1.0 + 0.1 * np.sin(100.0 * X[:, :1]))
+        answer = Deformation(
+            displacement,
+            np.arange(len(self.anatomy.mesh.nodes)),
+            (Outcome.CONVERGED,) * count,
+            np.zeros(count, int),
+            np.zeros(count),
+            loads.times,
+            wrench(force, posed(loads, BALL), BALL),
+        )
+        return answer if at is None else answer.at(at)
+
+
+@pytest.fixture(scope="module")
+def elements(box, pressed):
+    return Stiffening(box, *pressed)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory, elements):
+    path = tmp_path_factory.mktemp("touched") / "data.h5"
+    said = {"shape": repr(BALL), "tissue": tissue_to_json(SOFT), "effects": "as given", "element": "p1"}
+    simulate(path, elements, draw_poses("palpation", elements.anatomy, 160, 0), said)
+    return read_dataset(path)
+
+
+@pytest.fixture(scope="module")
+def trained(data):
+    return train(data, TOUCHED)
+
+
+def test_contact_learns_how_forces_grow_and_a_process_the_rest(trained, elements, box):
+    """On discs left out and on fresh poses; and bounds hold about as often as they say."""
+    contact, both = (trained.models[name] for name in TOUCHED)
+    regressor = contact.parts[0].regressor
+    assert isinstance(regressor, Contact)
+    np.testing.assert_allclose(regressor.line[:, 0], LINE, atol=0.1)
+    scores = {row.name: row.mean_percent for row in trained.scores}
+    assert scores["contact"] < 9.0
+    assert scores["contact-gp"] < 0.7 * scores["contact"]
+    fresh, nodes = draw_poses("palpation", box, 60, 77), box.tumour_nodes
+    truth = elements.deform(fresh, at=nodes).displacement
+    error, found = errors(both, fresh, truth, nodes), both.deform(fresh, at=nodes)
+    assert error.mean() < 0.02 * np.linalg.norm(truth, axis=2).mean()
+    assert (error.max(axis=1) <= found.bound[0]).mean() > 0.8
+    assert (errors(contact, fresh, truth, nodes).max(axis=1) <= contact.deform(fresh, at=nodes).bound[0]).mean() > 0.8
+    cortex = open_patch(box).nodes
+    exact = elements.deform(fresh, at=cortex).displacement
+    assert np.linalg.norm(both.deform(fresh, at=cortex).displacement - exact) < 0.05 * np.linalg.norm(exact)
+
+
+def test_the_tool_s_force_is_answered_with_a_bound_of_its_own(data, trained, elements, box):
+    contact, both = (trained.models[name] for name in TOUCHED)
+    regressor = contact.parts[0].regressor
+    assert isinstance(regressor, Contact)
+    np.testing.assert_allclose(regressor.grip, GRIP, atol=0.1)
+    fresh = draw_poses("palpation", box, 60, 77)
+    truth = elements.deform(fresh).reaction
+    found, plain = both.deform(fresh), contact.deform(fresh)
+    size = np.linalg.norm(truth[:, 0, :3], axis=1)
+    error = np.linalg.norm((found.reaction - truth)[:, 0, :3], axis=1)
+    assert (error / size).mean() < 0.02
+    assert (error / size).mean() < 0.7 * (np.linalg.norm((plain.reaction - truth)[:, 0, :3], axis=1) / size).mean()
+    # Moments about the tool's lowest point follow the force.
+    assert np.linalg.norm((found.reaction - truth)[:, 0, 3:]) < 0.05 * np.linalg.norm(truth[:, 0, 3:])
+    for answer in (found, plain):
+        off = np.linalg.norm((answer.reaction - truth)[:, 0, :3], axis=1)
+        assert (off <= answer.reaction_bound[0]).mean() > 0.75  # 40 loads calibrate
+        assert (answer.reaction_bound[0] < size).mean() > 0.9
+    judged = judged_force(both, fresh, truth[:, 0, :3])
+    assert judged.mean_percent == pytest.approx(100.0 * (error / size).mean())
+    assert judged.held is not None and judged.held[0] == pytest.approx((error <= found.reaction_bound[0]).mean())
+    assert trained.force["contact-gp"].mean_percent < trained.force["contact"].mean_percent < 9.0
+    lifted = poses_at(BALL, np.array([[0.0, 0.0, 0.1]]), np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 0.0, -1e-3]]))
+    assert not both.deform(Loads((lifted,))).reaction.any()
+
+
+def test_without_reactions_the_force_is_not_answered(tmp_path, data, box):
+    """Files of earlier versions, whose rows end before the reaction, are read and train models all the same."""
+    older = tmp_path / "older.h5"
+    shutil.copy(data.path, older)
+    with h5py.File(older, "r+") as file:
+        rows = np.empty(len(data.loads), row_type(len(box.mesh.nodes)))
+        for name in rows.dtype.names or ():
+            rows[name] = file[f"answers/{name}"][:]
+        del file["answers/reaction"]
+        file["answers/checksum"][:] = checksums(rows)
+    read = read_dataset(older)
+    assert read.reaction() is None and data.reaction() is not None
+    np.testing.assert_array_equal(read.displacement(box.tumour_nodes), data.displacement(box.tumour_nodes))
+    found = train(read, ["contact"])
+    assert found.force == {}
+    answer = found.models["contact"].deform(draw_poses("palpation", box, 2, 1))
+    assert answer.reaction.shape == (2, 0, 6) and np.isnan(answer.reaction_bound).all()
+
+
+def test_it_is_stored_and_answers_alone_as_in_company(tmp_path, trained, box):
+    save(tmp_path / "model.npz", trained.models)
+    again, fresh = load(tmp_path / "model.npz", box), draw_poses("palpation", box, 6, 1)
+    for name in TOUCHED:
+        together = trained.models[name].deform(fresh).displacement
+        np.testing.assert_array_equal(again[name].deform(fresh).displacement, together)
+        for what in ("reaction", "reaction_bound"):
+            np.testing.assert_array_equal(
+                *(getattr(model.deform(fresh), what) for model in (again[name], trained.models[name]))
+            )
+        alone = [again[name].deform(fresh.rows(slice(row, row + 1))).displacement[0] for row in range(6)]
+        np.testing.assert_allclose(alone, together, atol=1e-8)
+
+
+def test_what_contact_needs_is_said(data):
+    assert set(TOUCHED) < set(learners_for(data))
+    untold = replace(data, provenance={"ball": repr(BALL.radius)})
+    assert not set(TOUCHED) & set(learners_for(untold))
+    with pytest.raises(InputError, match="does not state its tissue, so no series or contact can be had"):
+        train(untold, ["contact"])
+    pushes = replace(data, provenance={name: said for name, said in data.provenance.items() if name != "shape"})
+    with pytest.raises(InputError, match="holds pushes, of which contact-gp cannot be had: choose from linear"):
+        train(pushes, ["contact-gp"])

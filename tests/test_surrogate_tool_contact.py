@@ -1,0 +1,117 @@
+"""Blades that go on from where an answer had them, how hard they press, and the spatula's model that ships."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenes.script.shipped_files import spatula_model_path, template_path
+from sim.anatomy import Anatomy
+from sim.bodies.meshfile import read_anatomy
+from sim.contact_pressure import pressure
+from sim.deformation import joined
+from sim.effects import Elasticity, Held, ToolContact, pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Touching
+from sim.material import Material
+from sim.tools import Spatula
+from surrogate.data.cortex_patch import open_patch
+from surrogate.data.indentation import indented
+from surrogate.model.guarded import knows_pressure, tool_pressure
+from surrogate.model.learned import Learned, Part
+from surrogate.model.store import load
+from surrogate.model.tool_contact import HELD, ForceModel
+from surrogate.model.training_range import envelope_of
+from surrogate.training.fem_tables import condensed, side_by_side
+
+BLADE = Spatula(8e-3, 12e-3, 1.5e-3)
+SOFT = Material("linear", 3000.0, 0.45)
+
+
+def over(body: Anatomy, *places: tuple[float, float]) -> Loads:
+    """The blade straight over the middle of a box's flat top: so far aside, and so deep [mm]."""
+    points = open_patch(body).points
+    pose = np.tile(np.eye(4), (len(places), 1, 1, 1))
+    pose[:, 0, :3, 3] = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    pose[:, 0, 0, 3] += [1e-3 * aside for aside, _ in places]
+    pose[:, 0, 2, 3] -= [1e-3 * deep for _, deep in places]
+    return Loads((Touching(pose),))
+
+
+@pytest.fixture(scope="module")
+def model(box):
+    """Contact on linear tissue, of which nothing is learned."""
+    parts = [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)]
+    contact, bases = condensed(Fem(box, pushed_effects(box, SOFT), device="cpu", element="p1"), parts, BLADE)
+    contact = replace(contact, grip=np.array([1.0, 0.0]))
+    asked = indented(over(box, (0.0, 0.2), (1.0, 4.0)), BLADE, open_patch(box))
+    known = envelope_of(open_patch(box), asked)
+    part = Part("core", contact, side_by_side(bases))
+    return Learned(box, (part,), known, tool=BLADE, force=ForceModel())
+
+
+def test_a_blade_goes_on_from_where_it_was(model, box):
+    """To the contact that it finds straight from the air; the same start gives the same bytes."""
+    first, second = over(box, (0.0, 2.5)), over(box, (0.4, 3.0))
+    start = model.deform(first)
+    on, straight = model.deform(second, start), model.deform(second)
+    assert on.displacement.tobytes() == model.deform(second, start).displacement.tobytes()
+    for nodes, share in ((model.nodes, 0.08), (box.tumour_nodes, 0.05)):  # on facets of 6 mm, its edge counts
+        one, other = on.at(nodes).displacement, straight.at(nodes).displacement
+        assert 0.0 < np.linalg.norm(one - other, axis=2).max() < share * np.linalg.norm(other, axis=2).max()
+    force = straight.reaction[:, 0, :3]
+    np.testing.assert_allclose(on.reaction[:, 0, :3], force, atol=0.05 * np.linalg.norm(force))
+    # Where it stays, nothing changes; and without what is warm it comes straight in.
+    again = model.deform(first, start)
+    np.testing.assert_allclose(again.displacement, start.displacement, atol=2e-5)
+    dropped = model.deform(second, replace(start, warm={}))
+    assert dropped.displacement.tobytes() == straight.displacement.tobytes()
+
+
+def test_it_comes_straight_in_where_that_is_nearer(model, box):
+    """From the air, from far aside, and out of the tissue again; each row goes its own way."""
+    starts = [model.deform(over(box, place)) for place in ((0.0, -2.0), (9.0, 0.5), (0.3, 1.5))]
+    there = over(box, (0.0, 1.0), (0.0, 1.0), (0.0, 1.5))
+    found, straight = model.deform(there, joined(starts)), model.deform(there)
+    for row in (0, 1):
+        assert found.displacement[row].tobytes() == straight.displacement[row].tobytes()
+    assert found.displacement[2].tobytes() != straight.displacement[2].tobytes()
+    lifted = model.deform(over(box, (0.0, -1.0)), starts[2])
+    assert not lifted.displacement.any() and not lifted.reaction[:, 0, :3].any()
+    strange = replace(starts[2], warm={HELD: np.ones((1, 5))})
+    alone = there.rows(np.array([2]))
+    assert model.deform(alone, strange).displacement.tobytes() == model.deform(alone).displacement.tobytes()
+    spoiled = replace(starts[2], warm={HELD: np.nan * starts[2].warm[HELD]})
+    assert model.deform(alone, spoiled).displacement.tobytes() == model.deform(alone).displacement.tobytes()
+
+
+def test_pressure_is_that_of_the_finite_elements(model, box):
+    """Its sum over areas is the force; its highest is that of the barrier's forces."""
+    loads = over(box, (0.0, 2.0), (2.0, 3.0), (0.0, -1.0))
+    answer = model.deform(loads)
+    found = tool_pressure(model, loads, answer)
+    assert knows_pressure(model) and not found[2].any()
+    np.testing.assert_array_equal(tool_pressure(model, loads, replace(answer, warm={})), found)
+    fem = Fem(box, (Elasticity(SOFT), Held(), ToolContact((BLADE,))), device="cpu", batch=1, element="p1")
+    touching = loads.rows(np.array([0, 1]))
+    truth = pressure(fem, touching, fem.deform(touching))
+    np.testing.assert_allclose(found[:2].max(axis=1), truth.max(axis=1), rtol=0.2)
+    with pytest.raises(InputError, match="give the whole answer"):
+        tool_pressure(model, loads, answer.at(box.tumour_nodes))
+    with pytest.raises(InputError, match="train the learner contact"):
+        tool_pressure(replace(model, force=None), loads, answer)
+
+
+def test_the_spatula_that_ships_has_the_finite_elements_answers():
+    """Fresh poses, two of which have contacts whose single precision is no longer positive definite."""
+    model = load(spatula_model_path(), read_anatomy(template_path()))["contact-gp"]
+    kept = np.load(Path(__file__).parent / "data" / "spatula_poses.npz")
+    answer = model.deform(Loads((Touching(kept["pose"][:, None]),)))
+    off = np.linalg.norm(answer.at(model.anatomy.tumour_nodes).displacement - kept["tumour"], axis=2)
+    moved = np.linalg.norm(kept["tumour"], axis=2)
+    assert (off.max(axis=1) <= answer.bound[1]).all()
+    assert np.mean(off.mean(axis=1) / moved.mean(axis=1)) < 0.08
+    size = np.linalg.norm(kept["force"], axis=1)
+    assert np.mean(np.linalg.norm(answer.reaction[:, 0, :3] - kept["force"], axis=1) / size) < 0.1
