@@ -6,7 +6,6 @@ import json
 import cv2
 import numpy as np
 import pytest
-from ar.tracking.stamp import CELL, WIDTH, read_stamp, stamped
 from theatres import template_theatre
 
 from ar.tracking.drawn import CELL, WIDTH, read_stamp, stamped

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from theatres import template_theatre
 
-from ar.tracking.stamp import read_stamp
+from ar.tracking.drawn import read_stamp
+from ar.tracking.pose import Tracker
 from ar.tracking.targets import Detector, patient_reference, tool_cube
-from ar.tracking.track import Tracker
 from scenes.play.deformers import AtRest
 from scenes.play.player import Player
 from scenes.script.scene import find_scene

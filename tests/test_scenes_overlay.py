@@ -8,10 +8,9 @@ from itertools import islice
 import cv2
 import numpy as np
 import pytest
-from ar.overlay.refind import changed_share, of_ink, outline_gap
 from films import FILM, Recorded
 
-from ar.overlay.outlines import ink_of, silhouette
+from ar.overlay.outlines import changed_share, ink_of, of_ink, outline_gap, silhouette
 from ar.rendering.layer import Layer
 from ar.rendering.real_picture import real_picture
 from ar.tracking.pictures import Named, film_of

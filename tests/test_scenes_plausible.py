@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from test_scenes_overlay import INK, pictures
 
-from ar.overlay.refind import of_ink
+from ar.overlay.outlines import of_ink
 from scenes.tracked.follower import State
 from scenes.tracked.picture import Painter
 from scenes.tracked.plausible import implausible

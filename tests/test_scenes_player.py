@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from ar.overlay.refind import stands
 from theatres import PUSHING, on_template, player, short, small
 
 from ar.optics.camera import project_cv2
