@@ -236,19 +236,19 @@ def demo(theatre, scene):
     assert wait_for(lambda: not [t for t in set(threading.enumerate()) - before if t.name in ("page", "fem", "busy")])
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def study_box():
     return make_box((6, 6, 4), tumour=9e-3, depth=14e-3, opening=20e-3)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def study(tmp_path_factory, study_box):
     from studies import study_of
 
     return study_of(tmp_path_factory.mktemp("report"), study_box, 280)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def study_rows(study):
     from studies import SPECS
 
@@ -312,6 +312,7 @@ def warp_out(warp_folder):
     return warp_folder / "out"
 
 
+@pytest.fixture(scope="module")
 def boxed(box, tmp_path_factory):
     """The box as a file."""
     from sim.bodies.meshfile import write_anatomy
