@@ -1,0 +1,128 @@
+"""Rules of form for docstrings, comments, help strings, headings and names."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import io
+import re
+import tokenize
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+FIRST_WORDS = re.compile(r"\W*(?:what|how|where|whether|which|who|whose|whom|of|as|why|by|that)\b", re.IGNORECASE)
+"""Words that begin no docstring, comment, help string or heading."""
+BANNED = re.compile(
+    r"\b(?:so (?:many|much|far|long|exactly)|beside|anew|nobody|somebody|whoever|of (?:no )?account|by itself|heard"
+    r"|felt|(?:is|are) said|in turn|make good|want of|goes on|promised|refus(?:e[sd]?|al)|film(?:s|ed)?|pictures?"
+    r"|answer(?:s|ed)?|off by|far off|mm off|above all|likewise|stated|learnt|(?:un)?taught|teach(?:es|ing)?|told"
+    r"|vicinit(?:y|ies)|lanes?|rungs?)\b",
+    re.IGNORECASE,
+)
+"""Words that have a standard term instead."""
+HISTORY = re.compile(
+    r"\b(?:earlier (?:than|versions?|runs?)|formerly|used to|until 20\d\d|was aimed|was tried|no longer)\b"
+)
+"""Words of history, for which user pages have no room."""
+QUOTED = re.compile(r"``[^`]+``|`[^`]+`|\$[^$]+\$|\"[^\"]*\"")
+"""Code, formulas and titles of cited works."""
+VERBS = frozenset((Path(__file__).parent / "data/verbs.txt").read_text().split())
+"""Verbs that public functions begin with, next to `is`, `has`, `can`, `to`, `from` and `as`."""
+OPENERS = VERBS | {"is", "has", "can", "to", "from", "as"}
+
+
+class Text(NamedTuple):
+    """Piece of prose: its kind, its place and its words."""
+
+    kind: str
+    place: str
+    text: str
+
+
+@cache
+def read_tree(path: Path) -> ast.Module:
+    """Parsed source of a file."""
+    return ast.parse(path.read_text())
+
+
+def is_string(node: ast.AST | None) -> bool:
+    """Return True for a literal or formatted string."""
+    return isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
+
+
+def to_text(node: ast.AST) -> str:
+    """Text of a string node; each value that is filled in counts as one word."""
+    if isinstance(node, ast.JoinedStr):
+        return "".join(to_text(part) if isinstance(part, ast.Constant) else "x" for part in node.values)
+    return str(node.value) if isinstance(node, ast.Constant) else ""
+
+
+@cache
+def find_texts(path: Path) -> tuple[Text, ...]:
+    """Docstrings (also those under constants), comments, help strings and messages of a Python file."""
+    found, used = [], set()
+    nodes = list(ast.walk(read_tree(path)))
+    for node in nodes:
+        if isinstance(node, ast.Expr) and is_string(node.value):
+            used.add(id(node.value))
+            found.append(Text("docstring", f"{path.name}:{node.lineno}", inspect.cleandoc(to_text(node.value))))
+        for word in node.keywords if isinstance(node, ast.Call) else []:
+            if word.arg in ("help", "description", "epilog") and is_string(word.value):
+                used |= {id(part) for part in ast.walk(word.value)}
+                found.append(Text("help", f"{path.name}:{word.value.lineno}", to_text(word.value)))
+    for node in nodes:  # a formatted string comes before its parts
+        if is_string(node) and id(node) not in used and " " in to_text(node).strip():
+            used |= {id(part) for part in ast.walk(node)}
+            found.append(Text("message", f"{path.name}:{node.lineno}", to_text(node)))  # type: ignore[attr-defined]
+    found += [Text("comment", f"{path.name}:{row}", text) for row, text in find_comments(path.read_text())]
+    return tuple(found)
+
+
+def find_comments(source: str) -> Iterator[tuple[int, str]]:
+    """Line and text of each comment; consecutive lines at one column are one comment."""
+    first, last, column, text = 0, -1, -1, ""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            words = token.string.lstrip("#").strip()
+            if token.start == (last + 1, column):
+                last, text = last + 1, f"{text} {words}"
+                continue
+            if text:
+                yield first, text
+            (first, column), last, text = token.start, token.start[0], words
+    if text:
+        yield first, text
+
+
+def find_headings(page: str) -> list[str]:
+    """Headings of a Markdown page."""
+    return re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", page, flags=re.MULTILINE | re.DOTALL), re.MULTILINE)
+
+
+def begins_well(text: str) -> bool:
+    """Return True unless the first word is one of `FIRST_WORDS`; a name in backticks is none."""
+    return text.lstrip().startswith("`") or not FIRST_WORDS.match(text)
+
+
+def find_banned(text: str) -> list[str]:
+    """Banned words of a text, outside code, formulas and titles."""
+    return BANNED.findall(QUOTED.sub("x", text))
+
+
+def find_functions(path: Path) -> Iterator[str]:
+    """Names of public functions and methods: no properties, kernels, overloads or tests of a base class's name."""
+    tree = read_tree(path)
+    for owner in [tree, *(node for node in ast.walk(tree) if isinstance(node, ast.ClassDef))]:
+        for node in owner.body:
+            if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+                marks = {ast.unparse(mark).partition("(")[0].rpartition(".")[2] for mark in node.decorator_list}
+                if not marks & {"property", "cached_property", "setter", "func", "kernel", "overload", "override"}:
+                    yield node.name
+
+
+def count_classes(paths: Iterable[Path]) -> Counter[str]:
+    """Number of definitions of each class name."""
+    return Counter(node.name for path in paths for node in ast.walk(read_tree(path)) if isinstance(node, ast.ClassDef))
