@@ -1,4 +1,4 @@
-"""The command line: `sulcus COMMAND ...`."""
+"""Simulate brain deformation under surgical tools, and draw the tumour into camera images."""
 
 from __future__ import annotations
 
@@ -18,40 +18,57 @@ from sim.runtime.versions import version_of
 from .commands.guidance import guidance
 from .commands.interrupt import INTERRUPTED
 
-# A command's module is imported only when it is asked for: `sulcus solve` does not wait for torch.
-COMMANDS = {
-    "anatomy": "make a tetrahedral brain with a tumour, from a label volume or drawn in a healthy head",
-    "solve": "find the static equilibrium of any tetrahedral mesh",
-    "simulate": "draw loads of a tool and answer them by finite elements, into a data set",
-    "train": "fit surrogate models to a data set, and compare their errors on cortex that was left out",
-    "judge": "test models on loads that they have never seen: errors, and whether their bounds hold",
-    "export": "write a trained model as an ONNX file, for programs in other languages",
-    "patient": "make all that the scenes need from a label volume: anatomy, data set, models",
-    "locate": "tell where the tumour is from what is seen of the open cortex, and how surely",
-    "locator": "make what `locate`, and scenes in which a tumour is located, need of an anatomy",
-    "fit": "find a patient's tissue and skull from what is seen of the open cortex in several frames",
-    "scenes": "list the built-in scenes: effects, who can play them, pictures and cost",
-    "effects": "measure what each effect of a scene costs, and what it changes",
-    "demo": "play a scene on a page in the browser",
-    "render": "write the frames of a scene as pictures, without display",
-    "collect": "write a scene as one episode: pictures, depth, segmentation, forces, tumour",
-    "episodes": "make thousands of scripted surgeries, drawn from a plan, by many processes and machines",
-    "convert": "write episodes as LeRobot, robomimic, pictures and tables or XDMF, or the card of a data set",
-    "validate": "look whether episodes are whole: their arrays, pictures, checksums and silhouettes",
-    "markers": "write the pages to print: markers of tool and patient, and the board that calibrates cameras",
-    "track": "follow the tool and the patient's reference through a film: poses, covariances, and where they are lost",
-    "warp": "write a deformed brain for 3D Slicer and ITK: fields, the patient's own images, meshes, points",
-    "film": "film a scene as a real camera would, with printed targets in view, and write down what is true of it",
-    "overlay": "draw where the tumour is into a film or what a camera sees, by the tracked reference and tool",
-    "link": "send where the tumour is to 3D Slicer, PLUS and others by OpenIGTLink, live, by the poses that they send",
-    "calibrate": "find a camera's intrinsics, a tool's tip, or how two tracked bodies lie together, and how surely",
-    "register": "find how a scan lies beside the patient's reference, from points that were touched, and how surely",
-    "sensitivity": "measure how the tumour's motion changes with tissue, skull, tool and element, one at a time",
-    "uncertainty": "measure how far a scene's tumour may be from where it is in a patient, and what of that is whose",
-    "budget": "tell how many millimetres to believe of an overlay on a tracked camera, and what takes most of them",
-    "report": "measure what accuracy costs in time, for every deformer, as a page",
-    "check": "play scenes without display, and fail where a picture is farther off than its stated bounds",
+# A command's module is imported only when it is called: `sulcus solve` does not wait for torch.
+GROUPS = {
+    "Start": {
+        "demo": "play a scene in the browser",
+        "scenes": "list the built-in scenes: effects, deformation models, images and cost",
+        "patient": "build all that the scenes need from a label map: anatomy, data set, models",
+    },
+    "Patient model, step by step": {
+        "anatomy": "build a tetrahedral brain with a tumour, from a label map or synthetic in a healthy head",
+        "simulate": "sample loads of a tool and solve them by FEM, into a data set",
+        "train": "fit surrogate models to a data set, and compare their errors on held-out cortex",
+        "judge": "evaluate models on test loads: errors, and coverage of their bounds",
+    },
+    "Scenes without display": {
+        "render": "write the frames of a scene as images",
+        "collect": "write a scene as one episode: images, depth, segmentation, forces, tumour",
+        "check": "play scenes, and fail where an image or a number exceeds its bound",
+    },
+    "Locate the tumour from the exposed cortex": {
+        "locate": "estimate the tumour position from observations of the open cortex, with covariance",
+        "locator": "precompute the ensemble for `locate` and for scenes that locate the tumour",
+        "fit": "estimate a patient's tissue and skull from observations of the open cortex in several frames",
+    },
+    "Cameras and tracking": {
+        "markers": "write printable pages: markers of tool and patient, and the board that calibrates cameras",
+        "calibrate": "estimate a camera's intrinsics, a tool's tip, or a hand-eye transform, with covariance",
+        "register": "register a scan to the patient's reference from touched points, with covariance",
+        "track": "follow the tool and the patient's reference through a video: poses, covariances, gaps",
+        "overlay": "draw the tumour into a video or a live camera, by the tracked reference and tool",
+        "film": "render a scene as a tracked camera records it, with printed targets and ground truth",
+        "budget": "estimate the error budget of an overlay on a tracked camera, and its largest contributions",
+    },
+    "Accuracy and cost": {
+        "report": "measure error and time of every deformation model, as a page",
+        "uncertainty": "estimate the error of a scene's tumour position, and the contribution of each source",
+        "sensitivity": "measure how the tumour's motion depends on tissue, skull, tool and element",
+        "effects": "measure the cost of each effect of a scene, and its influence",
+    },
+    "Data sets": {
+        "episodes": "make thousands of simulated surgeries, sampled from a plan, on many processes and machines",
+        "convert": "write episodes as LeRobot, robomimic, images and tables or XDMF, or write a data set's card",
+        "validate": "check that episodes are complete: arrays, images, checksums and silhouettes",
+    },
+    "Other programs": {
+        "solve": "compute the static equilibrium of any tetrahedral mesh",
+        "warp": "write a deformed brain for 3D Slicer and ITK: fields, the patient's images, meshes, points",
+        "link": "send the tumour to 3D Slicer, PLUS and others by OpenIGTLink, live, from the poses that they send",
+        "export": "write a trained model as an ONNX file",
+    },
 }
+COMMANDS = {name: text for group in GROUPS.values() for name, text in group.items()}
 
 # Commands that make or read models, whose learners may be a user's own.
 MAKING = ("train", "patient")
@@ -107,15 +124,15 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
     """The parser of `sulcus`, and that of each command by name; those asked for know their arguments and examples."""
     parser = argparse.ArgumentParser(
         prog="sulcus",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
         description=__doc__,
-        epilog="First steps: `sulcus demo`, then `sulcus patient --help`. Research only; not a medical device.",
+        epilog=_list_commands(),
     )
     parser.add_argument("--version", action="version", version=f"sulcus {version_of('sulcus')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in COMMANDS.items():
         command = commands.add_parser(
             name,
-            help=text,
             description=text[0].upper() + text[1:] + ".",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
@@ -126,6 +143,16 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
             if name in MAKING + READING:
                 add_plugin(command)
     return parser, dict(commands.choices)
+
+
+def _list_commands() -> str:
+    """Commands by group, with their purposes, and the first steps."""
+    lines = []
+    for title, group in GROUPS.items():
+        lines += [f"{title}:", *(f"  {name:<12}{text}" for name, text in group.items()), ""]
+    return "\n".join(
+        [*lines, "First: `sulcus demo`, then `sulcus patient --help`. Research only; not a medical device."]
+    )
 
 
 def add_plugin(parser: argparse.ArgumentParser) -> None:
