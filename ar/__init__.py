@@ -1,4 +1,4 @@
-"""What the surgeon sees: triangles and cameras in, pixels out. Knows no brain."""
+"""Rendering, camera geometry and overlays for the surgeon's view, independent of brain anatomy."""
 
 import lazy_loader
 

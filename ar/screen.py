@@ -11,10 +11,10 @@ import numpy as np
 
 
 class Film:
-    """A folder of `frame_0000.png`, `frame_0001.png`, ...; each file appears whole."""
+    """Folder of `frame_0000.png`, `frame_0001.png`, ...; each file is written atomically."""
 
     def __init__(self, folder: Path) -> None:
-        """Make the folder where it is missing; ValueError when the path is a file."""
+        """Create the folder if it is missing; ValueError if the path is a file."""
         self.folder = Path(folder)
         if self.folder.exists() and not self.folder.is_dir():
             raise ValueError(f"{self.folder} is a file: name a folder for the frames.")
@@ -26,9 +26,9 @@ class Film:
 
 
 def write_png(path: Path, colour: np.ndarray) -> None:
-    """Write a picture (H, W, 3) uint8 sRGB; the file appears whole, and its folder if there is none.
+    """Write an image (H, W, 3) uint8 sRGB atomically, and create its folder if necessary.
 
-    Raises OSError where it cannot be written.
+    Raises OSError if it cannot be written.
     """
     part = path.with_name(f".{path.name}.part")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -40,34 +40,34 @@ def write_png(path: Path, colour: np.ndarray) -> None:
 
 
 def shrunk(colour: np.ndarray, width: int, height: int) -> np.ndarray:
-    """A picture (H, W, 3) uint8 as one of fewer pixels (height, width, 3): means of those that it covers."""
+    """Downsample an image (H, W, 3) uint8 to (height, width, 3): means of the pixels covered."""
     return cv2.resize(colour, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def read_png(path: Path) -> np.ndarray:
-    """The picture (H, W, 3) uint8 sRGB in a file; ValueError when it holds none."""
+    """Read an image (H, W, 3) uint8 sRGB from a file; ValueError if it holds none."""
     bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if bgr is None:
-        raise ValueError(f"{path} is not a picture that can be read.")
+        raise ValueError(f"{path} is not a readable image.")
     return np.ascontiguousarray(bgr[..., ::-1])
 
 
 def write_film(path: Path, pictures: Iterable[np.ndarray], frames_per_second: float = 25.0) -> None:
-    """Write pictures (H, W, 3) uint8 sRGB of one size as a film: `.mp4`, or `.gif` or `.webp` that loops on a page.
+    """Write images (H, W, 3) uint8 sRGB of one size as a video: `.mp4`, or `.gif` or `.webp` that loops.
 
-    The file appears whole, or not at all when `pictures` or the writing fails.
+    The file is written atomically, or not at all if `pictures` or the writing fails.
 
     Raises
     ------
     ValueError
-        Another suffix, a rate that is not positive, no picture, or pictures of different sizes.
+        Another suffix, a rate that is not positive, no image, or images of different sizes.
     OSError
         A file that cannot be written.
     """
     path = Path(path)
     writers = {".mp4": write_video, ".gif": write_animation, ".webp": write_animation}
     if path.suffix not in writers:
-        raise ValueError(f"{path} ends in {path.suffix!r}: films are {', '.join(writers)}.")
+        raise ValueError(f"{path} ends in {path.suffix!r}: videos are {', '.join(writers)}.")
     if not frames_per_second > 0.0:
         raise ValueError(f"{frames_per_second} frames per second: give a positive rate.")
     part = path.with_name(f".{path.stem}.part{path.suffix}")
@@ -79,7 +79,7 @@ def write_film(path: Path, pictures: Iterable[np.ndarray], frames_per_second: fl
 
 
 def write_video(path: Path, pictures: Iterable[np.ndarray], frames_per_second: float) -> None:
-    """MPEG-4 part 2, picture by picture: nothing is kept in memory."""
+    """Write MPEG-4 part 2, image by image: nothing is kept in memory."""
     writer, size = None, None
     for colour in pictures:
         if writer is None:
@@ -87,19 +87,19 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], frames_per_second: f
             code = cv2.VideoWriter.fourcc(*"mp4v")
             writer = cv2.VideoWriter(str(path), code, frames_per_second, (size[1], size[0]))
             if not writer.isOpened():
-                raise OSError(f"{path.parent} takes no film: see that the folder exists and may be written.")
+                raise OSError(f"{path.parent} cannot hold the video: check that the folder exists and is writable.")
         check_size(colour, size)
         writer.write(np.ascontiguousarray(colour[..., ::-1]))
     if writer is None:
-        raise ValueError("a film needs at least one picture.")
+        raise ValueError("a video needs at least one image.")
     writer.release()
 
 
 def write_animation(path: Path, pictures: Iterable[np.ndarray], frames_per_second: float) -> None:
-    """GIF or WebP that loops for ever; all pictures are in memory at once."""
+    """Write a GIF or WebP that loops for ever; all images are in memory at once."""
     frames = [np.ascontiguousarray(colour[..., ::-1]) for colour in pictures]
     if not frames:
-        raise ValueError("a film needs at least one picture.")
+        raise ValueError("a video needs at least one image.")
     for frame in frames:
         check_size(frame, frames[0].shape)
     animation = cv2.Animation()
@@ -107,25 +107,25 @@ def write_animation(path: Path, pictures: Iterable[np.ndarray], frames_per_secon
     animation.durations = [round(1e3 / frames_per_second)] * len(frames)
     quality = [cv2.IMWRITE_WEBP_QUALITY, 80] if path.suffix == ".webp" else []
     if not cv2.imwriteanimation(str(path), animation, quality):
-        raise OSError(f"{path.parent} takes no film: see that the folder exists and may be written.")
+        raise OSError(f"{path.parent} cannot hold the video: check that the folder exists and is writable.")
 
 
 def check_size(colour: np.ndarray, size: tuple[int, ...] | None) -> None:
-    """ValueError unless a picture has the size of the first."""
+    """Raise ValueError unless an image has the size of the first."""
     if colour.shape != size:
-        raise ValueError(f"pictures of {size} and {colour.shape}: a film's pictures all have one size.")
+        raise ValueError(f"images of {size} and {colour.shape}: all images of a video must have one size.")
 
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 PNG_END, JPEG_END = b"IEND\xaeB`\x82", b"\xff\xd9"
-# Markers of a JPEG's frame header, which states its size; of those between, the coders' tables are none.
+# Markers of a JPEG's frame header, which holds its size; the markers of coding tables in that range are excluded.
 SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION
-"""Not turned as a file may ask: its camera matrix is not."""
+"""Flag to ignore EXIF orientation: the camera matrix is for unrotated images."""
 
 
 def stated_size(code: bytes) -> tuple[int, int]:
-    """Width and height [pixel] that a JPEG or a PNG states of itself; nothing is decoded.
+    """Read width and height [pixel] from the header of a JPEG or a PNG, without decoding.
 
     Raises
     ------
@@ -155,18 +155,18 @@ def stated_size(code: bytes) -> tuple[int, int]:
 
 
 def decoded_colour(code: bytes, width: int, height: int) -> np.ndarray:
-    """A picture (height, width, 3) uint8 sRGB.
+    """Decode an image (height, width, 3) uint8 sRGB.
 
     Raises
     ------
     ValueError
-        Bytes that are no such picture, or one of another size.
+        Bytes that are not such an image, or one of another size.
     """
     return _decoded(code, (height, width, 3), cv2.IMREAD_COLOR_RGB | AS_STORED, np.uint8)
 
 
 def decoded_depth(code: bytes, width: int, height: int, scale: float) -> np.ndarray:
-    """Depth (height, width) float32 [m] out of a PNG of 16 bits whose step is `scale` [m]; 0 where nothing is seen.
+    """Decode depth (height, width) float32 [m] from a PNG of 16 bits with unit `scale` [m]; 0 where nothing is seen.
 
     Raises
     ------
@@ -178,7 +178,7 @@ def decoded_depth(code: bytes, width: int, height: int, scale: float) -> np.ndar
 
 
 def decoded_labels(code: bytes, width: int, height: int) -> np.ndarray:
-    """Labels (height, width) uint8 out of a PNG of 8 bits.
+    """Decode labels (height, width) uint8 from a PNG of 8 bits.
 
     Raises
     ------

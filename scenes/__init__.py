@@ -1,4 +1,4 @@
-"""What happens: scripted tools, the loop that plays them, and the command line."""
+"""Scenes: scripted tools, the loop that plays them, and the command line."""
 
 import lazy_loader
 

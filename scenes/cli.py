@@ -115,7 +115,7 @@ def carried_out(args: argparse.Namespace, package: str) -> int:
 
 
 def limit_threads() -> None:
-    """Hold libraries that are not loaded yet to `MOST_THREADS`, here and in processes to come, if nobody said more."""
+    """Limit libraries that are not loaded yet to `MOST_THREADS`, here and in child processes, unless already set."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, str(min(MOST_THREADS, os.cpu_count() or 1)))
 

@@ -1,4 +1,4 @@
-"""What was learnt about tissue: data sets, regressors, and deformers made of them."""
+"""Trained models of tissue: data sets, regressors, and deformers built from them."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Array functions that NumPy lacks. A type of array registers its own version, as graphs do for export."""
+"""Array functions that NumPy lacks. Other array types, as graphs for export, register their own versions."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ import numpy as np
 
 @singledispatch
 def squared_distances(points: np.ndarray, sites: np.ndarray) -> np.ndarray:
-    """Squared distances (B, n) of points (B, f) from sites (n, f)."""
-    from scipy.spatial.distance import cdist  # takes a tenth of a second, and help texts need none of it
+    """Compute squared distances (B, n) of points (B, f) from sites (n, f)."""
+    from scipy.spatial.distance import cdist  # import takes a tenth of a second; help texts do not need it
 
     return cdist(points, sites, "sqeuclidean")
 
 
 @dataclass(frozen=True, eq=False)
 class Rounded:
-    """A table (n, r) of whole numbers of steps, which takes a fraction of a file's bytes.
+    """Table (n, r) of whole numbers of steps, which takes a fraction of a file's bytes.
 
     Parameters
     ----------
     whole
-        (n, r) numbers of steps, int16, column after column: alike numbers side by side compress better.
+        (n, r) numbers of steps, int16, column by column: similar numbers side by side compress better.
     step
-        (r,) float32, of the table's unit.
+        (r,) float32, in the table's unit.
     """
 
     whole: np.ndarray
@@ -35,14 +35,14 @@ class Rounded:
 
     @classmethod
     def of(cls, table: np.ndarray, step: np.ndarray | float) -> Self:
-        """Round a table (n, r) to a step, or steps (r,); longer ones where int16 would not hold the largest number."""
+        """Round a table (n, r) to a step, or steps (r,); to longer ones if int16 would not hold the largest number."""
         largest = np.abs(table).max(axis=0, initial=0.0) / np.iinfo(np.int16).max
         step = np.maximum(np.broadcast_to(step, largest.shape), largest).astype(np.float32)
         return cls(np.rint(table / step).astype(np.int16, order="F"), step)
 
     @cached_property
     def values(self) -> np.ndarray:
-        """The table (n, r) float32."""
+        """Table (n, r) float32."""
         return np.multiply(self.whole, self.step, order="C", dtype=np.float32)
 
 
@@ -57,24 +57,24 @@ def half_precision(table: np.ndarray) -> np.ndarray:
 
 @singledispatch
 def taken(index: np.ndarray, table: np.ndarray | Rounded) -> np.ndarray:
-    """Rows of a table (n, ...) at whole numbers of any shape: `table[index]`."""
+    """Return rows of a table (n, ...) at whole numbers of any shape: `table[index]`."""
     return (table.values if isinstance(table, Rounded) else table)[index]
 
 
 @singledispatch
 def product_of(rows: np.ndarray, table: Rounded, index: np.ndarray) -> np.ndarray:
-    """rows (B, k) @ the rows of a table (n, r) at an index (k,)."""
+    """Multiply rows (B, k) by the rows of a table (n, r) at an index (k,)."""
     return rows @ table.values[index]
 
 
 @singledispatch
 def columns_in_use(rows: np.ndarray) -> np.ndarray:
-    """The columns of rows (B, n) that are not all zero, ascending."""
+    """Return the columns of rows (B, n) that are not all zero, ascending."""
     return np.flatnonzero(rows.any(axis=0))
 
 
 def in_chunks(predicted: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, most: int = 64) -> np.ndarray:
-    """What is predicted of rows (B, f), at most so many at a time: bounds the memory that it takes."""
+    """Predict rows (B, f) in chunks of at most `most`: limits memory."""
     if len(rows) <= most:
         return predicted(rows)
     return np.concatenate([predicted(rows[first : first + most]) for first in range(0, len(rows), most)])

@@ -158,7 +158,7 @@ def changed(old, new, text=ROS):
         "width": (changed("640", "0"), "image_width of 1 to"),
         "wide": (changed("640", "1000000"), "image_width of 1 to"),
         "part of a pixel": (changed("640", "640.5"), "image_width must be a whole number"),
-        "other size": (changed("640", "100"), "principal point .* far outside a picture of 100 x 480"),
+        "other size": (changed("640", "100"), "principal point .* far outside an image of 100 x 480"),
         "name": (changed("narrow_stereo/left", "[1]"), "camera_name must be text"),
         "long name": (changed("narrow_stereo/left", "x" * 300), "at most 256 characters"),
         "long": (ROS + "#" * LONGEST_TEXT, "more than"),

@@ -26,5 +26,5 @@ class TestRecording:
         assert film.read()[1].shape == (48, 64, 3)
 
     def test_of_nothing_there_is_no_film(self):
-        with pytest.raises(ValueError, match="at least one picture"):
+        with pytest.raises(ValueError, match="at least one image"):
             Recording(0.0).film(1.0)

@@ -77,7 +77,7 @@ def test_bad_places_are_refused(tmp_path):
         write_film(tmp_path / "film.avi", [picture()])
     with pytest.raises(ValueError, match="positive"):
         write_film(tmp_path / "film.mp4", [picture()], 0.0)
-    with pytest.raises(ValueError, match="not a picture"):
+    with pytest.raises(ValueError, match="not a readable image"):
         read_png(tmp_path / "file")
 
 

@@ -326,7 +326,7 @@ def test_twins_are_kept_one_by_one_and_read_at_the_bodys_vertices(body, tmp_path
     assert len(kept) == 4
     for path in kept:
         path.write_bytes(path.read_bytes()[:-300])
-    with pytest.raises(InputError, match="made anew"):
+    with pytest.raises(InputError, match="computed again"):
         list(twins(body, finer, 1, seed=7, folder=tmp_path))
 
 

@@ -23,7 +23,7 @@ def test_the_tumour_comes_where_it_is_with_the_time_of_its_pose(follower, regist
             rest = corners_of(body)
             assert rest == pytest.approx(1e3 * follower.motion.stage.tumour_at_rest.vertices, abs=1e-3)
             tracker.send("TRANSFORM", "ProbeToTracker", transform(beside[row]), NOW)
-            while "no StylusTipToReference yet; other transforms heard: ProbeToTracker" not in await slicer.said(
+            while "no StylusTipToReference yet; other transforms received: ProbeToTracker" not in await slicer.said(
                 "Sulcus"
             ):
                 pass
@@ -68,7 +68,7 @@ def test_a_pose_that_is_none_is_refused_and_counted(follower, registration, besi
             assert why in await tracker.said()
             while why not in (words := await tracker.said("Sulcus")):
                 pass
-            assert "no StylusTipToReference yet; refused: 1 a matrix" in words or "the identity" in words
+            assert "no StylusTipToReference yet; rejected: 1 a matrix" in words or "the identity" in words
             assert not len(corners_of((await tracker.next("POLYDATA", "TumourNow"))[1]))
 
     played(scene())

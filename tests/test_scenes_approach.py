@@ -108,7 +108,7 @@ def test_what_misses_the_opening_is_refused(site, tmp_path):
     beside = line + 60e-3 * site.right
     oblique = site.origin + np.outer([-40e-3, 40e-3], site.direction(Touch(tilt=(1.3, 0.0))))
     for points, kind, reason in (
-        (beside, "Line", r"passes \d\d mm beside the open cortex\. Open the skull where it enters: --opening-at"),
+        (beside, "Line", r"passes \d\d mm from the open cortex\. Open the skull where it enters: --opening-at"),
         (oblique, "Line", "runs at 74 degrees to the opening's axis, and 60 is the most"),
         (
             line + 130e-3 * site.axis,
@@ -155,7 +155,7 @@ def test_it_is_an_option_of_the_command(site, tmp_path, capsys):
     line = marked(tmp_path, planned(site, 0.0, 0.0, (0.0, 0.0))[2] + 60e-3 * site.right)
     words = ["render", "press", "--anatomy", str(tmp_path / "a.vtu"), "--out", str(tmp_path / "out"), "--device", "cpu"]
     assert main([*words, "--trajectory", str(line)]) == 2
-    assert "mm beside the open cortex" in capsys.readouterr().err
+    assert "mm from the open cortex" in capsys.readouterr().err
 
 
 def test_a_patient_says_how_its_scenes_follow_it(site, tmp_path):

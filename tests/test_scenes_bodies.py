@@ -93,9 +93,9 @@ def test_a_model_is_weak_by_what_it_states():
 
     assert not OffBy(LIMIT, None).weak and OffBy(1.1 * LIMIT, None).weak and OffBy(math.nan, None).weak
     assert not left_out(0.01).weak and left_out(0.02).weak and left_out(0.01, 3e-4).weak
-    assert str(OffBy(4e-4, None)) == "0.4 mm off at most in 95 of 100 loads, where 0.2 mm are enough"
-    assert str(left_out(0.042)) == "4.2 % of the motion off in the mean, where 1 % are enough"
-    assert str(left_out(0.042, 3e-4)).endswith("enough; 0.3 mm off at 99.9 %, where 0.2 mm are enough")
+    assert str(OffBy(4e-4, None)) == "maximum error up to 0.4 mm in 95 % of loads (limit 0.2 mm)"
+    assert str(left_out(0.042)) == "mean error 4.2 % of the motion (limit 1 %)"
+    assert str(left_out(0.042, 3e-4)).endswith("); 99.9th percentile 0.3 mm (limit 0.2 mm)")
 
 
 def test_the_worst_are_named_first_and_not_all_of_many():

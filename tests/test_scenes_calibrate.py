@@ -75,17 +75,17 @@ def test_a_video_gives_the_same_camera(pictures, tmp_path, capsys):
 def test_pictures_that_are_no_views_of_the_board_are_refused(folder, pictures, tmp_path, capsys):
     out = ["--out", tmp_path / "camera.yaml"]
     assert "none.mp4: no such file. Give a video" in refused([tmp_path / "none.mp4", *out], capsys)
-    assert "holds no pictures. Give a folder" in refused([tmp_path, *out], capsys)
+    assert "holds no images. Give a folder" in refused([tmp_path, *out], capsys)
     (tmp_path / "text.mp4").write_text("no film")
-    assert "text.mp4: is no video that can be read, as its bytes are not a video's: give" in refused(
+    assert "text.mp4: is not a readable video, as its bytes are not a video's: give" in refused(
         [tmp_path / "text.mp4", *out], capsys
     )
-    assert "640 x 480 pixels, but 1280 x 960 was stated" in refused([folder, *out, "--size", "1280x960"], capsys)
+    assert "640 x 480 pixels, but 1280 x 960 was given" in refused([folder, *out, "--size", "1280x960"], capsys)
     assert "--size '640' is no size" in refused([folder, *out, "--size", "640"], capsys)
     some = tmp_path / "some"
     some.mkdir()
     cv2.imwrite(str(some / "a.png"), np.full_like(pictures[0], 120))
-    assert "the board is in none of 1 pictures: print it" in refused([some, *out], capsys)
+    assert "the board is in none of 1 images: print it" in refused([some, *out], capsys)
     for number in range(3):
         cv2.imwrite(str(some / f"b{number}.png"), pictures[number])
     assert "3 sharp views show the board, but 8 are needed" in refused([some, *out], capsys)

@@ -131,13 +131,13 @@ def test_frames_on_the_way_are_shown_as_they_come_and_the_slider_stays(demo, gat
         for number in (1, 2, 3):
             gated.let(1)
             assert wait_for(lambda number=number: shows(page, number))
-            pending = f"Not yet what is asked: on the way to frame 12, this is frame {number} of 15."
+            pending = f"Result pending: on the way to frame 12, this is frame {number} of 15."
             assert wait_for(lambda pending=pending: pending in page.shown[2])
             assert wait_for(lambda number=number: said[-1] == f"on the way to frame 12: frame {number} is solved")
         assert page.frame.value == 12 and page.shown[3] == 12
         gated.let(9)
         assert wait_for(lambda: shows(page, 12)) and "solved to its tolerance" in page.shown[2]
-        assert "Not yet what is asked" not in page.shown[2]
+        assert "Result pending" not in page.shown[2]
         visitor.wire.close()
 
 

@@ -31,11 +31,11 @@ SENTENCES = {
     "motion_mm": (0.0, "never moves"),
     "pixels": (0.01, "0.01 pixels off"),
     "drawn": (2.5, "the drawn outline is 2.5 pixels off, more than 2"),
-    "printed": (False, "does not say its frame's number"),
+    "printed": (False, "does not show its frame number"),
     "labelled": (False, "cut off, or far from the tip"),
-    "honest": (False, "as if it were seen"),
+    "honest": (False, "as if it were visible"),
     "finite": (False, "not finite"),
-    "answered": (False, "answer is not good"),
+    "answered": (False, "solution is not good"),
     "in_step": (False, "another moment"),
     "covered": (0.89, "in 89% of the frames, less than 90%"),
     "removed": (-0.1, "remove -10% of the tumour's motion, less than 0%"),
@@ -240,10 +240,10 @@ def test_a_bad_outcome_fails_on_either_side(play, frames, truth):
     doubtful = replace(frames[1].deformation, outcome=(Outcome.EXTRAPOLATED,))
     off = [frames[0], replace(frames[1], deformation=doubtful), *frames[2:]]
     why = Outcome.EXTRAPOLATED.value
-    assert broken(play, off, truth)[0] == {f"an answer is not good: frame {frames[1].number} as drawn, {why}"}
+    assert broken(play, off, truth)[0] == {f"a solution is not good: frame {frames[1].number} as drawn, {why}"}
     stopped = replace(truth, outcome=(*truth.outcome[:-1], Outcome.BUDGET))
     why, last = Outcome.BUDGET.value, frames[-1].number
-    assert broken(play, frames, stopped)[0] == {f"an answer is not good: frame {last} by the finite elements, {why}"}
+    assert broken(play, frames, stopped)[0] == {f"a solution is not good: frame {last} by the finite elements, {why}"}
     assert broken(play, off, stopped)[0].pop().endswith(" (1 more)")
 
 

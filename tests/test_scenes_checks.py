@@ -109,7 +109,7 @@ def again(frame, play, opening, gauge=None, style="window"):
 
 def test_what_the_drape_covers_must_be_drawn_so():
     frame, play = frame_of(), player((640, 360))
-    seen = "as if it were seen"
+    seen = "as if it were visible"
     assert broken(again(frame, play, OPENING), play) == []
     for opening in (None, replace(OPENING, ids=(*OPENING.ids, DRAPE))):  # all solid and shaded
         assert any(seen in sentence for sentence in broken(again(frame, play, opening), play))

@@ -74,8 +74,8 @@ def test_a_client_that_does_not_read_gets_the_newest_later_and_keeps_nobody_wait
     ("sent", "why", "goes_on"),
     [
         (b"\x16\x03\x01" + bytes(80), "no OpenIGTLink message", False),
-        (framed("TRANSFORM", "A", bytes(48), 0)[:-1] + b"\1", "TRANSFORM A is refused: wrong checksum", True),
-        (framed("TRANSFORM", "bad", bytes(48), 0), "TRANSFORM bad is refused: what", True),
+        (framed("TRANSFORM", "A", bytes(48), 0)[:-1] + b"\1", "TRANSFORM A is rejected: wrong checksum", True),
+        (framed("TRANSFORM", "bad", bytes(48), 0), "TRANSFORM bad is rejected: what", True),
         (framed("NDARRAY", "A", bytes(90), 0), "NDARRAY A is passed over: type not used", True),
         (framed("TRANSFORM", "A", bytes(1 << 17), 0), "too long", True),
         (HEADER.pack(1, b"POINT", b"A", 0, 1 << 60, 0), "announces 1152921504606846976 bytes", False),

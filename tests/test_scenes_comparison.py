@@ -44,7 +44,7 @@ def test_without_a_common_load_nobody_is_ranked():
     shown(tally, "pressing", "c", 1.0, 0.2)
     assert [row.best for row in tally.rows] == [None, None]
     words = table(tally.rows)
-    assert "not to be compared" in words and "best" not in words
+    assert "not comparable" in words and "best" not in words
 
 
 def test_a_load_shown_again_counts_once_and_old_loads_are_forgotten():
@@ -58,7 +58,7 @@ def test_a_load_shown_again_counts_once_and_old_loads_are_forgotten():
 
 def test_an_error_too_small_to_print_is_not_reported_as_none():
     rows = [Row("a", 1.0, 4e-4, 3, None), Row("b", 1.0, 1.234e-3, 3, None)]
-    assert "under 0.001 mm off" in table(rows) and "0.001 mm off</td><td>3 loads" in table(rows)
+    assert "error under 0.001 mm" in table(rows) and "error 0.001 mm</td><td>3 loads" in table(rows)
     assert "0.000" not in table(rows)
 
 
@@ -71,7 +71,7 @@ class TestVerdict:
 
     def test_of_another_load_it_is_greyed_and_says_so(self):
         said = verdict_words(self.JUDGED, True, "waits")
-        assert said.startswith('<p class="stale">of an earlier load') and "frame 28" in said and "waits" in said
+        assert said.startswith('<p class="stale">previous load') and "frame 28" in said and "waits" in said
 
     def test_an_answer_short_of_its_tolerance_is_not_relied_on(self):
         said = [
@@ -101,4 +101,4 @@ def test_a_verdict_is_the_error_in_millimetres(theatre):
     tip = whole.drawn(3, whole.touch(3), loads, answer, 0.0).distance
     assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
     assert " by FEM, without the error of the tumour (" in said
-    assert verdict_words(found, stale=True, waits="").startswith('<p class="stale">of an earlier load: ')
+    assert verdict_words(found, stale=True, waits="").startswith('<p class="stale">previous load: ')

@@ -47,13 +47,13 @@ def test_changes_are_noted_once_and_a_status_is_not_repeated_ten_times_a_second(
                 await noted("comes; clients: 1")
                 for _ in range(20):
                     one.send("TRANSFORM", NAMES.tool, transform(np.eye(4)))
-                await noted("refused: TRANSFORM StylusTipToReference", "the identity")
+                await noted("rejected: TRANSFORM StylusTipToReference", "the identity")
                 while "20 the identity" not in await one.said("Sulcus"):
                     pass
                 assert await repeated(one, 1.5) <= 2
             await noted("goes; clients: 0")
             server = await asyncio.start_server(lambda reader, writer: writer.close(), HOST, other)
-            await noted(f"{HOST}:{other} is heard")
+            await noted(f"{HOST}:{other} is connected")
             await noted("has ended the connection")
             server.close()
 
@@ -111,7 +111,7 @@ def test_link_slow_solver_reports_each_second_and_empties(follower):
                     assert now - heard < 1.3
                     heard = now
             assert max(ages) < stale + 0.1 and emptied[0] < stale + 0.3
-            assert any("stale, the answer is" in each for each in words)
+            assert any("stale, the result is" in each for each in words)
             slow.clear()
             while not len(corners_of((await viewer.next("POLYDATA", "TumourNow"))[1])):
                 pass

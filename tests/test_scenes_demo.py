@@ -69,7 +69,7 @@ def test_how_the_finite_elements_solve_a_load_can_be_read(demo, monkeypatch):
     assert demo.referee.plan and plan_words(demo.referee.plan) in text.content
     assert "Newton-CG" in text.content and text.content.count("<li>") == len(demo.referee.plan)
     demo.wish.set(deformer="fem")
-    assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in report(demo) and folder.visible)
+    assert wait_for(lambda: demo.run(0.3) and "result of the FEM solver" in report(demo) and folder.visible)
     monkeypatch.setattr(demo.referee, "plan", ())
     assert wait_for(lambda: demo.run(0.3) and not folder.visible)
 
@@ -106,7 +106,7 @@ def test_finite_elements_that_fail_are_not_waited_for(demo, monkeypatch):
         raise RuntimeError("out of memory")
 
     monkeypatch.setattr(Fem, "deform", overflowing)
-    assert wait_for(lambda: demo.run(0.3) and "do not answer any more (out of memory)" in report(demo))
+    assert wait_for(lambda: demo.run(0.3) and "do not solve any more (out of memory)" in report(demo))
 
 
 def test_the_error_is_found_once_for_each_answer(demo, monkeypatch):
@@ -132,7 +132,7 @@ def test_visitors_take_over_scrub_and_switch(running):
     assert wait_for(lambda: demo.wish.touch == Touch(0.0, -5e-3, 0.31, (np.radians(20.0), 0.0)))
     visitor.set(page.inputs["deformer"], "fem")
     assert wait_for(lambda: "|finite elements|: solved to its tolerance" in report(demo))
-    assert wait_for(lambda: "finite elements' own answer" in report(demo))
+    assert wait_for(lambda: "result of the FEM solver" in report(demo))
     visitor.set(page.inputs["deformer"], "svr")
     assert wait_for(lambda: "|trained model svr|" in report(demo))
     assert not demo.wish.plays  # nothing moves under a hand that is still
@@ -225,7 +225,8 @@ def test_a_long_solve_is_reported_while_it_lasts(demo, monkeypatch):
     demo.wish.set(plays=False)
     demo.wish.hand(force=0.2)
     demo.run(0.2)
-    assert said[0].startswith("solving the tool in your hand, 0.20 N (trained model linear)") and said[-1] == ""
+    assert said[0].startswith("computing the deformation for the manual tool, 0.20 N (trained model linear)")
+    assert said[-1] == ""
 
 
 def test_a_model_answers_while_the_finite_elements_are_in_a_solve(demo, monkeypatch):

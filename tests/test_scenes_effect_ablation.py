@@ -109,7 +109,7 @@ def test_the_change_is_that_between_the_answers(small_theatre):
 
 def test_a_frame_that_is_not_answered_is_a_sentence(theatre):
     scene = replace(short(), accuracy=replace(short().accuracy, outer=1, inner=1, steps=0))
-    with pytest.raises(InputError, match=r"the frame at 0\.\d+ s is not answered: stopped"):
+    with pytest.raises(InputError, match=r"the frame at 0\.\d+ s is not solved: stopped"):
         run(theatre, scene, 1)
 
 

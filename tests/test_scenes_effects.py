@@ -124,7 +124,7 @@ class TestSwitches:
     def test_effects_go_off_and_on_and_the_change_is_reported(self, demo, theatre):
         page, visitor = demo.browser, Visitor(demo.browser, 1200)
         assert {"ToolForce", "Gravity"} < set(page.inputs) and not {"Held", "Elasticity"} & set(page.inputs)
-        assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in page.shown[2])
+        assert wait_for(lambda: demo.run(0.3) and "result of the FEM solver" in page.shown[2])
         visitor.set(page.inputs["Gravity"], False)
         assert wait_for(lambda: demo.run(0.3) and "without gravity and fluid the tumour is" in page.shown[2])
         said = float(page.shown[2].split("the tumour is ")[1].split(" mm")[0])
@@ -138,7 +138,7 @@ class TestSwitches:
         assert change > 0.1 and said == pytest.approx(change, abs=0.02)
         assert "gravity pulls" not in page.shown[2]
         visitor.set(page.inputs["Gravity"], True)
-        assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in page.shown[2])
+        assert wait_for(lambda: demo.run(0.3) and "result of the FEM solver" in page.shown[2])
         visitor.wire.close()
 
     def test_without_any_nothing_moves(self, demo):

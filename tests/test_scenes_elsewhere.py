@@ -132,9 +132,9 @@ def test_clocks_are_compared_by_motion_with_an_error_that_holds():
     turning = np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in samples])
     with pytest.raises(ValueError, match="more than one offset"):
         clock_by_motion(times, np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in times]), samples, turning)
-    with pytest.raises(ValueError, match="pictures show what the poses have"):
+    with pytest.raises(ValueError, match="images show what the poses have"):
         clock_by_motion(times[:3], places[:3], samples, others)
-    with pytest.raises(ValueError, match="end before the pictures"):
+    with pytest.raises(ValueError, match="end before the images"):
         clock_by_motion(3.0 * times, places, samples, others)
     some = np.abs(samples - 2.5) > 0.06
     with pytest.raises(ValueError, match="gaps of more than"):
@@ -266,7 +266,7 @@ def test_poses_of_another_clock_say_by_how_much_it_differs(follower, bodies):
     )
     last = followed(follower, Elsewhere(tool, patient), 0.2)[-1]
     assert last.state is State.NO_TOOL
-    assert last.words.startswith("tool not known, the patient's poses begin 99.4 s after this picture (see --clock)")
+    assert last.words.startswith("tool not known, the patient's poses begin 99.4 s after this image (see --clock)")
     late = followed(follower, Elsewhere(tool, replace(patient, times=times - 100.0)), 0.2)[-1]
     assert "the patient's poses end 96." in late.words
     assert (
@@ -379,7 +379,7 @@ def test_a_calibration_s_error_is_in_the_band_as_far_as_the_reference_does_not_t
     write_exactly_known(tmp_path / "k.json", follower.calibration)
     exact = replace(follower, intrinsic=read_intrinsic_covariance(tmp_path / "k.yaml")).step(first.grey, 0.0)
     assert exact.parts["camera"] == 0.0 and exact.band == pytest.approx(bare.band)
-    assert "The camera is stated to be exactly known." in overlay_error(exact)
+    assert "The camera is reported to be exactly known." in overlay_error(exact)
     (tmp_path / "k.json").write_text(json.dumps(stored | {"covariance": [[1.0]]}))
     with pytest.raises(InputError, match="none of 9 x 9"):
         read_intrinsic_covariance(tmp_path / "k.yaml")

@@ -46,8 +46,8 @@ def test_what_is_no_video_is_one_sentence_with_its_reason(content, why, tmp_path
     given = [str(tmp_path / "short.mp4"), "--camera", str(FILM / "camera.yaml")]
     assert main(["track", *given, "--out", str(tmp_path / "poses.csv")]) == 2
     assert capsys.readouterr().err == (
-        f"sulcus track: {tmp_path}/short.mp4: is no video that can be read, as {why}: give a video, or a folder of PNG "
-        "or JPEG pictures.\n"
+        f"sulcus track: {tmp_path}/short.mp4: is not a readable video, as {why}: give a video, or a folder of PNG "
+        "or JPEG images.\n"
     )
 
 

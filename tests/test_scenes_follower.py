@@ -43,7 +43,7 @@ def test_a_registration_that_does_not_say_whose_it_is_is_not_relied_on(follower)
 def test_a_camera_that_repeats_a_picture_or_stops_is_stale(follower):
     few = [each.picture for each in islice(pictures(), 2)]
     known = follower.step(few[0].grey, 0.0)
-    assert follower.step(few[0].grey, 0.0, known).words.startswith("stale, the camera repeats a picture")
+    assert follower.step(few[0].grey, 0.0, known).words.startswith("stale, the camera repeats an image")
     assert follower.step(few[1].grey, 0.5, replace(known, interval=0.1)).state is State.STALE
     assert follower.step(few[1].grey, 0.1, known).state is State.REST
     old = aged(known, 0.5)

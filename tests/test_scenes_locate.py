@@ -137,7 +137,7 @@ def test_what_is_said_is_in_json_too(files, body, tmp_path, capsys):
     assert main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["regions"] == {"tumour": 3.0} and said["warnings"] == sentences and len(sentences) == 3
-    assert "off by 8.0 mm" in sentences[0] and "rows 5 of the file" in sentences[2] and said["slipped"]
+    assert "error of 8.0 mm" in sentences[0] and "rows 5 of the file" in sentences[2] and said["slipped"]
     assert sentences[1] == "If it was checked, say so by --registration-checked."
     assert main([*words, "--json", "--registration-checked"]) == 0
     said = json.loads(capsys.readouterr().out)

@@ -148,7 +148,7 @@ def body_of(raw):
         (lambda: read_points(points(["a"], np.array([[0.0, np.nan, 0.0]]))), "not finite"),
         (lambda: read_image(bytes(20)), "too short"),
         (lambda: read_image(image(np.zeros((4, 4, 3), np.uint8))[:-1]), "another number of pixels"),
-        (lambda: read_image(image(np.zeros((4, 4, 2), np.uint8))), "no single picture"),
+        (lambda: read_image(image(np.zeros((4, 4, 2), np.uint8))), "not one complete 8-bit image"),
     ],
 )  # fmt: skip
 def test_what_is_no_message_is_refused(read, why):

@@ -55,7 +55,7 @@ def test_every_picture_shows_what_is_known_of_it(shown, truth):
     assert [each.known.camera is None for each in shown].count(True) == 5  # the reference is lost for longer
     assert {each.known.words for each in shown if each.known.relied} == {""}
     assert "tool lost: the tumour as 0.1 s ago" in shown[7].known.words
-    assert "no picture for 0.3 s" in shown[15].known.words
+    assert "no image for 0.3 s" in shown[15].known.words
     lost = [shown[n].known.words for n in (4, 10, 11, 13)]
     assert lost == ["reference lost: nothing is drawn"] * 4
 
@@ -150,7 +150,7 @@ def test_the_command_draws_a_film_and_says_how_it_went(tmp_path, capsys):
     assert [row["state"] for row in rows].count("no_reference") == 5
     assert (
         rows[0]["moved_mm"] == rows[0]["within_mm"] == ""
-        and "nobody says how it moved" in rows[0]["words"]
+        and "tissue motion unknown" in rows[0]["words"]
         and rows[11]["tumour_x_mm"] == ""
     )
     film = list(film_of(out, 30.0, colour=True))
@@ -171,7 +171,7 @@ def test_what_does_not_belong_together_is_refused(tmp_path, capsys):
     assert "--rate 0" in refused("--rate", "0")
     assert "no such file" in refused(film=str(tmp_path / "none.mp4"))
     (tmp_path / "text.mp4").write_text("no video")
-    assert "no video that can be read" in refused(film=str(tmp_path / "text.mp4"))
+    assert "not a readable video" in refused(film=str(tmp_path / "text.mp4"))
     small = tmp_path / "small"
     small.mkdir()
     cv2.imwrite(str(small / "a.png"), np.zeros((360, 480, 3), np.uint8))
@@ -189,5 +189,5 @@ def test_what_does_not_belong_together_is_refused(tmp_path, capsys):
     blank.mkdir()
     cv2.imwrite(str(blank / "a.png"), np.full((720, 960, 3), 120, np.uint8))
     assert main(["overlay", str(blank), *GIVEN, "--device", "cpu"]) == 1  # nothing is known
-    with pytest.raises(InputError, match="cannot be read as what is true of a film"):
+    with pytest.raises(InputError, match="cannot be read as the ground truth of a video"):
         read_truth(tmp_path / "text.mp4", "", 0)

@@ -53,7 +53,7 @@ def page(follower, stage):
 
 def seek(page, number):
     page.sought.append(number)
-    return wait_for(lambda: page.browser.shown[0] == number and f"picture {number} of" in page.browser.shown[2])
+    return wait_for(lambda: page.browser.shown[0] == number and f"image {number} of" in page.browser.shown[2])
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_each_state_is_said_with_both_errors(page, number, state, words):
     assert page.newest.known.state is state and words in said and "Error of the tumour: not known" in said
     if state is State.GOOD:
         assert re.search(r'"number">tip to tumour \d+\.\d&nbsp;±&nbsp;\d\.\d&nbsp;mm<', said)
-        assert "within 0.2 mm of where it is drawn" in said and "none stated of" in said
+        assert "within 0.2 mm of where it is drawn" in said and "not given:" in said
         assert "What the camera's calibration adds is not known." in said
         assert "reference seen; tool seen; tumour moved 0.5&nbsp;±&nbsp;0.1&nbsp;mm (error of model and tool)" in said
     else:
@@ -141,8 +141,8 @@ def test_a_camera_s_picture_is_dimmed_once_it_is_old_and_goes_on_when_it_is_back
         assert len(shown) == 2 and {each.known.state for each in shown} <= {State.REST, State.STALE}
         assert all(each.latency > 0.0 for each in shown)
         silent, unplugged, back, paused = fades
-        assert "no picture for 0.2 s" in silent[2] and silent[1].mean() < 0.4 * first.colour.mean()
-        assert re.search("no picture for [1-9][0-9]* s: what is shown is old", unplugged[2])
+        assert "no image for 0.2 s" in silent[2] and silent[1].mean() < 0.4 * first.colour.mean()
+        assert re.search("no image for [1-9][0-9]* s: what is shown is old", unplugged[2])
         assert "Is film.mp4 plugged in?" in unplugged[2]
         assert back[1].mean() > 0.8 * first.colour.mean() and "live from film.mp4" in back[2]
         assert "paused: what is shown is old" in paused[2] and "Error of the overlay: not known" in paused[2]

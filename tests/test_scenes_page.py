@@ -45,7 +45,7 @@ def test_the_page_reads_what_the_frame_holds(theatre):
         "error of the tumour not known); ",
         "; tip to tumour within 2.5 mm of the model&#x27;s finite elements (95 %)</p>",
         "<p>Error of the tumour: not known.",
-        "milliseconds: answer 12.3, camera picture 4.5, overlay 0.7<",
+        "milliseconds: deformation 12.3, rendering 4.5, overlay 0.7<",
     ):
         assert line in said
     plain = report(replace(frame, distance_error=None), player.stage, "linear", "", (), 7)
@@ -56,9 +56,9 @@ def test_the_page_reads_what_the_frame_holds(theatre):
     prior, seen = (report(replace(frame, tumour_error=one), player.stage, "linear", "", (), 7) for one in known)
     where = "95 of 100 times no point of it is more than"
     assert f"<p>Error of the tumour: {where} 4.7 mm from where it is; the largest part is E.</p>" in prior
-    assert f"<p>Error of the tumour: {where} 1.2 mm from where it is; without observation 4.7 mm.</p>" in seen
+    assert f"<p>Error of the tumour: {where} 1.2 mm from where it is; without cortex observation 4.7 mm.</p>" in seen
     guess = report(replace(frame, tumour_error=replace(known[0], guess=True)), player.stage, "linear", "", (), 7)
-    assert f"{where} 4.7 mm from where it is: a guess, of few draws or" in guess and "largest part" not in guess
+    assert f"{where} 4.7 mm from where it is: rough estimate (few samples or" in guess and "largest part" not in guess
     for said, off in ((prior, "4.7"), (seen, "1.2")):
         assert f"tip to tumour 12.3&nbsp;±&nbsp;{off}&nbsp;mm<" in said
     surely = report(replace(frame, moved_error=5.31e-3, model_error=None), player.stage, "fem", "", (), 7)

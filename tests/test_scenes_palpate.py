@@ -86,7 +86,7 @@ class TestPalpate:
     def test_the_page_says_what_it_reads(self, palpated):
         frame = palpated[6]
         reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
-        assert frame.acts == f"the tool reads {reads:.2f} N"
+        assert frame.acts == f"tool force {reads:.2f} N"
 
     def test_what_a_learnt_model_does_not_know_is_not_said(self, palpated):
         """Trained on where a ball is, it answers without the force that it takes."""
@@ -97,9 +97,9 @@ class TestPalpate:
         frame = palpated[6]
         reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
         answer = replace(frame.deformation, reaction_bound=np.array([[0.012], [0.02]]), outcome=(Outcome.PREDICTED,))
-        assert acting(frame.loads, answer, NODES) == f"the tool reads {reads:.2f} N within 0.02 N (model)"
+        assert acting(frame.loads, answer, NODES) == f"tool force {reads:.2f} N within 0.02 N (model)"
         far = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
-        assert acting(frame.loads, far, NODES) == f"the tool reads {reads:.2f} N"
+        assert acting(frame.loads, far, NODES) == f"tool force {reads:.2f} N"
 
     @pytest.mark.parametrize("force", [ForceModel(), None])
     def test_guarded_frames_are_the_model_s_or_the_finite_elements(self, theatre, palpated, force):

@@ -74,7 +74,7 @@ def test_where_no_two_poses_are_round_a_picture_the_newest_counts_with_how_far_t
         placed = at(heard, time, stamped=stamped)
         assert np.allclose(placed.T[:3, :3], camera(times[-1])[:3, :3])
         assert placed.moved == pytest.approx(way * apart / STEP, rel=1e-4)
-    assert at(heard_of(times), times[-1] + 1.0) == "no {name} within 0.3 s of the picture's time"
+    assert at(heard_of(times), times[-1] + 1.0) == "no {name} within 0.3 s of the image's time"
     assert "alone" in at(heard_of(times[-1:]), times[-1])
 
 

@@ -54,7 +54,7 @@ def test_a_damaged_answer_is_named(study):
     answer, table = min(kept.glob("reference-*")), kept / f"series-{study.digest}.npz"
     for path, ask in ((answer, lambda: reference_of(study)), (table, lambda: replace(study).expansion.tabulated)):
         path.write_bytes(b"PK" * 100)
-        with pytest.raises(InputError, match=f"{path.name}.*Delete it: it is made anew"):
+        with pytest.raises(InputError, match=f"{path.name}.*Delete it: it is computed again"):
             ask()
         path.unlink()
 

@@ -77,7 +77,7 @@ def test_there_is_one_mask_for_each_picture_of_its_size():
     assert not next(timed(film(1), iter([soft]))).covered.any()
     with pytest.raises(ValueError, match="frame 1 has no mask"):
         list(timed(film(2), iter([black])))
-    with pytest.raises(ValueError, match="more masks than pictures"):
+    with pytest.raises(ValueError, match="more masks than images"):
         list(timed(film(1), iter([black, black])))
     with pytest.raises(ValueError, match=r"the mask b\.png"):
         list(timed(film(1), iter([Named("b.png", black.grey[1:])])))

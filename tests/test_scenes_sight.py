@@ -90,7 +90,7 @@ def test_the_picture_shows_estimate_truth_and_ellipsoid(play, frames):
     assert np.array_equal(believed[others], positions[others])  # the camera sees the true cortex
     moved = middle_of(play.site.anatomy, (believed - play.site.anatomy.mesh.nodes)[None])[0]
     assert moved == pytest.approx(found.motion, abs=1e-6)
-    assert "locate" in frame.seconds and frame.remark.endswith(f"estimate {1e3 * found.off:.1f} mm off")
+    assert "locate" in frame.seconds and frame.remark.endswith(f"estimate error {1e3 * found.off:.1f} mm")
 
 
 def test_the_checks_pass_and_tell_what_an_estimate_is_worth(play, frames, truth):
@@ -113,8 +113,8 @@ def test_the_checks_see_what_is_wrong_of_an_estimate(play, frames, truth):
     astray = replace(frame.estimate, middle=frame.estimate.middle + 0.01)
     for wrong in (astray, replace(frame.estimate, location=None)):  # one that is refused has no ellipsoid
         assert "ellipsoid holds the tumour's middle in" in sentences(replace(frame, estimate=wrong))
-    silent = replace(frame, remark="estimate 9.9 mm off")
-    assert "does not say its frame's number or" in sentences(silent)
+    silent = replace(frame, remark="estimate error 9.9 mm")
+    assert "does not show its frame number or" in sentences(silent)
     other = replace(frame, estimate=replace(frame.estimate, true=np.full(3, 1.0)))
     assert sentences(other) == ""  # the truth is that of the finite elements
     assert sentences(frame) == ""
@@ -131,8 +131,8 @@ def test_an_ellipsoid_holds_what_its_covariance_says(frames):
 
 def test_where_nothing_moves_that_is_said(play, frames):
     found = frames[0].estimate
-    assert not found.noticed and frames[0].remark.startswith("the estimate sees no motion beyond its error; ")
-    assert "The estimate sees no motion beyond its error." in " ".join(estimated(found))
+    assert not found.noticed and frames[0].remark.startswith("no significant motion detected; ")
+    assert "No significant motion detected." in " ".join(estimated(found))
     tried, guess = (replace(found, location=replace(found.location, calibrated=known)) for known in (True, False))
     assert "guess" not in tried.words + " ".join(estimated(tried))
     assert "; a guess; " in guess.words and "It is a guess" in " ".join(estimated(guess))
@@ -174,8 +174,8 @@ def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
     assert np.count_nonzero(of_ink(frame.shown, ink_of(TRUTH_COLOUR))) > 10
     monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, lines, **more: said.extend(lines) or colour)
     labelled(frame, "fem")
-    assert any(line == f"estimate: refused, {found.refusal}" for line in said)
-    assert "What is seen was refused" in report(frame, play.stage, "fem", "", (), 100)
+    assert any(line == f"estimate: rejected, {found.refusal}" for line in said)
+    assert "Observation rejected" in report(frame, play.stage, "fem", "", (), 100)
 
 
 def test_check_says_what_the_locator_holds_against_its_answers(refused, frames):
@@ -185,9 +185,10 @@ def test_check_says_what_the_locator_holds_against_its_answers(refused, frames):
     slipped = replace(best.estimate, location=replace(best.estimate.location, slipped=True))
     still = replace(best, estimate=replace(best.estimate, true=np.zeros(3)))
     assert objections([best, best]) == [] and objections([replace(best, estimate=None)]) == []
-    assert objections([wild, best]) == [f"the locator refuses what is seen in 1 of 2 frames: {wild.estimate.refusal}"]
+    why = wild.estimate.refusal
+    assert objections([wild, best]) == [f"the locator rejects the observation in 1 of 2 frames: {why}"]
     (doubt,) = objections([replace(best, estimate=slipped), best])
-    assert "doubts its answer in 1 of 2 frames" in doubt and "may have slipped" in doubt
+    assert "doubts its result in 1 of 2 frames" in doubt and "may have slipped" in doubt
     (sparse,) = objections([still, best, still])
     assert "moves in 1 of 3 frames" in sparse and "give a smaller --every" in sparse
 
@@ -235,7 +236,7 @@ def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
     assert "estimate" not in legend(replace(play.scene, sight=None))
     found = frames[1].estimate
     words = " ".join(estimated(found))
-    assert f"{1e3 * found.off:.1f} mm off the truth, which is inside the ellipsoid" in words
+    assert f"error {1e3 * found.off:.1f} mm; the truth is inside the ellipsoid" in words
     assert f"{len(found.observation.now)} points of the cortex, and where the tool touches; no force" in words
     assert "outside of" in " ".join(estimated(replace(found, true=np.ones(3))))
 

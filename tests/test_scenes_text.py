@@ -31,13 +31,13 @@ class TestTrust:
     def test_nothing_is_promised_of_an_answer_that_is_not_good(self, outcome):
         """It stands in another colour, with the reason."""
         said = trust(answer(outcome), "svr")
-        assert "95 of 100" not in said and 'class="warn"' in said and "Do not rely on this answer" in said
+        assert "95 of 100" not in said and 'class="warn"' in said and "Do not rely on this result" in said
 
     def test_a_guarded_model_says_which_of_the_two_answered(self):
         assert trust(answer(Outcome.PREDICTED), GUARDED).startswith(
             "<p><b>trained model (guarded)</b>: inside the range"
         )
-        assert "as the trained model is unsure of this load</b>: solved" in trust(answer(Outcome.CONVERGED), GUARDED)
+        assert "as the error bound of the model is too large</b>: solved" in trust(answer(Outcome.CONVERGED), GUARDED)
 
     def test_code_names_are_not_shown(self):
         for outcome in Outcome:

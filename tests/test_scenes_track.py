@@ -143,7 +143,7 @@ def test_what_cannot_be_followed_is_refused(folder, camera, pictures, tmp_path, 
     cv2.imwrite(str(small / "a.png"), pictures[0][::2, ::2])
     assert "calibrate it at this size" in refused(folder=small)
     (tmp_path / "text.mp4").write_text("no video")
-    assert "no video that can be read" in refused(folder=tmp_path / "text.mp4")
+    assert "not a readable video" in refused(folder=tmp_path / "text.mp4")
     blank = tmp_path / "blank"
     blank.mkdir()
     cv2.imwrite(str(blank / "a.png"), np.full((CAMERA.height, CAMERA.width), 120, np.uint8))

@@ -81,10 +81,10 @@ def test_what_was_not_perturbed_passes(film, parts):
 @pytest.mark.parametrize(
     ("follower", "painter", "broken"),
     [
-        (Sure, Painter, "draw a lost or old place as if it were known"),
-        (Blind, Painter, "back after inf pictures"),
+        (Sure, Painter, "draw a lost or old position as if it were known"),
+        (Blind, Painter, "back after inf images"),
         (Frozen, Painter, "pixels off, more than 2"),
-        (Follower, Fresh, "draw a lost or old place as if it were known"),
+        (Follower, Fresh, "draw a lost or old position as if it were known"),
         (Follower, Silent, "do not say that something is lost or old"),
     ],
 )

@@ -231,7 +231,7 @@ class TestSaid:
                 True, 2.21e-4, TumourError(4.11e-3, "E"),
                 [
                     "model: within 0.23 mm of its finite elements (95 %)",
-                    "tumour: within 4.2 mm of where it is (95 %), above all E",
+                    "tumour: within 4.2 mm of where it is (95 %), mainly E",
                 ],
             ),
             (False, None, NOT_KNOWN, ["model: finite elements themselves", NOT_KNOWN_WORDS]),
@@ -239,7 +239,7 @@ class TestSaid:
                 True, None, TumourError(4.11e-3, "E"),
                 [
                     "model: error against its finite elements not known",
-                    "tumour: within 4.2 mm of where it is (95 %), above all E",
+                    "tumour: within 4.2 mm of where it is (95 %), mainly E",
                 ],
             ),
             (

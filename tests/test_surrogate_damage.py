@@ -180,7 +180,7 @@ class TestFinished:
     def test_a_tool_is_one(self, whole):
         data = read_dataset(whole)
         for radius in ("abc", "-1", "nan"):
-            with pytest.raises(InputError, match=r"data.h5: 'Ball\(radius=.*' is no tool: .* damaged: simulate anew"):
+            with pytest.raises(InputError, match=r"data.h5: 'Ball\(radius=.*' is no tool: .* damaged: simulate again"):
                 replace(data, provenance={**data.provenance, "ball": radius})
 
     def test_files_of_the_version_before_are_read_if_they_were_finished(self, tmp_path, pretender, loads, whole):

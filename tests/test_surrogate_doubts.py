@@ -66,8 +66,8 @@ def test_points_that_are_turned_are_in_doubt_as_those_that_slip(locator, way):
     now = middle + turn.apply(seen.now - middle) + 0.5e-3 * axis
     found = locator.locate(replace(seen, now=now, sigma=None, rigid=0.8e-3))
     assert found.slipped and not found.calibrated and np.linalg.norm(found.centroid) < found.p95
-    assert np.degrees(found.rigid_alone.turn) == pytest.approx(10.0, abs=0.1) and "is off by 0.5 mm and" in found.doubt
-    assert "degrees, where 0.8 mm and 0.3 degrees are stated," in found.doubt
+    assert np.degrees(found.rigid_alone.turn) == pytest.approx(10.0, abs=0.1) and "error of 0.5 mm and" in found.doubt
+    assert "degrees, where 0.8 mm and 0.3 degrees are reported," in found.doubt
     assert "The two cannot be distinguished" in found.doubt and found.warnings == (found.doubt,)
 
 
@@ -78,7 +78,7 @@ def test_a_slip_is_held_against_what_is_stated(locator):
     slipped = replace(seen, now=seen.now + sideways(body, 12e-3))
     expected, far = (locator.locate(replace(slipped, rigid=rigid)) for rigid in (8e-3, 4e-3))
     assert not expected.slipped and not expected.warnings and np.linalg.norm(expected.centroid) < expected.p95
-    assert far.slipped and "where 4 mm and 1.5 degrees are stated" in far.doubt
+    assert far.slipped and "where 4 mm and 1.5 degrees are reported" in far.doubt
 
 
 def test_a_registration_that_was_checked_is_not_doubted(locator):
@@ -97,7 +97,7 @@ def test_a_shift_along_the_axis_is_answered_as_sinking_and_said_to_look_alike(lo
     found = locator.locate(replace(seen, now=seen.now + 12e-3 * open_cortex(body).axis))
     assert not found.slipped and found.calibrated and not found.doubt
     (said,) = found.warnings
-    assert "with a brain at rest. The two cannot be distinguished. If it may be off so far" in said
+    assert "with a brain at rest. The two cannot be distinguished. If such an error is possible" in said
 
 
 @pytest.mark.parametrize("seed", range(6))

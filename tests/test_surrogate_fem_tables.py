@@ -264,7 +264,7 @@ def test_what_contact_needs_is_said(data):
     assert set(TOUCHED) < set(learners_for(data))
     untold = replace(data, provenance={"ball": repr(BALL.radius)})
     assert not set(TOUCHED) & set(learners_for(untold))
-    with pytest.raises(InputError, match="does not state its tissue, so no series or contact can be had"):
+    with pytest.raises(InputError, match="does not state its tissue, so series and contact are not available"):
         train(untold, ["contact"])
     pushes = replace(data, provenance={name: said for name, said in data.provenance.items() if name != "shape"})
     with pytest.raises(InputError, match="holds pushes, of which contact-gp cannot be had: choose from linear"):

@@ -21,7 +21,7 @@ def test_bad_frames_are_refused(body):
         "frame 1: half of the points lie": [
             replace(good, observation=replace(good.observation, rest=1e3 * good.observation.rest))
         ],
-        "mm off the open cortex": [replace(good, tools=(Tool((1e3, 0.0, 0.0)),))],
+        "mm from the open cortex": [replace(good, tools=(Tool((1e3, 0.0, 0.0)),))],
         "not finite": [replace(good, tools=(Tool((np.nan, 0.0, 0.0)),))],
         "give newtons": [replace(good, tools=(Tool(tip, force=50.0),))],
         "needs a force": [replace(good, tools=(Tool(tip, sigma=0.1),))],

@@ -141,7 +141,7 @@ def test_errors_on_left_out_cortex_count_what_finite_elements_answer_as_exact():
     stated = left_out_of(distance, np.full(3, 10e-3), 1e-3 * np.array([0.5, 0.1, 0.1]), np.array([False, False, True]))
     assert stated.mean == pytest.approx((0.02 + 0.002 + 0.04) / 3) and stated.guarded == pytest.approx(0.002 / 3)
     assert stated.solved == pytest.approx(2 / 3) and stated.p999 is None and not stated.enough
-    assert "2.07 % of the motion off alone, with finite elements behind it" in str(stated)
+    assert "2.07 % of the motion alone; with FEM for" in str(stated)
     many = left_out_of(np.full((1000, 2), 0.3e-3), np.full(1000, 1.0), np.full(1000, 0.1e-3), np.zeros(1000, bool))
     assert many.p999 == pytest.approx(0.3e-3) and many.mean < 0.01 and not many.enough
     assert left_out_of(distance[1:2], np.full(1, 10e-3), np.full(1, np.nan), np.zeros(1, bool)).solved == 1.0
@@ -154,7 +154,7 @@ def test_finite_elements_answer_as_much_as_a_model_s_errors_on_left_out_cortex_a
     wide, middle, none = (left_out_of(distance, np.full(4, size), bound, inside) for size in (1e-2, 1e-3, 5e-5))
     assert (wide.limit, wide.solved) == (LIMIT, 0.0) and wide.guarded == pytest.approx(wide.mean)
     assert (middle.limit, middle.solved) == (0.05e-3, 0.5) and middle.guarded == pytest.approx(0.024 / 4)
-    assert (none.limit, none.solved, none.guarded) == (0.0, 1.0, 0.0) and "over 0 mm off, 0.00 %" in str(none)
+    assert (none.limit, none.solved, none.guarded) == (0.0, 1.0, 0.0) and "above 0 mm) 0.00 %" in str(none)
     many = left_out_of(np.full((1000, 1), 0.3e-3), np.full(1000, 1.0), np.full(1000, 0.15e-3), np.zeros(1000, bool))
     assert (many.limit, many.solved) == (0.1e-3, 1.0)
     (_, model), *_ = theatre.models.items()

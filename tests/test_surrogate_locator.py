@@ -233,7 +233,7 @@ def test_a_cloud_may_lie_as_far_off_as_brains_sink(locator, body):
     sunk = rest - [0.0, 0.0, 14e-3]
     assert placed(body, Observation(sunk)).value == pytest.approx(-14e-3)
     for far in (Observation(rest - [0.0, 0.0, 19e-3]), Observation(rest, sunk)):
-        with pytest.raises(InputError, match="off the open cortex"):
+        with pytest.raises(InputError, match="from the open cortex"):
             placed(body, far)
 
 
@@ -314,7 +314,7 @@ def along_x(points):
         (lambda o: replace(o, now=1e-3 * o.now, rest=1e-3 * o.rest), "a thousand times of that"),
         (lambda o: replace(o, rest=o.rest + [0.0, 0.0, 0.05]), "another brain or frame"),
         (lambda o: replace(o, now=o.now + 0.2), "which no brain does"),
-        (lambda o: replace(o, tips=o.now[:1] + [0.0, 0.0, 0.1]), r"tip 1 lies \d+ mm off the open cortex"),
+        (lambda o: replace(o, tips=o.now[:1] + [0.0, 0.0, 0.1]), r"tip 1 is \d+ mm from the open cortex"),
         (lambda o: replace(o, now=o.now[:50]), "50 points have 60 places at rest"),
         (lambda o: replace(o, now=o.now[:, :2]), "no array of shape"),
         (lambda o: replace(o, sigma=np.ones(3)), "60 points have a sigma of shape"),

@@ -16,5 +16,5 @@ def test_points_far_from_vertices_lie_on_the_cortex_all_the_same():
         rest = middle + np.where(np.arange(len(middle)) < 3, above, 0.0)[:, None] * [0.0, 0.0, 1.0]
         evidence = placed(body, Observation(rest + 1e-3, rest))
         assert len(np.unique(evidence.point)) == kept
-    with pytest.raises(InputError, match="half of the points lie more than 7 mm off the open cortex"):
+    with pytest.raises(InputError, match="half of the points lie more than 7 mm from the open cortex"):
         placed(body, Observation(middle + [0.0, 0.0, 7e-3], middle + [0.0, 0.0, 7e-3]))

@@ -159,8 +159,8 @@ def test_a_class_that_lacks_something_is_a_sentence(clean):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ("[:, 0]", r"answers \d+ loads with numbers of shape \(\d+,\): let `predict` give \(\d+, \d+\), all finite"),
-        (" * np.nan", r"numbers of shape \(\d+, \d+\): let `predict` give"),
+        ("[:, 0]", r"returns shape \(\d+,\) for \d+ loads: let `predict` give \(\d+, \d+\), all finite"),
+        (" * np.nan", r"returns shape \(\d+, \d+\) for \d+ loads: let `predict` give"),
     ],
 )
 def test_answers_that_are_none_are_refused_when_it_is_trained(folder, tmp_path, capsys, change, words, clean):

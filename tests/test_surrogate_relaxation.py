@@ -189,7 +189,7 @@ def test_a_model_plays_the_series_that_it_learned_and_no_other(model, box):
     assert under(()) == f"{words}does not relax"
     timeless = replace(model, training={name: said for name, said in model.training.items() if name != "history"})
     assert "from loads without time, and here the tissue relaxes" in str(refusal(timeless, EFFECTS))
-    with pytest.raises(InputError, match="others than this version knows"):
+    with pytest.raises(InputError, match="unsupported histories"):
         stated_series({**SAID, "history": "the tool fell"})
 
 
@@ -200,9 +200,9 @@ def test_it_plays_alone_frame_by_frame(model, box):
     scene = replace(scene, element="p1")
     assert theatre.names(scene) == ("contact", "fem") and theatre.usual(scene) == "contact"
     assert judged(replace(model, bound=1e-3)).endswith("enough: it plays alone nevertheless, as its tissue relaxes")
-    with pytest.raises(InputError, match="its tissue relaxes, so that finite elements would have to answer"):
+    with pytest.raises(InputError, match="its tissue relaxes, so that finite elements would have to solve"):
         theatre.deformer(GUARDED, scene)
-    with pytest.raises(InputError, match="would need every frame before"):
+    with pytest.raises(InputError, match="would need every earlier frame"):
         Guarded(model, Fading(box))
     with pytest.raises(InputError, match="contact follows tissue that relaxes in time"):
         onnx_model("contact", model)

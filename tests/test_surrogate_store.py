@@ -84,7 +84,7 @@ def encoder(name):
         (basis(lambda b: {"nodes": b.nodes.astype(float)}), "no vertex numbers"),
         (basis(lambda b: {"modes": put(b.modes, (0, 0), np.nan)}), "modes are no finite numbers"),
         (basis(lambda b: {"modes": b.modes[:, 3:]}), "modes are not those of its nodes"),
-        (basis(lambda b: {"modes": b.modes[1:]}), "answers no load"),
+        (basis(lambda b: {"modes": b.modes[1:]}), "gives no result for a load"),
         (lambda model: replace(model, parts=()), "no parts"),
         (
             lambda model: replace(model, parts=(replace(model.parts[0], encoder="magic"),)),
@@ -300,5 +300,5 @@ def test_bad_model_files_are_sentences(box, tmp_path):
     with pytest.raises(InputError, match="cannot be read as a model"):
         load(tmp_path / "arrays.npz", box)
     np.savez(tmp_path / "old.npz", header=np.array(json.dumps({"format": "sulcus model 0"})))
-    with pytest.raises(InputError, match="train it anew"):
+    with pytest.raises(InputError, match="train it again"):
         load(tmp_path / "old.npz", box)

@@ -98,7 +98,7 @@ def test_pressure_is_that_of_the_finite_elements(model, box):
     touching = loads.rows(np.array([0, 1]))
     truth = pressure(fem, touching, fem.deform(touching))
     np.testing.assert_allclose(found[:2].max(axis=1), truth.max(axis=1), rtol=0.2)
-    with pytest.raises(InputError, match="give the whole answer"):
+    with pytest.raises(InputError, match="give the complete result"):
         tool_pressure(model, loads, answer.at(box.tumour_nodes))
     with pytest.raises(InputError, match="train the learner contact"):
         tool_pressure(replace(model, force=None), loads, answer)

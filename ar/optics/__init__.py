@@ -1,1 +1,1 @@
-"""Cameras: where points land in a picture, lenses, calibrations."""
+"""Cameras: projection, lenses, calibrations."""

@@ -1,4 +1,4 @@
-"""What a calibration says of a camera, and its text as OpenCV and ROS write it.
+"""Calibration of a camera, and its text in the formats of OpenCV and ROS.
 
 OpenCV: `cv2.FileStorage` with the names of its calibration sample. ROS: the camera_info of camera_calibration_parsers.
 """
@@ -15,38 +15,38 @@ import numpy as np
 from .camera import Camera
 from .lens import Lens
 
-# Pixels along a side.
+# Largest image side [pixel].
 LARGEST_SIDE = 16384
 READOUT = "readout_time"
-"""The key of a rolling shutter's readout [s]: neither OpenCV nor ROS has one, and both leave it alone."""
-# Of a camera's name.
+"""Key of a rolling shutter's readout time [s]: neither OpenCV nor ROS has one, and both ignore it."""
+# Maximum length of a camera's name.
 LONGEST = 256
-# From the first row of a picture to the last [s].
+# Largest readout time, from the first row of an image to the last [s].
 LONGEST_READOUT = 1.0
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """The inside of a camera.
+    """Intrinsic calibration of a camera.
 
     Parameters
     ----------
     focal, principal
         Focal lengths, and the principal point, along columns and rows [pixel]; whole numbers are pixel centres.
     width, height
-        Size of the picture [pixel].
+        Size of the image [pixel].
     lens
-        How its lens distorts.
+        Lens distortion.
     name
         Of the camera; may be empty.
     readout
-        How much later the last row of a picture is taken than the first [s]: of a rolling shutter. A picture's time is
-        that of its middle row.
+        Rolling-shutter readout time: from the first row of an image to the last [s]. An image's time is that of its
+        middle row.
 
     Raises
     ------
     ValueError
-        A picture, a focal length, a principal point or a readout that no camera has.
+        An image size, a focal length, a principal point or a readout out of range.
     """
 
     focal: tuple[float, float]
@@ -61,11 +61,11 @@ class Calibration:
         for what, pixels in (("width", self.width), ("height", self.height)):
             if not 1 <= pixels <= LARGEST_SIDE:
                 raise ValueError(
-                    f"a picture has an image_{what} of 1 to {LARGEST_SIDE}, not {pixels}: calibrate again."
+                    f"an image_{what} of 1 to {LARGEST_SIDE}, not {pixels}: calibrate again."
                 )
         if not 0.0 <= self.readout <= LONGEST_READOUT:
             raise ValueError(
-                f"a picture's rows are read in 0 to {LONGEST_READOUT:g} s, not in {self.readout:g}: give another "
+                f"an image's rows are read in 0 to {LONGEST_READOUT:g} s, not in {self.readout:g}: give another "
                 f"{READOUT} [s]."
             )
         if not all(0.0 < each < np.inf for each in self.focal):
@@ -73,7 +73,7 @@ class Calibration:
         for at, size in zip(self.principal, (self.width, self.height), strict=True):
             if not -size <= at <= 2 * size:
                 raise ValueError(
-                    f"the principal point {self.principal} is far outside a picture of {self.width} x {self.height}: "
+                    f"the principal point {self.principal} is far outside an image of {self.width} x {self.height}: "
                     "give the size that the camera was calibrated with."
                 )
         if len(self.name) > LONGEST or not (self.name + "x").isprintable():
@@ -86,20 +86,20 @@ class Calibration:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def camera(self, T_camera_world: np.ndarray) -> Camera:
-        """The camera at a pose, (4, 4) as in `Camera`; errors as there."""
+        """Return the camera at a pose, (4, 4) as in `Camera`; errors as there."""
         return Camera(self.K, T_camera_world, self.width, self.height, self.lens)
 
     def sized(self, width: int, height: int, scale: bool = False) -> Calibration:
-        """The same camera with pictures of another size, if `scale` is set and the picture has the same shape.
+        """Return the calibration for another image size, if `scale` is set and the aspect ratio is the same.
 
         Raises
         ------
         ValueError
-            Another size, and it is not to be scaled; or a picture of another shape.
+            Another size without `scale`, or another aspect ratio.
         """
         if (width, height) == (self.width, self.height):
             return self
-        here = f"the camera was calibrated with pictures of {self.width} x {self.height}, not {width} x {height}"
+        here = f"the camera was calibrated with images of {self.width} x {self.height}, not {width} x {height}"
         if not scale:
             raise ValueError(f"{here}: calibrate with that size, or ask for the calibration to be scaled.")
         larger = self.camera(np.eye(4)).scaled(width / self.width)
@@ -110,7 +110,7 @@ class Calibration:
 
 
 def opencv_text(calibration: Calibration) -> str:
-    """A calibration as `cv2.FileStorage` writes it in YAML; five coefficients, or eight of a rational lens."""
+    """Write a calibration as YAML of `cv2.FileStorage`; five coefficients, or eight of a rational lens."""
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", calibration.width)
     storage.write("image_height", calibration.height)
@@ -123,9 +123,9 @@ def opencv_text(calibration: Calibration) -> str:
 
 
 def ros_text(calibration: Calibration) -> str:
-    """A calibration as ROS's camera_info in YAML, of the model plumb_bob, or rational_polynomial where that is needed.
+    """Write a calibration as YAML of ROS's camera_info, of the model plumb_bob, or rational_polynomial if needed.
 
-    Its rectification is none, and its projection that of the camera matrix.
+    Without rectification; the projection is that of the camera matrix.
     """
     coefficients = coefficients_of(calibration.lens)
     lines = [
@@ -143,7 +143,7 @@ def ros_text(calibration: Calibration) -> str:
 
 
 def coefficients_of(lens: Lens) -> np.ndarray:
-    """(5,) or, of a rational lens, (8,), in OpenCV's order."""
+    """Return coefficients (5,) or, of a rational lens, (8,), in OpenCV's order."""
     return lens.coefficients if lens.coefficients[5:].any() else lens.coefficients[:5]
 
 
@@ -153,13 +153,13 @@ def _matrix(name: str, values: np.ndarray) -> list[str]:
     return [f"{name}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{numbers}]"]
 
 
-# Characters: a calibration has some thousand.
+# Maximum number of characters: a calibration has about a thousand.
 LONGEST_TEXT = 64 * 1024
-# Brackets in brackets, and dashes in a line: OpenCV's parser calls itself for each, and a calibration needs two.
+# Maximum depth of brackets and of dashes in a line: OpenCV's parser is recursive, and a calibration needs two.
 DEEPEST = 4
-# Of models that ROS names: how many coefficients they have at least.
+# Minimum number of coefficients of the models named by ROS.
 MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
-# Coefficients that OpenCV takes; those after the eighth are of thin prisms and tilted sensors.
+# Numbers of coefficients in OpenCV; those after the eighth are of thin prisms and tilted sensors.
 COUNTS = (4, 5, 8, 12, 14)
 KEYS = (
     "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model", "distortion_coefficients",
@@ -168,25 +168,25 @@ KEYS = (
 """Keys of a calibration that are read."""
 BLOCK_LIST = re.compile(r"^(( *)data: *)\n((?:\2 *- *[-+.\w]+ *\n)+)", re.MULTILINE)
 ITEM = re.compile(r"^ *- *([-+.\w]+)", re.MULTILINE)
-"""A list of numbers, one on a line, and one of them."""
+"""Patterns of a list of numbers, one on a line, and of one of them."""
 NAME_LINE = re.compile(r"^(camera_name:[ \t]+)([^\s\"'\[{][^\n\"#]*?)[ \t]*$", re.MULTILINE)
 OTHER_LINE = re.compile(rf"^(?!(?:{'|'.join(KEYS)})\b)\w+:[ \t]+[^\s\[{{|>&!][^\n]*\n", re.MULTILINE)
-"""A name without quotes, and a value on one line whose key is not read."""
+"""Patterns of a name without quotes, and of a value on one line whose key is not read."""
 WANTED = (
     "Give YAML with image_width, image_height, camera_matrix and distortion_coefficients, as OpenCV or ROS writes it."
 )
 
 
 def parsed(text: str) -> Calibration:
-    """The calibration in a YAML text of `cv2.FileStorage`, or of ROS's camera_info.
+    """Parse a calibration from YAML of `cv2.FileStorage`, or of ROS's camera_info.
 
-    Four coefficients (k1 k2 p1 p2) are taken as five. More than eight are taken if those after the eighth are 0.
+    Four coefficients (k1 k2 p1 p2) are read as five. More than eight are accepted if those after the eighth are 0.
 
     Raises
     ------
     ValueError
-        A text that is too long or no such YAML. A part that is missing, is given twice, has another shape or is not
-        finite. A lens or a model of distortion that this program does not have. What `Calibration` refuses.
+        A text that is too long or not such YAML. A part that is missing, is given twice, has another shape or is not
+        finite. An unsupported lens or distortion model. Errors of `Calibration`.
     """
     storage = _opened(text)
     root = storage.root()
@@ -214,7 +214,7 @@ def parsed(text: str) -> Calibration:
 
 
 def _opened(text: str) -> cv2.FileStorage:
-    """The text as OpenCV reads it."""
+    """Open the text with OpenCV."""
     if len(text) > LONGEST_TEXT:
         raise ValueError(f"it has more than {LONGEST_TEXT} characters, and a calibration some thousand. {WANTED}")
     text = text.removeprefix("\ufeff").replace("\r\n", "\n")
@@ -228,12 +228,12 @@ def _opened(text: str) -> cv2.FileStorage:
         text = "%YAML:1.0\n---\n" + re.sub(r"\A\s*---[ \t]*\n", "", text)
     try:
         return cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    except (cv2.error, SystemError) as error:  # the second is how a failing constructor shows
+    except (cv2.error, SystemError) as error:  # a failing constructor raises SystemError
         raise ValueError(f"it is no YAML that OpenCV reads: set lists in brackets, or indent them. {WANTED}") from error
 
 
 def _needed(text: str) -> str:
-    """The text as OpenCV's parser takes it: lists in brackets, names in quotes, and no key that is not read."""
+    """Convert the text for OpenCV's parser: lists in brackets, names in quotes, and only keys that are read."""
     text = BLOCK_LIST.sub(lambda found: f"{found[1]}[{', '.join(ITEM.findall(found[3]))}]\n", text)
     return OTHER_LINE.sub("", NAME_LINE.sub(r'\1"\2"', text))
 
@@ -246,7 +246,7 @@ def _int(root: cv2.FileNode, key: str) -> int:
 
 
 def _read_matrix(root: cv2.FileNode, key: str, shape: tuple[int, int] | None = None) -> np.ndarray:
-    """A matrix of finite numbers; nothing of the size that it says it has is made room for."""
+    """Read a matrix of finite numbers; its declared size allocates no memory."""
     node = root.getNode(key)
     if not node.isMap() or not {"rows", "cols", "data"} <= set(node.keys()):
         raise ValueError(f"{key} must have rows, cols and data. {WANTED}")
@@ -264,7 +264,7 @@ def _read_matrix(root: cv2.FileNode, key: str, shape: tuple[int, int] | None = N
 
 
 def _lens(root: cv2.FileNode, keys: list[str]) -> Lens:
-    """How the lens distorts."""
+    """Read the lens distortion."""
     if "distortion_coefficients" not in keys:
         raise ValueError(f"distortion_coefficients is missing; five times 0 for no distortion. {WANTED}")
     values = _read_matrix(root, "distortion_coefficients")
@@ -285,7 +285,7 @@ def _lens(root: cv2.FileNode, keys: list[str]) -> Lens:
 
 
 def _readout(root: cv2.FileNode, keys: list[str]) -> float:
-    """The readout of a rolling shutter [s]; 0 where the text has none."""
+    """Read the readout time of a rolling shutter [s]; 0 if the text has none."""
     if READOUT not in keys:
         return 0.0
     node = root.getNode(READOUT)
@@ -295,7 +295,7 @@ def _readout(root: cv2.FileNode, keys: list[str]) -> float:
 
 
 def _name(root: cv2.FileNode, keys: list[str]) -> str:
-    """The camera's name."""
+    """Read the camera's name."""
     if "camera_name" not in keys:
         return ""
     node = root.getNode("camera_name")

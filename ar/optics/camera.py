@@ -22,7 +22,7 @@ from .lens import Lens, straightened, with_focus, without_focus
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera, or one with a lens that distorts.
+    """Pinhole camera, optionally with lens distortion.
 
     Parameters
     ----------
@@ -31,9 +31,9 @@ class Camera:
     T_camera_world
         (4, 4) rigid transform: x_camera = T_camera_world x_world [m].
     width, height
-        Size of the picture [pixel].
+        Size of the image [pixel].
     lens
-        How the lens distorts; None, or all coefficients 0: not at all.
+        Lens distortion; None, or all coefficients 0: none.
 
     Raises
     ------
@@ -57,7 +57,7 @@ class Camera:
         if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0.0:
             raise ValueError("T_camera_world must be a rotation and a translation.")
         if self.width < 1 or self.height < 1:
-            raise ValueError(f"a picture of {self.width} x {self.height} pixels is empty: both must be at least 1.")
+            raise ValueError(f"an image of {self.width} x {self.height} pixels is empty: both must be at least 1.")
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "T_camera_world", T)
         if self.lens is not None and not self.lens.coefficients.any():
@@ -65,7 +65,7 @@ class Camera:
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) the camera's position in the world [m]."""
+        """(3,): position of the camera in the world [m]."""
         return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
 
     @property
@@ -79,11 +79,11 @@ class Camera:
         return float(2.0 * np.arctan(0.5 * self.height / self.K[1, 1]))
 
     def in_frame(self, points: np.ndarray) -> np.ndarray:
-        """World points (..., 3) in the camera frame, (..., 3) [m]."""
+        """Transform world points (..., 3) to the camera frame, (..., 3) [m]."""
         return points @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (..., 2) and depth (...) [m] of world points (..., 3).
+        """Project world points (..., 3) to pixels (..., 2) and depth (...) [m].
 
         Pixels are NaN where depth <= 0 (behind), and beyond the reach of the lens (`Lens.reach`).
         """
@@ -97,7 +97,7 @@ class Camera:
         return homogeneous[..., :2] / np.where(depth > 0.0, depth, np.nan)[..., None], depth
 
     def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """World points (..., 3) [m] at `depth` (...) [m] (z, not range) behind pixels (..., 2).
+        """Compute world points (..., 3) [m] at `depth` (...) [m] (z, not range) behind pixels (..., 2).
 
         NaN at pixels where the lens sees nothing.
         """
@@ -109,16 +109,16 @@ class Camera:
 
     @cached_property
     def straight(self) -> np.ndarray:
-        """Where each pixel would be without the lens, (H, W, 2) [pixel]; NaN where the lens sees nothing."""
+        """Undistorted position of each pixel, (H, W, 2) [pixel]; NaN where the lens sees nothing."""
         if self.lens is None:
             rows, columns = np.mgrid[: self.height, : self.width].astype(np.float64)
             return np.stack([columns, rows], axis=-1)
         return straightened(self.lens, tuple(self.K.ravel().tolist()), self.width, self.height)
 
     def perturbed(self, degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Camera:
-        """The same camera, before which the world is turned about its centre by an angle [degree].
+        """Return the same camera with the world rotated about its centre by an angle [degree].
 
-        Right-handed round `axis` (camera frame): round y, the default, what lies ahead moves to the right.
+        Right-handed round `axis` (camera frame): round y, the default, the scene ahead moves to the right.
         """
         direction = np.asarray(axis, np.float64) / np.linalg.norm(axis)
         turn = np.eye(4)
@@ -126,13 +126,13 @@ class Camera:
         return replace(self, T_camera_world=turn @ self.T_camera_world)
 
     def moved(self, shift: np.ndarray) -> Camera:
-        """The same camera elsewhere: moved by `shift` (3,) [m] in its own frame, right, down and forward."""
+        """Return the same camera moved by `shift` (3,) [m] in its own frame, right, down and forward."""
         T = self.T_camera_world.copy()
         T[:3, 3] -= shift
         return replace(self, T_camera_world=T)
 
     def zoomed(self, factor: float) -> Camera:
-        """The same camera of `factor` times the focal length, about its principal point; the lens keeps its shape.
+        """Return the same camera with `factor` times the focal length, about its principal point, with the same lens.
 
         Raises
         ------
@@ -146,16 +146,16 @@ class Camera:
         return replace(self, K=K)
 
     def refocused(self, focal_length: float, before: float, now: float) -> Camera:
-        """The same camera focused on another distance, which changes how large it draws.
+        """Return the same camera focused on another distance, which changes its magnification.
 
-        A thin lens of focal length f has the picture of what lies at d at the distance f d / (d - f) behind it.
+        A thin lens of focal length f forms the image of an object at d at the distance f d / (d - f) behind it.
 
         Parameters
         ----------
         focal_length
             Of the lens itself [m].
         before, now
-            The distances [m] that it was focused on when calibrated, and is now.
+            Focus distances [m] during calibration, and now.
 
         Raises
         ------
@@ -164,13 +164,13 @@ class Camera:
         """
         if not 0.0 < focal_length < min(before, now) < np.inf:
             raise ValueError(
-                f"a lens of {focal_length:g} m has no picture of what is {min(before, now):g} m away: focus farther."
+                f"a lens of {focal_length:g} m forms no image of an object {min(before, now):g} m away: focus farther."
             )
         behind = [distance / (distance - focal_length) for distance in (now, before)]
         return self.zoomed(behind[0] / behind[1])
 
     def scaled(self, factor: float) -> Camera:
-        """The same view on `factor` times as many pixels along each side."""
+        """Return the same view on `factor` times as many pixels along each side."""
         width, height = round(self.width * factor), round(self.height * factor)
         resize = np.array(
             [
@@ -182,16 +182,16 @@ class Camera:
         return replace(self, K=resize @ self.K, width=width, height=height)
 
     def cropped(self, rows: slice, columns: slice) -> Camera:
-        """The camera of `picture[rows, columns]`, slices with start and stop."""
+        """Return the camera of `picture[rows, columns]`, slices with start and stop."""
         shift = np.zeros((3, 3))
         shift[:2, 2] = columns.start, rows.start
         part = replace(self, K=self.K - shift, width=columns.stop - columns.start, height=rows.stop - rows.start)
-        if self.lens is not None:  # to find it again would take longer
+        if self.lens is not None:  # computing it again would take longer
             part.__dict__["straight"] = self.straight[rows, columns] - shift[:2, 2]
         return part
 
     def padded(self, aspect: float) -> Camera:
-        """The same picture centred on the smallest canvas of width / height = `aspect` that contains it."""
+        """Return the camera of the image centred on the smallest canvas of width / height = `aspect` that holds it."""
         width = max(self.width, round(self.height * aspect))
         height = max(self.height, round(self.width / aspect))
         shift = np.zeros((3, 3))
@@ -207,10 +207,10 @@ def look_at(
     width: int = 640,
     height: int = 480,
 ) -> Camera:
-    """A camera at `eye` (3,) [m] that looks at `target` (3,) [m], `up` (3,) upwards in the picture.
+    """Build a camera at `eye` (3,) [m] that looks at `target` (3,) [m], with `up` (3,) upwards in the image.
 
-    `vertical_fov` [rad]; square pixels, principal point in the centre. Raises ValueError where no direction is
-    defined: eye on target, or `up` along the line of sight.
+    `vertical_fov` [rad]; square pixels, principal point in the centre. Raises ValueError if no direction is defined:
+    eye on target, or `up` along the line of sight.
     """
     forward = np.asarray(target, np.float64) - eye
     right = np.cross(forward, up)
@@ -226,7 +226,7 @@ def look_at(
 
 
 def project_cv2(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Pixels (N, 2) of world points (N, 3) [m] by `cv2.projectPoints`: the independent check on `Camera.project`."""
+    """Project world points (N, 3) [m] to pixels (N, 2) by `cv2.projectPoints`, to check `Camera.project`."""
     rotation = cv2.Rodrigues(camera.T_camera_world[:3, :3])[0]
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 1, 3)
     pixels, _ = cv2.projectPoints(points, rotation, camera.T_camera_world[:3, 3], camera.K, camera.distortion)
@@ -234,19 +234,18 @@ def project_cv2(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 BASELINE = 24e-3
-"""Between the two ways of light of an operating microscope [m]."""
+"""Distance between the two optical paths of an operating microscope [m]."""
 
 
 def stereo_pair(
     camera: Camera, baseline: float = BASELINE, working_distance: float | None = None
 ) -> tuple[Camera, Camera]:
-    """The left and the right camera about one in the middle, `baseline` [m] apart along its rows.
+    """Build the left and the right camera about a central one, `baseline` [m] apart along its rows.
 
     Parameters
     ----------
     working_distance
-        How far ahead of the middle the two axes meet [m]; None: they are parallel, and rows of both pictures show the
-        same.
+        Distance at which the two axes meet [m]; None: they are parallel, and rows of both images correspond.
 
     Raises
     ------
@@ -260,21 +259,21 @@ def stereo_pair(
     return camera.moved(-half).perturbed(-inwards), camera.moved(half).perturbed(inwards)
 
 
-# What is seen moves by so many pixels at most while a band of rows is taken: then no row is off by half as much.
+# Largest motion of points during a band of rows [pixel]: the error of a row is then at most half of it.
 STEP = 0.4
-# Moments of a picture in which motion is looked at; a band's fewest rows; steps to the row in which a point is seen.
+# Number of times at which motion is sampled; fewest rows of a band; iterations to the row in which a point is seen.
 MOMENTS, FEWEST, STEPS = 33, 4, 6
 
 
 def row_time(row: np.ndarray | float, height: int, readout: float) -> np.ndarray | float:
-    """When a row of a picture of so many is taken [s]; rows beyond the picture as its first or last one."""
+    """Compute the time [s] of a row in an image of `height` rows; rows outside as the first or last one."""
     return readout * (np.clip(np.asarray(row) / max(height - 1, 1), 0.0, 1.0) - 0.5)
 
 
 def row_bands(camera_at: Callable[[float], Camera], readout: float, points: np.ndarray) -> list[tuple[slice, Camera]]:
-    """Bands of rows from top to bottom, each with the camera at its time, of these rows alone.
+    """Split the rows, from top to bottom, into bands, each with the camera at its time, cropped to these rows.
 
-    There are so many that points (n, 3) [m] move by at most `STEP` pixels in each.
+    There are as many as needed for points (n, 3) [m] to move by at most `STEP` pixels in each.
     """
     middle = camera_at(0.0)
     moments = readout * np.linspace(-0.5, 0.5, MOMENTS)
@@ -290,7 +289,7 @@ def row_bands(camera_at: Callable[[float], Camera], readout: float, points: np.n
 
 
 def time_of_point(camera_at: Callable[[float], Camera], readout: float, point: np.ndarray) -> float:
-    """When the row is taken in which a point (3,) [m] is seen [s]; 0 where it has no pixel."""
+    """Compute the time [s] of the row in which a point (3,) [m] is seen; 0 if it has no pixel."""
     time = 0.0
     for _ in range(STEPS):
         camera = camera_at(time)

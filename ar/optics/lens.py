@@ -1,6 +1,6 @@
-"""What a lens does to a picture: distortion by Brown and Conrady, with OpenCV's coefficients in OpenCV's order.
+"""Lens distortion by Brown and Conrady, with OpenCV's coefficients in OpenCV's order.
 
-Places in the picture are normalised here: (x, y) = (X / Z, Y / Z) of a point in the camera frame.
+Image positions are normalised here: (x, y) = (X / Z, Y / Z) of a point in the camera frame.
 """
 
 from __future__ import annotations
@@ -10,21 +10,21 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-# Directions are tried up to this angle from the axis [rad], in so many steps and at so many angles round the axis.
+# Largest angle from the axis that is tried [rad]; number of angles from the axis; number of angles round the axis.
 WIDEST = np.radians(88.0)
 STEPS, ROUND = 4096, 32
-# Newton's steps at most, and the residual that ends them, in normalised coordinates: 1e-9 pixel at a focal length of
+# Maximum Newton steps, and the residual that ends them, in normalised coordinates: 1e-9 pixel at a focal length of
 # 1000.
 NEWTON, EXACT = 20, 1e-12
-# So many places are solved for together: their arrays stay in a processor's cache. All at once take longer by a half.
+# Chunk size: its arrays fit in the CPU cache. All at once take half as long again.
 TOGETHER = 8192
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens that distorts.
+    """Lens with distortion.
 
-    With r^2 = x^2 + y^2 and q = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6), (x, y) comes to
+    With r^2 = x^2 + y^2 and q = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6), (x, y) is mapped to
 
         (x q + 2 p1 x y + p2 (r^2 + 2 x^2), y q + p1 (r^2 + 2 y^2) + 2 p2 x y).
 
@@ -33,7 +33,7 @@ class Lens:
     Raises
     ------
     ValueError
-        A coefficient that is not finite, or a lens that folds the picture already at its middle.
+        A coefficient that is not finite, or a lens that folds the image already at its centre.
     """
 
     k1: float = 0.0
@@ -49,19 +49,19 @@ class Lens:
         if not np.isfinite(self.coefficients).all():
             raise ValueError(f"a lens takes finite coefficients, not {self.coefficients.tolist()}: calibrate again.")
         if not self.reach > 0.0:
-            raise ValueError(f"a lens of {self.coefficients.tolist()} folds the whole picture: calibrate again.")
+            raise ValueError(f"a lens of {self.coefficients.tolist()} folds the whole image: calibrate again.")
 
     @property
     def coefficients(self) -> np.ndarray:
-        """(8,) in OpenCV's order, which `cv2.projectPoints` takes."""
+        """(8,): coefficients in OpenCV's order, for `cv2.projectPoints`."""
         return np.array(astuple(self), np.float64)
 
     @cached_property
     def reach(self) -> float:
-        """The distance from the axis, X / Z, to which the lens keeps places apart: what is beyond is not seen.
+        """Largest distance from the axis, X / Z, where the distortion is one-to-one: points beyond are not seen.
 
-        Polynomials fold back. In a disc where the Jacobian's symmetric part is positive definite, no two places come
-        to one.
+        Polynomials fold back. In a disc where the Jacobian's symmetric part is positive definite, no two points have
+        the same image.
         """
         radii = np.tan(np.linspace(0.0, WIDEST, STEPS))
         angles = np.linspace(0.0, 2.0 * np.pi, ROUND, endpoint=False)
@@ -76,7 +76,7 @@ class Lens:
         return float(radii[-1] if not len(folds) else radii[max(folds[0] - 1, 0)])
 
     def bent(self, places: np.ndarray) -> np.ndarray:
-        """Where places (..., 2) come to, (..., 2); NaN beyond `reach`."""
+        """Distort positions (..., 2); NaN beyond `reach`."""
         x, y = places[..., 0], places[..., 1]
         with np.errstate(invalid="ignore"):
             seen = np.hypot(x, y) <= self.reach
@@ -84,11 +84,11 @@ class Lens:
         return np.stack(self._moved(x, y), axis=-1)
 
     def straight(self, places: np.ndarray) -> np.ndarray:
-        """The inverse of `bent`, (..., 2), by Newton's method; NaN where nothing within `reach` comes to a place."""
+        """Undistort positions (..., 2), the inverse of `bent`, by Newton's method; NaN without solution in `reach`."""
         places = np.asarray(places, np.float64)
         wanted = places.reshape(-1, 2).T
         _, moved = self._along
-        # No tangential part moves a place further than this.
+        # Upper bound of positions with the tangential part.
         far = moved[-1] + 3.0 * (abs(self.p1) + abs(self.p2)) * self.reach**2
         near = np.flatnonzero(np.hypot(*wanted) <= far)
         out = np.full(wanted.shape, np.nan)
@@ -97,9 +97,9 @@ class Lens:
         return out.T.reshape(places.shape)
 
     def _solved(self, wanted: np.ndarray) -> np.ndarray:
-        """What comes to places (2, n), (2, n)."""
+        """Undistort positions (2, n)."""
         far = np.hypot(*wanted)
-        # Without its tangential part the lens moves places along rays: from there.
+        # Start: without its tangential part the lens moves positions along rays.
         radii, moved = self._along
         x, y = np.interp(far, moved, radii) / np.where(far > 0.0, far, 1.0) * wanted
         for _ in range(NEWTON):
@@ -110,7 +110,7 @@ class Lens:
             a, b, c = self._slopes(x, y)
             inverse = 1.0 / (a * c - b * b)
             x, y = x - inverse * (c * off_x - b * off_y), y - inverse * (a * off_y - b * off_x)
-            # Beyond the reach the slopes mean nothing: a step that leads there ends at its rim.
+            # Beyond the reach the derivatives are meaningless: a step that leads there ends at its edge.
             back = np.minimum(1.0, self.reach / np.maximum(np.hypot(x, y), self.reach))
             x, y = back * x, back * y
         at = self._moved(x, y)
@@ -119,13 +119,13 @@ class Lens:
 
     @cached_property
     def _along(self) -> tuple[np.ndarray, np.ndarray]:
-        """Distances from the axis, and those they come to without the tangential part, both ascending."""
+        """Distances from the axis, undistorted and distorted without the tangential part, both ascending."""
         radii = np.linspace(0.0, self.reach, STEPS)
         moved = radii * self._radial(radii**2)[0]
         return radii, np.maximum.accumulate(moved)
 
     def _radial(self, r2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Q, and its slope by r^2."""
+        """Compute q, and its derivative by r^2."""
         over = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         under = 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
         steep = self.k1 + r2 * (2.0 * self.k2 + 3.0 * r2 * self.k3)
@@ -134,7 +134,7 @@ class Lens:
         return q, (steep - q * lower) / under
 
     def _moved(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where (x, y) comes to, whatever the reach."""
+        """Distort (x, y) without the limit of the reach."""
         r2, xy = x * x + y * y, 2.0 * x * y
         q, _ = self._radial(r2)
         return (
@@ -143,7 +143,7 @@ class Lens:
         )
 
     def _slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The Jacobian's entries (xx, xy, yy): it is symmetric."""
+        """Compute the entries (xx, xy, yy) of the Jacobian, which is symmetric."""
         q, steep = self._radial(x * x + y * y)
         across = 2.0 * steep * x * y + 2.0 * self.p1 * x + 2.0 * self.p2 * y
         return (
@@ -155,7 +155,7 @@ class Lens:
 
 @lru_cache(maxsize=4)
 def straightened(lens: Lens, K: tuple[float, ...], width: int, height: int) -> np.ndarray:
-    """Where each pixel would be without its lens, (H, W, 2) [pixel]; NaN where nothing is seen. K (9,): row by row."""
+    """Undistort each pixel, (H, W, 2) [pixel]; NaN where nothing is seen. K (9,): row by row."""
     matrix = np.reshape(K, (3, 3))
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
     places = lens.straight(without_focus(matrix, np.stack([columns, rows], axis=-1)))
@@ -163,10 +163,10 @@ def straightened(lens: Lens, K: tuple[float, ...], width: int, height: int) -> n
 
 
 def with_focus(K: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Pixels (..., 2) of normalised places (..., 2) by K (3, 3)."""
+    """Map normalised positions (..., 2) to pixels (..., 2) by K (3, 3)."""
     return places @ K[:2, :2].T + K[:2, 2]
 
 
 def without_focus(K: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Normalised places (..., 2) of pixels (..., 2) by K (3, 3)."""
+    """Map pixels (..., 2) to normalised positions (..., 2) by K (3, 3)."""
     return (pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T

@@ -1,1 +1,1 @@
-"""What is drawn over the picture: the hidden surface, in each style, its lines and its words."""
+"""Overlay of the hidden surface on the image: styles, lines and text."""

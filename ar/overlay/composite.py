@@ -1,4 +1,4 @@
-"""What lies under the surface, drawn into the picture in register, and never over the tool."""
+"""Composition of the hidden surface into the camera image, registered to it, and never over the tool."""
 
 from __future__ import annotations
 
@@ -26,33 +26,33 @@ from .places import CLEAR, PAD
 from .styles import STYLES, Opening, Style
 from .window import DARK, FRONT, SHUT, Lines, Roles, overlaid
 
-# What may not be relied on is drawn in amber, and broken, with words in a paler one, so that pixels of the outline are
+# Unreliable overlays are amber and broken; their text has a paler colour, so that pixels of the outline's colour are
 # the outline's alone.
 DOUBTFUL = (0.92, 0.50, 0.05)
 WARNING = (1.0, 0.84, 0.5)
 SEEN = (255.0, 245.0, 190.0)
-"""Ink of points that are seen."""
-# Of the outline's brightness: that of the margin round it, which is no place of the surface.
+"""Colour of observed points."""
+# Brightness of the margin line relative to the outline, as the margin is not the surface itself.
 FAINT = 0.75
-# Lengths of the strokes and gaps of a doubtful outline, of a margin, and of an outline under closed ground [pixel].
+# Stroke and gap lengths of an unreliable outline, of a margin, and of an outline under closed ground [pixel].
 BROKEN, DASHED, HIDDEN = (9, 6), (12, 7), (9, 6)
-# Width of the latter [pixel].
+# Line width of an outline under closed ground [pixel].
 BOLD = 2
-# Width of lines that stand in the silhouette [pixel].
+# Width of text lines within the silhouette [pixel].
 SHORT = 96
-# Rows of text by which words of the head may be lower to leave a line in sight.
+# Rows by which text at the top may be lower, to leave a line visible.
 LOWER = 2
-# Shares of the picture's width that lines at the head may have, the first at which they run over no tool.
+# Widths of text at the top, as shares of the image width; the first that covers no tool is used.
 HEAD_WIDTHS = 0.62, 0.5, 0.4, 0.32, 0.25
-# So far the words of a style stay from the number beside the tip [pixel].
+# Distance of a style's text from the number next to the tip [pixel].
 APART = 2 * ROW
 
 
 @dataclass(frozen=True, eq=False)
 class Overlaid:
-    """A picture with lines and words in it: colour (H, W, 3) uint8, and taken (H, W) uint8, above 0 where they are.
+    """Image with lines and text in it: colour (H, W, 3) uint8, and taken (H, W) uint8, above 0 at lines and text.
 
-    `named`: whether a legend names the lines.
+    `named`: True if a legend names the lines.
     """
 
     colour: np.ndarray
@@ -62,14 +62,14 @@ class Overlaid:
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """What lies over the silhouette in a box of the picture.
+    """Ground over the silhouette, in a box of the image.
 
     Parameters
     ----------
     mask, shut
-        (h, w) bool: the silhouette, and the ground that nothing shines through.
+        (h, w) bool: the silhouette, and the ground that the surface does not shine through.
     words
-        What is said of the latter; empty where it is no noticeable share.
+        Label of the closed ground; empty if it covers too small a share.
     """
 
     mask: np.ndarray
@@ -78,24 +78,24 @@ class Ground:
 
 
 def load_kernels(device: str = "cpu") -> None:
-    """Load all kernels that draw a picture with its overlay, so that the first does not wait for them."""
+    """Load all kernels that draw an image with its overlay, so that the first image does not wait for them."""
     load(device, surfaces, rasteriser, shade, real_picture, window, distances)
 
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """A picture with its lines, before words.
+    """Image with its lines, before text.
 
     Parameters
     ----------
     colour, taken
         As of `Overlaid`.
     faint, thin
-        (H, W) bool: lines of the margin, and of rings, which words may run over.
+        (H, W) bool: lines of the margin, and of rings, which text may cover.
     around
-        The box that was drawn in; None where nothing is in sight.
+        Box that was drawn in; None if nothing is visible.
     ground
-        What lies over the surface there, if the style tells.
+        Ground over the surface in the box, if the style shows it.
     """
 
     colour: np.ndarray
@@ -167,7 +167,7 @@ def _sketched(
     measure: Measure, grown: Layer | None, marks: Marks, opening: Opening | None, doubtful: bool,
     box: tuple[slice, slice] | None,
 ) -> Sketch:  # fmt: skip
-    """Draw all lines of what a measure shows, `grown` by its margin; the surfaces lie in a `box`."""
+    """Draw all lines of a measure, with `grown` (the surface plus its margin); the surfaces are in a `box`."""
     picture, camera, hidden, style, gauge = measure.picture, measure.camera, measure.hidden, measure.style, marks.gauge
     shape = camera.height, camera.width
     taken, faint, thin = np.zeros(shape, np.uint8), np.zeros(shape, bool), np.zeros(shape, bool)
@@ -204,20 +204,20 @@ def _sketched(
 
 
 def _motion(hidden: Layer, before: Layer, words: Words) -> str:
-    """Mean motion of the surface, or the one that is given, in words."""
+    """Describe the surface's mean motion, or the given motion."""
     mean = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
     return f"{words.names.motion} {millimetres(mean) if words.moved is None else millimetres(*words.moved)}"
 
 
 def _written(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overlaid:
-    """Write head, motion and doubt.
+    """Write the lines at the top, the motion and the warning.
 
-    Head and corner come first, so that their words seldom move; then by importance, for some are left out without room.
+    Top and corner come first, so that their text seldom moves; then by importance, for some is left out without space.
     """
     drawn = Overlaid(sketch.colour, sketch.taken.copy())
     write_head(drawn, words.head)
     if motion:
-        firm = drawn.taken * ~sketch.faint  # it keeps its place, though it stands on the margin's line
+        firm = drawn.taken * ~sketch.faint  # it keeps its place, although it is on the margin's line
         lay(drawn.colour, firm, folded(motion, NARROW * camera.width), (0, camera.height))
         np.bitwise_or(drawn.taken, firm, out=drawn.taken)
     write_doubt(drawn, words.doubt)
@@ -225,7 +225,7 @@ def _written(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overl
 
 
 def _explained(drawn: Overlaid, sketch: Sketch, measure: Measure, keys: Sequence[Entry]) -> Overlaid:
-    """Write the number beside the tip, what closed ground covers, what the style means, and the legend."""
+    """Write the number next to the tip, the label of closed ground, the text of the style, and the legend."""
     out, taken = drawn.colour, drawn.taken
     whole = measure.roles.of(measure.picture.segmentation)
     front = (whole == FRONT).view(np.uint8)
@@ -233,7 +233,7 @@ def _explained(drawn: Overlaid, sketch: Sketch, measure: Measure, keys: Sequence
     if measure.gauge is not None:
         before_it = taken.copy()
         write_gauge(out, taken, measure.camera, measure.gauge, front, sketch.taken, sketch.thin)
-        # What explains the style is no explanation of the number.
+        # The text of the style is not about the number.
         apart = cv2.dilate(((taken > 0) & (before_it == 0)).view(np.uint8), np.ones((2 * APART + 1,) * 2, np.uint8))
     ground, around = sketch.ground, sketch.around
     if ground is None or around is None:
@@ -254,14 +254,14 @@ def _check(picture: Picture, camera: Camera, style: str, covered: np.ndarray | N
         raise ValueError(f"there is no overlay style {style!r}: choose one of {', '.join(STYLES)}.")
     shape = picture.drawn.colour.shape[1:]
     if shape != (camera.height, camera.width):
-        raise ValueError(f"the picture is {shape}, the camera {(camera.height, camera.width)}.")
+        raise ValueError(f"the image is {shape}, the camera {(camera.height, camera.width)}.")
     if covered is not None and (covered.shape != shape or covered.dtype != bool):
         given = f"{covered.shape} of {covered.dtype}"
-        raise ValueError(f"covered is {given}: give a mask (H, W) of bool as large as the picture, {shape}.")
+        raise ValueError(f"covered is {given}: give a mask (H, W) of bool as large as the image, {shape}.")
 
 
 def ground_over(segmentation: np.ndarray, role: np.ndarray, found: Seen, opening: Opening) -> Ground:
-    """What lies over a surface that is found in a box, whose segmentation and roles (h, w) uint8 are given."""
+    """Determine the ground over a surface in a box, from the segmentation and roles (h, w) uint8."""
     mask = found.mask
     counts = np.bincount(segmentation[mask & (role != FRONT)], minlength=256)
     layers = np.flatnonzero(counts).tolist()
@@ -271,7 +271,7 @@ def ground_over(segmentation: np.ndarray, role: np.ndarray, found: Seen, opening
 def draw_broken(
     sheet: np.ndarray, found: Seen, ink: tuple[float, float, float], ground: Ground | None, doubtful: bool
 ) -> None:
-    """Draw what of an outline is no solid line, in place: all of a doubtful one, and what closed ground covers."""
+    """Draw the broken parts of an outline, in place: all of an unreliable one, and those under closed ground."""
     if doubtful:
         dash(sheet, outlines(found.mask), ink, BROKEN)
     elif ground is not None and ground.shut.any():
@@ -279,12 +279,12 @@ def draw_broken(
 
 
 def margin_ink(hidden: Layer) -> tuple[float, ...]:
-    """The ink of the margin round a surface."""
+    """Compute the colour of the margin line round a surface."""
     return tuple(FAINT * share for share in ink_of(hidden.colour))
 
 
 def legend_entries(hidden: Layer, grown: Layer | None, marks: Marks, words: Words) -> tuple[Entry, ...]:
-    """The lines that are drawn and have a name."""
+    """List legend entries of the drawn lines that have a name."""
     names = words.names
     named = zip(marks.traces, names.traces, strict=False)
     entries = [
@@ -301,7 +301,7 @@ def draw_points(drawn: Overlaid, camera: Camera, points: np.ndarray, where: np.n
     pixels, _ = camera.project(points)
     here = pixels[np.isfinite(pixels).all(axis=1)].round().astype(int)
     here = here[((here >= 0) & (here < (camera.width, camera.height))).all(axis=1)]
-    near = cv2.dilate(drawn.taken, np.ones((7, 7), np.uint8))  # of words, all letters stay whole
+    near = cv2.dilate(drawn.taken, np.ones((7, 7), np.uint8))  # keeps letters of text intact
     for column, row in here[where[here[:, 1], here[:, 0]] & (near[here[:, 1], here[:, 0]] == 0)].tolist():
         cv2.circle(drawn.colour, (column, row), 2, DARK, -1)
         cv2.circle(drawn.colour, (column, row), 1, SEEN, -1)
@@ -310,7 +310,7 @@ def draw_points(drawn: Overlaid, camera: Camera, points: np.ndarray, where: np.n
 def write_ground(
     drawn: Overlaid, box: tuple[slice, slice], ground: Ground, front: np.ndarray, lines_there: np.ndarray
 ) -> None:
-    """Write what the surface lies under, where it does, in place; front and lines (H, W) uint8 as `lay` takes them."""
+    """Write the label of closed ground over the surface, in place; front and lines (H, W) uint8 as in `Below`."""
     if not ground.words:
         return
     there = cv2.moments((ground.mask & ground.shut).view(np.uint8), binaryImage=True)
@@ -322,12 +322,12 @@ def write_ground(
 
 
 def ground_lines(words: str) -> list[str]:
-    """What is said of the ground as it stands in a picture: short lines, which have room in a silhouette."""
+    """Break the ground's label into short lines, which fit into a silhouette."""
     return folded(words, SHORT)
 
 
 def head_lines(texts: Sequence[str], tool: np.ndarray) -> list[str]:
-    """Lines for the head of a picture, broken no more than it takes to run over no tool (H, W) bool, if they can."""
+    """Break text for the top of an image into lines, as wide as possible without covering a tool (H, W) bool."""
     width = tool.shape[1]
     tried = [[part for text in texts for part in folded(text, share * width)] for share in HEAD_WIDTHS]
     for lines in tried:
@@ -338,21 +338,21 @@ def head_lines(texts: Sequence[str], tool: np.ndarray) -> list[str]:
 
 
 def write_head(drawn: Overlaid, lines: Sequence[str]) -> None:
-    """Write lines at the left of the head, under the letter of a side, in place, even over other lines."""
+    """Draw text lines in the top-left corner, below the orientation letter, in place; may cover other lines."""
     free, middle, below = drawn.taken.copy(), len(drawn.taken) // 2, HEAD + ROW * (len(lines) + LOWER)
-    free[:HEAD] = free[middle - HEAD // 2 : middle + HEAD // 2] = 1  # letters of sides come there
-    free[below:] = 1  # rather over a line than in the midst of the picture
+    free[:HEAD] = free[middle - HEAD // 2 : middle + HEAD // 2] = 1  # for the orientation letters
+    free[below:] = 1  # rather over a line than in the centre of the image
     before = free.copy()
     lay(drawn.colour, free, lines, (0, HEAD), needed=True, below=Below(lines=drawn.taken))
     drawn.taken[free > before] = 1
 
 
 def write_doubt(drawn: Overlaid, doubt: str) -> None:
-    """Write why an answer may not be relied on at the left of the foot, in place, even over other words."""
+    """Write the reason why a result is unreliable in the bottom-left corner, in place; may cover other text."""
     height, width = drawn.taken.shape
     lay(drawn.colour, drawn.taken, doubt_lines(doubt, width), (0, height), FINE, ink_of(WARNING), needed=True)
 
 
 def doubt_lines(doubt: str, width: int) -> list[str]:
-    """A doubt as it is written into a picture of this width [pixel]: its reason, and what follows from it."""
+    """Break a warning into lines for an image of this width [pixel]: its reason, and its consequence."""
     return [line for part in doubt.split(": ") for line in folded(part, NARROW * width)]

@@ -1,6 +1,7 @@
-"""A cut through a hidden surface, in an inset: along the line of sight, through its middle and the tool's tip.
+"""Cross-section of a hidden surface in an inset: along the line of sight, through its centroid and the tool's tip.
 
-The plane holds the camera's centre, so that the picture sees it as a line, and what is seen along that line lies in it.
+The plane contains the camera's centre, so that it appears in the image as a line, and everything seen along that line
+is in the plane.
 """
 
 from __future__ import annotations
@@ -17,48 +18,48 @@ from .hud import WHITE, haloed
 from .outlines import dash, outlines
 from .window import FRONT, SHUT
 
-# A tip so near to the line of sight through the middle gives no direction: the picture's own is taken [m].
+# Smallest distance of a tip from the line of sight that gives a direction; below, the image's right is used [m].
 ASTRAY = 1e-3
-# What the inset shows round the hidden surface, and above what is seen [m]; of how much of that distance is measured.
+# Margin of the inset round the hidden surface, and above the visible surface [m]; largest measured distance [m].
 ROUND, OVER, FAR = 12e-3, 4e-3, 60e-3
-# Tissue is toned by its distance: a tone every so many metres.
+# Tissue is toned by its distance to the surface: width of a tone [m].
 BAND = 5e-3
 TONES = np.array([(222, 206, 192), (184, 168, 156), (146, 132, 124), (112, 100, 94), (82, 74, 70)], np.float64)
 EMPTY = (20.0, 24.0, 27.0)
-"""Of the inset above the surface."""
+"""Colour of the inset above the visible surface."""
 CLOSED = (120.0, 165.0, 180.0)
-"""Of the surface where the hidden one is not seen through it."""
-# Letters, a line of them, strokes of the margin [pixel].
+"""Colour of the visible surface where the hidden one does not shine through."""
+# Letter size, line spacing, strokes of the margin [pixel].
 SMALL, LEADING, STROKES = 0.38, 14, (5, 4)
 SCALE = 10e-3
-"""Length of the bar that says how large things are [m]."""
+"""Length of the scale bar [m]."""
 ENDS = ("a", "b")
-"""Letters at the ends of the line along which the picture is cut, and at the inset's sides."""
+"""Letters at the ends of the cutting line in the image, and at the inset's sides."""
 # Half the width of a number [pixel].
 WIDE = 10
 
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A plane through `middle` (3,) [m]: `along` (3,) the line of sight and, at right angles, `across` (3,)."""
+    """Plane through `middle` (3,) [m]: `along` (3,) the line of sight and, at right angles, `across` (3,)."""
 
     middle: np.ndarray
     across: np.ndarray
     along: np.ndarray
 
     def coordinates(self, points: np.ndarray) -> np.ndarray:
-        """Points (..., 3) [m] of the plane as (..., 2) [m]: across, and along the line of sight."""
+        """Convert points (..., 3) [m] of the plane to (..., 2) [m]: across, and along the line of sight."""
         return (points - self.middle) @ np.stack([self.across, self.along], axis=1)
 
     def points(self, coordinates: np.ndarray) -> np.ndarray:
-        """The same back."""
+        """Convert plane coordinates (..., 2) [m] back to points (..., 3) [m]."""
         return self.middle + coordinates @ np.stack([self.across, self.along])
 
 
 def plane_through(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) -> Plane:
-    """The plane of a camera's centre, a middle (3,) [m] and a tip (3,) [m], which lies to its right in the picture.
+    """Build the plane of a camera's centre, a centre (3,) [m] and a tip (3,) [m], which is on its right in the image.
 
-    Without a tip, or where that is on the line of sight, the plane lies level in the picture.
+    Without a tip, or with one on the line of sight, the plane is horizontal in the image.
     """
     along = (middle - camera.centre) / np.linalg.norm(middle - camera.centre)
     level = camera.T_camera_world[0, :3]
@@ -73,10 +74,10 @@ def plane_through(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) ->
 def profile(
     camera: Camera, plane: Plane, depth: np.ndarray, roles: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What is seen along the plane: places (n, 2) [m] of it, in order across, and what they are (n,).
+    """Extract the visible surface along the plane: positions (n, 2) [m], in order across, and their roles (n,).
 
-    depth (H, W) [m] and roles (H, W) uint8 of the picture; what is in front of the overlay is left out. `reach` [m] is
-    how far across to look.
+    depth (H, W) [m] and roles (H, W) uint8 of the image; objects in front of the overlay are left out. `reach` [m] is
+    the half width of the search across.
     """
     steps = np.linspace(-reach, reach, 4 * max(camera.width, 1))
     pixels, _ = camera.project(plane.points(np.stack([steps, 0.0 * steps], axis=1)))
@@ -99,18 +100,18 @@ def section(
     tip: np.ndarray | None = None,
     error: float | None = None,
 ) -> np.ndarray:
-    """The inset (h, w, 3) uint8: tissue toned by its distance to the hidden surface, whose inside has its ink.
+    """Draw the inset (h, w, 3) uint8: tissue toned by its distance to the hidden surface, the inside in its colour.
 
     Parameters
     ----------
     seen
-        As `profile` gives it.
+        As returned by `profile`.
     size
         Width and height [pixel].
     tip
         (3,) [m]: a dot.
     error
-        How far off the surface may be [m]: a broken line so far outside of it.
+        Error bound of the surface [m]: a broken line at this distance outside.
     """
     wide, tall = size
     low, scale = _frame(plane, hidden, seen[0], tip, size)
@@ -144,7 +145,7 @@ def section(
 
 
 def captioned(inset: np.ndarray, lines: list[str]) -> np.ndarray:
-    """An inset (h, w, 3) uint8 with lines of text under it and a thin frame."""
+    """Add lines of text below an inset (h, w, 3) uint8, and a thin frame."""
     foot = np.full((LEADING * len(lines) + 4, inset.shape[1], 3), np.array(EMPTY), np.uint8)
     for number, line in enumerate(lines):
         haloed(foot, line, (5, LEADING * (number + 1) - 2), SMALL)
@@ -156,7 +157,7 @@ def captioned(inset: np.ndarray, lines: list[str]) -> np.ndarray:
 def _frame(
     plane: Plane, hidden: Layer, surface: np.ndarray, tip: np.ndarray | None, size: tuple[int, int]
 ) -> tuple[np.ndarray, float]:
-    """The place (2,) [m] of the inset's upper left corner, and pixels a metre."""
+    """Compute the position (2,) [m] of the inset's upper left corner, and pixels per metre."""
     places = plane.coordinates(hidden.vertices)
     held = [places.min(axis=0) - ROUND, places.max(axis=0) + ROUND]
     near = surface[(surface[:, 0] > held[0][0]) & (surface[:, 0] < held[1][0])]
@@ -168,7 +169,7 @@ def _frame(
 
 
 def _write_bands(out: np.ndarray, distance: np.ndarray, places: np.ndarray, surface: np.ndarray) -> None:
-    """Write the distances [mm] where tones change, about the middle's row, on the side of more tissue; in place."""
+    """Write the distances [mm] where tones change, near the centre row, on the side of more tissue; in place."""
     middle, wide = int(np.abs(places[:, 0, 1]).argmin()), out.shape[1]
     for step in (1, 2, 3):
         row = min(max(middle + (step - 2) * LEADING, 0), len(out) - 1)

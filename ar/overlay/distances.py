@@ -14,18 +14,18 @@ from .hud import FINE, FONT
 from .outlines import OPAQUE, inner, outlines, pieces
 from .window import DARK
 
-# Rays that say whether a point is inside: an odd number, so that they are never of two minds.
+# Rays of the inside test: an odd number, so that there is always a majority.
 RAYS = wp.constant(3)
 
 
 def tree_of(vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> wp.Mesh:
-    """A tree of the triangles (F, 3) of vertices (V, 3) [m]."""
+    """Build a BVH of the triangles (F, 3) of vertices (V, 3) [m]."""
     points = wp.array(vertices, dtype=wp.vec3f, device=device)
     return wp.Mesh(points, wp.array(np.asarray(triangles, np.int32).ravel(), dtype=wp.int32, device=device))
 
 
 def signed_distance(tree: wp.Mesh, points: np.ndarray, reach: float) -> np.ndarray:
-    """(n,) float32 [m] from points (n, 3) [m] to a closed surface, negative inside; NaN beyond `reach` [m]."""
+    """Compute distances (n,) float32 of points (n, 3) to a closed surface, < 0 inside, NaN beyond `reach`; all [m]."""
     device = str(tree.device)
     load(device, __name__)
     at = wp.array(points, dtype=wp.vec3f, device=device)
@@ -37,14 +37,14 @@ def signed_distance(tree: wp.Mesh, points: np.ndarray, reach: float) -> np.ndarr
 def distance_of_seen(
     tree: wp.Mesh, camera: Camera, box: tuple[slice, slice], depth: wp.array, where: np.ndarray, reach: float
 ) -> np.ndarray:
-    """How far what is seen at each pixel of a box is from a surface: (h, w) float32 [m].
+    """Compute the distance of the visible point at each pixel of a box from a surface: (h, w) float32 [m].
 
     NaN beyond `reach` [m], and where `where` (h, w) bool is false.
 
     Parameters
     ----------
     camera, depth
-        Of the whole picture; z in the camera frame, (H, W) float32 [m] on the surface's device.
+        Of the whole image; z in the camera frame, (H, W) float32 [m] on the surface's device.
     box
         Rows and columns.
     """
@@ -74,7 +74,7 @@ def measure_points(
     # output
     distance: wp.array(dtype=wp.float32),
 ):
-    """A run of points."""
+    """Measure a run of points."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         found = wp.mesh_query_point_sign_parity(tree, points[index], reach, RAYS)
@@ -100,7 +100,7 @@ def measure_seen(
     # output
     distance: wp.array2d(dtype=wp.float32),
 ):
-    """A run of the box's pixels; `rays` reach to where z is 1."""
+    """Measure a run of the box's pixels; `rays` reach to where z is 1."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         row = index / distance.shape[1]
@@ -115,33 +115,33 @@ def measure_seen(
                 distance[row, column] = wp.length(point - nearest)
 
 
-# Distances of the rings [m]; the first is as good as none.
+# Distances of the rings [m]; the first stands for contact.
 RINGS = (1e-3, 5e-3, 10e-3, 15e-3)
 RING = (232.0, 228.0, 204.0)
-"""Ink of rings."""
-# A ring of fewer pixels is no line. Rings keep so far from where the ground ends [pixel].
+"""Colour of rings."""
+# Smallest length of a ring; distance of rings from the edge of the ground [pixel].
 SHORTEST, OFF = 24, 3
-# The largest gap in a ring for its number, on both sides of the number [pixel].
+# Gap on both sides of a ring's number [pixel].
 ROOM = 3
-# No line is so thick, and every number is [pixel].
+# Thickness above every line and below every number [pixel].
 THICK = 9
-# A piece of so many pixels has a number of its own.
+# Smallest length of a piece with a number of its own [pixel].
 LONG = 80
 
 
 def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels: Sequence[float] = RINGS) -> list[str]:
-    """Draw rings with their numbers in millimetres, in place; returns the numbers of the rings that are drawn.
+    """Draw rings with their numbers in millimetres, in place; return the numbers of the rings that are drawn.
 
-    Each piece that is long enough has its number, and each ring one at least, even over other lines.
+    Each piece that is long enough has its number, and each ring at least one, even over other lines.
 
     Parameters
     ----------
     sheet
         (h, w, 4) uint8.
     distance
-        (h, w) float32 [m] from what is seen at each pixel to the hidden surface; NaN where that has no ring.
+        (h, w) float32 [m] from the visible point at each pixel to the hidden surface; NaN where there is no ring.
     free
-        (h, w) bool: where a number may stand; it is false where other lines are.
+        (h, w) bool: free places for a number; false at other lines.
     """
     ground = np.isfinite(distance).astype(np.uint8)
     within = cv2.erode(ground, np.ones((2 * OFF + 1,) * 2, np.uint8), borderValue=0) > 0
@@ -159,7 +159,7 @@ def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels
     for number, lines in rings.items():
         found = [_write_on(sheet, line, number, taken, written) for line in lines if len(line) >= LONG]
         if not any(found):
-            # Where nothing is free: first over lines, and then over another number.
+            # Without free space: first over lines, and then over another number.
             any(
                 _write_on(sheet, line, number, shut, written)
                 for shut in (written, np.zeros_like(written))
@@ -169,13 +169,13 @@ def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels
 
 
 def lines_of(drawn: np.ndarray) -> np.ndarray:
-    """Rings (h, w) without their numbers, of what is `drawn` (h, w) of both, bool."""
+    """Separate rings (h, w) bool from their numbers, given the mask `drawn` (h, w) of both."""
     numbers = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_OPEN, np.ones((THICK,) * 2, np.uint8))
     return drawn & (numbers == 0)
 
 
 def _write_on(sheet: np.ndarray, line: np.ndarray, text: str, shut: np.ndarray, written: np.ndarray) -> bool:
-    """Write a number on a line (n, 1, 2), as near to its middle as nothing is `shut`, in place; whether it could.
+    """Write a number on a line (n, 1, 2), as close to its centre as `shut` allows, in place; return True if possible.
 
     Its place is marked in both (h, w) bool.
     """

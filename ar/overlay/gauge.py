@@ -1,4 +1,4 @@
-"""How far a tool is from a hidden surface: a line, and the number beside the tip."""
+"""Distance of a tool from a hidden surface: a line, and the number next to the tip."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from ..optics.camera import Camera
 from .hud import Below, lay, millimetres
 from .outlines import OPAQUE
 
-# Scale of the number, and how far from the tip it is wanted [pixel].
+# Scale of the number; its distance from the tip [pixel].
 GAUGE, BESIDE = 0.6, 10
-# Points of a straight line that a lens bends.
+# Number of points of a straight line, to draw it under lens distortion.
 BENDS = 33
 
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
-    """The number asked for first: how far the tool is from the hidden surface.
+    """Distance of the tool from the hidden surface.
 
     Parameters
     ----------
     tip, nearest
-        (3,) [m] world points: the tool's tip and the point of the hidden surface that is nearest to it.
+        (3,) [m] world points: the tool's tip and the closest point of the hidden surface.
     read
-        The distance [m], where it is known better than by the line between the two.
+        The distance [m], if known more accurately than by the line between the two.
     error
-        How far off the number may be [m]; None where nobody knows.
+        Error bound of the distance [m]; None if not available.
     inside
-        Whether the tip is within the hidden surface.
+        True if the tip is within the hidden surface.
     """
 
     tip: np.ndarray
@@ -41,23 +41,23 @@ class Gauge:
 
     @property
     def distance(self) -> float:
-        """[m]."""
+        """Distance [m]."""
         return float(np.linalg.norm(np.asarray(self.tip) - self.nearest)) if self.read is None else self.read
 
     def __str__(self) -> str:
-        """As it is printed beside the tip."""
+        """Text next to the tip."""
         return gauge_words(self.distance, self.error, self.inside)
 
 
 def gauge_words(distance: float, error: float | None, inside: bool) -> str:
-    """How far [m] a tip is from a surface, in words, and how far off [m] that may be."""
+    """Format the distance [m] of a tip from a surface, with its error bound [m]."""
     length = millimetres(distance, error)
     return f"inside, {length} from its edge" if inside else length
 
 
 def draw_line(sheet: np.ndarray, camera: Camera, gauge: Gauge) -> None:
-    """Draw the gauge's line, in place; nothing when a part of it lies behind the camera or beyond its lens."""
-    # A lens bends it.
+    """Draw the gauge's line, in place; nothing if a part of it is behind the camera or beyond its lens."""
+    # Lens distortion bends it.
     shares = np.linspace(0.0, 1.0, 2 if camera.lens is None else BENDS)[:, None]
     line, _ = camera.project((1.0 - shares) * gauge.tip + shares * gauge.nearest)
     if not np.isfinite(line).all():
@@ -77,16 +77,18 @@ def write_gauge(
     lines: np.ndarray,
     thin: np.ndarray,
 ) -> None:
-    """Write the gauge's number beside the tip, in place; nothing when neither end of its line has a pixel.
+    """Write the gauge's number next to the tip, in place; nothing if neither end of its line has a pixel.
 
-    It stands inside the picture, even over other lines where there is no space.
+    It is placed inside the image, even over other lines if there is no space.
 
     Parameters
     ----------
-    colour, taken, lines, thin
-        As `lay` takes them; the third as its `lines_there`.
+    colour, taken
+        As in `lay`.
+    lines, thin
+        As in `Below`.
     covered
-        (H, W) uint8: above 0 where tools are, which the number leaves in sight if it can.
+        (H, W) uint8: above 0 at tools, which the number leaves visible if it can.
     """
     ends, _ = camera.project(np.stack([gauge.tip, gauge.nearest]))
     seen = ends[np.isfinite(ends).all(axis=1)]

@@ -1,4 +1,4 @@
-"""Words on the picture: a number beside a thing, a panel in a corner."""
+"""Text in the image: a number next to an object, a panel in a corner."""
 
 from __future__ import annotations
 
@@ -17,33 +17,30 @@ from .places import PAD, free_place
 Corner = Literal["top left", "top right", "bottom left", "bottom right"]
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 WHITE = (244, 244, 240)
-# Scale of the lines at the foot of a picture, from one's baseline to the next [pixel], and the share of the picture's
-# width that they may have.
+# Scale of text at the bottom of an image; line spacing [pixel]; its largest width as a share of the image width.
 FINE, ROW, NARROW = 0.45, 18, 0.25
-# Words that may cover thin lines do so rather than stand farther than this from their wish [pixel].
+# Distance from the desired place beyond which text covers thin lines instead [pixel].
 NEAR = 48
-# Shares of the picture's width that a panel's lines may have, the first for which there is room, if need be in smaller
-# letters.
+# Widths of a panel's lines as shares of the image width, the first that fits is used; scale of the second, smaller try.
 PANEL_WIDTHS, SMALLER = (0.9, 0.5, 0.36, 0.27, 0.2), 0.85
-# Lines at the head begin so far down, under the letter of a side [pixel].
+# Top of the lines at the top, under the orientation letter [pixel].
 HEAD = 34
-# Scale of the letters of the patient's sides.
+# Scale of the orientation letters.
 SIGN = 0.6
-# The patient's sides along the axes of RAS, and against them.
+# Orientation letters along the axes of RAS, and against them.
 SIDES = ("RL", "AP", "SI")
-# A direction's second letter is shown where it is more than so much of it.
+# Smallest component of a direction for which its second letter is shown.
 OBLIQUE = 0.38
-# Where a line of text may be broken: not after a colon, nor between a name, its number, that number's error and their
-# unit.
+# Allowed line breaks: not after a colon, nor between a name, its number, that number's error and their unit.
 BREAK = re.compile(
     r"\s+(?!(?:moved |reads )?[-+]?\d|\(\d\.|\+- )(?<![:-] )(?<!\d (?=%))(?<!\d (?=(?:mm|s|ms|N|kPa|ml|points)\b))"
 )
 
 
 def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5, ink: Sequence[float] = WHITE) -> None:
-    """Write one line of ASCII text into the picture (H, W, 3) uint8, its baseline's left end at (column, row).
+    """Write one line of ASCII text into the image (H, W, 3) uint8, its baseline's left end at (column, row).
 
-    A dark halo keeps it legible on any ground; the line is moved as far as it takes to lie inside the picture.
+    A dark halo keeps it legible on any ground; the line is moved as needed to be inside the image.
     """
     (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
     column = min(max(at[0], 2), max(colour.shape[1] - width - 3, 2))
@@ -73,17 +70,16 @@ def haloed(sheet: np.ndarray, text: str, at: tuple[int, int], scale: float, ink:
 
 @dataclass(frozen=True, eq=False)
 class Below:
-    """Parts of a picture that words may hide.
+    """Parts of an image that text may hide.
 
     Parameters
     ----------
     sights
-        (H, W) uint8: above 0 where words hide what should stay in sight, as a tool; they do where there is no other
-        space.
+        (H, W) uint8: above 0 where text hides what should stay visible, as a tool; used if there is no other space.
     lines
-        (H, W) uint8: above 0 where no words but lines are, which words that are needed may cover.
+        (H, W) uint8: above 0 at lines without text, which `needed` text may cover.
     thin
-        (H, W) bool: lines that words cover rather than stand farther than `NEAR` from their wish.
+        (H, W) bool: lines that text covers rather than being farther than `NEAR` from its desired place.
     """
 
     sights: np.ndarray | None = None
@@ -104,18 +100,18 @@ def lay(
     needed: bool = False,
     below: Below = NOTHING,
 ) -> None:
-    """Write lines of ASCII text at the free place nearest to a wish, and take that place; both arrays change in place.
+    """Write lines of ASCII text at the free place closest to a wish, and mark that place; both arrays change in place.
 
-    Lay the most important words first: where there is no space nothing is written, unless it is `needed`.
+    Write the most important text first: without space nothing is written, unless it is `needed`.
 
     Parameters
     ----------
     colour, taken
-        The picture (H, W, 3) uint8; (H, W) uint8, above 0 where lines and words are.
+        The image (H, W, 3) uint8; (H, W) uint8, above 0 at lines and text.
     wish
-        Column and row where the upper left corner of the lines is wanted, as `free_place` takes it.
+        Desired column and row of the upper left corner of the lines, as `free_place` takes it.
     below
-        What the words may hide.
+        Parts of the image that the text may hide.
     """
     if not lines:
         return
@@ -141,9 +137,9 @@ def lay(
 
 
 def folded(text: str, room: float, scale: float = FINE) -> list[str]:
-    """Break a line of text into as few lines as fit into `room` [pixel] where its words allow it, about as wide.
+    """Break a line of text into as few lines as fit into `room` [pixel], at allowed breaks, of about equal width.
 
-    A number stays beside its name, its error and its unit, even where that takes more room.
+    A number stays next to its name, its error and its unit, even if that takes more space.
     """
     if cv2.getTextSize(text, FONT, scale, 1)[0][0] <= room:
         return [text] if text else []
@@ -168,19 +164,19 @@ def _broken(text: str, room: float, scale: float) -> list[str]:
 
 
 def millimetres(length: float, error: float | None = None) -> str:
-    """A length [m] as it is read: in millimetres, with what it may be off by [m], rounded up, where that is finite."""
+    """Format a length [m] in millimetres, with its error bound [m] rounded up if that is finite."""
     if error is None or not math.isfinite(error):
         return f"{1e3 * length:.1f} mm"
     return f"{1e3 * length:.1f} +- {bound_words(error, 1)}"
 
 
 def bound_words(metres: float, digits: int) -> str:
-    """A bound in millimetres, rounded up: nothing is known to be without error."""
+    """Format a bound [m] in millimetres, rounded up: at least one unit of the last digit."""
     return f"{max(rounded_up(1e3 * metres, digits), 10.0**-digits):.{digits}f} mm"
 
 
 def rounded_up(value: float, digits: int) -> float:
-    """The least number of so many decimals that is no smaller, for bounds: a bound must not be rounded down."""
+    """Return the smallest number with `digits` decimals that is >= a value: a bound must not be rounded down."""
     return math.ceil(round(value * 10**digits, 6)) / 10**digits
 
 
@@ -192,16 +188,16 @@ def panel(
     below: int = 0,
     sights: Sequence[np.ndarray] = (),
 ) -> np.ndarray:
-    """The picture (H, W, 3) uint8 with lines of ASCII text on a dark translucent ground in one corner; a copy.
+    """Return a copy of the image (H, W, 3) uint8 with lines of ASCII text on a dark translucent ground in one corner.
 
-    One at the top begins `below` so many rows. The last lines are left out where there is room for the others alone.
+    A panel at the top begins `below` this row. If there is not enough space, the last lines are left out.
 
     Parameters
     ----------
     sights
-        Each (H, W) uint8, above 0 where the panel hides what should stay in sight. It stands as near to its corner as
-        the first of them lets it, broken into narrower lines or with fewer of them where it takes that. The next is
-        asked where even one line has no room, and the corner is taken where none has any.
+        Masks, each (H, W) uint8, above 0 where the panel would hide what should stay visible. The panel is placed as
+        close to its corner as the first mask allows, with narrower or fewer lines if necessary. The next mask is used
+        if not even one line fits; the corner itself if no mask has space.
 
     Raises
     ------
@@ -235,7 +231,7 @@ def panel(
 
 
 def _size(lines: Sequence[str], scale: float) -> tuple[tuple[int, int], int]:
-    """The width and height of a panel of lines, and from one to the next [pixel]."""
+    """Compute the width and height of a panel of lines, and its line spacing [pixel]."""
     sizes = [cv2.getTextSize(line, FONT, scale, 1)[0] for line in lines]
     step = max(height for _, height in sizes) + PAD
     return (max(width for width, _ in sizes) + 2 * PAD, step * len(lines) + PAD), step
@@ -244,7 +240,7 @@ def _size(lines: Sequence[str], scale: float) -> tuple[tuple[int, int], int]:
 def _lettered(
     out: np.ndarray, lines: Sequence[str], at: tuple[int, int], size: tuple[int, int], step: int, scale: float
 ) -> np.ndarray:
-    """The picture (H, W, 3) uint8 with lines on a dark ground whose upper left corner is at a column and row."""
+    """Draw lines on a dark ground, with the upper left corner at a column and row, into an image (H, W, 3) uint8."""
     left, top = at
     ground = out[top : top + size[1], left : left + size[0]]
     ground[:] = ground * 0.35 + np.array([6.0, 9.0, 11.0])
@@ -254,7 +250,7 @@ def _lettered(
 
 
 def towards(direction: np.ndarray) -> str:
-    """Where a direction (3,) of RAS points, in a surgeon's letters: "R", or "AS" between two, the greater part first.
+    """Describe a direction (3,) of RAS by orientation letters: "R", or "AS" between two, the larger component first.
 
     L left, R right, A anterior, P posterior, S superior, I inferior; of the patient.
     """
@@ -264,21 +260,21 @@ def towards(direction: np.ndarray) -> str:
 
 
 def bearings(rotation: np.ndarray) -> dict[str, str]:
-    """What lies left, right, up and down of a picture: `rotation` (3, 3) turns RAS to x right, y down, z forward."""
+    """Return orientation letters of an image's edges: `rotation` (3, 3) from RAS to x right, y down, z forward."""
     right, down = np.asarray(rotation)[:2]
     return {"left": towards(-right), "right": towards(right), "top": towards(-down), "bottom": towards(down)}
 
 
 def marked(colour: np.ndarray, rotation: np.ndarray, taken: np.ndarray) -> np.ndarray:
-    """The picture (H, W, 3) uint8 with the patient's sides at its edges; a copy.
+    """Return a copy of the image (H, W, 3) uint8 with orientation letters at its edges.
 
-    rotation (3, 3): of the camera, as `bearings` takes it; taken (H, W) uint8: above 0 where lines and words are.
+    rotation (3, 3): of the camera, as `bearings` takes it; taken (H, W) uint8: above 0 at lines and text.
     """
     out, taken = colour.copy(), taken.copy()
     height, width = taken.shape
     for edge, letters in bearings(rotation).items():
         (long, tall), below = cv2.getTextSize(letters, FONT, SIGN, 1)
-        # Not at the middles of top and foot: tools come in there, and a tumour may reach down to the foot.
+        # Not at the centre of the top and bottom edges: tools enter there, and a tumour may extend to the bottom.
         strip, wish = {
             "left": (np.s_[:, : long + 2 * PAD], (0, (height - tall) // 2)),
             "right": (np.s_[:, -long - 2 * PAD :], (width, (height - tall) // 2)),

@@ -1,4 +1,4 @@
-"""What the lines of an overlay are, in the picture's own corner; and the scale of its tint."""
+"""Legend of the overlay's lines in a corner of the image, and the scale of its tint."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from .outlines import OPAQUE
 from .places import CLEAR, PAD
 from .window import DARK, FAINTEST, STEP, STEPS, STRONGEST
 
-# Scale of its letters, length of a line's sample, and of the gap after it [pixel].
+# Letter scale; length of a line's sample, and of the gap after it [pixel].
 SMALL, SAMPLE, AFTER = 0.4, 26, 6
-# Heights of a line of text and of a step of the tint's scale [pixel]; in a narrower picture there is neither.
+# Heights of a line of text and of a step of the tint's scale; smallest image width with a legend [pixel].
 LEADING, TALL, LEAST = 16, 12, 480
-# The tint's scale is shown on ground of this colour.
+# Ground colour under the tint's scale.
 GROUND = (200.0, 150.0, 135.0)
 SHEET = 255
-"""Of `taken`, where a legend, a scale or an inset is: no panel goes there."""
+"""Value of `taken` at a legend, a scale or an inset: no panel goes there."""
 
 
 @dataclass(frozen=True)
 class Names:
-    """What a legend calls the lines of an overlay; those without a name are left out.
+    """Names of the overlay's lines in a legend; lines without a name are left out.
 
     Parameters
     ----------
     now, margin, before
-        The hidden surface, the dashed line round it, and where it was before.
+        The hidden surface, the dashed line round it, and its earlier position.
     traces
-        Other surfaces, in the order in which they are given.
+        Other surfaces, in the given order.
     motion
-        What the length at the foot is: how far the hidden surface has moved.
+        Name of the length at the bottom: motion of the hidden surface.
     """
 
     now: str = ""
@@ -46,7 +46,7 @@ class Names:
 
 @dataclass(frozen=True)
 class Entry:
-    """A line's name, ink (3,) in 0 .. 255, strokes and gaps [pixel] (None: solid) and width [pixel]."""
+    """Line of a legend: name, colour (3,) in 0 .. 255, strokes and gaps [pixel] (None: solid) and width [pixel]."""
 
     name: str
     ink: tuple[float, ...]
@@ -56,14 +56,14 @@ class Entry:
 
 @lru_cache(maxsize=16)
 def legend(entries: tuple[Entry, ...]) -> np.ndarray:
-    """A sheet (h, w, 4) uint8, colour times coverage and coverage: a sample of each line, and its name."""
+    """Draw a sheet (h, w, 4) uint8, colour times coverage and coverage: a sample of each line, and its name."""
     wide = max(cv2.getTextSize(entry.name, FONT, SMALL, 1)[0][0] for entry in entries)
     sheet = np.zeros((LEADING * len(entries), SAMPLE + AFTER + wide + 4, 4), np.uint8)
     for number, entry in enumerate(entries):
         row = LEADING * number + LEADING // 2
         stroke, gap = entry.pattern or (SAMPLE, 0)
         strokes = [(left, min(left + stroke, SAMPLE) - 1) for left in range(2, SAMPLE - 2, stroke + gap)]
-        rim = [(DARK, entry.width + 2)] if entry.width > 1 else []  # as `dash` has it
+        rim = [(DARK, entry.width + 2)] if entry.width > 1 else []  # border as in `dash`
         for ink, width in (*rim, (entry.ink, entry.width)):
             for left, right in strokes:
                 cv2.line(sheet, (left, row), (right, row), (*ink, OPAQUE), width, cv2.LINE_AA)
@@ -73,7 +73,7 @@ def legend(entries: tuple[Entry, ...]) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def depth_scale(ink: tuple[float, ...], caption: str) -> np.ndarray:
-    """A sheet (h, w, 4) uint8: the tint of the depth style from the ground down, with millimetres and a caption."""
+    """Draw a sheet (h, w, 4) uint8: the tint of the depth style by depth, with millimetres and a caption."""
     lines = caption.split("\n")
     wide = max(cv2.getTextSize(line, FONT, SMALL, 1)[0][0] for line in lines)
     sheet = np.zeros((LEADING * len(lines) + STEPS * TALL + 10, wide + 4, 4), np.uint8)
@@ -92,21 +92,21 @@ def depth_scale(ink: tuple[float, ...], caption: str) -> np.ndarray:
 
 
 def place_sheet(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, sights: np.ndarray) -> bool:
-    """Lay a sheet at the right of a picture, or else at its left, where nothing is in the way; whether there is room.
+    """Place a sheet at the right of an image, or else at its left, in free space; return True if there was space.
 
     Parameters
     ----------
     colour, taken
-        The picture (H, W, 3) uint8; (H, W) uint8, above 0 where lines and words are. Both change in place.
+        The image (H, W, 3) uint8; (H, W) uint8, above 0 at lines and text. Both change in place.
     sheet
         (h, w, 4) uint8: colour times coverage, and coverage.
     sights
-        (H, W) uint8: above 0 on what should stay in sight, as tools.
+        (H, W) uint8: above 0 on what should stay visible, as tools.
     """
     (height, width), (tall, wide) = taken.shape, sheet.shape[:2]
     if width < LEAST:
         return False
-    upper, lower = height // 2 - HEAD // 2, height // 2 + HEAD // 2  # letters of sides come between, and at both ends
+    upper, lower = height // 2 - HEAD // 2, height // 2 + HEAD // 2  # orientation letters are between, and at both ends
     rows = [row for row in (HEAD, upper - tall) if HEAD <= row <= upper - tall]
     rows += [row for row in (lower, height - HEAD - tall) if lower <= row <= height - HEAD - tall]
     for column in (width - PAD - wide, PAD):
@@ -119,7 +119,7 @@ def place_sheet(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, sights
 
 
 def paste(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, at: tuple[int, int]) -> None:
-    """Lay a sheet (h, w, 4) uint8 over a picture (H, W, 3) uint8 at a column and a row; its place becomes `SHEET`."""
+    """Paste a sheet (h, w, 4) uint8 over an image (H, W, 3) uint8 at a column and a row; its place becomes `SHEET`."""
     column, row = at
     box = np.s_[row : row + sheet.shape[0], column : column + sheet.shape[1]]
     left = 1.0 - sheet[..., 3:] / np.float32(OPAQUE)

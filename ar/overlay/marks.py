@@ -1,4 +1,4 @@
-"""Arguments of `composite`: marks and words beside a hidden surface, and the cover over it."""
+"""Arguments of `composite`: lines and text in addition to a hidden surface, and the cover over it."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from .outlines import OPAQUE, blank, box_around, dash, ink_of, outlines, silhoue
 from .styles import Opening
 from .window import DARK
 
-# What was believed before is drawn in grey, and dotted: lengths of strokes and gaps [pixel].
+# The position before is grey and dotted: colour, lengths of strokes and gaps [pixel].
 BEFORE, DOTTED = (0.86, 0.88, 0.90), (2, 5)
-# A motion of fewer pixels has no arrow.
+# Smallest motion with an arrow [pixel].
 LEAST_ARROW = 4.0
 UNNAMED = Names()
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """The outline of another surface, in its layer's colour: strokes and gaps of so many pixels, and a dot at a point.
+    """Outline of another surface in its layer's colour: a pattern of strokes and gaps [pixel], and a dot.
 
-    The point is `dot` (3,) [m].
+    The dot is at `dot` (3,) [m].
     """
 
     layer: Layer
@@ -37,9 +37,9 @@ class Trace:
 
 
 def draw_before(sheet: np.ndarray, camera: Camera, box: tuple[slice, slice], before: Layer, hidden: Layer) -> None:
-    """Draw where the hidden surface was, dotted, and an arrow from its middle there to its middle now, in place.
+    """Draw the dotted position of the hidden surface before, and an arrow from its centroid there to the present one.
 
-    The sheet is that of the picture's rows and columns `box`, which hold both surfaces.
+    In place, on the sheet of the image's rows and columns `box`, which hold both surfaces.
     """
     there = box_around(camera, before.vertices)
     if there is not None:
@@ -57,7 +57,7 @@ def draw_before(sheet: np.ndarray, camera: Camera, box: tuple[slice, slice], bef
 
 @lru_cache(maxsize=4)
 def dotted(camera: Camera, layer: Layer) -> np.ndarray:
-    """The dotted outline of a layer that stays, on the sheet of the box around it: drawn once for a camera."""
+    """Draw the dotted outline of a fixed layer, on the sheet of the box around it; cached for a camera."""
     box = box_around(camera, layer.vertices)
     assert box is not None
     part = camera.cropped(*box)
@@ -67,14 +67,14 @@ def dotted(camera: Camera, layer: Layer) -> np.ndarray:
 
 
 def draw_trace(sheet: np.ndarray, camera: Camera, trace: Trace) -> None:
-    """Draw a trace, in place; nothing when its dot lies behind the camera or beyond its lens."""
+    """Draw a trace, in place; nothing if its dot is behind the camera or beyond its lens."""
     (at,), _ = camera.project(np.asarray(trace.dot)[None])
     if not np.isfinite(at).all():
         return
     ink = ink_of(trace.layer.colour)
     dash(sheet, outlines(silhouette(camera, trace.layer.vertices, trace.layer.triangles)), ink, trace.pattern)
     column, row = np.clip(at, -1e4, 1e4).round().astype(int).tolist()
-    pale = [0.5 * (share + 255.0) for share in ink]  # so that pixels of the ink are the outline's alone
+    pale = [0.5 * (share + 255.0) for share in ink]  # so that pixels of this colour are the outline's alone
     for colour, radius in ((DARK, 4), (pale, 3)):
         cv2.circle(sheet, (column, row), radius, (*colour, OPAQUE), -1, cv2.LINE_AA)
 
@@ -86,12 +86,12 @@ class Cover:
     Parameters
     ----------
     occluders
-        Ids of the layers (tool, hand) that cover the overlay wherever the picture shows them.
+        Ids of the layers (tool, hand) that cover the overlay wherever the image shows them.
     opening
-        The ground that the surface may be seen through; None: any. Under other ground the outline is broken, nothing
-        shines through, and the picture says what it lies under where that is a noticeable share.
+        Ground that the surface may be seen through; None: any. Under other ground the outline is broken, nothing shines
+        through, and the image shows a label of that ground if it covers a noticeable share.
     covered
-        (H, W) bool: what covers the overlay besides the occluders, as a hand or cottonoids in a real picture.
+        (H, W) bool: further occluders, as a hand or cottonoids in a real image.
     """
 
     occluders: Sequence[int] = ()
@@ -101,16 +101,16 @@ class Cover:
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Lines that are drawn beside the hidden surface's outline.
+    """Lines in addition to the hidden surface's outline.
 
     Parameters
     ----------
     margin
-        One number or (V,) [m]: how uncertain the surface is. Where positive, a dashed second outline runs that far out.
+        One number or (V,) [m]: error bound of the surface. If positive, a dashed second outline runs at that distance.
     gauge
-        Draws the line from the tip to the hidden surface, and its length in millimetres beside the tip.
+        Draws the line from the tip to the hidden surface, and its length in millimetres next to the tip.
     before
-        Where the hidden surface was before, as in the scan: a dotted grey outline, with an arrow from there to here and
+        Hidden surface before its motion, as in the scan: a dotted grey outline, with an arrow to the present one and
         the mean motion in millimetres.
     traces
         Outlines of other surfaces, drawn under the hidden one's.
@@ -124,22 +124,22 @@ class Marks:
 
 @dataclass(frozen=True, eq=False)
 class Words:
-    """Words in the picture.
+    """Text in the image.
 
     Parameters
     ----------
     doubt
-        Why the surface's place may not be relied on. It is written at the picture's foot, see `doubt_lines`, whatever
-        the style. The outline is amber and broken. Nothing is promised: no margin is drawn, and the number beside the
-        tip has no error.
+        Reason why the surface's position is unreliable. It is written at the bottom of the image, see `doubt_lines`, in
+        any style. The outline is amber and broken. No error is guaranteed: no margin is drawn, and the number next to
+        the tip has no error.
     head
-        Lines that are written at the picture's head, whatever the style and whatever lies there.
+        Lines at the top of the image, in any style and over anything.
     names
-        What the lines are called in the legend, which is drawn where there is room.
+        Names of the lines in the legend, which is drawn if there is space.
     moved
-        Length and error [m] to be written in place of the mean motion, which has none.
+        Length and error [m] to be written instead of the mean motion, which has none.
     error
-        How far off the surface may be [m], for the words of the styles that measure; None where it is not known.
+        Error bound of the surface [m], for the text of the styles that measure; None if not available.
     """
 
     doubt: str = ""

@@ -1,4 +1,4 @@
-"""What the styles that measure add to a picture: rings on the ground, a cut in an inset, the scale of a tint."""
+"""Measuring styles of an image: rings on the ground, a cross-section in an inset, the scale of a tint."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from .places import PAD, free_place
 from .styles import Style
 from .window import FRONT, Roles
 
-# Rings are looked for so far beyond the last [m].
+# Search margin beyond the last ring [m].
 BEYOND = 3e-3
-# Shares of the picture's width that the inset of a cut may have, the first for which there is room; its height to its
-# width; and strokes of the line along which the picture is cut [pixel].
+# Widths of a cut's inset as shares of the image width, the first that fits is used; its aspect ratio; strokes of the
+# cutting line in the image [pixel].
 WIDTHS, ASPECT, CUT_STROKES = (0.34, 0.27, 0.21), 0.75, (3, 5)
-# How far across the plane the surface over a cut is looked for, in radii of what is hidden.
+# Search half-width of the surface over a cut, in radii of the hidden surface.
 ACROSS = 4.0
-# Letters of the cut stay so far from a sheet's edge [pixel].
+# Distance of the cut's letters from a sheet's edge [pixel].
 EDGE = 12
-# They stand so far beside the line, and reach so far from their middle [pixel].
+# Distance of a letter from the line; half the size of a letter [pixel].
 ASIDE, HALF = 10, 6
 NO_ROOM = "no room for the cut"
 
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """A style that measures, of one picture.
+    """Measuring style, applied to one image.
 
     Parameters
     ----------
     name
-        What the hidden surface is called.
+        Name of the hidden surface.
     error
-        How far off it may be [m]; None where it is not known.
+        Its error bound [m]; None if not available.
     """
 
     style: Style
@@ -58,12 +58,12 @@ class Measure:
 
     @property
     def off(self) -> str:
-        """How far off what is measured may be, in words."""
+        """Text of the error bound of the measured distances."""
         return "error not known" if self.error is None else f"error {bound_words(self.error, 1)} (95 %)"
 
     @property
     def reached(self) -> np.ndarray:
-        """Points (n, 3) [m] whose box in the picture holds what is drawn round the silhouette."""
+        """Points (n, 3) [m] whose box in the image holds the lines drawn round the silhouette."""
         low, high = self.hidden.vertices.min(axis=0), self.hidden.vertices.max(axis=0)
         if self.style != "rings":
             return np.stack([low, high])[:0]
@@ -72,12 +72,12 @@ class Measure:
 
     @property
     def plane(self) -> Plane:
-        """The plane of a cut."""
+        """Plane of a cut."""
         middle = self.hidden.vertices.mean(axis=0)
         return plane_through(self.camera, middle, None if self.gauge is None else self.gauge.tip)
 
     def draw(self, sheet: np.ndarray, above: np.ndarray, box: tuple[slice, slice]) -> None:
-        """Draw the lines of rings, or that along which the picture is cut, on the sheet of a box; in place.
+        """Draw the rings, or the cutting line in the image, on the sheet of a box; in place.
 
         Letters go on the sheet `above` all lines.
         """
@@ -100,31 +100,31 @@ class Measure:
             lines = np.ascontiguousarray(sheet[..., 3] > 0).astype(np.uint8)
             dash(sheet, [line[:, None]], RING, CUT_STROKES, 1)
             line = line[((line >= EDGE) & (line < (part.width - EDGE, part.height - EDGE))).all(axis=1)]
-            # Letters stand where the line comes out behind a tool.
+            # Letters are outside of tools, where the line is visible.
             front = (self.roles.of(self.picture.segmentation, box) == FRONT).astype(np.uint8)
             line = line[cv2.dilate(front, np.ones((2 * EDGE + 1,) * 2, np.uint8))[line[:, 1], line[:, 0]] == 0]
             if len(line):
-                # Beside the line: there may be another on it, from the tip.
+                # Next to the line: there may be another on it, from the tip.
                 along = (line[-1] - line[0]) / max(float(np.linalg.norm(line[-1] - line[0])), 1.0)
                 beside = np.rint(ASIDE * np.array([along[1], -along[0]])).astype(int)
                 places = np.clip(line + beside, EDGE, (part.width - EDGE, part.height - EDGE))
-                # And hide no other line, if they can.
+                # Prefer places that hide no other line.
                 clear = cv2.dilate(lines, np.ones((2 * HALF + 1,) * 2, np.uint8))[places[:, 1], places[:, 0]] == 0
                 places = places[clear] if clear.any() else places
                 for letter, (column, row) in zip(ENDS, places[[0, -1]].tolist(), strict=True):
                     haloed(above, letter, (column - 4, row + 4), FINE, RING)
 
     def lay(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
-        """Lay what explains the lines into a composite picture, as `place_sheet` takes it; in place.
+        """Add the explanation of the lines to a composite image, with arguments of `place_sheet`; in place.
 
-        needed (H, W) uint8: above 0 on what alone stays in sight where there is no other room.
+        needed (H, W) uint8: above 0 on objects that must stay visible even without other space.
         """
         width = taken.shape[1]
         if self.style == "depth":
             caption = f"{self.name or 'surface'}: mm under\nwhat is seen\n{self.off}"
             scale = depth_scale(key_of(ink_of(self.hidden.colour)), caption)
             if not place_sheet(colour, taken, scale, sights):
-                # A tint says nothing without its scale: rather over cortex than not at all.
+                # A tint needs its scale: rather over cortex than not at all.
                 wish = colour.shape[1], HEAD
                 places = (
                     free_place(shut, scale.shape[1::-1], wish) for shut in (taken | sights, taken | needed, taken)
@@ -153,7 +153,7 @@ class Measure:
                 for line in folded(text, wide - PAD, SMALL)
             ]
             inset = captioned(np.zeros((round(ASPECT * wide), wide, 3), np.uint8), lines)
-            shut[-HEAD:] = 1  # words of the foot come there
+            shut[-HEAD:] = 1  # for the text at the bottom
             place = free_place(shut, inset.shape[1::-1], (taken.shape[1], HEAD))
             if place is not None:
                 drawn = section(

@@ -13,25 +13,25 @@ from ..rendering.rasteriser import seen
 from .hud import FONT, WHITE
 from .window import DARK, NEAR_EDGE, SURROUND
 
-# Of a sheet's fourth channel, where a line covers what is under it.
+# Value of a sheet's fourth channel that covers what is under it.
 OPAQUE = 255
-# Pixels from one to the next that is looked at first, where a lens bends what lies between points.
+# Grid spacing of the coarse search under lens distortion [pixel].
 COARSE = 16
 
 
 def ink_of(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
-    """The mean of colours (3,) or (V, 3), sRGB in [0, 1], as lines are drawn: whole numbers of 0 .. 255."""
+    """Compute the mean of colours (3,) or (V, 3), sRGB in [0, 1], as a line colour: whole numbers of 0 .. 255."""
     red, green, blue = np.rint(255.0 * np.asarray(colour, np.float64).reshape(-1, 3).mean(axis=0)).tolist()
     return red, green, blue
 
 
 def blank(camera: Camera) -> np.ndarray:
-    """A sheet (h, w, 4) uint8 for lines: colour times coverage, and coverage."""
+    """Create a sheet (h, w, 4) uint8 for lines: colour times coverage, and coverage."""
     return np.zeros((camera.height, camera.width, 4), np.uint8)
 
 
 def joined(a: tuple[slice, slice] | None, b: tuple[slice, slice] | None) -> tuple[slice, slice] | None:
-    """The rows and columns that hold two boxes."""
+    """Return the rows and columns of the smallest box that holds two boxes."""
     if a is None or b is None:
         return a or b
     rows, columns = (slice(min(i.start, j.start), max(i.stop, j.stop)) for i, j in zip(a, b, strict=True))
@@ -39,7 +39,7 @@ def joined(a: tuple[slice, slice] | None, b: tuple[slice, slice] | None) -> tupl
 
 
 def box_around(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None:
-    """Rows and columns that hold the pixels of points (V, 3) and `SURROUND` more; None when none is in the picture."""
+    """Return rows and columns that hold the pixels of points (V, 3) and `SURROUND` more; None if outside the image."""
     pixels, depth = camera.project(points)
     if not (depth > 0.0).all():
         return slice(0, camera.height), slice(0, camera.width)
@@ -54,12 +54,12 @@ def box_around(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None
 
 
 def corners_between(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Corners (n, 2) of the pixels that may lie between points (V, 3) in front of a camera with a lens.
+    """Find corners (n, 2) of the pixels that may be between points (V, 3) in front of a camera with a lens.
 
-    A lens bends the lines between points, but not out of the box that holds them in its straight picture.
+    A lens bends the lines between points, but not out of the box that holds them in its undistorted image.
     """
     ends, _ = replace(camera, lens=None).project(points)
-    # Every few pixels first, with as much room as the straight picture changes from one of these to the next.
+    # Coarse grid first, with a margin of the largest step of the undistorted coordinates.
     step = COARSE if min(camera.width, camera.height) > 2 * COARSE else 1
     few = camera.straight[::step, ::step]
     steps = [np.abs(np.diff(few, axis=axis)).reshape(-1, 2) for axis in (0, 1)]
@@ -76,13 +76,13 @@ def corners_between(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def _inside(straight: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns with places (h, w, 2) between two corners (2,)."""
+    """Find rows and columns with positions (h, w, 2) between two corners (2,)."""
     inside = np.all((straight >= low) & (straight <= high), axis=2)
     return np.flatnonzero(np.any(inside, axis=1)), np.flatnonzero(np.any(inside, axis=0))
 
 
 def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> np.ndarray:
-    """(H, W) bool: the pixels whose centres a surface covers, seen alone. vertices (V, 3) [m], triangles (F, 3).
+    """Compute the mask (H, W) bool of pixels whose centres a surface covers. vertices (V, 3) [m], triangles (F, 3).
 
     `device` is the Warp device that draws it.
     """
@@ -90,22 +90,22 @@ def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, devi
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of two masks (H, W); 0 when both are empty, for nothing seen is no agreement."""
+    """Compute intersection over union of two masks (H, W); 0 if both are empty."""
     union = np.count_nonzero(a | b)
     return float(np.count_nonzero(a & b) / union) if union else 0.0
 
 
 def outlines(mask: np.ndarray) -> list[np.ndarray]:
-    """Closed outlines of a mask (H, W), each (n, 1, 2) int32 pixels."""
+    """Extract closed outlines of a mask (H, W), each (n, 1, 2) int32 pixels."""
     return list(cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
 
 
 def dash(
     out: np.ndarray, lines: Sequence[np.ndarray], ink: Sequence[float], pattern: tuple[int, int], width: int = 2
 ) -> None:
-    """Draw strokes of outlines, each (n, 1, 2), with gaps, both of so many pixels as `pattern` says, in place.
+    """Draw outlines, each (n, 1, 2), with strokes and gaps of lengths `pattern` [pixel], in place.
 
-    A line of more than one pixel has a dark rim. Nothing is drawn along the sheet's edge, where an outline is cut off.
+    A line of more than one pixel has a dark border. Nothing is drawn along the sheet's edge, where an outline is cut.
     """
     stroke, gap = pattern
     lines = [piece for line in lines for piece in inner(line, out.shape[1], out.shape[0])]
@@ -116,18 +116,18 @@ def dash(
 
 
 def inner(line: np.ndarray, width: int, height: int) -> list[np.ndarray]:
-    """The pieces of an outline (n, 1, 2) that lie inside a sheet, away from its edge."""
+    """Return the pieces of an outline (n, 1, 2) inside a sheet, away from its edge."""
     inside = (line >= NEAR_EDGE) & (line < (width - NEAR_EDGE, height - NEAR_EDGE))
     return runs(line, inside.all(axis=(1, 2)))
 
 
 def pieces(lines: Sequence[np.ndarray], where: np.ndarray) -> list[np.ndarray]:
-    """The pieces of outlines, each (n, 1, 2), whose pixels lie where a mask (H, W) bool is true."""
+    """Return the pieces of outlines, each (n, 1, 2), whose pixels are in a mask (H, W) bool."""
     return [piece for line in lines for piece in runs(line, where[line[:, 0, 1], line[:, 0, 0]])]
 
 
 def runs(line: np.ndarray, kept: np.ndarray) -> list[np.ndarray]:
-    """The pieces of a line (n, 1, 2) whose points are kept (n,) bool; none of an empty one."""
+    """Return the pieces of a line (n, 1, 2) whose points are kept (n,) bool; none for an empty line."""
     if not len(line):
         return []
     cuts = np.flatnonzero(np.diff(kept)) + 1
@@ -135,43 +135,43 @@ def runs(line: np.ndarray, kept: np.ndarray) -> list[np.ndarray]:
 
 
 def key_of(ink: Sequence[float]) -> tuple[float, ...]:
-    """A shade (3,) that looks as an ink in 0 .. 255, but is not it: an outline's pixels are the outline's alone."""
+    """Return a shade (3,) slightly different from a colour in 0 .. 255: the outline's colour is the outline's alone."""
     return tuple(share + 8.0 if share < 128.0 else share - 8.0 for share in ink)
 
 
-# Middles of lines have their ink's very colour, within rounding.
+# Tolerance of a colour in each channel: centres of lines have the exact colour, within rounding.
 SAME = 2
-# Of an outline's pixels this share must be near: corners and crossings of lines are the rest [%].
+# Percentile of an outline's pixels that counts: corners and crossings of lines are excluded [%].
 SHARE = 95.0
-# So near to what covers it or to the picture's border an outline may be cut [pixel].
+# Distance from occluders or the image border within which an outline may be cut [pixel].
 CUT = 5
-# So far from a mask's rim lines may run; a share of fewer pixels says nothing [pixel].
+# Distance from a mask's edge within which lines may run; minimum number of pixels of a share [pixel].
 BESIDE, FEW = 6, 60
-# Room round a line of text that holds nothing of its ink: else "1.5" would be found in "11.5" [pixel].
+# Margin round a line of text without its colour: else "1.5" would be found in "11.5" [pixel].
 APART = 8
 
 
 def outline_gap(
     colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, covered: np.ndarray, least: int = 1, gap: float = 0.0
 ) -> float:
-    """How far the outline drawn in a picture is from the one that should be there [pixel].
+    """Compute the distance of the outline drawn in an image from the expected one [pixel].
 
-    The larger of two 95th percentiles: from pixels of the ink to the true outline, and from the true outline to them.
-    0 where nothing of the outline can be seen and nothing is drawn, infinite where only one of the two is there.
+    The larger of two 95th percentiles: from pixels of the colour to the true outline, and from the true outline to
+    them. 0 if nothing of the outline is visible and nothing is drawn, infinite if only one of the two is there.
 
     Parameters
     ----------
     colour, ink
-        The picture (H, W, 3) uint8, and the colour (3,) in 0 .. 255 that outlines are drawn in.
+        The image (H, W, 3) uint8, and the colour (3,) in 0 .. 255 of outlines.
     mask
         (H, W) bool: the true silhouette.
     covered
-        (H, W) bool: what lies in front of the overlay.
+        (H, W) bool: objects in front of the overlay.
     least
-        Fewer pixels than this are nothing, and each is held against all of the other outline: what can be seen of a
-        broken line may be a gap.
+        Smallest number of pixels that counts. Above 1, each outline is compared with all of the other: the visible part
+        of a broken line may be a gap.
     gap
-        How long the gaps of a broken line are [pixel]: the true outline may be half of that from it.
+        Length of the gaps of a broken line [pixel]: the true outline may be half of that from it.
     """
     found = of_ink(colour, ink)
     true = np.zeros(mask.shape, np.uint8)
@@ -190,25 +190,25 @@ def outline_gap(
 
 
 def of_ink(colour: np.ndarray, ink: Sequence[float], off: int = SAME) -> np.ndarray:
-    """(H, W) bool: the pixels of a picture (H, W, 3) uint8 with an ink's colour (3,) in 0 .. 255, `off` in each."""
+    """Return the mask (H, W) bool of pixels of an image (H, W, 3) uint8 within `off` of a colour (3,) in 0 .. 255."""
     low, high = (tuple(np.clip(np.rint(ink) + by, 0, 255).tolist()) for by in (-off, off))
     return cv2.inRange(np.ascontiguousarray(colour), low, high) > 0
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:
-    """How far each pixel is from the nearest of a mask (H, W) [pixel]."""
+    """Compute the distance (H, W) of each pixel from the nearest pixel of a mask (H, W) [pixel]."""
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
 def stands(colour: np.ndarray, text: str, scale: float, ink: Sequence[float] = WHITE) -> bool:
-    """Whether `hud.write` wrote just this line of text at this scale into the picture (H, W, 3) uint8, anywhere."""
+    """Return True if `hud.write` wrote exactly this text at this scale anywhere into the image (H, W, 3) uint8."""
     return found_at(colour, text, scale, ink) is not None
 
 
 def found_at(
     colour: np.ndarray, text: str, scale: float, ink: Sequence[float] = WHITE
 ) -> tuple[int, int, int, int] | None:
-    """Where `hud.write` wrote just this line of text: left, top, right and foot [pixel]; None where nowhere."""
+    """Locate a line of text written by `hud.write`: left, top, right and bottom [pixel]; None if not found."""
     (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
     blank = np.zeros((above + below + 2, width + 2 * APART, 3), np.uint8)
     cv2.putText(blank, text, (APART, above + 1), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
@@ -219,7 +219,7 @@ def found_at(
     right = cv2.matchTemplate(here, shape, cv2.TM_CCORR)
     every = cv2.matchTemplate(here, np.ones_like(shape), cv2.TM_CCORR)
     count = shape.sum()
-    # All of the text's pixels, and no other of its ink between them.
+    # All of the text's pixels, and no other pixel of its colour between them.
     places = np.argwhere((right > count - 0.5) & (every < count + 0.5))
     if not len(places):
         return None
@@ -228,9 +228,9 @@ def found_at(
 
 
 def inked_share(colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, covered: np.ndarray) -> float:
-    """What share of a silhouette's outline has an ink; NaN of an outline of fewer than `FEW` pixels.
+    """Compute the share of a silhouette's outline that has a colour; NaN for an outline of fewer than `FEW` pixels.
 
-    Parameters as in `outline_gap`: near what covers it, and near the border, an outline is left out.
+    Parameters as in `outline_gap`: pixels near occluders and near the border are left out.
     """
     outline = np.zeros(mask.shape, np.uint8)
     cv2.drawContours(outline, outlines(mask), -1, (1,))
@@ -239,9 +239,9 @@ def inked_share(colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, cove
 
 
 def changed_share(before: np.ndarray, after: np.ndarray, where: np.ndarray) -> float:
-    """What share of pixels differs between pictures (H, W, 3) uint8, in a mask (H, W) bool without its outer rim.
+    """Compute the share of pixels that differ between images (H, W, 3) uint8, in a mask (H, W) bool without its edge.
 
-    NaN of fewer than `FEW` pixels.
+    NaN for fewer than `FEW` pixels.
     """
     inner = cv2.erode(where.astype(np.uint8), np.ones((2 * BESIDE + 1,) * 2, np.uint8), borderValue=0) > 0
     return _share(~of_ink(cv2.absdiff(before, after), (0, 0, 0)), inner)

@@ -1,30 +1,30 @@
-"""Where words go in a picture: the free place that is nearest to the one where they are wanted."""
+"""Placement of text in an image: the free place closest to the desired one."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-# So far words stay from the border, and from lines and other words [pixel].
+# Distance of text from the border; distance from lines and other text [pixel].
 PAD, CLEAR = 8, 6
-# Places are tried at every so many pixels.
+# Grid spacing of candidate places [pixel].
 STEP = 4
-# Places so far from the wish are tried before all others [pixel].
+# Search radii around the desired place, tried in order before the whole image [pixel].
 REACHES = 64, 256
-# So many times as far as a place to its side a place is that lies above: lines of text go below each other.
+# Weight of a sideways distance relative to a vertical one: lines of text go below each other.
 ASIDE = 2
 
 
 def free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) -> tuple[int, int] | None:
-    """Find where a box can stand, as near as can be to where it is wanted; None where there is no space.
+    """Find the free place for a box closest to the desired one; None if there is no space.
 
     Parameters
     ----------
     taken
-        (H, W) uint8: above 0 where nothing may stand.
+        (H, W) uint8: above 0 where the box must not be.
     size, wish
-        Width and height of the box; column and row where its upper left corner is wanted, which may lie outside the
-        picture [pixel].
+        Width and height of the box; desired column and row of its upper left corner, which may be outside the image
+        [pixel].
     """
     (height, width), (wide, tall) = taken.shape, size
     right, low = width - PAD - wide, height - PAD - tall
@@ -36,11 +36,11 @@ def free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) 
         return column, row
     whole = ASIDE * width + height
     for reach in (*REACHES, whole):
-        # All places that may be as near as that, and what is taken round them.
+        # All places within this radius, and the taken pixels round them.
         columns, rows = within(column, reach // ASIDE, right), within(row, reach, low)
         top, left = rows[0] - CLEAR, columns[0] - CLEAR
         there = taken[top : rows[-1] + tall + CLEAR, left : columns[-1] + wide + CLEAR]
-        # What is taken above and left of each pixel: the box's share of it is a sum of four.
+        # Integral image: the number of taken pixels in a box is a sum of four values.
         sums = cv2.integral((there > 0).astype(np.uint8))
         up, aside = rows[:, None] - CLEAR - top, columns - CLEAR - left
         down, across = up + tall + 2 * CLEAR, aside + wide + 2 * CLEAR
@@ -54,6 +54,6 @@ def free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) 
 
 
 def within(middle: int, reach: int, last: int) -> np.ndarray:
-    """The tried places PAD, PAD + STEP, ... up to `last` that are at most `reach` from a middle."""
+    """List the candidate places PAD, PAD + STEP, ... up to `last` that are at most `reach` from a centre."""
     places = np.arange(PAD, last + 1, STEP)
     return places[np.abs(places - middle) <= reach]

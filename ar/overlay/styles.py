@@ -1,4 +1,4 @@
-"""How a hidden surface may be drawn, and what it is seen through."""
+"""Styles of drawing a hidden surface, and the ground it is seen through."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ STYLES: Mapping[Style, str] = MappingProxyType(
         "none": "none",
     }
 )
-"""What each is, in words."""
-# Shares of the silhouette in sight from which its ground is spoken of, and from which it is all of it.
+"""Display names of the styles."""
+# Shares of the visible silhouette from which its ground is reported, and from which it counts as all of it.
 NOTICED, WHOLE = 0.1, 0.9
 
 
 @dataclass(frozen=True)
 class Opening:
-    """Ground through which a hidden surface may be drawn as if it were seen.
+    """Ground through which a hidden surface may be drawn as if visible.
 
     Elsewhere its outline is broken and nothing shines through.
 
     Parameters
     ----------
     ids
-        Of the layers that are such ground, as cortex.
+        Ids of the layers that are such ground, as cortex.
     under
-        What is said by the id of another layer under which it lies, as drape.
+        Labels of other layers, as drape, by id.
     otherwise
-        What is said of layers without such words.
+        Label of layers that are not in `under`.
     """
 
     ids: tuple[int, ...]
@@ -45,7 +45,7 @@ class Opening:
     otherwise: str = "not in the open"
 
     def said(self, counts: Mapping[int, int]) -> str:
-        """What a picture says of the ground; empty where too little lies elsewhere.
+        """Return the label of the ground in an image; empty if too little of the silhouette is under other layers.
 
         counts: pixels of the silhouette by the id of the layer over it, without those in front of the overlay.
         """

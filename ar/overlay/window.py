@@ -1,4 +1,4 @@
-"""A hidden surface that shines through the ground, which is dimmed round it, and the lines over and under it."""
+"""Hidden surface that shines through the ground, which is dimmed round it, and the lines over and under it."""
 
 from __future__ import annotations
 
@@ -17,42 +17,41 @@ from ..rendering.rasteriser import NOTHING, Seen, depth_of, face_of
 from ..rendering.renderer import Pictures
 from ..rendering.triangle import weights_of
 
-# Light that falls to 1 / e over this depth under the surface [m]: the deeper, the darker.
+# Depth under the surface over which light falls to 1 / e [m].
 FADE = wp.constant(0.03)
-# Width of the window's soft rim round the silhouette [pixel].
+# Width of the window's soft edge round the silhouette [pixel].
 SURROUND = wp.constant(24)
-# Lengths of OpenCV's steps along rows and columns, and across both [pixel]; steps that hold the rim.
+# Lengths of OpenCV's chamfer steps, straight and diagonal [pixel]; radius that covers the soft edge [pixel].
 STRAIGHT, SLANTED = wp.constant(0.955), wp.constant(1.3693)
 REACH = wp.constant(26)
-# Half the widths of the outline and of its dark rim, and how far from the edge neither is drawn [pixel].
+# Half the widths of the outline and of its dark border; distance from the edge where neither is drawn [pixel].
 LINE, RIM, NEAR_EDGE = wp.constant(1.7), wp.constant(2.7), wp.constant(5.0)
-# The depth style's tint weakens by steps of so much depth [m] so often, from its strength at the surface to its least.
+# Depth style: step of depth [m], number of steps; below, tint at the surface and smallest tint.
 STEP, STEPS = wp.constant(0.005), wp.constant(6)
 STRONGEST, FAINTEST = wp.constant(0.85), wp.constant(0.1)
-# What a layer is to the overlay: in front of it, or ground that nothing shines through.
+# Roles of a layer: in front of the overlay, or ground that nothing shines through.
 FRONT, SHUT = wp.constant(1), wp.constant(2)
-# What is done to the ground inside of the silhouette.
+# Shading of the ground inside of the silhouette.
 SHINES, TINTED, DEEPENED = wp.constant(1), wp.constant(2), wp.constant(3)
 SHADES = {"window": SHINES, "fill": TINTED, "depth": DEEPENED}
-"""By style; none in others."""
-# The ink of the rims of lines.
+"""Shading by style; none in other styles."""
+# Colour of the dark border of lines.
 DARK = (10.0, 12.0, 12.0)
 DARK_INK = wp.constant(wp.vec3f(*DARK))
 
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """The lines of an overlay in a box of the picture.
+    """Lines of an overlay in a box of the image.
 
     Parameters
     ----------
     ink
-        (3,) in 0 .. 255: of the hidden surface's outline, and of its tint.
+        (3,) in 0 .. 255: colour of the hidden surface's outline, and of its tint.
     solid
-        Whether the outline is drawn as one solid line.
+        True if the outline is drawn as one solid line.
     under, above
-        (h, w, 4) uint8: colour times coverage, and coverage, of what else is drawn, under the outline and above it; or
-        None.
+        (h, w, 4) uint8: colour times coverage, and coverage, of further lines, under the outline and above it; or None.
     """
 
     ink: tuple[float, float, float]
@@ -71,21 +70,21 @@ def overlaid(
     style: str,
     lines: Lines,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The picture (H, W, 3) uint8 with an overlay, and where its lines are, (h, w) uint8 of the box.
+    """Draw an overlay; return the image (H, W, 3) uint8, and the mask of its lines, (h, w) uint8 of the box.
 
     Parameters
     ----------
     drawn
-        The one picture, on its device.
+        The one image, on its device.
     box, camera
-        Rows and columns of the picture in which to draw, and the camera of that part.
+        Rows and columns of the image in which to draw, and the camera of that part.
     hidden, seen
-        The surface, and what that camera sees of it, on the same device.
+        The surface, and its rendering by that camera, on the same device.
     roles
-        What stays as it is, and what nothing shines through.
+        Parts that stay unchanged, and parts that nothing shines through.
     style
         "window" dims the ground round the silhouette, where the surface shines through; "fill" tints it; "depth" the
-        more the nearer the surface is to the ground.
+        more the closer the surface is to the ground.
     """
     device = str(drawn.colour.device)
     load(device, __name__)
@@ -108,16 +107,16 @@ def overlaid(
 
 @dataclass(frozen=True, eq=False)
 class Roles:
-    """What the parts of a picture are to an overlay.
+    """Roles of an image's parts for an overlay.
 
     Parameters
     ----------
     front
-        Ids of the layers that stay as they are: tools.
+        Ids of the layers that stay unchanged: tools.
     open
         Ids of those that the surface may shine through; None: all.
     covered
-        (H, W) bool: what stays as it is besides, as a hand in a real picture; or None.
+        (H, W) bool: further parts that stay unchanged, as a hand in a real image; or None.
     """
 
     front: tuple[int, ...] = ()
@@ -125,7 +124,7 @@ class Roles:
     covered: np.ndarray | None = None
 
     def of(self, segmentation: np.ndarray, box: tuple[slice, slice] = np.s_[:, :]) -> np.ndarray:
-        """(h, w) uint8: `FRONT`, `SHUT` or 0 in a box of a picture's segmentation (H, W) uint8."""
+        """Return the roles (h, w) uint8, `FRONT`, `SHUT` or 0, in a box of an image's segmentation (H, W) uint8."""
         found = cv2.LUT(segmentation[box], role_table(self.front, self.open))
         if self.covered is not None:
             found[self.covered[box]] = FRONT
@@ -134,7 +133,7 @@ class Roles:
 
 @lru_cache(maxsize=8)
 def role_table(front: tuple[int, ...], open_to: tuple[int, ...] | None) -> np.ndarray:
-    """(256,) uint8 by the id of a layer: `FRONT`, `SHUT` or 0."""
+    """Return the table (256,) uint8 of roles by the id of a layer: `FRONT`, `SHUT` or 0."""
     ids = np.arange(256)
     shut = np.zeros(256, bool) if open_to is None else ~np.isin(ids, open_to)
     return np.where(np.isin(ids, front), FRONT, np.where(shut, SHUT, 0)).astype(np.uint8)
@@ -142,21 +141,21 @@ def role_table(front: tuple[int, ...], open_to: tuple[int, ...] | None) -> np.nd
 
 @lru_cache(maxsize=8)
 def on_device(front: tuple[int, ...], open_to: tuple[int, ...] | None, device: str) -> wp.array:
-    """The same on a device: brought there once."""
+    """Return `role_table` on a device, copied there once."""
     return wp.array(role_table(front, open_to), dtype=wp.uint8, device=device)
 
 
 def sheet(lines: np.ndarray | None, device: str) -> wp.array:
-    """A sheet (h, w, 4) of lines, flat on a device; empty if there is none."""
+    """Copy a sheet (h, w, 4) of lines to a device, flattened; empty if there is none."""
     if lines is None:
         return wp.empty(0, dtype=wp.vec4ub, device=device)
     return wp.array(lines.reshape(-1, 4), dtype=wp.vec4ub, device=device, copy=False)
 
 
 def from_edge(seen: Seen) -> wp.array:
-    """How far each pixel (h, w) is from a silhouette's edge [pixel], as far as the rim reaches: a chamfer distance.
+    """Compute the chamfer distance (h, w) of each pixel from a silhouette's edge [pixel], up to the soft edge's width.
 
-    OpenCV's on the processor, and the same by kernels on a card.
+    OpenCV's on the CPU, and the same by kernels on a GPU.
     """
     device, shape = str(seen.nearest.device), seen.nearest.shape[1:]
     beside = wp.empty(shape, dtype=wp.uint8, device=device)
@@ -168,7 +167,7 @@ def from_edge(seen: Seen) -> wp.array:
 
 
 def chamfer(beside: wp.array, device: str) -> wp.array:
-    """How far each pixel (h, w) is from those where `beside` is 0 [pixel], as far as the rim reaches."""
+    """Compute the chamfer distance (h, w) of each pixel from those where `beside` is 0 [pixel], up to `REACH`."""
     aside = wp.empty(beside.shape, dtype=wp.int32, device=device)
     distance = wp.empty(beside.shape, dtype=wp.float32, device=device)
     launch_in_bands(find_aside, [beside], [aside], beside.size, device)
@@ -185,7 +184,7 @@ def find_edge(
     # output
     beside: wp.array2d(dtype=wp.uint8),
 ):
-    """Each pixel: 0 where a surface is seen that is not seen at one of its four neighbours, else 1."""
+    """Mark each pixel: 0 if a surface is visible there but not at one of its four neighbours, else 1."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         row = index / nearest.shape[1]
@@ -210,7 +209,7 @@ def find_aside(
     # output
     aside: wp.array2d(dtype=wp.int32),
 ):
-    """How many columns each pixel is from the edge in its own row, at most `REACH`."""
+    """Compute the distance in columns of each pixel from the edge in its own row, at most `REACH`."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         row = index / beside.shape[1]
@@ -231,7 +230,7 @@ def find_distance(
     # output
     distance: wp.array2d(dtype=wp.float32),
 ):
-    """The length of the shortest way of straight and slanted steps: in each row it begins at the nearest pixel."""
+    """Compute the chamfer distance: shortest path of straight and diagonal steps from each row's nearest pixel."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         row = index / aside.shape[1]
@@ -249,7 +248,7 @@ def find_distance(
 def smooth_distance(
     row: wp.int32, column: wp.int32, away: wp.array2d(dtype=wp.float32), nearest: wp.array2d(dtype=wp.uint64)
 ) -> wp.float32:
-    """How far a pixel is outside the silhouette, below 0 inside: the mean of nine, in which steps do not show."""
+    """Signed distance of a pixel from the silhouette, below 0 inside: mean of nine pixels, which hides steps."""
     total = wp.float32(0.0)
     for i in range(-1, 2):
         for j in range(-1, 2):
@@ -261,7 +260,7 @@ def smooth_distance(
 
 @wp.func
 def over(line: wp.vec4ub, light: wp.vec3f) -> wp.vec3f:
-    """Light with a line over it: colour times coverage, and coverage."""
+    """Blend a line (colour times coverage, and coverage) over light."""
     left = 1.0 - wp.float32(line[3]) / 255.0
     return left * light + wp.vec3f(wp.float32(line[0]), wp.float32(line[1]), wp.float32(line[2]))
 
@@ -275,7 +274,7 @@ def shining(
     looks: wp.array(dtype=wp.vec4f),
     surface: wp.float32,
 ) -> wp.vec3f:
-    """The light of a hidden surface at a pixel p = (u, v, 1), through the ground at depth `surface` [m].
+    """Compute the light of a hidden surface at a pixel p = (u, v, 1), through the ground at depth `surface` [m].
 
     0 where there is none.
     """
@@ -290,7 +289,7 @@ def shining(
 
 @wp.func
 def strength(under: wp.float32) -> wp.float32:
-    """Of the depth style's tint, this far under the ground [m]."""
+    """Strength of the depth style's tint, at a depth under the ground [m]."""
     share = wp.clamp(wp.floor(under / STEP) / wp.float32(STEPS - 1), 0.0, 1.0)
     return STRONGEST - (STRONGEST - FAINTEST) * share
 
@@ -322,9 +321,9 @@ def lay_over(
     ground: wp.array2d(dtype=wp.vec3ub),
     taken: wp.array2d(dtype=wp.uint8),
 ):
-    """A run of the box's pixels begin .. end - 1; `away` is how far each is from the silhouette's edge [pixel].
+    """Composite pixels begin .. end - 1 of the box; `away` is the distance of each from the silhouette's edge [pixel].
 
-    `looks` of the hidden surface's vertices: how much they face the camera, and colour in 0 .. 255.
+    `looks` of the hidden surface's vertices: cosine of their normals to the optical axis, and colour in 0 .. 255.
     """
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):

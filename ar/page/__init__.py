@@ -1,1 +1,1 @@
-"""The page in the browser: its parts, its visitors, what they may say to it."""
+"""Browser page: its parts, its clients, and the messages that they may send."""

@@ -1,8 +1,8 @@
-"""The page: the camera picture, a 3-D view beside it, playback, controls and a report, made with viser.
+"""Browser page: camera image, 3-D view next to it, playback, controls and a report, made with viser.
 
-The overlay is composited into the picture before it comes here (`ar.overlay.composite`). The picture is shown whole, as
-an image of its own. So no window shape and no client can bring the two out of register. The 3-D view follows by sending
-vertices alone. `ar.page.style` says where things are.
+The overlay is composited into the image before it comes here (`ar.overlay.composite`). The whole image is shown, as one
+element. So no window shape and no client can misalign the two. The 3-D view is updated by sending vertices alone.
+`ar.page.style` holds the layout.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from .recording import Recorder
 from .scene import add_body, dress
 from .style import PAGE, STATUS, style
 
-# Behind all that is added later.
+# Sort order after all elements that are added later.
 LAST = 1e9
-# Hosts that this machine reaches by the name localhost.
+# Addresses that this machine reaches by the name localhost.
 EVERYWHERE = ("127.0.0.1", "0.0.0.0", "::1", "::")
 
 
 Shown = tuple[int, np.ndarray, str, int]
-"""A frame's number, its picture (H, W, 3) uint8, the words, HTML, beside it, and where the playback slider is."""
+"""Frame number, its image (H, W, 3) uint8, the report next to it (HTML), position of the playback slider."""
 
 
 class Browser:
-    """A screen in the browser, for any number of visitors, who share picture and controls.
+    """Browser screen for any number of clients, who share image and controls.
 
-    `show`, `move`, `report`, `write` and `put` only note what is newest. They may be called from any thread at any
-    rate. A thread of the page sends it on, as often as `Limits` allow.
+    `show`, `move`, `report`, `write` and `put` only note the newest value. They may be called from any thread at any
+    rate. A thread of the page sends it, as often as `Limits` allow.
     """
 
     def __init__(
@@ -55,19 +55,19 @@ class Browser:
         limits: Limits = LIMITS,
         origins: tuple[str, ...] = (),
     ) -> None:
-        """Start the server; where `port` is taken, the next free one serves, see `address`.
+        """Start the server; if `port` is taken, the next free one is used, see `address`.
 
-        `words` is HTML under the picture, `size` the picture's width and height [pixel] until the first arrives.
-        `origins` are further addresses of the page, of a proxy or another port, as `ar.page.guard.origin_of` has them.
+        `words` is HTML under the image, `size` the image's width and height [pixel] until the first arrives. `origins`
+        are further addresses of the page, of a proxy or another port, in the form of `ar.page.guard.origin_of`.
 
         Raises
         ------
         ValueError
-            A port that is none.
+            An invalid port.
         OSError
             A host that is not this machine.
         UnguardedError
-            A viser that serves otherwise than `ar.page.guard` knows.
+            A viser release that `ar.page.guard` does not support.
         """
         check_address(host, port)
         self.limits, self.origins = limits, origins
@@ -77,18 +77,18 @@ class Browser:
         gui.add_html(style(size[0] / size[1]))
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
         gui.add_html(held(PICTURE, ""))
-        # Last: where a low window has no room for them under the picture, the controls come before them.
+        # Last: if a low window has no space for them under the image, the controls come before them.
         self.words = gui.add_html(held(PAGE, unparted(words)), order=LAST)
         self.line = gui.add_html("")
         self.text = gui.add_html(held(SAID, ""))
-        # What is shown, newest first asked for: frame, picture and words; the picture as it is sent, and how many were.
+        # Shown and requested state: frame, image and words. Last encoded image, and number of images sent.
         self.shown: Shown = (0, blank, "", 0)
         self.wanted: Shown = self.shown
         self.coded, self.sent = coded(blank), 0
         self.sight = gui.add_html(sight(0, self.coded, ""))
         gui.add_html(aside(KEYS if playback.frames else LIVE_KEYS))
         self.beside = gui.add_html("")
-        # What draws slices and the last seconds, if they are others than those that were sent; when they may be [s].
+        # Function that draws slices and charts, if not yet sent; earliest time to send them [s].
         self.drawn: Callable[[], tuple[np.ndarray, str]] | None = None
         self.due = 0.0
         self.crowd, self.recorder = Crowd(self.server, self.text.order + 0.5), Recorder(self.server)
@@ -110,9 +110,9 @@ class Browser:
         title: str = "sulcus",
         words: str = "",
     ) -> None:
-        """Put other bodies, playback, controls, title and words in the place of those that are there.
+        """Replace bodies, playback, controls, title and words.
 
-        What was noted for the old ones is dropped.
+        Pending updates of the old ones are dropped.
         """
         with self.sending, self.server.atomic():
             with self.lock:
@@ -143,12 +143,12 @@ class Browser:
 
     @property
     def deed(self) -> Deed | None:
-        """What the newest message did, as the `changed` that it calls may ask."""
+        """Action of the newest message, for the `changed` that it calls."""
         return self.controls.deed
 
     @property
     def address(self) -> str:
-        """Where the page is, as this machine reaches it, with the token that others than this machine need."""
+        """Address of the page as seen from this machine, with the token that other machines need."""
         host = self.server.get_host()
         name = "localhost" if host in EVERYWHERE else bracketed(host)
         return f"http://{name}:{self.server.get_port()}" + (f"/?token={self.token}" if self.token else "")
@@ -160,31 +160,31 @@ class Browser:
 
     @property
     def visitors(self) -> int:
-        """How many browsers look at the page now."""
+        """Number of connected browsers."""
         return len(self.server.get_clients())
 
     @property
     def here(self) -> set[int]:
-        """Numbers of the visitors who look at the page now, from 1 in the order that they came."""
+        """Numbers of the connected clients, from 1 in order of arrival."""
         return self.crowd.here
 
     def show(self, number: int, colour: np.ndarray, words: str, sought: int | None = None) -> None:
-        """Show the picture (H, W, 3) uint8 of frame `number`, and its words in HTML.
+        """Show the image (H, W, 3) uint8 of frame `number`, and its report in HTML.
 
-        The playback slider goes to that number. Of a frame on the way to another, `sought`, it goes to the other's.
+        The playback slider moves to that number, or to `sought`, the target frame, if this frame is on the way to it.
         """
         with self.lock:
             self.wanted = number, colour, words, number if sought is None else sought
             self.newest["sight"] = self.send_sight
 
     def report(self, words: str) -> None:
-        """Show other words, HTML, beside the picture."""
+        """Replace the report (HTML) next to the image."""
         with self.lock:
             self.wanted = self.wanted[0], self.wanted[1], words, self.wanted[3]
             self.newest["sight"] = self.send_sight
 
     def send_sight(self) -> None:
-        """Send the picture with its words, unless both are there."""
+        """Send the image with its report, unless both are shown already."""
         with self.lock:
             _, colour, words, place = wanted = self.wanted
         at = self.shown[3]
@@ -193,26 +193,26 @@ class Browser:
         if colour is not self.shown[1] or words != self.shown[2]:
             self.put_sight(self.coded, words)
         self.shown = wanted
-        # Not oftener: a visitor may be moving it.
+        # Only on a change: a client may be moving it.
         if place != at:
             self.controls.assign(self.frame, place)
 
     def put_sight(self, code: str, words: str) -> None:
-        """Send a `coded` picture and words, HTML, at once."""
+        """Send a `coded` image and words (HTML) at once."""
         self.sent += 1
         self.sight.content = sight(self.sent, code, unparted(words))
         self.recorder.take(code)
 
     def show_beside(self, drawn: Callable[[], tuple[np.ndarray, str]]) -> None:
-        """Show a picture (H, W, 3) uint8 of slices, and HTML of the last seconds, in tabs beside the 3-D view.
+        """Show an image (H, W, 3) uint8 of slices, and charts (HTML) of the last seconds, in tabs next to the 3-D view.
 
-        `drawn` makes them, on the page's own thread, as often as `Limits` allow: what comes between is left out.
+        `drawn` makes them, on the page's own thread, as often as `Limits` allow: intermediate ones are skipped.
         """
         with self.lock:
             self.drawn = drawn
 
     def send_beside(self) -> None:
-        """Draw and send the newest slices, where it is time and somebody looks."""
+        """Draw and send the newest slices, if they are due and a client is connected."""
         with self.lock:
             drawn = self.drawn if clock.monotonic() >= self.due and self.visitors else None
             if drawn is None:
@@ -223,7 +223,7 @@ class Browser:
         self.beside.content = sight(self.sent, coded(colour), words, ASIDE_SPOT)
 
     def move(self, name: str, vertices: np.ndarray, triangles: np.ndarray | None = None) -> None:
-        """Put the vertices (V, 3) [m] of a body in the 3-D view elsewhere; triangles (F, 3) where they are others."""
+        """Replace the vertices (V, 3) [m] of a body in the 3-D view; also the triangles (F, 3) if they changed."""
         mesh = self.meshes[name]
 
         def send() -> None:
@@ -234,17 +234,17 @@ class Browser:
         self.note(f"body {name}", send)
 
     def tint(self, name: str, colour: tuple[float, float, float]) -> None:
-        """Give a body in the 3-D view another colour (3,), sRGB in [0, 1]."""
+        """Set the colour (3,) of a body in the 3-D view, sRGB in [0, 1]."""
         mesh = self.meshes[name]
         self.note(f"colour {name}", lambda: setattr(mesh, "color", tuple(round(255 * part) for part in colour)))
 
     def status(self, words: str) -> None:
-        """Show a line, HTML, over the picture, or none."""
+        """Show a line (HTML) over the image; empty: none."""
         said = held(STATUS, f"<span>{words}</span>") if words else ""
         self.note("status", lambda: setattr(self.line, "content", said))
 
     def plays(self, playing: bool) -> None:
-        """Let the button say whether the scene plays."""
+        """Set the button's label to the playback state."""
         button, self.playing = self.button, playing
 
         def send() -> None:
@@ -254,23 +254,23 @@ class Browser:
         self.note("button", send)
 
     def tell(self, line: Callable[[int], str]) -> None:
-        """Show each visitor a line of Markdown of its own under the report: `line` takes the visitor's number.
+        """Show each client a line of Markdown of its own under the report: `line` takes the client's number.
 
-        Where several look, it is said besides who leads, and the others may ask to.
+        With several clients it also shows who has control, and the others may request it.
         """
 
         def send() -> None:
             if not self.closed.is_set():
                 self.crowd.read(line)
 
-        # There, no visitor leaves meanwhile.
+        # On that thread, no client leaves meanwhile.
         self.note("lines", lambda: self.server.get_event_loop().call_soon_threadsafe(send))
 
     def put(self, label: str, value: float | str, wanted: Callable[[], bool] | None = None) -> None:
         """Set a control without calling its `changed`, as when a script moves the tool.
 
-        A slider stays within its ends. With `wanted` another value alone is set, if that returns True on the thread
-        that hears the visitors.
+        A slider stays within its range. With `wanted` the control is set only if the value differs and `wanted` returns
+        True on the thread that receives the clients' messages.
         """
         control = self.controls.handles[label]
         if isinstance(control, viser.GuiSliderHandle) and not isinstance(value, str):
@@ -278,7 +278,7 @@ class Browser:
         self.note(f"control {label}", lambda: self.controls.assign(control, value, wanted))
 
     def write(self, label: str, words: str) -> None:
-        """Put other words, HTML, into a note; without any it is not shown."""
+        """Replace the words (HTML) of a note; an empty note is hidden."""
         folder, text = self.controls.notes[label]
 
         def send() -> None:
@@ -293,12 +293,12 @@ class Browser:
         self.server.stop()
 
     def note(self, key: str, send: Callable[[], object]) -> None:
-        """Keep the newest thing to send of each kind."""
+        """Keep the newest update of each kind for sending."""
         with self.lock:
             self.newest[key] = send
 
     def send(self) -> None:
-        """Send what is newest until the page is closed; all that came together arrives together."""
+        """Send the newest updates until the page is closed; updates of one interval arrive together."""
         while not self.closed.wait(1.0 / self.limits.sendings):
             with self.sending:
                 with self.lock:
@@ -309,7 +309,7 @@ class Browser:
                 self.send_beside()
 
     def add_playback(self, playback: Playback) -> None:
-        """A button that plays and pauses, and a slider over the frames, if there are any; keys do the same."""
+        """Add a play/pause button and a slider over the frames, if there are any; keys do the same."""
         gui, self.playing, seekable = self.server.gui, True, playback.frames > 0
         self.button = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         self.frame = gui.add_slider("frame", 0, max(playback.frames - 1, 1), 1, 0, visible=seekable)
@@ -326,7 +326,7 @@ class Browser:
             self.controls.assign(self.frame, number)
 
         self.controls.press(self.button, toggle)
-        # The slider of a single frame has a second place: it must have a length.
+        # A slider needs a length, so that of a single frame has two positions.
         self.controls.hear(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
         self.controls.command(SPACE, toggle)
         if seekable:
@@ -334,9 +334,9 @@ class Browser:
             self.controls.command(ON, lambda _: step(1))
 
     def add_savers(self) -> None:
-        """Buttons that download the picture as it is shown, for everybody, and a film, for who leads."""
+        """Add buttons that download the shown image (every client) and a video (client with control)."""
         name = self.title.replace(":", "").replace(" ", "-")
-        self.saver = self.server.gui.add_button("Save the picture", icon=viser.Icon.CAMERA, color="gray")
+        self.saver = self.server.gui.add_button("Save the image", icon=viser.Icon.CAMERA, color="gray")
 
         @self.saver.on_click
         def save(event: viser.GuiEvent) -> None:
@@ -353,5 +353,5 @@ class Browser:
 
 
 def held(name: str, words: str) -> str:
-    """An element of the page that the rules find by its name."""
+    """Wrap words in an element with an id, for the style rules."""
     return f'<div id="{name}">{words}</div>'

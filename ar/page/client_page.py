@@ -1,7 +1,7 @@
-"""The document that a browser loads first: viser's own, with this page's title and icon, and usable without WebGL.
+"""HTML document that a browser loads first: viser's own, with this page's title and icon, and usable without WebGL.
 
-Viser's client reads what the server sends only while it draws. Where a browser has no WebGL, drawing into nothing takes
-its place: image, controls and tabs work, and the 3-D view alone says that it cannot be shown.
+Viser's client reads the server's messages only while it draws. In a browser without WebGL, a null renderer takes its
+place: image, controls and tabs work, and only the 3-D view is unavailable.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ICON = (
 )
 WITHOUT = "sulcus-without-webgl"
 """Class of the document's element in a browser without WebGL."""
-# Constants of WebGL are their own names here: what is asked about by a name is answered by that name.
+# Each WebGL constant equals its own name here, so that results are looked up by name.
 SCRIPT = """
 (() => {
   const given = HTMLCanvasElement.prototype.getContext;
@@ -56,7 +56,7 @@ SCRIPT = """
 
 @lru_cache(maxsize=4)
 def own_document(document: bytes, is_zipped: bool) -> bytes:
-    """Viser's document with this page's title, icon and script."""
+    """Insert this page's title, icon and script into viser's document."""
     text = (gzip.decompress(document) if is_zipped else document).decode()
     icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON)}" />'
     script = f"<script>{SCRIPT.replace('WITHOUT', WITHOUT)}</script>"

@@ -14,31 +14,31 @@ from .parts import Choice, Control, Deed, Fold, Key, Note, Slider, Toggle
 from .style import LOOKS_ON, NOTE
 
 IDLE = 60.0
-"""A leader who has set nothing for so long [s] hands over as soon as somebody asks."""
+"""Idle time of the client with control [s], after which a request for control is granted at once."""
 
 
 @dataclass
 class Lead:
-    """The leader's number, when they last set something [s], and who asks to lead, in that order."""
+    """State of the lock: number of the client with control, time of its last action [s], queue of requests."""
 
     leader: int | None = None
     acted: float = 0.0
     asking: tuple[int, ...] = ()
 
     def see(self, here: Collection[int], now: float) -> None:
-        """Note who is here: if the leader has left, who asked first leads, or who has been here longest."""
+        """Update the clients present: if the one with control has left, the first in the queue or the oldest has it."""
         self.asking = tuple(visitor for visitor in self.asking if visitor in here)
         if self.leader not in here:
             self._pass((*self.asking, *sorted(here), None)[0], now)
 
     def act(self, visitor: int, now: float) -> bool:
-        """Note that a visitor sets something; whether it is heard."""
+        """Record that a client sets something; return True if it has control."""
         if visitor == self.leader:
             self.acted = now
         return visitor == self.leader
 
     def ask(self, visitor: int, now: float) -> None:
-        """Note that a visitor asks to lead."""
+        """Record that a client requests control."""
         if visitor == self.leader or visitor in self.asking:
             return
         self.asking += (visitor,)
@@ -46,7 +46,7 @@ class Lead:
             self.give(now)
 
     def give(self, now: float) -> None:
-        """Let the visitor lead who asked first."""
+        """Hand over control to the first client in the queue."""
         if self.asking:
             self._pass(self.asking[0], now)
 
@@ -55,7 +55,7 @@ class Lead:
         self.asking = tuple(other for other in self.asking if other != visitor)
 
     def words(self, visitor: int, here: Collection[int]) -> str:
-        """What a visitor reads of it, in Markdown; nothing where they are alone."""
+        """Return the status line of a client in Markdown; empty with a single client."""
         if len(here) < 2:
             return ""
         if visitor == self.leader:
@@ -67,7 +67,7 @@ class Lead:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """What one visitor alone sees: a line, buttons that ask to lead and let lead, and rules that dim the controls."""
+    """Elements that one client sees: line, buttons to request and hand over control, rules that dim the controls."""
 
     line: viser.GuiMarkdownHandle
     ask: viser.GuiButtonHandle
@@ -76,27 +76,27 @@ class Row:
 
 
 class Crowd:
-    """The visitors of a page, by their numbers from 1 in the order that they came. Only for viser's own thread."""
+    """Clients of a page, by their numbers from 1 in order of arrival. Only for viser's own thread."""
 
     def __init__(self, server: viser.ViserServer, order: float) -> None:
-        """`order` is where on the page each reads their line."""
+        """Build the list; `order` is the position on the page of each client's line."""
         self.server, self.order = server, order
         self.lead = Lead()
         self.rows: dict[int, Row] = {}
 
     @property
     def here(self) -> set[int]:
-        """Numbers of the visitors who look at the page now."""
+        """Numbers of the connected clients."""
         return {identifier + 1 for identifier in self.server.get_clients()}
 
     def heard(self, client: viser.ClientHandle) -> bool:
-        """Note that a visitor does something to the page; whether they lead, so that it is heard."""
+        """Record that a client acts on the page; return True if it has control."""
         now = clock.monotonic()
         self.lead.see(self.here | {client.client_id + 1}, now)
         return self.lead.act(client.client_id + 1, now)
 
     def read(self, line: Callable[[int], str]) -> None:
-        """Show each visitor a line of their own: who leads, after what `line` says to a visitor's number."""
+        """Show each client its own line: the result of `line`, then who has control."""
         clients = self.server.get_clients()
         self.rows = {identifier: row for identifier, row in self.rows.items() if identifier in clients}
         here = self.here
@@ -113,7 +113,7 @@ class Crowd:
             _set(row.dim, "content", "" if leads else LOOKS_ON)
 
     def add_row(self, client: viser.ClientHandle) -> Row:
-        """Put into a visitor's page what they alone see."""
+        """Add the elements that only this client sees to its page."""
         gui, lead = client.gui, self.lead
         ask = gui.add_button("Ask to lead", color="orange", order=self.order + 0.1, visible=False)
         give = gui.add_button("Let them lead", color="orange", order=self.order + 0.2, visible=False)
@@ -131,20 +131,20 @@ class Crowd:
 
 
 def _set(handle: object, name: str, value: object) -> None:
-    """Change a part of the page only where it is another: each change is sent."""
+    """Change a property only if it differs: each change is sent."""
     if getattr(handle, name) != value:
         setattr(handle, name, value)
 
 
 class Inputs:
-    """Controls by their labels. What they call is called on the page's own thread.
+    """Controls by their labels. Their callbacks run on the page's own thread.
 
     Parameters
     ----------
     deed
-        What the newest message did, as the `changed` that it calls may ask.
+        Action of the newest message, for the `changed` that it calls.
     kept
-        What each control was set to last by who may: what others set is put back.
+        Last value of each control set by the client with control; other clients' values are reset to it.
     notes
         Folders of words by their labels.
     """
@@ -153,13 +153,13 @@ class Inputs:
         self.server, self.crowd = server, crowd
         self.deed: Deed | None = None
         self.handles: dict[str, viser.GuiInputHandle] = {}
-        # By identity, as viser's controls have no hash.
+        # Keyed by identity, as viser's controls have no hash.
         self.kept: dict[int, float | str] = {}
         self.notes: dict[str, tuple[viser.GuiFolderHandle, viser.GuiHtmlHandle]] = {}
         self.commands: list[viser.CommandHandle] = []
 
     def clear(self) -> None:
-        """Forget all: what is on its way to them comes to nothing."""
+        """Remove all controls: pending updates have no effect."""
         for command in self.commands:
             command.remove()
         self.handles, self.kept, self.notes, self.commands = {}, {}, {}, []
@@ -167,13 +167,13 @@ class Inputs:
     def assign(
         self, control: viser.GuiInputHandle, value: float | str, wanted: Callable[[], bool] | None = None
     ) -> None:
-        """Set a control on the thread that hears the visitors: another could overwrite what is not yet read.
+        """Set a control on the thread that receives clients' messages: another could overwrite an unread value.
 
-        With `wanted` it is set to another value alone, and if that returns True there.
+        With `wanted` it is set only if the value differs and `wanted` returns True there.
         """
 
         def put() -> None:
-            # The page may have been filled anew meanwhile.
+            # The page may have been filled again meanwhile.
             if id(control) in self.kept and (wanted is None or (control.value != value and wanted())):
                 self.kept[id(control)] = value
                 control.value = value
@@ -181,7 +181,7 @@ class Inputs:
         self.server.get_event_loop().call_soon_threadsafe(put)
 
     def press(self, button: viser.GuiButtonHandle, act: Callable[[viser.ClientHandle], None]) -> None:
-        """Have a button do something for who leads."""
+        """Bind a button to an action of the client with control."""
 
         @button.on_click
         async def pressed(event: viser.GuiEvent) -> None:
@@ -190,7 +190,7 @@ class Inputs:
                 act(event.client)
 
     def command(self, key: Key, act: Callable[[viser.ClientHandle], None]) -> None:
-        """Have a key of the keyboard do something for who leads."""
+        """Bind a key of the keyboard to an action of the client with control."""
         handle = self.server.gui.add_command(key.does.capitalize(), hotkey=key.hotkey)
         self.commands.append(handle)
 
@@ -201,7 +201,7 @@ class Inputs:
                 act(event.client)
 
     def add(self, control: Control | Fold | Note) -> None:
-        """A slider, a list, a box to tick, a folder of them, or a folder of words."""
+        """Add a slider, a list, a checkbox, a folder of them, or a folder of words."""
         gui = self.server.gui
         if isinstance(control, Note):
             with gui.add_folder(control.label, expand_by_default=False, visible=bool(control.words)) as folder:
@@ -226,19 +226,19 @@ class Inputs:
             self.command(control.key, partial(self.next, handle, control))
 
     def next(self, handle: viser.GuiInputHandle, choice: Choice, _: viser.ClientHandle) -> None:
-        """Choose the next of several names."""
+        """Select the next of several names."""
         options = choice.options
         name = options[(options.index(str(handle.value)) + 1) % len(options)]
         self.assign(handle, name)
         choice.changed(name)
 
     def hear(self, control: viser.GuiInputHandle, changed: Callable[[Any], None]) -> None:
-        """Pass on what the leading visitor sets, on the thread that they are heard on, before anything else there."""
+        """Pass on values set by the client with control, on the receiving thread, before anything else there."""
         self.kept[id(control)] = control.value
 
         @control.on_update
         async def update(event: viser.GuiEvent) -> None:
-            # The page's own updates come through here too, without a client.
+            # The page's own updates arrive here too, without a client.
             if event.client is None:
                 return
             if not self.crowd.heard(event.client):
@@ -250,5 +250,5 @@ class Inputs:
 
 
 def noted(words: str) -> str:
-    """The words of a note, which the rules find by their class."""
+    """Wrap the words of a note in an element with a class, for the style rules."""
     return f'<div class="{NOTE}">{words}</div>'

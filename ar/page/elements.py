@@ -22,14 +22,14 @@ from .parts import Key
 
 QUALITY = 88
 PICTURE, SAID, NEXT = "sulcus-picture", "sulcus-said", "sulcus-next"
-"""Names of the elements that hold the picture, the words beside it, and what waits to take their places."""
+"""Ids of the elements that hold the image, the words next to it, and the hidden next ones."""
 SLICES, HISTORY = "sulcus-slices", "sulcus-history"
-"""Names of the elements that hold slices of the scan, and the last seconds."""
+"""Ids of the elements that hold slices of the scan, and charts of the last seconds."""
 
 
 @dataclass(frozen=True)
 class Spot:
-    """Where a picture and its words go, and where they wait: names of elements; `alt` says what the picture is."""
+    """Ids of the elements that show an image and its words, and of those that wait; `alt` describes the image."""
 
     picture: str
     words: str
@@ -39,7 +39,7 @@ class Spot:
 
 MAIN = Spot(PICTURE, SAID, NEXT, "what the camera sees")
 ASIDE_SPOT = Spot(SLICES, HISTORY, "sulcus-next-aside", "axial, coronal and sagittal slices of the scan")
-# Of pictures that are loaded in another order than they came, an older one is left out.
+# If images are loaded out of order, older ones are dropped.
 SWAP = """
 const words = this.parentNode.querySelector('template').content, number = Number(this.dataset.number);
 const picture = document.getElementById('PICTURE'), said = document.getElementById('SAID');
@@ -53,7 +53,7 @@ if (number >= Number(picture.dataset.number || 0)) {
 
 
 def unparted(words: str) -> str:
-    """Words, HTML, in which no new line parts a number from its name, its error and its unit: as in a picture."""
+    """Keep numbers on one line with their name, error and unit: replace spaces in words (HTML) by no-break spaces."""
     return re.sub(
         r"<[^>]*>|\s+",
         lambda part: part[0] if part[0][0] == "<" or BREAK.match(words, part.start()) else "&nbsp;",
@@ -62,28 +62,28 @@ def unparted(words: str) -> str:
 
 
 def coded(colour: np.ndarray) -> str:
-    """A picture (H, W, 3) uint8 as an address that holds it."""
+    """Encode an image (H, W, 3) uint8 as a data URL."""
     written = cv2.imencode(".jpg", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
     return f"data:image/jpeg;base64,{base64.b64encode(written.tobytes()).decode()}"
 
 
 def sight(number: int, picture: str, words: str, spot: Spot = MAIN) -> str:
-    """An element that puts a `coded` picture and words, HTML, into their places; `number` counts them."""
+    """Build the element that puts a `coded` image and words (HTML) into their places; `number` counts them."""
     swap = escape(" ".join(SWAP.replace("PICTURE", spot.picture).replace("SAID", spot.words).split()))
-    # Decoded with the rest of the page: else the words are painted first.
+    # Decoded synchronously: otherwise the words would be painted first.
     image = f'<img alt="{spot.alt}" decoding="sync" data-number="{number}" onload="{swap}" src="{picture}">'
     return f'<div id="{spot.waits}" hidden>{image}<template>{words}</template></div>'
 
 
 ASIDE, HELP = "sulcus-aside", "sulcus-keys"
-"""Names of the elements that hold the tabs with what they show, and the list of keys."""
+"""Ids of the elements that hold the tabs with their content, and the list of keys."""
 TABS = (("3-D view", "sulcus-tab-view"), ("slices", "sulcus-tab-slices"), ("last 20 s", "sulcus-tab-history"))
-"""What the tabs are called, and the names of their buttons."""
+"""Labels of the tabs, and ids of their buttons."""
 CAPTION = (
     "The scan as it was taken. Dotted: the tumour in the scan; green: now; band: where its outline is, 95 of 100 times "
-    "by the error that is named (none: not known). White: the tool; a ring: its tip, beside the slice."
+    "by the error that is named (none: not known). White: the tool; a ring: its tip, outside the slice."
 )
-# An image of one pixel: loading it runs the script, which an element's HTML alone would not.
+# Image of one pixel: loading it runs the script, which an element's HTML alone would not.
 PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
 
 
@@ -96,9 +96,9 @@ STYLE = Key("s", "S", "s", "next overlay")
 RECORD = Key("r", "R", "r", "start or stop recording")
 LIVE_KEYS = (SPACE, STYLE, RECORD)
 KEYS = (SPACE, BACK, ON, STYLE, RECORD)
-"""The keys that the server hears of: of a page without frames to go to, and of any other."""
-# In the 3-D view arrows and letters move the camera: a key of ours goes to viser's own commands alone, which listen on
-# the document's element. What is being typed into, or is moved by arrows, keeps its keys.
+"""Keys that the server receives: of a page with frames to seek (`LIVE_KEYS`: of one without)."""
+# In the 3-D view arrows and letters move the camera: our keys go to viser's own commands alone, which listen on the
+# document's element. Text fields, and sliders that arrows move, keep their keys.
 SCRIPT = """
 if (!window.sulcusKeys) {
   window.sulcusKeys = [KEYS];
@@ -129,7 +129,7 @@ if (!window.sulcusKeys) {
 
 
 def aside(keys: Sequence[Key] = KEYS) -> str:
-    """An element with the tabs, empty places for slices and for the last seconds, and the list of keys."""
+    """Build the element with the tabs, empty places for slices and charts, and the list of keys."""
     tabs = "".join(
         f'<input type="radio" name="{ASIDE}" id="{name}"{" checked" if number == 0 else ""}>'
         f'<label for="{name}">{words}</label>'

@@ -1,8 +1,8 @@
-"""The page's server lets in the page's own visitors alone, and hears from them what `ar.page.messages` passes.
+"""Access guard of the page's server: only the page's clients may connect, with messages of `ar.page.messages`.
 
-Whoever can reach the server may ask it for anything: another page in a visitor's browser, a name that its owner points
-at this machine (DNS rebinding), a program. Each request is held to the page's own address and, where others than this
-machine can reach it, to a secret in the page's address.
+Any program that reaches the server may send it requests: another page in a user's browser, a name whose owner points it
+at this machine (DNS rebinding), a script. Each request is checked against the page's own address and, if other machines
+can reach it, a secret in the page's address.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ from websockets.http11 import Request, Response
 from .client_page import own_document
 from .messages import LARGEST, MessageError, checked
 
-# The guard stands on how this release line of viser serves: another is refused.
+# The guard relies on internals of this viser release line: others are rejected.
 KNOWN = "1.1."
-# Another page must not frame this one to have it clicked, nor learn its address.
+# Default ports; valid host names; headers so that another page can neither frame this one (clickjacking) nor learn its
+# address.
 PORTS = {"http": 80, "https": 443}
 NAME = re.compile(r"[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?")
 HEADERS = {"Content-Security-Policy": "frame-ancestors 'self'", "Referrer-Policy": "no-referrer"}
@@ -41,18 +42,19 @@ HEADERS = {"Content-Security-Policy": "frame-ancestors 'self'", "Referrer-Policy
 
 @dataclass(frozen=True)
 class Limits:
-    """How much goes back and forth between a page and its visitors.
+    """Limits of the traffic between a page and its clients.
 
     Parameters
     ----------
     visitors
-        Browsers that are served at once.
+        Maximum number of connected browsers.
     burst, per_second
-        Messages that one may send at once, and per second for long; viser's own page sends some 50 a second at most.
+        Messages that one client may send at once, and sustained per second; viser's own page sends some 50 a second at
+        most.
     sendings
-        Times per second that the page sends what is new, at most.
+        Maximum updates per second that the page sends.
     asides
-        The same of slices and of the last seconds, which take longer to draw.
+        Maximum updates per second of slices and charts, which take longer to draw.
     """
 
     visitors: int = 32
@@ -66,14 +68,14 @@ LIMITS = Limits()
 
 
 class UnguardedError(RuntimeError):
-    """A viser that serves otherwise than this guard knows."""
+    """Unsupported viser release."""
 
 
 @dataclass(frozen=True)
 class Door:
-    """Who may come in: `host` as the page is bound to, `token` (None: whoever is on this machine).
+    """Access policy: `host` that the page is bound to, `token` (None: any program of this machine may connect).
 
-    `origins` are further addresses of the page, by a proxy or another port, as `origin_of` writes them.
+    `origins` are further addresses of the page, by a proxy or another port, in the form of `origin_of`.
     """
 
     host: str
@@ -82,7 +84,7 @@ class Door:
 
     @classmethod
     def of(cls, host: str, origins: tuple[str, ...] = ()) -> Door:
-        """A door with a fresh token, unless only this machine reaches the host and no proxy leads there.
+        """Build a policy with a fresh token, unless only this machine reaches the host and no proxy leads there.
 
         Raises
         ------
@@ -94,7 +96,7 @@ class Door:
         return cls(host, None if near and not origins else secrets.token_urlsafe(24), origins)
 
     def refusal(self, request: Request, address: str, port: int) -> str | None:
-        """Why a request that reached this machine at an address and a port is refused; None where it is not."""
+        """Return the reason to reject a request received at an address and a port; None to accept it."""
         names = {"localhost", "127.0.0.1", "[::1]", bracketed(self.host), bracketed(address)}
         if self.token is not None:
             names.add(socket.gethostname())
@@ -115,18 +117,18 @@ class Door:
         return None
 
     def is_encrypted(self, request: Request) -> bool:
-        """Return True if a request came by an address of https alone."""
+        """Return True if a request's address is served by https only."""
         schemes = [
             each.split(":")[0] for each in self.origins if request.headers.get("Host", "").lower() in hosts_of(each)
         ]
         return set(schemes) == {"https"}
 
     def is_token(self, text: str) -> bool:
-        """Whether a text is the token; the time that it takes does not tell how much of it is right."""
+        """Return True if a text is the token; compares in constant time."""
         return self.token is not None and hmac.compare_digest(text.encode(), self.token.encode())
 
     def tokens(self, request: Request, port: int) -> Iterator[str]:
-        """What a request gives as tokens, in its address or as a cookie."""
+        """Yield the tokens of a request, from its address and its cookies."""
         yield from parse_qs(urlsplit(plain(request.path)).query).get("token", [])
         for header in request.headers.get_all("Cookie"):
             for pair in plain(header).split(";"):
@@ -136,7 +138,7 @@ class Door:
 
 
 class Visit(ServerConnection):
-    """A visitor's connection: what it sends is checked before viser hears it; `controls` finds what can be set."""
+    """WebSocket connection of a client: its messages are checked before viser gets them; `controls` finds controls."""
 
     def __init__(self, *args: Any, controls: Callable[[str], object], limits: Limits, **settings: Any) -> None:
         super().__init__(*args, **settings)
@@ -144,7 +146,7 @@ class Visit(ServerConnection):
         self.credit, self.counted = limits.burst, self.loop.time()
 
     def data_received(self, data: bytes) -> None:
-        """Answer what asks otherwise than by GET, which websockets leaves without an answer."""
+        """Reject requests other than GET, to which websockets would not respond."""
         if self.request is None and not data.startswith(b"GET "[: len(data)]):
             self.transport.write(b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nContent-Length: 0\r\n\r\n")
             self.transport.close()
@@ -152,26 +154,26 @@ class Visit(ServerConnection):
             super().data_received(data)
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """Wait for the next message that may be passed on; none of a page's, or a flood, ends the visit."""
+        """Wait for the next valid message; a malformed message, or too many, closes the connection."""
         while True:
             message = await super().recv(decode)
             try:
                 self.count()
                 return checked(message, self.controls)
             except MessageError as error:
-                self.logger.warning("A visitor's message was refused: %s.", error)
+                self.logger.warning("A client's message was rejected: %s.", error)
                 if self.credit < 0.0:
-                    self.transport.abort()  # what lies unread is not waited for
+                    self.transport.abort()  # do not wait for unread data
                 elif error.malformed:
                     await self.close(1008, "That is no message of this page.")
 
     def count(self) -> None:
-        """Note that a message came.
+        """Count a message.
 
         Raises
         ------
         MessageError
-            More came than a page sends.
+            The rate limit is exceeded.
         """
         now, limits = self.loop.time(), self.limits
         self.credit = min(limits.burst, self.credit + (now - self.counted) * limits.per_second) - 1.0
@@ -181,14 +183,14 @@ class Visit(ServerConnection):
 
 
 class Brief(logging.Filter):
-    """What goes to the terminal about visitors: each sentence once, without what led to it; scanners, not at all."""
+    """Log filter for client connections: each message once, without traceback; failed handshakes never."""
 
     def __init__(self) -> None:
         super().__init__()
         self.said: set[str] = set()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a record is shown; its traceback is cut."""
+        """Return True if a record is shown; its traceback is removed."""
         record.exc_info = None
         text = record.getMessage()
         new = text not in self.said and text != "opening handshake failed"
@@ -198,12 +200,12 @@ class Brief(logging.Filter):
 
 @dataclass
 class Controls:
-    """What visitors can set or hit, found by its identifier; nothing before viser's server stands."""
+    """Lookup of controls and commands by identifier; empty before viser's server runs."""
 
     server: viser.ViserServer | None = None
 
     def __call__(self, identifier: str) -> object:
-        """Find a control of all visitors, or of one alone, or a command."""
+        """Find a control of all clients, or of one alone, or a command."""
         if self.server is None:
             return None
         for gui in (self.server.gui, *(client.gui for client in self.server.get_clients().values())):
@@ -215,12 +217,12 @@ class Controls:
 def open_server(
     host: str, port: int, title: str, limits: Limits = LIMITS, origins: tuple[str, ...] = ()
 ) -> tuple[viser.ViserServer, str | None]:
-    """Serve a page; returns viser's server and the token that the page's address must carry, if any.
+    """Serve a page; return viser's server and the token that the page's address must carry, if any.
 
     Raises
     ------
     UnguardedError
-        A viser that serves otherwise than this guard knows: nothing is served.
+        An unsupported viser release: nothing is served.
     """
     if not viser.__version__.startswith(KNOWN):
         raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {KNOWN}*.")
@@ -244,7 +246,7 @@ PATCHING = threading.Lock()
 
 @contextmanager
 def guarding(door: Door, controls: Controls, limits: Limits) -> Iterator[list[bool]]:
-    """Guard the server that viser opens meanwhile; what it yields is true once it was opened."""
+    """Guard the server that viser opens within this context; the yielded list is non-empty once it is open."""
     opened: list[bool] = []
     serve = websockets.asyncio.server.serve
     log = logging.Logger("page", logging.WARNING)
@@ -267,7 +269,7 @@ def guarding(door: Door, controls: Controls, limits: Limits) -> Iterator[list[bo
 def answer(
     door: Door, limits: Limits, served: Callable, connection: ServerConnection, request: Request
 ) -> Response | None:
-    """Answer a request as viser does, if it may come in; None opens a visit."""
+    """Respond to a request as viser does, if it is accepted; None opens a WebSocket connection."""
     address, port = connection.local_address[:2]
     refusal = door.refusal(request, address, port)
     if refusal is not None:
@@ -299,7 +301,7 @@ def origin_of(address: str) -> str:
     Raises
     ------
     ValueError
-        A text that is no address, or has a path, a user or a query.
+        A text that is not an address, or has a path, a user or a query.
     """
     try:
         parts = urlsplit(address)
@@ -316,28 +318,28 @@ def origin_of(address: str) -> str:
 
 
 def hosts_of(origin: str) -> set[str]:
-    """Names that a request by an address carries as its host, with and without the port that the scheme implies."""
+    """Return the host names of requests to an address, with and without the port that the scheme implies."""
     scheme, _, place = origin.partition("://")
     return {place} if place.rpartition(":")[2].isdecimal() else {place, f"{place}:{PORTS[scheme]}"}
 
 
 def bracketed(host: str) -> str:
-    """A host as it stands in an address."""
+    """Write a host as part of an address (IPv6 in brackets)."""
     return f"[{host}]" if ":" in host else host
 
 
 def cookie(port: int) -> str:
-    """What a page's cookie is called; pages on other ports of the same host have others."""
+    """Return the name of a page's cookie; pages on other ports of the same host have others."""
     return f"page-{port}"
 
 
 def plain(text: str) -> str:
-    """A header's text, of which websockets keeps bytes that are no characters."""
+    """Return a header's text as ASCII; websockets keeps bytes that are no characters."""
     return text.encode("ascii", "replace").decode()
 
 
 def check_address(host: str, port: int) -> None:
-    """Raise where no page can be served: viser would fail on a thread of its own, and its maker wait for ever.
+    """Raise if no page can be served: viser would fail on a thread of its own, and its caller wait for ever.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What was read in the last seconds, as a small chart: lines over time, each with its error as a band."""
+"""Chart of the last seconds: readings over time as lines, each with its error as a band."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from dataclasses import dataclass, field
 from html import escape
 
 SPAN = 20.0
-"""So long a chart reaches back [s]."""
-# Of a chart, in units of its own: its width, a line's height, and what numbers at the left and words above take.
+"""Time span of a chart [s]."""
+# Layout of a chart [SVG units]: width, height of a line, margins at the left, above and below.
 WIDE, HIGH, LEFT, ABOVE, BELOW = 600.0, 105.0, 44.0, 20.0, 16.0
-# Samples that are kept, and that are drawn: a pixel or two apart.
+# Samples that are kept; samples that are drawn: a pixel or two apart.
 MOST, DRAWN = 1200, 240
-# Moments farther apart are not joined [s]. Half the width of one alone [s].
+# Time gap beyond which samples are not joined [s]; half the width of an isolated sample [s].
 PAUSE, DOT = 2.0, 0.06
 
 
 @dataclass(frozen=True)
 class Line:
-    """What is read: its name, unit and colour; `whose` says in a few words what its error is of."""
+    """Line of a chart: its name, unit and colour; `whose` names the source of its error."""
 
     name: str
     unit: str
@@ -30,7 +30,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Sample:
-    """What was read at a time [s]: a value of each line and its error, both in the line's unit; None: not known."""
+    """Readings at a time [s]: a value of each line and its error, both in the line's unit; None: not available."""
 
     time: float
     values: tuple[float | None, ...]
@@ -39,24 +39,24 @@ class Sample:
 
 @dataclass
 class History:
-    """The last samples of some lines. Those of more than `SPAN` before the newest are forgotten."""
+    """Recent samples of some lines. Samples more than `SPAN` older than the newest are dropped."""
 
     lines: tuple[Line, ...]
     samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MOST))
 
     def add(self, sample: Sample) -> None:
-        """Note what was read now."""
+        """Append a sample, and drop those older than `SPAN`."""
         self.samples.append(sample)
         while self.samples[0].time < sample.time - SPAN:
             self.samples.popleft()
 
     def break_off(self, time: float) -> None:
-        """Let no line go from what was read before a time [s] to what is read after."""
+        """Interrupt all lines at a time [s]."""
         unknown = (None,) * len(self.lines)
         self.add(Sample(time, unknown, unknown))
 
     def chart(self) -> str:
-        """All lines, one over the other, as an SVG element."""
+        """Draw all lines, one below the other, as an SVG element."""
         kept = list(self.samples)
         step = max(1, math.ceil(len(kept) / DRAWN))
         gaps = [None in each.values for each in kept]
@@ -76,7 +76,7 @@ def _newest(samples: Sequence[Sample], number: int) -> str:
 
 
 def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
-    """One line with its scale; where its error is not known it is dotted, and where it is itself, there is none."""
+    """Draw one line with its scale; dotted where its error is not available, interrupted where its value is not."""
     known = [each for each in samples if each.values[number] is not None]
     top, end = HIGH * number + ABOVE, samples[-1].time if samples else 0.0
     room = HIGH - ABOVE - BELOW
@@ -89,7 +89,7 @@ def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
 
     drawn = []
     for piece in pieces(samples, number):
-        # A moment alone is as wide as its dot.
+        # An isolated sample is as wide as its dot.
         moments = [(each.time + aside, each) for each in piece for aside in ((0.0,) if len(piece) > 1 else (-DOT, DOT))]
         if piece[-1].errors[number] is not None:
             above = [at(time, (each.values[number] or 0.0) + (each.errors[number] or 0.0)) for time, each in moments]
@@ -117,9 +117,9 @@ def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
 
 
 def pieces(samples: Iterable[Sample], number: int) -> list[list[Sample]]:
-    """Parts of a line that are joined, and of one kind: its error is known, or it is not.
+    """Split a line into joined pieces, each with or without an error throughout.
 
-    They end where the value is not known.
+    They end where the value is not available.
     """
     found: list[list[Sample]] = []
     last: Sample | None = None
@@ -138,7 +138,7 @@ def pieces(samples: Iterable[Sample], number: int) -> list[list[Sample]]:
 
 
 def ceiling(value: float) -> float:
-    """The end of a scale that holds a value: 1, 2 or 5 times a power of ten."""
+    """Return the upper end of a scale for a value: 1, 2 or 5 times a power of ten."""
     if not value > 0.0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))

@@ -1,6 +1,6 @@
-"""What a visitor may say to the page: where its camera is, a control's new value in its range, and which key was hit.
+"""Messages that a client may send to the page: its camera, a control's new value within range, a key that was hit.
 
-Messages come from outside. What is passed on is written anew from what was checked: nothing else gets through.
+Messages are untrusted. Those passed on are encoded again from the checked values: nothing else gets through.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Annotated
 import msgspec
 import viser
 
-# A longer message is none of a visitor's: camera and value take some 300 bytes.
+# Maximum size of a client's message [bytes]: camera and value take some 300.
 LARGEST = 65536
-# Share of a slider's range by which a browser's own rounding may leave it.
+# Tolerance for a browser's rounding, as a share of a slider's range.
 ROUNDING = 1e-6
 
 Pixels = Annotated[float, msgspec.Meta(ge=0.0, le=65536.0)]
@@ -23,7 +23,7 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class MessageError(ValueError):
-    """A message that is not passed on; `malformed` where its sender is no page of ours."""
+    """Rejected message; `malformed` if its sender is not a page of this server."""
 
     def __init__(self, reason: str, malformed: bool = False) -> None:
         super().__init__(reason)
@@ -31,7 +31,7 @@ class MessageError(ValueError):
 
 
 class Camera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
-    """Where a visitor looks from, as viser's page says it."""
+    """Camera of a client, in viser's message format."""
 
     wxyz: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
     position: Vector
@@ -44,26 +44,26 @@ class Camera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid
     up_direction: Vector
 
     def __post_init__(self) -> None:
-        """Refuse a camera that looks nowhere."""
+        """Reject a camera without a viewing direction."""
         if math.dist(self.position, self.look_at) < 1e-9 or not any(self.up_direction) or not any(self.wxyz):
             raise ValueError("It looks nowhere.")
 
 
 class Value(msgspec.Struct, forbid_unknown_fields=True):
-    """The one property of a control that a visitor may change."""
+    """The one property of a control that a client may change."""
 
     value: bool | int | float | str
 
 
 class Setting(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
-    """A control that a visitor set, as viser's page says it."""
+    """Control that a client set, in viser's message format."""
 
     uuid: str
     updates: Value
 
 
 class Command(msgspec.Struct, tag_field="type", tag="CommandTriggerMessage", forbid_unknown_fields=True):
-    """A key that a visitor hit, or its words in the list of commands, as viser's page says it."""
+    """Key that a client hit, or its entry in the list of commands, in viser's message format."""
 
     uuid: str
 
@@ -72,12 +72,12 @@ DECODER = msgspec.msgpack.Decoder(Camera | Setting | Command)
 
 
 def checked(message: str | bytes, control: Callable[[str], object]) -> bytes:
-    """Return the message as it may be passed on; `control` finds what a visitor can set or hit, by its identifier.
+    """Return the checked message, encoded again; `control` finds a control or command by its identifier.
 
     Raises
     ------
     MessageError
-        Anything but a camera, a value in the range of a control that is there, or a command that is there.
+        Anything but a camera, a value in the range of an existing control, or an existing command.
     """
     if isinstance(message, str):
         raise MessageError("it is text", malformed=True)
@@ -110,7 +110,7 @@ def ranged(control: object, value: bool | int | float | str) -> bool | int | flo
         low, high = control.min, control.max
         slack = ROUNDING * (high - low)
         whole = isinstance(control.value, int)
-        # A comparison with NaN is false: it ends below.
+        # A comparison with NaN is false, so NaN is rejected below.
         if low - slack <= value <= high + slack and (not whole or value == int(value)):
             return int(value) if whole else float(min(max(value, low), high))
     raise MessageError(

@@ -1,4 +1,4 @@
-"""What a page is made of: surfaces and signs in the 3-D view, a first view of it, playback, controls."""
+"""Parts of a page: surfaces and labels in the 3-D view, its first view, playback, controls."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A surface in the 3-D view: vertices (V, 3) [m], triangles (F, 3), colour (3,) sRGB in [0, 1].
+    """Surface in the 3-D view: vertices (V, 3) [m], triangles (F, 3), colour (3,) sRGB in [0, 1].
 
-    The browser makes normals anew for each update: some 5,000 vertices for all bodies together stay fluent.
+    The browser computes normals again for each update: some 5,000 vertices for all bodies together stay fluent.
     """
 
     name: str
@@ -26,7 +26,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Sign:
-    """A word in the 3-D view, at a place (3,) [m]."""
+    """Text label in the 3-D view, at a position (3,) [m]."""
 
     word: str
     place: np.ndarray
@@ -34,9 +34,9 @@ class Sign:
 
 @dataclass(frozen=True)
 class Slider:
-    """A number that a visitor sets; `changed` takes it, on the page's own thread, and must return at once.
+    """Slider for a number; `changed` receives it, on the page's own thread, and must return at once.
 
-    `label` is its name for `Browser.put`; `words` are shown in the name's place, `hint` under the pointer.
+    `label` is its name for `Browser.put`; `words` are shown instead of the name, `hint` as a tooltip.
     """
 
     label: str
@@ -51,7 +51,7 @@ class Slider:
 
 @dataclass(frozen=True)
 class Key:
-    """A key of the keyboard: as JavaScript and as viser call it, what is shown for it, and what it does."""
+    """Key of the keyboard: its names in JavaScript and in viser, its shown symbol, and its action."""
 
     name: str
     hotkey: Literal["space", "arrowleft", "arrowright", "S", "R"]
@@ -61,7 +61,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several names; the rest as in `Slider`. A `key` takes the next one."""
+    """Selection of one of several names; other fields as in `Slider`. A `key` selects the next one."""
 
     label: str
     options: tuple[str, ...]
@@ -74,7 +74,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Toggle:
-    """Something that is on or off; the rest as in `Slider`."""
+    """Checkbox; other fields as in `Slider`."""
 
     label: str
     start: bool
@@ -85,7 +85,7 @@ class Toggle:
 
 @dataclass(frozen=True)
 class Fold:
-    """Controls that are out of sight until a visitor opens them."""
+    """Folder of controls, closed at first."""
 
     label: str
     controls: tuple[Slider | Choice | Toggle, ...]
@@ -93,7 +93,7 @@ class Fold:
 
 @dataclass(frozen=True)
 class Note:
-    """Words, HTML, that a visitor opens to read them, for `Browser.write`; there is no note while there are none."""
+    """Folder of words (HTML) that a user can open, for `Browser.write`; hidden while empty."""
 
     label: str
     words: str = ""
@@ -104,9 +104,9 @@ Control = Slider | Choice | Toggle
 
 @dataclass(frozen=True)
 class Playback:
-    """Play, pause and scrub over frames 0 .. frames - 1: `played` takes whether to play, `sought` a frame number.
+    """Play, pause and seek over frames 0 .. frames - 1: `played` receives whether to play, `sought` a frame number.
 
-    Of 0 frames, as of a camera, there is nothing to scrub over.
+    With 0 frames, as for a camera, there is no seeking.
     """
 
     frames: int
@@ -116,7 +116,7 @@ class Playback:
 
 @dataclass(frozen=True)
 class Deed:
-    """What a visitor set last: the visitor's number, from 1, and the label of the control."""
+    """Last action of a client: its number, from 1, and the label of the control."""
 
     visitor: int
     label: str
@@ -124,7 +124,7 @@ class Deed:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """Where the 3-D view starts: eye, target and up direction, (3,) [m]; vertical field of view [rad]."""
+    """Initial viewpoint of the 3-D view: eye, target and up direction, (3,) [m]; vertical field of view [rad]."""
 
     eye: np.ndarray
     target: np.ndarray

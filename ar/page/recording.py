@@ -1,4 +1,4 @@
-"""Recording: what the page showed for some seconds, made into a video, and the button that records it."""
+"""Recording of the page's recent images as a video, and the button that records it."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ import viser
 from ..screen import write_film
 
 LONGEST, LARGEST = 60.0, 64_000_000
-"""A recording ends by itself after so long [s], or so many characters of coded pictures."""
+"""Maximum duration [s] and size [characters of coded images] of a recording; it then ends automatically."""
 RATE = 15.0
-"""Pictures per second of a film."""
-RECORDS, STOPS, MAKES = "Record", "Stop recording", "Making the film ..."
-"""What the button says."""
+"""Frame rate of a video [1/s]."""
+RECORDS, STOPS, MAKES = "Record", "Stop recording", "Encoding the video ..."
+"""Labels of the button."""
 
 
 @dataclass
 class Recording:
-    """Pictures as `coded` writes them, each with the time [s] when it came."""
+    """Images as encoded by `coded`, each with its arrival time [s]."""
 
     began: float
     taken: list[tuple[float, str]] = field(default_factory=list)
     size: int = 0
 
     def take(self, code: str, now: float) -> None:
-        """Keep a picture, unless it is the last one still, or the recording is full."""
+        """Keep an image, unless it equals the last one, or the recording is full."""
         if (not self.taken or self.taken[-1][1] is not code) and not self.full(now):
             self.taken.append((now, code))
             self.size += len(code)
 
     def full(self, now: float) -> bool:
-        """Whether no more is kept."""
+        """Return True if the recording is full."""
         return now - self.began >= LONGEST or self.size >= LARGEST
 
     def film(self, ended: float) -> bytes:
-        """An MP4 of what was shown until then, as long as that took; the pictures have the size of the first.
+        """Return an MP4 video of the recording up to `ended` [s], in real time; all frames have the size of the first.
 
         Raises
         ------
         ValueError
             Nothing was shown.
         OSError
-            There is no room for it on the disk.
+            Not enough space on the disk.
         """
         with tempfile.TemporaryDirectory(prefix="sulcus-") as folder:
             path = Path(folder) / "page.mp4"
@@ -59,11 +59,11 @@ class Recording:
 
 
 def played(taken: Sequence[tuple[float, str]], ended: float, rate: float) -> Iterator[np.ndarray]:
-    """The picture (H, W, 3) uint8 that was shown at each step of a clock of so many steps a second."""
+    """Yield the image (H, W, 3) uint8 shown at each step of a clock with `rate` steps a second."""
     size: tuple[int, int] | None = None
     for number, (began, code) in enumerate(taken):
         until = taken[number + 1][0] if number + 1 < len(taken) else max(ended, began)
-        # So many steps lie before each end: the film is as long as what it shows.
+        # Steps before each end are counted, so that the video lasts as long as the recording.
         start, stop = (round((time - taken[0][0]) * rate) for time in (began, until))
         if number + 1 == len(taken):
             stop = max(stop, start + 1)
@@ -78,13 +78,13 @@ def played(taken: Sequence[tuple[float, str]], ended: float, rate: float) -> Ite
 
 
 def decoded(code: str) -> np.ndarray:
-    """The picture (H, W, 3) uint8 of an address that `coded` wrote."""
+    """Decode an image (H, W, 3) uint8 from an address written by `coded`."""
     written = np.frombuffer(base64.b64decode(code.partition(",")[2]), np.uint8)
     return cv2.cvtColor(cv2.imdecode(written, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)  # type: ignore[arg-type]
 
 
 class Recorder:
-    """One recording at a time. It ends when the button is pressed again, when it is full, or with who began it."""
+    """Recorder of one video at a time. It ends when stopped by the button, when full, or when its client leaves."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.server = server
@@ -96,8 +96,8 @@ class Recorder:
         self.making = False
 
     def add_button(self, name: str) -> viser.GuiButtonHandle:
-        """Put the button on the page; `name` is that of the file, without its suffix."""
-        hint = f"what the page shows, as a film (.mp4), {LONGEST:.0f} seconds at most"
+        """Add the button to the page; `name` is the file name without suffix."""
+        hint = f"what the page shows, as a video (.mp4), {LONGEST:.0f} seconds at most"
         self.button, self.name = (
             self.server.gui.add_button(RECORDS, hint=hint, icon=viser.Icon.PLAYER_RECORD, color="gray"),
             name,
@@ -106,7 +106,7 @@ class Recorder:
         return self.button
 
     def toggle(self, client: viser.ClientHandle, code: str) -> None:
-        """Begin with a `coded` picture that is shown, or end and send the film."""
+        """Start with a shown `coded` image, or end and send the video."""
         with self.lock:
             if self.making:
                 return
@@ -118,7 +118,7 @@ class Recorder:
         self.end()
 
     def take(self, code: str) -> None:
-        """Keep a `coded` picture that is shown, and end where no more is kept; forget all where its owner has left."""
+        """Keep a shown `coded` image, and end the recording once full; discard it if its client has left."""
         with self.lock:
             recording, client = self.recording, self.client
             if recording is None or client is None:
@@ -132,7 +132,7 @@ class Recorder:
             self.end()
 
     def end(self) -> None:
-        """Make the film, on a thread of its own, and send it."""
+        """Encode the video on a thread of its own, and send it."""
         with self.lock:
             recording, client = self.recording, self.client
             self.recording = self.client = None
@@ -145,18 +145,18 @@ class Recorder:
         ).start()
 
     def send(self, recording: Recording, client: viser.ClientHandle, ended: float) -> None:
-        """Send the film of what was shown until then; where it cannot be made, say why."""
+        """Send the video of the recording; if that fails, report the reason."""
         try:
             client.send_file_download(f"{self.name}.mp4", recording.film(ended), save_immediately=True)
         except (OSError, ValueError) as error:
-            client.add_notification("The film could not be made.", str(error), color="red")
+            client.add_notification("The video could not be written.", str(error), color="red")
         finally:
             with self.lock:
                 self.making = False
                 self.say()
 
     def say(self) -> None:
-        """Let the button say what it does next."""
+        """Set the button's label to its next action."""
         words = MAKES if self.making else RECORDS if self.recording is None else STOPS
         button = self.button
         if button is not None and button.label != words:

@@ -1,4 +1,4 @@
-"""The 3-D view of a page: its surfaces, light and signs, where it is seen from, and the panel beside it."""
+"""3-D view of a page: surfaces, light, labels, camera, and the panel next to it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import viser
 
 from .parts import Body, Sign, Viewpoint
 
-# Width of the docked panel where a browser does not know the page's own rules [CSS pixel].
+# Width of the docked panel in browsers that do not support the page's rules [CSS pixel].
 PANEL = 676.0
 
 
 def dress(server: viser.ViserServer, viewpoint: Viewpoint, signs: Sequence[Sign]) -> None:
-    """Colours, light, signs, the panel's place and the first view of the 3-D scene."""
+    """Set up colours, light, labels, the panel's place and the first view of the 3-D scene."""
     gui, scene = server.gui, server.scene
     gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
     gui.main_panel.dock_left()
@@ -34,7 +34,7 @@ def dress(server: viser.ViserServer, viewpoint: Viewpoint, signs: Sequence[Sign]
 
 
 def add_body(server: viser.ViserServer, body: Body) -> viser.MeshHandle:
-    """A surface in the 3-D view, seen from both sides."""
+    """Add a two-sided surface to the 3-D view."""
     return server.scene.add_mesh_simple(
         f"/{body.name}",
         np.asarray(body.vertices, np.float32),

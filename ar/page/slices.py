@@ -17,25 +17,25 @@ from ..overlay.marks import BEFORE, DOTTED
 from ..overlay.outlines import dash, ink_of
 from ..rendering.layer import Layer, Solid
 
-# Of a view: half of its side [m], its side [pixel], and how far apart the scan is read [m]: finer adds nothing.
+# Half the side of a view [m], its side [pixel], sampling distance of the scan [m]: finer adds nothing.
 REACH, SIDE, GRAIN = 40e-3, 280, 0.8e-3
-# What the scan does not hold, as grey; the scan's brightest, for lines must stand out; the band's share of its colour.
+# Grey level outside the scan; maximum grey level of the scan, so that lines stand out; opacity of the band.
 NOWHERE, BRIGHT, TINT = 26, 190.0, 0.22
 # Grey between two views.
 EDGE = 90
-# The band is found at every so many pixels, between which distances are straight lines.
+# Grid spacing of distances for the band [pixel]; linear interpolation between.
 COARSE = 7
-# Length of the scale's bar [m]; a tip no farther from a plane lies in it [m].
+# Length of the scale bar [m]; maximum distance of a tip that counts as in the plane [m].
 BAR, BESIDE = 20e-3, 1e-3
-# From the edge to a letter, a name or the bar [pixel].
+# Distance of letters, names and the bar from the edge [pixel].
 PAD = 8
-# Outlines are drawn to so many binary digits of a pixel.
+# Binary digits of subpixel positions of outlines.
 DIGITS = 4
 
 
 @dataclass(frozen=True)
 class Plane:
-    """A view along an axis of RAS: what lies to the right of it and below, as unit vectors (3,)."""
+    """View along an axis of RAS: its right and down directions, as unit vectors (3,)."""
 
     name: str
     right: tuple[float, float, float]
@@ -47,12 +47,12 @@ class Plane:
         return np.cross(self.right, self.down)
 
     def points(self, middle: np.ndarray, count: int) -> np.ndarray:
-        """Places (count, count, 3) [m] of a square grid of pixels round a middle (3,) [m], row by row."""
+        """Compute positions (count, count, 3) [m] of a square pixel grid round a centre (3,) [m], row by row."""
         steps = REACH * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
         return middle + steps[:, None, None] * np.asarray(self.down) + steps[None, :, None] * np.asarray(self.right)
 
     def pixels(self, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
-        """Columns and rows (n, 2) of places (n, 3) [m], in a view of `SIDE` pixels; whole numbers are centres."""
+        """Project positions (n, 3) [m] to columns and rows (n, 2) of a view; whole numbers are pixel centres."""
         off = (np.asarray(points) - middle) @ np.stack([self.right, self.down], axis=1)
         return (off / REACH + 1.0) * (0.5 * SIDE) - 0.5
 
@@ -62,27 +62,27 @@ PLANES = (
     Plane("coronal", (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
     Plane("sagittal", (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
 )
-"""As radiologists have them: the patient's right on the left."""
+"""Views in radiological convention: the patient's right on the left."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """What is cut by the planes.
+    """Surfaces to cut by the planes.
 
     Parameters
     ----------
     now, before
-        The tumour's surface, and where the scan has it.
+        The tumour's surface, deformed and in the scan.
     error
-        With a probability of 95 % no point of it is farther off [m]; None: not known.
+        Bound [m] on the distance of every point with a probability of 95 %; None: not available.
     doubtful
-        Whether its place may not be relied on. Then its outline is amber and broken, and has no band.
+        True if the position is unreliable. Then its outline is amber and broken, and has no band.
     others
-        Surfaces beside it, such as the tool's: plain lines of their colours.
+        Further surfaces, such as the tool: plain lines of their colours.
     tip
-        Where the tool touches (3,) [m].
+        Position of the tool's contact (3,) [m].
     whose
-        What the error is of, in a word.
+        Source of the error, in a word.
     """
 
     now: Layer
@@ -95,12 +95,12 @@ class Cut:
 
 
 def sliced(scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
-    """Three views (SIDE, 3 SIDE, 3) uint8 through a middle (3,) [m], side by side; without a scan, on plain ground."""
+    """Draw three views (SIDE, 3 SIDE, 3) uint8 through a centre (3,) [m], side by side; plain ground without a scan."""
     return np.concatenate([view(plane, scan, np.asarray(middle, np.float64), cut) for plane in PLANES], axis=1)
 
 
 def view(plane: Plane, scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
-    """One view (SIDE, SIDE, 3) uint8."""
+    """Draw one view (SIDE, SIDE, 3) uint8."""
     grey = np.full((SIDE, SIDE), NOWHERE, np.uint8) if scan is None else resampled(plane, scan, middle)
     colour = np.repeat(grey[..., None], 3, axis=2)
     ink = ink_of(DOUBTFUL if cut.doubtful else cut.now.colour if len(cut.now.vertices) else BEFORE)
@@ -126,14 +126,14 @@ def view(plane: Plane, scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.n
 
 
 def said_of(cut: Cut) -> str:
-    """What the band is, in few words."""
+    """Describe the band in a few words."""
     if cut.doubtful or cut.error is None:
         return f"{cut.whose}: not known"
     return f"{cut.whose}: within {bound_words(cut.error, 1)}"
 
 
 def resampled(plane: Plane, scan: Solid, middle: np.ndarray) -> np.ndarray:
-    """The scan in a view, (SIDE, SIDE) uint8; `NOWHERE` where there is none."""
+    """Resample the scan in a view, (SIDE, SIDE) uint8; `NOWHERE` outside it."""
     count = round(2.0 * REACH / GRAIN)
     matrix = scan.T_index_world
     index = plane.points(middle, count) @ matrix[:3, :3].T + matrix[:3, 3]
@@ -146,7 +146,7 @@ def resampled(plane: Plane, scan: Solid, middle: np.ndarray) -> np.ndarray:
 
 
 def within(plane: Plane, middle: np.ndarray, layer: Layer, error: float) -> np.ndarray:
-    """(SIDE, SIDE) bool: the pixels that are no farther [m] than an error from a surface, wherever in space that is."""
+    """Compute the mask (SIDE, SIDE) bool of pixels within a distance (error [m]) of a surface, in 3-D."""
     count = SIDE // COARSE
     if not len(layer.triangles):
         return np.zeros((SIDE, SIDE), bool)
@@ -160,7 +160,7 @@ def within(plane: Plane, middle: np.ndarray, layer: Layer, error: float) -> np.n
 
 
 def section(vertices: np.ndarray, triangles: np.ndarray, point: np.ndarray, normal: np.ndarray) -> list[np.ndarray]:
-    """Lines (n, 3) [m] in which a plane cuts a surface; a closed one ends where it begins.
+    """Cut a surface by a plane; return lines (n, 3) [m]. A closed line ends at its start.
 
     vertices (V, 3) [m], triangles (F, 3), point (3,) [m] and normal (3,) of the plane.
     """
@@ -180,13 +180,13 @@ def section(vertices: np.ndarray, triangles: np.ndarray, point: np.ndarray, norm
 
 
 def chained(segments: np.ndarray) -> list[list[int]]:
-    """Segments (n, 2) of numbered points as lines of such numbers; a closed one ends where it begins."""
+    """Chain segments (n, 2) of numbered points to lines of such numbers; a closed line ends at its start."""
     beside: dict[int, list[int]] = defaultdict(list)
     for a, b in segments.tolist():
         beside[a].append(b)
         beside[b].append(a)
     lines = []
-    # From the ends of open lines first: what is left is closed.
+    # Start with the ends of open lines: the remaining lines are closed.
     for start in sorted(beside, key=lambda point: len(beside[point]) != 1):
         while beside[start]:
             line = [start]
@@ -199,19 +199,19 @@ def chained(segments: np.ndarray) -> list[list[int]]:
 
 
 def lines_of(plane: Plane, layer: Layer, middle: np.ndarray) -> list[np.ndarray]:
-    """The lines in which a view's plane cuts a surface, each (n, 2) as columns and rows."""
+    """Cut a surface by a view's plane; return lines, each (n, 2) as columns and rows."""
     found = section(layer.vertices, layer.triangles, middle, plane.normal)
     return [plane.pixels(line, middle) for line in found]
 
 
 def stroke(colour: np.ndarray, lines: Sequence[np.ndarray], ink: Sequence[float], width: int = 1) -> None:
-    """Draw lines, each (n, 2), between pixels too, into a picture (H, W, 3), in place."""
+    """Draw lines, each (n, 2), with subpixel accuracy into an image (H, W, 3), in place."""
     fine = [np.rint(line * 2**DIGITS).astype(np.int32)[:, None] for line in lines]
     cv2.polylines(colour, fine, False, tuple(ink), width, cv2.LINE_AA, DIGITS)
 
 
 def dense(line: np.ndarray) -> np.ndarray:
-    """A line (n, 2) as `dash` takes it: (m, 1, 2) int32, a pixel apart."""
+    """Resample a line (n, 2) for `dash`: (m, 1, 2) int32, a pixel apart."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     steps = np.arange(0.0, along[-1] + 1.0)
     at = np.stack([np.interp(steps, along, line[:, axis]) for axis in (0, 1)], axis=1)
@@ -219,7 +219,7 @@ def dense(line: np.ndarray) -> np.ndarray:
 
 
 def mark(colour: np.ndarray, plane: Plane, tip: np.ndarray, middle: np.ndarray) -> None:
-    """Mark a tip (3,) [m], in place: a dot where it lies in the plane, and a ring where it lies beside it."""
+    """Mark a tip (3,) [m], in place: a dot if it is in the plane, else a ring."""
     ((column, row),) = np.clip(plane.pixels(tip[None], middle), -1e4, 1e4).round().astype(int).tolist()
     beside = abs(float((tip - middle) @ plane.normal)) > BESIDE
     cv2.circle(colour, (column, row), 5, (12, 14, 16), 1 if beside else -1, cv2.LINE_AA)
@@ -227,7 +227,7 @@ def mark(colour: np.ndarray, plane: Plane, tip: np.ndarray, middle: np.ndarray) 
 
 
 def label(colour: np.ndarray, plane: Plane, middle: np.ndarray) -> None:
-    """Write a view's name, where it lies, the patient's sides and a scale, in place."""
+    """Draw a view's name and position, the orientation labels and a scale bar, in place."""
     right, down = np.asarray(plane.right), np.asarray(plane.down)
     axis = int(np.argmax(np.abs(plane.normal)))
     write(colour, f"{plane.name}  {'xyz'[axis]} {1e3 * middle[axis]:.0f} mm", (PAD, 2 * PAD + 4), FINE)

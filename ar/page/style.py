@@ -1,8 +1,8 @@
-"""Where things are on the page: the picture pinned and growing with the window, words, controls and 3-D view around it.
+"""Layout of the page: the image fixed and scaled with the window; words, controls and 3-D view round it.
 
-viser places panels in pixels; these rules go over its own. Its elements have no names, so they are found by what they
-hold. In a wide window the controls stand in two columns, so that all are in sight. A browser that knows no `:has()`
-leaves the rules aside and shows picture and controls in one docked panel.
+viser places panels in pixels; these rules override its own. Its elements have no names, so they are found by their
+content. In a wide window the controls have two columns, so that all are visible. A browser without `:has()` ignores the
+rules and shows image and controls in one docked panel.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from .client_page import WITHOUT
 from .elements import ASIDE, HELP, HISTORY, PICTURE, SAID, SLICES, TABS
 
 PAGE, STATUS = "sulcus", "sulcus-status"
-"""Names of the elements that hold the words under the picture, and the line over it."""
+"""Ids of the elements that hold the words under the image, and the line over it."""
 NOTE = "sulcus-note"
 """Class of the words of a note."""
 PANEL = f"div:has(canvas) ~ div:has(#{PAGE})"
@@ -19,13 +19,13 @@ VIEW = f"div:has(canvas):has(~ div #{PAGE})"
 PARTS = f"div:has(> div > #{SAID})"
 NOTES = ".mantine-Notifications-root"
 
-# For a visitor who looks on: what they could set is dimmed, and no pointer reaches it.
+# For a client without control: controls are dimmed and do not receive pointer events.
 DIMMED = (
     ".mantine-Slider-root, .mantine-InputWrapper-root, .mantine-NumberInput-root, .mantine-Checkbox-root, "
     "div:has(> button):has(+ div .mantine-Slider-root) > button, div:has(> button) + div:has(> button) > button"
 )
 LOOKS_ON = f"<style>{PARTS} :is({DIMMED}) {{ opacity: 0.45; pointer-events: none }}</style>"
-"""Rules for a visitor who looks on while another leads."""
+"""Rules for a client without control."""
 
 RULES = """
 :root { --w: min(62vw, calc((100vh - 10.5rem) * var(--aspect))); --low: max(29vh, 9rem); }
@@ -130,7 +130,7 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
 
 
 def style(aspect: float) -> str:
-    """An element of rules for a picture of width / height `aspect`."""
+    """Build the style element for an image with width / height `aspect`."""
     rules = RULES
     for name, value in (
         ("WITHOUT", WITHOUT),

@@ -1,1 +1,1 @@
-"""From surfaces and a camera to a lit picture."""
+"""Rendering of surfaces to lit images."""

@@ -1,4 +1,4 @@
-"""What is drawn: surfaces with a look."""
+"""Surfaces to render, with their appearance."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from .rasteriser import checked_mesh
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A solid texture: a grey volume that the surface cuts, sampled per pixel at the material points `Layer.rest`.
+    """Solid texture: a grey volume that the surface cuts, sampled per pixel at the material points `Layer.rest`.
 
     Parameters
     ----------
     values
         (X, Y, Z) in [0, 1]; the layer's colour is multiplied by a blend from `dark` (0) to white (1).
     T_index_world
-        (4, 4) affine: voxel index of a rest point [m]. Points outside take the value at the border.
+        (4, 4) affine: voxel index of an undeformed point [m]. Points outside take the value at the border.
     dark
         (3,) multiplier at value 0.
     relief
-        Height [m] by which value 1 stands above value 0: darker is deeper. Shading only; the surface stays.
+        Height [m] of value 1 above value 0: darker is deeper. Shading only; the surface stays.
     height
-        (X, Y, Z) in [0, 1]: what stands so high, in place of `values`.
+        (X, Y, Z) in [0, 1]: height map of the relief, instead of `values`.
 
     Raises
     ------
@@ -51,30 +51,30 @@ class Solid:
         ].astype(np.float32)
         object.__setattr__(self, "texels", np.concatenate([values[..., None], gradient], axis=-1))
 
-    # (X, Y, Z, 4) float32: value and its gradient in the world [1/m], made once.
+    # (X, Y, Z, 4) float32: value and its gradient in the world [1/m], computed once.
     texels: np.ndarray = None  # type: ignore[assignment]
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One surface with its look.
+    """One surface with its appearance.
 
     Parameters
     ----------
     name, id
-        What it is; its number in the segmentation, 1 .. 255 (0 is the background).
+        Name; number in the segmentation, 1 .. 255 (0 is the background).
     vertices, triangles
-        (V, 3) [m], (F, 3); seen from both sides.
+        (V, 3) [m], (F, 3); visible from both sides.
     colour
         (3,) or (V, 3), sRGB in [0, 1].
     gloss, shininess
         Strength of the wet highlight, 0 .. 1, and its Blinn–Phong exponent.
     solid, rest
-        A solid texture and the material points (V, 3) [m] where it is read (the undeformed vertices).
+        Solid texture and the material points (V, 3) [m] where it is sampled (the undeformed vertices).
     casts_shadow
-        Whether the lamp throws its shadow.
+        True if it casts a shadow of the lamp.
     still
-        Whether it never moves: a `Renderer` draws it once for a camera.
+        True if it never moves: a `Renderer` draws it once for a camera.
 
     Raises
     ------
@@ -110,7 +110,7 @@ class Layer:
 
 
 def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Unit vertex normals (V, 3): face normals weighted by area; zero where a vertex has no triangle."""
+    """Compute unit vertex normals (V, 3): face normals weighted by area; zero for vertices without a triangle."""
     a, b, c = (vertices[triangles[:, k]].T for k in range(3))
     (x, y, z), (u, v, w) = b - a, c - a
     faces = y * w - z * v, z * u - x * w, x * v - y * u

@@ -1,4 +1,4 @@
-"""Rasteriser for cameras with a lens: each pixel is tested where it would be without it."""
+"""Rasteriser for cameras with a lens: each pixel is tested at its undistorted position."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from ..optics.camera import Camera
 from .parallel import forward_kernel, load, run_length
 from .triangle import box_of, edge, first_row
 
-# About so many pixels share a cell of the table that finds them again.
+# Average number of pixels in a cell of the lookup table.
 CELL = 64
 
 
 @wp.struct
 class Unbent:
-    """Pixels of B pictures without their lenses, and which pixels are in a cell of the straight picture.
+    """Undistorted pixels of B images, and a lookup table of the pixels in each cell of the undistorted image.
 
-    `pixels` (B, H, W) [pixel], NaN where the lens sees nothing; empty where no camera has a lens. `cells` (B, n, m, 4):
-    the least box of the pixels in a cell, as first column and row, and last column and row. It is empty where a cell
-    has no pixel. `corner` and `scale` (B,) take a straight pixel to its cell: (column, row) = (pixel - corner) scale.
+    `pixels` (B, H, W) [pixel], NaN where the lens sees nothing; empty if no camera has a lens. `cells` (B, n, m, 4):
+    bounding box of the pixels in a cell, as first column and row, and last column and row. It is empty if a cell has no
+    pixel. `corner` and `scale` (B,) map an undistorted pixel to its cell: (column, row) = (pixel - corner) scale.
     """
 
     pixels: wp.array3d(dtype=wp.vec2d)
@@ -32,7 +32,7 @@ class Unbent:
 
 
 def unbent(cameras: Sequence[Camera], device: str) -> Unbent:
-    """Of cameras that all have one size; those without a lens beside others have one that does nothing."""
+    """Compute undistorted pixels of cameras of one size; unchanged for one without a lens among others with one."""
     if all(camera.lens is None for camera in cameras):
         return without_lens(device)
     return with_lens(tuple(cameras), device)
@@ -40,7 +40,7 @@ def unbent(cameras: Sequence[Camera], device: str) -> Unbent:
 
 @lru_cache(maxsize=4)
 def without_lens(device: str) -> Unbent:
-    """What kernels are given where no camera has a lens."""
+    """Build the empty argument for kernels without a lens."""
     out = Unbent()
     out.pixels = wp.empty((0, 0, 0), dtype=wp.vec2d, device=device)
     return out
@@ -48,7 +48,7 @@ def without_lens(device: str) -> Unbent:
 
 @lru_cache(maxsize=4)
 def with_lens(cameras: tuple[Camera, ...], device: str) -> Unbent:
-    """As `unbent`: a camera that stands still is asked for in every picture, and a part of it by each surface."""
+    """Compute `unbent`, cached: a fixed camera is used in every image, and a part of it by each surface."""
     straight = np.stack([camera.straight for camera in cameras])
     count, height, width = straight.shape[:3]
     side = max(int(np.sqrt(height * width / CELL)), 1)
@@ -76,7 +76,7 @@ def fill_cells(
     # output
     cells: wp.array4d(dtype=wp.int32),
 ):
-    """A run of pixels, each into the box of its cell."""
+    """Extend the box of each pixel's cell, for a run of pixels."""
     start = wp.tid() * run
     height = through.pixels.shape[1]
     width = through.pixels.shape[2]
@@ -97,7 +97,7 @@ def fill_cells(
 
 @wp.func
 def pixel_at(picture: wp.int32, column: wp.int32, row: wp.int32, pixels: wp.array3d(dtype=wp.vec2d)) -> wp.vec3d:
-    """A pixel as (u, v, 1), where it would be without its lens."""
+    """Return a pixel as (u, v, 1), at its undistorted position."""
     if pixels.shape[0] == 0:
         return wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
     at = pixels[picture, row, column]
@@ -106,14 +106,14 @@ def pixel_at(picture: wp.int32, column: wp.int32, row: wp.int32, pixels: wp.arra
 
 @wp.func
 def box_through_lens(picture: wp.int32, low: wp.vec2d, high: wp.vec2d, through: Unbent) -> wp.vec4i:
-    """The pixels (first column, first row, last column, last row) that may lie in a box of the straight picture."""
+    """Return the pixel box (first column, first row, last column, last row) of a box of the undistorted image."""
     out = wp.vec4i(2147483647, 2147483647, -1, -1)
     corner = through.corner[picture]
     scale = through.scale[picture]
     zero = wp.float64(0.0)
     rows = through.cells.shape[1]
     columns = through.cells.shape[2]
-    # One cell more on each side: rounding must not lose a pixel.
+    # One cell more on each side, so that rounding loses no pixel.
     top = wp.int32(wp.clamp((low[1] - corner[1]) * scale[1] - wp.float64(1.0), zero, wp.float64(rows)))
     left = wp.int32(wp.clamp((low[0] - corner[0]) * scale[0] - wp.float64(1.0), zero, wp.float64(columns)))
     below = wp.int32(wp.clamp((high[1] - corner[1]) * scale[1] + wp.float64(2.0), zero, wp.float64(rows)))
@@ -190,7 +190,7 @@ def keep_nearest_through_lens(
     # outputs
     nearest: wp.array3d(dtype=wp.uint64),
 ):
-    """A run of triangles in one picture, each in a part of the rows begin .. end - 1."""
+    """Draw a run of triangles in one image, each in a part of the rows begin .. end - 1."""
     picture, chunk, part = wp.tid()
     start = since + chunk * run
     for face in range(start, wp.min(start + run, triangles.shape[0])):

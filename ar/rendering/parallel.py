@@ -1,4 +1,4 @@
-"""Kernels on every core: Warp runs a CPU kernel on the calling thread, so a picture is cut into bands, one a thread."""
+"""Multi-threaded CPU kernels: Warp runs a kernel on the calling thread, so each thread gets a band of the image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
-"""`wp.kernel` without adjoint, launched as wide as the work: pictures are not differentiated here."""
+"""`wp.kernel` without adjoint, launched as wide as the work: images are not differentiated here."""
 
 
 _loading = Lock()
@@ -22,7 +22,7 @@ _loading = Lock()
 def load(device: str, *modules: wp.Module | ModuleType | str) -> None:
     """Load modules of kernels on a device; those that Warp has not cached are compiled, which takes seconds.
 
-    One thread does it at a time, and others wait: Warp alone would compile a module once for each that asks.
+    One thread does it at a time, and others wait: Warp alone would compile a module once per requesting thread.
     """
     with _loading:
         for module in modules:
@@ -32,7 +32,7 @@ def load(device: str, *modules: wp.Module | ModuleType | str) -> None:
 def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, device: str, bands: int = 1) -> None:
     """Launch a kernel over `count` independent items; it takes (begin, end, run) first, see `run_length`.
 
-    On a processor there are so many bands for each core: several where some items take longer than others.
+    On a CPU there are `bands` bands for each core: several if some items take longer than others.
     """
     run = run_length(device)
 
@@ -43,12 +43,12 @@ def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, 
 
 
 def run_length(device: str) -> int:
-    """How many items one kernel thread does: on a processor each thread copies its arguments, which costs the most."""
+    """Return the number of items per kernel thread: on a CPU each thread copies its arguments, which costs the most."""
     return 64 if device == "cpu" else 1
 
 
 def in_bands(draw: Callable[[int, int], None], count: int, device: str, bands: int = 1) -> None:
-    """Call `draw(begin, end)` on ranges that cover 0 .. count: `bands` for each core, where kernels have one each.
+    """Call `draw(begin, end)` on ranges that cover 0 .. count: `bands` for each core, on a CPU.
 
     The ranges must not write to the same places; the modules of their kernels must be loaded.
     """
@@ -61,9 +61,9 @@ def in_bands(draw: Callable[[int, int], None], count: int, device: str, bands: i
 
 @cache
 def workers() -> tuple[ThreadPoolExecutor, int]:
-    """The threads that draw, and how many: Warp runs a CPU kernel on the calling thread and frees the interpreter.
+    """Return the drawing threads and their number: Warp runs a CPU kernel on the calling thread and releases the GIL.
 
-    One, in a process that is asked for one by `OMP_NUM_THREADS`, as beside others on the same cores.
+    One, if `OMP_NUM_THREADS` is 1, as for several processes on the same cores.
     """
     cores = 1 if os.environ.get("OMP_NUM_THREADS") == "1" else min(os.cpu_count() or 1, 8)
     return ThreadPoolExecutor(cores, thread_name_prefix="raster"), cores

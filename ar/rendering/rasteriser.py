@@ -1,14 +1,14 @@
-"""Which triangle does each pixel see: a z-buffer rasteriser in Warp.
+"""Z-buffer rasteriser in Warp: the visible triangle at each pixel.
 
-Triangles are tested in homogeneous pixel coordinates q = K x_camera = (u w, v w, w), so nothing is ever clipped
-(Olano & Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates"). With p = (u, v, 1):
+Triangles are tested in homogeneous pixel coordinates q = K x_camera = (u w, v w, w), so nothing is ever clipped (Olano
+& Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates"). With p = (u, v, 1):
 
-    e_a = p . (q_b x q_c), and e_b, e_c likewise    edge functions, of one sign inside
+    e_a = p . (q_b x q_c); e_b, e_c by cycling      edge functions, of one sign inside
     n = (q_b - q_a) x (q_c - q_a)                   p . n is the sum of the edge functions
     n . q_a / p . n                                 depth
     e / sum e                                       weights on the triangle itself, hence perspective-correct
 
-A lens bends the picture, not the formulas: p is then where the pixel would be without it.
+A lens changes the pixels, not the formulas: p is then the undistorted position of the pixel.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from .parallel import forward_kernel, in_bands, launch_in_bands, load, run_lengt
 from .triangle import box_of, edge, first_row, weights_of
 
 NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
-"""Of a z-buffer where nothing is seen."""
+"""Value of an empty z-buffer entry."""
 NEAR = 1e-3
-"""Nothing closer to a camera is drawn [m]."""
+"""Near plane [m]: nothing closer to a camera is drawn."""
 PARTS = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Fragments:
-    """What each pixel sees.
+    """Visible triangle at each pixel.
 
     face (H, W) int32: index of the triangle, -1 where empty. weights (H, W, 3) float32: barycentric weights of the
     triangle's corners, 0 where empty. depth (H, W) float32 [m]: z in the camera frame, 0 where empty.
@@ -44,11 +44,11 @@ class Fragments:
 
     @property
     def mask(self) -> np.ndarray:
-        """(H, W) bool: where anything is seen."""
+        """(H, W) bool: mask of covered pixels."""
         return self.face >= 0
 
     def interpolate(self, triangles: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Vertex values (V, C) at every pixel, (H, W, C); 0 where empty. triangles (F, 3) as rasterised."""
+        """Interpolate vertex values (V, C) at every pixel, (H, W, C); 0 where empty. triangles (F, 3) as rasterised."""
         picture = np.zeros((*self.face.shape, values.shape[1]), values.dtype)
         seen = self.mask
         picture[seen] = np.einsum("nk,nkc->nc", self.weights[seen], values[triangles[self.face[seen]]])
@@ -58,9 +58,9 @@ class Fragments:
 def rasterise(
     camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR, device: str = "cpu"
 ) -> Fragments:
-    """The nearest triangle at every pixel centre.
+    """Find the nearest triangle at every pixel centre.
 
-    Both sides of a triangle are seen. A pixel centre on an edge belongs to both neighbours, so shared edges leave no
+    Both sides of a triangle are visible. A pixel centre on an edge belongs to both neighbours, so shared edges leave no
     cracks: the z-buffer keeps one, the lower index at equal depth. Triangles without area leave no trace.
 
     Parameters
@@ -68,7 +68,7 @@ def rasterise(
     vertices, triangles
         (V, 3) world points [m]; (F, 3) vertex indices.
     near
-        Nothing closer than this depth [m] is drawn; triangles may reach through the plane and behind the camera.
+        Nothing closer than this depth [m] is drawn; triangles may extend through the plane and behind the camera.
     device
         A Warp device.
 
@@ -91,10 +91,10 @@ def rasterise(
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A surface in one picture, on a device.
+    """Surface in one image, on a device.
 
-    points (1, V) vec3d: homogeneous, without the lens; triangles (F,) vec3i; nearest (1, H, W): z-buffer of (depth,
-    face); rows: those that may be covered. `unbent` is where pixels would be without the lens.
+    points (1, V) vec3d: homogeneous, undistorted; triangles (F,) vec3i; nearest (1, H, W): z-buffer of (depth, face);
+    rows: those that may be covered. `unbent` holds the undistorted pixels.
     """
 
     points: wp.array
@@ -105,7 +105,7 @@ class Seen:
 
     @property
     def mask(self) -> np.ndarray:
-        """(H, W) bool: the pixels whose centres the surface covers."""
+        """(H, W) bool: mask of the pixels whose centres the surface covers."""
         mask = wp.empty(self.nearest.size, dtype=wp.uint8, device=self.nearest.device)
         launch_in_bands(cover, [self.nearest.flatten()], [mask], self.nearest.size, str(self.nearest.device))
         return mask.numpy().reshape(self.nearest.shape[1:]).view(bool)
@@ -127,7 +127,7 @@ def seen(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: floa
 
 
 def empty_buffer(count: int, height: int, width: int, device: str) -> wp.array:
-    """Z-buffers (count, height, width) of (depth, face) that hold nothing."""
+    """Create empty z-buffers (count, height, width) of (depth, face)."""
     return wp.full((count, height, width), value=NOTHING, dtype=wp.uint64, device=device)
 
 
@@ -143,14 +143,14 @@ def draw(
 ) -> None:
     """Draw the triangles from number `since` on into z-buffers (B, H, W), in some rows.
 
-    points (B, V) vec3d: homogeneous, in each picture; triangles (F,) vec3i, the same in all pictures; `through`: the
-    lenses of the cameras, if they have any.
+    points (B, V) vec3d: homogeneous, in each image; triangles (F,) vec3i, the same in all images; `through`: the lenses
+    of the cameras, if they have any.
     """
     bent = through is not None and through.pixels.size > 0
     kernel = keep_nearest_through_lens if bent else keep_nearest
     load(device, kernel.module)
     count, run = triangles.shape[0] - since, run_length(device)
-    # On a card the rows of a triangle are shared by several threads.
+    # On a GPU the rows of a triangle are shared by several threads.
     parts = 1 if device == "cpu" else PARTS
     size = nearest.shape[0], -(-count // run), parts
 
@@ -162,7 +162,7 @@ def draw(
 
 
 def rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int, int]:
-    """First and last-but-one row of the picture that points (V, 3) (u w, v w, w) can cover: all, if one is too near."""
+    """Return the row range of the image that points (V, 3) (u w, v w, w) can cover: all, if one is too near."""
     if not len(homogeneous):
         return 0, 0
     if homogeneous[:, 2].min() < near:
@@ -173,7 +173,7 @@ def rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int
 
 
 def checked_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 and triangles (F, 3) int32; ValueError with the reason when they are no mesh."""
+    """Convert to vertices (V, 3) float64 and triangles (F, 3) int32; ValueError with the reason for an invalid mesh."""
     vertices = np.asarray(vertices, np.float64)
     triangles = np.asarray(triangles, np.int32)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
@@ -187,19 +187,19 @@ def checked_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarra
 
 @wp.func
 def depth_of(key: wp.uint64) -> wp.float32:
-    """The depth in an entry of the z-buffer."""
+    """Return the depth in an entry of the z-buffer."""
     return wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)
 
 
 @wp.func
 def face_of(key: wp.uint64) -> wp.int32:
-    """The face in an entry of the z-buffer."""
+    """Return the face in an entry of the z-buffer."""
     return wp.int32(key & wp.uint64(0xFFFFFFFF))
 
 
 @wp.func
 def within(slope: wp.float64, offset: wp.float64, span: wp.vec2d) -> wp.vec2d:
-    """The part of a row's span where slope u + offset >= 0, and a little more: each pixel is tested again."""
+    """Restrict a row's span to slope u + offset >= 0, with a margin: each pixel is tested again."""
     slack = wp.float64(1.0e-3)
     if slope > wp.float64(0.0):
         return wp.vec2d(wp.max(span[0], -offset / slope - slack), span[1])
@@ -235,7 +235,7 @@ def draw_triangle(
     if volume == wp.float64(0.0):
         return
     box = box_of(a, b, c, near)
-    # Rounding must not push a pixel out that lies on the box.
+    # Tolerance, so that rounding excludes no pixel on the box.
     slack = wp.vec2d(wp.float64(1.0e-6))
     low = wp.vec2d(box[0], box[1]) - slack
     high = wp.vec2d(box[2], box[3]) + slack
@@ -282,7 +282,7 @@ def keep_nearest(
     # outputs
     nearest: wp.array3d(dtype=wp.uint64),
 ):
-    """A run of triangles in one picture, each in a part of the rows begin .. end - 1."""
+    """Draw a run of triangles in one image, each in a part of the rows begin .. end - 1."""
     picture, chunk, part = wp.tid()
     start = since + chunk * run
     for face in range(start, wp.min(start + run, triangles.shape[0])):
@@ -298,7 +298,7 @@ def cover(
     # output
     mask: wp.array(dtype=wp.uint8),
 ):
-    """Each pixel: 1 where anything is seen."""
+    """Set each pixel: 1 if a surface is visible."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         mask[index] = wp.uint8(wp.where(nearest[index] != NOTHING, 1, 0))
@@ -319,7 +319,7 @@ def read_nearest(
     weights: wp.array2d(dtype=wp.vec3f),
     depth: wp.array2d(dtype=wp.float32),
 ):
-    """Each pixel: the winning face, its barycentric weights, its depth; `first` is the arrays' first row."""
+    """Read the visible face, its barycentric weights and its depth at each pixel; `first` is the arrays' first row."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         row = index / nearest.shape[1]

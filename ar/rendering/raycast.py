@@ -1,4 +1,4 @@
-"""The rasteriser's oracle: the same answer by casting one ray per pixel into a bounding-volume tree."""
+"""Reference for tests of the rasteriser: the same result by casting one ray per pixel into a BVH."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from .rasteriser import Fragments, checked_mesh
 
 
 def raycast(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = 1e-3) -> Fragments:
-    """The nearest triangle at every pixel centre, as `rasterise`, on the processor and several times slower."""
+    """Find the nearest triangle at every pixel centre, as `rasterise`, on the CPU and several times slower."""
     vertices, triangles = checked_mesh(vertices, triangles)
     shape = camera.height, camera.width
     if not len(triangles):
         return Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32))
     pixels = np.concatenate([camera.straight, np.ones((*shape, 1))], axis=-1)
     with wp.ScopedDevice("cpu"):
-        # In the camera frame a ray that is one long in z has its depth as parameter.
+        # In the camera frame a ray with z = 1 has its depth as parameter.
         mesh = wp.Mesh(
             wp.array(camera.in_frame(vertices), dtype=wp.vec3f), wp.array(triangles.reshape(-1), dtype=wp.int32)
         )
@@ -40,7 +40,7 @@ def cast_rays(
     weights: wp.array2d(dtype=wp.vec3f),
     depth: wp.array2d(dtype=wp.float32),
 ):
-    """One ray from the near plane on."""
+    """Cast one ray from the near plane on."""
     row, column = wp.tid()
     ray = rays[row, column]
     length = wp.length(ray)

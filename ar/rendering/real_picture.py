@@ -1,4 +1,4 @@
-"""Real images in place of drawn ones, and the round field of an operating microscope."""
+"""Real images instead of rendered ones, and the round field of view of an operating microscope."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from .parallel import forward_kernel, launch_in_bands, load
 from .rasteriser import rasterise
 from .renderer import Picture, Pictures
 
-# Over so large a share of the field's radius, inwards from its edge, its light falls to none.
+# Width of the field's soft edge as a share of its radius.
 SOFT = wp.constant(0.12)
 
 
 def vignetted(picture: Picture, field: float) -> Picture:
-    """The picture in a round field whose radius is `field` halves of the picture's longer side; depths and ids stay.
+    """Darken an image outside a round field with radius `field` x half its longer side; depths and ids are unchanged.
 
     Its colours change in place, on their device.
 
     Raises
     ------
     ValueError
-        A field that is no number above 0.
+        A field that is not a number above 0.
     """
     if not 0.0 < field < float("inf"):
         raise ValueError(f"a round field has a radius above 0, not {field}.")
@@ -47,7 +47,7 @@ def darken(
     # output
     colour: wp.array3d(dtype=wp.vec3ub),
 ):
-    """Darken a run of the pixels begin .. end - 1 beyond a radius [pixel] about the middle of each picture."""
+    """Darken a run of the pixels begin .. end - 1 beyond a radius [pixel] about the centre of each image."""
     start = begin + wp.tid() * run
     height = colour.shape[1]
     width = colour.shape[2]
@@ -72,22 +72,22 @@ def darken(
 def real_picture(
     colour: np.ndarray, camera: Camera, layers: Sequence[Layer], box: tuple[slice, slice], device: str = "cpu"
 ) -> Picture:
-    """A picture (H, W, 3) uint8 that a camera took, with depth and segmentation of layers where they should be seen.
+    """Combine a camera image (H, W, 3) uint8 with the depth and segmentation of layers that should be visible.
 
     Parameters
     ----------
     layers
-        What is known of the scene; of each the place and the id are used. The nearest one is seen.
+        Known surfaces of the scene; their positions and ids are used. The nearest one is visible.
     box
-        Rows and columns in which layers are looked for; elsewhere nothing is known.
+        Rows and columns in which layers are drawn; elsewhere nothing is known.
 
     Raises
     ------
     ValueError
-        A picture of another size than the camera's.
+        An image of another size than the camera's.
     """
     if colour.shape != (camera.height, camera.width, 3):
-        raise ValueError(f"the picture is {colour.shape}, the camera {(camera.height, camera.width, 3)}.")
+        raise ValueError(f"the image is {colour.shape}, the camera {(camera.height, camera.width, 3)}.")
     depth = np.zeros((1, *colour.shape[:2]), np.float32)
     segmentation = np.zeros(depth.shape, np.uint8)
     if layers:

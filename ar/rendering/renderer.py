@@ -1,4 +1,4 @@
-"""Surfaces and a camera in, a lit picture out."""
+"""Renderer: from surfaces, a camera and a lamp to a lit image."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SHADOW_PIXELS = 384
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """What cameras see, on the device that drew it; `.numpy()` of an array brings it here.
+    """Images of several cameras, on the device that drew them; `.numpy()` of an array copies it to the host.
 
     colour (B, H, W) vec3ub: in NumPy (B, H, W, 3) uint8; depth (B, H, W) float32 [m] and segmentation (B, H, W) uint8
     are as in `Picture`.
@@ -35,13 +35,13 @@ class Pictures:
 
     @property
     def arrays(self) -> tuple[wp.array, wp.array, wp.array]:
-        """All of them."""
+        """Colour, depth and segmentation."""
         return self.colour, self.depth, self.segmentation
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What one camera sees; what is asked for is brought from the device that drew it."""
+    """Image of one camera; arrays are copied from the device on first use."""
 
     drawn: Pictures
 
@@ -57,16 +57,16 @@ class Picture:
 
     @cached_property
     def segmentation(self) -> np.ndarray:
-        """(H, W) uint8: the id of the layer seen, 0 where nothing is seen."""
+        """(H, W) uint8: the id of the visible layer, 0 where nothing is seen."""
         return self.drawn.segmentation.numpy()[0]
 
 
 @dataclass(frozen=True, eq=False)
 class Backdrop:
-    """What one camera sees of the layers that stand still, in full light.
+    """Image of the fixed layers for one camera, without shadows.
 
-    `nearest` is the z-buffer, `placed` where all layers were when it was drawn; `lit_at` (H W) is where the shadow map
-    is read for each pixel.
+    `nearest` is the z-buffer, `placed` holds the positions of all layers when it was drawn; `lit_at` (H W) is the
+    shadow map position of each pixel.
     """
 
     camera: Camera
@@ -78,7 +78,7 @@ class Backdrop:
 
 @dataclass(frozen=True, eq=False)
 class Lamp:
-    """A surgical lamp: a spot with a soft rim.
+    """Surgical lamp: a spot light with a soft edge.
 
     position, target (3,) [m]; radius [m] of the lit circle at the target; strength and ambient light, scene-linear.
     """
@@ -90,7 +90,7 @@ class Lamp:
     ambient: float = 0.16
 
     def camera(self) -> Camera:
-        """The view from the lamp, in which shadows are found."""
+        """Return the camera at the lamp, for the shadow map."""
         axis = np.asarray(self.target) - self.position
         angle = np.arctan(self.radius / np.linalg.norm(axis))
         side = np.eye(3)[np.argmin(np.abs(axis))]
@@ -98,14 +98,14 @@ class Lamp:
 
 
 def lamp_beside(camera: Camera, target: np.ndarray, radius: float = 0.06) -> Lamp:
-    """A lamp above the camera's left shoulder, on `target` (3,) [m]: shadows fall beside the tool, not under it."""
+    """Build a lamp above the camera's left shoulder, aimed at `target` (3,) [m]: shadows fall next to the tool."""
     distance = np.linalg.norm(np.asarray(target) - camera.centre)
     right, down = camera.T_camera_world[0, :3], camera.T_camera_world[1, :3]
     return Lamp(camera.centre - distance * (0.45 * right + 0.3 * down), np.asarray(target), radius)
 
 
 def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> Picture:
-    """Draw layers as seen by a camera under a lamp. Those who draw the same layers again make a `Renderer`.
+    """Draw layers as seen by a camera under a lamp. For repeated drawing of the same layers use a `Renderer`.
 
     Raises
     ------
@@ -116,14 +116,14 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
 
 
 class Renderer:
-    """Layers under a lamp, made ready once and drawn any number of times; from one thread at a time.
+    """Layers under a lamp, prepared once and drawn any number of times; from one thread at a time.
 
-    What one camera sees of layers that stand still is drawn once, from its second picture on. For a camera that moves
-    it would be drawn for nothing.
+    The image of fixed layers is cached for a camera, from its second image on. For a moving camera it would be of no
+    use.
     """
 
     def __init__(self, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> None:
-        """Bring the layers to a Warp device; ValueError when two have one id."""
+        """Copy the layers to a Warp device; ValueError if two have one id."""
         load(device, shade.module, place.module)
         self.device, self.stack = device, Stack(layers, device)
         self.light, self.lamp_camera = as_light(lamp), lamp.camera()
@@ -134,7 +134,7 @@ class Renderer:
         self.backdrop: Backdrop | None = None
 
     def picture(self, camera: Camera, vertices: Sequence[np.ndarray]) -> Picture:
-        """What a camera sees; vertices (V, 3) [m]: of each layer that moves, in order.
+        """Render the image of a camera; vertices (V, 3) [m]: of each moving layer, in order.
 
         Raises
         ------
@@ -147,15 +147,15 @@ class Renderer:
         return Picture(self._drawn([camera], moved, backdrop))
 
     def pictures(self, vertices: np.ndarray | wp.array, cameras: Sequence[Camera]) -> Pictures:
-        """What cameras of one size see; nothing leaves the device.
+        """Render images of cameras of one size; nothing leaves the device.
 
         Parameters
         ----------
         vertices
-            (B, n, 3) [m]: of all layers that move, one after the other, in each picture. A Warp array (B, n) of
-            `vec3d` on this device is taken as it is, and must be finite.
+            (B, n, 3) [m]: of all moving layers, one after the other, in each image. A Warp array (B, n) of `vec3d` on
+            this device is used without a copy, and must be finite.
         cameras
-            B of them, or one for all pictures.
+            B of them, or one for all images.
 
         Raises
         ------
@@ -165,16 +165,16 @@ class Renderer:
         moved = self.stack.moved(vertices)
         count = moved.shape[0]
         if len(cameras) not in (1, count):
-            raise ValueError(f"{len(cameras)} cameras for {count} pictures: give one for each, or one for all.")
+            raise ValueError(f"{len(cameras)} cameras for {count} images: give one for each, or one for all.")
         if len({(camera.width, camera.height) for camera in cameras}) > 1:
             raise ValueError("the cameras have several sizes: draw those of each size together.")
         return self._drawn([*cameras] * (count // len(cameras)), moved, None)
 
     def _drawn(self, cameras: Sequence[Camera], moved: wp.array, backdrop: Backdrop | None) -> Pictures:
-        """Draw every picture, upon the backdrop if there is one."""
+        """Draw every image, upon the backdrop if there is one."""
         count, height, width = len(cameras), cameras[0].height, cameras[0].width
         if count * max(height * width, SHADOW_PIXELS**2) >= 2**31:
-            raise ValueError(f"{count} pictures of {width} x {height} are too many at once: draw fewer.")
+            raise ValueError(f"{count} images of {width} x {height} are too many at once: draw fewer.")
         stack, vertex, face = self.stack, 0, 0
         if backdrop is None:
             nearest, placed = empty_buffer(count, height, width, self.device), stack.unplaced(count)
@@ -201,7 +201,7 @@ class Renderer:
         through: Unbent,
         pictures: Pictures,
     ) -> None:
-        """Light what the z-buffers hold, in the shadow of some triangles, into pictures that hold all else."""
+        """Light the contents of the z-buffers, in the shadow of some triangles, into images that hold all else."""
         count, height, width = nearest.shape
         shadow = self._shadow(placed, casting)
         inputs = [
@@ -212,7 +212,7 @@ class Renderer:
         launch_in_bands(shade, inputs, outputs, count * height * width, self.device, bands=4)
 
     def _place(self, cameras: Sequence[Camera], moved: wp.array, placed: Placed, since: int) -> None:
-        """Find where the vertices from number `since` on lie in each picture."""
+        """Project the vertices from number `since` on in each image."""
         stack = self.stack
         matrices = wp.array([projection(camera) for camera in cameras], dtype=wp.mat44d, device=self.device)
         inputs = [
@@ -222,13 +222,13 @@ class Renderer:
         launch_in_bands(place, inputs, [placed], len(cameras) * (stack.vertices - since), self.device)
 
     def _rows(self, seen: wp.array, since: int, height: int) -> slice:
-        """The rows that vertices from number `since` on can cover: on a card all, for to ask would take longer."""
+        """Return the rows that vertices from number `since` on can cover: on a GPU all, as a test would take longer."""
         if self.device != "cpu":
             return slice(0, height)
         return slice(*rows_reached(seen.numpy()[:, since:].reshape(-1, 3), NEAR, height))
 
     def _shadow(self, placed: Placed, casting: wp.array) -> Shadow:
-        """Draw the shadow map of each picture."""
+        """Draw the shadow map of each image."""
         count, tiles = placed.lit.shape[0], SHADOW_PIXELS // int(TILE)
         shadow = Shadow()
         shadow.size = SHADOW_PIXELS
@@ -243,7 +243,7 @@ class Renderer:
         return wp.array([camera.centre for camera in cameras], dtype=wp.vec3f, device=self.device)
 
     def _backdrop(self, camera: Camera, moved: wp.array) -> Backdrop:
-        """What a camera sees of the layers that stand still; that of the last camera is kept."""
+        """Return the image of the fixed layers for a camera; that of the last camera is cached."""
         if self.backdrop is not None and self.backdrop.camera is camera:
             return self.backdrop
         stack, height, width = self.stack, camera.height, camera.width
@@ -262,7 +262,7 @@ class Renderer:
 
 
 def empty_pictures(count: int, height: int, width: int, device: str) -> Pictures:
-    """Pictures in which nothing is seen but what is behind all."""
+    """Create images with the background only."""
     shape = count, height, width
     colour = wp.empty(shape, dtype=wp.vec3ub, device=device)
     for row in range(count):
@@ -272,7 +272,7 @@ def empty_pictures(count: int, height: int, width: int, device: str) -> Pictures
 
 
 def copied(placed: Placed) -> Placed:
-    """The same arrays anew."""
+    """Copy the arrays."""
     out = Placed()
     for name in ("seen", "lit", "vertices", "normals"):
         setattr(out, name, wp.clone(getattr(placed, name)))
@@ -280,14 +280,14 @@ def copied(placed: Placed) -> Placed:
 
 
 def projection(camera: Camera) -> np.ndarray:
-    """(4, 4): takes a world point (x, 1) [m] to (u w, v w, w, 1)."""
+    """Build the matrix (4, 4) that maps a world point (x, 1) [m] to (u w, v w, w, 1)."""
     P = np.eye(4)
     P[:3] = camera.K @ camera.T_camera_world[:3]
     return P
 
 
 def as_light(lamp: Lamp) -> Light:
-    """The lamp as the kernel takes it."""
+    """Convert the lamp for the kernel."""
     camera = lamp.camera()
     axis = np.asarray(lamp.target) - lamp.position
     light = Light()
@@ -295,14 +295,14 @@ def as_light(lamp: Lamp) -> Light:
     angle = np.arctan(lamp.radius / np.linalg.norm(axis))
     light.outer, light.steepness = float(np.cos(angle)), float(1.0 / (np.cos(0.55 * angle) - np.cos(angle)))
     light.strength, light.ambient, light.P = lamp.strength, lamp.ambient, wp.mat44f(projection(camera))
-    # As high as the filter is wide: then no slant to the lamp brings the surface itself under the filter.
+    # The offset equals the filter width: then the surface itself is never under the filter, at any slant to the lamp.
     light.offset = float(1.05 * (SOFT + 0.5) * np.linalg.norm(axis) / camera.K[0, 0])
     return light
 
 
 @lru_cache(maxsize=4)
 def background(width: int, height: int, device: str) -> wp.array:
-    """(H, W, 3) uint8 on a device: a drape, brighter in the middle."""
+    """Draw the background (H, W, 3) uint8 on a device: a drape, brighter in the centre."""
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
     fall = 1.0 - 0.45 * np.clip(np.hypot(x, y) / np.sqrt(2.0), 0.0, 1.0)
     return wp.array((255.0 * fall[..., None] * DRAPE).astype(np.uint8), dtype=wp.vec3ub, device=device)
@@ -310,7 +310,7 @@ def background(width: int, height: int, device: str) -> wp.array:
 
 @lru_cache(maxsize=1)
 def tone_curve() -> np.ndarray:
-    """(4096,) uint8: scene-linear light to display: filmic curve (Narkowicz 2016), then a gamma of 2."""
+    """Compute the table (4096,) uint8 from scene-linear light to display: filmic (Narkowicz 2016), then gamma 2."""
     x = np.linspace(0.0, float(BRIGHTEST), 4096)
     filmic = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)
     return (255.0 * np.sqrt(filmic) + 0.5).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""What colour a seen point has under the lamp: deferred shading in Warp, one launch for all pictures."""
+"""Colour of visible points under the lamp: deferred shading in Warp, one launch for all images."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from .rasteriser import NOTHING, depth_of, face_of
 from .surfaces import Corners, Light, Look, Placed, Point, Shadow, Surfaces
 from .triangle import weights_at
 
-# A caster must be this much nearer to the lamp [m] than what it shades.
+# Minimum depth of a caster in front of a point that it shades [m].
 BIAS = wp.constant(0.0002)
-# Half the width of the shadow's soft rim [shadow-map pixel].
+# Half the width of the shadow's soft edge [shadow-map pixel].
 SOFT = wp.constant(3)
 TAPS = wp.constant(7)
 Taps = wp.types.vector(length=7, dtype=wp.float32)
-# The shadow map's bounds are kept for squares of so many pixels a side: the filter meets four of them at most.
+# Side of the tiles of the shadow map's depth bounds [pixel]: the filter overlaps at most four.
 TILE = wp.constant(8)
-# Scene-linear light that is white.
+# Scene-linear light displayed as white.
 BRIGHTEST = wp.constant(4.0)
 
 
 @wp.func
 def unit(v: wp.vec3f) -> wp.vec3f:
-    """v / |v| with one division; the library's has three, and this is half of the work at a pixel."""
+    """Compute v / |v| with one division; the library's has three, and this is half of the work at a pixel."""
     return v * (1.0 / wp.sqrt(wp.dot(v, v) + 1.0e-30))
 
 
 @wp.func
 def blend(w: wp.vec3f, a: wp.vec3f, b: wp.vec3f, c: wp.vec3f) -> wp.vec3f:
-    """The value at barycentric weights w of a triangle with these values at its corners."""
+    """Interpolate values at a triangle's corners by barycentric weights w."""
     return w[0] * a + w[1] * b + w[2] * c
 
 
 @wp.func
 def sample(texels: wp.array(dtype=wp.vec4f), begin: wp.int32, size: wp.vec3i, index: wp.vec3f) -> wp.vec4f:
-    """Trilinear value (value, gradient) at a voxel index, held to the border outside."""
+    """Sample (value, gradient) trilinearly at a voxel index, clamped to the border."""
     x = wp.clamp(index[0], 0.0, wp.float32(size[0] - 1))
     y = wp.clamp(index[1], 0.0, wp.float32(size[1] - 1))
     z = wp.clamp(index[2], 0.0, wp.float32(size[2] - 1))
@@ -59,7 +59,7 @@ def sample(texels: wp.array(dtype=wp.vec4f), begin: wp.int32, size: wp.vec3i, in
 
 @wp.func
 def corners_of(picture: wp.int32, winner: wp.int32, surfaces: Surfaces, placed: Placed) -> Corners:
-    """What a pixel needs to know of a face: its neighbours mostly need the same."""
+    """Gather the data of a face for its pixels: neighbouring pixels mostly need the same."""
     t = surfaces.triangles[winner]
     qa = placed.seen[picture, t[0]]
     qb = placed.seen[picture, t[1]]
@@ -86,13 +86,13 @@ def corners_of(picture: wp.int32, winner: wp.int32, surfaces: Surfaces, placed: 
 
 @wp.func
 def point_at(p: wp.vec3d, corners: Corners, look: Look, texels: wp.array(dtype=wp.vec4f), eye: wp.vec3f) -> Point:
-    """What a pixel p = (u, v, 1) sees of a face."""
+    """Compute the point of a face visible at a pixel p = (u, v, 1)."""
     w = weights_at(p, corners.edge_b, corners.edge_c, corners.normal)
     out = Point()
     out.place = blend(w, corners.a, corners.b, corners.c)
     out.view = unit(eye - out.place)
     n = unit(blend(w, corners.normal_a, corners.normal_b, corners.normal_c))
-    # Towards the viewer by the flat side that is seen: near a silhouette the smooth normal may point away.
+    # Oriented to the viewer by the visible flat side: near a silhouette the smooth normal may point away.
     if wp.dot(corners.flat, n) * wp.dot(corners.flat, out.view) < 0.0:
         n = -n
     out.base = blend(w, corners.colour_a, corners.colour_b, corners.colour_c)
@@ -108,7 +108,7 @@ def point_at(p: wp.vec3d, corners: Corners, look: Look, texels: wp.array(dtype=w
 
 @wp.func
 def read_at(place: wp.vec3f, normal: wp.vec3f, light: Light) -> wp.vec3f:
-    """Where the shadow map is read for a point: column, row, depth [m] (not above 0 behind the lamp)."""
+    """Compute the shadow map position of a point: column, row, depth [m] (not above 0 behind the lamp)."""
     above = place + light.offset * normal
     q = light.P * wp.vec4f(above[0], above[1], above[2], 1.0)
     if q[2] <= 0.0:
@@ -119,9 +119,9 @@ def read_at(place: wp.vec3f, normal: wp.vec3f, light: Light) -> wp.vec3f:
 
 @wp.func
 def lit(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
-    """Share of the lamp that reaches a point: percentage-closer filter of the shadow map (Reeves et al. 1987).
+    """Compute the lamp's share at a point: percentage-closer filter of the shadow map (Reeves et al. 1987).
 
-    The least and the greatest depth of the tiles under the filter settle most points at once.
+    The smallest and largest depth of the tiles under the filter decide most points at once.
     """
     column = wp.int32(at[0] + 0.5)
     row = wp.int32(at[1] + 0.5)
@@ -142,7 +142,8 @@ def lit(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
         return 1.0
     if z > wp.max(wp.max(first[1], second[1]), wp.max(third[1], fourth[1])):
         return 0.0
-    # A box 2 SOFT wide about (u, v): taps at its border count by the part of them inside, so that no steps show.
+    # A box 2 SOFT wide about (u, v): taps at its border are weighted by their part inside, so that no steps are
+    # visible.
     reach = wp.float32(SOFT) + 0.5
     across = Taps()
     for j in range(TAPS):
@@ -159,21 +160,21 @@ def lit(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
 
 @wp.func
 def tone(x: wp.float32, curve: wp.array(dtype=wp.uint8)) -> wp.uint8:
-    """Scene-linear light to an 8-bit value by the table `curve`, which spans 0 .. BRIGHTEST."""
+    """Map scene-linear light to an 8-bit value by the table `curve`, which spans 0 .. BRIGHTEST."""
     return curve[wp.int32(wp.min(x * (1.0 / BRIGHTEST), 1.0) * wp.float32(curve.shape[0] - 1))]
 
 
 @wp.func
 def light_on(point: Point, look: Look, light: Light, share: wp.float32) -> wp.vec3f:
-    """Scene-linear light from a point that a share of the lamp reaches.
+    """Compute scene-linear light from a point that a share of the lamp reaches.
 
-    It is base (ambient + wrapped Lambert) + Schlick's Fresnel x a Gaussian lobe, inside a lit circle with a soft rim.
+    It is base (ambient + wrapped Lambert) + Schlick's Fresnel x a Gaussian lobe, inside a lit circle with a soft edge.
     """
     ray = unit(light.position - point.place)
     rim = wp.clamp((-wp.dot(ray, light.axis) - light.outer) * light.steepness, 0.0, 1.0)
     arriving = share * light.strength * rim * rim * (3.0 - 2.0 * rim)
     wrapped = wp.max(0.0, (wp.dot(point.normal, ray) + 0.2) * 0.83333)
-    # The lamp sits near the viewer: what faces away from both lies in the wound's shade.
+    # The lamp is near the viewer: surfaces facing away from both are in the wound's shade.
     ambient = light.ambient * (0.35 + 0.65 * wp.max(0.0, wp.dot(point.normal, point.view)))
     out = point.base * (ambient + arriving * wrapped)
     glow = arriving * look.gloss
@@ -195,7 +196,7 @@ def bound(
     # output
     shadow: Shadow,
 ):
-    """The shadow maps' depths, and the least and greatest in each tile: a run of the tiles begin .. end - 1."""
+    """Compute the shadow maps' depths, and their minimum and maximum in a run of the tiles begin .. end - 1."""
     start = begin + wp.tid() * run
     tiles = shadow.size / TILE
     for index in range(start, wp.min(start + run, end)):
@@ -231,7 +232,7 @@ def remember(
     # outputs
     at: wp.array(dtype=wp.vec3f),
 ):
-    """Where the shadow map is read for each pixel of one picture, flat (H W)."""
+    """Compute the shadow map position of each pixel of one image, flat (H W)."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         row = index / width
@@ -268,10 +269,10 @@ def shade(
     depth: wp.array(dtype=wp.float32),
     segmentation: wp.array(dtype=wp.uint8),
 ):
-    """A run of the pixels begin .. end - 1 of all pictures; these are flat (B H W), and of `size` = H W pixels.
+    """Shade a run of the pixels begin .. end - 1 of all images; these are flat (B H W), and of `size` = H W pixels.
 
-    The outputs hold what is seen where nothing is, and of the first `still` faces in full light. They are left there
-    unless a shadow falls on them; `lit_at` (H W) is where the shadow map is read for each of their pixels.
+    The outputs hold the background, and the first `still` faces without shadows. They are unchanged unless a shadow
+    falls on them; `lit_at` (H W) is the shadow map position of each of their pixels.
     """
     start = begin + wp.tid() * run
     picture = start / size
@@ -298,7 +299,7 @@ def shade(
                 corners = corners_of(picture, winner, surfaces, placed)
                 look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
             p = wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
-            if bent:  # asked here, pictures without a lens take a seventh less time
+            if bent:  # tested here, images without a lens take a seventh less time
                 p = pixel_at(picture, column, row, pixels)
             point = point_at(p, corners, look, surfaces.texels, eyes[picture])
             if winner >= still:

@@ -1,4 +1,4 @@
-"""Layers as one surface on a device: topology, looks and textures, which stay, apart from vertices, which move."""
+"""Layers as one surface on a device: fixed topology, appearance and textures, separate from moving vertices."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from .parallel import forward_kernel
 
 @wp.struct
 class Light:
-    """The lamp as the kernel sees it.
+    """Lamp as seen by the kernel.
 
-    It has a position [m], a unit axis, the cosine of the lit cone's angle, how fast its rim fades in, a strength and an
-    ambient share. `P` takes a world point to (u w, v w, w) in the shadow map, which is read `offset` [m] above the
-    surface.
+    It has a position [m], a unit axis, the cosine of the lit cone's angle, the steepness of its soft edge, a strength
+    and an ambient share. `P` maps a world point to (u w, v w, w) in the shadow map, which is sampled `offset` [m] above
+    the surface.
     """
 
     position: wp.vec3f
@@ -33,7 +33,7 @@ class Light:
 
 @wp.struct
 class Look:
-    """A layer's look: its number, highlight, solid texture (first texel, size, transform, dark end, relief [m])."""
+    """Appearance of a layer: number, highlight, solid texture (first texel, size, transform, dark end, relief [m])."""
 
     id: wp.uint8
     gloss: wp.float32
@@ -48,7 +48,7 @@ class Look:
 
 @wp.struct
 class Surfaces:
-    """All layers as one surface, the same in every picture.
+    """All layers as one surface, the same in every image.
 
     `triangles` (F,) of vertices, `look_of` each, `looks` of the layers; `colours` (V,) scene-linear, `rest` (V,) [m];
     `texels` (T,) of all solid textures, one after the other: value and gradient.
@@ -64,7 +64,7 @@ class Surfaces:
 
 @wp.struct
 class Placed:
-    """The surface in each picture (B, V): homogeneous as seen by the camera, and by the lamp, in the world, normals."""
+    """Surface in each image (B, V): homogeneous as seen by the camera, and by the lamp, in the world, normals."""
 
     seen: wp.array2d(dtype=wp.vec3d)
     lit: wp.array2d(dtype=wp.vec3d)
@@ -74,7 +74,7 @@ class Placed:
 
 @wp.struct
 class Shadow:
-    """Shadow maps, flat (B N N): depth [m], infinite where nothing is; and the least and greatest of each tile.
+    """Shadow maps, flat (B N N): depth [m], infinite where empty; and the minimum and maximum of each tile.
 
     `size` is N, and there are N / TILE tiles along each side.
     """
@@ -86,7 +86,7 @@ class Shadow:
 
 @wp.struct
 class Corners:
-    """A face as its pixels need it: for the weights edges and normal in the picture, and what is blended."""
+    """Data of a face for its pixels: edges and normal in the image for the weights, and values to interpolate."""
 
     edge_b: wp.vec3d
     edge_c: wp.vec3d
@@ -108,7 +108,7 @@ class Corners:
 
 @wp.struct
 class Point:
-    """What a pixel sees: the place [m], the unit directions to the viewer and of the normal, the base colour."""
+    """Visible point of a pixel: position [m], unit directions to the viewer and of the normal, base colour."""
 
     place: wp.vec3f
     view: wp.vec3f
@@ -117,7 +117,7 @@ class Point:
 
 
 def faces_around(triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The faces at each of `count` vertices: where each one's begin (count + 1,), and the faces (3 F,), int32."""
+    """List the faces at each of `count` vertices: start of each list (count + 1,), and the faces (3 F,), int32."""
     corners = triangles.reshape(-1)
     begins = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=count))])
     return begins.astype(np.int32), (np.argsort(corners, kind="stable") // 3).astype(np.int32)
@@ -127,7 +127,7 @@ def faces_around(triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndar
 def place_of(
     picture: wp.int32, vertex: wp.int32, still: wp.array(dtype=wp.vec3d), moved: wp.array2d(dtype=wp.vec3d)
 ) -> wp.vec3d:
-    """Where a vertex is [m]: those that stand still come first."""
+    """Return the position of a vertex [m]: those of fixed layers come first."""
     if vertex < still.shape[0]:
         return still[vertex]
     return moved[picture, vertex - still.shape[0]]
@@ -135,7 +135,7 @@ def place_of(
 
 @wp.func
 def projected(P: wp.mat44d, x: wp.vec3d) -> wp.vec3d:
-    """Homogeneous pixel coordinates (u w, v w, w)."""
+    """Project a point to homogeneous pixel coordinates (u w, v w, w)."""
     q = P * wp.vec4d(x[0], x[1], x[2], wp.float64(1.0))
     return wp.vec3d(q[0], q[1], q[2])
 
@@ -156,7 +156,7 @@ def place(
     # output
     placed: Placed,
 ):
-    """Each vertex from number `since` on, in each picture; normals are the faces' weighted by area."""
+    """Place each vertex from number `since` on, in each image; normals are the faces' weighted by area."""
     start = begin + wp.tid() * run
     each = placed.seen.shape[1] - since
     for index in range(start, wp.min(start + run, end)):
@@ -178,14 +178,14 @@ def place(
 
 
 class Stack:
-    """Layers one after the other, those that stand still first.
+    """Layers one after the other, fixed ones first.
 
-    `still` (S,) [m] are the vertices that never move, `still_faces` how many triangles they have. `casting` (C,) are
-    the triangles that throw shadows; `around` and `faces` are as in `faces_around`.
+    `still` (S,) [m] are the vertices that never move, `still_faces` the number of their triangles. `casting` (C,) are
+    the triangles that cast shadows; `around` and `faces` are as in `faces_around`.
     """
 
     def __init__(self, layers: Sequence[Layer], device: str) -> None:
-        """Bring the layers to a device; ValueError when two have one id."""
+        """Copy the layers to a device; ValueError if two have one id."""
         ids = [layer.id for layer in layers]
         if len(set(ids)) < len(ids):
             raise ValueError(f"layers have the ids {ids}: give each its own.")
@@ -218,7 +218,7 @@ class Stack:
         self.surfaces.texels = texels
 
     def moved(self, vertices: np.ndarray | wp.array) -> wp.array:
-        """The vertices that move, (B, n, 3) [m] or a Warp array (B, n) of vec3d, on the device.
+        """Copy the moving vertices, (B, n, 3) [m] or a Warp array (B, n) of vec3d, to the device.
 
         Raises
         ------
@@ -237,7 +237,7 @@ class Stack:
         return wp.array(vertices, dtype=wp.vec3d, device=self.device)
 
     def unplaced(self, count: int) -> Placed:
-        """Room for where the surface lies in so many pictures."""
+        """Allocate positions of the surface in `count` images."""
         placed, shape = Placed(), (count, self.vertices)
         placed.seen, placed.lit = (wp.empty(shape, dtype=wp.vec3d, device=self.device) for _ in range(2))
         placed.vertices, placed.normals = (wp.empty(shape, dtype=wp.vec3f, device=self.device) for _ in range(2))
@@ -245,7 +245,7 @@ class Stack:
 
 
 def dressed(layers: Sequence[Layer], device: str) -> tuple[wp.array, list[Look]]:
-    """The texels of all solid textures, and the looks of the layers."""
+    """Build the texels of all solid textures, and the appearance of the layers."""
     solids = list(dict.fromkeys(layer.solid for layer in layers if layer.solid is not None))
     begins = np.cumsum([0, *(solid.values.size for solid in solids)])
     looks = []
@@ -263,8 +263,8 @@ def dressed(layers: Sequence[Layer], device: str) -> tuple[wp.array, list[Look]]
 
 @lru_cache(maxsize=4)
 def as_texels(solids: tuple[Solid, ...], device: str) -> wp.array:
-    """Solid textures as the kernel takes them, one after the other."""
+    """Copy solid textures to the device, one after the other."""
     each = [solid.texels.reshape(-1, 4) for solid in solids]
-    # One alone, as of a scan, is large: on the processor it is taken as it is.
+    # A single one, as of a scan, is large: on the CPU it is used without a copy.
     texels = each[0] if len(each) == 1 else np.concatenate([np.zeros((0, 4), np.float32), *each])
     return wp.array(texels, dtype=wp.vec4f, device=device, copy=False)

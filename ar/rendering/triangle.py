@@ -1,4 +1,4 @@
-"""A triangle in homogeneous pixel coordinates, as kernels see it: its edges, its box in the picture, weights in it."""
+"""Triangle in homogeneous pixel coordinates, for kernels: its edges, bounding box and barycentric weights."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import warp as wp
 
 @wp.func
 def weights_at(p: wp.vec3d, edge_b: wp.vec3d, edge_c: wp.vec3d, normal: wp.vec3d) -> wp.vec3f:
-    """The barycentric weights e / sum e of a triangle's corners at p = (u, v, 1), by two edges and their sum."""
+    """Compute barycentric weights e / sum e of a triangle's corners at p = (u, v, 1), by two edges and their sum."""
     scale = wp.float64(1.0) / wp.dot(p, normal)
     wb = wp.float32(wp.dot(p, edge_b) * scale)
     wc = wp.float32(wp.dot(p, edge_c) * scale)
@@ -16,13 +16,13 @@ def weights_at(p: wp.vec3d, edge_b: wp.vec3d, edge_c: wp.vec3d, normal: wp.vec3d
 
 @wp.func
 def weights_of(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3f:
-    """The barycentric weights of a triangle's corners at a pixel p = (u, v, 1)."""
+    """Compute barycentric weights of a triangle's corners at a pixel p = (u, v, 1)."""
     return weights_at(p, wp.cross(c, a - c), wp.cross(a, b - a), wp.cross(b - a, c - a))
 
 
 @wp.func
 def edge(a: wp.vec3d, b: wp.vec3d, i: wp.int32, j: wp.int32) -> wp.vec3d:
-    """a x b, vertices i and j, rounded alike for both neighbours of the edge: exactly edge(i, j) = -edge(j, i)."""
+    """Compute a x b, vertices i and j, rounded equally for both neighbours: exactly edge(i, j) = -edge(j, i)."""
     if i < j:
         return wp.cross(a, b)
     return -wp.cross(b, a)
@@ -30,7 +30,7 @@ def edge(a: wp.vec3d, b: wp.vec3d, i: wp.int32, j: wp.int32) -> wp.vec3d:
 
 @wp.func
 def around(q: wp.vec3d, box: wp.vec4d) -> wp.vec4d:
-    """The pixel box (u min, v min, u max, v max) grown to hold the pixel of q."""
+    """Extend the pixel box (u min, v min, u max, v max) to the pixel of q."""
     scale = wp.float64(1.0) / q[2]
     u = q[0] * scale
     v = q[1] * scale
@@ -39,7 +39,7 @@ def around(q: wp.vec3d, box: wp.vec4d) -> wp.vec4d:
 
 @wp.func
 def beyond(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d) -> wp.vec4d:
-    """The pixel box grown to hold the part of the edge a b that lies beyond the near plane."""
+    """Extend the pixel box to the part of the edge a b beyond the near plane."""
     if a[2] >= near:
         box = around(a, box)
     if (a[2] < near) != (b[2] < near):
@@ -49,7 +49,7 @@ def beyond(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d) -> wp.vec4
 
 @wp.func
 def box_of(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, near: wp.float64) -> wp.vec4d:
-    """The pixel box (u min, v min, u max, v max) of the part of a triangle that lies beyond the near plane."""
+    """Compute the pixel box (u min, v min, u max, v max) of the part of a triangle beyond the near plane."""
     far = wp.float64(1.0e30)
     box = wp.vec4d(far, far, -far, -far)
     box = beyond(a, b, near, box)
@@ -59,7 +59,7 @@ def box_of(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, near: wp.float64) -> wp.vec4d:
 
 @wp.func
 def first_row(first: wp.int32, begin: wp.int32, part: wp.int32, parts: wp.int32) -> wp.int32:
-    """The first row from `first` on that is a part's, which has every `parts`-th from `begin` on."""
+    """Return the first row of a part from `first` on; a part has every `parts`-th row from `begin` + part on."""
     ahead = (begin + part - first) % parts
     if ahead < 0:
         ahead += parts

@@ -1,1 +1,1 @@
-"""What two eyes see: rows made alike, depths, points that are followed."""
+"""Stereo vision: rectification, disparity and depth, tracked points."""

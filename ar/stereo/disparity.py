@@ -18,47 +18,49 @@ from scipy.spatial import KDTree
 
 from .rectified import Rectified
 
-# A grey level is taken relative to a square of this side [m]: between eyes, and from place to place, lamps differ.
+# Side of the square for local normalisation of grey levels [m]: lamps differ between eyes and positions.
 SQUARE = 2.5e-3
-# How steep what is left gets [grey level], and what a square must vary by to be made as steep as others [grey level].
+# Normalised contrast [grey level]; contrast of a square at which normalisation is halved [grey level].
 STEEP, FLAT = 60.0, 6.0
-# Matching: block, penalties of small and large steps of disparity, and how much better than others a match is [%].
+# Matching: block, penalties of small and large steps of disparity, uniqueness ratio [%].
 BLOCK, SMALL_STEP, LARGE_STEP, BETTER = 5, 200, 800, 5
-# Depths that are looked for, before and behind the target [m].
+# Search range of depths, in front of and behind the target [m].
 DEEP = 12e-3
-# Side of a point's square that is matched exactly [pixel], and how often it is moved, until by less than [pixel].
+# Side of the square of the subpixel match [pixel]; its maximum iterations and final step [pixel].
 SIDE, MOVES = 15, (15, 0.01)
-# An exact match may be so far from the whole pixel, and off its row [pixel].
+# Largest difference of the subpixel match from the whole pixel, and from its row [pixel].
 AWAY, OFF_ROW = 2.0, 1.0
-# Rows of eyes that differ by more in half of all places are those of other cameras [pixel].
+# Median row difference of the eyes above which the calibration is of other cameras [pixel].
 ROWS_APART = 0.7
-# A disparity is never known better [pixel], as light differs between eyes; errors within a square are alike, so that
-# a match is so many times as far off as independent ones would make it. Both are measured on drawn pictures.
+# Lower bound of the disparity's standard deviation [pixel], as light differs between eyes; factor for correlated errors
+# within a square. Both are measured on rendered images.
 LEAST_SIGMA, ALIKE = 0.12, 2.0
-# The mean size of an error of the differences of two windows is their standard deviation over this.
+# Standard deviation over mean absolute value of a Gaussian: converts the mean difference of two windows.
 MEAN_SIZE = float(np.sqrt(0.5 * np.pi))
-# Glare: so bright [grey level], and of so little colour [share of the brightest]; its rim is hidden too [pixel].
+# Glare: smallest brightness [grey level], largest saturation [share of the maximum], margin that is also hidden
+# [pixel].
 BRIGHT, COLOURLESS, RIM = 200, 0.12, 3
-# What varies by less in its square, noise included, tells no depth: light that slides over it would [grey level].
+# Smallest standard deviation in a square, noise included [grey level]: below, highlights that move over it would be
+# matched.
 TEXTURE = 5.0
-# An eye whose window is darker sees nothing [grey level].
+# Mean grey level of a window below which an eye is dark.
 BLACK = 12.0
 
 
 @dataclass(frozen=True, eq=False)
 class StereoView:
-    """What both eyes see at once.
+    """View of both eyes at the same time.
 
     Parameters
     ----------
     geometry
-        How the eyes stand.
+        Geometry of the eyes.
     left, right
-        Windows (size, size) uint8, made alike.
+        Windows (size, size) uint8, normalised.
     hidden
-        (size, size) bool, of the left window: tools, glare, and what has too little texture.
+        (size, size) bool, of the left window: tools, glare, and too little texture.
     hidden_right
-        The same of tools and glare in the right window.
+        Tools and glare in the right window.
     """
 
     geometry: Rectified
@@ -77,19 +79,19 @@ class StereoView:
             -count // 2, count, BLOCK, SMALL_STEP, LARGE_STEP, disp12MaxDiff=1, preFilterCap=63,
             uniquenessRatio=BETTER, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )  # fmt: skip
-        # Else the left border of the left window has no match.
+        # Otherwise the left border of the left window has no match.
         wide = [cv2.copyMakeBorder(each, 0, 0, count, count, cv2.BORDER_REPLICATE) for each in (self.left, self.right)]
         found = matcher.compute(*wide)[:, count:-count].astype(np.float32) / 16.0
         return np.where(self.hidden | (found < -count // 2), np.nan, found)
 
     @cached_property
     def slope(self) -> np.ndarray:
-        """(size, size): sum over a point's square of the left window's squared slope along rows, per pixel^2."""
+        """(size, size): sum over a point's square of the left window's squared gradient along rows, per pixel^2."""
         slope = cv2.Sobel(self.left, cv2.CV_32F, 1, 0, scale=0.125)
         return cv2.boxFilter(slope * slope, -1, (SIDE, SIDE), normalize=False)
 
     def at(self, pixels: np.ndarray, field: np.ndarray) -> np.ndarray:
-        """Values (n,) of a field (size, size) at the pixels (n, 2) that are nearest; NaN or True beyond its border."""
+        """Return values (n,) of a field (size, size) at the pixels nearest to (n, 2); NaN or True beyond its border."""
         here = np.nan_to_num(np.round(pixels).clip(-1.0, self.geometry.size), nan=-1.0).astype(int)
         inside = np.all((here >= 0) & (here < self.geometry.size), axis=1)
         here = np.where(inside[:, None], here, 0)
@@ -99,16 +101,16 @@ class StereoView:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Places whose depth two eyes tell.
+    """Points with stereo depth.
 
     Parameters
     ----------
     which
-        (k,): numbers of the pixels that were asked for.
+        (k,): numbers of the requested pixels.
     points
         (k, 3) [m] in the world.
     sigma
-        (k,) [m]: standard deviation of the depth's error; to the sides it is less.
+        (k,) [m]: standard deviation of the depth's error; lateral errors are smaller.
     """
 
     which: np.ndarray
@@ -119,12 +121,12 @@ class Cloud:
 def viewed(
     geometry: Rectified, left: np.ndarray, right: np.ndarray, tool: tuple[np.ndarray, np.ndarray] | None = None
 ) -> StereoView:
-    """What two pictures (H, W, 3) uint8 show; `tool`, where a tool hides each of them, (H, W) bool each.
+    """Build the stereo view of two images (H, W, 3) uint8; `tool` holds the masks of a tool in each, (H, W) bool.
 
     Raises
     ------
     ValueError
-        An eye that sees nothing.
+        An eye without light.
     """
     windows = geometry.windows(left, right)
     greys = [cv2.cvtColor(window, cv2.COLOR_RGB2GRAY) for window in windows]
@@ -142,39 +144,38 @@ def viewed(
 
 
 def glare(window: np.ndarray) -> np.ndarray:
-    """(H, W) bool: what is bright without colour in a picture (H, W, 3) uint8."""
+    """Return the mask (H, W) bool of bright pixels without colour in an image (H, W, 3) uint8."""
     red, green, blue = cv2.split(window)
     most, least = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
     return (most >= BRIGHT) & (most - least < COLOURLESS * most)
 
 
 def grown(mask: np.ndarray, by: int) -> np.ndarray:
-    """A mask (H, W) bool with a rim of so many pixels."""
+    """Dilate a mask (H, W) bool by `by` pixels."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by + 1, 2 * by + 1), np.uint8)) > 0
 
 
 def equalised(grey: np.ndarray, covered: np.ndarray, square: int) -> tuple[np.ndarray, np.ndarray]:
-    """Grey levels (H, W) uint8 less their mean in a square of so many pixels a side, over what they vary by there.
+    """Normalise grey levels (H, W) uint8 by the mean and standard deviation in a square of `square` pixels a side.
 
-    What is covered (H, W) bool takes no part, and is left grey. What they vary by (H, W) is given too, as a standard
-    deviation.
+    Pixels that are covered (H, W) bool are excluded, and become grey. The standard deviation (H, W) is returned too.
     """
     part = np.where(covered, np.float32(0.0), np.float32(1.0))
     count = np.maximum(cv2.blur(part, (square, square)), np.float32(1e-3))
     level = grey.astype(np.float32)
     level = (level - cv2.blur(level * part, (square, square)) / count) * part
-    # Sums that run along a row may round to less than nothing.
+    # Running sums along a row may round to negative values.
     varies = cv2.sqrt(np.maximum(cv2.blur(level * level, (square, square)), np.float32(0.0)) / count)
     return np.clip(level * (STEEP / (varies + FLAT)) + 128.0, 0.0, 255.0).astype(np.uint8), varies
 
 
 def cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
-    """Where what is seen at pixels (n, 2) of the left window lies, as far as the right eye sees it too.
+    """Compute 3-D points at pixels (n, 2) of the left window, where the right eye sees them too.
 
     Raises
     ------
     ValueError
-        Rows of both eyes that do not show the same: cameras other than those that were calibrated.
+        Rows of both eyes that do not correspond: cameras other than the calibrated ones.
     """
     rough = view.at(pixels, view.disparity)
     which = np.flatnonzero(np.isfinite(rough))
@@ -193,7 +194,7 @@ def cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
         raise ValueError(f"rows of the eyes are {rows:.1f} pixels apart: calibrate the pair again.")
     matched &= (np.abs(down) < OFF_ROW) & ~view.at(there, view.hidden_right)
     steep = view.at(here, view.slope)
-    apart = np.where(found.ravel() > 0, apart.ravel(), np.inf)  # it is not set where nothing was found
+    apart = np.where(found.ravel() > 0, apart.ravel(), np.inf)  # not set where nothing was found
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma = np.hypot(ALIKE * MEAN_SIZE * apart / np.sqrt(steep), LEAST_SIGMA)
     depth = view.geometry.depths(disparity)
@@ -202,22 +203,23 @@ def cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
     return Cloud(which[matched], points[matched], deviation[matched])
 
 
-# Pixels of the coarse search [m], half a side of what is searched for, and how far it is searched for, both in these.
+# Pixel size of the coarse search [m]; half a side of the template, and search radius, in these pixels.
 COARSE, HALF, REACH = 1.0 / 3000.0, 10, 27
-# How alike the two must be: normalised cross-correlation.
+# Smallest normalised cross-correlation of a match.
 FLOW_ALIKE = 0.5
-# Side of the square that is matched exactly [pixel], levels above it, and when its moves end.
+# Subpixel match: side of the square [pixel], pyramid levels, termination.
 FLOW_SIDE, FLOW_LEVELS, FLOW_MOVES = 21, 1, (20, 0.01)
-# A point that is followed back ends so near to its start [pixel].
+# Largest distance from the start after tracking back [pixel].
 BACK = 1.0
-# Neighbours of a point, and how far it may move otherwise than their median does: in their deviations, or [m].
+# Number of neighbours of a point, and largest deviation of its motion from their median: in standard deviations, or
+# [m].
 NEIGHBOURS, DEVIATIONS, FREE = 8, 4.0, 0.5e-3
 
 
 def followed(before: StereoView, now: StereoView, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which (k,) of the pixels (n, 2) of one left window are found in another, and where (k, 2).
+    """Track the pixels (n, 2) of one left window into another; return the numbers (k,) found, and positions (k, 2).
 
-    Both windows have the same fineness and target, so that a pixel is as large.
+    Both windows have the same resolution and target, so that pixels have equal size.
     """
     guess, alike = _searched(before, now, pixels)
     which = np.nonzero(alike > FLOW_ALIKE)[0]
@@ -232,7 +234,7 @@ def followed(before: StereoView, now: StereoView, pixels: np.ndarray) -> tuple[n
 
 
 def supported(places: np.ndarray, motions: np.ndarray) -> np.ndarray:
-    """(n,) bool: which motions (n, 3) [m] at places (n, 3) [m] are like those of their neighbours."""
+    """Return the mask (n,) of motions (n, 3) [m] at positions (n, 3) [m] that agree with those of their neighbours."""
     if len(places) <= NEIGHBOURS:
         return np.ones(len(places), bool)
     near = motions[np.asarray(KDTree(places).query(places, NEIGHBOURS + 1)[1])[:, 1:]]
@@ -242,7 +244,7 @@ def supported(places: np.ndarray, motions: np.ndarray) -> np.ndarray:
 
 
 def _searched(before: StereoView, now: StereoView, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where (n, 2) what is about pixels (n, 2) is found again, to a coarse pixel, and how alike it is (n,)."""
+    """Find pixels (n, 2) again to a coarse pixel, (n, 2), by template matching, with correlations (n,)."""
     size = before.geometry.size
     share = before.geometry.depth / before.geometry.focal / COARSE
     few = max(1, round(share * size))
@@ -263,7 +265,7 @@ def _searched(before: StereoView, now: StereoView, pixels: np.ndarray) -> tuple[
 
 
 def _matched(one: np.ndarray, other: np.ndarray, start: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where pixels (n, 2) float32 of a window are in another one, near a guess (n, 2), and whether they are (n,)."""
+    """Track pixels (n, 2) float32 of a window into another from a guess (n, 2); return positions, success (n,)."""
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, *FLOW_MOVES)
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         one, other, start, guess.copy(), winSize=(FLOW_SIDE, FLOW_SIDE), maxLevel=FLOW_LEVELS, criteria=criteria,

@@ -1,4 +1,4 @@
-"""Two eyes turned so that rows of both show the same: a window of each about what they look at."""
+"""Rectification of two eyes: windows about their target, whose rows correspond."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ import numpy as np
 
 from ..optics.camera import Camera
 
-# The right eye is to the right of the left one: the least share of the way between them along the left one's rows.
+# Smallest share of the baseline along the left eye's rows: the right eye is to the right of the left one.
 ALONG_ROWS = 0.9
 Maps = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class Rectified:
-    """Windows of a pair of eyes. What is as deep as their target has the same place in both.
+    """Rectified windows of a pair of eyes. Points at the target's depth have the same position in both.
 
     Fusiello, Trucco, Verri 2000, "A compact algorithm for rectification of stereo pairs", Mach. Vis. Appl. 12:16-22.
 
     Parameters
     ----------
     T_window_world
-        (4, 4): places [m] in the left eye's turned frame, whose x axis goes to the right eye.
+        (4, 4): positions [m] in the left eye's rectified frame, whose x axis points to the right eye.
     focal, principal
         Of the left window: focal length and principal point (2,) [pixel].
     baseline, depth
-        Between the eyes; from there to the target along the axis [m].
+        Distance between the eyes; distance from there to the target along the axis [m].
     size
         Of a window along each side [pixel].
     maps
-        Of the left and of the right eye: where the pixels of its window are in its picture.
+        Of the left and of the right eye: image positions of the window's pixels.
     """
 
     T_window_world: np.ndarray
@@ -44,32 +44,32 @@ class Rectified:
     maps: tuple[Maps, Maps]
 
     def windows(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pictures (H, W, ...) uint8 of both eyes as windows (size, size, ...), black beyond their borders."""
+        """Rectify images (H, W, ...) uint8 of both eyes to windows (size, size, ...), black beyond their borders."""
         one, other = self.maps
         return cv2.remap(left, *one, cv2.INTER_LINEAR), cv2.remap(right, *other, cv2.INTER_LINEAR)
 
     @property
     def gauge(self) -> float:
-        """Disparity [pixel] times depth [m], both from the eyes."""
+        """Disparity [pixel] times depth [m], both without the target's offset."""
         return self.focal * self.baseline
 
     def disparity(self, depth: np.ndarray) -> np.ndarray:
-        """How much farther to the left the right window shows what is so deep [m], in pixels: 0 at the target."""
+        """Compute the disparity [pixel] of a depth [m]: shift to the left in the right window, 0 at the target."""
         return self.gauge / depth - self.gauge / self.depth
 
     def place(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (n, 2) of the left window, and disparities (n,), of world points (n, 3) [m]."""
+        """Project world points (n, 3) [m] to pixels (n, 2) of the left window, and disparities (n,)."""
         at = points @ self.T_window_world[:3, :3].T + self.T_window_world[:3, 3]
         return self.focal * at[:, :2] / at[:, 2:] + self.principal, self.disparity(at[:, 2])
 
     def points(self, pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
-        """World points (n, 3) [m] at pixels (n, 2) of the left window with disparities (n,)."""
+        """Compute world points (n, 3) [m] at pixels (n, 2) of the left window with disparities (n,)."""
         depth = self.depths(disparity)
         ray = np.column_stack([(pixels - self.principal) / self.focal, np.ones(len(pixels))])
         return (depth[:, None] * ray - self.T_window_world[:3, 3]) @ self.T_window_world[:3, :3]
 
     def depths(self, disparity: np.ndarray) -> np.ndarray:
-        """Depths [m] of disparities [pixel]."""
+        """Compute depths [m] from disparities [pixel]."""
         return self.gauge / (disparity + self.gauge / self.depth)
 
 
@@ -77,12 +77,12 @@ class Rectified:
 def rectified(
     left: Camera, right: Camera, target: tuple[float, float, float], reach: float, fineness: float
 ) -> Rectified:
-    """Windows about a target [m] that reach so far [m] to each side, with so many pixels to a metre at its depth.
+    """Rectify about a target [m]: windows with half width `reach` [m] and `fineness` pixels per metre at its depth.
 
     Raises
     ------
     ValueError
-        Eyes that do not stand side by side, the left one on the left; a target that is not ahead of them.
+        Eyes that are not side by side, the left one on the left; a target that is not ahead of them.
     """
     between = right.centre - left.centre
     baseline = float(np.linalg.norm(between))

@@ -1,1 +1,1 @@
-"""Printed targets: what they look like, where a camera sees them, and what that says of camera and tool."""
+"""Printed targets: layout, detection in camera images, and poses of camera and tool computed from them."""

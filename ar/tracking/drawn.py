@@ -12,27 +12,27 @@ import numpy as np
 from ..optics.camera import Camera
 from .targets import BORDER, Face, Target, seen_from_front, window_round
 
-# Texture pixels along a square, and how many samples of the picture lie along a pixel.
+# Texture pixels along a square; samples of the image along a pixel.
 TEXTURE, SAMPLES = 48, 4
-# Pixels round a face that are looked at: its edges are straight without a lens only.
+# Margin round a face [pixel]: its edges are straight only without a lens.
 MARGIN = 3.0
-# What paper reflects: black ink, white paper.
+# Grey values of black ink and white paper.
 INK, PAPER = 25.0, 225.0
 
 
 def drawn(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, np.ndarray]]) -> np.ndarray:
-    """A picture (H, W) or (H, W, 3) uint8 with targets before it, seen sharply and evenly lit.
+    """Render targets in front of an image (H, W) or (H, W, 3) uint8, sharp and evenly lit.
 
-    Every pixel is the mean of `SAMPLES`^2 rays, each followed through the lens to the face that it meets first.
+    Every pixel is the mean of `SAMPLES`^2 rays, each traced through the lens to the first face that it meets.
 
     Parameters
     ----------
     picture
-        What lies behind.
+        Background.
     camera
-        Where it stands in the world.
+        Camera with its pose in the world.
     targets
-        With T_world_target (4, 4) each.
+        Each with its T_world_target (4, 4).
     """
     own = replace(camera, T_camera_world=np.eye(4))
     placed = [
@@ -78,26 +78,26 @@ def _printed(face: Face) -> np.ndarray:
 
 
 def _wider(side: slice, size: int) -> slice:
-    """Two pixels at least of a picture of so many: less has no slope."""
+    """Widen a side to at least two pixels of an image with `size` pixels: fewer have no gradient."""
     start = min(side.start, size - 2)
     return slice(start, max(side.stop, start + 2))
 
 
 def _shifts() -> np.ndarray:
-    """Where the samples of a pixel lie (n, 2), from its centre."""
+    """Compute offsets (n, 2) of the samples of a pixel from its centre."""
     middles = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     return np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
 
 
 def _edge(face: Face) -> np.ndarray:
-    """Places (n, 3) [m] along the edge of a face's border, in its own frame."""
+    """Sample points (n, 3) [m] along the edge of a face's border, in its own frame."""
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * (0.5 * face.size + BORDER)
     edge = np.concatenate([np.linspace(a, b, 9) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
     return np.column_stack([edge + 0.5 * face.size, np.zeros(len(edge))])
 
 
 def _grey(face: Face, printed: np.ndarray, on_face: np.ndarray) -> np.ndarray:
-    """Grey values (...) at places (..., 2) [m] of a face that was `printed`, NaN off its border."""
+    """Sample grey values (...) at positions (..., 2) [m] of a `printed` face, NaN outside its border."""
     pixels = (on_face * (TEXTURE / face.square) - 0.5).astype(np.float32)
     paper = cv2.remap(
         printed, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=255.0
@@ -107,33 +107,33 @@ def _grey(face: Face, printed: np.ndarray, on_face: np.ndarray) -> np.ndarray:
     return np.where(inside, INK + (PAPER - INK) / 255.0 * paper, np.nan)
 
 
-# Side of a cell [pixel]; the part of it that is read, from its border on; cells that begin every strip.
+# Side of a cell [pixel]; border of a cell that is not read [pixel]; cells that begin every strip.
 CELL, INNER, BEGIN = 8, 2, (1, 0, 1, 0)
-# Bits of the time, in units of [s], and of its check sum.
+# Bits of the time, its unit [s], bits of its checksum.
 TIME_BITS, UNIT, CHECK_BITS = 32, 1e-4, 8
 CELLS = len(BEGIN) + TIME_BITS + CHECK_BITS
 WIDTH = CELL * CELLS
-"""Columns that a strip takes [pixel]."""
-# Grey values under which a cell is black, and above which it is white.
+"""Width of a strip [pixel]."""
+# Grey values below which a cell is black, and above which it is white.
 BLACK, WHITE = 90.0, 165.0
 
 
 def stamped(colour: np.ndarray, time: float) -> np.ndarray:
-    """A picture (H, W, 3) or (H, W) uint8 with a time [s] in its upper right corner; a copy.
+    """Return a copy of an image (H, W, 3) or (H, W) uint8 with a time [s] in its upper right corner.
 
     Raises
     ------
     ValueError
-        A time that is negative or longer than five days, or a picture that is too narrow.
+        A time that is negative or longer than five days, or an image that is too narrow.
     """
     count = round(time / UNIT) if np.isfinite(time) else -1
     if not 0 <= count < 2**TIME_BITS:
         raise ValueError(
-            f"a picture cannot have the time {time:g} s written into it: give 0 to {2**TIME_BITS * UNIT:g} s."
+            f"the time stamp {time:g} s is out of range: give 0 to {2**TIME_BITS * UNIT:g} s."
         )
     if colour.shape[0] < CELL or colour.shape[1] < WIDTH:
         raise ValueError(
-            f"a time needs {WIDTH} x {CELL} pixels: the picture has {colour.shape[1]} x {colour.shape[0]}."
+            f"a time needs {WIDTH} x {CELL} pixels: the image has {colour.shape[1]} x {colour.shape[0]}."
         )
     bits = [*BEGIN, *_bits(count, TIME_BITS), *_bits(_check(count), CHECK_BITS)]
     strip = np.kron(np.array(bits, np.uint8), np.ones((CELL, CELL), np.uint8)) * 255
@@ -143,7 +143,7 @@ def stamped(colour: np.ndarray, time: float) -> np.ndarray:
 
 
 def read_stamp(grey: np.ndarray) -> float | None:
-    """The time [s] in the upper right corner of a picture (H, W) uint8; None where there is none, or a damaged one."""
+    """Read the time [s] in the upper right corner of an image (H, W) uint8; None if there is none, or a damaged one."""
     if grey.shape[0] < CELL or grey.shape[1] < WIDTH:
         return None
     cells = grey[INNER : CELL - INNER, -WIDTH:].reshape(CELL - 2 * INNER, CELLS, CELL)[..., INNER : CELL - INNER]
@@ -165,5 +165,5 @@ def _number(bits: list[int]) -> int:
 
 
 def _check(count: int) -> int:
-    """Eight bits that a damaged time seldom has: bytes weighted by odd numbers, so that none may change places."""
+    """Compute an 8-bit checksum of a time: bytes weighted by odd numbers, so that swapped bytes are detected."""
     return (0xA5 + sum((2 * k + 3) * byte for k, byte in enumerate(count.to_bytes(TIME_BITS // 8, "big")))) % 256

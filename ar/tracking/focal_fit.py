@@ -1,4 +1,4 @@
-"""Whether a focal length is that of the pictures: markers whose places are known fit one alone."""
+"""Check of a calibration's focal length against images: markers of known geometry determine it."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from ..optics.camera import Camera
 from .pose import LEAST, squares_of
 from .targets import Corners, Target
 
-# Views with fewer corners say little. Where it is looked for, as a factor, and how exactly.
+# Minimum number of corners in a view; search range and tolerance of the factor on the focal length.
 FEWEST, BOUNDS, EXACT = 12, (0.5, 2.0), 1e-3
-# Two steps of the factor tell how sharp the least sum of squares is.
+# Step of the factor for the curvature of the sum of squares.
 STEP = 0.02
-# A focal length that is off by more than this share, and by so many standard deviations, is another one.
+# Relative error, and error in standard deviations, above which a focal length differs.
 TOLERATED, SURE = 0.05, 6.0
 
 
 @dataclass(frozen=True)
 class FocalFit:
-    """By what `factor` a camera's focal lengths fit markers best, and its standard deviation."""
+    """Factor on a camera's focal lengths that fits markers best, and its standard deviation."""
 
     factor: float
     deviation: float
 
     @property
     def differs(self) -> bool:
-        """Whether it is surely another focal length."""
+        """True if the focal length differs significantly."""
         return abs(self.factor - 1.0) > max(TOLERATED, SURE * self.deviation)
 
 
 def focal_fit(camera: Camera, seen: Sequence[tuple[Target, Corners]]) -> FocalFit | None:
-    """The factor of both focal lengths with which poses of targets fit their corners best; None: too few are seen.
+    """Estimate the factor on both focal lengths that fits targets' corners best; None: too few corners.
 
-    Each target has the pose that fits it best. The deviation is that of least squares, by the curvature of the sum at
-    its minimum and the variance that is left of corners. Source: Triggs et al. 2000, "Bundle adjustment: a modern
-    synthesis", section 6.1.
+    Each target has its best-fitting pose. The deviation is that of least squares, from the curvature of the sum at its
+    minimum and the residual variance of corners. Source: Triggs et al. 2000, "Bundle adjustment: a modern synthesis",
+    section 6.1.
     """
     enough = [(target, corners) for target, corners in seen if len(corners.points) >= FEWEST]
     freedom = sum(2 * len(corners.points) - 6 for _, corners in enough) - 1

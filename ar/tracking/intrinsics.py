@@ -14,24 +14,24 @@ from ..optics.camera import Camera
 from ..optics.lens import Lens
 from .targets import Detector, Face
 
-# Corners that a view needs, and how many rows and columns of the board they stand in at least.
+# Minimum number of corners in a view, and of rows and columns of the board that they cover.
 FEWEST_CORNERS, FEWEST_LINES = 8, 3
-# Sharpness of a view that is left out, as a share of the median.
+# Sharpness below which a view is left out, as a share of the median.
 BLURRED = 0.6
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The corners of the board that one picture shows.
+    """Corners of the board detected in one image.
 
     Parameters
     ----------
     name
-        Of the picture.
+        Name of the image.
     points
         (n, 3) on the board [m].
     pixels
-        (n, 2) where they are seen.
+        (n, 2) detected positions.
     sharpness
         Steepest slope of its edges, as a share of their contrast [1/pixel].
     """
@@ -43,7 +43,7 @@ class View:
 
     @cached_property
     def homography(self) -> np.ndarray:
-        """(3, 3): pixels of places on the board [m], without regard of the lens; NaN where there is none."""
+        """(3, 3): homography from board positions [m] to pixels, without lens distortion; NaN if not found."""
         centred = self.points[:, :2] - self.points[:, :2].mean(axis=0)
         found = cv2.findHomography(centred, self.pixels)[0]
         if found is None:
@@ -54,9 +54,9 @@ class View:
 
 
 def find_board(detector: Detector, name: str, grey: np.ndarray) -> View | None:
-    """The board that a detector is for, in a picture (H, W) uint8.
+    """Detect the detector's board in an image (H, W) uint8.
 
-    None where too few of its corners are seen, or all in one or two rows.
+    None if too few of its corners are visible, or all are in one or two rows.
     """
     (board,) = detector.targets
     seen = detector.seen(grey).get(board.name)
@@ -70,7 +70,7 @@ def find_board(detector: Detector, name: str, grey: np.ndarray) -> View | None:
 
 
 def _sharpness(grey: np.ndarray, pixels: np.ndarray) -> float:
-    """Of the part of a picture that holds the pixels (n, 2): along columns or rows, whichever is less sharp."""
+    """Compute the sharpness of the image part that holds the pixels (n, 2): the smaller of columns and rows."""
     low, high = np.floor(pixels.min(axis=0)).astype(int), np.ceil(pixels.max(axis=0)).astype(int) + 1
     part = grey[max(low[1], 0) : high[1], max(low[0], 0) : high[0]].astype(np.float32)
     dark, bright = np.percentile(part, [5.0, 95.0])
@@ -79,9 +79,9 @@ def _sharpness(grey: np.ndarray, pixels: np.ndarray) -> float:
 
 
 def chosen(views: Sequence[View], face: Face, most: int) -> list[View]:
-    """At most so many of the sharp views, each as unlike those before it as there is.
+    """Select at most `most` of the sharp views, each as different from those before it as possible.
 
-    Views are compared by where the board's outline is in the picture. Gonzalez (1985), "Clustering to minimize the
+    Views are compared by the position of the board's outline in the image. Gonzalez (1985), "Clustering to minimize the
     maximum intercluster distance": the farthest view from all chosen ones comes next.
     """
     median = np.median([view.sharpness for view in views]) if views else 0.0
@@ -99,9 +99,9 @@ def chosen(views: Sequence[View], face: Face, most: int) -> list[View]:
 
 
 def directions(views: Sequence[View], width: int, height: int) -> float:
-    """The largest angle [rad] between planes of the board in two views, by the lines in which they vanish.
+    """Compute the largest angle [rad] between planes of the board in two views, by their vanishing lines.
 
-    The focal length, which is not known yet, is taken as the longer side of the picture. Hartley and Zisserman (2004),
+    The focal length, which is not known yet, is taken as the longer side of the image. Hartley and Zisserman (2004),
     "Multiple View Geometry", section 8.6: a plane's normal is K^T of its vanishing line.
     """
     middle = np.array(
@@ -114,37 +114,38 @@ def directions(views: Sequence[View], width: int, height: int) -> float:
 
 
 def covered(views: Sequence[View], width: int, height: int) -> float:
-    """The share of a picture that lies between the corners of at least one view."""
+    """Compute the share of an image that is inside the convex hull of the corners of at least one view."""
     mask = np.zeros((height, width), np.uint8)
     for view in views:
         cv2.fillConvexPoly(mask, np.rint(cv2.convexHull(view.pixels.astype(np.float32))).astype(np.int32), (1,))
     return float(mask.mean())
 
 
-# Columns of OpenCV's derivatives: turn and shift of a pose; focal lengths, principal point and five of the lens.
+# Columns of OpenCV's derivatives: rotation and translation of a pose; focal lengths, principal point and five of the
+# lens.
 POSE, INTRINSIC = slice(0, 6), slice(6, 15)
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-"""In the order of the covariance; focal lengths and principal point [pixel]."""
+"""Parameters in the order of the covariance; focal lengths and principal point [pixel]."""
 FEWEST_VIEWS = 8
-# A view whose error is so many times the median's is left out.
+# Ratio of a view's error to the median's above which it is left out.
 OUTLIER = 3.0
-# Planes must differ by this angle [rad], and the focal length be known to this share of it.
+# Smallest angle between planes [rad]; largest relative deviation of the focal length.
 SMALLEST_ANGLE, UNSURE = np.radians(12.0), 0.02
-TILT = "Tilt the board by 20 to 45 degrees to all sides, near and far, and also in the picture's corners."
+TILT = "Tilt the board by 20 to 45 degrees to all sides, near and far, and also in the image's corners."
 
 
 def calibration_error(
     camera: Camera, T_camera_target: np.ndarray, corners: np.ndarray, place: np.ndarray, covariance: np.ndarray
 ) -> np.ndarray:
-    """The covariance (3, 3) [m^2], in the camera's frame, of a place of a target, by that of the camera's calibration.
+    """Compute the covariance (3, 3) [m^2], in the camera's frame, of a target point by that of the calibration.
 
-    The pose takes up most of an error of the calibration, for target and place are seen by the same camera. What is
-    left is found by the derivatives of the projection: as far as it is seen, across the line of sight.
+    The pose absorbs most of a calibration error, as target and point are seen by the same camera. The remainder is
+    computed by the derivatives of the projection: as far as it is observable, across the line of sight.
 
     Parameters
     ----------
     camera
-        As it took the picture; where it stands is of no account.
+        Camera that took the image; its pose is ignored.
     T_camera_target
         (4, 4) [m]: fitted to the corners by this camera.
     corners, place
@@ -166,13 +167,13 @@ def calibration_error(
 
 
 def values_of(calibration: Calibration) -> np.ndarray:
-    """A calibration's values (9,) of `PARAMETERS`."""
+    """Return a calibration's values (9,) of `PARAMETERS`."""
     return np.array([*calibration.focal, *calibration.principal, *calibration.lens.coefficients[:5]])
 
 
 @dataclass(frozen=True, eq=False)
 class Intrinsics:
-    """A calibrated camera.
+    """Calibrated camera.
 
     Parameters
     ----------
@@ -181,11 +182,11 @@ class Intrinsics:
     covariance
         (9, 9) of `PARAMETERS`.
     rms
-        Root mean square distance [pixel] between corners as seen and as projected, over those of all views used.
+        Root mean square distance [pixel] between detected and projected corners, over all views used.
     used, left_out
-        Names of views: those that count, and those whose errors were too large.
+        Names of views: those used, and those whose errors were too large.
     covered
-        The share of the picture that lies between corners of a view.
+        Share of the image that is inside the corners of a view.
     """
 
     calibration: Calibration
@@ -207,10 +208,10 @@ class Intrinsics:
 
 
 def calibrated(views: Sequence[View], width: int, height: int, name: str = "") -> Intrinsics:
-    """The camera that saw these views in pictures of `width` x `height`.
+    """Calibrate the camera of these views, taken in images of `width` x `height`.
 
     Zhang (2000), "A flexible new technique for camera calibration", by OpenCV; a lens of Brown and Conrady with five
-    coefficients. Views that fit much worse than the others are left out, and the rest is calibrated anew.
+    coefficients. Views that fit much worse than the others are left out, and the camera is calibrated again.
 
     Raises
     ------
@@ -241,11 +242,11 @@ def calibrated(views: Sequence[View], width: int, height: int, name: str = "") -
 
 
 def _demand_views(views: Sequence[View], left_out: int, width: int, height: int) -> None:
-    """Refuse what determines no camera."""
+    """Raise ValueError for views that do not determine a camera."""
     if len(views) < FEWEST_VIEWS:
         without = f", and {left_out} more fit badly" if left_out else ""
         raise ValueError(
-            f"{len(views)} sharp views show the board{without}, but {FEWEST_VIEWS} are needed: take 20 pictures or "
+            f"{len(views)} sharp views show the board{without}, but {FEWEST_VIEWS} are needed: take 20 images or "
             "more, in good light and without motion."
         )
     angle = directions(views, width, height)
@@ -259,7 +260,7 @@ def _demand_views(views: Sequence[View], left_out: int, width: int, height: int)
 def _solved(
     views: Sequence[View], width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
-    """K (3, 3), five coefficients, each view's rotation vector and translation (3,), and its rms error [pixel] (n,)."""
+    """Solve for K (3, 3), five coefficients, and each view's rotation vector, translation (3,), rms error [pixel]."""
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
     try:
@@ -278,15 +279,15 @@ def _solved(
 def covariance_of(
     calibration: Calibration, views: Sequence[View], poses: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray, float]:
-    """Covariance (9, 9) of `PARAMETERS` at the least-squares solution, and the rms distance [pixel].
+    """Compute the covariance (9, 9) of `PARAMETERS` at the least-squares solution, and the rms distance [pixel].
 
-    The normal equations hold nine parameters of the camera and six of each view. A Schur complement eliminates those of
-    the views, with A and B the pixels' slopes by the camera's parameters and by the view's:
+    The normal equations have nine parameters of the camera and six of each view. A Schur complement eliminates those of
+    the views, with A and B the pixels' derivatives by the camera's parameters and by the view's:
 
         S = sum over views of A^T A - A^T B (B^T B)^-1 B^T A.
 
-    The covariance is s^2 S^-1, with s^2 the sum of squares over the degrees of freedom. Triggs et al. (2000),
-    "Bundle adjustment: a modern synthesis", section 6.1.
+    The covariance is s^2 S^-1, with s^2 the sum of squares over the degrees of freedom. Triggs et al. (2000), "Bundle
+    adjustment: a modern synthesis", section 6.1.
     """
     normal, squares, count = np.zeros((9, 9)), 0.0, 0
     for view, (turn, shift) in zip(views, poses, strict=True):

@@ -1,4 +1,4 @@
-"""What a camera of this machine sees, as time goes on."""
+"""Live images of a camera of this machine."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ import numpy as np
 
 from .pictures import Named, in_colour
 
-# So many pictures in a row may fail before the camera is opened again, with a pause between them [s].
+# Consecutive failed images before the camera is opened again; pause between tries [s].
 FAILURES, PAUSE = 10, 0.05
 
 
 class Source(Protocol):
-    """What gives pictures: `cv2.VideoCapture`, or what stands for one."""
+    """Source of images: `cv2.VideoCapture`, or a replacement."""
 
     def isOpened(self) -> bool:
-        """Whether it can be asked."""
+        """Return True if it is open."""
         ...
 
     def read(self) -> tuple[bool, np.ndarray | None]:
-        """Whether there was a picture, and the picture (H, W, 3) uint8, blue first."""
+        """Return whether there was an image, and the image (H, W, 3) uint8 in BGR order."""
         ...
 
     def release(self) -> None:
-        """Let it go."""
+        """Release the device."""
         ...
 
 
 def opened(number: int, width: int, height: int) -> Source:
-    """The camera of this machine with a number, asked for pictures of a size, of which it holds back none."""
+    """Open the camera of this machine with a number, for images of a size, without buffering."""
     camera = cv2.VideoCapture(number)
     camera.set(cv2.CAP_PROP_FRAME_WIDTH, width)
     camera.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
@@ -44,9 +44,9 @@ def opened(number: int, width: int, height: int) -> Source:
 def camera_pictures(
     source: Source, name: str, again: Callable[[], Source], now: Callable[[], float] = clock.perf_counter
 ) -> Generator[Named | None]:
-    """Pictures of a camera, each with the moment [s] by `now` at which it was there; None where there was none.
+    """Yield images of a camera, each with its arrival time [s] by `now`; None if there was none.
 
-    A camera that gives no more is let go, and opened `again` until it gives some.
+    A camera that stops responding is released, and opened `again` until it responds.
     """
     failed = 0
     try:
@@ -67,15 +67,15 @@ def camera_pictures(
 
 
 def newest(pictures: Generator[Named | None], patience: float) -> Iterator[Named | None]:
-    """The newest picture that has come each time one is asked for; None where none came for so long [s].
+    """Yield the newest image at each request; None if none arrived within `patience` [s].
 
-    A thread of its own takes the pictures: those that come while nobody asks are lost, and none waits. It ends, and
-    closes the pictures, with the last that is had here.
+    A thread of its own takes the images: those that arrive between requests are dropped, and none waits. It ends, and
+    closes the images, when this iterator ends.
 
     Raises
     ------
     Exception
-        Whatever the pictures raised.
+        Any exception of the images.
     """
     waiting: list[Named] = []
     ended: list[BaseException | None] = []

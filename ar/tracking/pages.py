@@ -1,4 +1,4 @@
-"""Pages of A4 to print the targets from, exact in millimetres, and the list of targets as other programs read it."""
+"""A4 pages to print the targets, exact in millimetres, and the list of targets for other programs."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from PIL.PngImagePlugin import PngInfo
 
 from .targets import BORDER, MARKER, MARKERS, TIP, Face, Target, all_targets, tool_cube
 
-# Pixels in a millimetre: each module of each marker takes a whole number of them.
+# Pixels per millimetre: each module of each marker takes a whole number of them.
 PER_MM = 20
 DPI = 25.4 * PER_MM
 A4 = (210.0, 297.0)
 RULER = 100.0
 MAKER = "sulcus markers"
-"""Who made a page, as PDF and PNG say it."""
-# Of lines, of the text, of titles and of the names of faces [mm].
+"""Program name in the metadata of PDF and PNG."""
+# Line width; sizes of the text, of titles and of the names of faces [mm].
 THIN, SMALL, LARGE, TINY = 0.2, 3.4, 6.0, 2.6
 LINE = 4.8
-"""From a line of text to the next [mm]."""
+"""Line spacing of text [mm]."""
 PRINTING = (
     "Print at 100 % on A4 ('actual size', not 'fit to page'), then measure both rulers.",
     f"If a ruler is not {RULER:.0f} mm long to 0.2 mm, do not use this page: correct the scale, and print it again.",
@@ -32,12 +32,12 @@ PRINTING = (
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Where a face stands on its page.
+    """Face at its place on a page.
 
     Parameters
     ----------
     face
-        What is printed.
+        Face to print.
     left, top
         Its left and upper side [mm] from the page's upper left corner, without its border.
     turns
@@ -57,11 +57,11 @@ class Page:
     Parameters
     ----------
     name
-        Of its target.
+        Name of its target.
     pixels
-        (H, W) uint8, 0 or 255, `PER_MM` a millimetre.
+        (H, W) uint8, 0 or 255, `PER_MM` per millimetre.
     placed
-        The faces on it.
+        Faces on it.
     """
 
     name: str
@@ -70,38 +70,38 @@ class Page:
 
 
 def printed_pages() -> tuple[Page, ...]:
-    """The pages of the tool's cube, the patient's reference and the calibration board."""
+    """Draw the pages of the tool's cube, the patient's reference and the calibration board."""
     cube, plate, board = all_targets()
     return _cube_page(cube), _plate_page(plate), _board_page(board)
 
 
 def face_name(face: Face) -> str:
-    """The axis of the target that a face looks along: "+x", "-z"."""
+    """Return the axis of the target that a face looks along: "+x", "-z"."""
     outwards = -face.T_target_face[:3, 2]
     axis = int(np.abs(outwards).argmax())
     return f"{'+' if outwards[axis] > 0.0 else '-'}{'xyz'[axis]}"
 
 
 def png_bytes(page: Page) -> bytes:
-    """A page as PNG of one bit a pixel, which says how many there are in a metre."""
+    """Encode a page as a PNG of one bit a pixel, with its resolution."""
     said = PngInfo()
     said.add_text("Source", MAKER)
     return _saved([page], "PNG", dpi=(DPI, DPI), pnginfo=said)
 
 
 def pdf_bytes(pages: Sequence[Page]) -> bytes:
-    """Pages as one PDF, each as large as its paper."""
+    """Encode pages as one PDF, each as large as its paper."""
     return _saved(pages, "PDF", resolution=DPI, creator=MAKER, title="Targets of sulcus")
 
 
 def dictionary_name() -> str:
-    """OpenCV's name of the dictionary that the markers are from."""
+    """Return OpenCV's name of the markers' dictionary."""
     names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
     return next(name for name in names if getattr(cv2.aruco, name) == MARKERS)
 
 
 def listed_targets() -> dict:
-    """All targets as JSON takes them, in millimetres: sizes, markers, and places of corners in the target's frame.
+    """List all targets for JSON, in millimetres: sizes, markers, and positions of corners in the target's frame.
 
     Corners are the inner ones of the chessboard in OpenCV's order, row by row as the face is seen. The outline is that
     of the squares, clockwise from the upper left.
@@ -131,12 +131,12 @@ def _listed(face: Face) -> dict:
 
 
 def _mm(metres: float | np.ndarray):
-    """Millimetres to the nanometre: a float, or lists of floats."""
+    """Convert to millimetres, rounded to the nanometre: a float, or lists of floats."""
     return (np.round(1e3 * np.asarray(metres), 6) + 0.0).tolist()
 
 
 def _cube_page(target: Target) -> Page:
-    """The three faces so that they fold into a corner of the cube: +z above +x, and +y to the right of it."""
+    """Draw the three faces so that they fold into a corner of the cube: +z above +x, and +y to the right of it."""
     along_x, along_y, along_z = target.faces
     wide, border = _mm(along_x.size[0] + 2.0 * BORDER), _mm(BORDER)
     left, top = 57.0, 118.0
@@ -170,7 +170,7 @@ def _cube_page(target: Target) -> Page:
 
 
 def _plate_page(target: Target) -> Page:
-    """One face with its border, to be cut out."""
+    """Draw one face with its border, to be cut out."""
     (face,) = target.faces
     wide, border = _mm(face.size[0] + 2.0 * BORDER), _mm(BORDER)
     left, top = 0.5 * (A4[0] - wide), 110.0
@@ -185,14 +185,14 @@ def _plate_page(target: Target) -> Page:
         *_sizes(target),
         *PRINTING,
         "Cut along the dashes, and glue the paper onto a stiff, flat plate.",
-        "Fix the plate beside the opening, so that it cannot move against the skull.",
+        "Fix the plate next to the craniotomy, so that it cannot move against the skull.",
         "Its frame has its origin in the upper left corner of the squares: x right, y down, z into the plate.",
     )
     return _finished(target, page, ink, (placed,), said, ((20.0, top), (55.0, top + wide + 50.0)))
 
 
 def _board_page(target: Target) -> Page:
-    """The board across the page; nothing is cut."""
+    """Draw the board across the page; nothing is cut."""
     (face,) = target.faces
     page, ink = _blank((A4[1], A4[0]))
     placed = Placed(face, 0.5 * (A4[1] - _mm(face.size[0])) + 20.0, 7.0)
@@ -214,7 +214,7 @@ def _finished(
     said: Sequence[str],
     rulers: tuple[tuple[float, float], tuple[float, float]],
 ) -> Page:
-    """An upright page with its title, its text, and the rulers that go down and right from two places."""
+    """Finish an upright page: title, text, and rulers down and right from two places."""
     _write(ink, f"sulcus: {target.name}", 15.0, 14.0, LARGE)
     _paragraph(ink, said, 15.0, 25.0)
     _ruler(ink, *rulers[0], down=True)
@@ -223,7 +223,7 @@ def _finished(
 
 
 def _sizes(target: Target) -> tuple[str, str]:
-    """What is on the faces, in words."""
+    """Describe the faces: squares and markers."""
     face, ids = target.faces[0], np.concatenate([each.ids for each in target.faces])
     return (
         f"Each face has {face.columns} x {face.rows} squares of {_mm(face.square):g} mm, "
@@ -233,7 +233,7 @@ def _sizes(target: Target) -> tuple[str, str]:
 
 
 def _blank(size: tuple[float, float]) -> tuple[Image.Image, ImageDraw.ImageDraw]:
-    """White paper of (width, height) [mm], and what draws on it."""
+    """Create white paper of (width, height) [mm], and the object that draws on it."""
     page = Image.new("1", (_px(size[0]), _px(size[1])), 1)
     return page, ImageDraw.Draw(page)
 
@@ -253,7 +253,7 @@ def _paragraph(ink: ImageDraw.ImageDraw, lines: Sequence[str], left: float, top:
 
 
 def _line(ink: ImageDraw.ImageDraw, start: tuple[float, float], end: tuple[float, float], dash: float = 0.0) -> None:
-    """A line between places [mm], of dashes and gaps of such a length; 0: without gaps."""
+    """Draw a line between positions [mm], with dashes and gaps of a length; 0: solid."""
     start_, end_ = np.array(start), np.array(end)
     pieces = max(2 * round(np.hypot(*(end_ - start_)) / (2.0 * dash)) + 1, 1) if dash else 1
     at = start_ + np.linspace(0.0, 1.0, pieces + 1)[:, None] * (end_ - start_)
@@ -262,7 +262,7 @@ def _line(ink: ImageDraw.ImageDraw, start: tuple[float, float], end: tuple[float
 
 
 def _ruler(ink: ImageDraw.ImageDraw, left: float, top: float, down: bool) -> None:
-    """A ruler with a mark every 10 mm, from a place to the right or down."""
+    """Draw a ruler with a mark every 10 mm, from a position to the right or down."""
     along, across = (
         (np.array([0.0, 1.0]), np.array([1.0, 0.0])) if down else (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     )
@@ -278,7 +278,7 @@ def _ruler(ink: ImageDraw.ImageDraw, left: float, top: float, down: bool) -> Non
 
 
 def _bar(ink: ImageDraw.ImageDraw, start: np.ndarray, end: np.ndarray) -> None:
-    """A line along a side of the page, whose middle is exact: `THIN` is a multiple of two pixels."""
+    """Draw a line along a side of the page, whose centre is exact: `THIN` is a multiple of two pixels."""
     half = _px(THIN) // 2
     low, high = np.minimum(start, end), np.maximum(start, end)
     ink.rectangle([_px(low[0]) - half, _px(low[1]) - half, _px(high[0]) + half - 1, _px(high[1]) + half - 1], fill=0)
@@ -293,7 +293,7 @@ def _pixels(page: Image.Image) -> np.ndarray:
 
 
 def _saved(pages: Sequence[Page], form: str, **how: object) -> bytes:
-    """Pages as a file of Pillow's: one picture, or several in one file."""
+    """Encode pages with Pillow as one image file, or several in one file."""
     first, *others = [Image.fromarray(page.pixels).convert("1", dither=Image.Dither.NONE) for page in pages]
     more = {"save_all": True, "append_images": others} if others else {}
     file = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Pictures of one camera, grey, and in colour where asked for, out of a folder or a video that comes from outside."""
+"""Image sequences of one camera, grey or in colour, from a folder or a video of unknown origin."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from PIL import Image
 
 from ..optics.calibration import LARGEST_SIDE
 
-# Pictures that are looked at, spread evenly over those that there are.
+# Maximum number of images used, spread evenly over all.
 MOST_PICTURES = 300
-# Pixels of a picture, and bytes of its file.
+# Maximum number of pixels of an image, and of bytes of its file.
 MOST_PIXELS, MOST_BYTES = 64_000_000, 256_000_000
 NUMBER = re.compile(r"([0-9]+)")
 SUFFIXES = (".png", ".jpg", ".jpeg")
-# Of a video that does not say how long it is, one frame in so many.
+# Frame step of a video of unknown length.
 STEP = 5
-GIVE = "Give a video, or a folder of PNG or JPEG pictures."
-# What videos begin with: MP4 and MOV (after four bytes), AVI, Matroska and WebM.
+GIVE = "Give a video, or a folder of PNG or JPEG images."
+# Signatures of video files: MP4 and MOV (after four bytes), AVI, Matroska and WebM.
 BEGINNINGS = (b"ftyp", b"RIFF", b"\x1aE\xdf\xa3")
 TOO_LARGE = "has more pixels than a camera gives. Write it smaller."
 
 
 @dataclass(frozen=True, eq=False)
 class Named:
-    """A picture.
+    """Image with name and time.
 
     Parameters
     ----------
     name
-        Of its file, or the number of its frame.
+        Name of its file, or the number of its frame.
     grey
         (H, W) uint8.
     time
-        As a video says [s]; of a file 0.
+        Time in the video [s]; 0 for a file.
     colour
-        (H, W, 3) uint8 sRGB, where it was asked for.
+        (H, W, 3) uint8 sRGB, if requested.
     """
 
     name: str
@@ -54,12 +54,12 @@ class Named:
 
 
 def pictures_of(path: Path) -> Iterator[Named]:
-    """At most `MOST_PICTURES` of the PNG and JPEG files of a folder, or of the frames of a video, in their order.
+    """Read at most `MOST_PICTURES` of the PNG and JPEG files of a folder, or of the frames of a video, in their order.
 
     Raises
     ------
     ValueError
-        No such file, a folder without pictures, what is no video or picture, or a picture that is too large.
+        No such file, a folder without images, a file that is not a video or image, or an image that is too large.
     """
     if path.is_dir():
         files = _files(path)
@@ -68,12 +68,12 @@ def pictures_of(path: Path) -> Iterator[Named]:
 
 
 def film_of(path: Path, rate: float, colour: bool = False, first: int = 0) -> Iterator[Named]:
-    """Every picture from the `first` on of a video, or of a folder, with its time [s].
+    """Read every image, from the `first` on, of a video or of a folder, with its time [s].
 
-    The order in a folder is that of the numbers in the names. Pixels are those that are stored: neither a video's
-    metadata nor EXIF turns them.
+    The order in a folder is that of the numbers in the names. Pixels are used as stored: a video's orientation metadata
+    and EXIF are ignored.
 
-    Of a folder `rate` is how many there are in a second; a video says its own times. `colour` asks for that, too.
+    `rate` is the frame rate [1/s] of a folder; a video has its own times. `colour` requests colour images.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def film_of(path: Path, rate: float, colour: bool = False, first: int = 0) -> It
 
 
 def length_of(path: Path) -> int:
-    """How many pictures `film_of` gives: of a video as it says itself, which may be wrong.
+    """Count the images that `film_of` yields; for a video this is its metadata, which may be wrong.
 
     Raises
     ------
@@ -107,28 +107,28 @@ def length_of(path: Path) -> int:
 
 
 def in_colour(name: str, colour: np.ndarray, time: float) -> Named:
-    """A picture (H, W, 3) uint8 sRGB with its grey one."""
+    """Build a named image from colour (H, W, 3) uint8 sRGB, with its grey image."""
     return Named(name, cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), time, colour)
 
 
 def _files(folder: Path) -> list[Path]:
     alphabetical = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     if not alphabetical:
-        raise ValueError(f"{folder}: holds no pictures. Give a folder of PNG or JPEG pictures.")
-    # A hyphen is a minus sign where the same words also stand before a number without it.
+        raise ValueError(f"{folder}: holds no images. Give a folder of PNG or JPEG images.")
+    # A hyphen is a minus sign if the same words also occur before a number without it.
     plain = {before for path in alphabetical for before, _ in _numbers(path)[:-1]}
     files = sorted(alphabetical, key=lambda path: [_signed(each, plain) for each in _numbers(path)])
     if files != alphabetical:
         first = next(index for index, path in enumerate(files) if path != alphabetical[index])
         _notice(
-            f"{folder}: is read in the order of the numbers in its names, not alphabetically: picture {first + 1} is "
+            f"{folder}: is read in the order of the numbers in its names, not alphabetically: image {first + 1} is "
             f"{files[first].name}, not {alphabetical[first].name}"
         )
     return files
 
 
 def _numbers(path: Path) -> list[tuple[str, str]]:
-    """The numbers in a file's name, each behind the words before it; words at the end have the number -1."""
+    """Split a file's name into numbers, each with the words before it; words at the end have the number -1."""
     *pairs, end = NUMBER.split(f"/{path.stem.casefold()}")
     return [*zip(pairs[::2], pairs[1::2], strict=True), (end, "-1")]
 
@@ -142,12 +142,12 @@ def _signed(numbered: tuple[str, str], plain: set[str]) -> tuple[str, int]:
 
 @cache
 def _notice(text: str) -> None:
-    """Warn once of each thing."""
+    """Warn once of each text."""
     warnings.warn(text, stacklevel=1)
 
 
 def _read(path: Path, kind: str = "L") -> np.ndarray:
-    """A picture as it was stored, grey or RGB: not turned as its file may say, since the lens is not."""
+    """Read an image as stored, grey or RGB; EXIF orientation is ignored, since the lens is not turned either."""
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"{path}: is larger than {MOST_BYTES / 1e6:.0f} MB. Remove it, or write it smaller.")
     try:
@@ -155,18 +155,18 @@ def _read(path: Path, kind: str = "L") -> np.ndarray:
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(path, formats=("PNG", "JPEG")) as picture:
                 _demand_size(path, *picture.size)
-                if picture.mode.startswith("I"):  # of 16 bits
+                if picture.mode.startswith("I"):  # 16 bits
                     grey = (np.asarray(picture) >> 8).astype(np.uint8)
                     return grey if kind == "L" else np.repeat(grey[..., None], 3, axis=2)
                 return np.asarray(picture.convert(kind))
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         raise ValueError(f"{path}: {TOO_LARGE}") from error
     except (OSError, SyntaxError) as error:
-        raise ValueError(f"{path}: is no picture that can be read. Remove it, or write it anew.") from error
+        raise ValueError(f"{path}: is not a readable image. Remove it, or write it again.") from error
 
 
 def _in_video(path: Path, step: int | None, colour: bool = False, first: int = 0) -> Iterator[Named]:
-    """One in `step` frames of a video from the `first` on; None: so many that there are `MOST_PICTURES`."""
+    """Read one in `step` frames of a video from the `first` on; None: a step that gives `MOST_PICTURES` frames."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file. {GIVE}")
     video = _opened(path)
@@ -174,13 +174,13 @@ def _in_video(path: Path, step: int | None, colour: bool = False, first: int = 0
         width, height = (int(video.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if not video.isOpened() or min(width, height) < 1:
             raise ValueError(
-                f"{path}: is no video that can be read, as {_flaw(path)}: give a video, or a folder of PNG or JPEG "
-                "pictures."
+                f"{path}: is not a readable video, as {_flaw(path)}: give a video, or a folder of PNG or JPEG "
+                "images."
             )
         _demand_size(path, width, height)
         if turn := int(video.get(cv2.CAP_PROP_ORIENTATION_META)):
             _notice(f"{path}: its metadata turns it by {turn} degrees: pixels are used as stored, as by calibrations")
-        # What a file says of its length may be wrong: it ends where it ends.
+        # The length in a file's metadata may be wrong: frames are read until the end.
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         every = step or (-(-count // MOST_PICTURES) if count > 0 else STEP)
         number = 0
@@ -198,20 +198,20 @@ def _in_video(path: Path, step: int | None, colour: bool = False, first: int = 0
 
 
 def _opened(path: Path) -> cv2.VideoCapture:
-    """A video; what cannot be read is said by a sentence, and not by FFmpeg and OpenCV on the console."""
+    """Open a video silently: errors are reported by an exception, not by FFmpeg and OpenCV on the console."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read at the first video of a process
     logging = cv2.utils.logging  # type: ignore[attr-defined]
     before = logging.setLogLevel(logging.LOG_LEVEL_ERROR)
     try:
         video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0.0)  # The calibration belongs to pixels as they are stored.
+        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0.0)  # the calibration is for pixels as stored
         return video
     finally:
         logging.setLogLevel(before)
 
 
 def _flaw(path: Path) -> str:
-    """Why a file is no video, as its first bytes have it."""
+    """Describe why a file is not a video, by its first bytes."""
     with path.open("rb") as file:
         first = file.read(8)
     if not first:
@@ -220,7 +220,7 @@ def _flaw(path: Path) -> str:
 
 
 def _spread(count: int) -> list[int]:
-    """At most `MOST_PICTURES` of so many numbers, evenly."""
+    """Select at most `MOST_PICTURES` of the numbers below `count`, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, MOST_PICTURES)).round().astype(int)).tolist()
 
 
@@ -230,7 +230,7 @@ def _demand_size(path: Path, width: int, height: int) -> None:
 
 
 def rate_of(path: Path) -> float | None:
-    """Pictures a second of a video, as it says itself; None of a folder, and where it does not say."""
+    """Return the frame rate [1/s] in a video's metadata; None for a folder, or if not given."""
     if not path.is_file():
         return None
     video = _opened(path)

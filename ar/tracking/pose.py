@@ -13,16 +13,16 @@ from ..optics.camera import Camera
 from .rigid import angles_of, cross_matrices
 from .targets import Corners, Detector, Target, seen_from_front, window_round
 
-# Corners that a pose needs at least; residuals are believed to be no smaller, and no larger, than these [pixel].
+# Minimum number of corners of a pose; lower bound of the residual's deviation, and largest residual [pixel].
 FEWEST, LEAST, MOST = 6, 0.1, 1.0
-# Another pose must fit worse by so much of chi^2 before it is ruled out, unless it lies within these of the best one.
+# Excess of chi^2 that rules out another pose; rotation [rad] and distance [m] within which poses count as equal.
 CLEARLY, ALIKE_TURN, ALIKE_SHIFT = 30.0, np.radians(2.0), 1e-3
-# A pose before this one decides between two if it is within this of one, and twice as far from the other [rad].
+# Largest rotation [rad] from the previous pose with which it selects one of two; the other must be twice as far.
 NEAR = np.radians(15.0)
 
 
 class Verdict(Enum):
-    """What is known of a target in a picture, as a person reads it."""
+    """Result of a target's detection in an image, as readable text."""
 
     GOOD = "seen"
     LOST = "lost: too few corners are seen"
@@ -32,18 +32,19 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where a target is in the camera's frame, or in that of another target.
+    """Pose of a target in the camera's frame, or in that of another target.
 
     Parameters
     ----------
     T_camera_target
         (4, 4) [m].
     covariance
-        (6, 6) of a shift in the camera's frame [m] and a small turn about the target's origin in its axes [rad].
+        (6, 6) of a translation in the camera's frame [m] and a small rotation about the target's origin in its axes
+        [rad].
     residual
-        Root mean square distance [pixel] of the corners from where the pose has them.
+        Root mean square distance [pixel] between detected and projected corners.
     corners
-        How many there are.
+        Number of corners.
     """
 
     T_camera_target: np.ndarray
@@ -52,7 +53,7 @@ class Pose:
     corners: int
 
     def seen_from(self, other: Pose) -> Pose:
-        """The same target in the frame of another one, of the same picture; both errors are in its covariance."""
+        """Transform this pose to the frame of another target in the same image; the covariance includes both errors."""
         into, away = other.T_camera_target[:3, :3].T, self.T_camera_target[:3, 3] - other.T_camera_target[:3, 3]
         none = np.zeros((3, 3))
         own = np.block([[into, none], [none, into]])
@@ -62,7 +63,7 @@ class Pose:
         return Pose(T, covariance, max(self.residual, other.residual), min(self.corners, other.corners))
 
     def point(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A place of the target (3,) [m] in the camera's frame (3,) [m], and its covariance (3, 3) [m^2]."""
+        """Return a point of the target (3,) [m] in the camera's frame (3,) [m], and its covariance (3, 3) [m^2]."""
         arm = self.T_camera_target[:3, :3] @ place
         slope = np.hstack([np.eye(3), -cross_matrices(arm)])
         return arm + self.T_camera_target[:3, 3], slope @ self.covariance @ slope.T
@@ -71,20 +72,20 @@ class Pose:
 def pose_of(
     camera: Camera, target: Target, corners: Corners | None, before: np.ndarray | None = None
 ) -> tuple[Verdict, Pose | None]:
-    """Where a target is; no pose unless it is certain.
+    """Estimate the pose of a target; none unless it is certain.
 
     Every face has two poses that mirror each other (Schweighofer, Pinz 2006, "Robust pose estimation from a planar
-    target", IEEE Trans. Pattern Anal. Mach. Intell. 28:2024-2030). Each is fitted to all corners. A pose is given where
-    no other one fits about as well, or where a pose just `before` tells them apart.
+    target", IEEE Trans. Pattern Anal. Mach. Intell. 28:2024-2030). Each is fitted to all corners. A pose is returned if
+    no other one fits about as well, or if a pose just `before` distinguishes them.
 
     Parameters
     ----------
     camera
-        As it took the picture; where it stands is of no account.
+        Camera that took the image; its pose is ignored.
     corners
-        Of `target`, as `Detector.seen` has them; None: none.
+        Corners of `target`, from `Detector.seen`; None: none.
     before
-        T_camera_target (4, 4) a moment ago, if it was certain.
+        Previous T_camera_target (4, 4), if it was certain.
     """
     if corners is None or len(corners.points) < FEWEST:
         return Verdict.LOST, None
@@ -107,12 +108,12 @@ def pose_of(
 
 
 def squares_of(camera: Camera, target: Target, corners: Corners) -> float:
-    """The least sum of squared distances [pixel^2] of a target's corners, of all its poses; inf where none fits."""
+    """Return the smallest sum of squared distances [pixel^2] of a target's corners over its poses; inf if none."""
     return min((squares for _, squares in _fits(camera, target, corners)), default=np.inf)
 
 
 def _fits(camera: Camera, target: Target, corners: Corners) -> list[tuple[np.ndarray, float]]:
-    """Poses (4, 4) that may be, and their squared distances of all corners [pixel^2]."""
+    """Compute candidate poses (4, 4), and their sums of squared distances of all corners [pixel^2]."""
     out = []
     for number in np.unique(corners.face):
         rows = corners.face == number
@@ -131,7 +132,7 @@ def _fits(camera: Camera, target: Target, corners: Corners) -> list[tuple[np.nda
 
 
 def _refined(camera: Camera, corners: Corners, T: np.ndarray) -> tuple[np.ndarray, float]:
-    """A pose fitted to all corners from T (4, 4) on, and the sum of squares [pixel^2]."""
+    """Refine a pose T (4, 4) to all corners; return it and the sum of squares [pixel^2]."""
     turn, shift = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3].reshape(3, 1).copy()
     turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, camera.K, camera.distortion, turn, shift)
     pixels = cv2.projectPoints(corners.points, turn, shift, camera.K, camera.distortion)[0].reshape(-1, 2)
@@ -139,7 +140,7 @@ def _refined(camera: Camera, corners: Corners, T: np.ndarray) -> tuple[np.ndarra
 
 
 def _faces_camera(target: Target, corners: Corners, T: np.ndarray) -> bool:
-    """Whether every face with corners is seen from its front, and lies before the camera."""
+    """Return True if every face with corners is seen from its front, and is before the camera."""
     for number in np.unique(corners.face):
         T_camera_face = T @ target.faces[number].T_target_face
         if T_camera_face[2, 3] <= 0.0 or not seen_from_front(T_camera_face):
@@ -148,7 +149,7 @@ def _faces_camera(target: Target, corners: Corners, T: np.ndarray) -> bool:
 
 
 def _inverse_normal(camera: Camera, T: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The covariance (6, 6) that corners of unit variance give."""
+    """Compute the covariance (6, 6) for corners of unit variance."""
     arm = points @ T[:3, :3].T
     slopes = cv2.projectPoints(arm + T[:3, 3], np.zeros(3), np.zeros(3), camera.K, camera.distortion)[1][:, 3:6]
     by_place = slopes.reshape(-1, 2, 3)
@@ -163,7 +164,7 @@ def _rigid(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
 
 
 def _turn(one: np.ndarray, other: np.ndarray) -> float:
-    """The angle [rad] between two poses."""
+    """Compute the angle [rad] between two poses."""
     return float(angles_of(one[:3, :3] @ other[:3, :3].T))
 
 
@@ -171,26 +172,26 @@ def _alike(one: np.ndarray, other: np.ndarray) -> bool:
     return _turn(one, other) < ALIKE_TURN and float(np.linalg.norm(one[:3, 3] - other[:3, 3])) < ALIKE_SHIFT
 
 
-# Round what a target covered, such a share of its size is looked at, and so many pixels at least.
+# Search margin round a target's last outline: share of its size; minimum [pixel].
 AROUND, MARGIN = 0.4, 32.0
-# A pose that is so many pictures old says nothing of the next; what is lost is looked for in every so many pictures.
+# Age in images after which a pose is not used; interval in images of searches for lost targets.
 STALE, SEARCHED = 5, 3
 
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """What one picture says of each target, by name.
+    """Tracking result of one image, by target name.
 
     Parameters
     ----------
     number
-        Of the picture.
+        Number of the image.
     verdicts
-        What is known.
+        Result of each target.
     poses
-        Of those that are certain.
+        Poses of the targets that are certain.
     last
-        The pose (4, 4) that was certain last, and the picture's number, of all that were.
+        The last certain pose (4, 4), and its image's number, of all that had one.
     """
 
     number: int
@@ -201,12 +202,12 @@ class Tracked:
 
 @dataclass(frozen=True, eq=False)
 class Tracker:
-    """Follows targets in the pictures of one camera.
+    """Tracker of targets in the images of one camera.
 
     Parameters
     ----------
     camera
-        As calibrated; where it stands is of no account.
+        Calibrated camera; its pose is ignored.
     targets
         Of different names, and with different markers.
     """
@@ -220,12 +221,12 @@ class Tracker:
         object.__setattr__(self, "_detector", Detector(self.targets))
 
     def track(self, grey: np.ndarray, before: Tracked | None = None) -> Tracked:
-        """Where the targets are in a picture (H, W) uint8, of the camera's size; `before` is what the last one said.
+        """Track the targets in an image (H, W) uint8 of the camera's size; `before` is the previous result.
 
         Raises
         ------
         ValueError
-            A picture of another size or kind.
+            An image of another size or kind.
         """
         demand_picture(grey, self.camera.width, self.camera.height)
         number = 0 if before is None else before.number + 1
@@ -241,7 +242,7 @@ class Tracker:
         return Tracked(number, verdicts, poses, last)
 
     def _seen(self, grey: np.ndarray, number: int, last: Mapping[str, tuple[np.ndarray, int]]) -> dict[str, Corners]:
-        """Corners of targets where they were; of those that left, and now and then of the lost, everywhere."""
+        """Detect corners near the last poses, or in the whole image if just lost, and at intervals while lost."""
         found: dict[str, Corners] = {}
         for target in self.targets:
             if target.name in last:
@@ -257,15 +258,15 @@ class Tracker:
 
 
 def demand_picture(grey: np.ndarray, width: int, height: int) -> None:
-    """Refuse a picture that a camera of so many pixels does not take.
+    """Check that an image has the camera's size.
 
     Raises
     ------
     ValueError
-        A picture of another size or kind.
+        An image of another size or kind.
     """
     if grey.shape != (height, width) or grey.dtype != np.uint8:
         raise ValueError(
-            f"the picture is {' x '.join(map(str, grey.shape[::-1]))} of {grey.dtype}, and the camera takes "
+            f"the image is {' x '.join(map(str, grey.shape[::-1]))} of {grey.dtype}, and the camera takes "
             f"{width} x {height} grey pixels of 8 bits: calibrate it at this size."
         )

@@ -1,4 +1,4 @@
-"""Poses of another tracker: interpolation between samples, and the offset of its clock."""
+"""Poses of an external tracker: interpolation between samples, and the time offset of its clock."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from scipy.spatial.transform import Rotation
 from .pose import Pose
 from .rigid import turn_vectors
 
-# Two samples that are farther apart have none between them; nobody knows a pose so long after the last one [s].
+# Largest gap between samples with interpolation [s]; largest extrapolation after the last sample [s].
 LONGEST, AHEAD = 0.1, 0.05
-# Times that are nearer are one [s]: files round them.
+# Difference below which times count as equal [s]: files round them.
 ROUNDING = 1e-3
 DAY = 86_400.0
-"""Seconds after which a clock of 24 hours begins anew."""
-# Offsets are tried so far apart, and then refined [s]; so many pictures are needed, and so many seconds are tried.
+"""Period of a 24-hour clock [s]."""
+# Step of tried time offsets [s]; minimum number of images; largest range of offsets [s].
 STEP, FEWEST, MOST_SECONDS = 0.01, 8, 900.0
-# A body must move so far [m]; another offset, so far away [s], must fit worse by so many times, beyond this noise [m].
+# Smallest motion of a body [m]; distance to another offset [s], ratio by which it must fit worse, noise level [m].
 LEAST_MOVED, ANOTHER, CLEARLY, NOISE = 1e-3, 0.15, 2.0, 0.1e-3
 ROUNDS = 20
 MOVE = "Move the tool to and fro by centimetres, quickly and unevenly, while markers and poses are both seen."
 
 
 def unwrapped(times: np.ndarray) -> np.ndarray:
-    """Times (n,) [s] of a clock of 24 hours, which go on at midnight; those of other clocks are left as they are."""
+    """Unwrap times (n,) [s] of a 24-hour clock at midnight; times of other clocks are unchanged."""
     back = np.diff(times) < -0.5 * DAY
     return times + DAY * np.concatenate([[0], np.cumsum(back)]) if _of_a_day(times) else times
 
@@ -36,7 +36,7 @@ def _of_a_day(times: np.ndarray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PoseStream:
-    """A body's poses in its tracker's frame.
+    """Poses of a body in its tracker's frame.
 
     Parameters
     ----------
@@ -45,9 +45,10 @@ class PoseStream:
     poses
         (n, 4, 4) [m]: T_tracker_body.
     covariances
-        (n, 6, 6) of a shift [m] in the tracker's frame and a small turn [rad] about the body's origin in its axes.
+        (n, 6, 6) of a translation [m] in the tracker's frame and a small rotation [rad] about the body's origin in its
+        axes.
     daily
-        Whether the clock begins anew after 24 hours: then times are meant up to whole days.
+        True if the clock restarts after 24 hours: then times are defined up to whole days.
     """
 
     times: np.ndarray
@@ -56,11 +57,11 @@ class PoseStream:
     daily: bool = False
 
     def at(self, time: float) -> Pose | None:
-        """The pose at a time [s], by turning and shifting evenly between two samples; None where there is none.
+        """Interpolate the pose at a time [s], with constant velocity between two samples; None if there is none.
 
-        Two samples that are more than `LONGEST` apart have none between them. Past a sample that no other follows in
-        time, the last motion goes on for `AHEAD`. The covariance grows by what a body that speeds up as it does here
-        may be off an even motion.
+        Gaps longer than `LONGEST` are not interpolated. After a sample without a successor, the last motion is
+        extrapolated for `AHEAD`. The covariance includes the interpolation error for a body that accelerates as
+        observed here.
         """
         time = self.in_its_day(time)
         first = int(np.searchsorted(self.times, time + ROUNDING, side="right")) - 1
@@ -78,13 +79,13 @@ class PoseStream:
         return self._between(first, second, time)
 
     def age(self, time: float) -> float:
-        """How long before a time [s] the last sample was; infinite before the first."""
+        """Return the time [s] since the last sample before `time`; infinite before the first."""
         time = self.in_its_day(time)
         first = int(np.searchsorted(self.times, time, side="right")) - 1
         return np.inf if first < 0 else float(time - self.times[first])
 
     def in_its_day(self, time: float) -> float:
-        """A time [s] as this stream's clock has it: of a clock of 24 hours, on the day nearest to its samples."""
+        """Convert a time [s] to this stream's clock: for a 24-hour clock, to the day nearest to its samples."""
         if not self.daily:
             return time
         middle = 0.5 * float(self.times[0] + self.times[-1])
@@ -103,7 +104,7 @@ class PoseStream:
         return Pose(T, own + np.diag(np.repeat(bent**2, 3)), 0.0, 0)
 
     def _quickening(self, first: int, second: int) -> np.ndarray:
-        """The largest change of speed (2,) round two samples, of shifts [m/s^2] and turns [rad/s^2]."""
+        """Compute the largest acceleration (2,) round two samples, of translations [m/s^2] and rotations [rad/s^2]."""
         low, high = max(0, first - 1), min(len(self.times), second + 2)
         times, poses = self.times[low:high], self.poses[low:high]
         steps = np.diff(times)
@@ -118,7 +119,7 @@ class PoseStream:
 
 
 def stream_of(times: np.ndarray, poses: np.ndarray, covariances: np.ndarray) -> PoseStream:
-    """A stream of samples as a tracker wrote them: at midnight a clock of 24 hours begins anew.
+    """Build a stream from a tracker's samples; a 24-hour clock is unwrapped at midnight.
 
     Raises
     ------
@@ -136,34 +137,34 @@ def stream_of(times: np.ndarray, poses: np.ndarray, covariances: np.ndarray) -> 
 
 @dataclass(frozen=True)
 class Clock:
-    """The tracker's time is the pictures' time + `offset` [s], which may be off by a deviation of `error` [s]."""
+    """Clock offset: the tracker's time is the images' time + `offset` [s], with standard deviation `error` [s]."""
 
     offset: float = 0.0
     error: float = 0.0
 
 
 def clock_by_motion(times: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray) -> Clock:
-    """The offset at which a place moves alike in pictures (n,) [s], (n, 3) [m], and by a tracker (m,) [s], (m, 3) [m].
+    """Estimate the time offset between a point's motion in images (n,) [s], (n, 3) [m], and by a tracker (m,), (m, 3).
 
-    Both places may lie apart by what does not change. The error is that of least squares, as residuals scatter.
+    Both points may differ by a constant. The error is that of least squares, from the scatter of residuals.
 
     Raises
     ------
     ValueError
-        Too few pictures, motion that is too small, no time at which poses are there for all pictures, or two offsets
-        that fit about as well.
+        Too few images, motion that is too small, no offset with poses for all images, or two offsets that fit about as
+        well.
     """
     if len(times) < FEWEST:
-        raise ValueError(f"{len(times)} pictures show what the poses have, and {FEWEST} are needed. {MOVE}")
+        raise ValueError(f"{len(times)} images show what the poses have, and {FEWEST} are needed. {MOVE}")
     low, high = samples[0] - times[0], samples[-1] - times[-1]
     if high < low:
-        raise ValueError("the poses end before the pictures do: record them for longer than the film.")
+        raise ValueError("the poses end before the images do: record them for longer than the video.")
     if high - low > MOST_SECONDS:
-        raise ValueError(f"the poses are {high - low:.0f} s longer than the film: cut them to {MOST_SECONDS:.0f} s.")
+        raise ValueError(f"the poses are {high - low:.0f} s longer than the video: cut them to {MOST_SECONDS:.0f} s.")
     tried = np.arange(low, high + STEP, STEP).clip(low, high)
     squares = np.array([_squares(_apart(times + offset, places, samples, others)) for offset in tried])
     if not np.isfinite(squares).any():
-        raise ValueError(f"the poses have gaps of more than {LONGEST:g} s wherever the pictures are.")
+        raise ValueError(f"the poses have gaps of more than {LONGEST:g} s wherever the images are.")
     best = int(np.argmin(squares))
     clock, least = _refined(float(tried[best]), times, places, samples, others)
     walled = np.pad(squares, 1, constant_values=np.inf)
@@ -179,7 +180,7 @@ def clock_by_motion(times: np.ndarray, places: np.ndarray, samples: np.ndarray, 
 def _refined(
     offset: float, times: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray
 ) -> tuple[Clock, float]:
-    """Gauss-Newton from an offset on, and the sum of squares [m^2] that is left."""
+    """Refine an offset by Gauss-Newton; return it and the remaining sum of squares [m^2]."""
     low, high = samples[0] - times[0], samples[-1] - times[-1]
     speed, off = np.zeros_like(places), np.zeros_like(places)
     for _ in range(ROUNDS):
@@ -200,7 +201,7 @@ def _refined(
 
 
 def _apart(at: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """How far places (n, 3) are from those of samples at times (n,), but for a shift; NaN in gaps."""
+    """Compute differences (n, 3) of positions from those of samples at times (n,), without their mean; NaN in gaps."""
     there = np.column_stack([np.interp(at, samples, column) for column in others.T])
     after = np.searchsorted(samples, at).clip(1, len(samples) - 1)
     there[samples[after] - samples[after - 1] > LONGEST] = np.nan

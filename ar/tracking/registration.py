@@ -1,4 +1,4 @@
-"""How the scan lies in the frame of the patient's reference: from pairs of points and a surface, with its error."""
+"""Registration of the scan to the patient's reference: from pairs of points and a surface, with covariance."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from scipy.stats import chi2, f
 from .rigid import cross_matrices, moved_about
 
 FEWEST_PAIRS, FEWEST_SURFACE = 3, 20
-# Nobody touches a point more exactly [m]; pairs that fit no better than this fit no rigid motion [m].
+# Lower bound of the error of a touched point [m]; largest rms residual of pairs [m].
 LEAST, MOST = 0.1e-3, 5e-3
-# Shares: the least spread of points beside the largest, and by how much two sets of points may differ in size.
+# Smallest ratio of the second to the largest spread of points; largest log-ratio of the sizes of two point sets.
 FLATTEST, RESIZED = 0.05, 0.1
-# Points round a head are farther apart [m].
+# Smallest spread of points on a head [m].
 SMALLEST = 5e-3
-# A pair is called wrong if the others fit so many times better without it. So is a frame beside its mirror image.
+# Ratio of residuals above which one wrong pair, a swap or a mirrored frame is reported.
 CLEARLY = 4.0
-# Rounds of Gauss-Newton on a surface, and the change at which they end [m], [rad].
+# Maximum Gauss-Newton iterations on a surface, and the step at which they end [m], [rad].
 ROUNDS, SMALL = 50, 1e-9
 LEVEL = 0.95
 
 Nearest = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Takes points of the scan (n, 3) [m] to the surface's nearest places (n, 3) [m] and unit normals (n, 3) there."""
+"""Map from scan points (n, 3) [m] to the closest surface points (n, 3) [m] and unit normals (n, 3) there."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scanned:
-    """What a registration was made for.
+    """Scan that a registration was made for.
 
     Parameters
     ----------
     digest
-        Of the body, as it was meshed.
+        Digest of the meshed body.
     bounds
-        (2, 3) [m]: the least and largest coordinates of its surface in the scan.
+        (2, 3) [m]: smallest and largest coordinates of its surface in the scan.
     target
-        (3,) [m]: the middle of what is shown in it.
+        (3,) [m]: centre of the displayed target.
     """
 
     digest: str
@@ -47,29 +47,29 @@ class Scanned:
     target: np.ndarray
 
     def apart(self, other: Scanned) -> float:
-        """How far two bodies' bounds and targets are from each other, at most [m]."""
+        """Compute the largest distance between two bodies' bounds and targets [m]."""
         return float(max(np.abs(self.bounds - other.bounds).max(), np.linalg.norm(self.target - other.target)))
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """How the scan lies in the frame of the patient's reference.
+    """Pose of the scan in the frame of the patient's reference.
 
     Parameters
     ----------
     T_patient_scan
-        (4, 4) [m]: takes a place in the scan, RAS, to the frame of the reference.
+        (4, 4) [m]: maps positions in the scan, RAS, to the frame of the reference.
     covariance
-        (6, 6) of a shift in the reference's frame [m], and of a small turn about `centre` in its axes [rad]. It is
-        widened for few points, so that the ellipsoid of 95 % by chi^2 holds as often as it says.
+        (6, 6) of a translation in the reference's frame [m], and of a small rotation about `centre` in its axes [rad].
+        It is widened for few points, so that the 95 % ellipsoid by chi^2 has its nominal coverage.
     centre
-        (3,) [m]: the middle of the points, in the scan.
+        (3,) [m]: centroid of the points, in the scan.
     rms
-        Root mean square distance [m] that is left between the pairs.
+        Root mean square residual distance [m] of the pairs.
     pairs, surface
-        How many points of each kind there are.
+        Numbers of points of each kind.
     scanned
-        What it was made for, where that is known.
+        Scan that it was made for, if known.
     """
 
     T_patient_scan: np.ndarray
@@ -81,14 +81,14 @@ class Registration:
     scanned: Scanned | None = None
 
     def point(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A place in the scan (3,) [m] in the reference's frame (3,) [m], and its covariance (3, 3) [m^2]."""
+        """Return a scan position (3,) [m] in the reference's frame (3,) [m], and its covariance (3, 3) [m^2]."""
         T = self.T_patient_scan
         slope = np.hstack([np.eye(3), -cross_matrices(T[:3, :3] @ (place - self.centre))])
         return T[:3, :3] @ place + T[:3, 3], slope @ self.covariance @ slope.T
 
 
 def registered(scan: np.ndarray, patient: np.ndarray) -> Registration:
-    """The rigid motion that takes points of the scan (n, 3) [m] to where they are in the reference's frame (n, 3) [m].
+    """Fit the rigid motion from points of the scan (n, 3) [m] to their positions in the reference's frame (n, 3) [m].
 
     Least squares (Horn 1987, "Closed-form solution of absolute orientation using unit quaternions", J. Opt. Soc. Am. A
     4:629-642). The covariance is that of the linear problem, as in Fitzpatrick, West, Maurer (1998), "Predicting error
@@ -110,15 +110,15 @@ def registered(scan: np.ndarray, patient: np.ndarray) -> Registration:
 
 
 def refined(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Nearest) -> Registration:
-    """As `registered`, with points `seen` on a surface of the scan (m, 3) [m], in the reference's frame, besides.
+    """Fit like `registered`, with additional points `seen` (m, 3) [m] of the surface, in the reference's frame.
 
     Pairs (n, 3) and distances from the surface's tangent planes (Chen, Medioni 1992, "Object modelling by registration
-    of multiple range images") are weighed by their own scatter. A surface that moved since the scan misleads it.
+    of multiple range images") are weighted by their own scatter. A surface that moved since the scan biases the result.
 
     Raises
     ------
     ValueError
-        As `registered`; too few points, or points that stay farther than 5 mm from the surface (root mean square).
+        As `registered`; too few points, or points that remain farther than 5 mm from the surface (root mean square).
     """
     if len(seen) < FEWEST_SURFACE:
         raise ValueError(f"{len(seen)} points of the surface are too few: trace {FEWEST_SURFACE} or more.")
@@ -149,7 +149,7 @@ def refined(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Ne
 
 
 def _demand_shape(scan: np.ndarray, patient: np.ndarray) -> None:
-    """Refuse points that determine no rigid motion."""
+    """Raise ValueError for points that determine no rigid motion."""
     if len(scan) < FEWEST_PAIRS:
         raise ValueError(f"{len(scan)} pairs are too few: touch {FEWEST_PAIRS} points or more, better six.")
     sizes = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in (scan, patient)]
@@ -166,7 +166,7 @@ def _demand_shape(scan: np.ndarray, patient: np.ndarray) -> None:
 
 
 def _demand_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray) -> None:
-    """Refuse a mirrored set, one wrong pair among good ones, and pairs that do not fit."""
+    """Raise ValueError for a mirrored set, one wrong pair among good ones, and pairs that do not fit."""
     rms = _rms(off)
     mirrored = _rms(_fitted(scan * [-1.0, 1.0, 1.0], patient)[1])
     if CLEARLY * max(mirrored, LEAST) < rms:
@@ -182,8 +182,8 @@ def _demand_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray) -> None:
             )
         if rms > MOST / 2 and CLEARLY * max(others[row], LEAST) < rms:
             raise ValueError(
-                f"pair {row + 1} (below the header) fits worse than the others, which are {1e3 * others[row]:.1f} mm "
-                "off without it: touch it again, or leave it out."
+                f"pair {row + 1} (below the header) fits worse than the others (error {1e3 * others[row]:.1f} mm "
+                "without it): touch it again, or leave it out."
             )
     if not rms <= MOST:
         raise ValueError(
@@ -193,7 +193,7 @@ def _demand_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray) -> None:
 
 
 def _if_swapped(scan: np.ndarray, patient: np.ndarray) -> dict[tuple[int, int], float]:
-    """What is left (rms) [m] if the patient's points of two pairs change places, by these two pairs."""
+    """Compute the rms residual [m] with the patient's points of two pairs swapped, by these two pairs."""
     out = {}
     for pair in combinations(range(len(scan)), 2):
         other = patient.copy()
@@ -203,7 +203,7 @@ def _if_swapped(scan: np.ndarray, patient: np.ndarray) -> dict[tuple[int, int], 
 
 
 def _fitted(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """T_patient_scan (4, 4), and what is left (n, 3) [m]."""
+    """Fit T_patient_scan (4, 4); return it and the residuals (n, 3) [m]."""
     middle, there = scan.mean(axis=0), patient.mean(axis=0)
     T = np.eye(4)
     u, _, v = np.linalg.svd((patient - there).T @ (scan - middle))
@@ -213,19 +213,19 @@ def _fitted(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def slopes_of(T: np.ndarray, scan: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """(3 n, 6): how places of the scan (n, 3) move in the reference's frame by a shift, and a turn about the centre."""
+    """Compute the Jacobian (3 n, 6) of scan positions (n, 3), in the reference, by shift and turn about `centre`."""
     arms = (scan - centre) @ T[:3, :3].T
     return np.concatenate([np.broadcast_to(np.eye(3), (len(scan), 3, 3)), -cross_matrices(arms)], axis=2).reshape(-1, 6)
 
 
 def _widened(normal: np.ndarray, freedom: int) -> np.ndarray:
-    """The covariance (6, 6) of a normal matrix, widened as the scatter in it is known from a few numbers only."""
+    """Compute the covariance (6, 6) of a normal matrix, widened because its scatter is estimated from few numbers."""
     inverse = 3.0 * f.ppf(LEVEL, 3, freedom) / chi2.ppf(LEVEL, 3) * np.linalg.inv(normal)
     return 0.5 * (inverse + inverse.T)
 
 
 def _scatter(off: np.ndarray, freedom: int) -> float:
-    """The deviation along one axis [m] that residuals have, `LEAST` at least."""
+    """Estimate the residuals' standard deviation along one axis [m], at least `LEAST`."""
     return max(float(np.sqrt((off**2).sum() / freedom)), LEAST)
 
 
@@ -233,25 +233,25 @@ def _rms(off: np.ndarray) -> float:
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-# The share of sound sets in which any pair is called suspect.
+# False-alarm rate: share of valid sets in which a pair is reported as suspect.
 FALSE_ALARM = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class PairResiduals:
-    """How n pairs of points fit one another.
+    """Residuals of n pairs of points.
 
     Parameters
     ----------
     off
-        (n,) [m]: how far each is from where the registration by all has it.
+        (n,) [m]: residual distance in the registration by all pairs.
     left_out
-        (n,) [m]: how far from where the registration by the others has it.
+        (n,) [m]: residual distance in the registration by the other pairs.
     studentised
-        (n,): the latter, over the deviation that the others' scatter gives it along and about all axes. NaN of three
-        pairs, which leave nothing to tell scatter by.
+        (n,): the latter, over the deviation that the others' scatter gives it along and about all axes. NaN for three
+        pairs, from which scatter cannot be estimated.
     chance
-        How often a set without a wrong pair has one that fits as badly as the worst of these; NaN as above.
+        Probability that a set without a wrong pair has one that fits as badly as the worst of these; NaN as above.
     """
 
     off: np.ndarray
@@ -261,21 +261,21 @@ class PairResiduals:
 
     @property
     def worst(self) -> int:
-        """The number from 0 of the pair that fits the others worst."""
+        """Number, from 0, of the pair that fits the others worst."""
         return int(np.argmax(self.left_out if np.isnan(self.studentised).any() else self.studentised))
 
     @property
     def suspect(self) -> bool:
-        """Whether the worst fits worse than in all but `FALSE_ALARM` of sound sets."""
+        """True if the worst pair fits worse than in all but `FALSE_ALARM` of valid sets."""
         return self.chance < FALSE_ALARM
 
 
 def pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResiduals:
-    """How pairs of points (n, 3) [m], in the scan and in the reference's frame, fit one another.
+    """Compute residuals of pairs of points (n, 3) [m], in the scan and in the reference's frame.
 
     Externally studentised residuals, of three coordinates each (Cook, Weisberg 1982, "Residuals and influence in
-    regression"). Their squares are F-distributed with 3 and 3 n - 9 degrees of freedom. The chance of the worst is
-    that by Bonferroni.
+    regression"). Their squares are F-distributed with 3 and 3 n - 9 degrees of freedom. The chance of the worst is that
+    by Bonferroni.
 
     Raises
     ------
@@ -286,7 +286,7 @@ def pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResiduals:
     T, count = found.T_patient_scan, len(scan)
     off = scan @ T[:3, :3].T + T[:3, 3] - patient
     if count == FEWEST_PAIRS:
-        # One pair of three, left out, leaves two points: they determine no registration.
+        # Two pairs, the remainder of three, determine no registration.
         none = np.full(count, np.nan)
         return PairResiduals(np.linalg.norm(off, axis=1), none, none, np.nan)
     J = slopes_of(T, scan, found.centre)

@@ -1,7 +1,7 @@
 """Printed targets: the tool's cube, the patient's reference, the calibration board; and their corners in an image.
 
 Every face is a ChArUco board of odd by odd squares, whose corners are those of a chessboard. OpenCV finds them to a
-tenth of a pixel. A marker's own corners are off by a fifth, always inwards.
+tenth of a pixel. A marker's own corners have an error of a fifth, always inwards.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import numpy as np
 from ..optics.camera import Camera
 
 MARKERS = cv2.aruco.DICT_4X4_250
-# Of a square, what its marker takes.
+# Side of a marker as a share of its square.
 MARKER = 0.75
 Window = tuple[slice, slice]
-"""Rows and columns of a picture, with start and stop."""
-# Widths [pixel] of the windows that decide what is black.
+"""Rows and columns of an image, with start and stop."""
+# Window widths [pixel] of the adaptive threshold.
 THOROUGH, QUICK = (5, 25), (15, 15)
-# Pixels along a side below which no marker can be.
+# Smallest side of an image part that can hold a marker [pixel].
 SMALLEST = 16
 
 
@@ -60,7 +60,7 @@ class Face:
 
     @cached_property
     def board(self) -> cv2.aruco.CharucoBoard:
-        """As OpenCV has it, in metres."""
+        """Board of OpenCV, in metres."""
         dictionary = cv2.aruco.getPredefinedDictionary(MARKERS)
         return cv2.aruco.CharucoBoard(
             (self.columns, self.rows), self.square, MARKER * self.square, dictionary, self.ids
@@ -74,23 +74,23 @@ class Face:
 
     @property
     def outline(self) -> np.ndarray:
-        """Its four corners in the target's frame (4, 3) [m], clockwise as it is seen, from the upper left one."""
+        """Four corners in the target's frame (4, 3) [m], clockwise as it is seen, from the upper left one."""
         own = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
         return (own * [*self.size, 1.0]) @ self.T_target_face[:3, :3].T + self.T_target_face[:3, 3]
 
     def picture(self, pixels: int) -> np.ndarray:
-        """What is printed (H, W) uint8, `pixels` along each side of a square, which are a multiple of 8."""
+        """Draw the print (H, W) uint8, `pixels` along each side of a square, which are a multiple of 8."""
         return np.asarray(self.board.generateImage((pixels * self.columns, pixels * self.rows), marginSize=0))
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A rigid body with printed faces.
+    """Rigid body with printed faces.
 
     Parameters
     ----------
     name
-        As it is called in files and messages.
+        Name in files and messages.
     faces
         Each with markers of its own.
     """
@@ -105,19 +105,19 @@ class Target:
 
 
 def seen_from_front(T_camera_face: np.ndarray) -> bool:
-    """Whether a face at a pose (4, 4) turns its print to the camera."""
+    """Return True if a face at a pose (4, 4) turns its print to the camera."""
     return bool(T_camera_face[:3, 2] @ T_camera_face[:3, 3] > 0.0)
 
 
-# Squares of the cube's faces, and how far the white border goes round them [m].
+# Side of a square of the cube's faces; width of the white border round them [m].
 CUBE_SQUARE, BORDER = 8e-3, 4e-3
-# The tool's tip is so far below the middle of its cube [m], along the shaft.
+# Distance of the tool's tip from the centre of its cube along the shaft [m].
 TIP = 150e-3
 
 
 @lru_cache
 def tool_cube() -> Target:
-    """A cube of three faces, 48 mm wide with their borders; its frame has its origin in the middle, z along the shaft.
+    """Build a cube of three faces, 48 mm wide with borders; its frame has its origin in the centre, z along the shaft.
 
     The faces look along +x, +y and +z, so that a camera before the corner between them sees all three. The tool's tip
     is nominally at (0, 0, -150) mm.
@@ -140,33 +140,33 @@ def tool_cube() -> Target:
 
 @lru_cache
 def patient_reference() -> Target:
-    """A plate of 60 mm that is fixed beside the opening; its frame is the face's own, z into the plate."""
+    """Build a plate of 60 mm to be fixed next to the craniotomy; its frame is the face's own, z into the plate."""
     return Target("patient", (Face(5, 5, 12e-3, 36, np.eye(4)),))
 
 
 @lru_cache
 def calibration_board() -> Target:
-    """A board of 9 x 7 squares of 24 mm, which fits A4; its frame is the face's own."""
+    """Build a board of 9 x 7 squares of 24 mm, which fits A4; its frame is the face's own."""
     return Target("board", (Face(9, 7, 24e-3, 48, np.eye(4)),))
 
 
 def all_targets() -> tuple[Target, Target, Target]:
-    """The tool's cube, the patient's reference and the calibration board."""
+    """Build the tool's cube, the patient's reference and the calibration board."""
     return tool_cube(), patient_reference(), calibration_board()
 
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """What is seen of one target.
+    """Detected corners of one target.
 
     Parameters
     ----------
     points
         In the target's frame (n, 3) [m].
     pixels
-        Where the picture has them (n, 2).
+        Detected positions (n, 2).
     face
-        Number of the face (n,) that each is on.
+        Number of the face (n,) of each.
     """
 
     points: np.ndarray
@@ -176,7 +176,7 @@ class Corners:
 
 @dataclass(frozen=True, eq=False)
 class Detector:
-    """Finds the corners of targets. Markers are looked for once; each face's corners follow from its own.
+    """Detector of targets' corners. Markers are detected once; each face's corners follow from its own.
 
     Parameters
     ----------
@@ -202,9 +202,9 @@ class Detector:
         object.__setattr__(self, "_boards", boards)
 
     def seen(self, grey: np.ndarray, names: Sequence[str] = ()) -> dict[str, Corners]:
-        """Corners by the target's name in a picture (H, W) uint8; targets of which none is seen are left out.
+        """Detect corners in an image (H, W) uint8, by the target's name; targets without visible corners are left out.
 
-        Of the targets those of the `names` are looked for; without any, all.
+        Only targets of these `names` are detected; without any, all.
         """
         corners, known = _markers(self._thorough, self.targets, np.ascontiguousarray(grey))
         wanted = [target for target in self.targets if not names or target.name in names]
@@ -212,7 +212,7 @@ class Detector:
         return {name: each for name, each in found.items() if len(each.points)}
 
     def seen_in(self, target: Target, grey: np.ndarray, window: Window) -> Corners | None:
-        """Corners of one target in a window of a picture (H, W) uint8, if there are any: faster, by one threshold."""
+        """Detect corners of one target in a window of an image (H, W) uint8, if any: faster, with one threshold."""
         part = np.ascontiguousarray(grey[window])
         if min(part.shape) < SMALLEST:
             return None
@@ -220,7 +220,7 @@ class Detector:
         return replace(found, pixels=found.pixels + [window[1].start, window[0].start]) if len(found.points) else None
 
     def _between(self, target: Target, grey: np.ndarray, markers: np.ndarray, ids: np.ndarray) -> Corners:
-        """The chessboards' corners of a target between its markers, (n, 1, 4, 2) of numbers (n,)."""
+        """Interpolate the chessboards' corners of a target between its markers, (n, 1, 4, 2) of numbers (n,)."""
         points, pixels, on = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, int)]
         for number, face in enumerate(target.faces):
             mine = np.isin(ids, face.ids)
@@ -238,10 +238,9 @@ class Detector:
 
 
 def window_round(camera: Camera, points: np.ndarray, share: float, least: float) -> Window | None:
-    """Rows and columns round points (n, 3) [m] in a camera's frame; None: they are out of view.
+    """Return rows and columns round points (n, 3) [m] in a camera's frame; None if they are out of view.
 
-    It goes beyond them by a `share` of what they cover, and by `least` pixels at least. The camera is at the world's
-    origin.
+    The margin is a `share` of their extent, and `least` pixels at least. The camera is at the world's origin.
     """
     pixels = camera.project(points)[0]
     pixels = pixels[~np.isnan(pixels).any(axis=1)]
@@ -257,25 +256,25 @@ def window_round(camera: Camera, points: np.ndarray, share: float, least: float)
 def _markers(
     detector: cv2.aruco.ArucoDetector, targets: Sequence[Target], grey: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (n, 1, 4, 2) [pixel] of markers in a picture, and their numbers (n,)."""
+    """Detect corners (n, 1, 4, 2) [pixel] of markers in an image, and their numbers (n,)."""
     corners, ids, _ = detector.detectMarkers(grey)
     which = np.zeros(0, int) if ids is None else np.asarray(ids, int).reshape(-1)
     return np.asarray(corners, np.float32).reshape(-1, 1, 4, 2), _numbers(targets)[which]
 
 
 def _numbers(targets: Sequence[Target]) -> np.ndarray:
-    """Numbers of the markers of targets (n,), sorted."""
+    """Return the marker numbers (n,) of targets, sorted."""
     return np.sort(np.concatenate([face.ids for target in targets for face in target.faces]))
 
 
 def _codes(targets: Sequence[Target]) -> cv2.aruco.Dictionary:
-    """The markers of targets alone: whatever looks like one is held against each, which takes most of the time."""
+    """Return a dictionary of the targets' markers alone: comparing candidates with each takes most of the time."""
     whole = cv2.aruco.getPredefinedDictionary(MARKERS)
     return cv2.aruco.Dictionary(whole.bytesList[_numbers(targets)], whole.markerSize)
 
 
 def _parameters(least: int, most: int) -> cv2.aruco.DetectorParameters:
-    """Thresholds by windows of two widths [pixel], or of one."""
+    """Build detector parameters with threshold windows of two widths [pixel], or of one."""
     found = cv2.aruco.DetectorParameters()
     found.adaptiveThreshWinSizeMin, found.adaptiveThreshWinSizeMax = least, most
     found.adaptiveThreshWinSizeStep = max(most - least, 1)

@@ -9,24 +9,25 @@ import numpy as np
 from .rigid import angles_of, cross_matrices
 
 FEWEST_POSES = 4
-# Motions turn by such angles [rad]: of smaller ones the axis is unsure, and near half a turn its sign is.
+# Smallest and largest rotation of a motion [rad]: the axis of smaller ones is uncertain; near pi, its sign is.
 LEAST_TURN, MOST_TURN = np.radians(8.0), np.radians(170.0)
-# Root mean square angle [rad] of the axes from the one that they are nearest to.
+# Smallest root mean square angle [rad] of the axes from their closest common axis.
 LEAST_SPREAD = np.radians(8.0)
-# Motions that are used, the largest first.
+# Maximum number of motions, the largest first.
 MOST_MOTIONS = 2000
-# Poses of which every pair is looked at, spread evenly over all.
+# Maximum number of poses whose pairs are all examined, spread evenly over all.
 MOST_POSES = 300
-# Root mean square residual angle of motions [rad]: two trackers with noise of 0.5 degrees give 1 degree.
+# Largest root mean square residual angle of motions [rad]: two trackers with noise of 0.5 degrees give 1 degree.
 LARGEST_TURN = np.radians(2.0)
-# Root mean square residual distance of motions [m]: two trackers with noise of 0.5 degrees give 7 mm over 0.7 m.
+# Largest root mean square residual distance of motions [m]: two trackers with noise of 0.5 degrees give 7 mm over 0.7
+# m.
 LARGEST_SHIFT = 10e-3
 TURN = "Turn the bodies by 30 degrees or more, about at least two different axes."
 
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """How the second body lies in the first.
+    """Pose of the second body in the first.
 
     Parameters
     ----------
@@ -35,9 +36,9 @@ class HandEye:
     turn, shift
         Root mean square residuals of the motions: angle [rad] and distance [m] between A X and X B.
     motions
-        How many were used.
+        Number of motions used.
     spread
-        Root mean square angle [rad] of the motions' axes from the one that they are nearest to.
+        Root mean square angle [rad] of the motions' axes from their closest common axis.
     distances
         (n,) root mean square `shift` of the motions from and to each pose [m]; 0 for poses without any.
     """
@@ -51,7 +52,7 @@ class HandEye:
 
     @property
     def misfit(self) -> str:
-        """Residuals and their limits in words; empty within the limits."""
+        """Description of residuals and their limits; empty within the limits."""
         if self.turn <= LARGEST_TURN and self.shift <= LARGEST_SHIFT:
             return ""
         found = (
@@ -61,7 +62,7 @@ class HandEye:
 
 
 def hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
-    """X with A X = X B for all motions A and B of two bodies, each given by poses (n, 4, 4) [m] in its tracker's frame.
+    """Compute X with A X = X B for all motions A and B of two bodies, given by poses (n, 4, 4) [m] in their trackers.
 
     Motions lead from pose i to pose j: A = P_i^-1 P_j of the first, B = Q_i^-1 Q_j of the second. Daniilidis (1999),
     "Hand-eye calibration using dual quaternions", equations 31 to 38: X is in the null space of a 6 m x 8 matrix.
@@ -94,7 +95,7 @@ def hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
 
 
 def _motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Motions of both bodies (m, 4, 4) that turn most, and the poses (2, m) that they lead from and to."""
+    """Select motions of both bodies (m, 4, 4) with the largest rotations, and the poses (2, m) that they connect."""
     kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), MOST_POSES)).round().astype(int))
     start, end = np.triu_indices(len(kept), 1)
     A, B = (np.linalg.inv(poses[kept])[start] @ poses[kept][end] for poses in (first, second))
@@ -110,7 +111,7 @@ def _motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def dual_quaternions(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rigid motions (n, 4, 4) as real and dual parts (n, 4), scalars first and not negative; the dual is t q / 2."""
+    """Convert rigid motions (n, 4, 4) to real and dual parts (n, 4), scalars first and >= 0; the dual is t q / 2."""
     R = T[:, :3, :3]
     # Bar-Itzhack (2000), "New method for extracting the quaternion": an eigenvector, whatever the angle.
     N = np.empty((len(T), 4, 4))
@@ -124,14 +125,14 @@ def dual_quaternions(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Of quaternions (..., 4), scalars first."""
+    """Multiply quaternions (..., 4), scalars first."""
     scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(axis=-1, keepdims=True)
     vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])
     return np.concatenate([scalar, vector], axis=-1)
 
 
 def _solved(a: np.ndarray, a_dual: np.ndarray, b: np.ndarray, b_dual: np.ndarray) -> np.ndarray:
-    """X (4, 4) from real and dual parts (m, 4) of motions."""
+    """Solve for X (4, 4) from real and dual parts (m, 4) of motions."""
     rows = np.zeros((len(a), 6, 8))
     for place, one, other in ((0, a, b), (3, a_dual, b_dual)):
         rows[:, place : place + 3, 0] = (one - other)[:, 1:]
@@ -163,28 +164,28 @@ def _rms(values: np.ndarray) -> float:
 
 
 FEWEST_PIVOT_POSES = 10
-# Root mean square angle [rad] by which every direction in the tool must turn.
+# Smallest root mean square rotation angle [rad] of any direction in the tool.
 LEAST_TILT = np.radians(5.0)
-# Root mean square distance [m]: 0.5 mm and 0.5 degrees of a tracker's noise, at a tip 300 mm away, give 2.7 mm.
+# Largest root mean square distance [m]: tracker noise of 0.5 mm and 0.5 degrees, at a tip 300 mm away, gives 2.7 mm.
 LARGEST_RMS = 3e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """A calibrated tip.
+    """Calibrated tip.
 
     Parameters
     ----------
     tip
         (3,) in the tool's frame [m].
     centre
-        (3,) where it stood, in the frame of the poses [m].
+        (3,) pivot point, in the frame of the poses [m].
     covariance
         (6, 6) of tip and centre [m^2].
     rms
         Root mean square distance [m] between the centre and the tip at each pose.
     tilt
-        Root mean square angle [rad] by which that direction in the tool turned that turned least.
+        Root mean square rotation angle [rad] of the direction in the tool that rotated least.
     distances
         (n,) between the centre and the tip at each pose [m].
     """
@@ -198,14 +199,14 @@ class Pivot:
 
     @property
     def misfit(self) -> str:
-        """Residual and its limit in words; empty within the limit."""
+        """Description of the residual and its limit; empty within the limit."""
         if self.rms <= LARGEST_RMS:
             return ""
         return f"the tip moves by {1e3 * self.rms:.1f} mm (rms): at most {1e3 * LARGEST_RMS:.0f} mm are required"
 
 
 def pivoted(poses: np.ndarray) -> Pivot:
-    """The tip from poses of the tool (n, 4, 4) [m], x_world = T x_tool: all R_i tip + p_i are one place.
+    """Compute the tip from poses of the tool (n, 4, 4) [m], x_world = T x_tool: all R_i tip + p_i coincide.
 
     Algebraic least squares. Yaniv (2015), "Which pivot calibration?", the one-step method: R_i tip - centre = -p_i.
 
@@ -221,7 +222,7 @@ def pivoted(poses: np.ndarray) -> Pivot:
         )
     turns, places = poses[:, :3, :3], poses[:, :3, 3]
     mean = turns.mean(axis=0)
-    # The tip's normal matrix over n, after the centre is eliminated: how far each direction in the tool turns.
+    # The tip's normal matrix over n, after the centre is eliminated: rotation of each direction in the tool.
     tilt = float(np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0)))
     if tilt < LEAST_TILT:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What each deformer of a theatre states about its error, and takes for a frame here: what a budget chooses from."""
+"""Reported error and measured frame time of each deformation model: the choices of a budget."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many millimetres to believe of an overlay on a tracked camera, and who is to blame: a Monte Carlo."""
+"""Error budget of an overlay on a tracked camera, by contributor: a Monte Carlo simulation."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from .uncertainty import Motions, off_by
 CALIBRATION, MARKERS, LATENCY, SHUTTER = "calibration", "markers", "latency x motion", "rolling shutter"
 PARAMETERS = "tissue, skull, tool's place"
 TECHNICAL = (CALIBRATION, MARKERS, LATENCY, SHUTTER, SURROGATE, MESH)
-"""What the system itself is off by."""
+"""Contributors of the system itself."""
 CLINICAL = (*TECHNICAL, REGISTRATION, SEGMENTATION, PARAMETERS)
-"""With what nobody measures of the patient."""
-# How many calibrations are drawn.
+"""Contributors including unmeasured properties of the patient."""
+# Number of sampled calibrations.
 CALIBRATIONS = 100
 
 
 @dataclass(frozen=True, eq=False)
 class Filmed:
-    """A scene at one moment, as a tracked camera films it.
+    """Scene at one time, seen by a tracked camera.
 
     Parameters
     ----------
     site, viewpoint
         The open cortex, and the camera with its calibration and path.
     duration
-        Of the scene [s], from which moments of the camera's path are drawn.
+        Duration of the scene [s], from which times of the camera's path are sampled.
     T_scan_patient
         (4, 4) of the patient's reference.
     covariance
@@ -89,7 +89,7 @@ class Filmed:
 
     @cached_property
     def calibration(self) -> Calibration:
-        """Of the camera.
+        """Calibration of the camera.
 
         Raises
         ------
@@ -104,20 +104,20 @@ class Filmed:
     def believed(self) -> tuple[Calibration, ...]:
         """Calibrations as they may have been found; to make one takes far longer than to use it."""
         scale = np.sqrt(np.diag(self.covariance))
-        scale[scale == 0.0] = 1.0  # what is exactly known
+        scale[scale == 0.0] = 1.0  # exact inputs
         values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
         steps = np.random.default_rng(0).standard_normal((CALIBRATIONS, 9)) * np.sqrt(values.clip(0.0))
         return tuple(changed(self.calibration, step) for step in scale * (steps @ vectors.T))
 
     @cached_property
     def off(self) -> np.ndarray:
-        """What the scene's own field is off by from the bodies' (b, n, 3) [m], their meshes apart."""
+        """Difference (b, n, 3) [m] between the scene's field and those of the bodies, without their mesh errors."""
         return self.bodies - self.field
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """What an overlay is off by in S samples: across the line of sight and along it [m], and in pixels.
+    """Errors of an overlay in S samples: across the line of sight and along it [m], and in pixels.
 
     Parameters
     ----------
@@ -134,14 +134,14 @@ class Errors:
 
     @property
     def middle(self) -> np.ndarray:
-        """(S,) [m]: how far off the middle is in all directions."""
+        """Distance error (S,) [m] of the centre."""
         return np.hypot(self.across, self.along)
 
 
 def errors_of(filmed: Filmed, contributors: Sequence[str], count: int, seed: int = 0) -> Errors:
-    """What contributors, all others being exact, put an overlay off by, in so many samples.
+    """Sample the overlay error caused by the contributors, all others being exact.
 
-    The same seed draws the same numbers whoever contributes.
+    The same seed gives the same random numbers for any set of contributors.
 
     Raises
     ------
@@ -198,7 +198,7 @@ def _begun(filmed: Filmed, seed: int, number: int) -> tuple[np.random.Generator,
 
 
 def _cameras(filmed: Filmed, time: float, late: float, readout: float, middle: np.ndarray) -> tuple[Camera, Camera]:
-    """The camera that sees the tumour's `middle` (3,) [m] in the picture of a time [s], and the one that is tracked."""
+    """Return the camera that sees the tumour's `middle` (3,) [m] in the image of a time [s], and the tracked camera."""
     true = _camera_after(filmed, time, 0.0)
     then = _camera_after(filmed, time, -late) if late else true
     if readout:
@@ -208,7 +208,7 @@ def _cameras(filmed: Filmed, time: float, late: float, readout: float, middle: n
 
 
 def _camera_after(filmed: Filmed, time: float, seconds: float) -> Camera:
-    """The true camera, so long after a time [s]."""
+    """Return the true camera at a delay after a time [s]."""
     return filmed.viewpoint.camera(filmed.site, time + seconds)
 
 
@@ -222,7 +222,7 @@ def _shift(filmed: Filmed, numbers: np.ndarray) -> np.ndarray:
 
 
 def _registered(filmed: Filmed, error: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """By how much places (n, 3) [m] in the scan move by an error of registration (6,)."""
+    """Return the displacement (n, 3) [m] of scan points (n, 3) by a registration error (6,)."""
     if filmed.registration is None:
         return np.broadcast_to(error[:3], points.shape)
     R = filmed.T_scan_patient[:3, :3]
@@ -234,7 +234,7 @@ def _registered(filmed: Filmed, error: np.ndarray, points: np.ndarray) -> np.nda
 def _compared(
     true: Camera, believed: Camera, surface: np.ndarray, shown: np.ndarray
 ) -> tuple[float, float, float, float]:
-    """What is drawn beside what is there: the middle across the line of sight, along it, in pixels; the worst point."""
+    """Compare the drawn tumour with the true one: centre across and along the line of sight, in pixels; worst point."""
     here, there = (np.vstack([points.mean(axis=0), points]) for points in (surface, shown))
     pixels, depth = true.project(here)
     drawn, farther = believed.project(there)
@@ -276,7 +276,7 @@ def budgeted(
     twins: Filmed | None = None,
     progress: Callable[[Sequence[str]], Iterable[str]] = iter,
 ) -> Budget:
-    """The budget from so many samples; `twins`, of other bodies, are held against its band with other numbers."""
+    """Compute the budget from `count` samples; `twins`, other bodies, test its band with other random numbers."""
     alone = {name: errors_of(filmed, [name], count, seed) for name in progress(CLINICAL)}
     technical, clinical = (errors_of(filmed, names, count, seed) for names in (TECHNICAL, CLINICAL))
     budget = Budget(alone, technical, clinical)
@@ -309,7 +309,7 @@ def moment_of(still: Motions, answers: Sequence[tuple[np.ndarray, ...]], meshes:
 
 
 def velocity_at(still: Motions, number: int) -> np.ndarray:
-    """How fast the tumour's surface moves (n, 3) [m/s] on the way to a moment; 0 where tissue was cut meanwhile."""
+    """Return the velocity (n, 3) [m/s] of the tumour's surface before a time; 0 if tissue was cut meanwhile."""
     before, here = still.fields[max(number - 1, 0)], still.fields[number]
     if number == 0 or before.shape != here.shape:
         return np.zeros_like(here)

@@ -1,4 +1,4 @@
-"""How far a tumour moves under every combination of skull, tissue, opening, depth and stiffness."""
+"""Tumour motion under every combination of skull, tissue, craniotomy, depth and stiffness."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LEVELS: Levels = {
     "nu": (0.45, 0.49, 0.499),
     "tumour's stiffness": (1.0, 3.0),
 }
-"""What is combined; the depth is that of the tumour's cap under the cortex, its stiffness a multiple of the brain's."""
+"""Combined factors: depth of the top of the tumour below the cortex, stiffness relative to the brain, and others."""
 DEFAULT = {"skull": "bonded", "nu": 0.49, "tumour's stiffness": 1.0}
 FORCE, FOOTPRINT = 0.2, 7e-3  # [N], [m]
 PLACES = ((0.0, 0.0), (6.0, 0.0), (0.0, 6.0))  # [mm] right and up from the middle of the opening
@@ -47,7 +47,7 @@ class Cell:
 
 
 def cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> Iterator[Cell]:
-    """Every combination, on meshes of the template of about so many nodes; the tool presses at three places."""
+    """Solve every combination on template meshes of about `nodes` nodes; the tool presses at three places."""
     for opening, depth in product(levels["opening [mm]"], levels["depth [mm]"]):
         subject = template_subject(Tumour(cover=1e-3 * float(depth)))
         anatomy = make_anatomy(subject, MeshPlan(nodes, 1e-3 * float(opening)))
@@ -77,7 +77,7 @@ def _motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
 
 
 def shares(found: Sequence[Cell], what: str = "force") -> dict[str, float]:
-    """Which part of the variance of the motion's logarithm each factor explains, and each pair beyond its two.
+    """Return the share of variance of the logarithmic motion explained by each factor, and by each pair beyond its two.
 
     The sums of squares of a balanced analysis of variance, by size; cells that did not converge are left out. What
     three and more do together is the rest to 1.

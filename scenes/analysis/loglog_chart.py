@@ -37,7 +37,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Dot:
-    """A point (x, y), both positive, with its name beside it, in the colour of its group; or pale."""
+    """Point (x, y), both positive, with a label, in the colour of its group; or pale."""
 
     name: str
     group: str
@@ -48,7 +48,7 @@ class Dot:
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes: title, what they show, curves, dots, and `marks`: lines at some x, with words beside.
+    """One pair of axes: title, what they show, curves, dots, and `marks`: labelled vertical lines.
 
     size: width and height [pixel]; y_range: limits of the axis (default: those of the data and a margin).
     """

@@ -50,7 +50,7 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def peak_memory() -> float | None:
-    """The largest resident size of this process so far [GiB], as Linux reports it."""
+    """Return the peak resident size of this process [GiB], as Linux reports it."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
@@ -86,7 +86,7 @@ T = TypeVar("T")
 
 
 def timed(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> tuple[T, float]:
-    """What `work` returns, and the wall seconds that it took; the device is waited for at both readings."""
+    """Return the result of `work` and its wall time [s]; the device is synchronised at both readings."""
     wp.synchronize()
     begun = time.perf_counter()
     found = work(*args, **kwargs)

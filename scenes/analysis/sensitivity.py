@@ -1,4 +1,4 @@
-"""What else moves the tumour: tissue, skull, tool and element, each changed by itself around a default."""
+"""Sensitivity of the tumour's motion to tissue, skull, tool and element, one change at a time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from surrogate.data.tool_loads import across
 
 @dataclass(frozen=True)
 class Body:
-    """What is pressed: the tissue, how many times as stiff the tumour is, the skull, the element.
+    """Variant of the body: tissue, relative stiffness of the tumour, skull model, element.
 
     `skull` is one of `sim.effects.SKULLS`. Linear tetrahedra lock as nu nears 0.5, which would pass for an influence of
     nu: hence smoothed ones.
@@ -36,7 +36,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Aim:
-    """How a tool's load is off: its force or motion by a `share` and `turn`ed [rad], its point by a `shift` [m].
+    """Perturbation of a load: force or motion scaled by `share` and rotated by `turn` [rad], point moved by `shift` [m].
 
     In several ways each: more and less, about two axes, to four sides.
     """
@@ -110,14 +110,14 @@ def aimed(loads: Loads, aim: Aim, patch: Patch) -> Loads:
 
 @dataclass(frozen=True)
 class Change:
-    """How the tumour's displacement differs from the default's, over the `solves` that converged; the `failed` not.
+    """Difference of the tumour's displacement from the default, over the converged `solves`; `failed` did not converge.
 
     Parameters
     ----------
     mean_mm, p95_mm, largest_mm
         Of the distances between the two, over every load x vertex [mm].
     worst95_mm
-        In 95 of 100 loads no vertex is farther off [mm], as a surrogate's bound is stated.
+        95th percentile over loads of the largest vertex distance [mm], comparable with a surrogate's bound.
     percent
         Mean of the distances, each divided by its load's mean motion under the default [%].
     motion
@@ -196,7 +196,7 @@ def rows(study: Study, changed: Sequence[Variant]) -> Iterator[Row]:
 
 
 def change(answer: Deformation, default: Deformation, origin: np.ndarray) -> Change:
-    """How far `answer`, k times the loads of `default` in blocks, lies from `origin` (B, n, 3) [m].
+    """Compare `answer`, k blocks of the loads of `default`, with `origin` (B, n, 3) [m].
 
     A load counts where it and its default converged.
     """

@@ -1,4 +1,4 @@
-"""What a camera's calibration and the corners of printed targets are off by, for a Monte Carlo without pictures."""
+"""Errors of a camera calibration and of detected target corners, for a Monte Carlo simulation without images."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from ar.tracking.intrinsics import View, covariance_of
 from ar.tracking.targets import Corners, Target, calibration_board, seen_from_front
 
 CORNER = 0.1
-"""Deviation of a corner along each axis [pixel], by default: twice that of sharp pictures (`benchmarks track`)."""
-# Views of a usual calibration; how far the board is tilted in them, and the shares of the picture that it is wide.
+"""Standard deviation of a corner per axis [pixel]: by default twice that of sharp images (`benchmarks track`)."""
+# Usual calibration: number of views, tilt of the board, and range of its width relative to the image.
 VIEWS, TILT, WIDE = 24, np.radians(35.0), (0.45, 0.8)
 
 
 def usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarray:
     """The covariance (9, 9) of intrinsics, in the order of `ar.tracking.intrinsics.PARAMETERS`, of a good calibration.
 
-    It has 24 views of the printed board, tilted by up to 35 degrees to all sides, near and far, all over the picture.
+    It has 24 views of the printed board, tilted by up to 35 degrees to all sides, near and far, all over the image.
     """
     random, board = np.random.default_rng(seed), calibration_board().faces[0]
     points = board.corners - np.array([*(0.5 * board.size), 0.0])
@@ -52,7 +52,7 @@ def changed(calibration: Calibration, step: np.ndarray) -> Calibration:
 
 
 def corners_in(camera: Camera, target: Target, T_world_target: np.ndarray, off: np.ndarray) -> Corners:
-    """The corners of a target's faces that look at a camera, each off by a row of `off` (n, 2) [pixel]."""
+    """Project the corners of a target's visible faces, each with an error from a row of `off` (n, 2) [pixel]."""
     points, faces, T = [], [], camera.T_camera_world @ T_world_target
     for number, face in enumerate(target.faces):
         if seen_from_front(T @ face.T_target_face):
@@ -67,9 +67,9 @@ def corners_in(camera: Camera, target: Target, T_world_target: np.ndarray, off: 
 def seen_by_rows(
     seen: Corners, camera_at: Callable[[float], Camera], readout: float, T_world_target: np.ndarray
 ) -> Corners:
-    """Corners as a rolling shutter sees them, which reads a picture's rows one after the other in `readout` [s].
+    """Project corners with a rolling shutter that reads the image rows within `readout` [s].
 
-    `camera_at` says where the camera is so long [s] after the middle row is read. The noise of `seen` corners stays.
+    `camera_at` returns the camera at a delay [s] after the middle row is read. The noise of `seen` corners stays.
     """
     at = seen.points @ T_world_target[:3, :3].T + T_world_target[:3, 3]
     middle = camera_at(0.0)

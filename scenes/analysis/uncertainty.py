@@ -44,9 +44,9 @@ from ..script.uncertainty import LEVEL, Uncertainty, mark_of
 
 # Thousandths of the motion, as in a locator's ensemble. Draws with inverted tetrahedra are counted, and not left out.
 ACCURACY = Accuracy(tolerance=3e-3, limit_strain=False)
-# Moments of a scene that are solved; a scene cannot be known where fewer draws than this share have an answer.
+# Times of a scene that are solved; share of the draws that must have an equilibrium.
 MOMENTS, LEAST = 5, 0.8
-# A moment that is not reached at once is in so many steps.
+# Number of load steps for a time that is not reached at once.
 PARTS = 4
 # Errors of registration and segmentation to each body.
 SHIFTS = 200
@@ -108,31 +108,31 @@ def changed(scene: Scene, draw: Draw) -> Scene:
 
 
 def skulls_of(scene: Scene) -> tuple[str, ...]:
-    """What the skull may do in a scene: where it lets go, fluid came between, and nothing is bonded any more."""
+    """List the possible skull models of a scene: if the brain may separate, fluid is in between and no bond remains."""
     lets_go = any(isinstance(effect, SkullContact) for effect in scene.effects)
     return tuple(name for name in SKULLS if not (lets_go and name == "bonded"))
 
 
 def skull_of(scene: Scene) -> str | None:
-    """What the skull does in a scene; None: it is not simulated."""
+    """Return the skull model of a scene; None if it is not simulated."""
     own = next((type(effect) for effect in scene.effects if isinstance(effect, SKULL_EFFECTS)), None)
     return next((name for name, skull in SKULLS.items() if type(skull) is own), None)
 
 
 def mesh_prior(scene: Scene, skull: str | None) -> Prior:
-    """What a scene's mesh may be off by where the skull does this."""
+    """Return the prior of a scene's mesh error for a skull model."""
     if skull in (None, "bonded"):
         return OF_MESH
     return OF_MESH_SINKING if any(isinstance(effect, Gravity) for effect in scene.effects) else OF_MESH_SLIDING
 
 
 def mesh_errors(scene: Scene, draws: Sequence[Draw]) -> np.ndarray:
-    """By which share of its motion each draw's mesh is off (draws,)."""
+    """Sample the mesh error (draws,) of each draw, relative to its motion."""
     return mesh_deviations(scene, draws) * np.array([draw.mesh for draw in draws])
 
 
 def mesh_deviations(scene: Scene, draws: Sequence[Draw]) -> np.ndarray:
-    """By which share of its motion each draw's mesh may be off (draws,), as a standard deviation."""
+    """Return the standard deviation (draws,) of each draw's mesh error, relative to its motion."""
     if skull_of(scene) is None:
         return np.full(len(draws), mesh_prior(scene, None).range[1])
     skulls = skulls_of(scene)
@@ -171,7 +171,7 @@ def tumour_of(scene: Scene) -> Material:
 
 
 def _aside(path: Path, tip: Sequence[float]) -> Path:
-    """A path that is off by so much (3,) [m]: right, up, inwards."""
+    """Return a path shifted by (3,) [m]: right, up, inwards."""
 
     def aside(time: float) -> Touch:
         touch = path(time)
@@ -186,12 +186,12 @@ def moments(scene: Scene) -> tuple[float, ...]:
 
 
 def nominal(theatre: Theatre, scene: Scene) -> Motions:
-    """The scene as it is.
+    """Solve the scene as it is.
 
     Raises
     ------
     InputError
-        An anatomy without tumour; a moment without an answer.
+        An anatomy without tumour; a time without equilibrium.
     """
     if not len(theatre.anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour to be uncertain of: make one with `sulcus anatomy`.")
@@ -249,7 +249,7 @@ def sound_of(draws: Sequence[Draw], answers: Iterable[Answer]) -> list[tuple[Dra
 def enough_of(
     scene: Scene, draws: Sequence[Draw], answers: Iterable[Answer]
 ) -> list[tuple[Draw, tuple[np.ndarray, ...]]]:
-    """As `sound_of`, of a scene that is known by them.
+    """Return the sound draws, as `sound_of`, of a scene with enough of them.
 
     Raises
     ------
@@ -265,7 +265,7 @@ def enough_of(
 def uncertainty(
     theatre: Theatre, scene: Scene, still: Motions, draws: Sequence[Draw], answers: Iterable[Answer], seed: int = 0
 ) -> Uncertainty:
-    """How far the tumour may be from where the scene shows it, from the answers of an ensemble's draws.
+    """Estimate the error of the shown tumour position from the motions of an ensemble.
 
     Raises
     ------
@@ -301,16 +301,16 @@ def uncertainty(
 
 
 def off_by(motion: np.ndarray, field: np.ndarray, meshes: np.ndarray) -> np.ndarray:
-    """What a scene's field (n, 3) [m] is off by from motions (draws, n, 3) whose meshes are off by so much (draws,)."""
+    """Return the error of a scene's field (n, 3) [m] relative to motions (draws, n, 3) with mesh errors (draws,)."""
     return (1.0 + meshes)[:, None, None] * motion - field
 
 
 def distances(
     off: np.ndarray, normals: np.ndarray, shift: np.ndarray, wide: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distances of the worst point and of the middle (draws, shifts) [m], for every draw with every rigid error.
+    """Return errors of the worst point and of the centre (draws, shifts) [m], for every draw with every rigid error.
 
-    off (draws, n, 3): what the model is off by; normals (n, 3); shift (shifts, 3) and wide (shifts,): registration and
+    off (draws, n, 3): errors of the model; normals (n, 3); shift (shifts, 3) and wide (shifts,): registration and
     segmentation [m].
     """
     aside = shift[:, None] + wide[:, None, None] * normals
@@ -320,7 +320,7 @@ def distances(
 
 
 def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw], scene: Scene) -> dict[str, float]:
-    """What each contributor does alone [m]: root mean square over the draws, at the surface's worst point of each.
+    """Return the error of each contributor alone [m]: root mean square over the draws, at the worst surface point of each.
 
     A linear fit of the draws (draws, n, 3) tells the causes apart; what it leaves is of several together.
     """
@@ -339,7 +339,7 @@ def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw], scene: S
 
 
 def causes(draws: Sequence[Draw], scene: Scene) -> dict[str, np.ndarray]:
-    """By contributor, how a draw differs from the scene (draws, columns): zero where it does not."""
+    """Return, by contributor, the difference of each draw from the scene (draws, columns); zero without difference."""
     poisson = tissue_of(scene).poisson
     table = np.array([[np.log(one.stiffness), one.poisson - poisson, np.log(one.ratio), *one.tip] for one in draws])
     found = {STIFFNESS.name: table[:, :1], POISSON.name: table[:, 1:2], RATIO.name: table[:, 2:3]}
@@ -372,7 +372,7 @@ def coverage(
             f"{len(sound)} of {len(draws)} synthetic patients of the scene {scene.name} have an equilibrium: too few."
         )
     meshes, inside = mesh_errors(scene, [draw for draw, _ in sound]), []
-    shift, wide = rigid(SHIFTS * len(sound), seed)  # of each patient their own
+    shift, wide = rigid(SHIFTS * len(sound), seed)  # a different one for each patient
     each = list(zip(shift.reshape(len(sound), SHIFTS, 3), wide.reshape(len(sound), SHIFTS), strict=True))
     for moment in range(1, len(still.times)):
         motion = np.stack([answer[moment] for _, answer in sound])

@@ -1,4 +1,4 @@
-"""A palpation ball lies on the cortex beside the tumour and draws it aside."""
+"""A palpation ball touches the cortex near the tumour and draws it aside."""
 
 import numpy as np
 

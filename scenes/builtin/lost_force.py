@@ -1,4 +1,4 @@
-"""A tool presses with a force that nobody measures; where the tumour is, its pose and the cortex alone tell."""
+"""A tool presses with unknown force. The tumour position is estimated from the tool pose and the cortex."""
 
 import numpy as np
 

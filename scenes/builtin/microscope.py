@@ -1,4 +1,4 @@
-"""Under a microscope the brain sinks and a tool presses; its pictures alone tell where the tumour is now."""
+"""Under a microscope the brain sinks and a tool presses; the tumour position is estimated from its images alone."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ PRESS = press(force=0.15, rise=0.8, hold=0.4, at=(-0.004, 0.008))
 
 
 def late(time: float) -> Touch:
-    """What the hand does at a time [s]."""
+    """Return the tool input at a time [s]."""
     return PRESS(time - 2.0)
 
 

@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
         intensity = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy], anatomy.mesh)
         write_anatomy(args.out, anatomy)
         if intensity is None:
-            beside.unlink(missing_ok=True)  # of an earlier mesh of this name
+            beside.unlink(missing_ok=True)  # belongs to an earlier mesh of this name
         else:
             write_intensity(beside, intensity)
     tumour = anatomy.mesh.tets[anatomy.in_tumour]
@@ -190,7 +190,7 @@ def _volume(mesh: TetMesh, part: Part) -> float:
 
 
 def _place(subject: Subject, place: np.ndarray) -> dict[str, Any]:
-    """Where a point (3,) [m] lies: in mm, and in words."""
+    """Describe the position of a point (3,) [m]: in mm, and in words."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     return {"at_mm": [round(1e3 * value, 1) for value in place.tolist()], "side": side_of(place, low, high)}
 

@@ -54,32 +54,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_camera(parser, "hand-held")
     parser.add_argument(
         "--intrinsics", type=Path, metavar="K.json",
-        help="covariance of --camera, written beside it by `sulcus calibrate` (default: of 24 good views of the board)",
+        help="covariance of --camera, from `sulcus calibrate` (default: that of 24 good views of the board)",
     )  # fmt: skip
     parser.add_argument(
         "--registration", type=Path, metavar="R.json",
         help="from `sulcus register` (default: a published 1.56 mm along each axis)",
     )  # fmt: skip
     parser.add_argument(
-        "--corner-px", type=float, default=0.1, help="what a marker's corner is off by [pixel] (default %(default)s)"
+        "--corner-px", type=float, default=0.1, help="standard deviation of a marker corner [pixel] (default: %(default)s)"
     )
     parser.add_argument(
         "--latency-ms", type=float, default=0.0,
-        help="how much later the picture drawn on is than the one that was tracked (default %(default)s: the same)",
+        help="delay between the tracked and the drawn image [ms] (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--clock-ms", type=float, default=5.0, help="what times of pictures and poses are off by (default %(default)s)"
+        "--clock-ms", type=float, default=5.0, help="standard deviation of image and pose times [ms] (default: %(default)s)"
     )
     parser.add_argument(
         "--readout-ms", type=float,
-        help="how long a rolling shutter takes to read a picture (default: the `readout_time` of --camera, or none)",
+        help="readout time of a rolling shutter [ms] (default: `readout_time` of --camera, or none)",
     )  # fmt: skip
     parser.add_argument(
-        "--draws", type=int, default=24, help=f"bodies to solve, {FEWEST} or more (default %(default)s)"
+        "--draws", type=int, default=24, help=f"number of bodies to solve, >= {FEWEST} (default: %(default)s)"
     )
-    parser.add_argument("--samples", type=int, default=1000, help="errors to draw (default %(default)s)")
+    parser.add_argument("--samples", type=int, default=1000, help="number of sampled errors (default: %(default)s)")
     parser.add_argument(
-        "--twins", type=int, default=0, help="try the band on so many other bodies (default %(default)s)"
+        "--twins", type=int, default=0, help="number of other bodies on which the band is tested (default: %(default)s)"
     )
     add_seed(parser, "the draws")
     add_device(parser, "finite elements")
@@ -147,7 +147,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _seen(args: argparse.Namespace, theatre: Theatre) -> Scene:
-    """The scene as a calibrated camera films it.
+    """Return the scene with a calibrated camera.
 
     Raises
     ------
@@ -200,7 +200,7 @@ def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
 
 
 def _bodies(args: argparse.Namespace, theatre: Theatre, scene: Scene, count: int, seed: int) -> Bodies:
-    """So many bodies drawn from priors, and how the tumour's surface moves in each; those without equilibrium are out.
+    """Sample bodies from the priors and solve the tumour's surface motion in each, without those that have no equilibrium.
 
     Raises
     ------
@@ -216,7 +216,7 @@ def _bodies(args: argparse.Namespace, theatre: Theatre, scene: Scene, count: int
 
 
 def _at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How the tumour's surface moves in each body at a moment, and what their meshes and own ones are off by."""
+    """Return the tumour's surface motion in each body at one time, and the errors of their meshes."""
     from ..analysis.uncertainty import mesh_errors, mesh_prior, skull_of
 
     draws = [draw for draw, _ in bodies]

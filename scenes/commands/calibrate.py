@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Found = TypeVar("Found", "Pivot", "HandEye")
 MOST_VIEWS = 40
-# The share of the picture that corners should cover.
+# Share of the image area that corners should cover.
 WANTED_COVER = 0.6
 # Seconds by which the times of two files of poses may differ.
 SAME_TIME = 1e-3
@@ -38,34 +38,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         type=Path,
         metavar="VIDEO|FOLDER",
-        help="of the board that `sulcus markers` prints: a video, or a folder of PNG or JPEG pictures",
+        help="images of the board that `sulcus markers` prints: a video, or a folder of PNG or JPEG images",
     )
     parser.add_argument(
         "--pivot",
         type=Path,
         metavar="POSES.csv",
-        help="find a tool's tip from its poses while the tip stays in one place; columns as below",
+        help="estimate a tool's tip from poses around a fixed tip; columns as below",
     )
     parser.add_argument(
         "--hand-eye",
         type=Path,
         nargs=2,
         metavar=("A.csv", "B.csv"),
-        help="find how body B lies in body A, from poses of both at the same times; columns as below",
+        help="estimate the transform from body B to body A from simultaneous poses of both; columns as below",
     )
-    parser.add_argument("--out", metavar="K.yaml", help="the camera; K.json beside it holds its covariance")
-    parser.add_argument("--size", metavar="WxH", help="refuse pictures of another size, such as 1280x960")
+    parser.add_argument("--out", metavar="K.yaml", help="calibration to write; its covariance goes to K.json next to it")
+    parser.add_argument("--size", metavar="WxH", help="reject images of any other size, such as 1280x960")
     add_json(parser, "print one JSON line, with covariances, in place of words")
     add_force(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Returns 0 when what was asked for is found.
+    """Calibrate; return 0 when the calibration is determined.
 
     Raises
     ------
     InputError
-        Nothing, or two things to calibrate; files that cannot be read or written; and what determines no answer.
+        Nothing, or two things to calibrate; files that cannot be read or written; data that do not determine the result.
     """
     asked = [each for each in (args.pictures, args.pivot, args.hand_eye) if each is not None]
     if len(asked) != 1:
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _camera(args: argparse.Namespace) -> int:
-    """The camera, from pictures of the board."""
+    """Calibrate a camera from images of the board."""
     from ar.tracking.intrinsics import calibrated, chosen
     from ar.tracking.targets import calibration_board
 
@@ -136,7 +136,7 @@ def _write_json(path: Path, report: dict) -> None:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Width and height of a picture, such as 1280x960."""
+    """Parse the width and height of an image, such as 1280x960."""
     try:
         return size(text)
     except argparse.ArgumentTypeError as error:
@@ -205,7 +205,7 @@ def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray
 
 
 def _bodies(args: argparse.Namespace) -> int:
-    """How one body lies in another, from poses of both."""
+    """Estimate the transform between two bodies from poses of both."""
     from ar.tracking.tracker_calibration import hand_eye
 
     from ..tracked.pose_file import read_numbered_poses

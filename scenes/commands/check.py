@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..script.uncertainty import TumourError
 
 
-# The name of what is no scene: a drawn film whose markers are lost and found.
+# Name of the check that is no scene: a synthetic video whose markers disappear and return.
 TRACKING = "tracking"
 
 
@@ -32,9 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
         "scenes", nargs="*",
-        help="built-in scenes, or MY_SCENE.py; tracking: a drawn film whose markers are lost and found (default: all)",
+        help="built-in scenes, or MY_SCENE.py; tracking: a synthetic video with markers that disappear (default: all)",
     )  # fmt: skip
-    parser.add_argument("--every", type=int, default=10, help="check one frame in so many (default %(default)s)")
+    parser.add_argument("--every", type=int, default=10, help="check every Nth frame (default: %(default)s)")
     add_theatre(parser)
     add_camera(parser)
     add_style(parser, without=("none",))  # there is an outline to be found
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _tracking(args: argparse.Namespace, theatre: Theatre, table: TextIO) -> dict[str, object]:
-    """What a drawn film shows whose markers are lost and found."""
+    """Check the overlay on a synthetic video whose markers disappear and return."""
     from ..tracked.drawn_film import drawn_film
     from ..tracked.tracking_checks import measure_tracking, usual
 
@@ -132,17 +132,17 @@ def _mm(metres: float | None) -> float | None:
 
 
 def _who(scene: Scene, name: str) -> str:
-    """What is held against the finite elements: a deformer's tumour, or the estimate of one."""
+    """Describe what is compared with FEM: the tumour of a deformation model, or an estimated one."""
     return f"{name}: the tumour" if scene.sight is None else f"{name} is the truth; the estimate of the tumour"
 
 
 def _bond(share: float) -> str:
-    """How near the skull's bond comes to tearing, where there is one."""
+    """Describe how close the skull's bond is to its strength, if there is one."""
     return f", whose bond bears {share:.0%} of its strength" if math.isfinite(share) else ""
 
 
 def _estimates(figures: Figures) -> str:
-    """What estimates of a scene with a sight are worth."""
+    """Summarise the errors of the estimates in a scene with observations."""
     if not math.isfinite(figures.covered):
         return ""
     held = f"Its middle is in the ellipsoid in {figures.covered:.0%} of the frames"

@@ -25,9 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--to",
         required=True,
         choices=FORMATS,
-        help="LeRobot v3.0, robomimic (.hdf5), pictures and tables, XDMF for ParaView, or the card of a data set",
+        help="LeRobot v3.0, robomimic (.hdf5), images and tables, XDMF for ParaView, or the card of a data set",
     )
-    parser.add_argument("--out", type=Path, help="a new folder, or the .hdf5 file; a card lies in the data set itself")
+    parser.add_argument("--out", type=Path, help="new folder, or .hdf5 file; a card is written into the data set itself")
     add_force(parser)
     add_json(parser)
 
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def writer_of(args: argparse.Namespace) -> Callable[..., dict[str, Any]]:
-    """What writes episodes as it was asked; its output is known to be free.
+    """Return the function that writes episodes in the requested format; its output path is free.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def writer_of(args: argparse.Namespace) -> Callable[..., dict[str, Any]]:
 
 
 def folder_writer(name: str) -> Callable[..., dict[str, Any]]:
-    """What writes a folder of that format.
+    """Return the function that writes a folder of this format.
 
     Raises
     ------

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
-"""How names of films end."""
+"""Endings of video file names."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,11 +32,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to serve on (default %(default)s); one that other machines reach asks visitors for a token",
+        help="network address of the server (default: %(default)s); users of other machines need a token",
     )
     parser.add_argument("--port", type=int, default=8080, help="port, or the next free one (default %(default)s)")
     add_address(parser)
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after so long (default: never)")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="exit after this many seconds (default: never)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
     addresses_of(args)
     find_device(args.device, LIVE.precision)
-    # One thread for all kernels of the first picture: each that compiles reads Warp's headers first, for two seconds.
+    # One thread for all kernels of the first image: each compilation reads Warp's headers first, for two seconds.
     kernels = ThreadPoolExecutor(1, "kernels")
     kernels.submit(load_kernels)
     from ar.page.guard import check_address
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitStack) -> int:
-    """Open the page, and play when `kernels` has loaded those of the first picture; `closing` closes the page."""
+    """Open the page, and play when `kernels` has loaded those of the first image; `closing` closes the page."""
     from ar.page.guard import UnguardedError
 
     from ..page.demo import Demo

@@ -27,31 +27,31 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("plan", metavar="PLAN", help="a plan that ships with sulcus, or your own .toml")
-    parser.add_argument("--count", required=True, type=_positive, help="episodes that are wanted")
+    parser.add_argument("--count", required=True, type=_positive, help="number of episodes")
     add_seed(parser, "all draws", _natural)
-    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="their folder; unfinished, it goes on")
-    parser.add_argument("--first", type=_natural, default=0, metavar="K", help="number of the first (default 0)")
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder of the episodes; an unfinished run is resumed")
+    parser.add_argument("--first", type=_natural, default=0, metavar="K", help="number of the first episode (default: 0)")
     who = parser.add_mutually_exclusive_group()
     who.add_argument(
         "--workers", type=_positive, metavar="K",
-        help="processes of this machine (default: one for each core, or for each card)",
+        help="number of processes on this machine (default: one per core, or per GPU)",
     )  # fmt: skip
     who.add_argument("--scheduler", metavar="ADDRESS", help="the workers of a running Dask scheduler: tcp://HOST:PORT")
     parser.add_argument(
         "--device", choices=("auto", "cpu", "cuda"), default="auto",
-        help="what episodes are made on. auto: what the folder was begun on, else cuda if there is a card",
+        help="compute device. auto: same as earlier runs in this folder, else cuda if available",
     )  # fmt: skip
-    parser.add_argument("--again", action="store_true", help="try those again, too, that failed for good")
+    parser.add_argument("--again", action="store_true", help="also retry episodes that failed permanently")
     parser.add_argument(
         "--force", action="store_true",
-        help="work in a folder that holds other files, or that other versions of sulcus began",
+        help="use a folder that contains other files, or that another version of sulcus created",
     )  # fmt: skip
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument(
-        "--estimate", action="store_true", help="make nothing: print time and disk, from what was made in DIR before"
+        "--estimate", action="store_true", help="print the estimated time and disk space only, from earlier runs in DIR"
     )
     instead.add_argument(
-        "--slurm", type=_positive, metavar="MACHINES", help="make nothing: print a script for sbatch, for so many"
+        "--slurm", type=_positive, metavar="MACHINES", help="print a script for sbatch with this many machines only"
     )
     add_json(parser)
 
@@ -75,7 +75,7 @@ def _natural(text: str) -> int:
 
 
 def _plan(args: argparse.Namespace) -> str:
-    """What the plan is called from any folder."""
+    """Return the path of the plan that is valid from any folder."""
     return str(Path(args.plan).absolute()) if args.plan.endswith(".toml") else args.plan
 
 
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
         return _print_script(args, out)
     from ..episodes.plan import load_plan
 
-    plan = load_plan(_plan(args))  # its bodies may lie beside it, and workers elsewhere
+    plan = load_plan(_plan(args))  # its bodies may be next to it, and workers elsewhere
     if args.estimate:
         return _print_estimate(args, plan, out)
     try:

@@ -1,4 +1,4 @@
-"""`sulcus export`: a learnt model as an ONNX file, for programs in other languages."""
+"""`sulcus export`: a trained model as an ONNX file, for programs in other languages."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ ENDING = ".model.npz"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("model", type=Path, metavar="MODEL.npz", help="from `sulcus train`")
-    parser.add_argument("--out", required=True, metavar="MODEL.onnx", help="its inputs and outputs say what they are")
-    parser.add_argument("--learner", help="which of its models (default: the one of the tightest error bound)")
+    parser.add_argument("--out", required=True, metavar="MODEL.onnx", help="ONNX file to write; its inputs and outputs carry descriptions")
+    parser.add_argument("--learner", help="name of the model (default: the one with the smallest error bound)")
     parser.add_argument(
-        "--anatomy", type=Path, help=f".vtu that it was trained on (default: MESH.vtu beside MESH{ENDING})"
+        "--anatomy", type=Path, help=f"anatomy it was trained on, .vtu (default: MESH.vtu next to MESH{ENDING})"
     )
     parser.add_argument(
         "--cortex",
         action="store_true",
-        help="the open cortex too, not the tumour alone: then the graph needs the footprint's weights at its nodes",
+        help="include the open cortex; the graph then needs the footprint's weights at its nodes",
     )
     add_force(parser)
 

@@ -1,4 +1,4 @@
-"""`sulcus film`: a scene as a real camera films it, with printed targets in view, and all that is true of it."""
+"""`sulcus film`: a scene as a tracked camera records it, with printed targets in view, and its ground truth."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
     from ..tracked.filming import Shot, Trouble
 
-# Named here too, so that a command's help waits for no picture to be drawn.
+# Repeated here, so that `--help` does not import the renderer.
 TROUBLES = ("reference", "tool", "bright", "smear", "gap")
-# Files that are written beside the film.
+# Files that are written next to the video.
 FILES = ("camera.yaml", "camera.json", "registration.json", "tool.json", "truth.npz", "truth.csv")
 
 
@@ -40,23 +40,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", required=True, type=Path, metavar="DIR",
         help="folder for film.mp4, camera.yaml and .json, registration.json, tool.json, truth.npz and truth.csv",
     )  # fmt: skip
-    parser.add_argument("--every", type=int, default=1, help="film one frame in so many (default %(default)s)")
-    parser.add_argument("--seconds", type=float, help="film only so much of the scene [s]")
-    parser.add_argument("--png", action="store_true", help="write DIR/frames/*.png, without loss, in place of film.mp4")
-    parser.add_argument("--blur", type=float, default=0.5, metavar="PX", help="of the lens (default %(default)s)")
-    parser.add_argument("--noise", type=float, default=2.0, help="of each pixel, of 255 (default %(default)s)")
+    parser.add_argument("--every", type=int, default=1, help="record every Nth frame (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, help="duration of the recorded part of the scene [s] (default: all)")
+    parser.add_argument("--png", action="store_true", help="write lossless DIR/frames/*.png instead of film.mp4")
+    parser.add_argument("--blur", type=float, default=0.5, metavar="PX", help="standard deviation of the lens blur [pixel] (default: %(default)s)")
+    parser.add_argument("--noise", type=float, default=2.0, help="standard deviation of the pixel noise, of 255 (default: %(default)s)")
     parser.add_argument(
         "--readout", type=float, metavar="MS",
-        help="a rolling shutter: how much later the last row is taken than the first [ms] (default: the camera's)",
+        help="rolling-shutter readout time [ms] (default: the camera's)",
     )  # fmt: skip
     add_seed(parser, "noise and of --registered")
     parser.add_argument(
         "--trouble", type=trouble, action="append", default=[], metavar="KIND:FROM-TO",
-        help=f"what goes wrong between two times [s]: {', '.join(TROUBLES)}; may be given again",
+        help=f"disturbance between two times [s]: {', '.join(TROUBLES)}; repeatable",
     )  # fmt: skip
     parser.add_argument(
         "--registered", type=float, nargs=2, default=(0.0, 0.0), metavar=("MM", "DEGREES"),
-        help="how far the registration is off at the opening: deviations along and about each axis (default 0 0)",
+        help="standard deviations of the registration error at the craniotomy, per axis (default: 0 0)",
     )  # fmt: skip
     add_theatre(parser)
     add_camera(parser)
@@ -76,12 +76,12 @@ def trouble(text: str) -> tuple[str, float, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Film and write. Returns 0.
+    """Record the video and its ground truth; return 0.
 
     Raises
     ------
     InputError
-        What cannot be read, written or filmed; numbers that are out of range.
+        Input that cannot be read, output that cannot be written, numbers out of range.
     """
     from ..tracked.calibration_file import write_calibration, write_exactly_known
     from ..tracked.filming import Taking, Trouble, mounted, registered, shots_of
@@ -133,7 +133,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _demand_troubles(troubles: Sequence[Trouble], times: np.ndarray) -> None:
-    """Refuse a trouble in which no picture is taken, of those at `times` (F,) [s]: it would change nothing."""
+    """Reject a disturbance that contains none of the frame `times` (F,) [s]: it would have no effect."""
     for each in troubles:
         if not ((each.since <= times) & (times < each.until)).any():
             raise InputError(
@@ -157,7 +157,7 @@ def _scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
 
 
 def _write_film(args: argparse.Namespace, taken: Iterator[Shot], shots: list[Shot], player: Player) -> Path:
-    """Write the pictures, and note what is true of each in `shots`; returns the film, or the folder of pictures."""
+    """Write the images, and append the ground truth of each to `shots`; return the path of the video or folder."""
     from tqdm import tqdm
 
     from ar.screen import Film, write_film

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("anatomy", metavar="ANATOMY.vtu", help="made by `sulcus anatomy` or `sulcus patient`")
+    parser.add_argument("anatomy", metavar="ANATOMY.vtu", help="anatomy from `sulcus anatomy` or `sulcus patient`")
     parser.add_argument(
         "frames", metavar="FRAME.csv", nargs="+",
-        help="what was seen in each frame, in millimetres, RAS: `x,y,z,dx,dy,dz[,sigma]`, as `sulcus locate` reads it. "
+        help="observations of each frame [mm, RAS]: `x,y,z,dx,dy,dz[,sigma]`, as `sulcus locate` reads it. "
         "In a frame without tool some fluid has drained",
     )  # fmt: skip
     parser.add_argument(
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--rigid", type=float, default=0.8, metavar="MM",
-        help="how far all points of a frame may be off together: a standard deviation along each axis "
+        help="standard deviation of the rigid registration error of a frame, per axis [mm] "
         "(default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--locator", metavar="FILE.npz", type=Path,
-        help="as of `sulcus locate`; made where there is none, which takes minutes (default: beside the anatomy)",
+        help="ensemble as for `sulcus locate`; computed in minutes if missing (default: next to the anatomy)",
     )  # fmt: skip
     add_region_argument(parser, REGIONS)
     add_device(parser)
@@ -120,7 +120,7 @@ def _numbers(tissue: FittedTissue, out: Path) -> dict[str, object]:
 
 
 def sentences(tissue: FittedTissue, out: Path) -> list[str]:
-    """What was found, and what was not."""
+    """Describe the fitted parameters, and those that are not determined."""
     low, middle, high = tissue.ratio
     lines = [
         f"The tumour is {middle:.2g} times as stiff as the brain (95 %: {low:.2g} to {high:.2g}).",
@@ -136,12 +136,12 @@ def sentences(tissue: FittedTissue, out: Path) -> list[str]:
 
 
 def fitted_beside(path: Path | None, anatomy: Path, digest: str) -> FittedTissue | None:
-    """The tissue that was asked for by its `path`, or that lies beside an anatomy; None: there is none.
+    """Read the tissue from `path`, or from the file next to an anatomy; None if there is none.
 
     Raises
     ------
     InputError
-        As `load_tissue`; a file that was asked for and is missing.
+        As `load_tissue`; a requested file that is missing.
     """
     from surrogate.fitting.tissue import load_tissue, tissue_path
 

@@ -1,4 +1,4 @@
-"""What stands below each command's help: examples, what to do next, and the scenes that there are."""
+"""Text below each command's help: examples, the next step, and the scenes."""
 
 from __future__ import annotations
 

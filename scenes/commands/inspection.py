@@ -1,4 +1,4 @@
-"""What would be made of a patient's labels, found in seconds: volumes, depth, opening, and what looks wrong."""
+"""Preview of an anatomy from a patient's labels, in seconds: volumes, depth, craniotomy and warnings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SMALL, LARGE = 850.0, 2000.0
 MUCH = 0.25
 # [m] From the opening to the tumour: farther than a press of the cortex moves anything.
 FAR = 0.040
-# Of the longest edge of a voxel to the shortest: beyond, surfaces are stairs along one axis.
+# Ratio of the longest edge of a voxel to the shortest above which surfaces show steps along one axis.
 OBLONG = 2.5
 # Share of the brain that a T1 in the same space covers, at least.
 COVERED = 0.98
@@ -39,7 +39,7 @@ MOST = 4
 
 @dataclass(frozen=True)
 class Inspection:
-    """What is found; lengths in mm, volumes in ml.
+    """Result of an inspection; lengths in mm, volumes in ml.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ class Inspection:
 
 
 def inspected(masks: HeadMasks, subject: Subject, regions: Mapping[int, Tissue]) -> Inspection:
-    """What would be made of `masks` and of the `subject` in them, with tissues of regions by label."""
+    """Inspect `masks` and the `subject` in them, with tissues of regions by label."""
     affine = masks.affine
     edges, voxel = 1e3 * np.linalg.norm(affine[:3, :3], axis=0), 1e6 * abs(float(np.linalg.det(affine[:3, :3])))
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
@@ -155,7 +155,7 @@ def inspected(masks: HeadMasks, subject: Subject, regions: Mapping[int, Tissue])
 
 
 def _tissue(label: int, regions: Mapping[int, Tissue]) -> str:
-    """What a region is made of, in words."""
+    """Describe the tissue of a region."""
     tissue = Elasticity(None, regions).of(label)
     around = "tumour" if label == NECROSIS_LABEL else "brain"
     return f"as stiff as the {around}" if tissue is None else str(tissue)

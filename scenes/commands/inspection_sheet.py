@@ -1,4 +1,4 @@
-"""The picture sheet of an inspection: three slices, the opening as a surgeon sees it, and the numbers."""
+"""Image sheet of an inspection: three slices, the craniotomy as a surgeon sees it, and the numbers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COLOURS: dict[str, Colour] = {
     "left out": (206, 92, 206),
     "opening": (70, 205, 110),
 }
-"""What is drawn in what colour; the later over the earlier."""
+"""Colour of each part; later parts are drawn over earlier ones."""
 CORTEX: Colour = (176, 168, 164)
 # [m] Round the brain; thickness of the opening's line in a slice; share of colour over a scan.
 ROOM, RIND, TINT = 6e-3, 2.2e-3, 0.6
@@ -43,20 +43,20 @@ ROOM, RIND, TINT = 6e-3, 2.2e-3, 0.6
 SHADOW = 0.45
 # Directions of RAS, against and along.
 SIDES = ("LR", "PA", "IS")
-# Of the light on the cortex: from the viewer's upper left.
+# Direction of the light on the cortex: from the viewer's upper left.
 LIGHT = np.array([-0.4, 0.5, 0.77])
 
 
 @dataclass(frozen=True)
 class View:
-    """A square picture of a plane of space.
+    """Square image of a plane in space.
 
     Parameters
     ----------
     name
-        In words.
+        Name of the view.
     right, down
-        Unit vectors (3,) of the picture.
+        Unit vectors (3,) along the image's columns and rows.
     middle
         (3,) [m]: what its middle shows.
     reach

@@ -12,13 +12,13 @@ from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
 from types import FrameType
 
-# What Ctrl-C and SIGTERM make of a command's exit code: a visit's ordinary end, and the shell's word for the other.
+# Exit codes after Ctrl-C (a normal end) and SIGTERM (the shell's code).
 CODES = {signal.SIGINT: 0, signal.SIGTERM: 128 + signal.SIGTERM}
-# The exit code of a command that Ctrl-C stops in its work, and that goes on when it is given again.
+# Exit code of a command that Ctrl-C stops during its work and that can be resumed.
 INTERRUPTED = 128 + signal.SIGINT
-# How long cleaning up may take after a signal [s].
+# Maximum time for cleaning up after a signal [s].
 PATIENCE = 0.3
-# How often the main thread looks for a signal [s]: the system may give one to another thread, which does not wake it.
+# Polling interval of the main thread [s]: a signal may be delivered to another thread, which does not wake it.
 POLL = 0.1
 
 

@@ -16,8 +16,8 @@ from ..options.shared_options import add_json
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("model", metavar="MODEL.npz", help="from `sulcus train`")
-    parser.add_argument("data", metavar="FRESH.h5", help="from `sulcus simulate` on the same mesh, with another --seed")
+    parser.add_argument("model", metavar="MODEL.npz", help="models from `sulcus train`")
+    parser.add_argument("data", metavar="FRESH.h5", help="test loads from `sulcus simulate` on the same mesh, with another --seed")
     add_json(parser)
 
 
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _physics(stated: Mapping[str, str]) -> dict[str, object]:
-    """What bodies must share to be compared, as a file states it: tissue, with that of regions, and element."""
+    """Return the properties that two bodies must share to be compared: tissue, with that of regions, and element."""
     from surrogate.data.answer_rows import BRAIN, stated_tissue
 
     return {"tissue": stated_tissue(stated) if BRAIN in stated else None, "element": stated.get("element")}

@@ -30,21 +30,21 @@ if TYPE_CHECKING:
 
 NAMES = "--tool-name", "--reference-name", "--camera-name", "--registration-name"
 PORT = 18944
-"""That of OpenIGTLink."""
-# So long a signal waits for clients to hear that the server ends [s].
+"""Default port of OpenIGTLink."""
+# Time for notifying clients before the server stops [s].
 FAREWELL = 0.25
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("anatomy", type=Path, metavar="PATIENT.vtu", help="from `sulcus patient` or `sulcus anatomy`")
-    parser.add_argument("--model", type=Path, help="MODEL.npz of a tool's poses (default: PATIENT.model.npz beside it)")
+    parser.add_argument("--model", type=Path, help="model of a pose-controlled tool (default: PATIENT.model.npz next to the anatomy)")
     parser.add_argument(
         "--deformer", metavar="NAME",
-        help="who says how the brain lies under the tool: a model of its poses, guarded, fem or rest. rest: as in the "
+        help="deformation model under the tool: a model of tool poses, guarded, fem or rest. rest: as in the "
         "scan. Default: the best model that knows the tool, else rest",
     )  # fmt: skip
-    parser.add_argument("--host", default="127.0.0.1", help="address to serve on (default %(default)s: this machine)")
+    parser.add_argument("--host", default="127.0.0.1", help="network address of the server (default: %(default)s, this machine only)")
     parser.add_argument("--port", type=int, default=PORT, help="0: any free one (default %(default)s)")
     parser.add_argument(
         "--client",
@@ -52,13 +52,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="hear this server, too, as that of PLUS, and send it nothing; --port is then another one than its own. An "
         "IPv6 address stands in brackets",
     )
-    parser.add_argument("--clients", type=int, default=16, help="how many there may be (default %(default)s)")
+    parser.add_argument("--clients", type=int, default=16, help="maximum number of clients (default: %(default)s)")
     what = "transforms that are heard, in mm; AToB takes places in A's frame to B's; the scan's space is RAS"
     names = parser.add_argument_group(what)
-    names.add_argument("--tool-name", default="StylusTipToReference", help="default %(default)s")
-    names.add_argument("--reference-name", default="ReferenceToTracker", help="for AToTracker (default %(default)s)")
-    names.add_argument("--camera-name", default="CameraToReference", help="default %(default)s")
-    names.add_argument("--registration-name", default="ReferenceToRas", help="the scan's, RAS (default %(default)s)")
+    names.add_argument("--tool-name", default="StylusTipToReference", help="name of the incoming tool transform (default: %(default)s)")
+    names.add_argument("--reference-name", default="ReferenceToTracker", help="name of the incoming reference transform, AToTracker (default: %(default)s)")
+    names.add_argument("--camera-name", default="CameraToReference", help="name of the incoming camera transform (default: %(default)s)")
+    names.add_argument("--registration-name", default="ReferenceToRas", help="name of the incoming scan registration, RAS (default: %(default)s)")
     parser.add_argument(
         "--registration",
         metavar="R.json",
@@ -75,10 +75,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of the tip's place along each axis, which no message says (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--stale", type=float, default=0.3, metavar="S", help="a pose that is older is not known (default %(default)s)"
+        "--stale", type=float, default=0.3, metavar="S", help="maximum pose age [s] (default: %(default)s)"
     )
     parser.add_argument("--camera", metavar="K.yaml", help="from `sulcus calibrate`: IMAGE is drawn into and sent back")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after so long (default: never)")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="exit after this many seconds (default: never)")
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_skull_argument(parser)
     add_element_argument(parser)
@@ -145,7 +145,7 @@ def address_of(text: str) -> tuple[str, int]:
 
 
 def is_ipv6(text: str) -> bool:
-    """Whether a text is an IPv6 address; a zone may follow it after %."""
+    """Return True if a text is an IPv6 address, with or without a %zone."""
     try:
         socket.inet_pton(socket.AF_INET6, text.partition("%")[0])
     except OSError:
@@ -154,7 +154,7 @@ def is_ipv6(text: str) -> bool:
 
 
 def is_here(host: str, served: str) -> bool:
-    """Whether a host is this machine, or the address that is served."""
+    """Return True if a host is this machine, or the server's own address."""
     if host == served:
         return True
     try:
@@ -165,7 +165,7 @@ def is_here(host: str, served: str) -> bool:
 
 
 def _is_own(family: int, address: tuple) -> bool:
-    """Whether a socket of this machine can have an address."""
+    """Return True if a socket of this machine can be bound to an address."""
     with socket.socket(family, socket.SOCK_DGRAM) as tried:
         try:
             tried.bind(address)

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "observed",
         metavar="OBSERVED.csv",
-        help="what was seen, in millimetres, RAS, with a header. `x,y,z,dx,dy,dz`: points in the scan, as of vessels, "
+        help="observations [mm, RAS], with a header. `x,y,z,dx,dy,dz`: points in the scan, as of vessels, "
         "and how they were seen to move; `x,y,z`: a cloud of where the open cortex is now. A last column `sigma` is "
         "each point's error, of what is not rigid (default 0.58)",
     )
@@ -37,24 +37,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--rigid", type=float, default=0.8, metavar="MM",
-        help="how far all points may be off together, as trackers are: a standard deviation along each axis, with a "
+        help="standard deviation of the rigid registration error per axis [mm], with a "
         "rotation in proportion (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--registration-checked", action="store_true",
-        help="it was checked by what does not move, as landmarks of the skull: no slip beyond --rigid is suspected",
+        help="the registration was checked on fixed landmarks: no registration shift beyond --rigid is assumed",
     )  # fmt: skip
     parser.add_argument(
         "--out",
         metavar="RESULT.vtu",
-        help="mean motion, deviation and covariance of every vertex. Left out, the tumour alone is said, for which a "
+        help="file for mean displacement and covariance of every vertex. Without it, only the tumour is reported, for which a "
         "small locator is enough",
     )
     parser.add_argument(
         "--locator",
         metavar="FILE.npz",
         type=Path,
-        help="what is made once for an anatomy; made where there is none, which takes minutes (default: beside it)",
+        help="ensemble of the anatomy; computed in minutes if missing (default: next to the anatomy)",
     )
     add_region_argument(parser, REGIONS)
     add_device(parser, "a locator that is made; without effect where there is one")
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     observation = replace(
         read_observation(args.observed, args.tool), rigid=1e-3 * args.rigid, checked=args.registration_checked
     )
-    placed(anatomy, observation)  # what cannot be placed need not wait for a locator
+    placed(anatomy, observation)  # reject points that cannot be placed before the locator is loaded
     locator = located_by(args, anatomy, small=out is None)
     found = locator.locate(observation)
     if out is not None:
@@ -135,7 +135,7 @@ def _sentences(found: Location, out: Path | None) -> str:
 
 
 def _warnings(found: Location) -> list[str]:
-    """What must be known of an answer beside its numbers, in sentences."""
+    """List remarks that a reader of the result needs, in sentences."""
     said = list(found.warnings)
     if found.slipped:
         said.append("If it was checked, say so by --registration-checked.")
@@ -145,6 +145,6 @@ def _warnings(found: Location) -> list[str]:
 
 
 def rows_left_out(numbers: np.ndarray) -> str:
-    """Which rows of a file were left out, by the numbers (k,) of their points from 0."""
+    """Describe which rows of a file were excluded, by the numbers (k,) of their points from 0."""
     rows = ", ".join(str(number + 2) for number in numbers[:20]) + (" ..." if len(numbers) > 20 else "")
     return f"Left out, off the open cortex or without support by other points: rows {rows} of the file."

@@ -1,4 +1,4 @@
-"""`sulcus locator`: what is made once for an anatomy, so that any number of observations can be answered."""
+"""`sulcus locator`: precompute the ensemble of an anatomy, for any number of observations."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def made(path: Path, anatomy: Anatomy, seed: int, device: str, regions: tuple[Region, ...]) -> Locator:
-    """Make a locator, with a bar of progress; what a stopped run kept beside its `path` is not made again."""
+    """Make a locator, with a bar of progress; parts that an interrupted run left next to `path` are reused."""
     from tqdm import tqdm
 
     from surrogate.locating.causes import Causes
@@ -85,12 +85,12 @@ def made(path: Path, anatomy: Anatomy, seed: int, device: str, regions: tuple[Re
 
 
 def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) -> Locator:
-    """The locator that lies beside the anatomy, or a new one; it knows every vertex, unless it may be `small`.
+    """Load the locator next to the anatomy, or make one; it covers every vertex, unless it may be `small`.
 
     Raises
     ------
     InputError
-        As `load_locator`; a small one; one that knows other regions than those that are asked for.
+        As `load_locator`; a small one; one of other regions than those requested.
     """
     from surrogate.locating.locator_store import load_locator, locator_path, save_locator
     from surrogate.locating.regions import regions_words
@@ -117,7 +117,7 @@ def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) 
 
 
 def regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Region, ...]:
-    """The regions of --region; without it those of which the models beside the anatomy state a tissue.
+    """Return the regions of --region; without it, those with a tissue in the models next to the anatomy.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Region, .
 
 
 def forget_parts(path: Path) -> None:
-    """Remove what was kept beside a locator's path while it was made."""
+    """Remove temporary files next to a locator's path."""
     shutil.rmtree(_parts(path), ignore_errors=True)
 
 

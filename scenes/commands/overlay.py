@@ -1,4 +1,4 @@
-"""`sulcus overlay`: where the tumour is, drawn into a film or into what a camera sees."""
+"""`sulcus overlay`: the tumour drawn into a video or a live camera image."""
 
 from __future__ import annotations
 
@@ -53,36 +53,36 @@ UNSTATED = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
-        "pictures", metavar="FILM|CAMERA", help="a video, a folder of PNG or JPEG pictures, or a camera's number"
+        "pictures", metavar="FILM|CAMERA", help="a video, a folder of PNG or JPEG images, or a camera number"
     )
     parser.add_argument("--camera", required=True, metavar="K.yaml", help="the camera, from `sulcus calibrate`")
     parser.add_argument("--registration", required=True, metavar="R.json", help="the scan's, from `sulcus register`")
-    parser.add_argument("--tool", metavar="TOOL.json", help="the tool with its cube (default: no tool is looked for)")
+    parser.add_argument("--tool", metavar="TOOL.json", help="tool with its marker cube (default: no tool)")
     add_bodies(parser)
     parser.add_argument(
         "--deformer", metavar="NAME",
-        help="who says how the brain lies under the tool: a model of its poses, guarded, fem or rest. rest: as in the "
+        help="deformation model under the tool: a model of tool poses, guarded, fem or rest. rest: as in the "
         "scan. Default: the best model that knows the tool, else rest",
     )  # fmt: skip
-    parser.add_argument("--out", type=Path, metavar="FILM.mp4", help="the film with its overlay: .mp4, .gif or .webp")
-    parser.add_argument("--table", type=Path, metavar="ROWS.csv", help="a row for each picture: state, place, error")
+    parser.add_argument("--out", type=Path, metavar="FILM.mp4", help="video with overlay: .mp4, .gif or .webp")
+    parser.add_argument("--table", type=Path, metavar="ROWS.csv", help="CSV with one row per frame: state, position, error")
     parser.add_argument(
         "--covered", type=Path, metavar="MASKS",
-        help="a video or a folder of PNG masks, one for each picture in order. What is not black lies in front, as "
+        help="video or folder of PNG masks, one per frame in order. Non-black pixels are in front, as "
         "a hand: nothing is drawn over it",
     )  # fmt: skip
     add_style(parser)
-    parser.add_argument("--rate", type=float, default=30.0, help="pictures a second, of a folder (default %(default)s)")
+    parser.add_argument("--rate", type=float, default=30.0, help="frame rate of a folder of images [1/s] (default: %(default)s)")
     parser.add_argument(
-        "--live", action="store_true", help="play the film as a camera would: pictures that come too fast are lost"
+        "--live", action="store_true", help="process the video in real time: frames that arrive too fast are skipped"
     )
-    parser.add_argument("--truth", metavar="TRUTH.npz", help="of `sulcus film`: says how far off the overlay is")
+    parser.add_argument("--truth", metavar="TRUTH.npz", help="ground truth from `sulcus film`: reports the overlay error")
     parser.add_argument(
-        "--page", action="store_true", help="show the film on a page in the browser; a camera has one always"
+        "--page", action="store_true", help="show the video in the browser; a live camera always has a page"
     )
-    parser.add_argument("--port", type=int, default=8080, help="of the page, or the next free (default %(default)s)")
+    parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one (default: %(default)s)")
     add_address(parser)
-    parser.add_argument("--seconds", type=float, default=np.inf, help="end the page after so long (default: never)")
+    parser.add_argument("--seconds", type=float, default=np.inf, help="close the page after this many seconds (default: never)")
     add_poses(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_skull_argument(parser)
@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """What a run is made of."""
+    """Inputs of a run."""
 
     calibration: Calibration
     follower: Follower
@@ -103,12 +103,12 @@ class Parts:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw. Returns 0; 1 if the tumour is drawn as known in no picture.
+    """Draw the overlay; return 0, or 1 if the tumour position is reliable in no frame.
 
     Raises
     ------
     InputError
-        Files that cannot be read, written, or do not belong together; pictures of another size than the camera's.
+        Files that cannot be read, written, or do not belong together; images of another size than the camera's.
     """
     from ..tracked.run import write_rows
     from ..tracked.truth import off, read_truth, summary
@@ -139,7 +139,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
-    """Show a film, or what a camera sees, on a page, until the time is over or a signal comes."""
+    """Show a video or a live camera on a page, until the time is over or a signal arrives."""
     from ar.page.guard import UnguardedError, check_address
 
     from ..tracked.run import write_rows
@@ -197,7 +197,7 @@ def _page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name: str,
 def _ended(
     args: argparse.Namespace, report: dict[str, object], shown: list[Shown], out: Path | None, table: Path | None
 ) -> int:
-    """Print what a run was like; returns 1 if the tumour is drawn as known in no picture."""
+    """Print the summary of a run; return 1 if the tumour position is reliable in no frame."""
     report |= {"out": None if out is None else str(out), "table": None if table is None else str(table)}
     print(json_line(report) if args.json else _words(report))
     return 0 if any(each.known.relied for each in shown) else 1
@@ -210,7 +210,7 @@ def _film_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path
 
 
 def _parts(args: argparse.Namespace, film: bool) -> Parts:
-    """Read what the pictures are looked at with; what is quickly read comes first."""
+    """Read the inputs of a run; those that are read quickly come first."""
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
@@ -252,7 +252,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
 
 
 def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:
-    """Draw all pictures, into a film if one is asked for; returns them without their colours."""
+    """Draw all frames, into a video if requested; return them without their colours."""
     from ar.screen import write_film
     from ar.tracking.pictures import film_of, rate_of
 
@@ -281,7 +281,7 @@ def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Sh
 
 
 def _report(shown: list[Shown], who: str) -> dict[str, object]:
-    """What a run was like, for machines."""
+    """Summarise a run for JSON."""
     from ..tracked.run import latencies
 
     count = len(shown)

@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         required=True,
         type=Path,
-        help="the anatomy, PATIENT.vtu; data (.h5) and models (.model.npz) are put beside it",
+        help="anatomy to write, PATIENT.vtu; data (.h5) and models (.model.npz) are written next to it",
     )
     parser.add_argument(
         "--nodes", type=int, default=5300, help="number of mesh nodes, 2000 to 250000 (default %(default)s)"
@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--inspect",
         action="store_true",
-        help="only show, in seconds, what would be made: numbers, warnings, and the picture PATIENT.inspect.png",
+        help="preview in seconds, without making anything: numbers, warnings, and the image PATIENT.inspect.png",
     )
     parser.add_argument("--count", type=int, default=1000, help="loads to simulate (default %(default)s)")
     parser.add_argument(
@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--learners",
         default="linear,series,series-gp",
-        help="of `sulcus train --help`, with commas (default %(default)s)",
+        help="model types, see `sulcus train --help`, separated by commas (default: %(default)s)",
     )
     add_devices(parser, "loads are simulated on all of these; models are trained on the first. ")
     add_force(parser)
@@ -78,8 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run anatomy, simulate and train; an interrupted run goes on when the same command is given again."""
-    # What can be said now is, not after minutes of reading and meshing.
+    """Run anatomy, simulate and train; the same command resumes an interrupted run."""
+    # Report problems now, not after minutes of reading and meshing.
     plan = MeshPlan(args.nodes, 1e-3 * args.craniotomy, fine_opening=args.fine_opening)
     regions = regions_of(args.region, replace(BRAIN, law=args.material))
     strange = set(regions) - set(REGION_NAMES.values())

@@ -1,4 +1,4 @@
-"""`sulcus register`: how a scan lies beside the patient's reference, from points that were touched, and how surely."""
+"""`sulcus register`: register a scan to the patient's reference from touched points, with covariance."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _stored(fits: PairResiduals) -> dict[str, object]:
-    """How the pairs fit, for machines."""
+    """Summarise the residuals of the pairs for JSON."""
     return {
         "residuals_mm": (1e3 * fits.off).tolist(),
         "left_out_mm": (1e3 * fits.left_out).tolist(),

@@ -1,4 +1,4 @@
-"""`sulcus render`: the frames of a scene as pictures, without display or browser."""
+"""`sulcus render`: the frames of a scene as images, without display or browser."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument("--out", required=True, type=Path, help="folder of frame_0000.png, frame_0001.png, ...")
-    parser.add_argument("--every", type=int, default=1, help="draw one frame in so many (default %(default)s)")
-    parser.add_argument("--film", type=Path, help="also write a film: .mp4, .gif or .webp")
+    parser.add_argument("--every", type=int, default=1, help="render every Nth frame (default: %(default)s)")
+    parser.add_argument("--film", type=Path, help="also write a video: .mp4, .gif or .webp")
     parser.add_argument("--plain", action="store_true", help="leave out the panel of figures")
     add_theatre(parser)
     add_camera(parser)
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw, frame by frame. 1: a frame was answered badly."""
+    """Render frame by frame; return 1 if a frame is unreliable."""
     from tqdm import tqdm
 
     from ..play.scene_costs import labelled

@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--loads",
         type=int,
         metavar="N",
-        help=f"how many loads to compare with the reference (--quick {QUICK[1]}, else {WHOLE[1]})",
+        help=f"number of loads compared with the reference (--quick: {QUICK[1]}, else {WHOLE[1]})",
     )
     add_force(parser)
     add_json(parser)
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _measured(args: argparse.Namespace) -> list[Section]:
-    """The rows of each data set; the page is written anew after each."""
+    """Measure the rows of each data set; rewrite the page after each."""
     from sim.runtime.device import device_names
 
     from ..analysis.measurement import machine

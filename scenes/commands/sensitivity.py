@@ -1,4 +1,4 @@
-"""`sulcus sensitivity`: what else moves the tumour, beside what the surrogate is wrong by."""
+"""`sulcus sensitivity`: influence of modelling choices on the tumour's motion, compared with the surrogate's error."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def _remarks(study: Study, beside: Sequence[str], model: Learned | None, failed: int) -> list[str]:
-    """What a reader of the table must know, in sentences."""
+    """List remarks that a reader of the table needs, in sentences."""
     said = []
     if failed:
         said.append(f"{failed} solves did not converge: they, and what is compared with them, are in no figure.")
@@ -205,7 +205,7 @@ def _remarks(study: Study, beside: Sequence[str], model: Learned | None, failed:
 
 
 def _stated(model: Learned) -> dict[str, Any]:
-    """What a model says of itself."""
+    """Read the reported error of a model."""
     training = model.training
     about = {name: training.get(name, "unknown") for name in ("learner", "preset")}
     return {**about, "element": training.get("element", "p1"), "bound_mm": 1e3 * model.bound}

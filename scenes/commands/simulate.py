@@ -1,4 +1,4 @@
-"""`sulcus simulate`: draw loads of a tool, answer them by finite elements, keep every displacement."""
+"""`sulcus simulate`: sample loads of a tool, solve them by FEM, store every displacement."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "anatomy", nargs="?", metavar="ANATOMY.vtu", help="from `sulcus anatomy`; default: the template"
     )
-    parser.add_argument("--out", required=True, metavar="DATA.h5", help="the data set; an unfinished one goes on")
-    parser.add_argument("--count", type=int, default=2000, help="loads to draw (default %(default)s)")
+    parser.add_argument("--out", required=True, metavar="DATA.h5", help="output data set; resumed if incomplete")
+    parser.add_argument("--count", type=int, default=2000, help="number of loads (default: %(default)s)")
     parser.add_argument(
         "--preset", choices=PRESETS, default="palpation",
         help="the tool. mixed: all of them; seed: the published protocol; brutal: far beyond surgery. "
@@ -70,17 +70,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--capsule or --blade it is a ball of the preset's middle radius",
     )
     shape = parser.add_mutually_exclusive_group()
-    shape.add_argument("--ball", type=float, metavar="MM", help="of this radius [mm] (in the scene palpate 7)")
+    shape.add_argument("--ball", type=float, metavar="MM", help="ball: radius [mm] (7 in the scene palpate)")
     shape.add_argument(
         "--capsule",
         type=float,
         nargs=2,
         metavar=("RADIUS", "LENGTH"),
-        help="a round rod, as a dissector or a closed bipolar: radius, and length of its straight part [mm]",
+        help="round rod, such as a dissector or a closed bipolar: radius and length of its straight part [mm]",
     )
     shape.add_argument(
         "--blade", type=float, nargs=3, metavar=("WIDTH", "LENGTH", "EDGE"),
-        help="a flat blade: sizes, and radius of its edge [mm] (in the scene retract 12 26 1.5)",
+        help="flat blade: width, length and edge radius [mm] (12 26 1.5 in the scene retract)",
     )  # fmt: skip
     add_seed(parser)
     add_tissue_arguments(parser)
@@ -91,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--batch",
         type=int,
-        help=f"loads solved together (default: as many as fit, {widest}; a file that goes on keeps its own)",
+        help=f"loads solved together (default: as many as fit, {widest}; a resumed file keeps its own)",
     )
     add_devices(parser)
     add_force(parser)

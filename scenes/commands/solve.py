@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", required=True, help=".vtu in metres with point data `displacement` [m]; not the mesh itself"
     )
-    # What the file says: who compares with another program means its constraints.
+    # The constraints of the file, for comparisons with other programs.
     add_skull_argument(parser, ("slide", "bonded", "contact"))
     add_force(parser)
     parser.add_argument("--explain", action="store_true", help="say first which solvers are tried, in which order")

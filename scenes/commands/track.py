@@ -1,4 +1,4 @@
-"""`sulcus track`: where the tool and the patient's reference are in every picture of a calibrated camera."""
+"""`sulcus track`: poses of the tool and the patient's reference in every frame of a calibrated camera."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from sim.errors import InputError
 from ..options.outputs import add_force, claimed
 from ..options.shared_options import add_json, json_line
 
-# What may be followed, and in whose frame.
+# Tracked bodies, and coordinate systems of their poses.
 BODIES, FRAMES = ("tool", "patient", "board", "camera"), ("camera", "patient", "board")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "pictures", type=Path, metavar="VIDEO|FOLDER", help="a video, or a folder of PNG or JPEG pictures by name"
+        "pictures", type=Path, metavar="VIDEO|FOLDER", help="a video, or a folder of PNG or JPEG images in order of name"
     )
     parser.add_argument("--camera", required=True, metavar="K.yaml", help="the camera, from `sulcus calibrate`")
-    parser.add_argument("--out", required=True, metavar="POSES.csv", help="a row for each picture")
-    parser.add_argument("--body", choices=BODIES, default="tool", help="what is followed (default %(default)s)")
+    parser.add_argument("--out", required=True, metavar="POSES.csv", help="CSV with one pose per frame")
+    parser.add_argument("--body", choices=BODIES, default="tool", help="tracked body (default: %(default)s)")
     parser.add_argument(
         "--frame", choices=FRAMES, default="camera",
-        help="whose frame the poses are in; patient, board: these must be seen, too (default %(default)s)",
+        help="coordinate system of the poses; patient and board must be visible (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--tip", type=float, nargs=3, metavar=("X", "Y", "Z"),
         help="the tool's tip in the frame of its cube [mm], from `sulcus calibrate --pivot` (default 0 0 -150)",
     )  # fmt: skip
-    parser.add_argument("--rate", type=float, default=30.0, help="pictures a second, of a folder (default %(default)s)")
+    parser.add_argument("--rate", type=float, default=30.0, help="frame rate of a folder of images [1/s] (default: %(default)s)")
     add_json(parser)
     add_force(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Returns 0 when every picture was looked at; 1 if the body was certain in none.
+    """Track every frame; return 0, or 1 if the body is certain in none.
 
     Raises
     ------
     InputError
-        Pictures or a camera that cannot be read; pictures of another size or focal length than the camera's. A rate
+        Images or a camera that cannot be read; images of another size or focal length than the camera's. A rate
         that is not above 0, a body in its own frame.
     """
     from ar.tracking.targets import TIP

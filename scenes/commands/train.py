@@ -32,13 +32,13 @@ from ..options.shared_options import add_devices, add_json
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("data", metavar="DATA.h5", help="from `sulcus simulate`; nothing else is needed")
-    parser.add_argument("--out", required=True, metavar="MODEL.npz", help="the models, all in one file")
+    parser.add_argument("--out", required=True, metavar="MODEL.npz", help="file for all models")
     parser.add_argument(
         "--learners",
-        help=f"which of {', '.join(LEARNERS)}, or of poses {', '.join(OF_POSES)}, separated by commas (default: "
+        help=f"model types, from {', '.join(LEARNERS)}, or for poses {', '.join(OF_POSES)}, separated by commas (default: "
         "all that the data can train)",
     )
-    parser.add_argument("--most", type=int, metavar="LOADS", help="train on at most so many loads (default: all)")
+    parser.add_argument("--most", type=int, metavar="LOADS", help="maximum number of training loads (default: all)")
     add_devices(parser, "where finite elements make the series; of a list the first. ")
     add_force(parser)
     add_json(parser)
@@ -85,7 +85,7 @@ def asked_learners(words: str) -> list[str]:
 
 
 def notes_on(data: Dataset, learners: Sequence[str]) -> list[str]:
-    """What takes long, and what too few loads cannot give, in sentences."""
+    """List notes on slow parts and on results that need more loads, in sentences."""
     notes, good = [], int(data.good.sum())
     expanded = [name for name in learners if name in EXPANDED]
     if expanded:
@@ -134,7 +134,7 @@ def _calibration(trained: Trained) -> str:
 
 
 def _stated(model: Learned) -> dict[str, object]:
-    """What a model says of itself, beside its score."""
+    """Describe the model's own reported errors, next to its score."""
     known = off_by(model)
     discs = None if known.left_out is None else asdict(known.left_out)
     return {"bound_mm": 1e3 * known.bound, "discs": discs, "weak": known.weak}

@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
     parser.add_argument(
-        "--draws", type=int, default=40, help=f"bodies to draw and solve, {FEWEST} or more (default %(default)s)"
+        "--draws", type=int, default=40, help=f"number of sampled bodies to solve, >= {FEWEST} (default: %(default)s)"
     )
     parser.add_argument(
         "--twins",
@@ -52,14 +52,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--tissue", type=Path, metavar="FILE.json",
-        help="tissue fitted by `sulcus fit`, from which bodies are drawn in place of priors (default: "
+        help="tissue fitted by `sulcus fit`, sampled instead of the priors (default: "
         "MESH.tissue.json beside the anatomy, where there is one)",
     )  # fmt: skip
     add_seed(parser, "the draws")
     add_device(parser, "finite elements")
     parser.add_argument(
         "--out", type=Path, metavar="FILE.json",
-        help="where scenes are added (default: MESH.uncertainty.json beside the anatomy, where `sulcus demo` reads it)",
+        help="file to which scenes are added (default: MESH.uncertainty.json next to the anatomy, where `sulcus demo` reads it)",
     )  # fmt: skip
     add_json(parser)
 

@@ -89,7 +89,7 @@ def as_json(report: Report) -> dict[str, object]:
 
 
 def lines(reports: list[Report], broken: list[Report]) -> list[str]:
-    """What is wrong with which file, what could not be looked at, and figures of all that are whole."""
+    """Format the faults of each file, the files that could not be checked, and statistics of all complete ones."""
     said = [f"{report.path}: {problem}" for report in broken for problem in report.problems]
     said = [
         *said[:MOST_SAID],

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..warp.moment import Moment
 
 ORDERS = ("linear", "cubic")
-# A push harder than this [N], or so far off the open cortex [mm], is a slip of the keyboard.
+# Largest accepted push [N], and distance from the open cortex [mm]: more is a typing error.
 HARDEST, FARTHEST = 20.0, 20.0
 
 
@@ -43,10 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--located", type=Path, metavar="RESULT.vtu",
         help="a result of `sulcus locate`, whose covariance gives the tumour's bound, or of `sulcus solve`",
     )  # fmt: skip
-    parser.add_argument("--frame", type=int, metavar="K", help="which moment of --scene")
+    parser.add_argument("--frame", type=int, metavar="K", help="frame number of --scene")
     parser.add_argument(
         "--sequence", type=int, metavar="EVERY",
-        help="also write the forward field of one frame in so many of the whole scene, for Slicer to play",
+        help="also write the forward field of every Nth frame of the scene, as a sequence for Slicer",
     )  # fmt: skip
     parser.add_argument(
         "--image", type=Path, nargs="+", action="extend", default=[], metavar="T1.nii.gz",
@@ -55,16 +55,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_axes(parser)
     parser.add_argument(
         "--labels", type=Path, nargs="+", action="extend", default=[], metavar="LABELS.nii.gz",
-        help="label maps, likewise: no label is mixed with another",
+        help="label maps in the same space; resampled with nearest neighbour",
     )  # fmt: skip
     parser.add_argument(
-        "--interpolation", choices=ORDERS, default=ORDERS[0], help="between voxels of images (default %(default)s)"
+        "--interpolation", choices=ORDERS, default=ORDERS[0], help="interpolation of images (default: %(default)s)"
     )
     parser.add_argument(
         "--spacing", type=float, metavar="MM",
-        help="of the fields' nodes, 0.3 to 5 mm (default: 1, or finer until tumour and landmarks are within 0.05 mm)",
+        help="grid spacing of the fields, 0.3 to 5 mm (default: 1, or finer until tumour and landmarks are within 0.05 mm)",
     )  # fmt: skip
-    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="new folder for all that is written")
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="new output folder")
     add_trajectory(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
@@ -82,7 +82,7 @@ def load(text: str) -> tuple[float, float, float, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve, write, say. 1: the answer did not converge, or space folds; all is written nevertheless."""
+    """Solve, write and report; return 1 if the solution did not converge or the field folds (all is written nevertheless)."""
     from tqdm import tqdm
 
     from sim.runtime.atomic_files import written_folder
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def demand_options(args: argparse.Namespace) -> None:
-    """Refuse options that do not go together, or are out of range.
+    """Reject options that conflict or are out of range.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def scene_of(args: argparse.Namespace, theatre: Theatre) -> Scene:
 
 
 def pushing(theatre: Theatre, asked: tuple[float, float, float, float]) -> Scene:
-    """The scene of a round tool that pushes on the open cortex at X, Y, Z [mm, RAS] with so many newton.
+    """Return the scene of a round tool that pushes on the open cortex at X, Y, Z [mm, RAS] with a force [N].
 
     Raises
     ------
@@ -223,7 +223,7 @@ def moments(
 
 
 def sentences(report: dict, out: Path) -> str:
-    """What is said of a warp, from its figures."""
+    """Format the summary of a warp."""
     error, bound = report["grid_error_mm"], report["bound_mm"]
     lines = [
         f"Moved by: {report['moved_by']}. The largest displacement is {report['largest_displacement_mm']:.2f} mm.",

@@ -38,7 +38,7 @@ from .half_made import DATA, TABLE, forget, gone_on
 from .plan import NO_LEARNER, Bodies, Plan, digest_beside, fields_of, ratio_of
 from .run_folder import BODIES, versions_here
 
-# Drawn tumours may reach out of the brain, or an opening have too few nodes: so many are tried.
+# Maximum number of sampled tumours: one may leave the brain, or its craniotomy have too few nodes.
 TRIES = 6
 PRESET = "palpation"
 TOGETHER = 512
@@ -55,20 +55,20 @@ class Body:
 
     @property
     def anatomy(self) -> Path:
-        """Its anatomy; the scan and the model lie beside it."""
+        """Path of its anatomy; scan and model are next to it."""
         return self.folder / ANATOMY
 
     @property
     def tissue(self) -> Elasticity:
-        """What it is made of."""
+        """Tissue of the body."""
         return tissue_of(self.drawn)
 
     def effects(self, *more: Effect, lets_go: bool = False) -> tuple[Effect, ...]:
-        """What holds it, and what else acts; a skull that `lets_go` does so whatever was drawn."""
+        """Return the effects: constraints, skull and others; with `lets_go`, the skull separates whatever was sampled."""
         return (self.tissue, Held(), SKULLS["contact" if lets_go else self.drawn["bodies.tissue.skull"]], *more)
 
     def theatre(self, device: str) -> Theatre:
-        """Who can play on it, as files have it.
+        """Open the body with its models, as its files have them.
 
         Raises
         ------
@@ -96,13 +96,13 @@ def _ratio(region: str) -> str:
 
 
 def _of_regions_in(values: Mapping[str, Any], anatomy: Anatomy) -> dict[str, Any]:
-    """What was drawn, without the stiffness of regions that an anatomy does not have."""
+    """Return the sampled values without the stiffness of regions that an anatomy does not have."""
     absent = {_ratio(name) for name, label in PART_LABELS.items() if not anatomy.mesh.within(label).any()}
     return {name: value for name, value in values.items() if name not in absent}
 
 
 def drawn_body(bodies: Bodies, seed: int, number: int, attempt: int = 0) -> dict[str, Any]:
-    """What is drawn for a body by name; another `attempt` draws the tumour anew."""
+    """Sample the values of a body by name; another `attempt` samples another tumour."""
     found: dict[str, Any] = {}
     for table, values, again in (
         ("bodies", bodies, 0), ("bodies.tissue", bodies.tissue, 0), ("bodies.tumour", bodies.tumour, attempt),
@@ -187,7 +187,7 @@ def _anatomy(plan: Plan, seed: int, number: int) -> tuple[Anatomy, Intensity | N
 
 
 def _shipped(body: Body, anatomy: Anatomy) -> bool:
-    """Whether the model that ships knows this body."""
+    """Return True if the shipped model applies to this body."""
     if body.drawn["bodies.anatomies"] != "template":
         return False
     models = load(model_path(template_path()), anatomy)
@@ -230,10 +230,10 @@ MOST_SAID = 10
 
 
 def models_of(folder: Path) -> dict[int, OffBy]:
-    """How far off the models of a folder's bodies are, by number; bodies without a model of their own are left out."""
+    """Read the reported errors of the models of a folder's bodies, by number; bodies without a model are excluded."""
     found = {}
     for path in sorted((folder / BODIES).glob("[0-9]*")):
-        with suppress(InputError, ValueError):  # what has no model, or none that can be read, plays nothing
+        with suppress(InputError, ValueError):  # bodies without a readable model play nothing
             found[int(path.name)] = min(stated_errors(model_path(path / ANATOMY)).values(), key=lambda one: one.bound)
     return found
 
@@ -244,7 +244,7 @@ def weak_of(models: Mapping[int, OffBy]) -> dict[int, OffBy]:
 
 
 def said_of_weak(models: Mapping[int, OffBy]) -> list[str]:
-    """Which models are weak, and by how much, in sentences; none where none is."""
+    """Describe the weak models and their errors, in sentences; empty if there is none."""
     weak = weak_of(models)
     if not weak:
         return []

@@ -34,7 +34,7 @@ def datasets_of(file: h5py.File) -> list[h5py.Dataset]:
 
 
 def digest_of_file(file: h5py.File) -> str:
-    """Hexadecimal digits of all attributes and of the data sets' checksums, as they are stated."""
+    """Return the hexadecimal digest of all attributes and of the data sets' recorded checksums."""
     found = sha256()
     for item in (file, *datasets_of(file)):
         for name in sorted(item.attrs):
@@ -55,7 +55,7 @@ def seal(file: h5py.File) -> None:
 
 
 def broken(file: h5py.File) -> list[str]:
-    """What is not as it was written, in words; nothing of a file without checksums."""
+    """List the differences from the recorded checksums; empty for a file without checksums."""
     if SUM not in file.attrs:
         return []
     found = [

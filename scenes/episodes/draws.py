@@ -12,7 +12,7 @@ from sim.errors import InputError
 
 
 class Spread(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a number or a word is spread; just one of `uniform`, `log`, `normal` and `choice` is given.
+    """Distribution of a number or a word; exactly one of `uniform`, `log`, `normal` and `choice` is given.
 
     Parameters
     ----------

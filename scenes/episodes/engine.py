@@ -24,19 +24,19 @@ from .tasks import Made, Outcome, Work, attempted
 from .workers import MOST_DEATHS, Workers, scheduler_ended
 
 RETRIES = 3
-"""How often a task that raises an error is tried again."""
+"""Number of retries of a task that raises an error."""
 AHEAD = 3
 """Episodes handed out for each worker: one is made while others wait, so that none is idle."""
 POLL = 1.0
-"""How often workers are counted [s]."""
+"""Interval between counts of the workers [s]."""
 EPISODE, BODY = "episode", "body"
 """Kinds of tasks."""
 GRACE = 60
-"""How long before its end a job hears of it [s]."""
+"""Warning time before the end of a job [s]."""
 
 
 class Heard(Protocol):
-    """Who hears of each task that ends, and how many workers there are; nothing ended where `outcome` is None."""
+    """Callback for each finished task, with the number of workers; `outcome` is None if no task finished."""
 
     def __call__(self, kind: str, outcome: Outcome | None, workers: int) -> object:
         """Take note."""
@@ -45,7 +45,7 @@ class Heard(Protocol):
 
 @dataclass(frozen=True)
 class Tally:
-    """What a run has done: episodes made now, there before, failed for good, lost for now; frames and bytes made."""
+    """Statistics of a run: episodes made now, present before, failed permanently, lost for now; frames and bytes made."""
 
     made: int = 0
     skipped: int = 0
@@ -67,9 +67,9 @@ class Tally:
 def still_missing(
     folder: Path, found: Set[int], numbers: range, first_client: bool, again: bool = False
 ) -> tuple[Tally, list[int]]:
-    """What is there of some episodes or has failed for good, and what is missing, in the order of its turn.
+    """Count episodes that exist or have failed permanently, and list the missing ones in their order of execution.
 
-    The first client goes upwards. Who comes later goes in a random order, so that two in one folder seldom make the
+    The first client takes them in ascending order. Later clients use a random order, so that two in one folder seldom make the
     same episode at the same time. If they do, one writes over the other's file the same bytes.
 
     Parameters
@@ -174,16 +174,16 @@ def _drained(ended: SimpleQueue[Future]) -> list[Future]:
 def _outcomes(
     futures: Sequence[Future], workers: Workers, ended: SimpleQueue[Future]
 ) -> Iterator[tuple[Future, Outcome]]:
-    """What came of tasks that ended; those whose worker took its answer with it will end once more."""
+    """Collect the results of finished tasks; those whose worker died with its result will finish again."""
     for future in futures:
         if future.status == "error":
             yield future, Outcome(0, failed=_reason(future.exception()), lost=True)
             continue
-        try:  # not for long, as the worker that is to answer may have to be started again
+        try:  # briefly, as the worker may have to be restarted
             outcome = future.result(timeout=POLL)
         except TimeoutError:
             future.add_done_callback(ended.put)
-        except CancelledError as error:  # what a client makes of all when its scheduler is gone
+        except CancelledError as error:  # state of all futures when the scheduler is gone
             raise scheduler_ended(workers.where) from error
         else:
             yield future, outcome
@@ -196,9 +196,9 @@ def _reason(error: object) -> str:
 
 
 def sbatch_script(command: Sequence[str], machines: int, device: str, name: str) -> str:
-    """A script for `sbatch`: an array of jobs that work in one folder and need no word with each other.
+    """Return a script for `sbatch`: an array of jobs that work in one folder without communication.
 
-    A job that ends early is queued again and goes on. No port is opened between machines.
+    A job that ends early is queued again and continues. No port is opened between machines.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""A scene as one episode in HDF5: what the camera saw, what the tool did, and where the tumour went.
+"""A scene as one episode in HDF5: camera images, tool poses and forces, and the tumour's motion.
 
-Patient space is RAS [m]; the camera frame is OpenCV's (x right, y down, z forward). Read a picture with
+Patient space is RAS [m]; the camera frame is OpenCV's (x right, y down, z forward). Read an image with
 `cv2.imdecode(file["pictures/colour"][i], cv2.IMREAD_COLOR)`. Attributes say what each data set is, what solved it, and
 with which tissue, element and tool: `finite_elements` gives them in words, `tissue` and `element` for a program.
 """
@@ -44,7 +44,7 @@ DEPTH_SCALE = 1e-5
 """Metres in one step of the 16-bit depth; 0 where nothing is seen."""
 JPEG_QUALITY = 95
 PIXEL_BYTES = 1.5
-"""Of all pictures of a frame together, packed: 0.9 to 1.0 in the scenes `press` and `draw`."""
+"""Compressed size of all images of a frame [bytes per pixel]: 0.9 to 1.0 in the scenes `press` and `draw`."""
 MEANINGS = {
     "pictures/colour": "JPEG bytes: what the camera sees, BGR when decoded by OpenCV",
     "pictures/colour_right": "JPEG bytes: what the right eye of a stereo pair sees",
@@ -107,14 +107,14 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Recording:
-    """What of a scene is written.
+    """Settings of what is written of a scene.
 
     Parameters
     ----------
     solved_every
-        Finite elements solve every so many frames; None: they play, and their answers are taken as they are.
+        FEM solves every Nth frame; None: FEM plays the scene, and its solutions are stored directly.
     overlay
-        Whether the picture with the overlay is kept too.
+        Whether the image with the overlay is stored too.
     dated
         Whether the date and wall times are kept: without them the same scene gives the same bytes.
     grain
@@ -149,9 +149,9 @@ def collect(
     solved: Callable[[int], object] = lambda more: None,
     recording: Recording = WHOLE,
 ) -> dict[str, object]:
-    """Play a scene and write its episode; the file appears whole or not at all. Returns what it holds.
+    """Play a scene and write its episode, whole or not at all; return its contents.
 
-    `progress` passes the frames on as they are drawn; `solved` hears how many more the finite elements have answered.
+    `progress` passes the frames on as they are drawn; `solved` receives the number of newly solved frames.
 
     Raises
     ------
@@ -185,7 +185,7 @@ def collect(
 
 
 def encoded(frame: Frame, player: Player, recording: Recording, right: Stage | None) -> dict[str, np.ndarray]:
-    """The frame's pictures as compressed bytes, by name; `right` draws for the right eye, if there is one."""
+    """Encode the frame's images, by name; `right` renders the right eye, if there is one."""
     picture = frame.picture
     tumour = player.stage.at(frame.loads).tumour(player.believed(frame))
     mask = silhouette(frame.camera, tumour.vertices, tumour.triangles, player.stage.device)
@@ -214,7 +214,7 @@ def _right(player: Player, frame: Frame) -> Camera:
 
 
 def motion(frame: Frame, player: Player, dated: bool = True) -> dict[str, np.ndarray | float | str]:
-    """What is not a picture, by name; the seconds that it took if it is `dated`."""
+    """Return all values except images, by name; with computing times if `dated`."""
     nodes, cortex = player.site.anatomy.tumour_nodes, cortex_of(player)
     right = player.scene.viewpoint.eye == "left"
     return {
@@ -243,7 +243,7 @@ def cortex_of(player: Player) -> np.ndarray:
 
 
 def held(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, np.ndarray | float]:
-    """Where the tool is, and what the picture says of its distance to the tumour; NaN where it says nothing."""
+    """Return the tool's pose and the printed distance to the tumour; NaN if none is printed."""
     return {
         "T_world_tool": pose,
         "tip": tip,
@@ -253,7 +253,7 @@ def held(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, np.ndarra
 
 
 def felt(answer: Deformation) -> dict[str, np.ndarray]:
-    """What a tool that is moved exerts, where the deformer knows it."""
+    """Return the force of a pose-controlled tool, if the deformation model provides it."""
     if not answer.reaction.shape[1]:
         return {}
     return {"reaction_predicted": answer.reaction[0], "reaction_bound": answer.reaction_bound[:, 0]}
@@ -265,7 +265,7 @@ def number(value: float | None) -> float:
 
 
 def caused(loads: Loads) -> dict[str, np.ndarray]:
-    """What each cause of one load case is, by name."""
+    """Return the values of each cause of one load case, by name."""
     found: dict[str, np.ndarray] = {}
     for cause in loads.causes:
         match cause:
@@ -285,7 +285,7 @@ def caused(loads: Loads) -> dict[str, np.ndarray]:
 def write_motion(
     file: h5py.File, player: Player, rows: list[dict], numbers: np.ndarray, truth: Deformation | None, how: Recording
 ) -> dict[str, int]:
-    """Write what is not a picture, one row per frame, and the finite elements' answers; returns their outcomes.
+    """Write all values except images, one row per frame, and the FEM solutions; return their outcomes.
 
     `truth` has one row for each frame in `numbers` (F,); None: the rows themselves are the finite elements'.
     """
@@ -324,7 +324,7 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, r
         file.create_dataset("distortion", data=camera.lens.coefficients)
     for name, unit in UNITS.items():
         for place in (name, f"pictures/{name}"):
-            if place in file:  # what no frame has is not written
+            if place in file:  # values that no frame has are not written
                 file[place].attrs["unit"] = unit
     for name, meaning in MEANINGS.items():
         if name in file:

@@ -30,14 +30,14 @@ class Amount:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What episodes will take.
+    """Estimated cost of a run.
 
     Parameters
     ----------
     episodes, bodies
-        That are asked for.
+        Requested numbers.
     measured, measured_bodies
-        From which that is known.
+        Numbers on which the estimate is based.
     seconds, frames, bytes
         Of one process that has started [s], frames, and bytes, of all episodes and their bodies.
     start, opening
@@ -59,15 +59,15 @@ class Estimate:
     apart: bool
 
     def lasts(self, processes: int) -> Amount:
-        """How long so many processes take [s]."""
+        """Return the duration [s] with a number of processes."""
         each = self.episodes / processes
-        further = self.bodies * -np.expm1(-each / self.bodies) - 1.0  # bodies that so many episodes of one meet
+        further = self.bodies * -np.expm1(-each / self.bodies) - 1.0  # bodies that the episodes of one process use
         parts = (self.start, 1.0), (self.opening, max(0.0, further)), (self.seconds, 1.0 / processes)
         return _added([Amount(part.mean * by, part.error * by) for part, by in parts if np.isfinite(part.mean)])
 
 
 def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
-    """What a number of episodes on a number of bodies will take, as those that were measured.
+    """Estimate the cost of a number of episodes on a number of bodies from measured ones.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
 
 
 def _longer(first: Sequence[Rate], others: Sequence[Rate]) -> Amount:
-    """How much longer the one take than the others, in the mean [s]; of one alone, all of that may be an error."""
+    """Return the mean extra time of the one compared with the others [s]; for a single one, all of it may be noise."""
     if not (first and others):
         return Amount(np.nan, np.nan)
     one, other = (_mean([rate.seconds for rate in those]) for those in (first, others))
@@ -115,7 +115,7 @@ def _mean(values: Sequence[float]) -> Amount:
 
 
 def _sum(values: Sequence[float], count: int) -> Amount:
-    """Of `count` as these, whose mean is known to its standard error only; exactly where all were measured."""
+    """Return the total of `count` such values with the standard error of their mean; exact if all were measured."""
     mean = _mean(values)
     return Amount(count * mean.mean, 0.0 if len(values) >= count else count * mean.error)
 

@@ -20,13 +20,13 @@ from ..script.tool_paths import Path, Touch, draw, idle, lay, palpate, press, sl
 from .draws import Limits, Number
 
 PRONY = RELAXING.prony
-"""How tissue relaxes under a spatula."""
+"""Relaxation of tissue under a spatula."""
 # A hand rests on its way between two places for this share of it.
 REST = 0.3
 
 
 class Motion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How often a family is taken, beside the weights of the others."""
+    """Weight of a family, relative to the others."""
 
     weight: Annotated[float, Limits(0, 100_000)] = 1.0
 
@@ -59,7 +59,7 @@ class Draw(Pushing, frozen=True):
 
 
 class Reach(Pushing, frozen=True):
-    """Touch several places in turn, with minimum jerk between them."""
+    """Touch several places one after the other, with minimum jerk between them."""
 
     places: Annotated[Number, Limits(2, 12)] = (2.0, 5.0)
 
@@ -122,18 +122,18 @@ class Motions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Act:
-    """What happens in an episode.
+    """Scenario of an episode.
 
     Parameters
     ----------
     path, tool, lying, surgery
         As of a `Scene`.
     effects
-        What acts beside the tissue, what is held, and the skull.
+        Effects beyond tissue, constraints and skull.
     relaxes
         Whether the tissue does.
     lets_go
-        Whether the skull lets go of the brain, whatever the body's skull does otherwise.
+        Whether the brain may separate from the skull, whatever the body's skull does otherwise.
     """
 
     path: Path = idle
@@ -147,9 +147,9 @@ class Act:
 
 @dataclass(frozen=True)
 class Chance:
-    """What an act is made of: values that were drawn, random numbers, how long it lasts [s], how far it may go [m].
+    """Inputs of a scenario: sampled values, random numbers, duration [s], reach [m].
 
-    `reach` is how far from the middle of the open cortex a tool of a radius [m] may go.
+    `reach` is the largest distance of a tool of a radius [m] from the centre of the open cortex.
     """
 
     values: Mapping[str, Any]
@@ -272,7 +272,7 @@ FAMILIES: dict[str, Callable[[Chance], Act]] = {
     "press": pressed, "slide": slid, "draw": drawn_aside, "reach": reach, "walk": walk, "palpate": palpated,
     "retract": retracted, "drain": drained, "debulk": debulked,
 }  # fmt: skip
-"""What each family of `Motions` does."""
+"""Scenario of each family of `Motions`."""
 
 
 def trembling(path: Path, seed: int, place: float, force: float) -> Path:

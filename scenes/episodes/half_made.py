@@ -1,4 +1,4 @@
-"""What a half-made body has solved for its model: whoever makes it next goes on with that.
+"""Solved loads of an unfinished body: the next process that makes it resumes them.
 
 Each process makes a body in a hidden folder of its own, and copies what others have of the same body. So there are no
 locks: records of loads prove themselves (`sim.runtime.journal`), those of who is at work just now, too.
@@ -18,18 +18,18 @@ from sim.runtime.partial_files import unfinished_path
 DATA = "training.h5"
 """The loads that a body's model is trained on, until it is trained."""
 NOTE, TABLE = ".json", ".series.npz"
-"""Endings of what lies beside it: of which loads it is; and the table of their series, where the learner has one."""
+"""Endings of companion files: the loads; and the series table, if the learner has one."""
 
 
 def gone_on(data: Path, stated: Mapping[str, str], others: Sequence[Path]) -> bool:
-    """See that a data set and its table go on with the most that any like it has; tell if that is any.
+    """Resume a data set and its table from the most complete copy; return True if there is one.
 
-    They are looked for in its own folder and in `others`.
+    Copies are searched in its own folder and in `others`.
 
     Parameters
     ----------
     stated
-        All that decides its bytes: what states something else is none.
+        All inputs that determine its bytes; files with other inputs are ignored.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def _copy(source: Path, target: Path) -> None:
     if source == target:
         return
     with (
-        suppress(FileNotFoundError),  # of a maker who is done with it by now
+        suppress(FileNotFoundError),  # from a process that has finished with it
         source.open("rb") as file,
         written_whole(target, target.suffix, sweep=False) as partial,
         partial.open("wb") as copy,
@@ -64,7 +64,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def begun(folder: Path) -> bool:
-    """Whether a folder holds what was solved for a body."""
+    """Return True if a folder contains solved loads of a body."""
     return any(path.exists() for path in _files(folder / DATA)[1:])
 
 
@@ -82,7 +82,7 @@ def forget(data: Path) -> None:
 
 
 def _files(data: Path) -> tuple[Path, ...]:
-    """What says of which loads a data set is; the part of it that is solved; the whole; the table."""
+    """Return the paths of the description of the loads, the solved part, the complete data set, and the table."""
     return data.with_suffix(NOTE), unfinished_path(data), data, data.with_suffix(TABLE)
 
 
@@ -93,7 +93,7 @@ def _is_of(data: Path, said: str) -> bool:
 
 
 def _kept(data: Path) -> Iterator[tuple[bool, int, Path]]:
-    """Whether a file of a data set is all of it, its bytes, and its name."""
+    """Return whether a file is the complete data set, its size, and its name."""
     for path in (data, unfinished_path(data)):
         with suppress(OSError):
             yield path == data, path.stat().st_size, path

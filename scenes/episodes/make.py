@@ -36,7 +36,7 @@ QUANTILES = ndtri((np.arange(256) + 0.5) / 256)
 
 
 def noisy(colour: np.ndarray, deviation: float, random: np.random.Generator) -> np.ndarray:
-    """A picture (H, W, 3) uint8 with normal noise of so many grey levels, alike in every pixel and colour.
+    """Return an image (H, W, 3) uint8 with Gaussian noise [grey levels], independent of pixel and colour.
 
     The noise has 256 values, each as probable: quantiles of the normal law. They are quicker to draw by far, and fit
     into a byte up to a deviation of 40.
@@ -58,7 +58,7 @@ def jittered(poses: np.ndarray, metres: float, radians: float, random: np.random
 
 
 def sensed(columns: Mapping[str, Any], noise: Mapping[str, float], seed: int, number: int) -> dict[str, np.ndarray]:
-    """What sensors read of an episode's columns: `force_read`, and both poses as tracked."""
+    """Return the measured columns of an episode: `force_read`, and both tracked poses."""
     found: dict[str, np.ndarray] = {}
     if "force" in columns:
         force = np.asarray(columns["force"])
@@ -89,15 +89,15 @@ def body_path(folder: Path, number: int) -> Path:
 
 
 def body_of(plan: Plan, seed: int, number: int) -> int:
-    """Which body an episode is played on."""
+    """Return the number of the body of an episode."""
     return drawn_body_of(plan.contents, seed, number)
 
 
 def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "auto") -> Made:
-    """Make a body, unless it is there; what cannot be made is said in `Made.failed`.
+    """Make a body, unless it exists; a failure is reported in `Made.failed`.
 
-    It is made under another name, so that a folder of its name is whole. Who comes second
-    throws his own away: both are alike. Loads that somebody has solved for it before are not solved again.
+    It is made under another name, so that a folder of its name is whole. A second
+    process discards its own copy: both are equal. Loads that were solved before are not solved again.
     """
     path = body_path(folder, number)
     if (path / ABOUT).is_file():
@@ -121,7 +121,7 @@ def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "a
 
 
 def make_episode(folder: Path, plan: Plan, seed: int, number: int, device: str = "auto") -> Made:
-    """Make an episode, unless it is there; its body must be. What cannot be made is said in `Made.failed`.
+    """Make an episode, unless it exists; its body must exist. A failure is reported in `Made.failed`.
 
     Loads without equilibrium fail no episode: their frames say so in `outcome_predicted` and `outcome_fem`.
     """

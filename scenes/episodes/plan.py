@@ -35,7 +35,7 @@ SHIPPED = Path(__file__).parent.parent / "data" / "plans"
 NO_LEARNER = "none"
 """The learner of bodies on which finite elements play."""
 MOST_BYTES = 200_000
-"""Of a plan's text: every episode holds it."""
+"""Largest size of a plan's text, which every episode contains."""
 FIXED = "fixed"
 """The path of a camera that stays."""
 
@@ -59,7 +59,7 @@ def _within(table: str, key: str) -> str:
 
 
 def _named(words: str) -> str:
-    """What was expected, with kinds by their names."""
+    """Format the expected types by their names."""
 
     def kinds(found: re.Match) -> str:
         names = [one.strip() for one in str(found[1]).split("|")]
@@ -81,7 +81,7 @@ class Tumour(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Tissue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a body is made of, and what the skull does to it."""
+    """Tissue and skull model of a body."""
 
     law: Annotated[Word, LAWS] = "neo-hookean"
     young_pa: Annotated[Number, Limits(100, 50_000, "Pa")] = 3000.0
@@ -94,17 +94,17 @@ class Tissue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Learner(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the model of a body is trained: which learner, on how many loads. `name` "none": finite elements play."""
+    """Training of a body's model: learner and number of loads. `name` "none": FEM plays."""
 
     name: Annotated[str, (NO_LEARNER, *LEARNERS)] = "series-gp"
     loads: Annotated[int, Limits(40, 100_000)] = 200
 
 
 class Bodies(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The bodies that episodes are played on: so many, drawn once from the seed.
+    """Bodies of the episodes: their number; sampled once from the seed.
 
     `anatomies`: "drawn", the template's brain with a tumour and an opening that are drawn; "template", the anatomy
-    that ships; or an own .vtu, beside the plan.
+    that ships; or an own .vtu, next to the plan.
     """
 
     count: Annotated[int, Limits(1, 100_000)] = 1
@@ -133,7 +133,7 @@ class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What sensors add; standard deviations of an episode."""
+    """Sensor noise; standard deviations of an episode."""
 
     grey_levels: Annotated[Number, Limits(0, 40, "grey levels")] = 0.0
     force_n: Annotated[Number, Limits(0, 1, "N")] = 0.0
@@ -144,7 +144,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Hand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The hand's tremor, beside what it means to do: as standard deviations."""
+    """Tremor of the hand, added to the intended motion: standard deviations."""
 
     tremor_mm: Annotated[Number, Limits(0, 3, "mm")] = 0.0
     tremor_n: Annotated[Number, Limits(0, 0.1, "N")] = 0.0
@@ -211,7 +211,7 @@ def load_plan(name: str) -> Plan:
         that is not there.
     """
     path = Path(name) if name.endswith(".toml") else SHIPPED / f"{name}.toml"
-    if not os.path.isfile(path):  # which answers for any name
+    if not os.path.isfile(path):  # which accepts any name
         raise InputError(
             f"no plan is called {name!r}: choose {', '.join(shipped())}, or name a file of your own, .toml."
         )
@@ -260,7 +260,7 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> Plan:
 
 
 def fields_of(table: msgspec.Struct) -> list[tuple[str, object, Limits | None, tuple[str, ...]]]:
-    """Of every field that may be drawn: name, value, limits of a number, and words that are known."""
+    """List every field that may be sampled: name, value, limits of a number, and known words."""
     found = []
     for name, (kind, about) in _kinds_of(type(table)).items():
         if kind in (Number, Word):
@@ -270,7 +270,7 @@ def fields_of(table: msgspec.Struct) -> list[tuple[str, object, Limits | None, t
 
 
 def fixed_of(table: msgspec.Struct) -> list[tuple[str, float, Limits]]:
-    """Of every number that is fixed: name, value and limits; one for each number of a pair."""
+    """List every fixed number: name, value and limits; one entry for each number of a pair."""
     found = []
     for name, (kind, about) in _kinds_of(type(table)).items():
         if kind != Number and isinstance(about, Limits):
@@ -280,7 +280,7 @@ def fixed_of(table: msgspec.Struct) -> list[tuple[str, float, Limits]]:
 
 
 def _kinds_of(table: type[msgspec.Struct]) -> dict[str, tuple[object, Limits | tuple[str, ...] | None]]:
-    """Of every field: what it may be, and its limits, or the words that are known."""
+    """List every field: its types, and its limits or known words."""
     hints = get_type_hints(table, include_extras=True)
     return {name: get_args(kind)[:2] if get_origin(kind) is Annotated else (kind, None) for name, kind in hints.items()}
 
@@ -329,12 +329,12 @@ def ratio_of(region: str) -> str:
 
 
 def _own_anatomies(contents: Contents) -> list[str]:
-    """What is named as the anatomies of bodies, but for those of ours."""
+    """List the named anatomies of bodies, except the built-in ones."""
     return sorted(_anatomies(contents) - {"drawn", "template"})
 
 
 def _anatomies(contents: Contents) -> set[str]:
-    """What is named as the anatomies of bodies."""
+    """List the named anatomies of bodies."""
     choices = contents.bodies.anatomies
     named = choices.choice if isinstance(choices, Spread) else [choices] if isinstance(choices, str) else choices
     return {str(each) for each in named or ()}

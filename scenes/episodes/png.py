@@ -1,4 +1,4 @@
-"""Grey pictures as PNG, by ISA-L: four times as fast as zlib for depth, ten times for labels, and no larger."""
+"""Grey images as PNG, by ISA-L: four times as fast as zlib for depth, ten times for labels, and no larger."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ LEVEL = 1
 
 
 def png(picture: np.ndarray) -> np.ndarray:
-    """A grey picture (H, W) uint8 or uint16 as the bytes (n,) uint8 of a PNG file.
+    """Encode a grey image (H, W) uint8 or uint16 as the bytes (n,) uint8 of a PNG file.
 
-    ISO/IEC 15948: one IDAT chunk, and the filter Sub in all rows. The same picture gives the same bytes.
+    ISO/IEC 15948: one IDAT chunk, and the filter Sub in all rows. The same image gives the same bytes.
     """
     height, width = picture.shape
     bits = 8 * picture.itemsize

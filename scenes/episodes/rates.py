@@ -1,4 +1,4 @@
-"""What tasks took: kept beside the episodes and never in them, whose bytes are the same whoever makes them."""
+"""Duration of tasks: stored next to the episodes and never in them, whose bytes do not depend on the machine."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Rate:
 
 @contextmanager
 def written_rates(folder: Path) -> Iterator[Callable[[str, Outcome], None]]:
-    """What writes down each task that was done, and not in part before, into a file of this process alone.
+    """Yield a function that records each completed task, unless it was resumed, in a file of this process.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""The state of a run on disk: whose folder it is, which episodes are there, which failed.
+"""State of a run on disk: its settings, finished and failed episodes.
 
 The folder is the state, and nothing else is: an episode is made if its file is there, and a file appears whole.
-Whoever works in the folder needs no word with others. Two that make the same episode write the same bytes.
+Processes that work in the folder do not communicate. Two that make the same episode write the same bytes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from sim.runtime.versions import version_of
 
 FORMAT = "sulcus run 1"
 PLAN, RUN, FAILED, BODIES, RATES = "plan.toml", "run.json", "failed", "bodies", "rates"
-"""What a folder holds beside its episodes."""
+"""Files of a folder other than its episodes."""
 EPISODE = re.compile(r"episode_(\d{6,})\.(?:h5|json)")
 PARTS = ("h5py", "numpy", "scipy", "sulcus", "warp-lang")
 """Packages whose version is part of an episode's bytes."""
@@ -30,14 +30,14 @@ PARTS = ("h5py", "numpy", "scipy", "sulcus", "warp-lang")
 
 @dataclass(frozen=True)
 class Run:
-    """Whose folder it is: all that decides the bytes of an episode, but for its number.
+    """Settings of a run: all that determines the bytes of an episode, except its number.
 
     Parameters
     ----------
     plan, digest
         Name of the plan, and the digest of its text.
     device
-        "cpu" or "cuda": answers of one differ from the other's in their last digits.
+        "cpu" or "cuda": solutions on one differ from the other's in the last digits.
     versions
         Of the packages in `PARTS`.
     """
@@ -70,9 +70,9 @@ def episode_name(number: int) -> str:
 
 
 def begin(folder: Path, run: Run, text: str, force: bool = False) -> bool:
-    """Make a folder a run's own, or find that it is; tell whether no other run was there before.
+    """Initialise the folder of a run, or open it; return True if it is new.
 
-    What dead processes left of unfinished files is removed; of a body that is not there yet it stays, to go on with.
+    Unfinished files of dead processes are removed; those of an unfinished body stay, to be resumed.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def begin(folder: Path, run: Run, text: str, force: bool = False) -> bool:
     if not (folder / PLAN).exists():
         with written_whole(folder / PLAN, ".toml") as partial:
             partial.write_text(text)
-    try:  # of clients that come at once one is the first
+    try:  # the first of simultaneous clients wins
         (folder / RATES).mkdir()
     except FileExistsError:
         return False
@@ -109,7 +109,7 @@ def begin(folder: Path, run: Run, text: str, force: bool = False) -> bool:
 
 
 def read_run(folder: Path) -> Run | None:
-    """Whose folder it is, if it is one's.
+    """Read the settings of the run of a folder, if it has one.
 
     Raises
     ------
@@ -146,8 +146,8 @@ def failed(folder: Path) -> set[int]:
 
 
 def failure_of(folder: Path, number: int) -> Failure | None:
-    """Why an episode could not be made; None where it is there by now, or that cannot be read."""
-    with suppress(OSError, ValueError, TypeError):  # of another client, who removes it just now
+    """Read the reason why an episode failed; None if it exists by now, or if the reason cannot be read."""
+    with suppress(OSError, ValueError, TypeError):  # another client is removing it
         return Failure(**json.loads(_failed_path(folder, number).read_text()))
     return None
 

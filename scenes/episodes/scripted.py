@@ -1,4 +1,4 @@
-"""What an episode of a plan is: drawn from the seed and its number alone, and made into a scene."""
+"""Episodes of a plan: sampled from the seed and the episode's number alone, and converted to scenes."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ SECOND = -0.3
 
 @dataclass(frozen=True)
 class Drawn:
-    """What is drawn for an episode.
+    """Sampled values of an episode.
 
     Parameters
     ----------
     body
         Number of its body.
     family
-        Of its motion, by name.
+        Family of its motion, by name.
     values
         All numbers and words by their names in the plan.
     """
@@ -58,7 +58,7 @@ def drawn_body_of(contents: Contents, seed: int, number: int) -> int:
 
 
 def drawn_episode(contents: Contents, seed: int, number: int) -> Drawn:
-    """What is drawn for an episode: from the seed and its number alone, each value by its own name."""
+    """Sample the values of an episode from the seed and its number alone, each by its own name."""
     named = contents.motion.named
     weights = np.array([motion.weight for motion in named.values()])
     family = list(named)[int(random_of(seed, number, "family").choice(len(named), p=weights / weights.sum()))]
@@ -73,12 +73,12 @@ def drawn_episode(contents: Contents, seed: int, number: int) -> Drawn:
 
 
 def scene_of(plan: Plan, body: Body, site: Site, asked: Drawn, seed: int, number: int) -> Scene:
-    """The scene of an episode on a body.
+    """Build the scene of an episode on a body.
 
     Raises
     ------
     InputError
-        What no scene can be: a tumour of too few tetrahedra for its shares, a lens that folds the picture.
+        An impossible scene: a tumour of too few tetrahedra for its shares, a lens that folds the image.
     """
     contents, seconds = plan.contents, asked.values["seconds"]
     chance = Chance(asked.group(f"motion.{asked.family}"), random_of(seed, number, "motion"), seconds, site.reach)
@@ -121,7 +121,7 @@ def _viewpoint(contents: Contents, look: Mapping[str, Any], seed: int, number: i
     if look["bent"] == 0.0:
         return view
     focal = 0.5 * height / np.tan(0.5 * view.fov)
-    # Of a picture's half diagonal: the bend is that of its corners, whatever the field of view.
+    # Distortion at the image corners, relative to half its diagonal, for any field of view.
     corner = float(np.hypot(width, height) / (2.0 * focal)) ** 2
     bent = look["bent"] / corner
     middle = 0.5 * (width - 1), 0.5 * (height - 1)

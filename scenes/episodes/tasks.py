@@ -1,4 +1,4 @@
-"""What a worker does: one body or one episode, and what came of it in words and numbers."""
+"""Tasks of a worker: one body or one episode, and their outcome."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from sim.runtime.threads import one_thread
 from .run_folder import Run, read_run, unlike, versions_here
 
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
-"""What no other episode gets round."""
+"""Errors that every other episode would meet too."""
 FIRST = OF_PROCESS, OF_BODY, LATER = "process", "body", "no"
 """The first of its kind by a process; the first on its body by that process; neither."""
 
 
 @dataclass(frozen=True)
 class Made:
-    """What became of an episode, or of a body.
+    """Outcome of making an episode or a body.
 
     Parameters
     ----------
     path
         Its file, or its folder.
     frames, bytes
-        How many it has, and how large it is.
+        Number of frames, and size.
     failed
-        Why there is none; empty where there is.
+        Reason of a failure; empty on success.
     skipped
-        Whether it was there before.
+        Whether it existed before.
     resumed
         Whether a part of it was.
     """
@@ -50,14 +50,14 @@ class Made:
 
 @dataclass(frozen=True)
 class Work:
-    """What is made: functions of modules, so that workers find them, and partial functions of these.
+    """Functions that make bodies and episodes: module-level, so that workers can import them, or partial functions of these.
 
     Parameters
     ----------
     body_of
         The number of the body that an episode needs.
     make_body, make_episode
-        Make the one of a number, or find it there.
+        Make the one of a number, or find the existing one.
     """
 
     body_of: Callable[[int], int]
@@ -67,20 +67,20 @@ class Work:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one task.
+    """Outcome of one task.
 
     Parameters
     ----------
     seconds
-        That it took.
+        Duration.
     failed
-        Why there is none.
+        Reason of a failure.
     lost
-        Whether another run may have more luck.
+        Whether another run may succeed.
     skipped
-        Whether it was there.
+        Whether the result existed.
     halt
-        Why nothing else can be made either.
+        Reason why no other task can succeed.
     resumed
         Whether a part of it was there.
     first
@@ -100,7 +100,7 @@ class Outcome:
 
 
 class _Process:
-    """What this process has made; and whether its card has failed, so that all that it would answer may be wrong."""
+    """State of this process: what it has made, and whether its GPU has failed, so that its results are unreliable."""
 
     made: ClassVar[set[object]] = set()
     spoilt = False
@@ -142,7 +142,7 @@ def attempted(make: Callable[[int], Made], number: int, folder: Path, run: Run, 
 
 
 def _unfit(folder: Path, run: Run) -> str:
-    """Why this worker can make nothing of the run; empty if it can."""
+    """Return the reason why this worker cannot take part in the run; empty if it can."""
     here = platform.node()
     other = unlike(versions_here(), run.versions)
     if other:

@@ -1,4 +1,4 @@
-"""Who makes the episodes: processes of this machine, or those that a running scheduler has.
+"""Workers that make episodes: processes of this machine, or those of a running scheduler.
 
 Dask's own nanny gives up on a worker that is killed while it starts.
 """
@@ -23,20 +23,20 @@ from sim.errors import InputError
 from sim.runtime.processes import card_variables, start_process
 
 HERE = "127.0.0.1"
-"""Where a scheduler and workers of our own listen: nobody outside this machine reaches them."""
+"""Address of our own scheduler and workers: not reachable from outside this machine."""
 CARD = "GPU"
-"""What a worker with a card of its own offers, by Dask's custom."""
+"""Resource of a worker with its own GPU, by Dask's convention."""
 ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""One thread a process: as many processes as cores, and the same sums whoever adds them."""
+"""One thread per process: as many processes as cores, and reproducible sums."""
 MOST_DEATHS = 20
-"""How often a task may see its worker end before it is given up: machines are taken back at any time."""
+"""Number of lost workers after which a task is given up: machines may be taken back at any time."""
 SETTINGS = {
     "distributed.scheduler.allowed-failures": MOST_DEATHS,
     "distributed.scheduler.worker-ttl": None,  # clocks jump, as after sleep; who ends is seen by its process
-    "distributed.scheduler.http.routes": [],  # what they serve asks for no keys
+    "distributed.scheduler.http.routes": [],  # their services need no keys
 }
 PATIENCE = 10.0
-"""How long a scheduler may take to answer [s]."""
+"""Time-out of a scheduler [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +50,9 @@ class _Started:
 def started_processes(
     address: str, security: Security, devices: Sequence[str], starts: int
 ) -> Iterator[Callable[[], None]]:
-    """Workers of the scheduler at an address, one for each device, killed at the end; gives what tends them.
+    """Start workers of the scheduler at an address, one for each device, killed at the end; yield a restart function.
 
-    Whoever calls that now and then has those started again that ended.
+    Call it regularly: it restarts workers that ended.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def started_processes(
 
     try:
         yield tend
-    finally:  # nobody waits for what they compute just then
+    finally:  # their current results are not needed
         for one in crew:
             one.process.kill()
         for one in crew:
@@ -85,7 +85,7 @@ def started_processes(
 
 
 def quiet_dask() -> None:
-    """Let Dask print no notes of its own: what matters of them is said in our sentences."""
+    """Silence Dask's own notes: relevant ones are reported in our messages."""
     for name in ("distributed", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
@@ -119,7 +119,7 @@ def _serve(address: str, security: Security, resources: dict[str, float] | None,
 
 
 async def _work(address: str, security: Security, resources: dict[str, float] | None, connected: Any) -> None:
-    # Without a limit: a worker that is paused near its share of memory never goes on, as its memory is not Dask's.
+    # Without a limit: a worker that is paused near its share of memory never resumes, as its memory is not Dask's.
     settings = {"nthreads": 1, "host": HERE, "memory_limit": 0, "resources": resources, "dashboard": False}
     async with Worker(address, security=security, **settings) as worker:
         connected.send_bytes(b"yes")
@@ -149,11 +149,11 @@ class Workers:
 
     @property
     def needs(self) -> Mapping[str, int] | None:
-        """What a task asks of a worker."""
+        """Resources that a task requires of a worker."""
         return {CARD: 1} if self.device == "cuda" else None
 
     def count(self) -> int:
-        """How many there are now.
+        """Return the current number of workers.
 
         Raises
         ------
@@ -213,7 +213,7 @@ def scheduled_workers(address: str, device: str, patience: float = PATIENCE) -> 
     device
         "cpu", "cuda", or "auto": cuda if one of them offers a card just now.
     patience
-        How long the scheduler may take to answer [s].
+        Time-out of the scheduler [s].
 
     Raises
     ------
@@ -237,7 +237,7 @@ def scheduled_workers(address: str, device: str, patience: float = PATIENCE) -> 
 
 @contextmanager
 def _environment() -> Iterator[None]:
-    """What Dask sets in the environment ends with the block."""
+    """Restore the environment variables that Dask sets, at the end of the block."""
     before = dict(os.environ)
     try:
         yield
@@ -247,5 +247,5 @@ def _environment() -> Iterator[None]:
 
 
 def scheduler_ended(where: str) -> InputError:
-    """What is said when a scheduler is gone."""
+    """Return the error of a lost scheduler."""
     return InputError(f"{where}: their scheduler ended. What is finished stays; the same command goes on.")

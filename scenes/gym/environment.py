@@ -26,7 +26,7 @@ from .touched import Asked
 
 RENDERED = ("rgb_array",)
 METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(1.0 / SECONDS)}
-"""What Gymnasium asks of every environment."""
+"""Render modes, as Gymnasium requires."""
 
 
 def opened(
@@ -56,7 +56,7 @@ class Operation(gymnasium.Env):
     anatomy, physics, device, size, model
         As `open_setting`.
     observation
-        "states", or "rgbd": pictures too.
+        "states", or "rgbd": with images.
     render_mode
         "rgb_array", or None.
 
@@ -114,7 +114,7 @@ class Operation(gymnasium.Env):
         return self._observed(step), step.reward, step.terminated, False, step.info
 
     def render(self) -> np.ndarray | None:
-        """What the camera sees (H, W, 3) uint8; None without a render mode.
+        """Return the camera image (H, W, 3) uint8; None without a render mode.
 
         Raises
         ------
@@ -138,7 +138,7 @@ class Operations(VectorEnv):
     Parameters
     ----------
     num_envs
-        How many.
+        Number of environments.
     max_episode_steps
         After so many steps an episode is cut short.
     task, anatomy, observation, physics, device, size, render_mode
@@ -229,7 +229,7 @@ class Operations(VectorEnv):
         return self._observed(steps), rewards, terminated, truncated, self._infos(steps)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """What each camera sees (H, W, 3) uint8; None without a render mode."""
+        """Return the image (H, W, 3) uint8 of each camera; None without a render mode."""
         if self.render_mode is None:
             return None
         return tuple(self.pictures.drawn([episode.seen for episode in self.episodes])[0])
@@ -252,12 +252,12 @@ class Operations(VectorEnv):
 
 
 def many(task: str, count: int, processes: bool = False, **given: Any) -> VectorEnv:
-    """So many environments of a task, as `gymnasium.make_vec` makes them.
+    """Make `count` environments of a task, as `gymnasium.make_vec` does.
 
     Parameters
     ----------
     processes
-        Whether each has a process of its own. Children begin anew, for what holds a card cannot be forked: a script
+        Whether each has a process of its own. Children are spawned, because a process that uses a GPU cannot be forked: a script
         that asks for them needs `if __name__ == "__main__":`.
     given
         Other arguments of `Operation`.

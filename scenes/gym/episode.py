@@ -19,27 +19,27 @@ from .tool_motion import Hand, frame_of, laid, lever_of, moved, trembling
 from .touched import Asked, Touched
 
 STEP, OVER_LIMIT, DONE, ENDED = 0.01, 0.5, 10.0, -10.0
-"""A step costs, a step over a limit costs, success brings, and the end at a limit brings so much."""
+"""Rewards of a step, of a step over a limit, of success, and of the end at a limit."""
 SHARE = 3.0
-"""What each share that is cut brings."""
+"""Reward of each share that is cut."""
 FAR, NEAR = 0.03, 0.01
 """Distances [m] beyond which all count alike, and that count 1."""
-# A hand trembles by up to so much [m, standard deviation]; tools begin so far above the cortex, and so far aside [m].
+# Largest standard deviation of the tremor [m]; initial height of tools above the cortex, and lateral distance [m].
 TREMOR, ABOVE, ASIDE = 1e-4, (5e-3, 8e-3), (3e-3, 8e-3)
-# The fluid falls within so many steps.
+# Steps within which the fluid falls.
 DRAINS = 60
 
 
 @dataclass(frozen=True)
 class Judged:
-    """How far an episode is from its goal.
+    """Distance of an episode from its goal.
 
     Parameters
     ----------
     away
-        Of the tool from its place [m].
+        Distance of the tool from its place [m].
     off
-        Of what is reached from what is asked for, as a share of that.
+        Relative difference between the reached and the requested amount.
     cut
         Shares of the tumour that are cut.
     load
@@ -53,7 +53,7 @@ class Judged:
 
     @property
     def potential(self) -> float:
-        """What a policy climbs: its differences are rewarded."""
+        """Potential whose differences are rewarded."""
         return SHARE * self.cut - min(self.away, FAR) / NEAR - min(self.off, 1.0)
 
 
@@ -67,7 +67,7 @@ def earned(before: Judged, now: Judged, success: bool, ended: bool) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What a step brought: the state (24,), its reward, whether the episode is over, and the truth."""
+    """Result of a step: state (24,), reward, end of the episode, and ground truth."""
 
     states: np.ndarray
     reward: float
@@ -77,7 +77,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """What is left to chance in an episode: goal, first posture, the tremor's seed and its size [m]."""
+    """Random values of an episode: goal, initial pose, seed and size of the tremor [m]."""
 
     goal: Goal
     hand: Hand
@@ -153,7 +153,7 @@ class Episode:
 
     @property
     def seen(self) -> Seen:
-        """What a picture shows.
+        """View of the episode for images.
 
         Raises
         ------
@@ -165,7 +165,7 @@ class Episode:
         return self.touched, self.actual.pose(self.setting.task.tool), self.shown
 
     def take(self, touched: Touched) -> Step:
-        """What a step brought, by the tissue's answer."""
+        """Return the result of a step from the tissue's response."""
         assert self.drawn is not None
         task, goal, self.shown = self.setting.task, self.drawn.goal, self.done
         target = self._target(touched)
@@ -184,7 +184,7 @@ class Episode:
         return Step(self._states(touched), reward, success or ended, self._truth(touched, target, success))
 
     def _target(self, touched: Touched) -> np.ndarray:
-        """Where the tool should be (3,) [m]: over the goal's place, or at the next share where it is now."""
+        """Target position of the tool (3,) [m]: above the goal, or at the next share where it is now."""
         planned = self._planned()
         return planned if self.share is None else planned + touched.motion[self.share].mean(axis=0)
 
@@ -195,7 +195,7 @@ class Episode:
         return shares[min(self.cut, len(shares) - 1)] if shares else None
 
     def _planned(self) -> np.ndarray:
-        """Where the tool should be by the scan (3,) [m]."""
+        """Target position of the tool in the scan (3,) [m]."""
         assert self.drawn is not None
         nodes = self.setting.site.anatomy.mesh.nodes
         return self.drawn.goal.place if self.share is None else nodes[self.share].mean(axis=0)
@@ -214,7 +214,7 @@ class Episode:
         return Judged(away, abs(self._reached(touched) - goal.amount) / goal.amount, 0, load)
 
     def _reached(self, touched: Touched) -> float:
-        """The force [N], the shift [m], or the shares so far, that a goal's amount is held against."""
+        """Return the force [N], the shift [m], or the shares cut, which are compared with the goal's amount."""
         assert self.drawn is not None
         if self.setting.task.cuts:
             return float(self.cut)
@@ -236,7 +236,7 @@ class Episode:
         return states(task, planned, tracked, sensed, time, done, self.frame, self.setting.site.origin)
 
     def _truth(self, touched: Touched, target: np.ndarray, success: bool) -> dict[str, Any]:
-        """What no robot has: see the docs. Arrays are new in each step."""
+        """Return ground truth that no robot has (see the docs). Arrays are new in each step."""
         assert self.judged is not None and self.drawn is not None
         setting = self.setting
         tumour = setting.site.anatomy.tumour_nodes

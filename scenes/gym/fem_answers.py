@@ -44,7 +44,7 @@ class PosedElements:
     together: bool = False
 
     def answer(self, asked: Sequence[Asked]) -> list[Touched]:
-        """As `Answers.answer`; those whose episode begins are a batch of their own."""
+        """Solve as `Answers.answer`; environments at the start of an episode form a separate batch."""
         found: dict[int, Touched] = {}
         begin = [row for row, each in enumerate(asked) if each.last is None]
         going = [row for row, each in enumerate(asked) if each.last is not None]
@@ -76,9 +76,9 @@ def _stacked(starts: Sequence[Deformation]) -> Deformation:
     return starts[0] if len(starts) == 1 else joined(starts)
 
 
-# Levels of the fluid that are solved, as a share of its height; between them answers are interpolated.
+# Solved fluid levels, relative to its height; solutions in between are interpolated.
 APART = 0.1
-# Healthy tissue is looked for so far [m] from the way to the tumour, and from the tumour.
+# Distance [m] from the corridor and from the tumour within which healthy tissue is considered.
 AROUND = 0.03
 
 
@@ -112,7 +112,7 @@ class CutElements:
     _surfaces: dict[int, Healthy] = field(default_factory=dict)
 
     def answer(self, asked: Sequence[Asked]) -> list[Touched]:
-        """As `Answers.answer`: what others asked before changes nothing, for levels are solved in one order."""
+        """Solve as `Answers.answer`; earlier requests have no influence, because levels are solved in one order."""
         return [self._touched(each) for each in asked]
 
     def _touched(self, asked: Asked) -> Touched:
@@ -128,7 +128,7 @@ class CutElements:
         return Touched(motion, np.arange(len(motion)), force, self.ball.pressure(size), good)
 
     def _at(self, level: int, done: int) -> Deformation:
-        """The answer so many levels below the scan's, from the one above; after more steps, from that after fewer."""
+        """Return the solution at a fluid level, started from the level above; after more steps, from that after fewer."""
         key = level, done
         if key not in self._solved:
             start = None
@@ -141,7 +141,7 @@ class CutElements:
         return self._solved[key]
 
     def _force(self, pose: np.ndarray, done: int, motion: np.ndarray) -> np.ndarray:
-        """That the ball exerts on healthy tissue (3,) [N]."""
+        """Force (3,) [N] of the ball on healthy tissue."""
         healthy, nodes = self._healthy(done), self.site.anatomy.mesh.nodes
         radius = self.ball.radius
         middle = pose[:3, 3] + radius * pose[:3, 2]
@@ -154,7 +154,7 @@ class CutElements:
         return -float(self.ball.force(np.array(radius - distance))) * outward
 
     def _healthy(self, done: int) -> Healthy:
-        """After so many steps."""
+        """Return the remaining body after a number of steps."""
         if done not in self._surfaces:
             self._surfaces[done] = self._near(done)
         return self._surfaces[done]

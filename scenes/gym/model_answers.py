@@ -21,7 +21,7 @@ from surrogate.model.learned import Learned
 from ..script.site import Site
 from .touched import Asked, Touched
 
-# How near to its depth a ball must come [m], and within how many tries.
+# Tolerance of the ball's depth [m], and maximum number of iterations.
 NEAR, TRIES = 1e-5, 12
 # Times the strongest force of the training, beyond which none is looked for.
 STRONGEST = 1.5
@@ -61,7 +61,7 @@ class Hertz:
         return 1.5 * force / (np.pi * float(self.contact(np.array(force))) ** 2) if force > 0.0 else 0.0
 
     def deeper(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-        """How much deeper [m] the ball's middle is than that of a wider footprint (k,) [m] under the same forces (k,).
+        """Return the extra depth [m] of the ball's centre compared with a wider footprint (k,) [m] under the same forces (k,).
 
         The middle of a footprint sqrt(1 - (s/a)^2) sinks by 3 F / (4 E' a).
         """
@@ -71,7 +71,7 @@ class Hertz:
 
 @dataclass(frozen=True, eq=False)
 class PressedModel:
-    """Finds the force under which the model has the cortex just where the ball is.
+    """Search for the force under which the predicted cortex touches the ball.
 
     The force acts at the place of the cortex at rest that is nearest to the ball's middle, straight away from that. The
     footprint is as wide as the contact of `Hertz`. Where the model knows only wider ones, the ball is deeper by what
@@ -99,13 +99,13 @@ class PressedModel:
         return open_patch(self.site.anatomy)
 
     def answer(self, asked: Sequence[Asked]) -> list[Touched]:
-        """As `Answers.answer`."""
+        """Predict as `Answers.answer`."""
         poses = np.stack([each.pose for each in asked])
         parts = [poses] if self.together else np.split(poses, len(poses))
         return [touched for part in parts for touched in self._answered(part)]
 
     def _answered(self, poses: np.ndarray) -> list[Touched]:
-        """Of tools at poses (B, 4, 4), all at once."""
+        """Predict tools at poses (B, 4, 4) together."""
         near = indented(Loads((Touching(poses[:, None]),)), Ball(self.ball.radius), self._patch)
         depth = np.linalg.norm(near.force, axis=1)
         inward = np.divide(near.force, depth[:, None], out=np.zeros_like(near.force), where=depth[:, None] > 0.0)
@@ -132,13 +132,13 @@ class PressedModel:
         return np.clip(self.ball.contact(size), *self.model.envelope.footprint)
 
     def _forces(self, point: np.ndarray, inward: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """By secants: forces (k,) [N] at points (k, 3), and whether each brings a ball to its depth (k,) [m]."""
+        """Find forces (k,) [N] at points (k, 3) by the secant method, and whether each brings a ball to its depth (k,) [m]."""
         patch, rows = self._patch, np.arange(len(depth))
         place = closest(point, patch.points[patch.triangles])
         corners, most = patch.triangles[place.triangle], STRONGEST * self.model.envelope.force[1]
 
         def off(size: np.ndarray) -> np.ndarray:
-            """How much deeper than it is a ball would be under forces (k,) [m]."""
+            """Return the signed depth error (k,) [m] of the ball under each trial force."""
             moved = self.model.deform(self._loads(point, inward, size), at=patch.nodes).displacement
             there = np.einsum("kc,kci,ki->k", place.weights, moved[rows[:, None], corners], inward)
             return there + self.ball.deeper(size, self._footprint(size)) - depth
@@ -151,14 +151,14 @@ class PressedModel:
             if near.all():
                 break
             slope = np.where(near, np.inf, now - short) / np.where(near | (size == before), 1.0, size - before)
-            # What is found stays: what is answered beside it changes nothing.
+            # Converged entries stay: others in the batch have no influence.
             before, short, size = size, now, np.where(near, size, np.clip(size - now / slope, 0.0, most))
         return size, np.abs(off(size)) < NEAR
 
 
 @dataclass(frozen=True, eq=False)
 class PosedModel:
-    """Asks a model of the tool's poses for motion, force and bound; a blade goes on from where it was.
+    """Prediction of motion, force and bound by a model of tool poses; a blade continues from its last state.
 
     The pressure under a ball is that of Hertz under its force; under a blade it is the highest of `tool_pressure`.
 
@@ -174,7 +174,7 @@ class PosedModel:
     ball: Hertz | None
 
     def answer(self, asked: Sequence[Asked]) -> list[Touched]:
-        """As `Answers.answer`, one after the other. Where the model refuses a pose, tissue stays, and is not good."""
+        """Predict as `Answers.answer`, one by one. If the model rejects a pose, the tissue stays and is marked unreliable."""
         return [self._answered(each.pose, each.last) for each in asked]
 
     def _answered(self, pose: np.ndarray, last: Touched | None) -> Touched:

@@ -1,4 +1,4 @@
-"""What a robot has of an episode: poses as tracked, forces as read, the plan's goal, and pictures."""
+"""Observations of a robot: tracked poses, measured forces, the planned goal, and images."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from .tasks import Goal, Task
 from .tool_motion import Hand
 
 KINDS = ("states", "rgbd")
-"""What observations may be."""
+"""Kinds of observations."""
 LENGTH = 0.01
-"""What is 1 in an observation [m]."""
+"""Length that is 1 in an observation [m]."""
 LONG = 10.0
-"""What is 1 in an observation [s]: as long as an episode may last."""
+"""Time that is 1 in an observation [s]: the longest episode."""
 TRACKED, FELT, SEEN = 1e-4, 2e-3, 2e-4
 """Standard deviations of a tracked place [m], a force's component [N], and a seen motion of the cortex [m]."""
 BOUND = 10.0
@@ -21,7 +21,7 @@ BOUND = 10.0
 COUNT = 24
 """Numbers of a state."""
 FARTHEST = 2.0
-"""Depths of pictures are less [m]."""
+"""Upper limit of depths in images [m]."""
 
 
 def twists() -> spaces.Box:
@@ -30,7 +30,7 @@ def twists() -> spaces.Box:
 
 
 def space_of(kind: str, size: tuple[int, int]) -> spaces.Space:
-    """The space of observations of one of `KINDS`, with pictures of a width and height [pixel]."""
+    """Return the observation space of one of `KINDS`, with images of a width and height [pixel]."""
     states = spaces.Box(-BOUND, BOUND, (COUNT,), np.float32)
     if kind == "states":
         return states

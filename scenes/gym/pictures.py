@@ -1,4 +1,4 @@
-"""Pictures of environments: colour and depth, those of one cavity drawn together."""
+"""Images of environments: colour and depth; those of one cavity are rendered together."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .setting import Setting
 from .touched import Touched
 
 Seen = tuple[Touched, np.ndarray, int]
-"""What is drawn: the tissue's answer, T_world_tool (4, 4), and how many steps of a resection are done."""
+"""Rendered state: the tissue's response, T_world_tool (4, 4), and the number of resection steps done."""
 
 
 class Pictures:

@@ -9,7 +9,7 @@ from .tasks import DEBULK, RETRACT, Task, find_task
 
 # A tool goes down when it is so near over its place [m]; a force above this is contact [N]: three of its deviations.
 OVER, TOUCHES = 1.5e-3, 6e-3
-# Of the tissue under a tool [N/m].
+# Stiffness of the tissue under a tool [N/m].
 STIFFNESS = 60.0
 # A blade goes so many times as far as the cortex shall, and by so much farther in an episode: it does not see how far
 # that is under it.

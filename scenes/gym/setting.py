@@ -1,4 +1,4 @@
-"""What the environments of one task on one body share: the body, its tissue, and what a goal may be."""
+"""Shared data of the environments of one task on one body: the body, its tissue, and possible goals."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from .touched import Answers
 PHYSICS = ("auto", "model", "fem")
 TEMPLATE = "template"
 ARGUMENTS = ("anatomy", "physics", "device", "size", "model")
-# Of several models the one of the least error bound answers.
+# The model with the smallest error bound is used.
 TIGHTEST = attrgetter("bound")
-# A goal lies within so far of the place over the tumour's middle [m].
+# Largest distance of a goal from the point above the tumour's centre [m].
 SPREAD = 6e-3
 # A drained fluid stands so high at least, and at most, as a share of its height.
 LOWEST, HIGHEST = 0.6, 0.9
@@ -49,14 +49,14 @@ PATCH = 8e-3
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """A task on a body.
+    """Task on a body.
 
     Parameters
     ----------
     task, scene, theatre
-        What is done, in which scene, and on which body. Regions are as the body's models learned them.
+        Task, scene and body. Regions have the tissue that the body's models were trained with.
     answers
-        Who answers the tool.
+        Model of the tissue's response to the tool.
     """
 
     task: Task
@@ -71,11 +71,11 @@ class Setting:
 
     @cached_property
     def stage(self) -> Stage:
-        """What is drawn."""
+        """Renderer of the body."""
         return self.theatre.stage(self.scene)
 
     def after(self, done: int) -> Stage:
-        """What is drawn after so many steps of a resection."""
+        """Return the rendered body after a number of resection steps."""
         return self.stage.at(Loads((Resected(np.array([float(done)])),))) if self.task.cuts else self.stage
 
     @cached_property
@@ -90,7 +90,7 @@ class Setting:
 
     @cached_property
     def shares(self) -> tuple[np.ndarray, ...]:
-        """Mesh vertices of the tetrahedra of each share that is cut, in turn."""
+        """Mesh vertices of the tetrahedra of each share that is cut, in order."""
         surgery = self.task.surgery
         if surgery is None:
             return ()
@@ -135,16 +135,16 @@ def open_setting(
         "template", or the path of a .vtu file.
     physics
         "model": the best trained model of the tool's poses, or of pushes where the tool is a ball. "fem": finite
-        elements. "auto": the model where there is one; where one lies there that may not answer, a warning says why.
+        elements. "auto": the model where there is one; if one exists that is not applicable, a warning gives the reason.
     device
         As of `Fem`.
     size
-        Width and height of pictures [pixel].
+        Width and height of images [pixel].
     model
-        A file of trained models. None: the one beside the anatomy; of the template and a spatula the one that ships.
+        A file of trained models. None: the one next to the anatomy; of the template and a spatula the one that ships.
         Regions have the tissue that its models learned.
     together
-        Whether all environments are answered at once; None: on a card. On the CPU that is several times as fast, but
+        Whether all environments are solved in one batch; None: on a GPU only. On the CPU that is several times as fast, but
         the last digits depend on the neighbours.
 
     Raises
@@ -177,7 +177,7 @@ def open_setting(
 
 
 def _touched(task: Task, scene: Scene, site: Site) -> Tissue:
-    """What a ball presses: of the tissues within its radius of the goals' middle the one that has most of the volume.
+    """Return the tissue that a ball presses: the one with the largest volume within its radius of the goals' centre.
 
     Where tissue is cut away, it is the brain's.
     """
@@ -193,7 +193,7 @@ def _touched(task: Task, scene: Scene, site: Site) -> Tissue:
 
 
 def _refusals(task: Task, scene: Scene, theatre: Theatre) -> dict[str, str | None]:
-    """Why each trained model may not answer a task, by name; None if it may. Of a ball a model of pushes may, too."""
+    """Return, by name, why a trained model is not applicable; None if it is. For a ball, models of pushes apply too."""
     if task.cuts:
         return dict.fromkeys(theatre.models, "tissue is cut away, which no model learned")
     ball = isinstance(task.tool, Probe)
@@ -208,7 +208,7 @@ def _refusals(task: Task, scene: Scene, theatre: Theatre) -> dict[str, str | Non
 
 
 def _say_none(task: Task, anatomy: str, physics: str, model: str | None, why: str | None) -> None:
-    """Say that no trained model answers, and why.
+    """Report that no trained model is applicable, and why.
 
     Raises
     ------

@@ -16,14 +16,14 @@ from ..script.tool import Blade, Instrument, Probe
 from ..script.viewpoint import Viewpoint
 
 SECONDS = 0.05
-"""How long a step lasts [s]."""
+"""Duration of a step [s]."""
 OVER = 1.25
-"""An episode ends at so many times a limit."""
+"""Multiple of a limit at which an episode ends."""
 
 
 @dataclass(frozen=True)
 class Goal:
-    """What is asked for in an episode, as the plan of the operation has it.
+    """Goal of an episode, from the plan of the operation.
 
     Parameters
     ----------
@@ -45,12 +45,12 @@ class Goal:
 
 @dataclass(frozen=True)
 class Task:
-    """A task of an environment; lengths in metres.
+    """Task of an environment; lengths in metres.
 
     Parameters
     ----------
     name, title
-        In lower case; what is to be done.
+        Name in lower case; description.
     tool
         What the robot holds.
     force, pressure
@@ -58,7 +58,7 @@ class Task:
     amount
         Least and greatest that a goal asks for, in its own unit; `unit` is what an observation has as 1.
     tolerance
-        How far off it may be, as a share of what is asked for.
+        Tolerance relative to the requested amount.
     aside
         How far the tool may be from its place [m].
     held
@@ -94,11 +94,11 @@ class Task:
 
     @property
     def surgery(self) -> Debulking | None:
-        """What is cut: after the corridor, share after share; the last is left."""
+        """Return the resection: the corridor, then share after share; the last remains."""
         return Debulking(tuple(float(each) for each in range(int(self.amount[1]) + 1))) if self.cuts else None
 
     def scene(self, size: tuple[int, int]) -> Scene:
-        """The scene that it is played in, with pictures of a width and height [pixel]."""
+        """Return the scene of the task, with images of a width and height [pixel]."""
         view = Viewpoint(width=size[0], height=size[1])
         if self.cuts:
             effects = Elasticity(MATERIALS["drained"].tissue), Held(), SkullContact(), Gravity()
@@ -135,7 +135,7 @@ DEBULK = Task(
     deepest=0.06, cuts=True,
 )  # fmt: skip
 TASKS = {task.name: task for task in (PALPATE, RETRACT, DEBULK)}
-"""By name."""
+"""Tasks by name."""
 
 
 def find_task(name: object) -> Task:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ..script.site import Site
 from ..script.tool import Instrument, Probe
 
-# How far above the middle of the open cortex a tool may be [m].
+# Largest height of a tool above the centre of the open cortex [m].
 HIGHEST = 0.02
 
 
@@ -38,7 +38,7 @@ class Hand:
 
 
 def lever_of(tool: Instrument) -> float:
-    """How far the point about which a tool turns lies up its shaft [m]."""
+    """Return the distance of the pivot point up the tool's shaft [m]."""
     return tool.radius if isinstance(tool, Probe) else 0.0
 
 
@@ -71,5 +71,5 @@ def moved(hand: Hand, site: Site, tool: Instrument, twist: np.ndarray, tilt: flo
 
 
 def trembling(hand: Hand, offset: np.ndarray) -> Hand:
-    """The same, off by (3,) [m]."""
+    """Return the pose shifted by (3,) [m]."""
     return replace(hand, place=hand.place + offset)

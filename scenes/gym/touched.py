@@ -1,4 +1,4 @@
-"""What is asked of tissue in a step, and what it answers."""
+"""Request to a tissue model in a step, and its response."""
 
 from __future__ import annotations
 
@@ -13,21 +13,20 @@ from sim.deformation import Deformation
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """Where tissue is under a tool, and what the tool does to it.
+    """Response of the tissue to a tool.
 
     Parameters
     ----------
     motion, nodes
         (n, 3) [m] of mesh vertices (n,).
     force
-        That the tool exerts on the tissue (3,) [N].
+        Force of the tool on the tissue (3,) [N].
     pressure
         The highest under the tool [Pa].
     good
-        Whether an answer was found that may be relied on.
+        Whether the solution is reliable.
     error
-        In 95 of 100 loads no tumour vertex is farther from where the model's finite elements have it [m]; 0 of these
-        themselves.
+        95 % bound of the tumour vertex error relative to the model's FEM [m]; 0 for FEM itself.
     memory
         What the next answer starts from.
     """
@@ -43,16 +42,16 @@ class Touched:
 
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """What happens to the tissue of one environment.
+    """Load on the tissue of one environment.
 
     Parameters
     ----------
     pose
         T_world_tool (4, 4).
     last
-        The answer before; None as an episode begins.
+        Previous response; None at the start of an episode.
     fluid
-        Share of its height at which the fluid stands.
+        Fluid level relative to its full height.
     done
         Steps of a resection that are done.
     """
@@ -64,12 +63,12 @@ class Asked:
 
 
 class Answers(Protocol):
-    """Whatever answers tools with tissue: a trained model, or finite elements.
+    """Model of the tissue's response to tools: trained, or FEM.
 
-    On a card all that is asked is answered together. On the CPU each is answered apart, so that answers are the same
-    byte for byte, however many are asked.
+    On a GPU all requests are solved in one batch. On the CPU each is solved alone, so that results are the same byte
+    for byte for any number of requests.
     """
 
     def answer(self, asked: Sequence[Asked]) -> list[Touched]:
-        """Answer what is asked, in its order."""
+        """Compute the responses to requests, in their order."""
         ...

@@ -1,1 +1,1 @@
-"""Live poses in and answers out by OpenIGTLink: its messages, a server of many clients, and what is answered."""
+"""OpenIGTLink: live poses in, results out; messages, a server of many clients, and the computation of results."""

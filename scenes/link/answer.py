@@ -1,4 +1,4 @@
-"""From a tool's pose to what is known: where tumour and open cortex are, and how far off that may be."""
+"""Tracking result of a tool's pose: positions of tumour and open cortex, with their errors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ..tracked.tracked_tool import TrackedTool
 from .frame import stamp_of, time_of
 from .heard import Heard, Sent
 
-# Of fewer poses nobody can say how evenly a camera moves between them.
+# # Minimum number of poses to estimate the camera's acceleration between them.
 EVEN = 3
 THEIRS = "are these its poses and registration?"
 NOT_SEEN = Tracked(0, {}, {}, {})
@@ -33,19 +33,19 @@ PRESSED = 2e-3
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A camera's pose T (4, 4) [m] in the reference's frame, and how far off a place may be as the camera moves [m]."""
+    """Camera pose T (4, 4) [m] in the reference's frame, and error of a position by the camera's motion [m]."""
 
     T: np.ndarray
     moved: float
 
 
 def placed_at(course: Sequence[Sent], now: float, stamp: int, place: np.ndarray, stale: float) -> Placed | str:
-    """A camera's pose at a picture's time stamp, of its poses so far, the newest last; or why nobody knows it.
+    """Interpolate a camera's pose at an image's time stamp, from its poses, the newest last; or return a reason.
 
-    Between two poses it is read as `PoseStream.at` does, and just past the newest, too. The error is by how much the
-    camera may speed up between them, at a place (3,) [m] in the reference's frame. Elsewhere, and of fewer than three
-    poses, it is the newest pose, and how far the place has moved since in the picture. Without stamps the time is when
-    messages came. A reason has {name} in the stead of the transform's name.
+    Between two poses, and just after the newest, it is interpolated as by `PoseStream.at`. The error is the camera's
+    possible acceleration between them, at a position (3,) [m] in the reference's frame. Otherwise, and with fewer than
+    three poses, it is the newest pose, and the position's motion in the image since. Without stamps, arrival times of
+    messages are used. A reason has {name} instead of the transform's name.
     """
     body = course[-1]
     stamped = bool(stamp and all(sent.stamp for sent in course))
@@ -60,7 +60,7 @@ def placed_at(course: Sequence[Sent], now: float, stamp: int, place: np.ndarray,
             return Placed(between.T_camera_target, float(shift + turn * arm))
     apart = abs(time - times[-1])
     if apart > stale:
-        return f"no {{name}} within {stale:g} s of the picture's time"
+        return f"no {{name}} within {stale:g} s of the image's time"
     if len(course) < 2:
         return "one {name} alone, which does not say how fast the camera moves"
     step = times[-1] - times[-2]
@@ -71,16 +71,16 @@ def placed_at(course: Sequence[Sent], now: float, stamp: int, place: np.ndarray,
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What is known of a pose.
+    """Result for a pose.
 
     Parameters
     ----------
     stamp
-        The pose's own time stamp; where it had none, or where nothing is known, that of the answer.
+        The pose's own time stamp; without one, or without a result, that of the computation.
     known
-        Where tumour and cortex are, by the state and words of an overlay.
+        Positions of tumour and cortex, with state and text of an overlay.
     gauge
-        From tip to tumour; None where that is not known.
+        Distance from tip to tumour; None if unknown.
     """
 
     stamp: int
@@ -90,9 +90,9 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """How the scan lies before a camera: T_camera_scan (4, 4) [m].
+    """Pose of the scan in a camera's frame: T_camera_scan (4, 4) [m].
 
-    `moved` is how far off the tumour may be [m], as no pose is of the picture's very time.
+    `moved` is the tumour's error [m] from the time between pose and image.
     """
 
     T_camera_scan: np.ndarray
@@ -101,18 +101,18 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Answering:
-    """Who answers poses: a pure function of what was heard, but for where a finite element's answer starts.
+    """Solver for poses: a pure function of the received transforms, except for the start of an FEM solution.
 
     Parameters
     ----------
     motion
-        Says how the brain lies under a tool.
+        Model of the brain's motion under a tool.
     tool
-        Its shape, and where it is in the frame that is tracked.
+        Shape of the tool, and its pose in the tracked frame.
     tracking
-        Standard deviation of the tip's place along each axis [m]: no message says it.
+        Standard deviation of the tip's position along each axis [m], which messages do not contain.
     registration
-        From a file; None: it is sent, and its error is not known, nor whose it is.
+        From a file; None: it is received, with unknown error and unknown patient.
     """
 
     motion: ToolMotion
@@ -121,7 +121,7 @@ class Answering:
     registration: Registration | None = None
 
     def answer(self, heard: Heard, now: float, moment: float, before: Known | None = None) -> Answer:
-        """What is known at a time `now` [s], from what was known `before`; `moment` is now, in seconds since 1970."""
+        """Compute the result at a time `now` [s], from the result `before`; `moment` is now, in seconds since 1970."""
         registration = self._registration(heard)
         if isinstance(registration, str):
             return self._nothing(registration, moment, before)
@@ -156,7 +156,7 @@ class Answering:
         return clock.perf_counter() - begun
 
     def camera(self, heard: Heard, now: float, stamp: int) -> Seen | str:
-        """How the scan lies before the camera in the picture of a time stamp, or why nobody knows that at `now` [s]."""
+        """Return the scan's pose in the camera's frame for an image's time stamp, or why it is unknown at `now` [s]."""
         name = heard.names.camera
         registration, body = self._registration(heard), heard.beside(name, now)
         if isinstance(registration, str) or isinstance(body, str):
@@ -177,7 +177,7 @@ class Answering:
         return Registration(np.linalg.inv(sent.T), np.zeros((6, 6)), np.zeros(3), 0.0, 0)
 
     def _doubts(self, known: Known, before: Known | None) -> dict[str, object]:
-        """The state, the words and whether the tool has been near, of an answer that may not be relied on."""
+        """Return state, text and `near` of an unreliable result; only `near` of a reliable one."""
         near = before is not None and before.near
         assert known.T_scan_tool is not None
         doubt, near = misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, THEIRS)
@@ -189,7 +189,7 @@ class Answering:
         return {"near": near}
 
     def _with_band(self, known: Known, registration: Registration) -> Known:
-        """With how far off the tumour may be [m], and by what, where it may be relied on."""
+        """Add the bound on the tumour's error [m], and its parts by source, to a reliable result."""
         if not known.relied:
             return known
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
@@ -211,15 +211,15 @@ class Answering:
 
 
 def bounded(known: Known, band: float, parts: dict[str, float]) -> Known:
-    """What is known with a bound [m] on its place, and what that is of; beyond 5 mm it may not be relied on."""
+    """Add a bound [m] on the position, and its parts, to a result; beyond 5 mm it is unreliable."""
     if band <= LIMIT:
         return replace(known, band=band, parts=parts)
     return replace(known, state=State.UNSURE, words=wide_words(band), band=None, parts={})
 
 
 def late(answer: Answer, age: float, stale: float) -> Answer:
-    """What is known of an answer to a pose that is so old by now [s]: beyond `stale` it is not relied on."""
+    """Return the result for a pose of the given age [s]: stale if older than `stale`."""
     if age <= stale or not (answer.known.relied or answer.known.state is State.UNSURE):
         return answer
-    words = f"stale, the answer is {age:.1f} s old: do not rely on it"
+    words = f"stale, the result is {age:.1f} s old: do not rely on it"
     return replace(answer, known=replace(answer.known, state=State.STALE, words=words, band=None), gauge=None)

@@ -1,4 +1,4 @@
-"""Many OpenIGTLink clients: what they send is checked, each is sent the newest, and nobody waits for another."""
+"""Connections of many OpenIGTLink clients: input is checked, each is sent the newest, and none blocks another."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ REFUSED = "SulcusRefused"
 """The device name of each STATUS that is sent to one client."""
 # Bytes of a message that is passed over if it is not wanted; a longer one ends the connection.
 LONGEST = 1 << 28
-# So long a body that was announced may take to come, and a client may leave unread what it is sent [s].
+# # Time limit for an announced body to arrive, and for a client to read its messages [s].
 PATIENCE = 10.0
-# So long a new client may take to ask before it is sent everything, and one that is sent away to hear why [s].
+# # Time in which a new client may send a request before it is sent everything, and for the reason of a rejection [s].
 GREETING, FAREWELL = 0.2, 1.0
-# So long all may take to read the last message when a server ends [s].
+# # Time to read the last message when a server ends [s].
 PARTING = 0.1
-# What the system holds for a client that is slow, in bytes: what is there is not replaced by what is newer.
+# # Size of a slow client's system buffer [bytes]: its content is not replaced by newer messages.
 HELD = 1 << 18
-# What is read ahead of a client, and is passed over at a time, in bytes.
+# # Size of read-ahead, and of chunks that are skipped [bytes].
 AHEAD = 1 << 16
 REQUESTS, ASKING = ("GET_", "STT_", "STP_"), ("GET_", "STP_")
 
@@ -65,20 +65,20 @@ class Clients:
     Parameters
     ----------
     receive
-        Hears each message that is wanted and whose checksum is right.
+        Callback for each wanted message with a valid checksum.
     longest
-        Which messages those are.
+        Maximum size of a message by type; 0: not wanted.
     most
-        How many clients there may be; another one is sent away.
+        Maximum number of clients; further ones are rejected.
     note
-        Is given a line when a client comes or goes, and when something is refused for a new reason.
+        Callback for a line when a client connects or leaves, and when a message is rejected for a new reason.
     """
 
     def __init__(
         self, receive: Receive, longest: Longest, most: int = 16, note: Callable[[str], None] = lambda line: None
     ) -> None:
         self.refused: Counter[str] = Counter()
-        """How often messages were refused, by why."""
+        """Number of rejected messages, by reason."""
         self._receive, self._longest, self._most, self._note = receive, longest, most, note
         self._numbers = count()
         self._clients: dict[int, Client] = {}
@@ -86,7 +86,7 @@ class Clients:
         self._attending: set[asyncio.Task] = set()
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Return the number of clients."""
         return len(self._clients)
 
     def publish(self, key: str, messages: Iterable[bytes]) -> None:
@@ -97,7 +97,7 @@ class Clients:
                 client.offer(key, self._newest[key])
 
     def refuse(self, number: int, code: Code, why: str, text: str) -> None:
-        """Count what was refused, and send a STATUS to one client; of many at once it gets the newest."""
+        """Count a rejected message, and send a STATUS to one client; of many at once it gets the newest."""
         self._count(why, text)
         client = self._clients.get(number)
         if client is not None and not client.asks:
@@ -192,11 +192,11 @@ class Clients:
                     raise BadMessageError(f"{_named(header)} announces {header.size} bytes; {LONGEST} are the most")
                 async with asyncio.timeout(PATIENCE):
                     await self._hear(client, reader, header)
-                await asyncio.sleep(0)  # One that sends without pause keeps nobody else waiting.
+                await asyncio.sleep(0)  # a client that sends without pause blocks no other
         except TimeoutError:
-            self.refuse(client.number, Code.TIMEOUT, "message that does not end", "a message did not end: connect anew")
+            self.refuse(client.number, Code.TIMEOUT, "message that does not end", "a message did not end: reconnect")
         except BadMessageError as error:
-            self.refuse(client.number, Code.OVERFLOW, "no message", f"{error}: connect anew")
+            self.refuse(client.number, Code.OVERFLOW, "no message", f"{error}: reconnect")
         except asyncio.IncompleteReadError as error:
             if error.partial:
                 self._count("message that breaks off")
@@ -204,7 +204,7 @@ class Clients:
             self._count("client that vanished")
 
     async def _hear(self, client: Client, reader: asyncio.StreamReader, header: Header) -> None:
-        """Hear one message's body, and answer."""
+        """Receive one message's body, and reply."""
         if header.kind[:4] in REQUESTS:
             await _pass_over(reader, header.size)
             self._ask(client, header)
@@ -222,8 +222,8 @@ class Clients:
             self._receive(client.number, replace(header, metadata=metadata_of(header, body)), content)
         except BadMessageError as error:
             code = Code.CHECKSUM if str(error) == WRONG_CHECKSUM else Code.CONFIGURATION
-            # What stands after a colon differs from message to message.
-            self.refuse(client.number, code, str(error).partition(":")[0], f"{_named(header)} is refused: {error}")
+            # # The text after a colon differs from message to message.
+            self.refuse(client.number, code, str(error).partition(":")[0], f"{_named(header)} is rejected: {error}")
 
     def _ask(self, client: Client, header: Header) -> None:
         """A client that asks, or wants no stream, is sent what it asks for and nothing else."""
@@ -242,10 +242,10 @@ class Clients:
             client.news.set()
 
     def _count(self, why: str, text: str = "") -> None:
-        """Count what was refused, and note it if it is the first for that reason."""
+        """Count a rejected message, and note the first for each reason."""
         self.refused[why] += 1
         if self.refused[why] == 1:
-            self._note(f"refused: {text or why}")
+            self._note(f"rejected: {text or why}")
 
 
 def _found(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> bytes | None:
@@ -261,7 +261,7 @@ def _named(header: Header) -> str:
 
 
 async def _pass_over(reader: asyncio.StreamReader, size: int) -> None:
-    """Read so many bytes, and keep none."""
+    """Read `size` bytes, and discard them."""
     while size:
         size -= len(await reader.readexactly(min(size, AHEAD)))
 

@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-# So many lines in so long [s].
+# # Maximum number of lines, and the interval [s].
 MOST, WHILE = 10, 5.0
 PREFIX = "sulcus link: "
 
 
 def printed(line: str) -> None:
-    """Print a line to standard error, without what a terminal would obey; where nobody can read it, it is let go."""
+    """Print a line to standard error, without control characters; ignored if standard error is closed."""
     plain = "".join(each if each.isprintable() else "?" for each in line)
     with suppress(OSError):
         print(f"{PREFIX}{plain}", file=sys.stderr, flush=True)

@@ -16,7 +16,7 @@ HEADER = struct.Struct(">H12s20sQQQ")
 # Sizes of the extended header, of the index of metadata and of metadata, and the message's number: of version 2 on.
 EXTENDED = struct.Struct(">HHII")
 INDEXED = struct.Struct(">HHI")
-"""Of one pair of metadata: size of its key, encoding and size of its value."""
+"""Layout of a metadata index entry: size of its key, encoding and size of its value."""
 VERSIONS = (1, 2)
 # A time stamp counts 2^-32 s since 1970.
 TICKS = 1 << 32
@@ -73,12 +73,12 @@ def read_header(raw: bytes) -> Header:
 
 
 def content_of(header: Header, body: bytes) -> bytes:
-    """What lies between an extended header and metadata, once the checksum is right; of version 1 the whole body.
+    """Extract the content between extended header and metadata, after the checksum test; of version 1 the whole body.
 
     Raises
     ------
     BadMessageError
-        A wrong checksum, or sizes that the body does not have.
+        A wrong checksum, or sizes that do not match the body.
     """
     if crc64.ecma_182(body) != header.checksum:
         raise BadMessageError(WRONG_CHECKSUM)

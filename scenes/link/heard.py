@@ -1,4 +1,4 @@
-"""What was heard of tool, reference, camera and scan, by OpenIGTLink's names; what is old is not known."""
+"""Received transforms of tool, reference, camera and scan, by OpenIGTLink's names; old ones are unknown."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from .frame import NAME_BYTES, TICKS, BadMessageError
 
-# By how much axes may differ from length 1 and right angles: matrices come in single precision.
+# # Tolerance of axes from length 1 and right angles: matrices have single precision.
 SQUARE = 2e-3
 # A tracked body is nearer to its tracker [m].
 FARTHEST = 10.0
 # A time stamp that is older than the last one is out of order, but for a clock that was set back by more [s].
 SET_BACK = 5.0
-# So many earlier transforms of one name are kept, for pictures that come later than the poses round them.
+# # Number of earlier transforms of one name that are kept, for images that arrive later than the poses around them.
 KEPT = 32
 
 
@@ -40,7 +40,7 @@ class Names:
         return {name[:NAME_BYTES].strip(): name for name in (self.tool, self.reference, self.camera, self.registration)}
 
     def by_tracker(self, name: str) -> bool:
-        """Whether a body's transform ends in the tracker's frame."""
+        """Return True if a body's transform is in the tracker's frame."""
         tracker = self.reference.rpartition("To")[2]
         return "To" in self.reference and name.rpartition("To")[2] == tracker
 
@@ -101,7 +101,7 @@ class Heard:
         return replace(self, sent=newest, earlier={**self.earlier, name: kept})
 
     def beside(self, name: str, now: float) -> Sent | str:
-        """A body beside the patient's reference, with its own time stamp; or why that is not known."""
+        """Return a body relative to the patient's reference, with its own time stamp; or why it is unknown."""
         needed = (name, self.names.reference) if self.names.by_tracker(name) else (name,)
         for each in needed:
             sent = self.sent.get(each)
@@ -112,7 +112,7 @@ class Heard:
         return self._in_reference(name, self.sent[name])
 
     def course(self, name: str) -> tuple[Sent, ...]:
-        """A body's transforms by one sender, the oldest first, beside the reference as it is now."""
+        """Return a body's transforms by one sender, oldest first, relative to the current reference."""
         newest = self.sent[name]
         every = (*self.earlier.get(name, ()), newest)
         return tuple(self._in_reference(name, sent) for sent in every if sent.sender == newest.sender)

@@ -135,7 +135,7 @@ def read_points(content: bytes) -> tuple[list[str], np.ndarray]:
 
 
 def image(colour: np.ndarray) -> bytes:
-    """IMAGE: a picture (H, W, 3) uint8, pixels of 1 mm round the origin."""
+    """Encode an image (H, W, 3) uint8 as IMAGE, with pixels of 1 mm around the origin."""
     height, width, channels = colour.shape
     size = width, height, 1
     axes = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
@@ -143,20 +143,20 @@ def image(colour: np.ndarray) -> bytes:
 
 
 def read_image(content: bytes) -> np.ndarray:
-    """The picture (H, W, 3) uint8 of an IMAGE; grey ones have three equal channels.
+    """Decode the image (H, W, 3) uint8 of an IMAGE; grey ones have three equal channels.
 
     Raises
     ------
     BadMessageError
-        What is no single picture of bytes, sent whole, in grey, RGB or RGBA.
+        Content that is not one complete 8-bit image in grey, RGB or RGBA.
     """
     if len(content) < IMAGE.size:
-        raise BadMessageError("is too short for a picture")
+        raise BadMessageError("is too short for an image")
     _, channels, kind, _, _, *numbers = IMAGE.unpack_from(content)
     size, part = numbers[:3], numbers[15:]
     width, height, depth = size
     if kind != BYTES or depth != 1 or channels not in (1, 3, 4) or part != [0, 0, 0, *size]:
-        raise BadMessageError("is no single picture of 8 bits, in grey or RGB, that is sent whole")
+        raise BadMessageError("is not one complete 8-bit image in grey or RGB")
     if len(content) != IMAGE.size + width * height * channels:
         raise BadMessageError("holds another number of pixels than it names")
     pixels = np.frombuffer(content, np.uint8, offset=IMAGE.size).reshape(height, width, channels)

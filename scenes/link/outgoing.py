@@ -1,4 +1,4 @@
-"""The messages of an answer: surfaces, the tumour's pose, distances with bounds, and places that were sent."""
+"""Messages of a result: surfaces, the tumour's pose, distances with bounds, and requested points."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .messages import NOTHING, Code, Mesh, points, polydata, status, string, tra
 
 # A place that is asked for belongs to tumour or open cortex where the scan has it no farther from them [m].
 BESIDE = 2e-3
-# So many places that nobody can follow are named.
+# # Maximum number of points outside the tracked surfaces that are named.
 MOST_NAMED = 5
 MOST_PLACES = 1000
-"""So many places may be asked for at once."""
+"""Maximum number of points in one request."""
 STRANGE = "places that are not in or on the tumour, nor on open cortex, so that their motion is not known"
-"""Why places are not followed."""
+"""Reason why points are not tracked."""
 # A place of which a tetrahedron's corners make one this near lies in it [m].
 ON = 1e-6
 
@@ -55,9 +55,9 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class Outgoing:
-    """Makes messages of answers on a stage. All places are in the scan's RAS, in millimetres.
+    """Encoder of results on a stage. All positions are in the scan's RAS, in millimetres.
 
-    `registered` says whether the registration's error is known.
+    `registered` is true if the registration's error is known.
     """
 
     stage: Stage
@@ -77,7 +77,7 @@ class Outgoing:
         return framed("POLYDATA", "TumourInScan", polydata(1e3 * at, mesh), stamp)
 
     def messages(self, answer: Answer, places: Places | None = None) -> tuple[bytes, ...]:
-        """All messages of an answer, with its stamp: what is not known is sent without points."""
+        """Build all messages of a result, with its stamp: unknown surfaces are sent without points."""
         known, stamp = answer.known, answer.stamp
         none = polydata(np.empty((0, 3)), NOTHING)
         out = []
@@ -98,19 +98,19 @@ class Outgoing:
         return tuple(out)
 
     def status(self, answer: Answer, refused: str) -> bytes:
-        """What is known, and how often messages were refused and why."""
+        """Build the STATUS of a result, with the number of rejected messages by reason."""
         known = answer.known
         code = Code.OK if known.relied else Code.NOT_READY
         words = known.words or f"the tumour is known, {known.state.value}"
         return framed("STATUS", "Sulcus", status(code, f"{words}{refused}"), answer.stamp)
 
     def placed(self, names: list[str], at: np.ndarray) -> Places:
-        """Find what places of the scan (n, 3) [m] move with: in the tumour its volume, else the nearest surface.
+        """Attach points of the scan (n, 3) [m]: to the tumour's volume if inside, else to the nearest surface.
 
         Raises
         ------
         BadMessageError
-            No place or too many; none in or on the tumour or on open cortex, so that nobody knows how they move.
+            No point or too many; none in or on the tumour or on open cortex, so that their motion is unknown.
         """
         if not 0 < len(at) <= MOST_PLACES:
             raise BadMessageError(f"no place, or more than are followed: 1 to {MOST_PLACES}")
@@ -132,7 +132,7 @@ class Outgoing:
         return Places(tuple(names[row] for row in good), at[good], vertices[good], weights[good], strange)
 
     def _in_tumour(self, held: Located, at: np.ndarray) -> np.ndarray:
-        """Whether places (n, 3) [m] lie in tetrahedra of the tumour."""
+        """Return True for each point (n, 3) [m] in tetrahedra of the tumour."""
         there = np.linalg.norm(np.einsum("nk,nkd->nd", held.weights, self._rest[held.vertices]) - at, axis=1)
         known = np.isin(held.vertices, self.stage.anatomy.tumour_nodes) | (held.weights <= 0.0)
         return known.all(axis=1) & (there <= ON)
@@ -142,7 +142,7 @@ class Outgoing:
         return self.stage.anatomy.mesh.nodes
 
     def _points(self, known: Known, places: Places) -> bytes:
-        """Where those of the places are that the answer knows of."""
+        """Build the POINT message of the positions of those points that the result covers."""
         moved = (known.motion.positions - self._rest)[places.vertices]
         at = 1e3 * (places.rest + np.einsum("nk,nkd->nd", places.weights, moved))
         nodes = () if known.motion.answer is None else known.motion.answer.nodes
@@ -158,7 +158,7 @@ class Outgoing:
         return f"{inside}{millimetres(gauge.distance, gauge.error)} (95 %; {self._of}){_but(known)}"
 
     def _motion_words(self, known: Known) -> str:
-        """How far the tumour has moved, with its error and what that is of; or why that is not known."""
+        """Describe the tumour's displacement, with its error and sources; or why it is unknown."""
         if known.band is None:
             return f"not known: {known.words}"
         moved = millimetres(known.motion.moved, known.motion.error)
@@ -166,14 +166,14 @@ class Outgoing:
 
     @property
     def _of(self) -> str:
-        """What an error is of, and what of it nobody states."""
+        """Sources included in an error, and those that are unknown."""
         if self.registered:
             return "of tracking, registration and model; not known of tissue and segmentation"
         return "of tracking and model; not known of registration, tissue and segmentation"
 
 
 def _but(known: Known) -> str:
-    """Why figures may not be relied on all the same; empty where they may."""
+    """Describe why numbers are unreliable; empty if they are reliable."""
     return "" if known.relied else f"; doubtful: {known.words}"
 
 
@@ -184,7 +184,7 @@ def _listed(names: list[str]) -> str:
 
 
 def _follows(known: Known, vertices: np.ndarray) -> bool:
-    """Whether it is known how these vertices move."""
+    """Return True if the motion of these vertices is known."""
     answer = known.motion.answer
     return answer is not None and bool(np.isin(vertices, answer.nodes).all())
 

@@ -25,14 +25,14 @@ from .heard import Heard, check_status
 from .messages import IMAGE, POINT, Code, image, read_image, read_points, read_position, read_transform, status
 from .outgoing import MOST_PLACES, STRANGE, Places
 
-# How often what is not known is said anew, a STATUS that has not changed, and how often a server is tried again [s].
+# # Intervals [s]: check of missing input, unchanged STATUS, new attempt to connect to a server.
 TICK, BEAT, AGAIN = 0.1, 1.0, 1.0
-# Other transforms that are heard of, to be named where the wanted one does not come.
+# # Maximum number of other received transforms that are named when the wanted one does not arrive.
 MOST_OTHERS = 6
-# Types that are heard and not answered: a STATUS that answers a STATUS would have no end.
+# # Types that are received without a reply: a STATUS in reply to a STATUS would loop forever.
 UNANSWERED = ("STATUS", "STRING", "CAPABILITY")
 SHORT = 1 << 16
-# What is read ahead of a client, in bytes.
+# # Read-ahead size of a client [bytes].
 AHEAD = 1 << 18
 
 Picture = tuple[np.ndarray, int]
@@ -40,49 +40,49 @@ Picture = tuple[np.ndarray, int]
 
 
 class Answers(Protocol):
-    """Who answers poses."""
+    """Interface of a solver for poses."""
 
     def answer(self, heard: Heard, now: float, moment: float, before: Known | None = None) -> Answer:
-        """As `Answering.answer`."""
+        """Compute the result, as `Answering.answer`."""
         ...
 
     def camera(self, heard: Heard, now: float, stamp: int) -> Seen | str:
-        """As `Answering.camera`."""
+        """Return the scan's pose, as `Answering.camera`."""
         ...
 
 
 class Speaks(Protocol):
-    """Who makes messages of answers."""
+    """Interface of an encoder of results."""
 
     def scan(self, stamp: int) -> bytes:
-        """As `Outgoing.scan`."""
+        """Build the scan's message, as `Outgoing.scan`."""
         ...
 
     def messages(self, answer: Answer, places: Places | None = None) -> tuple[bytes, ...]:
-        """As `Outgoing.messages`."""
+        """Build the messages, as `Outgoing.messages`."""
         ...
 
     def status(self, answer: Answer, refused: str) -> bytes:
-        """As `Outgoing.status`."""
+        """Build the STATUS, as `Outgoing.status`."""
         ...
 
     def placed(self, names: list[str], at: np.ndarray) -> Places:
-        """As `Outgoing.placed`."""
+        """Attach points, as `Outgoing.placed`."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Eye:
-    """Draws into a camera's pictures; `tracking` is the standard deviation of its place along each axis [m]."""
+    """Overlay of a camera's images; `tracking` is the standard deviation of its position along each axis [m]."""
 
     calibration: Calibration
     painter: Painter
     tracking: float
 
     def painted(self, colour: np.ndarray, known: Known, seen: Seen | str) -> np.ndarray:
-        """A picture (H, W, 3) uint8 with what is known.
+        """Draw a result on an image (H, W, 3) uint8.
 
-        Where it is not known how the scan lies before the camera, a sentence says why, and nothing else is drawn.
+        If the scan's pose in the camera's frame is unknown, only the reason is drawn.
         """
         if isinstance(seen, str):
             known = replace(known, state=State.NO_REFERENCE, words=f"{seen}: nothing is drawn")
@@ -97,22 +97,22 @@ class Eye:
 
 
 class Session:
-    """A live link: hears poses, has them answered, and publishes the answers.
+    """Live link that receives poses, computes results, and publishes them.
 
-    All but `_computed` and what is drawn belongs to the event loop's thread.
+    All but `_computed` and the drawing belongs to the event loop's thread.
 
     Parameters
     ----------
     answers, speaks
-        Who answers, and who makes messages of that.
+        Solver, and encoder of its results.
     heard
-        Which transforms are listened to.
+        Received transforms, with the names in use.
     eye
-        Draws into pictures that are sent; None: they are not wanted.
+        Overlay of received images; None: images are not wanted.
     most
-        How many clients there may be.
+        Maximum number of clients.
     note
-        Is given a line when something changes: clients, the source, what is known, and what is refused.
+        Callback for a line when something changes: clients, the source, the state, and rejections.
     """
 
     def __init__(
@@ -146,9 +146,9 @@ class Session:
     async def serve(
         self, host: str, port: int, seconds: float, ready: asyncio.Future[int], source: tuple[str, int] | None = None
     ) -> None:
-        """Answer clients for so long; `ready` is given the port.
+        """Serve clients for `seconds`; `ready` is given the port.
 
-        Poses may come from a server, too, the `source`: it is sent nothing, and tried again where it is not there.
+        Poses may also come from a server, the `source`: it is sent nothing, and the connection is retried.
 
         Raises
         ------
@@ -176,7 +176,7 @@ class Session:
                 reached = False
             else:
                 reached = True
-                self._note(f"{at} is heard")
+                self._note(f"{at} is connected")
                 with suppress(OSError):
                     await self.clients.listen(*streams)
                 self._note(f"{at} has ended the connection")
@@ -198,7 +198,7 @@ class Session:
             self.clients.publish("status", (over,))
             await self.clients.close()
             for task in done:
-                task.result()  # what went wrong is raised
+                task.result()  # raises the exception of the task
 
     async def _answering(self, thread: ThreadPoolExecutor) -> None:
         """Compute the solution of the newest pose, again and again."""
@@ -240,7 +240,7 @@ class Session:
         return answer
 
     def _computed(self, heard: Heard, places: Places | None, now: float) -> tuple[Answer, tuple[bytes, ...]]:
-        """Compute an answer and its messages, in the solver's thread."""
+        """Compute a result and its messages, in the solver's thread."""
         answer = self._answers.answer(heard, now, clock.time(), self._shown.known)
         return answer, self._speaks.messages(answer, places)
 
@@ -252,15 +252,15 @@ class Session:
         self.clients.publish("answer", messages)
 
     def _refused_words(self, known: Known) -> str:
-        """What was refused so far, and which other transforms there are where the wanted one does not come."""
+        """Describe rejected messages, and other received transforms if the wanted one does not arrive."""
         parts = [f"{number} {why}" for why, number in self.clients.refused.most_common(MOST_OTHERS)]
-        words = f"; refused: {', '.join(parts)}" if parts else ""
+        words = f"; rejected: {', '.join(parts)}" if parts else ""
         if self._others and known.state in (State.NO_TOOL, State.STALE):
-            words += f"; other transforms heard: {', '.join(self._others)}"
+            words += f"; other transforms received: {', '.join(self._others)}"
         return words
 
     async def _drawing(self, eye: Eye, thread: ThreadPoolExecutor) -> None:
-        """Draw into the newest picture, again and again."""
+        """Draw into the newest image, repeatedly."""
         while True:
             await self._pictured.wait()
             self._pictured.clear()
@@ -272,7 +272,7 @@ class Session:
             self.clients.publish("picture", (framed("IMAGE", "Overlay", image(drawn), stamp),))
 
     def _longest(self, kind: str) -> int:
-        """How many bytes a message of a type may have that is wanted; 0: none is."""
+        """Return the maximum size [bytes] of a wanted message of a type; 0: not wanted."""
         if kind == "IMAGE" and self._eye is not None:
             return IMAGE.size + 4 * self._eye.calibration.width * self._eye.calibration.height + SHORT
         if kind == "POINT":
@@ -316,7 +316,7 @@ class Session:
 
 
 def _found(known: Known) -> str:
-    """What is known of the tumour, for a console."""
+    """Describe the state of the tumour, for a console."""
     if known.relied:
         return f"known, {known.state.value}"
     return f"{'doubtful' if known.state is State.UNSURE else 'not known'}: {known.words}"

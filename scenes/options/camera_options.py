@@ -1,4 +1,4 @@
-"""Which camera films a scene, and how it moves, on the command line."""
+"""Command-line options for the camera of a scene and its motion."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None
         "--camera", type=Path, metavar="FILE.yaml", help="calibration of a camera, of OpenCV or ROS (default: ideal)"
     )
     group.add_argument(
-        "--size", type=size, metavar="WxH", help="scale the calibration of --camera to pictures of this size [pixel]"
+        "--size", type=size, metavar="WxH", help="scale the calibration of --camera to images of this size [pixel]"
     )
     group.add_argument(
-        "--path", choices=PATHS, default=path, help=f"how the camera moves (default: {path or 'it stays'})"
+        "--path", choices=PATHS, default=path, help=f"camera motion (default: {path or 'none'})"
     )
-    group.add_argument("--path-seed", type=int, default=0, help="of --path hand-held (default %(default)s)")
+    group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held (default: %(default)s)")
     group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")
 
 
@@ -71,7 +71,7 @@ def filmed(args: argparse.Namespace, scene: Scene) -> Scene:
 
 
 def filmed_with_targets(args: argparse.Namespace, scene: Scene) -> Scene:
-    """The scene as a tracked camera films it, from where it sees the opening, the reference and the tool's cube.
+    """Return the scene with a tracked camera that sees the craniotomy, the reference and the tool's cube.
 
     Raises
     ------

@@ -32,9 +32,9 @@ def claimed(
     inputs: Sequence[str | Path | None] = (),
     resumed: bool = False,
 ) -> Path:
-    """Path of a file that can be written, and is not there unless by `force`; nothing is left behind by asking.
+    """Check that a file can be written and, unless `force`, does not exist; return its path and leave nothing behind.
 
-    What the command reads, its `inputs`, is never replaced. A file that it goes on with, `resumed`, may be there.
+    What the command reads, its `inputs`, is never replaced. A file that it resumes, `resumed`, may exist.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def claimed(
 
 
 def claimed_folder(folder: Path, what: str) -> Path:
-    """Folder in which pictures can be written; nothing is left behind by asking. `what` names them in the plural.
+    """Check that images can be written into a folder; return it and leave nothing behind. `what` is their plural name.
 
     Raises
     ------
@@ -86,12 +86,12 @@ def claimed_frames(folder: Path, force: bool) -> list[Path]:
     return frames
 
 
-# What of a data set must stay as it was for a run to go on with it.
+# Attributes of a data set that must be unchanged for a run to resume it.
 KEPT = ("anatomy", "effects", "tissue", "element", "accuracy", "preset", "seed", "shape")
 
 
 def stated(path: Path) -> dict[str, str]:
-    """What a data set, an unfinished one, or a model file says of itself as texts; nothing where none can be read."""
+    """Read the attributes of a data set, an unfinished one, or a model file as texts; empty if unreadable."""
     import h5py
 
     from surrogate.model.npz_archive import Archive
@@ -109,8 +109,8 @@ def stated(path: Path) -> dict[str, str]:
 
 
 def strangers(mesh: Path, digest: str) -> list[Path]:
-    """Data and models beside a mesh file, by their names, that were made with an anatomy of another `digest`."""
-    from ..play.deformers import model_path  # takes seconds, and whoever only simulates needs none of it
+    """List data and models next to a mesh file that were made with an anatomy of another `digest`."""
+    from ..play.deformers import model_path  # takes seconds, and is not needed for simulation alone
 
     data = mesh.with_suffix(".h5")
     beside = (data, unfinished_path(data), model_path(mesh))
@@ -143,7 +143,7 @@ def remove_data(path: Path, wanted: Mapping[str, str]) -> None:
 
 
 def batch_begun(path: Path) -> int | None:
-    """The batch of a data set that is there, or begun, and that goes on with it; None where none can be read."""
+    """Return the batch size of an existing or unfinished data set, which it keeps; None if unreadable."""
     for each in (path, unfinished_path(path)):
         found = stated(each).get("batch", "")
         if found.isdigit():

@@ -1,4 +1,4 @@
-"""Where the skull is opened, on the command line: the same options for `anatomy` and `patient`."""
+"""Command-line options for the craniotomy, shared by `anatomy` and `patient`."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def trajectory_given(args: argparse.Namespace) -> Path | None:
 
 
 def opened_over(args: argparse.Namespace) -> str:
-    """What the skull is opened over, in words."""
+    """Describe the target of the craniotomy."""
     given = args.opening_over if args.opening_at is None else args.opening_at
     if isinstance(given, Path):
         return f"what {given} marks"
@@ -82,12 +82,12 @@ def opened_over(args: argparse.Namespace) -> str:
 
 
 def opened(subject: Subject, args: argparse.Namespace) -> Subject:
-    """The subject with its skull opened where the options say.
+    """Return the subject with the craniotomy placed by the options.
 
     Raises
     ------
     InputError
-        A piece that the tumour does not have; a point where nothing can be opened; a file that `read_markup` refuses,
+        A piece that the tumour does not have; a point where nothing can be opened; a file that `read_markup` rejects,
         or whose markup is of another kind.
     """
     if isinstance(args.opening_at, Path):
@@ -112,7 +112,7 @@ def opened(subject: Subject, args: argparse.Namespace) -> Subject:
 
 
 def _depth(subject: Subject, place: np.ndarray) -> float:
-    """How deep [m] a place (3,) lies in the brain; negative outside."""
+    """Return the depth [m] of a point (3,) below the brain surface; negative outside."""
     # Some voxels off the surface the field of a volume says no more than the side.
     apart = float(np.linalg.norm(subject.cortex - place, axis=1).min())
     return -apart if subject.brain(place[None])[0] > 0.0 else apart
@@ -132,7 +132,7 @@ def _marked(subject: Subject, markup: Markup) -> Subject:
 
 
 def _demand_kind(markup: Markup, option: str, **kinds: int | None) -> None:
-    """Refuse markups of other kinds, or with another number of points than is stated."""
+    """Reject markups of other kinds, or with another number of points than they declare."""
     if markup.kind in kinds and kinds[markup.kind] in (None, len(markup.points)):
         return
     words = {"Fiducial": "one point", "Line": "a line of two points", "ClosedCurve": "a closed curve"}
@@ -143,7 +143,7 @@ def _demand_kind(markup: Markup, option: str, **kinds: int | None) -> None:
 
 
 def _held(markup: Markup) -> str:
-    """What a file holds, in words."""
+    """Describe the content of a file."""
     count = "1 point" if len(markup.points) == 1 else f"{len(markup.points)} points"
     known = {
         "Fiducial": f"a list of {count}",

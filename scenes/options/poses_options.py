@@ -29,22 +29,22 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--clock", nargs="+", metavar="S", default=["0"],
-        help="the tracker's time less the pictures' [s], and by how much that is off (default 0). auto: from the "
+        help="tracker time minus image time [s], and its standard deviation (default: 0). auto: from the "
         "motion of a cube and a reference that the film shows, too",
     )  # fmt: skip
     group.add_argument(
         "--hand-eye", type=Path, metavar="H.json",
-        help="where the camera is in the tracker's frame, from `sulcus calibrate --hand-eye --json` (default: the film "
+        help="camera pose in the tracker's frame, from `sulcus calibrate --hand-eye --json` (default: the video "
         "says it by the printed reference)",
     )  # fmt: skip
     group.add_argument(
         "--camera-poses", type=Path, metavar="CAMERA.csv",
-        help="poses of the body that the camera is fixed to; --hand-eye is then beside that body",
+        help="poses of the body that carries the camera; --hand-eye is then relative to that body",
     )  # fmt: skip
 
 
 def demand_poses(args: argparse.Namespace) -> None:
-    """Refuse options that do not go together, before anything is read.
+    """Reject options that conflict, before anything is read.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def elsewhere_of(args: argparse.Namespace, calibration: Calibration) -> Elsewher
 
 
 def _say_apart(args: argparse.Namespace, elsewhere: Elsewhere) -> None:
-    """Say when poses and pictures are, if the film begins where there are no poses."""
+    """Report the times of poses and images, if the video begins outside the poses."""
     from ar.tracking.pictures import film_of
 
     from ..tracked.run import timed
@@ -118,7 +118,7 @@ def _say_apart(args: argparse.Namespace, elsewhere: Elsewhere) -> None:
 
 
 def _clock_of(args: argparse.Namespace, calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:
-    """The clock that is stated, or that the film's own markers tell."""
+    """Return the given clock offset, or the one estimated from the video's own markers."""
     from ar.tracking.pictures import film_of
     from ar.tracking.pose_stream import Clock
 

@@ -71,7 +71,7 @@ def add_style(parser: argparse.ArgumentParser, without: tuple[Style, ...] = ()) 
     styles: list[Style] = [style for style in STYLES if style not in without]
     said = ". ".join(f"{style}: {STYLES[style]}" for style in styles if style != "none")
     parser.add_argument(
-        "--style", choices=styles, default="window", help=f"how the overlay is drawn (default %(default)s). {said}"
+        "--style", choices=styles, default="window", help=f"overlay style (default: %(default)s). {said}"
     )
 
 

@@ -33,11 +33,11 @@ def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None
         *names,
         dest="convention",
         choices=tuple(CONVENTIONS),
-        help=f"whose labels they are, in place of numbers. {said}",
+        help=f"label convention, instead of label numbers. {said}",
     )
     parser.add_argument(
         "--mask", type=Path, metavar="BRAIN.nii.gz",
-        help="what is not 0 there is brain, in place of --brain, on a grid of its own",
+        help="brain mask (non-zero voxels), instead of --brain; may have its own grid",
     )  # fmt: skip
     parser.add_argument(
         "--tumour-in", type=Path, metavar="FILE", help="the file in which the tumour is marked, on a grid of its own"
@@ -126,49 +126,49 @@ def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
     drawn.add_argument(
         "--head",
         choices=("template", "fsaverage"),
-        help="whose: the ICBM template (default), or what fsaverage's inner skull holds, of the package mne. Or give "
+        help="healthy head: the ICBM template (default), or the inside of fsaverage's inner skull, from the package mne. Or give "
         "--mask, the brain of any healthy head, with --t1 if you like",
     )
     drawn.add_argument(
-        "--brain-ml", type=float, metavar="ML", help="volume that the brain is scaled to [ml] (1470; a --mask's own)"
+        "--brain-ml", type=float, metavar="ML", help="volume to which the brain is scaled [ml] (default: 1470; with --mask, its own)"
     )
     drawn.add_argument(
-        "--radius", type=float, metavar="MM", help="radius [mm]; of a ball of equal volume if lobed (12)"
+        "--radius", type=float, metavar="MM", help="radius of the tumour [mm]; if lobed, of a ball of equal volume (default: 12)"
     )
-    drawn.add_argument("--cover", type=float, metavar="MM", help="depth of its cap under the cortex [mm] (10)")
-    drawn.add_argument("--tumour-shape", choices=("sphere", "lobed"), help="its shape (default sphere)")
-    drawn.add_argument("--site", choices=tuple(SITES), help="the cortex that it lies under (central)")
+    drawn.add_argument("--cover", type=float, metavar="MM", help="distance from the cortex to the top of the tumour [mm] (default: 10)")
+    drawn.add_argument("--tumour-shape", choices=("sphere", "lobed"), help="shape of the tumour (default: sphere)")
+    drawn.add_argument("--site", choices=tuple(SITES), help="region of the cortex above the tumour (default: central)")
     drawn.add_argument(
-        "--tumour-at", type=point, metavar="X,Y,Z", help="its middle [mm, RAS], in place of --site and --cover"
+        "--tumour-at", type=point, metavar="X,Y,Z", help="centre of the tumour [mm, RAS], instead of --site and --cover"
     )
     drawn.add_argument(
         "--falx-depth",
         type=float,
         metavar="MM",
-        help="draw a falx in the midline, so deep [mm, 10 to 60]: it does not move (without it, there is none)",
+        help="depth of a synthetic falx in the midline, which does not move [mm, 10 to 60] (default: no falx)",
     )
     drawn.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random lobed shape (default 0)")
 
 
 def source(args: argparse.Namespace) -> str:
-    """What the brain is made from, in words."""
+    """Describe the source of the brain."""
     return str(args.labels or args.mask or (args.head if args.head == "fsaverage" else "the template"))
 
 
 def demand_no_drawn(args: argparse.Namespace) -> None:
-    """Refuse options of a drawn tumour beside a label volume, with an `InputError`."""
+    """Reject options of a synthetic tumour together with a label map, by an `InputError`."""
     for name in PLACED:
         if getattr(args, name) is not None:
             raise InputError(f"--{name.replace('_', '-')} draws in a healthy head: leave it out with --labels.")
 
 
 def drawn(args: argparse.Namespace, chosen: dict[str, Any]) -> Subject:
-    """The subject that the options draw; `chosen` has lengths [mm], shape and site after presets and defaults.
+    """Return the synthetic subject of the options; `chosen` has lengths [mm], shape and site after presets and defaults.
 
     Raises
     ------
     InputError
-        Options that contradict each other, a volume out of bounds; what the head and the tumour refuse.
+        Options that contradict each other, a volume out of bounds; what the head and the tumour reject.
     """
     if args.t1 is not None and args.mask is None:
         raise InputError("--t1 colours your own brain: give --labels or --mask too, or leave it out.")

@@ -24,7 +24,7 @@ def add_bodies(parser: argparse.ArgumentParser) -> None:
     """Declare which anatomy and models there are."""
     add_anatomy(parser)
     parser.add_argument(
-        "--model", type=Path, help="MODEL.npz made by `sulcus train` (default: MESH.model.npz beside the anatomy)"
+        "--model", type=Path, help="models from `sulcus train`, MODEL.npz (default: MESH.model.npz next to the anatomy)"
     )
     add_trajectory(parser)
 
@@ -45,14 +45,14 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     parser.add_argument(
         "--deformer",
-        help="who answers: a trained model (linear, ann, svr, ...), fem, or guarded: the best of them, and finite "
+        help="deformation model: a trained model (linear, ann, svr, ...), fem, or guarded: the best trained model, and finite "
         "elements where it is unsure. auto: chosen by --within-mm or --within-ms. Default: the model of least error",
     )
     parser.add_argument(
         "--guard-mm",
         type=float,
         metavar="MM",
-        help="how far off a tumour's vertex may be, in 95 of 100 loads, before the finite elements of guarded answer "
+        help="95 % bound of the surface error of the tumour beyond which guarded uses finite elements "
         "[mm] (default 0.2)",
     )
     budget = parser.add_argument_group("a budget, in place of --deformer; errors are those that models state")
@@ -60,13 +60,13 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
         "--within-mm",
         type=float,
         metavar="MM",
-        help="take the fastest deformer whose stated error is at most this [mm]",
+        help="use the fastest deformation model whose reported error is at most this [mm]",
     )
     budget.add_argument(
         "--within-ms",
         type=float,
         metavar="MS",
-        help="take the most accurate deformer that needs at most this a frame [ms]",
+        help="use the most accurate deformation model that needs at most this per frame [ms]",
     )
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
@@ -123,7 +123,7 @@ def _approached(args: argparse.Namespace, scene: Scene, site: Site) -> Scene:
 
 
 def playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]) -> list[Scene]:
-    """The scenes that were named; of none, those of all that the anatomy has a locator for, and the others are said."""
+    """Return the named scenes; by default all that the anatomy has a locator for, with a notice about the others."""
     left = [] if args.scenes else [scene for scene in scenes if theatre.lacks_locator(scene)]
     if left:
         names = ", ".join(scene.name for scene in left)
@@ -133,7 +133,7 @@ def playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]
 
 
 def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> str:
-    """The deformer that `add_theatre`'s arguments ask for; one that a budget chose is said, and why.
+    """Return the requested deformation model; one that a budget selected is reported, with the reason.
 
     Raises
     ------

@@ -33,7 +33,7 @@ AS_LEARNED = f"what the models beside the anatomy learned, or {AS_BRAIN}"
 
 
 def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, default_regions: str = AS_BRAIN) -> None:
-    """Declare --material, the constants of its laws, and --region, of which the `default_regions` are said.
+    """Declare --material, the constants of its laws, and --region, whose `default_regions` are reported.
 
     The help describes each tissue if `whole`, else names it.
     """
@@ -65,7 +65,7 @@ def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, d
     parser.add_argument(
         "--prony",
         metavar="G1,TAU1;G2,TAU2",
-        help="how the resistance to a change of shape relaxes: the share G goes with the time TAU [s]. In the scene "
+        help="Prony series of the shear resistance: the share G relaxes with the time TAU [s]. In the scene "
         'retract it is "0.45,0.5;0.365,50"',
     )
     add_region_argument(parser, default_regions)
@@ -96,7 +96,7 @@ def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] =
         "--skull",
         choices=choices,
         default=choices[0],
-        help=f"how the skull holds the brain. {said}. Default: %(default)s",
+        help=f"boundary condition at the skull. {said}. Default: %(default)s",
     )
 
 
@@ -189,9 +189,9 @@ def refuse(given: Mapping[str, object], material: str, owner: str) -> None:
 
 
 def dressed(args: argparse.Namespace, scene: Scene, theatre: Theatre) -> Scene:
-    """A scene of the tissue and on the element that are asked for, if any are.
+    """Return a scene with the requested tissue and element.
 
-    Regions that no --region names are as the scene says, or as `learned_regions` has them; the latter are said.
+    Regions that no --region names are those of the scene, or of `learned_regions`; the latter are reported.
 
     Raises
     ------
@@ -233,7 +233,7 @@ def regions_of(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | None = None
 
 
 def stiffness_doubt(tissue: Tissue) -> str:
-    """Why a tissue's stiffness at small strain seems to be a slip, as a sentence without its subject; empty if not."""
+    """Return the reason why a tissue's small-strain stiffness is implausible, as a predicate; empty if plausible."""
     mu, lame = tissue.lame
     young, (least, most) = mu * (3.0 * lame + 2.0 * mu) / (lame + mu), DOUBTED
     if least <= young <= most:

@@ -1,4 +1,4 @@
-"""What stands beside the 3-D view of a page: slices of the scan round the tumour, and what was read lately."""
+"""Side panels of the page's 3-D view: slices of the scan around the tumour, and recent readings."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from ..play.stage import TOOL, TOOL_COLOUR, Stage
 from ..script.scene import Scene
 
 TUMOUR_MIDDLE, TIP = "the tumour's middle", "the tool's tip"
-"""Where the slices lie."""
-DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of the model (95 %); dotted: none is stated")
-FORCE = Line("force", "N", "#ffa94d", "band: error of the model (95 %); dotted: none is stated")
+"""Positions of the slices."""
+DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of the model (95 %); dotted: error unknown")
+FORCE = Line("force", "N", "#ffa94d", "band: error of the model (95 %); dotted: error unknown")
 SET = Line("force", "N", "#ffa94d", "as it is set")
 MOVED = Line("tumour moved", "mm", "#4cf28c", "band: error of the tumour (95 %); dotted: not known")
 
 
 def lines_of(scene: Scene) -> tuple[Line, ...]:
-    """What is read in a scene: of one without a tool, how far the tumour has moved."""
+    """Return the plotted quantities of a scene: without a tool, the displacement of the tumour."""
     if scene.tool is None:
         return (MOVED,)
     return DISTANCE, FORCE if scene.posed else SET
 
 
 def sample_of(frame: Frame, scene: Scene, now: float) -> Sample:
-    """What is read in a frame that is shown at a time [s], with its errors: `lines_of` says in which order."""
+    """Build the readings, with errors, of a frame that is shown at a time [s], in the order of `lines_of`."""
     if scene.tool is None:
         known = frame.estimate.location if frame.estimate is not None else None
         error = frame.tumour_error.bound if known is None else known.p95
@@ -43,7 +43,7 @@ def sample_of(frame: Frame, scene: Scene, now: float) -> Sample:
 
 
 def force_of(loads: Loads, answer: Deformation) -> tuple[float | None, float | None]:
-    """How hard the tool pushes, and that number's error [N]: a force that is set has none; None: not known."""
+    """Return the tool force and its error [N]: a prescribed force has none; None: not known."""
     pushed = loads.every(Pushed)
     if pushed:
         return float(np.linalg.norm(pushed[0].force[0])), 0.0

@@ -1,4 +1,4 @@
-"""Who plays a scene on a page: trained models, and finite elements, which solve in threads of their own."""
+"""Deformers of a scene on a page: trained models, and FEM, which runs in its own threads."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from ..script.scene import Scene
 from .referee import Question, Referee, Truth
 
 ALL: frozenset[str] = frozenset()
-"""What is switched off where all effects act."""
+"""Disabled effects when all effects are active."""
 
 
 class Cast:
-    """The stages, models and finite elements of one scene, with all its effects or without some.
+    """Stages, models and FEM solvers of one scene, with all its effects or without some.
 
-    `playable` says whether any of them is ready to answer.
+    `playable` is true if one of them is ready to compute.
     """
 
     def __init__(self, theatre: Theatre, scene: Scene, deformer: str, turn: threading.Lock) -> None:
@@ -66,7 +66,7 @@ class Cast:
         return self.solvers[off]
 
     def player(self, name: str, off: frozenset[str] = ALL) -> Player:
-        """Who plays the scene without some effects: a trained model, or finite elements that have answered."""
+        """Return the player of the scene without some effects: a trained model, or FEM with a solution."""
         if (name, off) not in self.players:
             stage = self.stage(off)
             if name == "fem":
@@ -90,14 +90,14 @@ class Cast:
         return replace(player, stage=self.filmed[off, path])
 
     def _trained(self, name: str, scene: Scene) -> Deformer:
-        """A trained model. Finite elements behind it are made in turn, and on the CPU, for the reason of the stages."""
+        """Return a trained model. Its FEM fallback is built under `turn`, on the CPU like the stages."""
         with self.turn if name == GUARDED else nullcontext():
             return replace(self.theatre, device="cpu").deformer(name, scene)
 
     def predicted(self, name: str, question: Question) -> Truth:
-        """A trained model's answer; finite elements behind it start from its last one.
+        """Compute a trained model's solution; its FEM fallback starts from the last one.
 
-        One that follows its tissue in time goes through the frames before.
+        A model that integrates its tissue in time computes the previous frames first.
         """
         begun, player = clock.perf_counter(), self.player(name)
         if player.follows:
@@ -111,19 +111,19 @@ class Cast:
         return Truth(question[0], loads, answer, clock.perf_counter() - begun, question)
 
     def solved(self, off: frozenset[str], question: Question, seen: Truth | None, patience: float) -> Truth | None:
-        """The finite elements' answer, or that to a frame on the way there. They are asked, if they were not yet.
+        """Return the FEM solution of a frame, or of one on the way to it. The solver is started if necessary.
 
         Parameters
         ----------
         seen
-            An answer that is known already.
+            A solution that is known already.
         patience
-            How long to wait for another [s]; None is returned where none came.
+            Maximum time to wait for another [s]; None is returned after it.
 
         Raises
         ------
         Exception
-            Whatever the solver's thread raised.
+            Any exception of the solver's thread.
         """
         solver = self.solver(off)
         if self.seeking != (solver, question):

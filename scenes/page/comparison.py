@@ -20,15 +20,15 @@ from ..play.tip_reading import measured
 from ..script.tool_paths import lifted
 from .referee import Truth
 
-OWN, TRUTH = "this is the finite elements' own answer", "the truth is the finite elements' own answer"
+OWN, TRUTH = "this is the result of the FEM solver", "the truth is the result of the FEM solver"
 
 
 @dataclass(frozen=True)
 class Judged:
-    """How far off a deformer is where the finite elements have answered: mean and largest, and the motion [m].
+    """Error of a deformer relative to an FEM solution: mean and maximum, and the motion [m].
 
-    doubt says why their answer may not be relied on. mean and largest are None where the answer shown is theirs.
-    distance is theirs from tip to tumour [m].
+    doubt is the reason why the FEM solution is unreliable. mean and largest are None if the shown solution is by FEM.
+    distance is that from tip to tumour by FEM [m].
     """
 
     number: int
@@ -41,9 +41,9 @@ class Judged:
 
 
 def judge(truth: Truth, player: Player, own: bool, shown: Deformation | None = None) -> Judged:
-    """Hold a deformer against the finite elements under the loads that they answered.
+    """Compare a deformer with an FEM solution, for the same loads.
 
-    `shown` is what it answered these loads with, where that depends on what it answered before.
+    `shown` is the deformer's solution of these loads, if it depends on previous ones.
     """
     nodes = player.stage.at(truth.loads).anatomy.tumour_nodes
     right = truth.deformation.at(nodes).displacement[0]
@@ -61,9 +61,9 @@ def judge(truth: Truth, player: Player, own: bool, shown: Deformation | None = N
 
 
 def verdict_words(judged: Judged | None, stale: bool, waits: str, own: str = OWN) -> str:
-    """The verdict; of an earlier load it is greyed and says so, and what the finite elements do meanwhile.
+    """Format the comparison; that of a previous load is greyed and marked, with the state of the FEM solver.
 
-    `own` says that an answer is the finite elements' own.
+    `own` is the text for a solution by FEM itself.
     """
     if judged is None:
         return f'<p class="stale">{escape(waits)}</p>'
@@ -75,12 +75,12 @@ def verdict_words(judged: Judged | None, stale: bool, waits: str, own: str = OWN
     tail += f" (frame {judged.number}, FEM {1e3 * judged.seconds:.0f} ms"
     tail += f", {judged.doubt})" if judged.doubt else ")"
     if stale:
-        return f'<p class="stale">of an earlier load: {said}; {tail}. {escape(waits)}</p>'
+        return f'<p class="stale">previous load: {said}; {tail}. {escape(waits)}</p>'
     return f"<p>{said}; {tail}</p>"
 
 
 def changed(truth: Truth, player: Player, shown: Deformation, off: Sequence[str]) -> str:
-    """How far from where all effects together have it the tumour of an answer without some lies."""
+    """Describe the tumour's distance from its position under all effects, for a solution without some."""
     nodes = player.stage.at(truth.loads).anatomy.tumour_nodes
     apart = truth.deformation.at(nodes).displacement[0] - shown.at(nodes).displacement[0]
     mean = 1e3 * float(np.linalg.norm(apart, axis=1).mean())
@@ -91,9 +91,9 @@ def changed(truth: Truth, player: Player, shown: Deformation, off: Sequence[str]
 
 @dataclass
 class Moment:
-    """What the page shows now: the wish, its answer, the frame, and what the finite elements said of it.
+    """State of the page: the request, its solution, the frame, and the FEM comparison.
 
-    `goal` is the wish that the frame is on the way to, `asked` the one that it answers, `look` how that is shown.
+    `goal` is the request that the frame is on the way to, `asked` the one that it fulfils, `look` the display style.
     """
 
     goal: tuple | None = None
@@ -135,11 +135,11 @@ class Tally:
         self._missed: dict[str, dict[str, float]] = {}
 
     def took(self, name: str, load: str, seconds: float) -> None:
-        """A deformer answered a load, named by its stamp."""
+        """Record the time of a deformer for a load, named by its stamp."""
         _keep(self._took.setdefault(name, {}), load, 1e3 * seconds)
 
     def missed(self, name: str, load: str, metres: float) -> None:
-        """The finite elements, solved to the end, say how far off a deformer was under a load."""
+        """Record the error of a deformer for a load, relative to the converged FEM solution."""
         _keep(self._missed.setdefault(name, {}), load, 1e3 * metres)
 
     @property

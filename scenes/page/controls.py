@@ -1,4 +1,4 @@
-"""What a visitor can set on the page, in the visitor's words."""
+"""Controls of the page, labelled for users."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from .text import effect_words
 MOST_FORCE, MOST_DEPTH, MOST_TILT = 0.4, 8.0, 40.0
 """Ends of the sliders [N], [mm], [deg]."""
 STAYS = "stays"
-"""What a visitor calls a camera that does not move."""
-PLAN = "how the finite elements solve a load"
+"""Label of a static camera."""
+PLAN = "solver details (advanced)"
 """Label of the note that says which solvers they try."""
-OWN_FILM = "your own film or camera"
+OWN_FILM = "your own video or camera"
 """Label of the note that says how to have them in the scene's place."""
 ASKED = (
-    "<p>The same page shows your own film, or what a camera of this machine sees, with the tumour drawn into it:</p>"
-    "<p><code>sulcus overlay FILM --page --camera K.yaml --registration R.json --tool T.json</code></p>"
-    "<p>A camera's number in the film's place asks for that camera. <code>sulcus film palpate --out film</code> makes "
-    "a film to try it on. <code>sulcus overlay --help</code> says which command makes each file.</p>"
+    "<p>The same page shows your own video, or what a camera of this machine sees, with the tumour drawn into it:</p>"
+    "<p><code>sulcus overlay VIDEO --page --camera K.yaml --registration R.json --tool T.json</code></p>"
+    "<p>A camera's number instead of the video selects that camera. <code>sulcus film palpate --out film</code> makes "
+    "a video to try it on. <code>sulcus overlay --help</code> says which command makes each file.</p>"
 )
 HANDS = "A slider takes the tool in your hand; 'script' gives it back."
 
@@ -46,17 +46,17 @@ def controls(
     give: Callable[[str], None],
     take: Callable[..., None],
 ) -> list[Slider | Choice | Toggle | Fold | Note]:
-    """All that a visitor can set in a scene that deformers of these names answer.
+    """Build all controls of a scene that these deformers support.
 
-    `give` takes who gets the tool, `take` numbers of its touch, as `Wish.hand` does.
+    `give` receives who gets the tool, `take` numbers of its touch, as `Wish.hand` does.
     """
-    cameras = "as the scene has it", STAYS, *PATHS
+    cameras = "scene default", STAYS, *PATHS
 
     def film(name: str) -> None:
         wish.set(path="" if name == cameras[0] else name)
 
     switches = tuple(
-        Toggle(effect, True, partial(wish.switch, effect), effect_words(effect), "what happens without it?")
+        Toggle(effect, True, partial(wish.switch, effect), effect_words(effect), "switch this effect on or off")
         for effect in switched(scene, site)
     )
     slices = through(wish.through, lambda name: wish.set(through=name))
@@ -68,20 +68,20 @@ def controls(
             names,
             wish.deformer,
             lambda name: wish.set(deformer=name),
-            "answered by",
-            "fem: finite elements, solved anew; the others: models that were trained on them",
+            "model",
+            "fem: finite elements, solved each time; the others: models that were trained on them",
         ),
         overlays(wish.style, lambda style: wish.set(style=style)),
         Choice("camera", cameras, wish.path or cameras[0], film, hint="how the camera moves"),
         *([] if scene.tool is None else [*hand(scene, site, wish, give, take), slices]),
-        *([Fold("more: switch parts of the physics off", switches)] if switches else []),
+        *([Fold("physics effects (on/off)", switches)] if switches else []),
         Note(PLAN),
         Note(OWN_FILM, ASKED),
     ]
 
 
 def overlays(now: Style, choose: Callable[[Style], None]) -> Choice:
-    """How the overlay is drawn."""
+    """Build the choice of overlay styles."""
     styles: dict[str, Style] = {words: style for style, words in STYLES.items()}
     return Choice(
         "overlay", tuple(styles), STYLES[now], lambda words: choose(styles[words]), hint="how it is drawn", key=STYLE
@@ -89,9 +89,9 @@ def overlays(now: Style, choose: Callable[[Style], None]) -> Choice:
 
 
 def through(now: str, choose: Callable[[str], None]) -> Choice:
-    """Where the slices of the scan lie."""
+    """Build the choice of slice positions."""
     places = TUMOUR_MIDDLE, TIP
-    hint = "where the slices of the scan lie, which a tab beside the 3-D view shows"
+    hint = "position of the scan slices (tab slices)"
     return Choice("slices", places, now or places[0], choose, hint=hint)
 
 
@@ -102,7 +102,7 @@ def switched(scene: Scene, site: Site) -> list[str]:
 
 
 def clocked(scene: Scene, site: Site) -> bool:
-    """Whether anything moves by itself while the hand is still."""
+    """Return True if the scene evolves without tool input."""
     effects = scene.effects_on(site.anatomy)
     relaxing = remember(effect for effect in effects if isinstance(effect, Elasticity))
     return relaxing or any(isinstance(effect, Gravity | Inertia | Pulsation | Resection) for effect in effects)
@@ -111,12 +111,12 @@ def clocked(scene: Scene, site: Site) -> bool:
 def hand(
     scene: Scene, site: Site, wish: Wish, give: Callable[[str], None], take: Callable[..., None]
 ) -> list[Slider | Choice]:
-    """Who has the tool, and where: as far as the opening lets it go, in directions of the patient."""
+    """Build the controls of the tool: who holds it, and its position within the opening, in patient directions."""
     assert scene.tool is not None
     room = max(0.5, np.floor(2e3 * (site.clearance - scene.tool.radius)) / 2.0)
     sides = bearings(scene.viewpoint.camera(site).T_camera_world[:3, :3])
-    stops = "the bone stops the tool at the rim of the opening"
-    against = "which way the tool pushes, against straight inwards"
+    stops = "limited by the edge of the craniotomy"
+    against = "direction of the push: tilt from the surface normal"
     ways = (("right", "x", sides["right"]), ("up", "y", sides["top"]))
     places = (
         Slider(
@@ -144,7 +144,7 @@ def slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
 
 
 def strength(scene: Scene, wish: Wish, take: Callable[..., None]) -> Slider:
-    """How hard the hand pushes, or how deep it goes."""
+    """Build the slider of the force, or of the depth of a posed tool."""
     touch = wish.touch
     if scene.posed:
         low = -1e3 * AIR

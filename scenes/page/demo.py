@@ -43,8 +43,8 @@ from .view import (
 )
 
 WAITS = "The finite elements are working on this load."
-RESTS = '<p class="stale">The body at rest, as in the scan. The first answer is on its way.</p>'
-# How long a page that plays shows why a frame is left out [s].
+RESTS = '<p class="stale">The undeformed body, as in the scan. The first result is being computed.</p>'
+# # Time for which a playing page shows why a frame is skipped [s].
 READING = 2.0
 
 
@@ -85,12 +85,12 @@ class Demo:
         self.asked, self.drawn = self.wish.now(), 0
 
     def run(self, seconds: float = float("inf")) -> int:
-        """Play until the time is over; returns the frames drawn. What fails is said on the page, and is left out.
+        """Play for the given time; return the number of frames drawn. Failures are reported on the page and skipped.
 
         Raises
         ------
         InputError
-            The finite elements of the first scene cannot be had, and nothing else was asked to play it.
+            FEM of the first scene is not available, and no other deformer was requested.
         """
         self.drawn, end = 0, clock.perf_counter() + seconds
         while (left := end - clock.perf_counter()) > 0.0:
@@ -150,7 +150,7 @@ class Demo:
 
     @property
     def stage(self) -> Stage:
-        """What is drawn, with all effects."""
+        """Drawn stage, with all effects."""
         return self.cast.stage()
 
     @property
@@ -200,13 +200,13 @@ class Demo:
         return 0
 
     def _arrive(self) -> None:
-        """All is shown: nothing more is wanted, and playing goes on."""
+        """Mark the request as shown: nothing is pending, and playback continues."""
         self.busy.off()
         self.cast.rest()
         self.wish.go_on(self.asked[0], len(self.stage.scene.times))
 
     def _found(self, now: Moment) -> Truth | None:
-        """The answer to what is wished, or to a frame on the way there; None until there is one."""
+        """Return the solution of the request, or of a frame on the way to it; None until there is one."""
         number, name, touch, off = self.asked
         question, scene = (number, touch), self.stage.scene
         if name != "fem" and not off:  # no model was trained without
@@ -237,7 +237,7 @@ class Demo:
         now.rests = True
 
     def _draw(self, now: Moment, found: Truth) -> None:
-        """Draw an answer, and have it judged by the finite elements unless it is theirs."""
+        """Draw a solution, and have it compared with FEM unless it is by FEM."""
         number, name, touch, off = self.asked
         fem = name == "fem" or bool(off)
         look = self.wish.look
@@ -269,7 +269,7 @@ class Demo:
                 self.browser.put(label, value, wanted)
 
     def _restyle(self, now: Moment) -> None:
-        """Draw the same answer in another way."""
+        """Draw the same solution in another style."""
         assert now.frame is not None and now.asked is not None
         frame, now.look = now.frame, self.wish.look
         player, seconds = self._seen(now.asked, now.look), frame.seconds["deform"]
@@ -278,7 +278,7 @@ class Demo:
         self._beside(now.frame, player)
 
     def _seen(self, asked: tuple, look: tuple[Style, str, str]) -> Player:
-        """Who plays what is asked, drawn in that way."""
+        """Return the player of a request, in the given style."""
         _, name, _, off = asked
         style, path, _ = look
         return replace(self.cast.seen("fem" if off else name, off, path), style=style)
@@ -313,7 +313,7 @@ class Demo:
         if self.referee.failure is not None:
             what = "this" if self.referee.thread.is_alive() else "any more"
             why = escape(str(self.referee.failure))
-            verdict = f'<p class="warn">error: the finite elements do not answer {what} ({why})</p>'
+            verdict = f'<p class="warn">error: the finite elements do not solve {what} ({why})</p>'
         elif off and truth is not None:
             shown, whole = now.frame.deformation, self.cast.player(name)
             verdict = changed(truth, whole, shown, gone) if fresh else verdict_words(None, True, WAITS)
@@ -332,12 +332,12 @@ class Demo:
         self.browser.show(now.frame.number, now.picture, said, self.asked[0])
 
     def _whole(self, number: int, touch: Touch | None) -> Loads:
-        """What acts in a frame under all effects of the scene."""
+        """Return the loads of a frame under all effects of the scene."""
         scene, time = self.stage.scene, float(self.stage.scene.times[number])
         return scene.loads(self.stage.site, touch or scene.path(time), time)
 
     def _parts(self, deformer: str) -> tuple:
-        """What the page is filled with: bodies, playback, controls, title, words."""
+        """Build the contents of the page: bodies, playback, controls, title, text."""
         scene, site = self.stage.scene, self.stage.site
         wish, names = self.wish, self.theatre.names(scene)
         playback = Playback(len(scene.times), self._play, lambda number: self._give(SCRIPT, number=number))
@@ -345,7 +345,7 @@ class Demo:
         return bodies_of(self.stage), playback, given, f"sulcus: {scene.name}", words(self.theatre, scene, self.anatomy)
 
     def _play(self, plays: bool) -> None:
-        """The button: where nothing moves by itself, playing gives the tool to the script. A pause stops on the way."""
+        """Handle the play button: in a static scene the script takes the tool. A pause stops on the way."""
         self.wish.play(plays)
         if not plays and self.reached is not None:
             self.wish.set(number=self.reached)
@@ -371,12 +371,12 @@ class Demo:
         self.browser.put("tool", HAND)
 
     def _start_hand(self) -> None:
-        """Where the script has the tool, a hand takes it as it is in the frame that is shown."""
+        """Initialise manual control, when the script has the tool, from the touch of the frame shown."""
         if self.wish.tool == SCRIPT:
             number = self.wish.number if self.reached is None else self.reached
             scene = self.stage.scene
             self.wish.set(touch=scene.path(float(scene.times[number])))
 
     def _visitor(self) -> int | None:
-        """Who set what is heard now."""
+        """Return the user whose change is processed now."""
         return None if self.browser.deed is None else self.browser.deed.visitor

@@ -1,4 +1,4 @@
-"""The finite elements of a page: a thread that answers the newest frame, to show it or to judge a model by it."""
+"""FEM thread of a page: it solves the newest frame, to show it or to compare a model with it."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Question = tuple[int, Touch | None]
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The answer to one frame: its number, the deformation, the loads, and seconds; the question that was asked.
+    """Solution of one frame: its number, the deformation, the loads, and seconds; the request.
 
-    The frame may be one on the way to the question's.
+    The frame may be one on the way to the requested one.
     """
 
     number: int
@@ -35,12 +35,11 @@ class Truth:
 
 
 class Referee:
-    """A thread that answers the newest frame by finite elements; older ones that it did not reach are dropped.
+    """Thread that solves the newest frame by FEM; older requests that it did not reach are dropped.
 
-    It prepares when it is first asked. Frames on the way to the one that is asked for are answered too. Where the
-    finite elements fail, `failure` says why, and no further frames are answered; where they refuse loads, that frame is
-    left out alone, and `refused` says which. `player` has them, and `plan` says in sentences which solvers they try, as
-    soon as they are set up.
+    It is prepared at the first request. Frames on the way to the requested one are solved too. If FEM fails, `failure`
+    is the reason, and no further frames are solved; if loads are rejected, only that frame is skipped, and `refused` is
+    its request. After the setup, `player` has the solver, and `plan` lists its solvers as sentences.
     """
 
     def __init__(self, theatre: Theatre, scene: Scene, turn: threading.Lock) -> None:
@@ -58,9 +57,9 @@ class Referee:
         self.thread.start()
 
     def ask(self, number: int, touch: Touch | None) -> None:
-        """Replace the question that waits; `touch` is the hand's, if it has the tool.
+        """Replace the pending request; `touch` is the manual one, if the user has the tool.
 
-        Nothing is solved twice: the question may be the one in hand, or the last one that was answered.
+        Nothing is solved twice: the request may be the one in progress, or the last one that was solved.
         """
         truth, question = self.truth, (number, touch)
         with self.wake:
@@ -76,7 +75,7 @@ class Referee:
             self.newest = None
 
     def newer(self, question: Question, seen: Truth | None, seconds: float) -> Truth | None:
-        """An answer to a question, or on the way to it, that was not seen yet; wait for it so long at most."""
+        """Wait up to `seconds` for a solution of a question, or on the way to it, other than `seen`; None after it."""
 
         def found() -> Truth | None:
             truth = self.truth

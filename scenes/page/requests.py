@@ -15,10 +15,10 @@ SCRIPT, HAND = "script", "hand"
 
 @dataclass
 class Wish:
-    """What the visitors ask for, written by the page's threads and read by the loop, under its lock.
+    """Requests of the users, written by the page's threads and read by the loop, under its lock.
 
-    `path` is how the camera moves, by its name; "" as the scene has it. `through` is where slices lie.
-    `clocked` says whether anything moves by itself under a hand that is still: otherwise a hand pauses the script.
+    `path` is the name of the camera's motion; "": the scene's own. `through` is the position of the slices.
+    `clocked` is true if the scene evolves without tool input: otherwise manual control pauses the script.
     """
 
     deformer: str
@@ -49,7 +49,7 @@ class Wish:
             self.plays = self.plays and self.clocked
 
     def play(self, plays: bool) -> None:
-        """Play or pause; where nothing moves by itself, playing takes the tool from the hand."""
+        """Play or pause; in a scene that is static without tool input, playing returns the tool to the script."""
         with self.lock:
             self.plays = plays
             if plays and not self.clocked:
@@ -62,7 +62,7 @@ class Wish:
 
     @property
     def look(self) -> tuple[Style, str, str]:
-        """How an answer is shown: the overlay's style, the camera's path, and where slices lie."""
+        """Display style of a solution: the overlay's style, the camera's path, and the position of the slices."""
         with self.lock:
             return self.style, self.path, self.through
 
@@ -72,7 +72,7 @@ class Wish:
             return self.number, self.deformer, self.touch if self.tool == HAND else None, self.off
 
     def go_on(self, number: int, frames: int) -> None:
-        """A frame was shown: playing goes on to the next, unless a visitor has sought another meanwhile."""
+        """Advance playback after a frame was shown, unless a user has sought another one meanwhile."""
         with self.lock:
             if self.plays and self.number == number:
                 self.number = (number + 1) % frames

@@ -1,4 +1,4 @@
-"""The words of the page, as HTML: what is seen, what it is of, what was answered, and how far to trust it."""
+"""Text of the page, as HTML: scene, anatomy, result and its reliability."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ EFFECTS = {
     "SkullContact": "contact with the skull",
     "Inertia": "inertia",
 }
-"""What a visitor calls the effects of a scene."""
+"""Names of a scene's effects for users."""
 
 
 def effect_words(name: str) -> str:
-    """What a visitor calls an effect of this class name."""
+    """Return the name of an effect class for users."""
     return EFFECTS.get(name, name)
 
 
 def words(theatre: Theatre, scene: Scene, anatomy: str) -> str:
-    """What stands under the picture: what is seen, what the lines mean, and whose brain it is."""
+    """Describe the image: visible parts, meaning of the lines, and anatomy."""
     title = " ".join(scene.title.split())
     seen = SEEN if scene.sight is None else ESTIMATED
     return (
@@ -62,14 +62,14 @@ def words(theatre: Theatre, scene: Scene, anatomy: str) -> str:
 
 
 def legend(scene: Scene) -> str:
-    """What the lines mean, each beside a piece of it."""
+    """Build the legend of the lines, each with a sample."""
     scan = ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan")
     now, true, ellipsoid = (stroked(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
     under = (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone")
     keys = [
         (f'{now} stroke-width="3"', "tumour now (predicted)"),
         under,
-        (f'{now} stroke-width="1.5" stroke-dasharray="4 3"', "where it is, 95 of 100 times"),
+        (f'{now} stroke-width="1.5" stroke-dasharray="4 3"', "95 % error band"),
         scan,
         (f'{true} stroke-width="1.5"', "finite elements (3-D view)"),
     ]
@@ -78,7 +78,7 @@ def legend(scene: Scene) -> str:
             (f'{now} stroke-width="3"', "tumour now (estimate)"),
             under,
             (f'{true} stroke-width="2" stroke-dasharray="8 3"', "tumour now (truth: finite elements)"),
-            (f'{ellipsoid} stroke-width="2" stroke-dasharray="5 3"', "its middle, with 95 % probability"),
+            (f'{ellipsoid} stroke-width="2" stroke-dasharray="5 3"', "95 % region of the tumour centre"),
             scan,
         ]
     if scene.tool is not None:
@@ -101,7 +101,7 @@ def stroked(colour: Sequence[float]) -> str:
 
 
 def about(theatre: Theatre, scene: Scene, anatomy: str) -> str:
-    """Whose brain, which side, and what the finite elements take it to be made of."""
+    """Describe the anatomy, the side, and the tissue of the FEM model."""
     mesh = theatre.anatomy.mesh
     return (
         f"Brain: {anatomy}, opened {side(theatre.site)}; {len(mesh.nodes)} mesh points. Finite elements: "
@@ -110,7 +110,7 @@ def about(theatre: Theatre, scene: Scene, anatomy: str) -> str:
 
 
 def side(site: Site) -> str:
-    """Where the opening is, from the middle of the brain's width."""
+    """Describe the side of the opening, relative to the middle of the brain's width."""
     nodes = site.anatomy.mesh.nodes[:, 0]
     off = float(site.origin[0] - 0.5 * (nodes.min() + nodes.max()))
     return "near the midline" if abs(off) < MIDLINE else f"on the patient's {'right' if off > 0.0 else 'left'}"
@@ -137,42 +137,42 @@ def tissue_words(tissue: Tissue | None) -> str:
 
 
 def deformer_words(name: str) -> str:
-    """What a deformer is."""
+    """Describe a deformer."""
     if name == GUARDED:
-        return "best trained model, finite elements where it is unsure"
+        return "best trained model; finite elements if its error bound is too large"
     return "finite elements" if name == "fem" else f"trained model {name}"
 
 
 def work_words(scene: Scene, name: str, number: int, touch: Touch | None) -> str:
-    """What a deformer is solving: a frame of the script, or what the hand's touch asks for."""
+    """Describe the running solve: a frame of the script, or the manual touch."""
     if touch is None:
         return f"solving frame {number} ({deformer_words(name)})"
     how = f"{1e3 * touch.depth:.1f} mm deep" if scene.posed else f"{touch.force:.2f} N"
-    return f"solving the tool in your hand, {how} ({deformer_words(name)})"
+    return f"computing the deformation for the manual tool, {how} ({deformer_words(name)})"
 
 
 def pending_words(shown: int, asked: int, frames: int) -> str:
-    """A line that says of a picture that it does not yet answer what is asked."""
+    """Describe an image that does not show the requested frame yet."""
     way = f" on the way to frame {asked}, this is frame {shown} of {frames - 1}" if shown != asked else ""
-    return f'<p class="stale">Not yet what is asked:{way or " it is being solved"}.</p>'
+    return f'<p class="stale">Result pending:{way or " it is being computed"}.</p>'
 
 
 def plan_words(lines: Sequence[str]) -> str:
-    """Which solvers the finite elements try, as a list; nothing of none."""
+    """List the solvers of FEM in HTML; empty without solvers."""
     return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>" if lines else ""
 
 
 def trust(answer: Deformation, name: str) -> str:
-    """How an answer came about, and how far off it may be; in another colour, with the reason, where it is not good."""
+    """Describe the source of a solution and its error; as a warning with the reason, if it is unreliable."""
     outcome = answer.outcome[0]
     who = f"<b>{escape(_guarded_words(outcome) if name == GUARDED else deformer_words(name))}</b>"
     if outcome is Outcome.EXTRAPOLATED:
         return (
-            f'<p>{who}</p><p class="warn">Do not rely on this answer: the load lies outside the range that the model '
-            "was trained on, so nothing is promised about its error.</p>"
+            f'<p>{who}</p><p class="warn">Do not rely on this result: the load lies outside the range that the model '
+            "was trained on, so its error is not bounded.</p>"
         )
     if not outcome.good:
-        return f'<p>{who}</p><p class="warn">Do not rely on this answer: {escape(outcome.value)}.</p>'
+        return f'<p>{who}</p><p class="warn">Do not rely on this result: {escape(outcome.value)}.</p>'
     how = "inside the range that it was trained on" if outcome is Outcome.PREDICTED else "solved to its tolerance"
     if is_undeformed(answer):
         return f"<p>{who}: {how}. Nothing moves the tumour.</p>"
@@ -186,13 +186,13 @@ def trust(answer: Deformation, name: str) -> str:
 
 
 def _guarded_words(outcome: Outcome) -> str:
-    """Which of the two answered, where a model has finite elements behind it."""
+    """Describe which of the two computed the solution of a guarded model."""
     by_model = outcome in (Outcome.PREDICTED, Outcome.EXTRAPOLATED)
-    return "trained model (guarded)" if by_model else "finite elements, as the trained model is unsure of this load"
+    return "trained model (guarded)" if by_model else "finite elements, as the error bound of the model is too large"
 
 
 def tumour_trust(error: TumourError) -> str:
-    """How far the tumour may be from where it is in the patient: no matter of the model alone."""
+    """Describe the error of the tumour position relative to the patient, which includes more than the model."""
     if error.bound is None:
         return (
             "<p>Error of the tumour: not known. It is known of scripted scenes alone, after "
@@ -200,19 +200,19 @@ def tumour_trust(error: TumourError) -> str:
         )
     within = hud.bound_words(error.bound, 1)
     said = f"Error of the tumour: 95 of 100 times no point of it is more than {within} from where it is"
-    guess = ": a guess, of few draws or a load beyond the law of the tissue" if error.guess else ""
+    guess = ": rough estimate (few samples or load outside the tissue model)" if error.guess else ""
     if error.registration_words:
         said += f" ({error.registration_words} along each axis, as a standard deviation)"
     if error.observed is None:
         return f"<p>{said}{guess or f'; the largest part is {escape(error.largest)}'}.</p>"
-    without = "" if error.prior is None else f"; without observation {hud.bound_words(error.prior, 1)}{guess}"
+    without = "" if error.prior is None else f"; without cortex observation {hud.bound_words(error.prior, 1)}{guess}"
     return f"<p>{said}{without}.</p>"
 
 
 def report(
     frame: Frame, stage: Stage, name: str, verdict: str, rows: Sequence[Row], frames: int, without: Sequence[str] = ()
 ) -> str:
-    """What was answered: the distance first, then how far to trust it, what acts, the verdict and the table."""
+    """Build the report of a solution: distance first, then reliability, loads, comparison and table."""
     left = stage.at(frame.loads).left
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
     if frame.estimate is not None or not is_undeformed(frame.deformation):
@@ -230,14 +230,14 @@ def report(
     if without:
         parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
     if left is not None and len(left.loose):
-        parts.append(f"<p>{len(left.loose)} tetrahedra that nothing held any more came off with the last steps.</p>")
-    spent = {"deform": "answer", "render": "camera picture", "overlay": "overlay"}
+        parts.append(f"<p>{len(left.loose)} loose elements were removed with the resection.</p>")
+    spent = {"deform": "deformation", "render": "rendering", "overlay": "overlay"}
     took = ", ".join(f"{spent.get(stage, stage)} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
     return "".join([*parts, verdict, table(rows), f'<p class="dim">milliseconds: {took}</p>'])
 
 
 def moved_words(frame: Frame) -> str:
-    """How far the tumour moved, and what that is off by: of the model, and of the tumour in the patient."""
+    """Describe the tumour's displacement with its errors: of the model, and of the tumour in the patient."""
     said = f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' by the estimate'}"
     if frame.moved_error is not None:
         off = f"error of the tumour {hud.bound_words(frame.moved_error, 1)}"
@@ -249,20 +249,20 @@ def moved_words(frame: Frame) -> str:
 
 
 def estimated(found: Estimate) -> list[str]:
-    """What an estimate says, how far it is from the truth, and what it was given; or why it was refused."""
+    """Describe an estimate, its error and its input; or the reason of its rejection."""
     truth = f"truly {unbroken(found.truly)}"
     if found.location is None:
         return [
-            f'<p class="number">where the tumour is, is not known ({truth})</p>',
-            f'<p class="warn">What is seen was refused: {escape(found.refusal)}</p>',
+            f'<p class="number">tumour position unknown ({truth})</p>',
+            f'<p class="warn">Observation rejected: {escape(found.refusal)}</p>',
         ]
     moved = unbroken(found.moved, found.location.p95)
     held = "inside" if found.held else "outside of"
     guess = f" {found.location.doubt}" if found.location.doubt else ""
-    still = "" if found.noticed else " The estimate sees no motion beyond its error."
+    still = "" if found.noticed else " No significant motion detected."
     return [
         f'<p class="number">tumour moved {moved} by the estimate ({truth})</p>',
-        f"<p><b>estimate</b> from {escape(found.source)}: {1e3 * found.off:.1f} mm off the truth, which is {held} the "
+        f"<p><b>estimate</b> from {escape(found.source)}: error {1e3 * found.off:.1f} mm; the truth is {held} the "
         f"ellipsoid. Causes: {found.location.named_causes}.{still}{guess}</p>",
     ]
 
@@ -280,20 +280,20 @@ def unbroken(length: float, error: float | None = None) -> str:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Time and error of the deformers so far; nothing is ranked that was not shown the same loads."""
+    """Build the table of time and error of the deformers shown; ranked only if all have the same loads."""
     if not rows:
         return ""
     ranked = rows[0].best is not None
     what = (
         f"Medians over the same {counted(rows[0].loads)}; bold: no other is both faster and more accurate."
         if ranked
-        else "Medians so far."
+        else "Medians up to now."
     )
     if len(rows) > 1 and not ranked:
-        what = "Medians so far, each over loads of its own: not to be compared."
+        what = "Medians over different loads: not comparable."
     lines = (
         f"<tr{' class=best' if row.best else ''}><td>{escape(row.name)}</td>"
-        f"<td>{row.milliseconds:.1f} ms</td><td>{_off(row.millimetres)} mm off</td><td>{counted(row.loads)}</td></tr>"
+        f"<td>{row.milliseconds:.1f} ms</td><td>error {_off(row.millimetres)} mm</td><td>{counted(row.loads)}</td></tr>"
         for row in rows
     )
     return f'<p class="dim">{what}</p><table>{"".join(lines)}</table>'
@@ -305,5 +305,5 @@ def _off(millimetres: float) -> str:
 
 
 def counted(loads: int) -> str:
-    """So many loads, in words."""
+    """Format the number of loads."""
     return f"{loads} load{'' if loads == 1 else 's'}"

@@ -16,10 +16,10 @@ from .referee import Truth
 
 FEM_COLOUR = TRUTH_COLOUR
 STALE_COLOUR = (0.45, 0.45, 0.45)
-"""Of the finite elements' tumour while it belongs to another load than the one that is shown."""
+"""Colour of the FEM tumour while it belongs to another load than the one shown."""
 # Radius of an ellipsoid before there is one [m].
 SMALL = 1e-4
-# How far the patient's sides stand from the brain [m].
+# # Distance of the orientation letters from the brain [m].
 BESIDE = 12e-3
 
 
@@ -83,5 +83,5 @@ def move_wire(browser: Browser, stage: Stage, truth: Truth, player: Player) -> N
 
 
 def pictured(frame: Frame) -> np.ndarray:
-    """A frame's picture (H, W, 3) uint8 with the patient's sides."""
+    """Return a frame's image (H, W, 3) uint8 with the orientation letters."""
     return marked(frame.shown, frame.camera.T_camera_world[:3, :3], frame.taken)

@@ -1,4 +1,4 @@
-"""Whether a scene's pictures can be trusted: figures of every frame, and the bounds that they must keep."""
+"""Verification of a scene's images: metrics of every frame, and their limits."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from ..script.scene import Bounds
 from .picture_checks import beside_tip, drawn_off, honest, printed, silhouette_of, truth_off
 from .player import Frame, Player
 
-# A tumour that has moved by less than this share of its largest motion lies still.
+# # Share of its largest motion below which the tumour counts as still.
 STILL = 0.25
 NOWHERE = 0.0, np.inf, np.inf, np.inf, False
-"""Of a tumour whose place is no number: overlap, distance [m], two in the picture [pixel], whether that is honest."""
+"""Metrics of a tumour at an invalid position: overlap, distance [m], two image distances [pixel], occlusion drawn."""
 
 
 @dataclass(frozen=True)
 class Figures:
-    """The worst of a scene's frames.
+    """Worst metrics over the frames of a scene.
 
     Parameters
     ----------
@@ -37,28 +37,28 @@ class Figures:
     pixels
         Distance between the drawn camera's projection of the tumour and OpenCV's for the scene's camera [pixel].
     drawn
-        Distance between the outline in the picture itself, found again by its colour, and that of the finite elements'
-        tumour by another renderer [pixel]. 95 in 100 of the outline's pixels are nearer.
+        95th percentile of the distance between the outline in the image, detected by its colour, and that of the FEM
+        tumour by another renderer [pixel].
     printed, labelled
-        Whether the picture says the frame's number and the distance from tip to tumour, as they are computed here.
-        Whether that distance stands in it whole, near the tip.
+        True if the image shows the frame number and the distance from tip to tumour as they are computed here; true if
+        that distance is completely visible near the tip.
     honest
-        Whether what is not seen through cortex is drawn broken and unshaded, and the picture says what it lies under.
+        True if occluded parts are drawn as a broken outline without shading, and the image names the occluder.
     finite, answered
-        Whether every number and picture is finite, and every answer, drawn or by finite elements, a good one.
+        True if every number and image is finite; true if every solution, drawn or by FEM, has a good outcome.
     doubt
-        The first answer that is not: frame, whose it is, and its outcome; how many more there are.
+        The first solution that has not: frame, source and outcome; number of others.
     in_step
-        Whether every picture shows the answer to its own moment.
+        True if every image shows the solution at its own time.
     leaked
-        The volume that passes the closed skull in the finite elements' answers, as a share of what the opening takes
-        in and gives out. It is reported and has no limit: see docs/verification.md.
+        Volume that leaks through the closed skull in the FEM solutions, as a share of the volume exchanged at the
+        craniotomy. It is reported and has no limit: see docs/verification.md.
     bond
-        The largest traction between brain and skull, as a share of what their bond bears: above 1 it would tear. NaN
-        where nothing is bonded. It is reported and has no limit.
+        Largest traction between brain and skull, as a share of the bond strength: above 1 it would debond. NaN without
+        bonds. It is reported and has no limit.
     covered, removed
-        In a scene with a sight: share of frames whose ellipsoid holds the tumour's true middle, and share of the
-        tumour's motion, summed over frames, that the estimate removes. NaN in others.
+        In a scene with an observation model: share of frames whose ellipsoid contains the true tumour centroid, and
+        share of the tumour motion, summed over frames, that the estimate removes. NaN in others.
     """
 
     overlap: float
@@ -85,13 +85,13 @@ class Figures:
             f"error {self.error_mm:.4f} mm is above {1e3 * bounds.error:g} mm": self.error_mm <= 1e3 * bounds.error,
             f"projection is {self.pixels:.3g} pixels off, more than {bounds.pixels:g}": self.pixels <= bounds.pixels,
             f"the drawn outline is {self.drawn:.1f} pixels off, more than {bounds.drawn:g}": self.drawn <= bounds.drawn,
-            "a picture does not say its frame's number or the distance to the tumour": self.printed,
+            "an image does not show its frame number or the distance to the tumour": self.printed,
             "the distance to the tumour is cut off, or far from the tip": self.labelled,
-            "what the drape or bone covers is drawn as if it were seen, or the picture does not say so": self.honest,
+            "what the drape or bone covers is drawn as if it were visible, or the image does not say so": self.honest,
             "the tumour never moves: nothing was shown": self.motion_mm > 0.0,
             "a number is not finite": self.finite,
-            f"an answer is not good: {self.doubt}": self.answered,
-            "a picture shows the answer to another moment": self.in_step,
+            f"a solution is not good: {self.doubt}": self.answered,
+            "an image shows the solution at another time": self.in_step,
             f"the ellipsoid holds the tumour's middle in {self.covered:.0%} of the frames, less than "
             f"{bounds.covered:.0%}": not self.covered < bounds.covered,
             f"estimates remove {self.removed:.0%} of the tumour's motion, less than {bounds.removed:.0%}": not (
@@ -109,9 +109,9 @@ class Figures:
 def measure(
     player: Player, camera_at: Callable[[float], Camera], frames: Sequence[Frame], truth: Deformation
 ) -> Figures:
-    """Hold drawn frames against the finite elements' answers to the same loads (one row per frame).
+    """Compare drawn frames with the FEM solutions of the same loads (one row per frame).
 
-    `camera_at` gives the camera that should have drawn what is seen at a time [s].
+    `camera_at` gives the reference camera at a time [s].
     """
     doubts = _doubts(frames, truth)
     moved = [
@@ -160,7 +160,7 @@ def _covered(player: Player, frames: Sequence[Frame], truth: Deformation) -> flo
 
 
 def within(closed: Layer, point: np.ndarray) -> bool:
-    """Whether a closed convex surface, whose triangles point outwards, holds a point (3,) [m]."""
+    """Return True if a closed convex surface, with triangles oriented outwards, contains a point (3,) [m]."""
     a, b, c = np.moveaxis(closed.vertices[closed.triangles], 1, 0)
     return bool((np.einsum("fi,fi->f", np.cross(b - a, c - a), point - a) <= 0.0).all())
 
@@ -177,7 +177,7 @@ def _removed(player: Player, frames: Sequence[Frame], truth: Deformation) -> flo
 
 
 def _doubts(frames: Sequence[Frame], truth: Deformation) -> list[str]:
-    """Which frames, drawn or by finite elements, are not answered well, and why."""
+    """List frames whose solution, drawn or by FEM, has no good outcome, with the outcome."""
     found = []
     for frame, true in zip(frames, truth.outcome, strict=True):
         outcomes = {"as drawn": frame.deformation.outcome[0], "by the finite elements": true}
@@ -186,17 +186,17 @@ def _doubts(frames: Sequence[Frame], truth: Deformation) -> list[str]:
 
 
 def objections(frames: Sequence[Frame]) -> list[str]:
-    """What speaks against the estimates of a scene with a sight, or against what they were tried on.
+    """List warnings about the estimates of a scene with an observation model, or about its frames.
 
-    How many frames the locator refuses or doubts, and why the first. Whether the tumour lies still in most frames:
-    then a share that is removed is mostly of the rigid error. They explain limits that are not kept, and are none.
+    Number of frames that the locator rejects or doubts, with the first reason. A tumour that is still in most frames:
+    the removed share is then mostly rigid error. They explain limits that are exceeded, and are not limits themselves.
     """
     estimates = [frame.estimate for frame in frames if frame.estimate is not None]
     refused = [estimate.refusal for estimate in estimates if estimate.location is None]
     slipped = [estimate.location.doubt for estimate in estimates if estimate.location and estimate.location.slipped]
     found = [
         f"the locator {does} in {len(why)} of {len(estimates)} frames: {why[0]}"
-        for does, why in {"refuses what is seen": refused, "doubts its answer": slipped}.items()
+        for does, why in {"rejects the observation": refused, "doubts its result": slipped}.items()
         if why
     ]
     motion = np.linalg.norm([estimate.true for estimate in estimates], axis=1) if estimates else np.zeros(0)
@@ -214,9 +214,9 @@ def _finite(frame: Frame) -> bool:
 
 
 def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, ...]:
-    """Between a frame and the truth: overlap, mean distance [m], largest in the picture [pixel], and the outline's.
+    """Compute overlap, mean distance [m], largest image distance [pixel] and outline distance of a frame to the truth.
 
-    Last, whether what is not seen through cortex is shown so.
+    The last value is true if parts that are not seen through cortex are drawn as occluded.
     """
     stage = player.stage.at(frame.loads)
     believed = player.believed(frame)
@@ -231,7 +231,7 @@ def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row:
     mean = float(np.linalg.norm(off, axis=1).mean())
     mask = silhouette_of(camera, true if frame.estimate is None else shown)
     drawn = drawn_off(frame, mask)
-    if frame.estimate is not None:  # both are in the picture
+    if frame.estimate is not None:  # both are in the image
         drawn = max(drawn, truth_off(frame, silhouette_of(camera, true)))
     # Not a number: behind the camera.
     return overlap, mean, np.inf if np.isnan(pixels) else float(pixels), drawn, honest(frame, mask)

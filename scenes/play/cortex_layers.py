@@ -102,7 +102,7 @@ class Squares:
     lift: np.ndarray
 
     def at(self, positions: np.ndarray) -> Layer:
-        """As they lie when the mesh's vertices are at positions (V, 3) [m]."""
+        """Return the layer for mesh vertices at positions (V, 3) [m]."""
         carried = np.einsum("nk,nkd->nd", self.weights, positions[self.vertices])
         return Layer("cotton", COTTON, carried + self.lift, self.triangles, COTTON_COLOUR, gloss=0.1)
 

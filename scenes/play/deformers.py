@@ -1,4 +1,4 @@
-"""Who can play: an anatomy with its scan, and the deformers that know it, by name."""
+"""Anatomy with its scan, and the deformers available for it, by name."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ TRUTH = "what an estimate is held against is the truth, as finite elements have 
 
 @dataclass(frozen=True, eq=False)
 class Theatre:
-    """An anatomy, its T1 scan if there is one, models by name, learnt from one data set, and uncertainties by scene.
+    """Anatomy, its T1 scan if there is one, models by name, trained on one data set, and uncertainties by scene.
 
-    `locator_file` is where the locator of its tumour is, for scenes with a sight. `limit` [m] is that of a guarded
-    model; None: the one that its own errors on left-out cortex ask for.
+    `locator_file` is the locator of its tumour, for scenes with an observation model. `limit` [m] is that of a guarded
+    model; None: the limit derived from its own errors on held-out cortex.
     """
 
     anatomy: Anatomy
@@ -69,12 +69,12 @@ class Theatre:
 
     @cached_property
     def locator(self) -> Locator:
-        """What locates its tumour.
+        """Locator of the tumour.
 
         Raises
         ------
         InputError
-            There is no such file, or it is of another anatomy.
+            The file does not exist, or belongs to another anatomy.
         """
         path = self.locator_file
         if path is None or not path.is_file():
@@ -87,17 +87,17 @@ class Theatre:
 
     @cached_property
     def learned_tissue(self) -> Elasticity | None:
-        """What its models learned from, with the tissue of regions; None where none states it.
+        """Tissue that the models were trained on, with that of regions; None if no model gives it.
 
         Raises
         ------
         InputError
-            A statement that is no tissue.
+            A model gives an invalid tissue.
         """
         return first_stated(model.training for model in self.models.values())
 
     def lacks_locator(self, scene: Scene) -> bool:
-        """Whether a scene has a sight, and no locator lies beside this anatomy."""
+        """Return True if a scene has an observation model and this anatomy has no locator file."""
         return scene.sight is not None and (self.locator_file is None or not self.locator_file.is_file())
 
     def stage(self, scene: Scene) -> Stage:
@@ -111,8 +111,8 @@ class Theatre:
         device = find_device(self.device, LIVE.precision).name
         if scene.sight is not None and (unlike := differing(scene.elasticity, self.locator.regions)):
             raise InputError(
-                f"{scene.name}: the locator at {self.locator_file} knows another stiffness of "
-                f"{' and '.join(map(region_words, unlike))} than the scene has. Make it anew: `sulcus locator "
+                f"{scene.name}: the locator at {self.locator_file} has another stiffness of "
+                f"{' and '.join(map(region_words, unlike))} than the scene. Compute it again: `sulcus locator "
                 "ANATOMY.vtu`, with the same --region."
             )
         stage = Stage(scene, self.site, self.intensity, device=device)
@@ -125,10 +125,11 @@ class Theatre:
                 return replace(stage, observer=StereoObserver(stage, self.locator, scene.sight))
 
     def refusals(self, scene: Scene) -> dict[str, str | None]:
-        """Why each learnt model may not answer a scene, by name; None if it may.
+        """Find the reason why each trained model does not support a scene, by name; None if it does.
 
-        A model answers the effects, the tissue and the element that it learned from, and no others. None is the truth
-        that an estimate is held against.
+        A model supports only the effects, the tissue and the element that it was trained on. None is the reference with
+        which
+        an estimate is compared.
         """
         if scene.sight is not None:
             return dict.fromkeys(self.models, TRUTH)
@@ -136,38 +137,38 @@ class Theatre:
         return {name: refusal(model, effects, element) for name, model in self.models.items()}
 
     def knowing(self, scene: Scene) -> dict[str, Learned]:
-        """The learnt models that may answer a scene, by name."""
+        """Select the trained models that support a scene, by name."""
         return {name: self.models[name] for name, why in self.refusals(scene).items() if why is None}
 
     def names(self, scene: Scene) -> tuple[str, ...]:
-        """Every deformer that can be asked for a scene: learnt ones that know it, the best guarded, finite elements."""
+        """List all deformers available for a scene: trained models that support it, the best one guarded, FEM."""
         knowing = tuple(self.knowing(scene))
         return (*knowing, *([GUARDED] if self._guardable(scene) else []), "fem")
 
     def best(self, scene: Scene) -> str:
-        """The learnt model of the tightest error bound; the finite elements where none knows the scene."""
+        """Select the trained model with the smallest error bound; FEM if none supports the scene."""
         knowing = self.knowing(scene)
         return min(knowing, key=lambda name: knowing[name].bound, default="fem")
 
     def limit_of(self, scene: Scene) -> float:
-        """Where finite elements answer behind the best model that knows a scene [m]."""
+        """Return the predicted error [m] above which FEM replaces the best model of a scene."""
         stated = self.models[self.best(scene)].left_out
         if self.limit is not None:
             return self.limit
         return LIMIT if stated is None else stated.limit
 
     def usual(self, scene: Scene) -> str:
-        """Who plays a scene unless somebody else is asked: the best model, guarded where it may not answer alone.
+        """Select the default deformer of a scene: the best model, guarded if its bound is weak.
 
-        A model of tissue that relaxes plays alone, with its bound: see `_guardable`.
+        A model of tissue that relaxes is used without guard, with its bound: see `_guardable`.
         """
         name = self.best(scene)
         return GUARDED if self._guardable(scene) and off_by(self.models[name]).weak else name
 
     def _guardable(self, scene: Scene) -> bool:
-        """Whether finite elements can stand behind the best model.
+        """Return True if FEM can serve as fallback of the best model.
 
-        Where tissue relaxes they cannot: a frame that the model hands over depends on all that it did not.
+        With relaxing tissue it cannot: an FEM frame depends on all previous frames, which the model computed.
         """
         name = self.best(scene)
         return name in self.models and not self.models[name].series
@@ -177,7 +178,7 @@ class Theatre:
         solver = solver_named(self.element_of(scene), scene.effects)
         if name == GUARDED:
             model, limit = self.models[self.best(scene)], 1e3 * self.limit_of(scene)
-            return f"{model.source}; where that may be over {limit:g} mm off, {solver}"
+            return f"{model.source}; where its error may exceed {limit:g} mm, {solver}"
         return solver if name == "fem" else self.models[name].source
 
     def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | Operated:
@@ -203,7 +204,7 @@ class Theatre:
         if name == GUARDED and self.knowing(scene) and not self._guardable(scene):
             raise InputError(
                 f"{self.best(scene)} cannot be {GUARDED} in the scene {scene.name}: its tissue relaxes, so that finite "
-                f"elements would have to answer from the first frame on. Choose one of {allowed}."
+                f"elements would have to solve from the first frame on. Choose one of {allowed}."
             )
         if name == GUARDED and self._guardable(scene):
             model, limit = self.models[self.best(scene)], self.limit_of(scene)
@@ -233,7 +234,7 @@ class Theatre:
         return Player(self.stage(scene), self.deformer(name, scene), uncertainty=self.uncertainty(scene))
 
     def uncertainty(self, scene: Scene) -> Uncertainty | None:
-        """How far the tumour may be off in a scene; None where no ensemble was solved of just this one."""
+        """Return the expected error of the tumour position in a scene; None without an ensemble of exactly it."""
         found = self.uncertainties.get(scene.name)
         return found if found and found.mark == mark_of(scene, self.site, self.element_of(scene)) else None
 
@@ -251,19 +252,19 @@ class AtRest:
 
 
 def plan_of(deformer: Deformer) -> tuple[str, ...]:
-    """Which solvers a deformer tries for a load, in sentences; none of a model, or of a body that is operated on."""
+    """List the solvers that a deformer tries for a load, as sentences; empty for a model or a resected body."""
     return deformer.plan.explain() if isinstance(deformer, Fem) else ()
 
 
 def model_path(anatomy: Path) -> Path:
-    """Where the models of an anatomy file are looked for: MESH.model.npz beside MESH.vtu."""
+    """Return the default path of an anatomy's models: MESH.model.npz next to MESH.vtu."""
     return anatomy.with_suffix(".model.npz")
 
 
 def open_theatre(
     anatomy: Path | None = None, model: Path | None = None, device: str = "auto", scenes: Sequence[str] = ()
 ) -> Theatre:
-    """Read an anatomy (default: the template that ships) with what lies beside it: scan, models, uncertainties.
+    """Read an anatomy (default: the template that ships) with the files next to it: scan, models, uncertainties.
 
     `scenes` are names of those that will play there.
 
@@ -275,7 +276,7 @@ def open_theatre(
     """
     for name in scenes:
         demand_scene(name)
-    # Learnt models alone would not notice, and the finite elements behind them fail too late.
+    # # Trained models alone would not detect this, and the FEM fallback would fail too late.
     find_device(device, LIVE.precision)
     path = template_path() if anatomy is None else Path(anatomy)
     body = read_anatomy(path)

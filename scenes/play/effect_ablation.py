@@ -1,4 +1,4 @@
-"""What each effect of a scene costs and changes: the scene solved with it and without it, frame after frame."""
+"""Cost and influence of each effect of a scene: the scene is solved with and without it, frame by frame."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def without(scene: Scene, effect: Effect) -> Scene:
 
 
 def rows(theatre: Theatre, scene: Scene, every: int) -> Iterator[Row]:
-    """The scene itself, then each of its effects, of the scene's own tissue; every so many frames are solved.
+    """Yield the row of the scene, then of each effect, with the scene's own tissue; solve each `every`-th frame.
 
     Raises
     ------
@@ -85,14 +85,14 @@ def rows(theatre: Theatre, scene: Scene, every: int) -> Iterator[Row]:
 
 
 def run(theatre: Theatre, scene: Scene, every: int) -> Run:
-    """Solve every so many frames of a scene in turn, each from the last, as it is played.
+    """Solve each `every`-th frame of a scene in order, each starting from the previous one.
 
     Raises
     ------
     InputError
-        A body that is not held, a frame of which no good answer is found.
+        A body without fixed nodes, or a frame without a good solution.
     """
-    before = device_arrays()  # whoever lets go of them meanwhile, they were not the scene's
+    before = device_arrays()  # freed meanwhile or not, they are not the scene's
     fem = theatre.fem(scene, scene.accuracy, live=True)
     times = scene.times[::every].tolist()
     found, seconds = _solved(fem, scene, theatre.site, times)
@@ -113,7 +113,7 @@ def _solved(fem: Deformer, scene: Scene, site: Site, times: list[float]) -> tupl
         seconds.append(clock.perf_counter() - begun)
         found.append(np.where(stage.at(loads).anatomy.orphaned[:, None], np.nan, last.displacement[0]))
         if not last.outcome[0].good:
-            raise InputError(f"the frame at {time:.2f} s is not answered: {last.outcome[0].value}")
+            raise InputError(f"the frame at {time:.2f} s is not solved: {last.outcome[0].value}")
     return found, seconds
 
 

@@ -21,26 +21,26 @@ NAMED = 0.05
 OWN_TISSUES, OWN = re.compile(r"; region \d.*?(?=\)(?:;|$))"), re.compile(r"(?:(?<=; )|\()([\w ]+)\)?: ")
 
 
-# What is written into a picture whose answer may not be relied on.
+# # Warnings written into an image whose solution is unreliable.
 DOUBTS = {
     Outcome.EXTRAPOLATED: "outside what the model learned: do not rely on it",
-    Outcome.PIERCED: "the tool came to be inside the tissue: do not rely on it",
+    Outcome.PIERCED: "the tool penetrates the tissue: do not rely on it",
     Outcome.ON_BONE: "the tool stands on bone: do not rely on it",
     Outcome.INVERTED: "the mesh is inverted under this load: do not rely on it",
     Outcome.OVERSTRAINED: "strained beyond measured tissue: do not rely on it",
-    Outcome.GUESSED: "nothing was solved: do not rely on it",
+    Outcome.GUESSED: "no solution: do not rely on it",
 }
 
 
 def doubt_of(outcome: Outcome) -> str:
-    """Why an answer may not be relied on, in a few words for the picture; empty where it may."""
+    """Return the reason why a solution is unreliable, in a few words for the image; empty if it is reliable."""
     return "" if outcome.good else DOUBTS.get(outcome, "not solved to the end: do not rely on it")
 
 
 def acting(loads: Loads, answer: Deformation, nodes: np.ndarray) -> str:
-    """What acts in the first load case, and its tool reads, as one line; empty where time alone goes on.
+    """Describe the active loads of the first load case, and the measured tool force, as one line; empty without loads.
 
-    `nodes` (V, 3) [m] are the vertices of the brain at rest: it is said how much of its height stands in fluid.
+    `nodes` (V, 3) [m] are the undeformed vertices of the brain: the fluid level is given as a share of its height.
     """
     return ", ".join(words for words in (_words(cause, answer, nodes) for cause in loads.causes) if words)
 
@@ -54,17 +54,17 @@ def _words(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str:
         case Resected():
             steps = round(float(cause.done[0]))
             return f"resection: {steps} step{'' if steps == 1 else 's'} done"
-        case Touching() | Retracted() if answer.reaction.shape[1]:  # some learnt models do not know it
+        case Touching() | Retracted() if answer.reaction.shape[1]:  # some trained models do not predict it
             bound = float(answer.reaction_bound[0, 0])
             known = answer.outcome[0].good and np.isfinite(bound)
             within = f" within {rounded_up(bound, 2):.2f} N (model)" if known else ""
-            return f"the tool reads {np.linalg.norm(answer.reaction[0, -1, :3]):.2f} N{within}"
+            return f"tool force {np.linalg.norm(answer.reaction[0, -1, :3]):.2f} N{within}"
         case _:
             return ""
 
 
 def _way(direction: np.ndarray) -> str:
-    """Where a direction (3,) of RAS points, the greatest part first, with its components where there are several."""
+    """Name the RAS directions of a vector (3,), largest component first, with the components if there are several."""
     down = direction / np.linalg.norm(direction)
     axes = [axis for axis in np.argsort(-np.abs(down), kind="stable") if abs(down[axis]) > NAMED]
     names = [SIDES[axis][int(down[axis] < 0.0)] for axis in axes]
@@ -74,14 +74,14 @@ def _way(direction: np.ndarray) -> str:
 
 
 def _fluid(cause: Posture, nodes: np.ndarray) -> str:
-    """How high the fluid stands, as a share of the brain's height."""
+    """Describe the fluid level as a share of the brain's height."""
     height = -nodes @ (cause.direction[0] / np.linalg.norm(cause.direction[0]))
     share = float(np.clip((cause.csf_level[0] - height.min()) / np.ptp(height), 0.0, 1.0))
     return f"fluid up to {100.0 * share:.0f} % of the brain's height"
 
 
 def shortened(source: str) -> str:
-    """What answers, as `Deformation.source` has it, with regions of a tissue of their own by name alone."""
+    """Shorten `Deformation.source`: regions with a tissue of their own are given by name only."""
     return OWN_TISSUES.sub(lambda found: f"; own tissue: {', '.join(OWN.findall(found[0]))}", source)
 
 
@@ -91,25 +91,25 @@ NOT_KNOWN_WORDS = "error of the tumour: not known"
 def error_lines(
     promised: float | None, error: TumourError, trained: bool, doubt: str = "", brief: bool = False
 ) -> list[str]:
-    """Lines for a picture: what the model is off by, and what the tumour is off by.
+    """Build the lines for an image: error of the model, and error of the tumour position.
 
-    The latter alone of a doubtful answer, and of one that is found from what is observed.
+    Only the latter for an unreliable solution, and for an estimate from observations.
 
     Parameters
     ----------
     promised
-        What the model promises [m]; None where nothing is.
+        Error bound guaranteed by the model [m]; None if there is none.
     trained
-        Whether a trained model answers, and not the finite elements.
+        True if a trained model computed the deformation, false if FEM.
     brief
-        Whether in few words, for a small picture.
+        True for the short form, for a small image.
     """
     modelled = error.observed is None and not doubt
     return [*([model_words(promised, trained, brief)] if modelled else []), tumour_words(error, brief)]
 
 
 def model_words(promised: float | None, trained: bool, brief: bool = False) -> str:
-    """What the model is off by, against its finite elements."""
+    """Describe the error of the model relative to its FEM."""
     if not trained:
         return "model: FEM itself" if brief else "model: finite elements themselves"
     if promised is None:
@@ -119,7 +119,7 @@ def model_words(promised: float | None, trained: bool, brief: bool = False) -> s
 
 
 def tumour_words(error: TumourError, brief: bool = False) -> str:
-    """What the tumour is off by, against where it is in the patient."""
+    """Describe the error of the drawn tumour position relative to the patient."""
     if error.bound is None:
         return "tumour: not known" if brief else NOT_KNOWN_WORDS
     within, guess = f"tumour: within {bound_words(error.bound, 1)}", ", a guess" if error.guess else ""
@@ -130,7 +130,7 @@ def tumour_words(error: TumourError, brief: bool = False) -> str:
     if error.observed is None:
         if of and not guess and error.largest == REGISTRATION:
             return f"{said}, {of}"
-        return f"{said}{guess or f', above all {error.largest}'}{f'; {of}' * bool(of)}"
+        return f"{said}{guess or f', mainly {error.largest}'}{f'; {of}' * bool(of)}"
     said += f", {of}" * bool(of)
     return said if error.prior is None else f"{said}; without observation {bound_words(error.prior, 1)}{guess}"
 

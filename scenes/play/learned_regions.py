@@ -1,4 +1,4 @@
-"""What a scene's regions are made of, where the models beside its anatomy learned them."""
+"""Tissue of a scene's regions, given the tissue that the models of its anatomy were trained on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def learned_regions(
 
 
 def _beside(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
-    """A region's tissue in a scene of this brain, where models learned it beside another; the brain's of other laws."""
+    """Return a region's tissue in a scene of this brain, scaled from the trained one; other laws: the brain's."""
     if isinstance(region, Material | Ogden) and _at_once(brain) == _at_once(learned):
         return replace(region, prony=brain.prony)
     if not isinstance(brain, Material) or not isinstance(region, Material) or not isinstance(learned, Material):

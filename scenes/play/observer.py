@@ -1,4 +1,4 @@
-"""Who sees the open cortex and says where the tumour is: without a force, a stiffness or a cause."""
+"""Observers of the open cortex that estimate the tumour position, without force, stiffness or load."""
 
 from __future__ import annotations
 
@@ -29,34 +29,34 @@ from ..script.tool import sphere
 
 # A tool so near to the cortex touches it; it hides points that are so near to it [m].
 TOUCHES, HIDES = 1e-3, 4e-3
-# Of a tool's corners so many that are nearest to those of the cortex are looked at, for where it touches.
+# # Number of tool corners, nearest to those of the cortex, that are searched for the contact point.
 CORNERS = 32
 ELLIPSOID_COLOUR = (0.21, 0.30, 0.90)
 ELLIPSOID = 5
-"""Segmentation id of the ellipsoid's layer, which no picture holds."""
+"""Segmentation id of the ellipsoid's layer, which no image contains."""
 BALL, BALL_FACES = sphere()
 NOTHING = Observation(np.zeros((0, 3)))
-"""What is seen where nothing is."""
+"""Empty observation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Where the tumour is by what is seen, beside the truth.
+    """Estimated tumour position, with the ground truth.
 
     Parameters
     ----------
     anatomy
         The body at rest.
     observation
-        What was seen.
+        Observed points.
     location
-        What the locator says; None where it refuses the observation.
+        Result of the locator; None if it rejects the observation.
     refusal
-        Why, in its words; else empty.
+        Reason of the rejection, in its words; else empty.
     middle, true
-        (3,) [m]: the middle of the tumour's volume in the scan, and how far it truly moved.
+        (3,) [m]: centroid of the tumour in the scan, and its true displacement.
     seconds
-        What seeing and locating took.
+        Time of observation and localisation [s].
     """
 
     anatomy: Anatomy
@@ -69,7 +69,7 @@ class Estimate:
 
     @property
     def motion(self) -> np.ndarray:
-        """(3,) [m]: how far the tumour's middle moved, as a mean; nothing is believed to move where that is refused."""
+        """Mean displacement (3,) [m] of the tumour centroid; zero if the observation is rejected."""
         return np.zeros(3) if self.location is None else self.location.centroid
 
     @property
@@ -79,7 +79,7 @@ class Estimate:
 
     @property
     def worst(self) -> float | None:
-        """With a probability of 95 % its least known vertex is no farther off [m]; None where all is refused."""
+        """95 % bound on the error of the least certain tumour vertex [m]; None if the observation is rejected."""
         if self.location is None:
             return None
         largest = np.linalg.eigvalsh(self.location.covariance(self.anatomy.tumour_nodes))[:, -1].max()
@@ -87,22 +87,22 @@ class Estimate:
 
     @property
     def truly(self) -> float:
-        """How far the tumour's middle moved in truth [m]."""
+        """True displacement of the tumour centroid [m]."""
         return float(np.linalg.norm(self.true))
 
     @property
     def off(self) -> float:
-        """How far the tumour's middle is from where it is believed to be [m]."""
+        """Error of the estimated tumour centroid [m]."""
         return float(np.linalg.norm(self.motion - self.true))
 
     @property
     def noticed(self) -> bool:
-        """Whether the motion is more than it may be off by."""
+        """True if the estimated motion is larger than its error (95 %)."""
         return self.location is not None and self.moved > self.location.p95
 
     @property
     def held(self) -> bool:
-        """Whether the ellipsoid holds the tumour's true middle; what is refused has none."""
+        """True if the ellipsoid contains the true tumour centroid; false if the observation is rejected."""
         if self.location is None:
             return False
         away = self.true - self.motion
@@ -110,18 +110,18 @@ class Estimate:
 
     @property
     def words(self) -> str:
-        """What is said beside the picture, in a few words."""
+        """Remark in the image, in a few words."""
         if self.location is None:
             return ""
-        still = "" if self.noticed else "the estimate sees no motion beyond its error; "
+        still = "" if self.noticed else "no significant motion detected; "
         guess = "" if self.location.calibrated else "a guess; "
-        return f"{still}{guess}truth moved {millimetres(self.truly)}; estimate {millimetres(self.off)} off"
+        return f"{still}{guess}truth moved {millimetres(self.truly)}; estimate error {millimetres(self.off)}"
 
     @property
     def source(self) -> str:
-        """What it was given, in words; or why it was refused."""
+        """Description of the observation; or the reason why it was rejected."""
         if self.location is None:
-            return f"refused, {self.refusal}"
+            return f"rejected, {self.refusal}"
         tip = ", and where the tool touches" if len(self.observation.tips) else ""
         return f"{len(self.observation.now)} points of the cortex{tip}; no force, no stiffness"
 
@@ -134,7 +134,7 @@ class Estimate:
         return believed
 
     def ellipsoid(self) -> Layer | None:
-        """The surface that holds the tumour's middle with a probability of 95 %; None where all is refused."""
+        """Return the surface that contains the tumour centroid with a probability of 95 %; None after a rejection."""
         if self.location is None:
             return None
         root = np.linalg.cholesky(self.location.centroid_covariance)
@@ -143,34 +143,34 @@ class Estimate:
 
 
 class Sees(Protocol):
-    """What a stage asks where the tumour is by what is seen."""
+    """Observer that estimates the tumour position from observations, for a stage."""
 
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Estimate:
-        """What is said in a frame by its number, of a body at `positions` (V, 3) [m].
+        """Estimate the tumour position in frame `number`, for a body at `positions` (V, 3) [m].
 
-        `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is seen.
+        `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is observed.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Observer:
-    """Sees the points of a `Sight`, with its errors, and asks a locator. It knows no loads."""
+    """Observer that samples the points of a `Sight`, with its errors, and calls a locator. Loads are not used."""
 
     site: Site
     locator: Locator
     sight: Sight
 
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Estimate:
-        """What is said in a frame by its number, of a body at `positions` (V, 3) [m].
+        """Estimate the tumour position in frame `number`, for a body at `positions` (V, 3) [m].
 
-        `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is seen.
+        `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is observed.
         """
         begun = clock.perf_counter()
         return estimated(self.site.anatomy, self.locator, lambda: self.seen(number, positions, tool), positions, begun)
 
     def seen(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Observation:
-        """What is seen in a frame; arguments as of `estimate`."""
+        """Sample the observation of a frame; arguments as of `estimate`."""
         sight, random = self.sight, np.random.default_rng([self.sight.seed, 1 + number])
         now = self._at(positions)
         off = self._smooth + sight.white * random.standard_normal(now.shape)
@@ -187,7 +187,7 @@ class Observer:
         return self.site.anatomy.mesh.nodes
 
     def _at(self, positions: np.ndarray) -> np.ndarray:
-        """Where the points are (n, 3) [m]."""
+        """Interpolate the observed points (n, 3) [m]."""
         vertices, weights = self._places
         return np.einsum("nc,nci->ni", weights, positions[vertices])
 
@@ -219,7 +219,7 @@ class Observer:
 
 @dataclass(frozen=True, eq=False)
 class RigidError:
-    """By what all that is seen is off together: a rotation vector (3,) [rad], and a translation (3,) [m]."""
+    """Rigid registration error of all observations: a rotation vector (3,) [rad], and a translation (3,) [m]."""
 
     turn: np.ndarray
     shift: np.ndarray
@@ -247,9 +247,9 @@ def touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> np.nda
 def estimated(
     anatomy: Anatomy, locator: Locator, see: Callable[[], Observation], positions: np.ndarray, begun: float
 ) -> Estimate:
-    """What a locator says of what is seen, beside the truth at `positions` (V, 3) [m]; refused where either refuses.
+    """Locate the tumour from an observation, and compare with the truth at `positions` (V, 3) [m]; rejections are kept.
 
-    `begun` is when what is timed began, by `time.perf_counter`.
+    `begun` is the start time of the measurement, by `time.perf_counter`.
     """
     observation, location, refusal = NOTHING, None, ""
     try:

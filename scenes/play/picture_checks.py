@@ -1,4 +1,4 @@
-"""What a frame's picture shows, found again from its pixels: outline, numbers, and what is not seen through cortex."""
+"""Detection of a frame's overlay in its pixels: outline, numbers, and parts that are not seen through cortex."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from .stage import ESTIMATED_LINES, OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
 STEPS = 24
 SAMPLES = np.array([(i, j, STEPS - i - j) for i in range(STEPS + 1) for j in range(STEPS + 1 - i)]) / STEPS
 
-# A share of the silhouette may be found off by so much.
+# # Share of the silhouette's pixels that may deviate.
 SLACK = 0.02
-# Of a broken outline's pixels this share has its ink; of ground that nothing shines through, so much may be changed.
+# # Range of the ink share of a broken outline; largest changed share of occluded ground.
 BROKEN_SHARES, CHANGED = (0.35, 0.88), 0.5
 # The soft ends of two strokes [pixel]: their ink is not the outline's.
 SOFT = 2
-# So far the number may stand from the tip, as a share of the picture's width.
+# # Largest distance of the number from the tip, as a share of the image width.
 FAR = 0.3
 
 
 def silhouette_of(camera: Camera, layer: Layer) -> np.ndarray:
-    """(H, W) bool: the pixels that a surface covers, by the renderer that is not the picture's own."""
+    """Compute the pixels (H, W) bool that a surface covers, by the independent renderer."""
     return raycast(camera, layer.vertices, layer.triangles).mask
 
 
 def drawn_off(frame: Frame, mask: np.ndarray) -> float:
-    """How far the outline in a frame's picture is from that of a silhouette (H, W) bool [pixel].
+    """Compute the distance between the outline in a frame's image and that of a silhouette (H, W) bool [pixel].
 
-    What is drawn broken, for closed ground covers it or it may not be relied on, may have gaps.
+    Outlines drawn broken, because they are occluded or unreliable, may have gaps.
     """
     ink, shut = ink_of(DOUBTFUL if frame.doubt else TUMOUR_COLOUR), closed(frame)
     above = _above(frame)
@@ -53,7 +53,7 @@ def drawn_off(frame: Frame, mask: np.ndarray) -> float:
 
 
 def truth_off(frame: Frame, mask: np.ndarray) -> float:
-    """The same of the truth's outline, drawn beside an estimate's, whose own is drawn over it."""
+    """Compute the distance of the truth's outline [pixel]; the estimate's outline, drawn over it, is masked out."""
     above = _above(frame) | of_ink(frame.shown, ink_of(TUMOUR_COLOUR))
     return outline_gap(frame.shown, ink_of(TRUTH_COLOUR), mask, above, 2 * sum(TRUE_STROKES))
 
@@ -69,9 +69,9 @@ def closed(frame: Frame) -> np.ndarray:
 
 
 def honest(frame: Frame, mask: np.ndarray) -> bool:
-    """Whether a picture shows that a part of a silhouette (H, W) bool is not seen through cortex, where one is not.
+    """Return True if the image marks the occluded part of a silhouette (H, W) bool, if there is one.
 
-    There its outline is broken, nothing shines through, and the picture says what it lies under.
+    There the outline must be broken, without shading, and the image must name the occluder.
     """
     ink, shut = ink_of(DOUBTFUL if frame.doubt else TUMOUR_COLOUR), closed(frame)
     least, most = BROKEN_SHARES
@@ -92,14 +92,14 @@ def _said(frame: Frame, mask: np.ndarray) -> bool:
 
 
 def printed(player: Player, frame: Frame) -> bool:
-    """Whether a picture says its frame's number, how far the tip is from the tumour, and what an estimate says."""
+    """Return True if the image shows the frame number, the distance from tip to tumour, and the estimate."""
     if not stands(frame.shown, f"frame {frame.number}", FINE) or not _estimate_printed(player, frame):
         return False
     return frame.tip is None or _number(player, frame, frame.tip) is not None
 
 
 def beside_tip(player: Player, frame: Frame) -> bool:
-    """Whether a picture has the distance whole, and near the tip, or near the border where the tip is out of sight."""
+    """Return True if the distance is completely visible near the tip, or near the border if the tip is out of view."""
     if frame.tip is None:
         return True
     (tip,), _ = frame.camera.project(frame.tip[None])
@@ -113,7 +113,7 @@ def beside_tip(player: Player, frame: Frame) -> bool:
 
 
 def _number(player: Player, frame: Frame, tip: np.ndarray) -> tuple[int, int, int, int] | None:
-    """The box of the distance where it stands in a picture; None where it does not."""
+    """Find the box of the distance text in an image; None if it is not found."""
     corners = _corners(player, frame)
     distance, inside = _distance(player, frame, corners, tip), encloses(corners, tip)
     error = None if frame.doubt else frame.tumour_error.bound
@@ -126,7 +126,7 @@ def _number(player: Player, frame: Frame, tip: np.ndarray) -> tuple[int, int, in
 
 
 def _estimate_printed(player: Player, frame: Frame) -> bool:
-    """Whether a picture says how far the tumour moved, as is estimated, and how far off that is: as found here."""
+    """Return True if the image shows the estimated tumour motion and its error as computed here."""
     found = frame.estimate
     if found is None or found.location is None:
         return True
@@ -140,7 +140,7 @@ def _estimate_printed(player: Player, frame: Frame) -> bool:
         for text in (f"{ESTIMATED_LINES.motion} {millimetres(length, found.location.p95)}", frame.remark)
         for line in folded(text, NARROW * frame.shown.shape[1])
     ]
-    return frame.remark.endswith(f"{1e3 * off:.1f} mm off") and all(stands(frame.shown, text, FINE) for text in said)
+    return frame.remark.endswith(f"error {1e3 * off:.1f} mm") and all(stands(frame.shown, text, FINE) for text in said)
 
 
 def _corners(player: Player, frame: Frame) -> np.ndarray:
@@ -149,7 +149,7 @@ def _corners(player: Player, frame: Frame) -> np.ndarray:
 
 
 def _distance(player: Player, frame: Frame, corners: np.ndarray, tip: np.ndarray) -> float:
-    """From tip to tumour [m] by samples of the drawn surfaces, with what the model knows it to be off by."""
+    """Compute the distance from tip to tumour [m] by sampling the drawn surfaces, corrected by the model."""
     apart = float(np.linalg.norm(np.einsum("qc,scx->sqx", SAMPLES, corners) - tip, axis=2).min())
     model = answering(player.deformer, frame.deformation)
     if model is None:

@@ -39,72 +39,72 @@ from .observer import Estimate
 from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, TOOL, Stage
 from .tip_reading import reading
 
-REFUSED = "what is seen was refused, and the scan is shown: do not rely on it"
+REFUSED = "observation rejected, and the scan is shown: do not rely on it"
 # Strokes and gaps of the outlines of the truth and of the ellipsoid [pixel].
 TRUE_STROKES, ELLIPSOID_STROKES = (12, 4), (8, 5)
 COVERS = (TOOL, COTTON, GLOVE)
-"""What is drawn in front of the overlay."""
-IN_BONE = "the bone is where this push needs the tool: do not rely on it"
-# Tissue may carry a tool into the bone's edge by so much before it is drawn elsewhere, and before its load counts as
-# none that a tool can make [m].
+"""Layers drawn in front of the overlay."""
+IN_BONE = "blocked by bone at the craniotomy edge: do not rely on it"
+# # Largest penetration of the tool into the craniotomy edge, carried by tissue, before the tool is drawn elsewhere, and
+# # before its load counts as infeasible [m].
 CARRIED, BLOCKED = 0.5e-3, 2e-3
-# A picture of fewer pixels in width has its lines of errors in few words.
+# # Image width [pixel] below which the error lines are short.
 FEW = 480
 # Displacement below which a brain is undeformed [m].
 STILL = 1e-6
 STAGES = ("deform", "render", "overlay")
-"""What the time of a frame is spent on."""
+"""Stages of a frame that are timed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One moment of a scene.
+    """Frame of a scene.
 
     Parameters
     ----------
     number, time
         From 0; [s].
     touch, loads
-        What the hand asked for, and what that does to the tissue.
+        Requested tool input, and the resulting loads on the tissue.
     deformation
-        The deformer's answer.
+        The deformer's solution.
     camera
-        The camera that the picture was drawn with.
+        The camera that the image was rendered with.
     pose, tip
-        T_world_tool (4, 4), and where the tool touches (3,) [m]; None where the scene has no tool.
+        T_world_tool (4, 4), and contact point of the tool (3,) [m]; None if the scene has no tool.
     picture
-        What the camera sees, without overlay.
+        The camera image without overlay.
     shown
-        The picture with the predicted tumour in it (H, W, 3) uint8, where the scan had it, and the frame's number.
+        The image (H, W, 3) uint8 with the predicted tumour, its position in the scan, and the frame number.
     taken, named
-        (H, W) uint8: above 0 where lines and words stand in it; and whether a legend names the lines.
+        (H, W) uint8: above 0 on lines and text; and true if a legend names the lines.
     distance
         From the tool's tip to the tumour's predicted surface [m]; None without a tool.
     distance_error
-        How far that may be from what the finite elements say [m]; None where nobody knows.
+        Bound on its difference from FEM [m]; None if unknown.
     inside
-        Whether the tip is in the tumour: the distance is then to the surface round it.
+        True if the tip is inside the tumour: the distance is then to the surface around it.
     moved
-        Mean distance of the tumour's predicted surface from where the scan has it [m]; by an estimate, its middle's.
+        Mean distance of the tumour's predicted surface from the scan [m]; by an estimate, that of the centroid.
     moved_error
-        How far that may be from the tumour's in the patient [m], with a probability of 95 %; None where nobody knows.
+        95 % bound on its difference from the motion in the patient [m]; None if unknown.
     model_error
-        In 95 of 100 loads no point of the tumour is farther [m] from where the model's finite elements have it. None of
-        these themselves, and where nobody knows.
+        95th percentile over loads of the maximum tumour vertex error relative to the model's FEM [m]. None for FEM
+        itself, and if unknown.
     tumour_error
-        How far the tumour may be from where it is drawn, whatever answers.
+        Expected error of the drawn tumour position, for any deformer.
     doubt
-        Why the answer may not be relied on, in the words that are in the picture; empty where it may.
+        Reason why the solution is unreliable, as written in the image; empty if it is reliable.
     acts
-        What acts, and what its tool reads, in words; empty where time alone goes on.
+        Description of the active loads and of the measured tool force; empty without loads.
     head
-        The lines at the picture's head: the errors of model and tumour.
+        The lines at the top of the image: errors of model and tumour.
     remark
-        What else is said in the picture, as of a tool that the bone stops; mostly empty.
+        Further text in the image, such as of a tool that the bone stops; mostly empty.
     seconds
-        Wall time by stage, see `STAGES`; of an estimate too, as "locate".
+        Wall time by stage, see `STAGES`; that of an estimate as "locate".
     estimate
-        Where the tumour is by what is seen, in a scene with a sight: that is drawn, and `deformation` is the truth.
+        Estimated tumour position, in a scene with an observation model: it is drawn, and `deformation` is the truth.
     """
 
     number: int
@@ -136,9 +136,9 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class HeldTool:
-    """Where a tool is drawn: tip (3,) [m], and T_world_tool pose (4, 4).
+    """Drawn position of a tool: tip (3,) [m], and T_world_tool pose (4, 4).
 
-    beyond [m]: how far inside the bone its load needs it.
+    beyond [m]: penetration of the bone that its load requires.
     """
 
     tip: np.ndarray
@@ -148,9 +148,9 @@ class HeldTool:
 
 @dataclass(frozen=True, eq=False)
 class Player:
-    """A scene on a stage with one deformer. `draw` is a pure function of time, touch and the previous answer.
+    """Scene on a stage with one deformer. `draw` is a pure function of time, touch and the previous solution.
 
-    Not `composed`: no overlay and no words are drawn, and `Frame.shown` is the picture itself.
+    If not `composed`, no overlay and no text are drawn, and `Frame.shown` is the camera image.
     """
 
     stage: Stage
@@ -181,38 +181,38 @@ class Player:
 
     @cached_property
     def remembers(self) -> bool:
-        """Whether an answer depends on the one before it."""
+        """True if a solution depends on the previous one."""
         solved = not isinstance(self.deformer, Learned)
         return self.follows or (solved and remember(self.scene.effects_on(self.site.anatomy)))
 
     @cached_property
     def follows(self) -> bool:
-        """Whether a trained model plays that follows its tissue in time."""
+        """True if the deformer is a trained model that integrates its tissue in time."""
         return isinstance(self.deformer, Learned) and bool(self.deformer.series)
 
     def touch(self, number: int) -> Touch:
-        """What the script's hand asks for in a frame."""
+        """Return the tool input of the script in a frame."""
         return self.scene.path(float(self.scene.times[number]))
 
     def loads(self, number: int, touch: Touch | None = None) -> Loads:
-        """What acts in a frame; `touch` in place of the script's."""
+        """Return the loads of a frame; `touch` replaces the script's."""
         return self.scene.loads(self.site, touch or self.touch(number), float(self.scene.times[number]))
 
     def answer(self, loads: Loads, last: Deformation | None = None) -> Deformation:
-        """The deformer's answer, from the last one: a learnt model's at the drawn vertices, which are all it knows."""
+        """Compute the deformation from the last one; a trained model returns the drawn vertices only."""
         if isinstance(self.deformer, Learned):
             return self.deformer.deform(loads, start=last if self.follows else None, at=self.stage.nodes)
         return self.deformer.deform(loads, start=last)
 
     def draw(self, number: int, time: float, touch: Touch, last: Deformation | None = None) -> Frame:
-        """The frame of a touch at a time [s]; the deformer starts from the last answer."""
+        """Draw the frame of a touch at a time [s]; the deformer starts from the last solution."""
         begun = clock.perf_counter()
         loads = self.scene.loads(self.site, touch, time)
         deformation = self.answer(loads, last)
         return self.drawn(number, touch, loads, deformation, clock.perf_counter() - begun)
 
     def drawn(self, number: int, touch: Touch, loads: Loads, deformation: Deformation, seconds: float) -> Frame:
-        """The frame of an answer to loads, which took so many seconds."""
+        """Draw the frame of a solution of loads, which took `seconds`."""
         begun = clock.perf_counter()
         positions = self.positions(deformation)
         held = None if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
@@ -222,7 +222,7 @@ class Player:
         picture = picture if field is None else vignetted(picture, field)
         corners = stage.corners(None if held is None else held.pose)
         estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
-        # What an observer draws to see it is no part of the estimate.
+        # # The observer's rendering time is not part of the estimate.
         seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds
         tumour, rest = stage.tumour(_believed(positions, estimate)), stage.tumour_at_rest
         doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.beyond > BLOCKED else "")
@@ -266,13 +266,13 @@ class Player:
         )  # fmt: skip
 
     def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
-        """From the tip to the tumour, and how far off that may be as far as the deformer knows."""
+        """Measure from the tip to the tumour, with the error bound of the deformer, if known."""
         gauge = gauged(held.tip, tumour)
         read = None if held.beyond > CARRIED else reading(self.deformer, loads, answer, self.scene.tool, gauge.distance)
         return gauge if read is None else replace(gauge, read=read.distance, error=read.bound)
 
     def _promised(self, answer: Deformation) -> float | None:
-        """What a model promises of an answer against its finite elements [m], of this load if it can; else None."""
+        """Return a model's guaranteed error relative to FEM [m], of this load if available; None if unknown."""
         model = answering(self.deformer, answer)
         if model is None:
             return None
@@ -281,7 +281,7 @@ class Player:
         return bound if np.isfinite(bound) else None
 
     def _tumour_error(self, touch: Touch, loads: Loads, promised: float, estimate: Estimate | None) -> TumourError:
-        """How far the tumour may be off: known where the script has the tool, and what sees the brain knows more."""
+        """Return the error of the tumour position: known on the script's tool path; an estimate replaces its bound."""
         time = float(loads.times[0])
         scripted = self.uncertainty is not None and touch == self.scene.path(time)
         error = self.uncertainty.at(time, promised) if self.uncertainty is not None and scripted else NOT_KNOWN
@@ -292,10 +292,11 @@ class Player:
         )
 
     def frames(self, every: int = 1, together: int = 1) -> Iterator[Frame]:
-        """The frames of the scene, or every so many of them.
+        """Yield the frames of the scene, or each `every`-th.
 
-        A model whose answers do not depend on each other gives those of so many frames `together`. It takes a quarter
-        of the time, and the first frame waits for the last answer.
+        A model whose solutions are independent computes `together` frames in one batch. It takes a quarter of the time,
+        and
+        the first frame waits for the last solution.
         """
         numbers = range(0, len(self.scene.times), every)
         if together == 1 or self.remembers or not isinstance(self.deformer, Learned):
@@ -314,19 +315,19 @@ class Player:
                 yield self.drawn(number, self.touch(number), loads, answers.rows(np.array([row])), seconds)
 
     def positions(self, deformation: Deformation, row: int = 0) -> np.ndarray:
-        """Where all mesh vertices are (V, 3) [m] in one load case; what the deformer does not know is at rest."""
+        """Return positions (V, 3) [m] of all mesh vertices in one load case; vertices without result are undeformed."""
         positions = self.site.anatomy.mesh.nodes.copy()
         positions[deformation.nodes] += deformation.displacement[row]
         return positions
 
     def believed(self, frame: Frame) -> np.ndarray:
-        """Where all mesh vertices are (V, 3) [m] by what is drawn: the tumour's, in a scene with a sight, by that."""
+        """Return the drawn positions (V, 3) [m] of all mesh vertices: the tumour's by the estimate, if there is one."""
         return _believed(self.positions(frame.deformation), frame.estimate)
 
     def tool(self, tool: Instrument, touch: Touch, positions: np.ndarray) -> HeldTool:
-        """Where the tool is: of one that pushes, where it comes to rest on the deformed cortex from outside.
+        """Compute the tool position: a pushing tool rests on the deformed cortex from outside.
 
-        It is lifted off where it is idle. Tissue that is drawn aside may carry it to the bone's edge, which stops it.
+        An idle tool is lifted off. Displaced tissue may carry it to the craniotomy edge, which stops it.
         """
         if self.scene.posed:
             return HeldTool(self.scene.tip(self.site, touch), self.scene.pose(self.site, touch), 0.0)
@@ -352,7 +353,7 @@ def _believed(positions: np.ndarray, estimate: Estimate | None) -> np.ndarray:
 
 
 def traces_of(estimate: Estimate, truth: Layer) -> tuple[Trace, ...]:
-    """What is drawn beside an estimate: its ellipsoid, and the tumour's true surface with its middle."""
+    """Build the traces of an estimate: its ellipsoid, and the true tumour surface with its centroid."""
     ellipsoid, true = estimate.ellipsoid(), Trace(truth, TRUE_STROKES, estimate.middle + estimate.true)
     if ellipsoid is None:
         return (true,)
@@ -360,7 +361,7 @@ def traces_of(estimate: Estimate, truth: Layer) -> tuple[Trace, ...]:
 
 
 def names_of(estimate: Estimate | None) -> Names:
-    """What the lines of a picture are called; an estimate that knows nothing has no ellipsoid."""
+    """Return the names of the lines of an image; a rejected estimate has no ellipsoid."""
     if estimate is None:
         return PREDICTED_LINES
     return ESTIMATED_LINES if estimate.location is not None else replace(ESTIMATED_LINES, traces=("truth",))
@@ -373,7 +374,7 @@ def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
 
 
 def annotate(over: Overlaid, number: int, remark: str) -> None:
-    """Write into a composite picture, in place: a remark at its foot, and a frame's number."""
+    """Write a remark at the bottom of a composite image and a frame's number, in place."""
     height, width = over.taken.shape
     lay(over.colour, over.taken, folded(remark, NARROW * width), (0, height))
     lay(over.colour, over.taken, [f"frame {number}"], (width, height))

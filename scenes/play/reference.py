@@ -1,4 +1,4 @@
-"""The finite elements' answer to every frame of a scene: what drawn frames are held against."""
+"""FEM solution of every frame of a scene: the reference for drawn frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sim.runtime.device import find_device
 from ..script.scene import Scene
 from .deformers import Theatre
 
-# Frames that are solved together: few enough that whoever waits sees them go by.
+# # Number of frames that are solved together: small enough for regular progress reports.
 TOGETHER = 16
 
 
@@ -30,9 +30,9 @@ def following(theatre: Theatre, scene: Scene) -> Fem | Operated:
 
 
 def past_matters(fem: Deformer) -> bool:
-    """Whether finite elements have to solve a frame after those before it.
+    """Return True if FEM must solve a frame after the previous ones.
 
-    They need not where forces alone act on a whole body that only resists. What is no finite elements needs no past.
+    Not needed if only forces act on an elastic intact body. A deformer that is not FEM needs no history.
     """
     return isinstance(fem, Operated) or (isinstance(fem, Fem) and not fem.problem.plain)
 

@@ -13,23 +13,24 @@ from ..script.tool_paths import Touch
 from .player import Player
 
 T = TypeVar("T")
-# How far one solve goes where the brain comes off the skull [s]. One long solve costs half as much as the steps that
-# show its way, but a quarter of a minute passes without a picture.
+# # Largest time step of one solve where the brain separates from the skull [s]. One long solve costs half as much as
+# the
+# # steps that show its course, but takes a quarter of a minute without an image.
 LEAP = 0.2
 
 
 @dataclass(frozen=True)
 class Course:
-    """How a frame is reached from others.
+    """Order in which frames are reached from others.
 
     Parameters
     ----------
     leap
-        Frames that one step goes at most. Longer ways stop at its multiples.
+        Maximum number of frames of one step. Longer ways stop at its multiples.
     back
-        Whether a frame may be found from a later one.
+        True if a frame may be computed from a later one.
     kept
-        Answers that are kept of a run, evenly over it, so that little is run again.
+        Number of solutions kept of a run, evenly spaced, to limit recomputation.
     """
 
     leap: int = 1
@@ -38,8 +39,9 @@ class Course:
 
 
 IN_ORDER = Course()
-"""Each frame depends on the one before. Kept answers take two megabytes each where the default brain relaxes, and ten
-times as much on quadratic elements."""
+"""Each frame depends on the previous one. Stored solutions take 2 MB each with relaxing tissue on the default brain,
+and ten times as much on quadratic elements.
+"""
 
 
 class Reel(Generic[T]):
@@ -76,7 +78,7 @@ class Reel(Generic[T]):
         return reached, known[reached]
 
     def _stop(self, start: int, number: int) -> int:
-        """Where a step from `start` towards a frame ends."""
+        """Return the frame at which a step from `start` towards a frame ends."""
         leap = self._course.leap
         if start < number:
             return min(number, (start // leap + 1) * leap)
@@ -84,11 +86,13 @@ class Reel(Generic[T]):
 
 
 class Session:
-    """What the finite elements answer visitors, who scrub through a script or take its tool over.
+    """FEM solutions for users who scrub through a script or control its tool.
 
-    Where answers depend on those before them, a frame of the script is that of the straight run. A hand goes on from
-    the last answer: each of its frames is one frame's time later than that, whichever number it has. Where the brain
-    comes off the skull, a jump goes by frames in between.
+    With history-dependent solutions, a frame of the script is that of the straight run. Manual control continues from
+    the
+    last solution: each of its frames is one frame period later, whichever number it has. If the brain separates from
+    the
+    skull, a jump passes through frames in between.
     """
 
     def __init__(self, player: Player) -> None:
@@ -100,7 +104,7 @@ class Session:
         self._last: Deformation | None = None
 
     def towards(self, number: int, touch: Touch | None = None) -> tuple[int, Deformation]:
-        """A frame's answer, or that of one on the way to it, and its number; `touch` where the hand has the tool."""
+        """Return number and solution of a frame, or of one on the way to it; `touch` under manual control."""
         player, last = self.player, self._last
         if self._reel is not None and touch is None:
             number, self._last = self._reel.towards(number)
@@ -113,11 +117,11 @@ class Session:
 
 
 def course_of(player: Player) -> Course | None:
-    """How frames of a script are reached; None where each is as quickly found from any other."""
+    """Return the order in which frames of a script are computed; None if all are independent."""
     scene = player.scene
     if player.remembers:
         return IN_ORDER
     if not any(isinstance(effect, SkullContact) for effect in scene.effects_on(player.site.anatomy)):
         return None
-    # Of such a state displacements alone are kept, a third of a megabyte each.
+    # # Only displacements of such a state are stored, a third of a megabyte each.
     return Course(max(1, round(LEAP * scene.frames_per_second)), back=True, kept=64)

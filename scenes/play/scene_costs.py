@@ -1,4 +1,4 @@
-"""Costs of a frame, by stage: on the panel of its picture, and for all scenes on one sheet."""
+"""Costs of a frame, by stage: on the panel of its image, and for all scenes on one sheet."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from .stage import DRAPE, TOOL
 
 # Frames that are drawn of each scene, evenly spaced; the first loads kernels and is not timed.
 DRAWN = 8
-# Width and height of a picture of the sheet [pixel].
+# # Width and height of an image of the sheet [pixel].
 SIZE = (480, 360)
 LINES = "green estimate, pink truth, blue 95 % of its middle"
-"""What lines beside an estimate are."""
+"""Legend of the lines drawn with an estimate."""
 
 
 def label_lines(frame: Frame, name: str) -> list[str]:
-    """What the panel says of a frame of a deformer, the most important first."""
+    """Build the panel's lines for a frame of a deformer, most important first."""
     answer, found = frame.deformation, frame.estimate
     source, spent = shortened(answer.source or name), frame.seconds.items()
     doubt = [] if answer.outcome[0].good else [answer.outcome[0].value]
@@ -37,12 +37,12 @@ def label_lines(frame: Frame, name: str) -> list[str]:
 
 
 def _within(length: float, error: float | None) -> str:
-    """A length and the tumour's error of it [m] in millimetres; where that is not known the picture's head says so."""
+    """Format a length and the tumour's error of it [m] in millimetres; an unknown error is given at the image's top."""
     return f"{1e3 * length:.2f} {'mm' if error is None else f'+- {bound_words(error, 1)}'}"
 
 
 def labelled(frame: Frame, name: str) -> np.ndarray:
-    """The shown picture (H, W, 3) with a panel: deformer, what acts, and milliseconds by stage; of an estimate too."""
+    """Draw a panel on the shown image (H, W, 3): deformer, loads, and milliseconds by stage; also of an estimate."""
     seen = frame.picture.segmentation
     # It hides cortex where it must, but no tool, no line and no word.
     hides = (frame.taken > 0) | (seen != DRAPE), (frame.taken > 0) | (seen == TOOL)
@@ -52,7 +52,7 @@ def labelled(frame: Frame, name: str) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A picture (H, W, 3) uint8; median milliseconds of a frame by stage; the tumour's largest mean motion [mm]."""
+    """Image (H, W, 3) uint8; median milliseconds of a frame by stage; the tumour's largest mean motion [mm]."""
 
     colour: np.ndarray
     milliseconds: dict[str, float]
@@ -85,7 +85,7 @@ def _medians(frames: list[Frame]) -> dict[str, float]:
 
 
 def sheet(pictures: list[np.ndarray], columns: int = 3) -> np.ndarray:
-    """Pictures (H, W, 3) uint8 of one size side by side in rows, dark where there is none."""
+    """Arrange images (H, W, 3) uint8 of one size in rows of a sheet; empty cells are dark."""
     blank = np.full_like(pictures[0], 12)
     whole = [*pictures, *[blank] * (-len(pictures) % columns)]
     return np.concatenate(

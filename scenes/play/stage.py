@@ -1,4 +1,4 @@
-"""What the camera sees of an anatomy: open cortex, drape with a hole, tool; and the tumour that lies beneath."""
+"""Visible parts of an anatomy: open cortex, drape with a hole, tool; and the tumour beneath them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .observer import Sees
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
 """Segmentation ids."""
 NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool", COTTON: "cotton", GLOVE: "glove"}
-"""What can be seen of them: the tumour never can."""
+"""Names of the visible layers: the tumour is never visible."""
 
 CORTEX_COLOUR = (0.86, 0.60, 0.54)
 DRAPE_COLOUR = (0.16, 0.36, 0.42)
@@ -36,20 +36,20 @@ TOOL_COLOUR = (0.78, 0.80, 0.83)
 # Lines that eyes without red or green tell apart, and see on cortex and drape: tests/test_scenes_checks.py.
 TUMOUR_COLOUR = (0.20, 0.94, 0.42)
 TRUTH_COLOUR = (0.90, 0.35, 0.78)
-"""Of the tumour where the finite elements have it."""
-# What a scan's black leaves of the cortex's colour, and how much deeper it lies than white [m].
+"""Colour of the tumour surface computed by FEM."""
+# # Share of the cortex colour that the scan's black keeps; depth of black below white [m].
 DARK, RELIEF = (0.33, 0.16, 0.17), 1.5e-3
 OPENING = Opening((CORTEX,), ((DRAPE, "under the drape"),), "seen through bone")
-"""What the tumour is seen through, and what is said of the rest."""
+"""Layer through which the tumour is seen, and text for the occluders."""
 PREDICTED_LINES = Names("predicted tumour", "its error, 95 %", "in the scan")
 ESTIMATED_LINES = Names("estimated tumour", "", "in the scan", ("95 % of its middle", "truth"), "estimate moved")
-"""What the lines are called in a picture, and in one of an estimate."""
+"""Names of the lines in an image of a prediction, and in one of an estimate."""
 # Grey matter's outer rim mixes with fluid in the scan: it is read this far under the surface [m].
 READ_BELOW = 2.0e-3
-# So far under the bone the cortex may come to light [m].
+# # Largest depth under the bone at which the cortex may become visible [m].
 RIM = 10e-3
 DRAPE_HEIGHT, DRAPE_DEPTH = 3.0e-3, 8.0e-3
-# What is beyond the hole is drawn lower by so many times as far as it is beyond, to the depth of the drape's wall.
+# # Slope of the drape beyond the hole, down to the depth of the drape's wall.
 DIP = 3.0
 
 
@@ -64,7 +64,7 @@ class Cortex:
     colour: np.ndarray | tuple[float, float, float] = CORTEX_COLOUR
 
     def at(self, positions: np.ndarray) -> Layer:
-        """As it is seen at `positions` (V, 3) [m]."""
+        """Return the layer at `positions` (V, 3) [m]."""
         rest = None if self.solid is None else self.rest
         return Layer(
             "cortex", CORTEX, positions[self.vertices], self.triangles, self.colour, 0.5, solid=self.solid, rest=rest
@@ -160,7 +160,7 @@ class Stage:
         return [*seen, Layer("tool", TOOL, corners, faces, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)]
 
     def picture(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None) -> Picture:
-        """What a camera sees of `layers`."""
+        """Render the image of `layers` by a camera."""
         return self.shown(camera, positions, self.corners(pose))
 
     def shown(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
@@ -181,7 +181,7 @@ class Stage:
 
     @cached_property
     def _renderers(self) -> dict[int, Renderer]:
-        """By the number of layers: with a tool and without."""
+        """Renderers by the number of layers: with a tool and without."""
         return {}
 
     def tumour(self, positions: np.ndarray) -> Layer:
@@ -190,7 +190,7 @@ class Stage:
         return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
 
     def truth(self, positions: np.ndarray) -> Layer:
-        """The same, where finite elements have it and an estimate is drawn beside it."""
+        """Return the tumour surface computed by FEM, drawn for comparison with an estimate."""
         return replace(self.tumour(positions), name="truth", colour=np.array(TRUTH_COLOUR))
 
     @cached_property
@@ -243,7 +243,7 @@ class Stage:
         mesh, site = self.site.anatomy.mesh, self.site
         normals = vertex_normals(mesh.nodes, mesh.surface)
         lifted = mesh.nodes + DRAPE_HEIGHT * normals
-        # How far a place lies outside the hole: across the axis on the near side, everywhere on the far side.
+        # # Distance of a node outside the hole: across the axis on the near side, everywhere on the far side.
         far = (mesh.nodes - site.origin) @ site.axis > 2.0 * site.radius
         outside = np.where(far, site.radius, site.across(mesh.nodes) - HOLE * site.clearance)
         points, triangles, rim = clipped(lifted, mesh.surface, outside)

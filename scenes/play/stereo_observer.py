@@ -1,4 +1,4 @@
-"""Who sees the open cortex in pairs of pictures alone, as a microscope takes them, and says where the tumour is."""
+"""Observer of the open cortex in stereo images of a microscope, which estimates the tumour position."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from .stereo_update import First, Shot, cloud_of, first_of, points_of
 
 @dataclass(frozen=True, eq=False)
 class StereoObserver:
-    """Draws what both eyes see, with a camera's noise, and asks a locator from these pictures. It knows no loads.
+    """Observer that renders both eyes' images, with camera noise, and locates from them. Loads are not used.
 
-    `stage` is what is drawn.
+    `stage` is the rendered stage.
     """
 
     stage: Stage
@@ -29,7 +29,7 @@ class StereoObserver:
     sight: StereoSight
 
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Estimate:
-        """What is said in a frame by its number; arguments as of `Observer.estimate`. To draw pictures is not timed."""
+        """Estimate the tumour in a frame; arguments as of `Observer.estimate`. Rendering time is not counted."""
         shot, anatomy = self.shot(number, positions, tool), self.stage.site.anatomy
         tips = NOTHING.now if tool is None else touched(anatomy, positions, tool)
         _ = self._first_shot  # to draw it takes long
@@ -37,12 +37,12 @@ class StereoObserver:
         return estimated(anatomy, self.locator, lambda: self.seen(shot, tips), positions, begun)
 
     def seen(self, shot: Shot, tips: np.ndarray) -> Observation:
-        """What a pair shows, and where a tool touches, `tips` (k, 3) [m].
+        """Extract the observation from a stereo pair, with contact points of a tool, `tips` (k, 3) [m].
 
         Raises
         ------
         InputError
-            As `points_of`, or `cloud_of` where points have no names; as `first_of`.
+            As `points_of`, or `cloud_of` without correspondences; as `first_of`.
         """
         site, sight = self.stage.site, self.sight
         if not sight.named:
@@ -50,7 +50,7 @@ class StereoObserver:
         return points_of(site, self.first, shot, self._tracked(1), tips)
 
     def shot(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Shot:
-        """What both eyes take in a frame, of a body at `positions` (V, 3) [m] and a tool's corners (t, 3) [m].
+        """Render both eyes' images of a frame, for positions (V, 3) [m] and a tool's corners (t, 3) [m].
 
         Number -1 is before the first frame.
         """
@@ -85,7 +85,7 @@ class StereoObserver:
         return replace(self.stage), replace(self.stage)
 
     def _noisy(self, picture: np.ndarray, number: int, eye: int) -> np.ndarray:
-        """A picture (H, W, 3) uint8 with the noise of an eye's camera; the right eye, 1, lacks light."""
+        """Add the noise of an eye's camera to an image (H, W, 3) uint8; the right eye, 1, is darker."""
         random = np.random.default_rng([self.sight.seed, 2 + number, eye])
         noise = self.sight.noise * random.standard_normal(picture.shape, np.float32)
         lit = np.float32(1.0 - eye * self.sight.darker) * picture + noise
@@ -97,7 +97,7 @@ class StereoObserver:
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """Where a tracked microscope has places: off by a rigid error about the middle (3,) [m] of an opening."""
+    """Rigid error of a tracked microscope about the centre (3,) [m] of the craniotomy."""
 
     error: RigidError
     middle: np.ndarray

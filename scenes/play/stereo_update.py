@@ -1,4 +1,4 @@
-"""From a pair of pictures to what is seen of the open cortex: points with their places in the scan, or a cloud."""
+"""Observation of the open cortex from a stereo pair: points with their positions in the scan, or a point cloud."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..script.site import HOLE, Site
 
 # Pixels of a window to a metre of cortex, and how far it reaches from the middle of the opening, in its radii.
 FINENESS, WIDE = 6000.0, 1.05
-# Points are looked for so far from the drape [m]: it stands above the cortex, and each eye sees it elsewhere.
+# # Minimum distance of points from the drape [m]: it is above the cortex, and its disparity differs.
 OFF_DRAPE = 1.5e-3
 # Points of the first pair whose middle one lies farther off the scan's cortex are of other cameras [m].
 MISPLACED = 2.5e-3
@@ -31,11 +31,11 @@ MOVED_FAR = (
     f" Or the cortex has moved by about {1e3 * FARTHEST:g} mm or more since the first pair, farther than it is "
     "searched for: begin with a new scan."
 )
-"""Why points of the first pair may not be found again."""
+"""Reasons why points of the first pair may not be found again."""
 # A smaller share of the points that were looked for is no sight of the cortex.
 FEWEST = 0.3
-# What lies round the opening does not move: so many of its places are looked at, if they are enough, and a quarter of
-# them must seem to stay within this [m]. Others are at the edge of the drape, before what moves.
+# # Static surroundings of the opening: number of points examined, minimum number, motion [m] within which a quarter of
+# # them must stay. Others are at the edge of the drape, in front of moving tissue.
 AROUND, ENOUGH, STILL = 60, 15, 2e-3
 Rigid = Callable[[np.ndarray], np.ndarray]
 """Takes places (n, 3) [m] to where a tracked microscope has them."""
@@ -43,12 +43,12 @@ Rigid = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """What both eyes of a microscope take at once.
+    """Stereo pair of a microscope.
 
     Parameters
     ----------
     cameras, pictures
-        Of the left and the right eye; (H, W, 3) uint8 each.
+        Cameras of the left and the right eye; images (H, W, 3) uint8.
     tool
         The surface of the tool in view, corners (t, 3) [m] and faces (f, 3), if there is one: its pose is known.
     """
@@ -97,7 +97,7 @@ class First:
 
 
 def first_of(site: Site, shot: Shot, count: int, rigid: Rigid) -> First:
-    """The first pair, of a brain as the scan has it: so many points, each at the scan's nearest place.
+    """Match the first pair, of an undeformed brain: `count` points, each at the nearest point of the scan.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def first_of(site: Site, shot: Shot, count: int, rigid: Rigid) -> First:
     rest, off = on_cortex(site, points)
     if len(off) and np.median(off) > MISPLACED:
         raise InputError(
-            f"the first pair of pictures shows a cortex {1e3 * np.median(off):.1f} mm off the scan's: check that eyes "
+            f"the first image pair shows a cortex {1e3 * np.median(off):.1f} mm from the scan's: check that eyes "
             "are not swapped, or calibrate them again."
         )
     good = supported(rest, points - rest)
@@ -145,7 +145,7 @@ def points_of(site: Site, first: First, shot: Shot, rigid: Rigid, tips: np.ndarr
 
 
 def cloud_of(site: Site, shot: Shot, count: int, rigid: Rigid, tips: np.ndarray) -> Observation:
-    """So many points of the cortex without names, as one pair shows them; arguments and errors as of `points_of`."""
+    """Return `count` cortex points without correspondences, from one pair; arguments and errors as of `points_of`."""
     view = shot.seen(site)
     pixels = grid(site, view, count)
     found = seen_points(site, view, pixels)
@@ -157,7 +157,7 @@ def cloud_of(site: Site, shot: Shot, count: int, rigid: Rigid, tips: np.ndarray)
 
 
 def grid(site: Site, view: StereoView, count: int) -> np.ndarray:
-    """Pixels (n, 2) of the left window, about so many, that are even over the drape's hole."""
+    """Build a regular grid of about `count` pixels (n, 2) of the left window, over the drape's hole."""
     reach = HOLE * site.clearance - OFF_DRAPE
     step = reach * np.sqrt(np.pi / count)
     ticks = np.arange(-np.floor(reach / step), np.floor(reach / step) + 1) * step
@@ -168,12 +168,12 @@ def grid(site: Site, view: StereoView, count: int) -> np.ndarray:
 
 
 def seen_points(site: Site, view: StereoView, pixels: np.ndarray) -> Cloud:
-    """Of pixels (n, 2), those with a depth that lie within the drape's hole.
+    """Select the pixels (n, 2) with a depth inside the drape's hole.
 
     Raises
     ------
     InputError
-        Rows of the eyes that do not show the same.
+        Epipolar rows of the two eyes do not match.
     """
     try:
         found = cloud(view, pixels)

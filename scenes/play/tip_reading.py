@@ -1,4 +1,4 @@
-"""The number that is read beside the tool: how far its tip is from the tumour, and how far off that may be."""
+"""Distance from tool tip to tumour that is displayed at the tool, with its error bound."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from ..script.tool import Instrument, Probe
 
 @dataclass(frozen=True)
 class Reading:
-    """The distance from tip to tumour.
+    """Distance from tip to tumour.
 
     Parameters
     ----------
     distance
         [m].
     bound
-        With probability 0.95 the finite elements' distance is no farther off [m]; None where nothing is promised.
+        95 % bound on the difference from the FEM distance [m]; None if there is none.
     """
 
     distance: float
@@ -38,14 +38,14 @@ class Reading:
 def reading(
     deformer: Deformer, loads: Loads, answer: Deformation, tool: Instrument | None, apart: float
 ) -> Reading | None:
-    """Read the distance in the first load case of a deformer's answer; None where no single ball pushes or is moved.
+    """Read the distance in the first load case of a solution; None unless a single ball pushes or is moved.
 
-    That of finite elements is their own and has no bound. A trained model has no bound outside of its training range.
+    A distance by FEM has no bound. A trained model has no bound outside of its training range.
 
     Parameters
     ----------
     apart
-        How far [m] the tip is from the tumour where both are drawn.
+        Distance [m] between the drawn tip and the drawn tumour.
     """
     if _ball(loads, tool) is None:
         return None
@@ -61,19 +61,19 @@ def reading(
 def measured(
     anatomy: Anatomy, loads: Loads, answer: Deformation, tool: Instrument | None, lift: float
 ) -> Reading | None:
-    """Measure the distance in an answer, whoever gave it; nothing is said of its error.
+    """Measure the distance in a solution of any deformer, without error bound.
 
     Parameters
     ----------
     answer
-        Of the open cortex and the tumour at least.
+        Solution that contains at least the open cortex and the tumour.
     lift
-        How far [m] an idle tool that pushes is drawn off the tissue.
+        Height [m] above the tissue at which an idle pushing tool is drawn.
 
     Raises
     ------
     InputError
-        An answer without open cortex or tumour.
+        A solution without open cortex or tumour.
     """
     ball = _ball(loads, tool)
     if ball is None:

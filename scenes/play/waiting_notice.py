@@ -18,14 +18,14 @@ class Busy:
         self._since: float | None = None
         self._what = ""
         self.noticed = False
-        """Whether the line is up."""
+        """True while the line is shown."""
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="busy", daemon=True)
         self._thread.start()
 
     def on(self, what: str) -> None:
-        """Work has begun, or goes on, on `what`."""
+        """Mark the start or continuation of work on `what`."""
         with self._lock:
             self._what = what
             self._since = clock.perf_counter() if self._since is None else self._since

@@ -1,4 +1,4 @@
-"""How long a row takes to know a body whose tumour was debulked by a fifth: until it answers there as it did before."""
+"""Adaptation time of a row to a body whose tumour was debulked by a fifth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from surrogate.data.simulate import simulate
 
 from .study import Study, note_seconds, noted_seconds
 
-# Of the tumour's volume.
+# Removed share of the tumour's volume.
 SHARE = 0.2
 
 
@@ -44,7 +44,7 @@ def debulked_study(study: Study) -> Study:
 
 
 def simulate_debulked(study: Study, progress: Callable[[int], object]) -> None:
-    """Answer the data's own loads on the debulked body; `progress` is given how many rows more are done."""
+    """Solve the data's own loads on the debulked body; `progress` receives the number of newly solved rows."""
     path = _path(study)
     if path.exists():
         progress(len(study.dataset.loads) + len(study.dataset.unit_good))
@@ -66,7 +66,7 @@ def simulate_debulked(study: Study, progress: Callable[[int], object]) -> None:
 
 
 def simulating_seconds(study: Study) -> float | None:
-    """What `simulate_debulked` took; None where it was not done, or not in one run."""
+    """Read the seconds of `simulate_debulked`; None if it was not run, or not in one run."""
     return noted_seconds(_path(study))
 
 

@@ -1,4 +1,4 @@
-"""A row of finite elements: each played load by itself, from rest, on this mesh or another."""
+"""Row of a FEM variant: each test load alone, from rest, on this mesh or another."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Elements:
 
     @property
     def accuracy(self) -> Accuracy:
-        """As the solver takes it."""
+        """Accuracy settings of the solver."""
         precision: Precision = "float32" if self.tolerance >= FLOOR["float32"] else "float64"
         return Accuracy(tolerance=self.tolerance, precision=self.precision or precision)
 
@@ -59,7 +59,7 @@ def measure_elements(study: Study, spec: Elements) -> tuple[Row, np.ndarray]:
     Raises
     ------
     InputError
-        What `Fem` refuses; a law that the data's tissue has no constants for.
+        Input that `Fem` rejects; a law that the data's tissue has no constants for.
     """
     body, own = body_of(study, spec.mesh), study.anatomy
     fem, set_up = timed(_fem, study, spec, body)
@@ -88,7 +88,7 @@ def measure_elements(study: Study, spec: Elements) -> tuple[Row, np.ndarray]:
 
 
 def _adapt(study: Study, spec: Elements, load: Loads) -> float:
-    """Seconds from the debulked body to its first answer; kernels are there already."""
+    """Return the seconds from the debulked body to its first solution, with compiled kernels."""
     body = debulked(body_of(study, spec.mesh))
     return timed(lambda: _fem(study, spec, body).deform(load))[1]
 
@@ -100,7 +100,7 @@ def _fem(study: Study, spec: Elements, body: Anatomy) -> Fem:
 
 
 def against(study: Study, spec: Elements) -> str:
-    """What the distance from the reference is."""
+    """Describe the kind of difference from the reference."""
     if tissue_of(study.tissue, spec.law) != study.tissue:
         return DIFFERENCE
     same = (spec.element or study.element) == "p2" and spec.mesh == (HALVED if study.fine else OWN)

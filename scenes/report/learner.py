@@ -35,12 +35,12 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
     Raises
     ------
     InputError
-        What `train` refuses.
+        Input that `train` rejects.
     """
     nodes, truth = study.anatomy.tumour_nodes, study.answers
 
     def judged(model: Deformer, split: Split) -> tuple[Figures | None, float]:
-        """Against the data's own answers to the loads that a split leaves out."""
+        """Return the errors relative to the data's own solutions of held-out loads."""
         rows = np.flatnonzero(split.test)
         return _held(model, study.converged.rows(rows), truth[rows], nodes)
 
@@ -93,7 +93,7 @@ def counts(most: int) -> list[int]:
 
 
 def coverage_of(study: Study, spec: Learner, outside: Loads, truth: np.ndarray) -> dict[str, float]:
-    """How often bounds at 0.95 hold where nothing is promised; `truth` (B, n, 3) [m] of the loads `outside`."""
+    """Return the coverage of the 95 % bounds outside their guarantee; `truth` (B, n, 3) [m] of the loads `outside`."""
     trained = train(study.dataset, [spec.name], expansion=study.expansion)
     model, found = trained.models[spec.name], trained.left_out.get(spec.name)
     held = {} if found is None else {"discs": found.held[0]}

@@ -47,7 +47,7 @@ def against_time(rows: Sequence[Row]) -> np.ndarray | None:
 
 
 def learners_against_time(rows: Sequence[Row]) -> np.ndarray | None:
-    """What learning lost against time, (H, W, 3) uint8. None without learners."""
+    """Plot the learning error against time, (H, W, 3) uint8; None without learners."""
     places = _places((row, row.own_fem.get("discs")) for row in rows)
     title = "What learning lost, against time: distance from its own finite elements, left-out discs"
     group = {row.name: row.family for row in rows}
@@ -180,7 +180,7 @@ def _section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
 
 
 def _plans(rows: Sequence[Row]) -> str:
-    """How the rows of finite elements go about a load."""
+    """Describe how the FEM rows solve a load."""
     plans = []
     for row in rows:
         lines = "".join(f"<li>{escape(line)}" for line in row.plan)
@@ -218,7 +218,7 @@ def _adapting(row: Row) -> str:
 
 
 def _solves(row: Row) -> str:
-    """How many solves of finite elements a row was given, by kind."""
+    """Format the number of FEM solves that a row used, by kind."""
     kinds = ((row.loads, ""), (row.units, " unit"), (row.series, " series"))
     return " + ".join(f"{count}{kind}" for count, kind in kinds if count)
 
@@ -254,7 +254,7 @@ def _share(share: float | None) -> str:
 
 
 def _by_force(measured: Sequence[Row], learnt: Sequence[Row]) -> str:
-    """Of learners those against their own finite elements, of which there are more."""
+    """Return the errors of learners relative to their own FEM, over more loads."""
     lines = [(row.name, "reference", row.reference) for row in measured]
     lines += [(row.name, "own FEM", row.own_fem["discs"]) for row in learnt if "discs" in row.own_fem]
     most = max((len(figures.tenths) for *_, figures in lines if figures), default=0)
@@ -292,7 +292,7 @@ def _table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> 
 
 
 def _picture(path: Path, words: str) -> str:
-    """A picture inside the page."""
+    """Embed an image in the page."""
     data = b64encode(path.read_bytes()).decode()
     return f'<img alt="{escape(words)}" src="data:image/png;base64,{data}">'
 

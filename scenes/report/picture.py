@@ -30,7 +30,7 @@ YELLOW = (255, 215, 50)
 
 
 def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
-    """A picture (H, W, 3) uint8 of the played load of the largest distance.
+    """Render the test load with the largest error, (H, W, 3) uint8.
 
     answer (n, k, 3) [m]: a row's displacements of the tumour's vertices.
     """

@@ -1,4 +1,4 @@
-"""What rows are held against: the reference's answers, kept load by load, and finite elements beyond the data."""
+"""Reference of the rows: reference solutions, stored load by load, and FEM solutions beyond the data."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TOGETHER = 16
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Answers to n loads: displacement (n, k, 3) [m]; good (n,) bool, which converged; seconds (n,) that each took."""
+    """Solutions of n loads: displacement (n, k, 3) [m]; good (n,) bool, which converged; seconds (n,) that each took."""
 
     displacement: np.ndarray
     good: np.ndarray
@@ -49,7 +49,7 @@ def solve_reference(study: Study, progress: Callable[[int], object], accuracy: A
 
 
 def solve_beyond(study: Study, progress: Callable[[int], object]) -> None:
-    """Answer the loads beyond the training range as the data's own loads were answered, and keep each at the tumour."""
+    """Solve the loads beyond the training range like the data's own loads, and store each at the tumour."""
 
     def made() -> tuple[Fem, Located]:
         body = study.anatomy
@@ -60,12 +60,12 @@ def solve_beyond(study: Study, progress: Callable[[int], object]) -> None:
 
 
 def reference_of(study: Study) -> Truth:
-    """What `solve_reference` kept."""
+    """Read the solutions of `solve_reference`."""
     return _read(study, "reference", len(study.played))
 
 
 def beyond_of(study: Study) -> Truth:
-    """What `solve_beyond` kept."""
+    """Read the solutions of `solve_beyond`."""
     return _read(study, "beyond", len(study.outside))
 
 

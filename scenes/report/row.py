@@ -1,4 +1,4 @@
-"""What a row of the report holds: distances, milliseconds, memory, and what its making took."""
+"""Row of the report: errors, milliseconds, memory, and cost of preparation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from surrogate.evaluation.score import spread
 from .reference import reference_of
 from .study import Study
 
-# What a distance from the reference is: of the same law, of another, or of the reference's own elements.
+# Kind of difference from the reference: same law, another law, or the reference's own elements.
 ERROR, DIFFERENCE, TOLERANCE_ALONE = "error", "model difference", "its tolerance alone"
 TENTHS, FEWEST_FOR_P99 = 10, 1000
 
@@ -43,7 +43,7 @@ class Tenth:
 
 @dataclass(frozen=True)
 class Figures:
-    """Distances between answers: how many loads and values, in mm and in % of each load's motion, by force.
+    """Distances between solutions: number of loads and values, in mm and in % of each load's motion, by force.
 
     `worst` is of each load's worst vertex, over the loads [mm].
     """
@@ -89,7 +89,7 @@ def figures_between(answer: np.ndarray, truth: np.ndarray, loads: Loads) -> Figu
 
 
 def against_reference(study: Study, answer: np.ndarray, good: np.ndarray, nodes: np.ndarray) -> Figures | None:
-    """Figures of answers (n, k, 3) [m] at vertices (k,) to the played loads, if both are good: `good` (n,)."""
+    """Compute the errors of solutions (n, k, 3) [m] at vertices (k,) of the test loads where both are `good` (n,)."""
     truth = reference_of(study)
     rows = np.flatnonzero(good & truth.good)
     known = np.isin(study.drawn, nodes)
@@ -97,7 +97,7 @@ def against_reference(study: Study, answer: np.ndarray, good: np.ndarray, nodes:
 
 
 def of_times(seconds: Sequence[float]) -> dict[str, Any]:
-    """What a row says of the wall times of single loads [s]."""
+    """Summarise the wall times of single loads [s]."""
     ms = 1e3 * np.array(seconds)
     p99 = float(np.percentile(ms, 99.0)) if len(ms) >= FEWEST_FOR_P99 else None
     return {"median": float(np.median(ms)), "p99": p99, "timed": len(ms)}
@@ -105,12 +105,12 @@ def of_times(seconds: Sequence[float]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured; None where nothing was.
+    """Measurements of one deformation model; None where nothing was measured.
 
     Parameters
     ----------
     name, family
-        Of the deformer.
+        Name and family of the deformation model.
     state
         "measured", or a sentence that says why not.
     against
@@ -120,17 +120,17 @@ class Row:
     own_fem
         Distances from the finite elements that it was trained on, by set of loads: "discs", "sectors", "beyond".
     flagged
-        Share of each set that it calls extrapolated by itself.
+        Share of each set that it marks as extrapolated.
     covered
         Share of the loads of "discs" and "beyond" whose largest error is within the bound at 0.95.
     failed
-        Played loads that it found no answer to; they are in none of the figures.
+        Test loads without a solution; they are excluded from all figures.
     median, p99
         Milliseconds a load, one at a time; p99 of at least 1,000.
     bare
-        Milliseconds a load of a learned model alone in NumPy: no bound, no limits, one kind of code for all learners.
+        Milliseconds a load of the trained model alone in NumPy: no bound, no limits, one kind of code for all learners.
     timed
-        How many loads were timed.
+        Number of timed loads.
     set_up
         Seconds before the first load.
     memory, card
@@ -144,7 +144,7 @@ class Row:
     learning
         Seconds of fitting; the solves' are not among them.
     adapt
-        Seconds until it answers again when the tumour is debulked by a fifth: set-up, or solves and fitting, anew.
+        Seconds to adapt to a tumour debulked by a fifth: set-up, or solves and fitting, again.
     adapted
         Distances from the finite elements of the debulked body then, on discs left out; None of finite elements.
     curve

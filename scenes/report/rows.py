@@ -48,7 +48,7 @@ def ready(device: str, study: Study) -> Study:
 
 
 def measured(study: Study, spec: Spec, picture: Path) -> Row:
-    """The row of a deformer, and the picture of its worst case; what cannot be had says why in `Row.state`."""
+    """Measure the row of a deformation model, and render its worst case; `Row.state` gives the reason for a missing one."""
     try:
         if isinstance(spec, Elements):
             with watched_card(study.device) as taken:
@@ -59,7 +59,7 @@ def measured(study: Study, spec: Spec, picture: Path) -> Row:
     except InputError as error:
         return Row(spec.name, FAMILY[type(spec)], state=str(error))
     row = replace(row, memory=peak_memory())
-    # What pictures take is not the row's.
+    # The time for images does not belong to the row.
     from ar.screen import write_png
 
     from .picture import worst_picture
@@ -79,7 +79,7 @@ ELEMENTS = ("p1", "smoothed", "p2")
 MESHES = {"2.5k": "2500", "17k": "17000"}
 TOLERANCES = (1e-2, 1e-3, STANDARD, 1e-5, 1e-6)
 Run = Callable[[Study, Spec, Path], Row]
-# Cores for each learner that is measured, of which it uses one; with so many the next process is made ready besides.
+# Cores per measured learner, which uses one; the others prepare the next process.
 CORES = 4
 
 
@@ -117,7 +117,7 @@ def learners() -> tuple[Learner, ...]:
 def apart(turn: AbstractContextManager[object], study: Study, spec: Spec, picture: Path) -> Row:
     """Measured in a process of its own, which starts at once and measures in its `turn`."""
     try:
-        # What the study has read already stays here.
+        # Data that the study has already read stay here.
         with process_pool(["cpu"], ready, replace(study)) as children, turn:
             return run_on_each(children, _measure, [(spec, picture)])[0]
     except LostError:
@@ -164,7 +164,7 @@ def rows(
 
 
 def _ahead(work: Callable[[Spec], Row], specs: Sequence[Spec], ahead: int) -> Iterator[Row]:
-    """The rows in order; so many more are under way while one is waited for. Of the others none begins after a stop."""
+    """Yield the rows in order, while further ones run ahead. After a stop, no other row begins."""
     waiting: deque[Future[Row]] = deque()
     with ThreadPoolExecutor(ahead + 1) as threads:
         try:
@@ -203,7 +203,7 @@ def _digest(study: Study, spec: Spec) -> str:
 
 
 FORMER_NAMES = {"teacher": "own_fem", "taught": "loads"}
-"""What files of rows from before called fields."""
+"""Former names of fields in files of rows."""
 
 
 def _kept(path: Path, digest: str) -> Row | None:

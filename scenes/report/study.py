@@ -39,7 +39,7 @@ class Study:
     data
         A data set of `sulcus simulate`: its anatomy, tissue, element and loads are the report's.
     folder
-        Where meshes and answers are kept.
+        Folder of meshes and solutions.
     device
         "auto", "cpu" or "cuda".
     loads, beyond, timed
@@ -59,7 +59,7 @@ class Study:
 
     @cached_property
     def on_card(self) -> bool:
-        """Whether its finite elements are solved on a graphics card."""
+        """True if FEM is solved on a GPU."""
         return find_device(self.device, TRAIN.precision).on_cuda
 
     @cached_property
@@ -79,7 +79,7 @@ class Study:
 
     @cached_property
     def of_template(self) -> bool:
-        """Whether the body is the one that ships, of which other meshes can be made."""
+        """True if the body is the shipped template, of which other meshes can be built."""
         return self.anatomy.digest == read_anatomy(template_path()).digest
 
     @cached_property
@@ -114,7 +114,7 @@ class Study:
 
     @property
     def pushed(self) -> Pushed:
-        """Of `converged`.
+        """Pushes of the `converged` loads.
 
         Raises
         ------
@@ -128,7 +128,7 @@ class Study:
 
     @cached_property
     def answers(self) -> np.ndarray:
-        """The data's own answers (B, k, 3) [m] to `converged`, at the tumour's vertices."""
+        """The data's own solutions (B, k, 3) [m] of `converged`, at the tumour's vertices."""
         return self.dataset.displacement(self.anatomy.tumour_nodes)[self.dataset.good]
 
     @cached_property
@@ -154,7 +154,7 @@ class Study:
 
     @cached_property
     def digest(self) -> str:
-        """Hash of what every answer here depends on."""
+        """Hash of all inputs of the solutions."""
         data = self.dataset
         on = "cuda" if self.on_card else "cpu"
         stated = repr((sorted(data.provenance.items()), self.loads, self.beyond, self.fine, on, version_of("sulcus")))
@@ -213,7 +213,7 @@ def note_seconds(made: Path, seconds: float) -> None:
 
 
 def noted_seconds(made: Path) -> float | None:
-    """What was kept; None where nothing was, or nothing whole."""
+    """Read the stored value; None if missing or incomplete."""
     try:
         return float(json.loads(_beside(made).read_text())["seconds"])
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
@@ -231,5 +231,5 @@ def tabulate_series(study: Study, progress: Callable[[int, int], object]) -> Non
 
 
 def series_seconds(study: Study, learner: str) -> float:
-    """What the table took, if this learner is made of it [s]."""
+    """Return the seconds spent on the table, if this learner uses it."""
     return study.expansion.tabulated.seconds if learner in EXPANDED else 0.0

@@ -1,1 +1,1 @@
-"""What a scene is: tool paths, site, tool, posture, debulking."""
+"""Definition of scenes: tool paths, site, tool, posture, debulking."""

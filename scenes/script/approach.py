@@ -1,4 +1,4 @@
-"""Where a planned trajectory enters the open cortex, and which way it goes on: what a scene's hand then follows."""
+"""Entry point and direction of a planned trajectory, which a scene's tool then follows."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ CORRECTIONS = 6
 
 @dataclass(frozen=True)
 class Approach:
-    """Where a hand goes in, in the tangent plane (x, y) [m], and how its way is tilted against the axis [rad].
+    """Entry point of the tool in the tangent plane (x, y) [m], and tilt of its path against the axis [rad].
 
-    Both as `Touch` has them; a `line` is also what a shaft lies along.
+    Both as in `Touch`; with `line`, a shaft is aligned with the path.
     """
 
     x: float
@@ -51,13 +51,13 @@ class Approach:
 
 
 def approach_of(markup: Markup, site: Site) -> Approach:
-    """The approach that a line marks, or a point, from which it goes straight inwards.
+    """Compute the approach of a line markup, or of a point, which is approached along the axis.
 
     Raises
     ------
     InputError
-        Markups of another kind. A line that passes beside the opening, runs along it, or ends far from it; a point that
-        is not at it.
+        Markups of another kind. A line that misses the opening, runs along it, or ends far from it; a point that is not
+        on it.
     """
     points, path = markup.points, markup.path
     if markup.kind == "Fiducial" and len(points) == 1:
@@ -84,7 +84,7 @@ def approach_of(markup: Markup, site: Site) -> Approach:
         arm = site.corners.reshape(-1, 3) - outer
         beside = float(np.linalg.norm(arm - np.outer(arm @ way, way), axis=1).min())
         raise InputError(
-            f"{path}: passes {1e3 * beside:.0f} mm beside the open cortex. Open the skull where it enters: "
+            f"{path}: passes {1e3 * beside:.0f} mm from the open cortex. Open the skull where it enters: "
             "--opening-at with this file."
         )
     before, beyond = float((outer - entry) @ way), float((entry - deep) @ way)
@@ -108,7 +108,7 @@ def _approach(site: Site, entry: np.ndarray, way: np.ndarray) -> Approach:
 
 
 def _entry(corners: np.ndarray, start: np.ndarray, way: np.ndarray) -> np.ndarray | None:
-    """Where a line first meets triangles (S, 3, 3) from outside (3,) [m]; None where it passes beside them.
+    """Compute the first intersection of a line with triangles (S, 3, 3) from outside (3,) [m]; None if it misses.
 
     Möller, Trumbore 1997, J. Graphics Tools 2:21-28.
     """

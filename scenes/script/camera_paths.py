@@ -1,4 +1,4 @@
-"""How cameras move, zoom and focus with time."""
+"""Camera motion, zoom and focus as functions of time."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import numpy as np
 from ar.optics.camera import Camera
 from sim.errors import InputError
 
-# Of a breath [Hz]: fifteen a minute.
+# # Breathing frequency [Hz]: fifteen breaths a minute.
 BREATH = 0.25
-# Of a hand that holds a camera [Hz]: it drifts slowly, and trembles at 8 to 12 Hz (Elble and Koller 1990, "Tremor").
+# # Frequencies of a hand that holds a camera [Hz]: slow drift, and tremor at 8 to 12 Hz (Elble and Koller 1990,
+# "Tremor").
 SLOW, TREMOR = (0.2, 2.5), (8.0, 12.0)
 # Waves of each, and the tremor's share of a hand's motion.
 WAVES, SHARE = 8, 0.1
@@ -30,14 +31,14 @@ class CameraPath(Protocol):
 
 @dataclass(frozen=True)
 class HandHeld:
-    """A camera in somebody's hand, who breathes: the same seed moves it in the same way.
+    """Hand-held camera with breathing motion: the same seed gives the same motion.
 
     Parameters
     ----------
     shift, turn
-        How far the hand moves and turns it along and about each axis, as standard deviations [m], [rad].
+        Standard deviations of its translation along and its rotation about each axis [m], [rad].
     breath
-        How far a breath lifts and lowers it [m].
+        Amplitude of the breathing motion [m].
 
     Raises
     ------
@@ -66,14 +67,14 @@ class HandHeld:
 
 @dataclass(frozen=True)
 class Orbit:
-    """A camera that swings to and fro about what it looks at, and keeps looking at it.
+    """Camera that orbits its target to and fro, and keeps looking at it.
 
-    `reach` [rad] to each side, about the upright axis of its picture; `period` [s].
+    `reach` [rad] to each side, about the vertical axis of its image; `period` [s].
 
     Raises
     ------
     InputError
-        A period that is not above 0.
+        A period that is not > 0.
     """
 
     reach: float = float(np.radians(20.0))
@@ -93,7 +94,7 @@ class Orbit:
 
 @dataclass(frozen=True)
 class Focus:
-    """What a microscope is set to from a time [s] on: times its first working distance, and times its first zoom."""
+    """Microscope setting from a time [s] on: working distance and zoom, as multiples of the initial ones."""
 
     since: float
     distance: float
@@ -102,16 +103,17 @@ class Focus:
 
 @dataclass(frozen=True)
 class Microscope:
-    """A microscope that is moved along its axis, zoomed and focused again on what it looks at.
+    """Microscope that is moved along its axis, zoomed and refocused on its target.
 
     Parameters
     ----------
     settings
-        What it is set to, in the order of time.
+        Settings, in temporal order.
     takes
-        How long each change takes [s].
+        Duration of each change [s].
     focal_length
-        Of the lens that focuses [m]: pictures grow a little as it focuses nearer. It is shorter than all distances.
+        Focal length of the focusing lens [m]: magnification increases slightly at nearer focus. It is shorter than all
+        distances.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What is cut, and when: a corridor to the tumour, and the tumour in shares."""
+"""Schedule of a resection: a corridor to the tumour, and the tumour in shares."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .site import site_of
 
 @dataclass(frozen=True)
 class Debulking:
-    """A corridor from the cortex to the tumour, then the tumour from the top down, in equal shares; one share is left.
+    """Resection of a corridor to the tumour, then of the tumour from the top, in equal shares; one share remains.
 
     Parameters
     ----------
     times
-        When each step is done [s], in turn: the corridor, then share after share.
+        Time of each step [s], in order: the corridor, then one share after another.
     corridor
         Its radius [m]; wider where the mesh is coarser.
     """
@@ -29,16 +29,16 @@ class Debulking:
     corridor: float = 5e-3
 
     def done(self, time: float) -> int:
-        """How many steps are done at a time [s]."""
+        """Count the steps done at a time [s]."""
         return int(np.searchsorted(self.times, time, side="right"))
 
     def resection(self, anatomy: Anatomy) -> Resection:
-        """The tetrahedra of each step.
+        """Select the tetrahedra of each step.
 
         Raises
         ------
         InputError
-            No open cortex, or no tumour of so many shares.
+            No open cortex, or a tumour with too few tetrahedra for the shares.
         """
         mesh, site = anatomy.mesh, site_of(anatomy)
         tumour = np.flatnonzero(anatomy.in_tumour)

@@ -1,4 +1,4 @@
-"""How the head lies as pure functions of time: which way is down, and how high its fluid stands."""
+"""Head pose as pure functions of time: direction of gravity and fluid level."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ SUPINE = (0.0, -1.0, 0.0)
 
 @dataclass(frozen=True)
 class Lying:
-    """How the head lies at one moment, whatever its size.
+    """Head pose at one time, independent of head size.
 
     Parameters
     ----------
     direction
-        Which way gravity pulls (3,), in RAS, of any length but none.
+        Direction of gravity (3,), in RAS, of any length > 0.
     fluid
-        How high the fluid stands, against gravity: from 0, wholly drained, to 1, over the highest vertex.
+        Fluid level against gravity: from 0, completely drained, to 1, above the highest vertex.
     """
 
     direction: tuple[float, float, float] = SUPINE
@@ -41,12 +41,12 @@ Lie = Callable[[float], Lying]
 
 
 def supine(time: float) -> Lying:
-    """As in the scan, at any time [s]: on the back, under fluid."""
+    """Return the pose of the scan, at any time [s]: supine, under fluid."""
     return Lying()
 
 
 def drained(seconds: float, to: float = 0.0) -> Lie:
-    """On the back while the fluid falls to a share of its height within so many seconds."""
+    """Return a supine pose whose fluid falls to a share of its height within `seconds`."""
     return lambda time: Lying(fluid=1.0 - (1.0 - to) * smooth(time / seconds))
 
 

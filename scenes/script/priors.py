@@ -1,4 +1,4 @@
-"""What nobody measures in theatre: how widely it may differ from what a scene takes it to be, with sources."""
+"""Prior distributions of parameters that are not measured during surgery, with sources."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ TOOL, SKULL = "tool's place", "skull"
 # A scene cannot be where its skulls have less probability.
 LEAST_POSSIBLE = 0.01
 TOGETHER = "several together"
-"""What is more, or less, than the sum of what each contributor does alone."""
+"""Interaction: difference from the sum of the single contributions."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """A number that is not known.
+    """Prior distribution of an unknown parameter.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Prior:
     source: str
 
     def at(self, share: np.ndarray) -> np.ndarray:
-        """The values that so many shares (n,) of all draws, in (0, 1), do not exceed."""
+        """Return the quantiles of the distribution at probabilities `share` (n,) in (0, 1)."""
         low, high = self.range
         match self.law:
             case "uniform":
@@ -71,12 +71,12 @@ POISSON = Prior(
 )  # fmt: skip
 RATIO = Prior(
     "tumour's stiffness", "log-uniform", (0.4, 2.5), "Young's modulus of the tumour over the brain's, over the scene's",
-    "22 glioblastomas of 1.32 kPa beside 1.54 in healthy tissue, five of them stiffer, all of soft and stiff parts: "
+    "22 glioblastomas of 1.32 kPa (healthy tissue: 1.54), five of them stiffer, all of soft and stiff parts: "
     "Streitberger et al. 2014, PLoS ONE 9:e110588",
 )  # fmt: skip
 TIP = Prior(
     TOOL, "normal", (1.06e-3, 1.06e-3), "place of the tool's tip, along each axis [m]",
-    "tracked probe off by 1.69 mm in the mean: Perwoeg et al. 2018, Int. J. Comput. Assist. Radiol. Surg. 13",
+    "mean error of a tracked probe 1.69 mm: Perwoeg et al. 2018, Int. J. Comput. Assist. Radiol. Surg. 13",
 )  # fmt: skip
 SKULL_HOLDS = Prior(
     SKULL, "uniform", (0.0, 1.0), "bonded, sliding or letting go, each as probable",
@@ -107,24 +107,24 @@ OF_SEGMENTATION = Prior(
 )  # fmt: skip
 OF_MESHES = OF_MESH, OF_MESH_SLIDING, OF_MESH_SINKING
 PRIORS = (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, *OF_MESHES, OF_REGISTRATION, OF_SEGMENTATION)
-"""All of them; what a trained model is off by is added where one answers."""
+"""All priors; the error of a trained model is added if one is used."""
 
 
 @dataclass(frozen=True)
 class Draw:
-    """A body and a tool as they may be.
+    """Sample of body and tool parameters.
 
     Parameters
     ----------
     stiffness, poisson, ratio
         Young's modulus over the scene's; Poisson's ratio; the tumour's Young's modulus over the brain's, as a multiple
-        of what the scene has.
+        of the scene's.
     skull
-        In [0, 1): which of the skulls that a scene may have.
+        In [0, 1): selects one of the skull conditions that a scene may have.
     tip
-        How far off the tool is (3,) [m]: to the right, up, and inwards.
+        Position error of the tool (3,) [m]: to the right, up, and inwards.
     mesh
-        What the mesh is off by, in standard deviations of its prior. Positive: the motion is longer.
+        Mesh error, in standard deviations of its prior. Positive: the motion is longer.
     """
 
     stiffness: float
@@ -136,7 +136,7 @@ class Draw:
 
 
 def drawn(count: int, seed: int = 0) -> list[Draw]:
-    """So many draws that cover each prior evenly (a Latin hypercube: McKay, Beckman, Conover 1979)."""
+    """Draw `count` samples that cover each prior evenly (a Latin hypercube: McKay, Beckman, Conover 1979)."""
     random = np.random.default_rng(seed)
 
     def shares() -> np.ndarray:
@@ -151,15 +151,15 @@ def drawn(count: int, seed: int = 0) -> list[Draw]:
 def drawn_from(
     tissue: FittedTissue, young: float, skulls: Sequence[str], count: int, seed: int = 0, ratio: float = 1.0
 ) -> list[Draw]:
-    """So many draws whose tissue and skull are drawn from what was fitted; all else as in `drawn`.
+    """Draw `count` samples whose tissue and skull are from a fit; all else as in `drawn`.
 
-    `young` [Pa] is the scene's own modulus, `ratio` how many times as stiff its tumour is, and `skulls` are those that
-    it may have. What was not fitted keeps its prior.
+    `young` [Pa] is the scene's own modulus, `ratio` its tumour's relative stiffness, and `skulls` the skulls that it
+    may have. Parameters that were not fitted keep their prior.
 
     Raises
     ------
     InputError
-        A skull was found that the scene does not allow.
+        The fitted skull is not allowed by the scene.
     """
     if sum(tissue.skulls[name] for name in skulls) < LEAST_POSSIBLE:
         raise InputError(

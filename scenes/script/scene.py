@@ -1,4 +1,4 @@
-"""What a scene is: effects, a scripted tool, a camera, an accuracy and the bounds that its figures must keep."""
+"""Definition of a scene: effects, scripted tool, camera, accuracy and limits of its metrics."""
 
 from __future__ import annotations
 
@@ -40,28 +40,28 @@ from .tool import Instrument, Probe
 from .tool_paths import AIR, Path, Touch, idle
 from .viewpoint import PLAIN, USUAL, Look, Viewpoint
 
-# Of a scene: an hour at 30 a second.
+# # Maximum number of frames of a scene: one hour at 30 frames/s.
 MOST_FRAMES = 108_000
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the figures of a scene must keep for it to pass.
+    """Limits of a scene's metrics.
 
     Parameters
     ----------
     overlap
-        Least intersection over union of the drawn tumour's silhouette and the finite elements'.
+        Minimum intersection over union of the silhouettes of the drawn tumour and the FEM tumour.
     error
-        Largest mean distance between the predicted tumour and the finite elements' [m].
+        Maximum mean distance between the predicted tumour and the FEM tumour [m].
     pixels
         Largest difference between our projection and OpenCV's [pixel].
     drawn
-        How far the outline in the picture may be from where the finite elements have it [pixel]. In a scene with a
-        sight, the estimate's from where the estimate has it.
+        Maximum distance between the outline in the image and that by FEM [pixel]. In a scene with an observation model:
+        between the drawn and the computed outline of the estimate.
     covered, removed
-        In a scene with a sight: least share of frames whose ellipsoid holds the tumour's true middle. Least share of
-        the tumour's motion, over all frames, that the estimate removes.
+        In a scene with an observation model: minimum share of frames whose ellipsoid contains the true tumour centroid.
+        Minimum share of the tumour motion, over all frames, that the estimate removes.
     """
 
     overlap: float = 0.95
@@ -76,32 +76,32 @@ PALPATION = Probe()
 # A tool that is stopped by less is where it was asked for [m].
 SHORT = 0.1e-3
 HANDLED = (ToolForce, ToolContact, Retraction)
-"""Effects that need a tool in somebody's hand."""
+"""Effects that need a tool."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One scripted scene. Times in seconds; what acts at a time follows from its effects.
+    """Scripted scene. Times in seconds; the loads at a time follow from its effects.
 
     Parameters
     ----------
     path, tool
-        What the hand does, and with what; without a tool none is in view.
+        Motion of the tool, and the tool; None: no tool is in view.
     lying
-        How the head lies, where `Gravity` is asked for.
+        Head pose, used with `Gravity`.
     surgery
-        What is cut, if anything.
+        Resection, if any.
     sight
-        What is seen of the open cortex, if an estimate shall say from that where the tumour is; the deformer's answer
-        is then the truth.
+        Observation model of the open cortex, if the tumour position is estimated from observations; the deformer's
+        solution is then the ground truth.
     element
         One of `sim.elements.ELEMENTS`; None: the one that is recommended for the mesh.
 
     Raises
     ------
     InputError
-        A tool's force or pose without a tool; a duration or a frame rate that is no number, not above 0, or of more
-        than `MOST_FRAMES` frames.
+        A tool's force or pose without a tool; a duration or a frame rate that is not a number > 0; more than
+        `MOST_FRAMES` frames.
     """
 
     name: str
@@ -137,7 +137,7 @@ class Scene:
             )
 
     def made_of(self, tissue: Tissue | None, element: str | None) -> Scene:
-        """The scene with another tissue, element, or both; tissue that relaxes goes on relaxing by the same series.
+        """Return the scene with another tissue, element, or both; tissue that relaxes keeps its Prony series.
 
         Raises
         ------
@@ -158,7 +158,7 @@ class Scene:
 
     @property
     def elasticity(self) -> Elasticity:
-        """What its tissue is; without laws where it has none."""
+        """Tissue of the scene; without laws if there is none."""
         return next((effect for effect in self.effects if isinstance(effect, Elasticity)), Elasticity(None))
 
     def with_regions(self, regions: Mapping[int, Tissue]) -> Scene:
@@ -188,11 +188,11 @@ class Scene:
 
     @property
     def posed(self) -> bool:
-        """Whether the hand moves its tool, instead of pushing with it."""
+        """True if the tool is moved by its pose, not by a force."""
         return any(isinstance(effect, ToolContact | Retraction) for effect in self.effects)
 
     def tip(self, site: Site, touch: Touch) -> np.ndarray:
-        """Where a tool that is moved would touch first (3,) [m]; the bone's edge stops it."""
+        """Compute the contact point (3,) [m] of a moved tool, limited by the craniotomy edge."""
         assert self.tool is not None
         asked = self.contact(site, touch).point + touch.depth * site.direction(touch)
         return site.within(asked, self.tool.radius)
@@ -213,12 +213,12 @@ class Scene:
         return self.tool.pose(self.tip(site, touch), site.axis, site.right)
 
     def loads(self, site: Site, touch: Touch, time: float) -> Loads:
-        """One load case: the cause of every effect that has one; where none has, time alone goes on."""
+        """Build one load case: the cause of every effect that has one; without causes, only time advances."""
         causes = (self._cause(effect, site, touch, time) for effect in self.effects_on(site.anatomy))
         return Loads(tuple(cause for cause in causes if cause is not None), np.array([time]))
 
     def _cause(self, effect: Effect, site: Site, touch: Touch, time: float) -> Cause | None:
-        """The cause that an effect of the scene answers at a moment."""
+        """Build the cause of an effect of the scene at a time."""
         match effect:
             case ToolForce():
                 return self._pushed(site, touch)

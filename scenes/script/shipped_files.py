@@ -1,4 +1,4 @@
-"""What ships with the package."""
+"""Files that ship with the package."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def template_path() -> Path:
-    """The template anatomy, a .vtu; its scan and its models lie beside it."""
+    """Return the path of the template anatomy, a .vtu; its scan and its models are next to it."""
     return Path(str(files("scenes"))) / "data" / "template.vtu"
 
 

@@ -1,4 +1,4 @@
-"""What is seen of the open cortex, and how far off it is: all that an estimate of the tumour's place is given."""
+"""Observation models of the open cortex with their errors: the only input of an estimate of the tumour position."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from sim.errors import InputError
 
 @dataclass(frozen=True)
 class Sight:
-    """Points of the open cortex that are seen to move, with errors. Neither force nor tissue is known.
+    """Observation of moving points of the open cortex, with errors. Force and tissue are unknown.
 
-    What the tool hides is not seen. Where its tip touches the cortex, that place is seen too.
+    Points occluded by the tool are not observed. The contact point of its tip is observed too.
 
     Parameters
     ----------
     points
-        How many, evenly by area inside the drape's hole; they stay the same in all frames.
+        Number of points, evenly by area inside the drape's hole; the same in all frames.
     white, smooth
-        Errors along each axis, as standard deviations [m]. The white one is another in each point and frame; the
-        smooth one stays, and neighbours within 15 mm share it.
+        Errors along each axis, as standard deviations [m]. The white one is independent between points and frames; the
+        smooth one is constant in time and spatially correlated over 15 mm.
     shift, turn
-        Size of the rigid error, which stays: a translation [m], and a rotation [rad] about the points' middle.
+        Size of the rigid error, constant in time: a translation [m], and a rotation [rad] about the points' centroid.
     seed
-        From which points and errors are drawn: the same seed gives the same pictures.
+        Seed of points and errors: the same seed gives the same images.
     """
 
     points: int = 100
@@ -38,33 +38,33 @@ class Sight:
 
 @dataclass(frozen=True)
 class StereoSight:
-    """Points of the open cortex that both eyes of an operating microscope see, and that are followed.
+    """Observation of points of the open cortex by the stereo images of an operating microscope.
 
-    Its first pair of pictures shows the brain as the scan has it. Points are found in pictures: their depth by both
-    eyes, their motion by the left one. The scan shows no vessels, so that some are drawn on the cortex.
+    The first stereo pair shows the undeformed brain. Points are detected in images: their depth by stereo, their motion
+    by the left image. The scan shows no vessels, so synthetic ones are drawn on the cortex.
 
     Parameters
     ----------
     points
-        How many are looked for, evenly over the drape's hole.
+        Number of points searched, evenly over the drape's hole.
     noise
-        Of each eye's pictures, a standard deviation [grey level of 255]; it is another in each picture.
+        Standard deviation of the image noise [grey level of 255], independent between images.
     darker
-        What of the light the right eye lacks, from 0 to below 1.
+        Relative loss of brightness of the right eye, 0 <= `darker` < 1.
     shift, turn
-        Size of the rigid error of a tracked microscope: a translation [m], and a rotation [rad] about the middle of the
-        opening. The first pair has one of its own; the other stays in all later ones.
+        Size of the rigid error of a tracked microscope: a translation [m], and a rotation [rad] about the centre of the
+        opening. The first pair has its own error; all later ones share another.
     named
-        Whether points are followed. If not, they are a cloud of the cortex, whose points have no places in the scan.
+        True if points are tracked. Otherwise they are a point cloud without correspondences in the scan.
     vessels
-        Whether vessels are drawn.
+        True if vessels are drawn.
     seed
-        From which vessels, noise and rigid errors are drawn: the same seed gives the same pictures.
+        Seed of vessels, noise and rigid errors: the same seed gives the same images.
 
     Raises
     ------
     InputError
-        A light that is not from 0 to below 1, fewer than 6 points, or a size below 0.
+        `darker` is not in [0, 1), fewer than 6 points, or a size below 0.
     """
 
     points: int = 150

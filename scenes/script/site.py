@@ -20,7 +20,7 @@ class Site(OpenCortex):
     """The open cortex, and what a hand asks of it."""
 
     def reach(self, radius: float) -> float:
-        """How far from the line through the origin along the axis the bone lets a tool of this `radius` go [m]."""
+        """Return the maximum distance [m] of a tool of this `radius` from the axis, as limited by the bone."""
         return max(0.0, HOLE * self.clearance - radius)
 
     def within(self, point: np.ndarray, radius: float) -> np.ndarray:

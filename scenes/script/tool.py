@@ -42,24 +42,24 @@ def shafted(shape: BuiltIn, top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Instrument(Protocol):
-    """What a scene's hand may hold: `Probe`, `Blade`, or an instrument of your own as a frozen dataclass.
+    """Interface of a scene's tool: `Probe`, `Blade`, or an instrument of your own as a frozen dataclass.
 
-    In its own frame [m] its lowest point is the origin and its shaft goes along +z.
+    In its own frame [m] its lowest point is the origin and its shaft is along +z.
     """
 
     @property
     def radius(self) -> float:
-        """Of its footprint where it pushes, and of the space round its tip that it needs in an opening [m]."""
+        """Radius of its footprint when it pushes, and of the space around its tip that it needs in an opening [m]."""
         ...
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
-        """How it looks; it is asked for in every frame."""
+        """Surface mesh for rendering; it is read in every frame."""
         ...
 
     @property
     def shape(self) -> Tool:
-        """What of it touches tissue, for `ToolContact`."""
+        """Contact shape, for `ToolContact`."""
         ...
 
     def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
@@ -103,7 +103,7 @@ class Probe:
 
     @property
     def shape(self) -> Ball:
-        """What of it touches tissue."""
+        """Contact shape."""
         return Ball(self.radius)
 
     def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
@@ -143,12 +143,12 @@ class Blade:
 
     @property
     def radius(self) -> float:
-        """Of the circle round its tip end to end: the space that it needs in an opening [m]."""
+        """Circumscribed radius around its tip: the space that it needs in an opening [m]."""
         return 0.5 * float(np.hypot(self.width, self.length))
 
     @property
     def shape(self) -> Spatula:
-        """What of it touches tissue."""
+        """Contact shape."""
         return Spatula(self.width, self.length, self.edge)
 
     @cached_property

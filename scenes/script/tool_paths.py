@@ -10,19 +10,19 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Touch:
-    """What the hand asks for at one moment.
+    """Requested tool input at one time.
 
     Parameters
     ----------
     x, y
-        Where on the open cortex, in its tangent plane, from its centre [m].
+        Position on the open cortex, in its tangent plane, from its centre [m].
     force
-        How hard [N]; zero is no contact.
+        Force [N]; zero is no contact.
     tilt
         Direction of the force against the inward normal, towards x and y [rad].
     depth
-        Of a tool that is moved, not pushed: how far it is beyond where it would just touch the tissue at rest [m]. It
-        is measured along that direction, and is negative in the air.
+        Depth of a moved tool beyond first contact with the undeformed tissue [m], along that direction; negative in the
+        air.
     """
 
     x: float = 0.0
@@ -35,7 +35,7 @@ class Touch:
 Path = Callable[[float], Touch]
 """Time [s] -> Touch."""
 
-# A tool that does not touch is so far above the tissue [m].
+# # Height of an idle tool above the tissue [m].
 AIR = 4e-3
 
 
@@ -44,7 +44,7 @@ FAINT = 2e-3
 
 
 def lifted(force: float) -> float:
-    """How far [m] a tool that pushes with a force [N] is drawn off the tissue: an idle one by `AIR`."""
+    """Return the height [m] above the tissue at which a tool that pushes with a force [N] is drawn: `AIR` when idle."""
     return AIR * max(0.0, 1.0 - force / FAINT)
 
 
@@ -58,7 +58,7 @@ def smooth(t: float) -> float:
 
 
 def idle(time: float) -> Touch:
-    """Nobody touches anything at any time [s]."""
+    """Return no contact at any time [s]."""
     return Touch()
 
 
@@ -118,7 +118,7 @@ def lay(depth: float, tilt: float = 0.0, rise: float = 1.5, at: tuple[float, flo
 
 
 def _lowered(share: float, depth: float) -> float:
-    """How deep [m] a tool is after a share of its way from the air to `depth` [m]."""
+    """Return the depth [m] of a tool after a share of its way from the air to `depth` [m]."""
     return share * (AIR + depth) - AIR
 
 

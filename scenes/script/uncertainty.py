@@ -1,4 +1,4 @@
-"""How far a tumour may be from where a scene shows it: what an ensemble found, stored beside the anatomy."""
+"""Error bounds of the displayed tumour position: results of an ensemble, stored next to the anatomy."""
 
 from __future__ import annotations
 
@@ -20,34 +20,33 @@ from .site import Site
 
 FORMAT = "sulcus uncertainty 1"
 LEVEL = 0.95
-"""Of every bound that is printed."""
+"""Probability level of every printed bound."""
 SUFFIX = ".uncertainty.json"
 SURROGATE = "surrogate"
 AT_REST = (REGISTRATION, SEGMENTATION)
 """Contributors that put a tumour elsewhere in the scan, and as far elsewhere after it has moved."""
-# A bound at 95 % is so many deviations of a Gaussian.
+# # Bound at 95 % of a Gaussian [standard deviations].
 DEVIATIONS = 1.96
 
 
 @dataclass(frozen=True)
 class TumourError:
-    """How far a tumour may be from where a frame shows it.
+    """Expected error of the tumour position shown in a frame.
 
     Parameters
     ----------
     prior
-        With a probability of 95 % no point of its surface is farther off [m], when nothing is observed; None: not
-        known.
+        95 % bound on the maximum error over its surface [m], without observation; None: not known.
     largest
-        The name of the largest contributor to that.
+        Name of the largest contributor to `prior`.
     observed
-        The same with what is observed of the brain [m]; None where nothing is.
+        The same bound with observations of the brain [m]; None without observations.
     moved
-        The part of `prior` by which its motion since the scan may be off: that without registration and segmentation.
+        The part of `prior` from errors of its motion since the scan: without registration and segmentation.
     guess
-        Whether `prior` is a guess, as `Uncertainty.guess` says.
+        True if `prior` is a rough estimate, as in `Uncertainty.guess`.
     registration
-        Standard deviation along each axis [m] of the registration that the bound is of; None: not available.
+        Standard deviation along each axis [m] of the registration that the bound includes; None: not available.
     """
 
     prior: float | None
@@ -66,7 +65,7 @@ class TumourError:
 
     @property
     def bound(self) -> float | None:
-        """What holds: with the observation where there is one [m]."""
+        """Valid bound [m]: with the observation if there is one."""
         return self.prior if self.observed is None else self.observed
 
 
@@ -75,29 +74,29 @@ NOT_KNOWN = TumourError(None)
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What an ensemble found of one scene on one anatomy; lists go along `times`.
+    """Ensemble results for one scene on one anatomy; lists are indexed like `times`.
 
     Parameters
     ----------
     scene, mark
-        Its name, and what tells it from others of that name, see `mark_of`.
+        Name of the scene, and its fingerprint, see `mark_of`.
     draws, failed
-        Bodies that were solved, and those of which no equilibrium was found: these are left out.
+        Number of samples, and of those without equilibrium: these are excluded.
     times
         [s].
     worst, middle
-        What 95 % of all errors do not exceed [m]: of the tumour's worst surface point, and of its middle.
+        95th percentile of the errors [m]: maximum over the tumour's surface, and of its centroid.
     moved
         Mean motion of the tumour's surface [m].
     parts
-        Root mean square over draws, at the surface's worst point of each [m], by contributor.
+        Root mean square over draws of the maximum surface error [m], by contributor.
     frames
-        How many frames the draws' tissue was fitted to; 0: it was drawn from priors.
+        Number of frames that the draws' tissue was fitted to; 0: it was drawn from priors.
     folded
-        In how many draws tetrahedra lie inside out, as under a tool on soft tumour: no tissue moves so. 0, too, in
-        files that do not say it.
+        Number of draws with inverted tetrahedra, which is unphysical, such as under a tool on soft tumour. 0 in files
+        without this entry.
     numbers
-        How many numbers the parts are fitted to the draws by; 0 in files that do not say it.
+        Number of parameters by which the parts are fitted to the draws; 0 in files without this entry.
     patients
         Number of synthetic patients, none of them among the draws, on which the bound was tested.
     covered, deviation
@@ -123,12 +122,12 @@ class Uncertainty:
 
     @property
     def few(self) -> bool:
-        """Whether fewer than two draws were solved for each number that was fitted to them."""
+        """True if fewer than two draws were solved per fitted parameter."""
         return self.draws - self.failed < 2 * self.numbers
 
     @property
     def guess(self) -> bool:
-        """Whether this is no more than a guess: of few draws, or of a load beyond the tissue's law."""
+        """True if the bound is only a rough estimate: few draws, or a load beyond the range of the tissue law."""
         return self.few or self.folded > 0
 
     def at(self, time: float, surrogate: float = 0.0) -> TumourError:
@@ -147,7 +146,7 @@ class Uncertainty:
 
 
 def mark_of(scene: Scene, site: Site, element: str) -> str:
-    """What an uncertainty is of: sixteen digits of all that acts in a scene, and of the priors."""
+    """Compute the fingerprint of a scene: 16 hexadecimal digits of its loads, its anatomy and the priors."""
     times = np.linspace(0.0, scene.duration, 25).tolist()
     # Rounded, for sines differ from machine to machine in the last digit.
     acts = [np.round(_numbers(scene, time), 6).tolist() for time in times]
@@ -157,13 +156,13 @@ def mark_of(scene: Scene, site: Site, element: str) -> str:
 
 
 def _numbers(scene: Scene, time: float) -> list[float]:
-    """What hand and head do at a time [s]."""
+    """Return the parameters of tool and head at a time [s]."""
     touch, lying = scene.path(time), scene.lying(time)
     return [touch.x, touch.y, touch.force, *touch.tilt, touch.depth, *lying.direction, lying.fluid]
 
 
 def uncertainty_path(anatomy: Path) -> Path:
-    """Where the uncertainties of an anatomy file are looked for: MESH.uncertainty.json beside MESH.vtu."""
+    """Return the path of an anatomy's uncertainties: MESH.uncertainty.json next to MESH.vtu."""
     return anatomy.with_suffix(SUFFIX)
 
 
@@ -177,10 +176,10 @@ def read_uncertainties(path: Path) -> dict[str, Uncertainty]:
     """
     if not path.is_file():
         return {}
-    with read_as(path, "uncertainties", "Delete it, and make it anew by `sulcus uncertainty`."):
+    with read_as(path, "uncertainties", "Delete it, and compute it again by `sulcus uncertainty`."):
         stored = json.loads(path.read_text(encoding="utf-8-sig"))
         if stored.get("format") != FORMAT:
-            raise InputError(f"its format is not {FORMAT!r}: delete it, and make it anew by `sulcus uncertainty`.")
+            raise InputError(f"its format is not {FORMAT!r}: delete it, and compute it again by `sulcus uncertainty`.")
         return {name: _read(row) for name, row in stored["scenes"].items()}
 
 

@@ -65,38 +65,37 @@ class Look:
 
 
 PLAIN = Look()
-"""That of scenes that say nothing else."""
+"""Default look of scenes."""
 
 
-# So far under the cortex a camera looks: between the tool and the tumour [m].
+# # Depth under the cortex of the camera's target [m]: between the tool and the tumour.
 UNDER = 10e-3
 Eye = Literal["left", "right"]
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera by its place relative to the open cortex: from the side, for a tool moves a tumour mostly downwards.
+    """Camera pose relative to the open cortex: oblique, because a tool moves a tumour mostly downwards.
 
-    It has a distance [m] from the site, a vertical field of view [rad] and a size of the picture [pixel]. Its tilt
-    [rad] is that of the way to the camera, from the outward normal towards the site's `up`.
+    It has a distance [m] from the site, a vertical field of view [rad] and an image size [pixel]. Its tilt [rad] is
+    that of the direction to the camera, from the outward normal towards the site's `up`.
 
     Parameters
     ----------
     calibration
-        That of a real camera, in place of the field of view.
+        Calibration of a real camera, instead of the field of view.
     path
-        How the camera moves, zooms and focuses; None: it stays.
+        Motion, zoom and focus of the camera; None: static.
     eye
-        Which of an operating microscope's two ways of light is shown, with the axes meeting at the site; None: the
-        middle.
+        Optical path of an operating microscope, whose axes meet at the site; None: the centre.
     field
-        Radius of a microscope's round field, in halves of the picture's longer side: beyond it the shown picture is
-        dark. What is found in pictures is found without it. None: the picture is whole.
+        Radius of a microscope's circular field, relative to half of the image's longer side: the shown image is dark
+        beyond. Image processing ignores it. None: the complete image.
 
     Raises
     ------
     InputError
-        A calibration for pictures of another size, another eye than left and right, or a field not above 0.
+        A calibration for another image size, another eye than left and right, or a field that is not > 0.
     """
 
     distance: float = 0.20
@@ -121,11 +120,11 @@ class Viewpoint:
                 raise InputError(str(error)) from error
 
     def calibrated(self, calibration: Calibration) -> Viewpoint:
-        """The same place, with a calibrated camera and pictures of its size."""
+        """Return this viewpoint with a calibrated camera and its image size."""
         return replace(self, calibration=calibration, width=calibration.width, height=calibration.height)
 
     def target(self, site: Site) -> np.ndarray:
-        """What a camera looks at (3,) [m]."""
+        """Return the target point of the camera (3,) [m]."""
         return site.origin + UNDER * site.axis
 
     def camera(self, site: Site, time: float = 0.0) -> Camera:
@@ -144,4 +143,4 @@ class Viewpoint:
 
 
 USUAL = Viewpoint()
-"""That of scenes that say nothing else."""
+"""Default viewpoint of scenes."""

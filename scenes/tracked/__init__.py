@@ -1,1 +1,1 @@
-"""A real or drawn film in, an overlay out; the files of a real camera."""
+"""Overlay on a real or rendered video; files of a real camera."""

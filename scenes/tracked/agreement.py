@@ -1,4 +1,4 @@
-"""Whether another tracker's poses agree with the printed targets that the pictures show."""
+"""Consistency of an external tracker's poses with the printed targets in the images."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from ar.tracking.pose import Pose
 
 # A printed target is no farther from the body that carries it [m], and stays where it is on it but for this [m].
 FARTHEST, LOOSE = 0.2, 5e-3
-# Poses of targets that are less well known say nothing [m]; so many pictures are remembered, and so many are enough.
+# # Largest standard deviation of a usable target pose [m]; number of images kept, and minimum number.
 KNOWN, KEPT, FEWEST = 2e-3, 30, 4
-# Bodies that lie so many times nearer to the target when the two files change places are swapped, beyond this [m].
+# # Factor by which bodies are closer to the target with swapped files, and distance beyond which this counts [m].
 NEARER, BESIDE = 3.0, 0.02
-# Of the pictures that are remembered, so many in 100 count: one in ten may be misread.
+# # Percentile of the kept images that is used: one in ten may be misread.
 MOST = 90.0
 REMEDY = "see --poses and --clock"
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """Where printed targets were seen beside the bodies that carry them, in the last pictures.
+    """Positions of printed targets relative to the bodies that carry them, in the last images.
 
     Parameters
     ----------
     places
-        By the target's name: places in the body's frame (n, 3) [m].
+        By the target's name: positions in the body's frame (n, 3) [m].
     doubts
-        By the target's name: what the last picture that shows it says against the poses; empty: nothing.
+        By the target's name: inconsistency of the poses with the last image that shows it; empty: none.
     """
 
     places: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -37,13 +37,13 @@ class Agreement:
 
     @property
     def doubt(self) -> str:
-        """What speaks against the poses, in words; empty: nothing."""
+        """Description of the inconsistency of the poses; empty: none."""
         return next(filter(None, self.doubts.values()), "")
 
     def seen(self, name: str, target: Pose, body: Pose, swapped: Pose | None) -> Agreement:
-        """With one more picture: a target as it is seen, its body as poses have it, and as the other's file has it.
+        """Add an image: observed target pose, its body's pose, and the body's pose with swapped files.
 
-        All are in one frame. A target whose place is not well known says nothing.
+        All are in one frame. A target whose position is too uncertain is skipped.
         """
         if np.linalg.eigvalsh(target.covariance[:3, :3])[-1] > KNOWN**2:
             return self
@@ -55,12 +55,12 @@ class Agreement:
 
 
 def _beside(target: Pose, body: Pose) -> np.ndarray:
-    """Where a target is in a body's frame (3,) [m]."""
+    """Return the position of a target in a body's frame (3,) [m]."""
     return (np.linalg.inv(body.T_camera_target) @ target.T_camera_target)[:3, 3]
 
 
 def _doubt(name: str, places: np.ndarray, swapped: np.ndarray | None) -> str:
-    """What places (n, 3) [m] of a target on its body say against the poses; the newest is the last."""
+    """Describe the inconsistency of positions (n, 3) [m] of a target on its body; the newest is the last."""
     away = float(np.linalg.norm(places[-1]))
     if swapped is not None and away > BESIDE and NEARER * np.linalg.norm(swapped) < away:
         return f"the {name}'s target is seen {1e3 * away:.0f} mm from its poses: are the two files of --poses swapped?"

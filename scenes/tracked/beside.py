@@ -1,4 +1,4 @@
-"""What stands beside the 3-D view of an overlay's page: slices of the scan, and what was read lately."""
+"""Side panels of an overlay page's 3-D view: slices of the scan, and recent readings."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ WITHIN = Line("error of the overlay", "mm", "#4cf28c", "across the view (95 %), 
 
 
 def lines_of(tooled: bool) -> tuple[Line, ...]:
-    """What is read of each picture."""
+    """Return the plotted quantities of each image."""
     return (DISTANCE, WITHIN) if tooled else (WITHIN,)
 
 
 def sample_of(known: Known, gauge: Gauge | None, tooled: bool, now: float) -> Sample:
-    """What is read of a picture that is shown at a time [s]: `lines_of` says in which order."""
+    """Build the readings of an image that is shown at a time [s], in the order of `lines_of`."""
     within = 1e3 * known.band if known.relied and known.band is not None else None
     if not tooled:
         return Sample(now, (within,), (0.0,))

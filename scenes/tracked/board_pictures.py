@@ -1,4 +1,4 @@
-"""Views of the calibration board in a folder of pictures or a video."""
+"""Views of the calibration board in a folder of images or a video."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from sim.runtime.outside_files import read_as
 
 @dataclass(frozen=True)
 class Seen:
-    """What was seen of the board.
+    """Detections of the board.
 
     Parameters
     ----------
     views
-        Of the pictures that show it.
+        Views of the images that show it.
     width, height
-        Of all pictures [pixel].
+        Size of all images [pixel].
     looked_at
-        How many pictures there were.
+        Number of images.
     """
 
     views: tuple[View, ...]
@@ -33,24 +33,24 @@ class Seen:
 
 
 def seen_views(path: Path, board: Target, size: tuple[int, int] | None = None) -> Seen:
-    """The board in each picture of a folder or a video; `size` is the width and height that they must have.
+    """Detect the board in each image of a folder or a video; `size` is the required width and height.
 
     Raises
     ------
     InputError
-        What cannot be read, pictures of different sizes or of another one than stated, or a board that is not seen.
+        Unreadable input, images of different sizes or of another one than given, or no visible board.
     """
     views, count, first, detector = [], 0, "", Detector([board])
-    with read_as(path, "pictures of a board", GIVE):
+    with read_as(path, "images of a board", GIVE):
         try:
             for picture in pictures_of(path):
                 count += 1
                 found = (picture.grey.shape[1], picture.grey.shape[0])
                 if size is not None and found != size:
-                    than = f"{first} {size[0]} x {size[1]}" if first else f"{size[0]} x {size[1]} was stated"
+                    than = f"{first} {size[0]} x {size[1]}" if first else f"{size[0]} x {size[1]} was given"
                     raise InputError(
                         f"{picture.name} has {found[0]} x {found[1]} pixels, but {than}: "
-                        "calibrate with pictures of one size, which is that of later use."
+                        "calibrate with images of one size, which is that of later use."
                     )
                 size, first = found, first or f"{picture.name} has"
                 view = find_board(detector, picture.name, picture.grey)
@@ -58,9 +58,9 @@ def seen_views(path: Path, board: Target, size: tuple[int, int] | None = None) -
         except ValueError as error:
             raise InputError(str(error)) from error
     if size is None or not count:
-        raise InputError(f"{path}: holds no pictures. {GIVE}")
+        raise InputError(f"{path}: holds no images. {GIVE}")
     if not views:
         raise InputError(
-            f"{path}: the board is in none of {count} pictures: print it by `sulcus markers`, and show most of it."
+            f"{path}: the board is in none of {count} images: print it by `sulcus markers`, and show most of it."
         )
     return Seen(tuple(views), *size, count)

@@ -15,7 +15,7 @@ from sim.runtime.outside_files import path_of, read_as
 
 SUFFIXES = (".yaml", ".yml")
 INTRINSICS = "sulcus intrinsics"
-"""The format of the covariance beside a calibration."""
+"""Format of the covariance file of a calibration."""
 FORMATS = {"opencv": opencv_text, "ros": ros_text}
 GIVE_HAND_EYE = "Give what `sulcus calibrate --hand-eye A.csv B.csv --json` prints, B being the camera."
 LARGEST_HAND_EYE, RIGID = 1 << 16, 1e-4
@@ -44,17 +44,17 @@ def read_calibration(path: str | Path) -> Calibration:
 
 
 def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
-    """The covariance (9, 9) that `sulcus calibrate` wrote beside a calibration, K.json for K.yaml; None: there is none.
+    """Read the covariance (9, 9) that `sulcus calibrate` writes with a calibration, K.json for K.yaml; None: no file.
 
     Raises
     ------
     InputError
-        A file of that name and kind whose covariance is none.
+        A file of that name and kind with an invalid covariance.
     """
     beside = path_of(path).with_suffix(".json")
     if not beside.is_file() or beside.stat().st_size > LONGEST_TEXT:
         return None
-    with read_as(beside, "a covariance of `sulcus calibrate`", "Remove it, or calibrate the camera anew."):
+    with read_as(beside, "a covariance of `sulcus calibrate`", "Remove it, or calibrate the camera again."):
         stored = json.loads(beside.read_text(encoding="utf-8-sig"))
         if not isinstance(stored, dict) or not str(stored.get("format", "")).startswith(INTRINSICS):
             return None
@@ -65,7 +65,7 @@ def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
 
 
 def intrinsics_header(calibration: Calibration, covariance: np.ndarray) -> dict[str, object]:
-    """What a K.json beside a calibration says: its values (9,) and their covariance (9, 9), 0 where they are exact."""
+    """Build the K.json of a calibration: its values (9,) and their covariance (9, 9), 0 where they are exact."""
     from ar.tracking.intrinsics import PARAMETERS, values_of
 
     return {
@@ -80,7 +80,7 @@ def intrinsics_header(calibration: Calibration, covariance: np.ndarray) -> dict[
 
 
 def write_exactly_known(path: str | Path, calibration: Calibration) -> None:
-    """Write the K.json of a camera that is exactly known, as that of a rendered film: it appears whole or not at all.
+    """Write the K.json of a camera that is exactly known, as that of a rendered video; the write is atomic.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A short drawn film whose markers are covered for a while, on a brain whose motion under the tool is known exactly."""
+"""Short rendered video with temporarily covered markers, of a brain whose motion under the tool is known exactly."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from ..script.site import Site
 from .filming import USUAL, VIEW, Mounted, Shot, Taking, Trouble, from_where_it_sees_all, mounted, shots_of
 
 SCENE = "palpate"
-"""The scene that is filmed."""
+"""Scene of the video."""
 CAMERA = USUAL.sized(800, 600, scale=True)
-"""Its camera: fewer pixels than usual, so that it takes seconds."""
-# Pictures a second, how long it is, and when in the scene it begins: the ball begins to touch at 0.4 s [s].
+"""Camera of the video: fewer pixels than usual, so that it takes seconds."""
+# # Frame rate [1/s], length [s], and start time in the scene [s]: the ball makes contact at 0.4 s.
 RATE, LENGTH, BEGIN = 10.0, 1.7, 0.5
-# What is covered and left out, and when [s].
+# # Covered targets and gaps, with their times [s].
 TROUBLES = (Trouble("reference", 0.25, 0.55), Trouble("tool", 0.85, 1.05), Trouble("gap", 1.25, 1.55))
-# How far round a tool's tip tissue goes with it [m].
+# # Width of the tissue displacement around a tool's tip [m].
 ROUND = 25e-3
 
 
@@ -42,7 +42,7 @@ class Dent:
     site: Site
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Where the tissue is under tools at poses; it is as deep as their tip is under the open cortex."""
+        """Compute the deformation under posed tools: the tissue is as deep as their tip is under the open cortex."""
         nodes = self.anatomy.mesh.nodes
         cause = loads.of(Touching)
         assert cause is not None
@@ -61,16 +61,16 @@ class Dent:
 
 @dataclass(frozen=True, eq=False)
 class DrawnFilm:
-    """Pictures with all that is true of them.
+    """Images with their ground truth.
 
     Parameters
     ----------
     stage, mounts, calibration, deformer
-        What is filmed, what is printed, by which camera, and who knows how the brain moves.
+        Scene, printed targets, camera, and deformer that gives the true motion.
     shots
-        In the order of their times.
+        Images in temporal order.
     taking
-        With what is covered, and when.
+        Image degradation, with covered targets and their times.
     """
 
     stage: Stage
@@ -81,12 +81,12 @@ class DrawnFilm:
     taking: Taking
 
     def picture(self, shot: Shot) -> Named:
-        """A picture as a film gives it."""
+        """Return an image as a video gives it."""
         return in_colour(f"{shot.time:.1f} s", shot.colour, shot.time)
 
 
 def drawn_film(theatre: Theatre) -> DrawnFilm:
-    """The film of a theatre's body.
+    """Render the video of a theatre's anatomy.
 
     Raises
     ------

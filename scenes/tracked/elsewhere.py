@@ -1,4 +1,4 @@
-"""Tool and reference as another tracker has them, at the times of the pictures and where the camera sees them."""
+"""Poses of tool and reference by an external tracker, at the times of the images and in the camera's frame."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from .pose_file import TrackedRow
 
 AT_REST = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
 """The camera in its own frame."""
-# Poses that begin or end so far from a picture [s] are of another clock, or of another time.
+# # Time between poses and an image [s] beyond which they belong to another clock or another recording.
 FAR = 1.0
 
 
 def rows_of(film: Iterable[Named], calibration: Calibration, body: str, frame: str) -> Iterator[TrackedRow]:
-    """A row for each picture: of `body` (tool, patient, board, camera) in the `frame` of one of them that is seen.
+    """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `frame` of a visible one of them.
 
     Raises
     ------
     ValueError
-        Pictures of another size than the camera was calibrated at.
+        Images of another size than the camera was calibrated at.
     """
     targets = {each.name: each for each in all_targets()}
     wanted = [each for each in (body, frame) if each != "camera"]
@@ -50,17 +50,17 @@ def rows_of(film: Iterable[Named], calibration: Calibration, body: str, frame: s
 
 
 def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: float) -> Iterator[TrackedRow]:
-    """A row for each picture: of `body` (tool, patient, board, camera) in the `frame` of one of them that is seen.
+    """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `frame` of a visible one of them.
 
-    Times are those that pictures hold, or else those of the film.
+    Times are the stamps in the images, or else those of the video.
 
     Raises
     ------
     InputError
-        What cannot be read, and pictures of another size than the camera was calibrated at.
+        Unreadable input, or images of another size than the camera was calibrated at.
     """
     count = 0
-    with read_as(path, "a film", GIVE):
+    with read_as(path, "a video", GIVE):
         try:
             for row in rows_of(map(_at_its_time, film_of(path, rate)), calibration, body, frame):
                 count += 1
@@ -68,17 +68,17 @@ def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: 
         except ValueError as error:
             raise InputError(str(error)) from error
     if not count:
-        raise InputError(f"{path}: holds no picture. {GIVE}")
+        raise InputError(f"{path}: holds no image. {GIVE}")
 
 
 def _at_its_time(picture: Named) -> Named:
-    """A picture with the time that it holds, if it holds one."""
+    """Return an image with the time of its stamp, if it has one."""
     stamp = read_stamp(picture.grey)
     return picture if stamp is None else replace(picture, time=stamp)
 
 
 def _known(state: Tracked, wanted: list[str]) -> tuple[Verdict, Pose | None, str]:
-    """The pose of the first target, beside the second if there are two; else what is known of the one that lacks."""
+    """Return the pose of the first target, relative to the second if given; else the verdict of the missing one."""
     for name in wanted:
         if name not in state.poses:
             return state.verdicts[name], None, name
@@ -88,16 +88,16 @@ def _known(state: Tracked, wanted: list[str]) -> tuple[Verdict, Pose | None, str
 
 @dataclass(frozen=True, eq=False)
 class Eye:
-    """Where the camera is in the tracker's frame.
+    """Pose of the camera in the tracker's frame.
 
     Parameters
     ----------
     T_body_camera
-        (4, 4) [m]: from the camera to what it is fixed to.
+        (4, 4) [m]: from the camera to the body that it is fixed to.
     covariance
-        (6, 6) of a shift of the camera [m] and a small turn about it [rad], in the axes of that body.
+        (6, 6) of a translation of the camera [m] and a small rotation about it [rad], in the axes of that body.
     body
-        The poses of what it is fixed to; None: the tracker's own frame.
+        Poses of that body; None: the tracker's own frame.
     """
 
     T_body_camera: np.ndarray
@@ -112,11 +112,11 @@ class Elsewhere:
     Parameters
     ----------
     tool, patient
-        What it says of the tool and of the patient's reference.
+        Poses of the tool and of the patient's reference.
     clock
-        By how much its clock differs from that of the pictures.
+        Offset of its clock from that of the images.
     eye
-        Where the camera is; None: its pictures say where it is beside the printed reference.
+        Pose of the camera; None: its images determine it relative to the printed reference.
     """
 
     tool: PoseStream
@@ -125,11 +125,11 @@ class Elsewhere:
     eye: Eye | None = None
 
     def beside(self, time: float) -> Pose | None:
-        """The tool beside the reference in the picture of a time [s]; None where the poses do not say it."""
+        """Return the tool relative to the reference, in the image of a time [s]; None if the poses are missing."""
         return self._at(time, self._beside)
 
     def reference(self, time: float) -> Pose | None:
-        """The reference in the camera's frame in the picture of a time [s]; None where nobody says it."""
+        """Return the reference in the camera's frame, in the image of a time [s]; None if it is unknown."""
         return self._at(time, self._in_camera)
 
     @property
@@ -138,10 +138,11 @@ class Elsewhere:
         return replace(self, tool=self.patient, patient=self.tool)
 
     def agreed(self, time: float, seen: Mapping[str, Pose], before: Agreement) -> Agreement:
-        """What printed targets that are seen in the picture of a time [s] say of these poses.
+        """Check these poses against the printed targets that are visible in the image of a time [s].
 
-        `seen` has the targets in the camera's frame, by name. Where pictures say where the camera is beside the
-        reference, the tool's alone can be compared.
+        `seen` has the targets in the camera's frame, by name. If images determine the camera relative to the reference,
+        only
+        the tool's poses can be compared.
         """
         reference, tool = (seen.get(target().name) for target in (patient_reference, tool_cube))
         if self.eye is None:
@@ -161,24 +162,24 @@ class Elsewhere:
         return {"tool": self.tool, "patient": self.patient, **camera}
 
     def outside(self, time: float) -> str:
-        """Say whose poses are all far from the picture of a time [s], and by how much; empty: nobody's."""
+        """Describe the body whose poses are all far from the image of a time [s], and by how much; empty: none."""
         for name, stream in self.streams.items():
             at = stream.in_its_day(time + self.clock.offset)
             first, last = stream.times[[0, -1]].tolist()
             if at < first - FAR:
-                return f"the {name}'s poses begin {first - at:.1f} s after this picture"
+                return f"the {name}'s poses begin {first - at:.1f} s after this image"
             if at > last + FAR:
-                return f"the {name}'s poses end {at - last:.1f} s before this picture"
+                return f"the {name}'s poses end {at - last:.1f} s before this image"
         return ""
 
     def age(self, time: float) -> float | None:
-        """How old the poses of a picture's time [s] are [s]; None where there are some for it."""
+        """Return the age [s] of the poses at an image's time [s]; None if current ones exist."""
         time = time + self.clock.offset
         missing = [each.age(time) for each in self.streams.values() if each.at(time) is None]
         return max(missing) if missing else None
 
     def _at(self, time: float, pose_at: Callable[[float], Pose | None]) -> Pose | None:
-        """A pose at a picture's time [s]; its covariance has in it how far it moves by the error of the clocks."""
+        """Return a pose at an image's time [s]; its covariance includes the motion during the clock error."""
         time, error = time + self.clock.offset, self.clock.error
         pose = pose_at(time)
         if pose is None or error == 0.0:
@@ -210,7 +211,7 @@ class Elsewhere:
 
 
 def clock_of_film(film: Iterable[Named], calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:
-    """By how much the tracker's clock differs from that of a film in which printed cube and reference are seen, too.
+    """Estimate the clock offset between the tracker and a video that shows the printed cube and reference.
 
     Raises
     ------

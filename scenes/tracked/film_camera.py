@@ -1,4 +1,4 @@
-"""Whether a film is of the camera that is stated."""
+"""Check that a video is of the given camera."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from ar.tracking.targets import Detector, all_targets
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
-# Of the first pictures of a film one in so many is looked at.
+# # Number of first images of a video, and stride of those examined.
 LOOKED, EACH = 120, 10
 
 
 def demand_film(film: Path, rate: float, calibration: Calibration, camera: str) -> None:
-    """Refuse what is no film, or one of another camera, by its first pictures: before anything that takes long.
+    """Reject an invalid video, or one of another camera, by its first images, before any long computation.
 
-    Without markers nothing is known of its focal length.
+    Without markers the focal length is not checked.
 
     Parameters
     ----------
     film, rate
-        A video, or a folder of pictures with so many a second.
+        A video, or a folder of images with this frame rate [1/s].
     camera
         Name of the calibration's file.
 
     Raises
     ------
     InputError
-        No such film, none that can be read, pictures of another size than the camera's, and focal lengths that are
-        surely off by more than 5 %.
+        A missing or unreadable video, images of another size than the camera's, and focal lengths with a significant
+        error of more than 5 %.
     """
     targets = {target.name: target for target in all_targets()}
     detector, seen, count = Detector(tuple(targets.values())), [], 0
-    with read_as(film, "a film", GIVE):
+    with read_as(film, "a video", GIVE):
         try:
             for picture in islice(film_of(film, rate), 0, LOOKED, EACH):
                 demand_picture(picture.grey, calibration.width, calibration.height)
@@ -48,7 +48,7 @@ def demand_film(film: Path, rate: float, calibration: Calibration, camera: str) 
         except ValueError as error:
             raise InputError(str(error)) from error
     if not count:
-        raise InputError(f"{film}: holds no picture. {GIVE}")
+        raise InputError(f"{film}: holds no image. {GIVE}")
     fit = focal_fit(calibration.camera(np.eye(4)), seen)
     if fit is not None and fit.differs:
         way = "longer" if fit.factor > 1.0 else "shorter"

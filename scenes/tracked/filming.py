@@ -1,4 +1,4 @@
-"""Films of a scene as a real camera would take them, with printed targets in view and all that is true of them."""
+"""Synthetic videos of a scene by a realistic camera, with printed targets in view and their ground truth."""
 
 from __future__ import annotations
 
@@ -30,34 +30,34 @@ from .registration_file import scanned_of
 from .tracked_tool import TrackedTool
 
 USUAL = Calibration((1400.0, 1400.0), (620.0, 540.0), 1280, 960, Lens(-0.1, 0.02, 5e-4, -3e-4), "sulcus film")
-"""The camera of a film that says nothing else."""
+"""Default camera of a video."""
 VIEW = Viewpoint(distance=0.32).calibrated(USUAL)
-"""At arm's length: it sees the opening, the reference beside it and the tool's cube."""
+"""View from arm's length: it shows the opening, the reference near it and the tool's cube."""
 # The reference's middle from the site, to the right, up and outwards [m]; turned from the line of sight [degree].
 BESIDE, TURNED = (-0.078, 0.010, 0.022), (28.0, -24.0)
 # From the tool's tip up its shaft to the middle of its cube [m].
 MOUNT = 0.09
-# Of a hand that covers a target; by what an over-exposed picture is brighter; pixels of a smear.
+# # Colour of a hand that covers a target; added brightness of an over-exposed image; length of a smear [pixel].
 HAND, BRIGHT, SMEAR = (196, 148, 128), 12.0, 41
 KINDS = {
     "reference": "a hand covers the patient's reference",
     "tool": "a hand covers the tool's cube",
-    "bright": "the picture is over-exposed",
-    "smear": "the picture is smeared by motion",
-    "gap": "there are no pictures",
+    "bright": "the image is over-exposed",
+    "smear": "the image is smeared by motion",
+    "gap": "there are no images",
 }
-"""What may go wrong in a film, and how it is called."""
+"""Disturbances of a video, with their description."""
 
 
 def from_where_it_sees_all(view: Viewpoint) -> Viewpoint:
-    """The same camera, from where its picture shows as much as that of `VIEW` does."""
+    """Return the same camera, at a distance from which its image shows as much as that of `VIEW`."""
     assert view.calibration is not None
     longer = (view.calibration.focal[1] / view.height) / (USUAL.focal[1] / USUAL.height)
     return replace(view, distance=longer * VIEW.distance)
 
 
 def reference_beside(site: Site, camera: Camera) -> np.ndarray:
-    """T_scan_patient (4, 4) of the reference beside a site, as `camera` sees it from in front."""
+    """Return T_scan_patient (4, 4) of the reference near a site, facing `camera`."""
     right, up, outwards = BESIDE
     middle = site.origin + right * site.right + up * site.up - outwards * site.axis
     T = np.eye(4)
@@ -89,7 +89,7 @@ class Trouble:
 
 @dataclass(frozen=True)
 class Taking:
-    """How pictures are taken: blur [pixel] and noise [of 255] as standard deviations, and what goes wrong."""
+    """Image degradation: blur [pixel] and noise [of 255] as standard deviations, and disturbances."""
 
     blur: float = 0.5
     noise: float = 2.0
@@ -97,13 +97,13 @@ class Taking:
     seed: int = 0
 
     def happening(self, time: float) -> set[str]:
-        """What goes wrong at a time [s]."""
+        """Return the disturbances at a time [s]."""
         return {each.kind for each in self.troubles if each.since <= time < each.until}
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One picture and what is true of it.
+    """Image with its ground truth.
 
     Parameters
     ----------
@@ -126,19 +126,19 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Mounted:
-    """What is printed in a film, and where: the tool with its cube, and T_scan_patient (4, 4) of the reference."""
+    """Printed targets of a video: the tool with its cube, and T_scan_patient (4, 4) of the reference."""
 
     tool: TrackedTool
     T_scan_patient: np.ndarray
 
 
 def mounted(player: Player) -> Mounted:
-    """A cube on the scene's tool and a reference beside the opening, both turned towards the camera as it starts.
+    """Mount a cube on the scene's tool and a reference near the opening, both facing the initial camera.
 
     Raises
     ------
     InputError
-        A scene whose tool is none that can be tracked.
+        A scene whose tool cannot be tracked.
     """
     scene, site, camera = player.scene, player.site, player.camera
     shape = None if scene.tool is None else scene.tool.shape
@@ -157,9 +157,9 @@ def mounted(player: Player) -> Mounted:
 
 
 def registered(site: Site, mounts: Mounted, shift: float, turn: float, seed: int) -> Registration:
-    """The reference's registration to the scan, with an error that is drawn once, and stated.
+    """Draw the reference's registration to the scan, with one random error of the given standard deviations.
 
-    `shift` [mm] and `turn` [degree] are its standard deviations along and about each axis, about the opening's middle.
+    `shift` [mm] and `turn` [degree] are its standard deviations along and about each axis, about the opening's centre.
     """
     deviations = np.repeat([1e-3 * shift, np.radians(turn)], 3)
     error = deviations * np.random.default_rng([seed, 1]).standard_normal(6)
@@ -169,10 +169,10 @@ def registered(site: Site, mounts: Mounted, shift: float, turn: float, seed: int
 
 
 def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) -> Iterator[Shot]:
-    """The pictures of a scene, one in `every` frame; the deformer's answers are what is true.
+    """Render the images of a scene, one in `every` frames; the deformer's solutions are the ground truth.
 
-    A camera with a rolling shutter is where its path has it for each row; tool and tissue stay as at the picture's
-    time. The camera that is true of such a picture is that of the row in which the tumour's middle is seen.
+    With a rolling shutter, each row is rendered from its own camera pose; tool and tissue are those of the image's
+    time. The ground-truth camera of such an image is that of the row that shows the tumour's centroid.
     """
     tool, site, stage, last = player.scene.tool, player.site, player.stage, None
     assert tool is not None
@@ -210,7 +210,7 @@ def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) ->
 
 
 def _later(player: Player, time: float, after: float) -> Camera:
-    """The camera so long after a picture's time [s]."""
+    """Return the camera `after` seconds from an image's time [s]."""
     return player.camera_at(time + after)
 
 
@@ -221,7 +221,7 @@ def _seen(
     wrong: set[str],
     camera: Camera,
 ) -> np.ndarray:
-    """What a camera sees (H, W, 3) uint8 with targets T_scan_target (4, 4), some of which a hand covers."""
+    """Render a camera's image (H, W, 3) uint8 with targets T_scan_target (4, 4), some of them covered by a hand."""
     sharp = renderer.picture(camera, moving).colour
     shown = drawn(sharp, camera, [each for each in targets if NAMES[each[0].name] not in wrong])
     for target, T in targets:
@@ -235,7 +235,7 @@ NAMES = {"tool": "tool", "patient": "reference"}
 
 
 def _covered(colour: np.ndarray, camera: Camera, target: Target, T_scan_target: np.ndarray) -> np.ndarray:
-    """The picture with a hand before a target."""
+    """Draw a hand in front of a target."""
     T = camera.T_camera_world @ T_scan_target
     outline = target.outline
     where = window_round(replace(camera, T_camera_world=np.eye(4)), outline @ T[:3, :3].T + T[:3, 3], 0.1, 0.0)
@@ -246,7 +246,7 @@ def _covered(colour: np.ndarray, camera: Camera, target: Target, T_scan_target: 
 
 
 def _taken(colour: np.ndarray, taking: Taking, wrong: Sequence[str] | set[str], number: int) -> np.ndarray:
-    """The picture with blur and noise, and what goes wrong with it as a whole."""
+    """Apply blur, noise and the global disturbances to an image."""
     out = colour.astype(np.float32)
     if "bright" in wrong:
         out *= BRIGHT

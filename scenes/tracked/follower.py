@@ -1,4 +1,4 @@
-"""From one picture of a real camera to the next: where the tumour is, how far off that may be, and what is lost."""
+"""Frame-by-frame tracking with a real camera: tumour position, its error, and lost targets."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from .plausible import implausible, misplaced_tool
 from .tool_motion import Motion, ToolMotion
 from .tracked_tool import TrackedTool
 
-# So long a picture's overlay stays where it was when the reference is lost: in a hand's picture it is off by less than
-# LIMIT then. And so long pictures may be missing [s].
+# # Time for which the overlay keeps its position after the reference is lost: hand-held, its error is then less than
+# # LIMIT. Longest gap between images [s].
 HELD, GAP = 0.1, 0.2
-# A slow film's pictures may be apart by so many of its own intervals, which are no longer than this [s].
+# # Longest gap of a slow video, in its own intervals; maximum interval [s].
 MISSED, SLOWEST = 1.5, 1.0
-# Times of pictures are rounded [s].
+# # Rounding of image times [s].
 ROUNDING = 1e-6
-# A tumour whose place in the picture is not known this well is not to be relied on [m].
+# # Largest position error of a reliable overlay [m].
 LIMIT = 5e-3
-UNKNOWN = "as in the scan, and nobody says how it moved: do not rely on it"
-# What is seen moves while a rolling shutter reads a picture. So much of that way is an overlay's error, and so many
-# times as much the error of a tool's tip, which is far from its cube: measured in docs/overlay.md, "A rolling shutter".
+UNKNOWN = "scan position, tissue motion unknown: do not rely on it"
+# # Motion during the readout of a rolling shutter: share of it that is the overlay's error, and factor to the error of
+# # a tool's tip, which is far from its cube: measured in docs/overlay.md, "A rolling shutter".
 SKEW, LEVER = 0.5, 2.0
-# What is left after a second of how fast a hand was.
+# # Decay of a hand's maximum speed within a second.
 CALMS = 0.1
 UNCHECKED = "not checked whose registration this is: make one by `sulcus register --anatomy`"
 NO_PACE = "a rolling shutter, and how the camera moves is not known yet: do not rely on it"
@@ -45,7 +45,7 @@ TOOL, PATIENT = tool_cube().name, patient_reference().name
 
 
 class State(Enum):
-    """What a picture shows of the tumour."""
+    """State of the tumour in an image."""
 
     GOOD = "where it is now"
     REST = "as in the scan"
@@ -58,37 +58,36 @@ class State(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is known after a picture.
+    """Tracking result of an image.
 
     Parameters
     ----------
     time
-        When it was taken [s].
+        Time of the image [s].
     state, words
-        What it shows; why that is no more, or not to be relied on, for people; empty where it may be.
+        State, and the reason for users why it is limited or unreliable; empty if it is reliable.
     tracked
-        What was seen of the targets.
+        Detected targets.
     motion
-        The brain as it is believed to be.
+        Estimated motion of the brain.
     camera
-        With T_camera_scan; None where the reference has been lost for longer than `HELD`.
+        Camera with T_camera_scan; None if the reference has been lost for longer than `HELD`.
     T_scan_tool, tip_covariance
-        (4, 4) [m] and (3, 3) [m^2], where the tool is seen.
+        (4, 4) [m] and (3, 3) [m^2], if the tool is visible.
     band
-        With a probability of 95 % the tumour is no farther off across the line of sight [m]; None where that is not
-        known.
+        95 % bound on the tumour's error across the line of sight [m]; None if unknown.
     parts
-        The same by what it comes from [m].
+        The same bound by source [m].
     seen, felt
-        When the reference, and the tool beside it, were seen last [s]; None: never.
+        Time of the last detection of the reference, and of the tool relative to it [s]; None: never.
     interval
-        The shortest between two pictures so far [s].
+        Shortest interval between two images up to now [s].
     near
-        Whether the tool has been near the head: until then its place may be due to another patient's registration.
+        True once the tool has been near the head: until then the registration may be of another patient.
     pace
-        How fast the brain has moved across the picture lately [m/s]; None: not known.
+        Recent speed of the brain across the image [m/s]; None: not known.
     agreement
-        What printed targets in the pictures say of another tracker's poses.
+        Consistency of an external tracker's poses with printed targets in the images.
     """
 
     time: float
@@ -110,27 +109,26 @@ class Known:
 
     @property
     def relied(self) -> bool:
-        """Whether the tumour is drawn as known."""
+        """True if the tumour is drawn as reliable."""
         return self.state in (State.GOOD, State.REST)
 
 
 @dataclass(frozen=True, eq=False)
 class Follower:
-    """Follows reference and tool through the pictures of a calibrated camera, and asks how the brain lies.
+    """Tracker of reference and tool in the images of a calibrated camera, which computes the brain's motion.
 
     Parameters
     ----------
     calibration
-        Of the camera.
+        Calibration of the camera.
     registration
-        Of the patient's reference to the scan.
+        Registration of the patient's reference to the scan.
     tool
-        With its cube; None: no tool is looked for.
+        Tool with its cube; None: no tool is tracked.
     motion
-        Who says how the brain lies under it.
+        Model of the brain's motion under the tool.
     elsewhere
-        Poses of another tracker, which take the place of the cube's; where they say where the camera is, the
-        reference's, too.
+        Poses of an external tracker, which replace the cube's; with a tracked camera, the reference's, too.
     intrinsic
         (9, 9), covariance of the camera's calibration, as of `ar.tracking.intrinsics.PARAMETERS`; None: not known.
     """
@@ -144,12 +142,12 @@ class Follower:
 
     @cached_property
     def tracker(self) -> Tracker:
-        """Of the targets that are wanted."""
+        """Tracker of the required targets."""
         wanted = (patient_reference(),) if self.tool is None else (patient_reference(), tool_cube())
         return Tracker(self.calibration.camera(np.eye(4)), wanted)
 
     def step(self, grey: np.ndarray, time: float, before: Known | None = None) -> Known:
-        """What is known after a picture (H, W) uint8 that was taken at a time [s], from what was known `before`.
+        """Compute the tracking result of an image (H, W) uint8 taken at a time [s], from the result `before`.
 
         Raises
         ------
@@ -174,7 +172,7 @@ class Follower:
         return replace(known, state=State.UNSURE, words=known.agreement.doubt, band=None, parts={})
 
     def _looked(self, grey: np.ndarray, time: float, before: Known | None) -> Known:
-        """As `step`, whatever the intervals are."""
+        """Compute the result of `step`, for any intervals."""
         apart = None if before is None else time - before.time
         longest = GAP if before is None else max(GAP, MISSED * before.interval)
         stale = apart is not None and not 0.0 < apart <= longest
@@ -203,14 +201,14 @@ class Follower:
         if doubt or known.state is State.UNKNOWN:
             known = replace(known, band=None, parts={})
         if stale and apart is not None:
-            why = f"no picture for {apart:.1f} s" if apart > 0.0 else "the camera repeats a picture"
+            why = f"no image for {apart:.1f} s" if apart > 0.0 else "the camera repeats an image"
             return replace(known, state=State.STALE, words=f"stale, {why}: do not rely on it")
         if known.state in (State.GOOD, State.REST) and band > LIMIT:
             return replace(known, state=State.UNSURE, words=wide_words(band))
         return known
 
     def _implausible(self, camera: Camera, tool: np.ndarray | None, before: Known | None) -> tuple[str, bool]:
-        """Why this can be no registration of this patient, in words; and whether the tool has been near the head."""
+        """Describe why the registration is implausible for this patient; and return the updated `near`."""
         stage, near = self.motion.stage, before is not None and before.near
         theirs = "is this its registration?" if self.elsewhere is None else "are these its poses and registration?"
         misplaced, near = ("", near) if tool is None else misplaced_tool(self.tool, tool, stage, near, theirs)
@@ -231,9 +229,9 @@ class Follower:
         )  # fmt: skip
 
     def _pace(self, reference: Pose, time: float, before: Known | None) -> float | None:
-        """The fastest that the brain has moved across the picture lately [m/s]; None where that is not known.
+        """Return the recent maximum speed of the brain across the image [m/s]; None if unknown.
 
-        A hand trembles: what it does while one picture is taken may be faster than from this picture to the next.
+        A hand trembles: the speed during one image may be larger than that between two images.
         """
         last = None if before is None else before.tracked.poses.get(PATIENT)
         if before is None or last is None or not time > before.time:
@@ -244,7 +242,7 @@ class Follower:
         return max(speed, CALMS ** (time - before.time) * (before.pace or 0.0))
 
     def _with_tool(self, tracked: Tracked, reference: Pose, time: float, before: Known | None, shutter: float) -> Known:
-        """How the brain lies under the tool, by its pose beside the reference, and what a `shutter` adds to it [m]."""
+        """Compute the motion under the tool, by its pose relative to the reference; a `shutter` adds an error [m]."""
         felt, last = (None, None) if before is None else (before.felt, before.motion)
         beside = self._beside(tracked, reference, time)
         if self.tool is None or beside is None:
@@ -265,14 +263,14 @@ class Follower:
         return Known(time, state, words, tracked, motion, None, pose, spread, felt=time)
 
     def _beside(self, tracked: Tracked, reference: Pose, time: float) -> Pose | None:
-        """The tool's cube beside the reference."""
+        """Return the tool's cube relative to the reference."""
         if self.elsewhere is not None:
             return self.elsewhere.beside(time)
         cube = tracked.poses.get(TOOL)
         return None if cube is None else cube.seen_from(reference)
 
     def _late(self, time: float) -> str:
-        """How old the poses of another tracker are, where they are what is missing; else empty."""
+        """Describe the age of an external tracker's poses, if they are missing; else empty."""
         age = None if self.elsewhere is None else self.elsewhere.age(time)
         if self.elsewhere is None or age is None:
             return ""
@@ -283,7 +281,7 @@ class Follower:
     def _band(
         self, reference: Pose, middle: np.ndarray, motion: Motion, shutter: float
     ) -> tuple[float, dict[str, float]]:
-        """How far off the tumour's `middle` (3,) [m] may be across the line of sight, by what is known of it."""
+        """Compute the error bound of the tumour's `middle` (3,) [m] across the line of sight, and its parts by source."""
         place, beside = self.registration.point(middle)
         at, tracked = reference.point(place)
         turned = reference.T_camera_target[:3, :3]
@@ -305,12 +303,12 @@ class Follower:
 
 
 def wide_words(band: float) -> str:
-    """Why a place that is known no better than to `band` [m] may not be relied on."""
+    """Describe an error `band` [m] that is too large for a reliable position."""
     return f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
 
 
 def tip_covariance(registration: Registration, tool: TrackedTool, beside: Pose) -> np.ndarray:
-    """Of a tool's tip in the scan (3, 3) [m^2]: by its pose beside the reference, its calibration and registration."""
+    """Compute a tool tip's covariance (3, 3) [m^2] in the scan: by pose, tool calibration and registration."""
     T = registration.T_patient_scan
     arm, tracked = beside.point(tool.T_cube_tool[:3, 3])
     turned = beside.T_camera_target[:3, :3]

@@ -1,4 +1,4 @@
-"""The page of a film, or of what a camera sees now, with the tumour in it."""
+"""Page of a video, or of a live camera, with the tumour overlay."""
 
 from __future__ import annotations
 
@@ -30,30 +30,30 @@ from .run import Shown, Timed, overlaid_one
 from .seekable_film import SeekableFilm
 from .words import about, report
 
-# Of a picture's brightness, what is left of one that is old; how long the page stays when it cannot go on [s].
+# # Brightness factor of an outdated image; time for which the page stays after a failure [s].
 FADED, STAYS = 0.35, 2.0
-# How often a page that shows nothing new looks for what is asked [s].
+# # Polling interval of an idle page [s].
 LOOKS = 0.03
-# A camera that gave no picture for so long may be unplugged [s].
+# # Time without an image after which a camera may be unplugged [s].
 UNPLUGGED = 1.0
-# So many pictures are kept for a table and a summary, without their colours.
+# # Number of results kept for a table and a summary, without their colours.
 KEPT = 20_000
 
 
 @dataclass(eq=False)
 class OverlayPage:
-    """The page of one film, or of one camera.
+    """Page of one video, or of one camera.
 
     Parameters
     ----------
     follower, painter
-        What looks at its pictures, and draws into them.
+        Tracker of its images, and overlay renderer.
     name, who
-        Of the film or the camera, and who says how the brain lies, in words.
+        Name of the video or the camera, and description of the deformation model.
     host, port
-        Where it is served.
+        Address of the server.
     frames
-        How many pictures the film has; 0: it is a camera.
+        Number of images of the video; 0: it is a camera.
     origins
         Further addresses of the page, as `ar.page.browser.Browser` takes them.
     """
@@ -70,16 +70,16 @@ class OverlayPage:
     busy: Busy = field(init=False)
     history: History = field(init=False)
     shown: deque[Shown] = field(default_factory=lambda: deque(maxlen=KEPT), init=False)
-    # What visitors ask for, written by the page's threads.
+    # # Requests of users, written by the page's threads.
     plays: bool = field(default=True, init=False)
     style: Style = field(init=False)
     through: str = field(default="", init=False)
     sought: deque[int] = field(default_factory=lambda: deque(maxlen=1), init=False)
-    # What is shown: the picture as it came, its overlay, and how that is drawn.
+    # # Displayed state: the original image, its overlay, and its style.
     taken: Timed | None = field(default=None, init=False)
     newest: Shown | None = field(default=None, init=False)
     number: int = field(default=-1, init=False)
-    # The shortest between two pictures so far [s].
+    # # Shortest interval between two images up to now [s].
     interval: float = field(default=SLOWEST, init=False)
     place: str = field(default="", init=False)
     drawn: tuple[str, ...] = field(default=(), init=False)
@@ -91,7 +91,7 @@ class OverlayPage:
         self.style, self.history = self.painter.style, History(lines_of(self.tooled))
         bodies = brain_of(stage)
         if tool is not None:
-            # Of no size, until it is seen.
+            # # Empty until the tool is seen.
             away = np.tile(stage.site.origin, (len(tool.bare[0]), 1))
             bodies.append(Body("tool", away, tool.bare[1], TOOL_COLOUR))
         self.browser = Browser(
@@ -114,7 +114,7 @@ class OverlayPage:
 
     @property
     def tooled(self) -> bool:
-        """Whether a tool is looked for."""
+        """True if a tool is tracked."""
         return self.painter.tool is not None
 
     def close(self) -> None:
@@ -123,15 +123,15 @@ class OverlayPage:
         self.browser.close()
 
     def play(self, film: SeekableFilm, seconds: float = np.inf) -> list[Shown]:
-        """Play a film, again and again, until the time is over; returns what was shown last, without colours.
+        """Play a video in a loop for the given time; return the last results, without colours.
 
-        No picture is left out: where they take longer than the film does, it plays more slowly. A picture that is not
-        the next one is looked at as if it were the first.
+        No image is skipped: if processing is slower than the video, playback slows down. An image that is not the next
+        one is tracked like a first image.
 
         Raises
         ------
         ValueError
-            A film that cannot be read, or of another size than the camera's; the page says it, too.
+            An unreadable video, or one of another size than the camera's; the page reports it, too.
         """
         due = clock.perf_counter()
         end, known = due + seconds, None
@@ -143,11 +143,11 @@ class OverlayPage:
                     self._restyle()
                     clock.sleep(LOOKS)
                     continue
-                self.busy.on(f"looking at picture {wanted}")
+                self.busy.on(f"processing image {wanted}")
                 taken = film.at(wanted)
                 if taken is None:
                     if film.count < 1:
-                        raise ValueError(f"{film.path}: holds no picture.")
+                        raise ValueError(f"{film.path}: holds no image.")
                     if wanted != self.number + 1:
                         self.sought.append(film.count - 1)
                     continue
@@ -158,11 +158,11 @@ class OverlayPage:
                 due = now + min(max(apart, 0.0), SLOWEST)
                 self.interval = min(self.interval, one.known.interval)
                 known = replace(one.known, interval=self.interval)
-                self._show(taken, one, wanted, f"picture {wanted} of {film.count - 1}, {taken.picture.time:.2f} s")
+                self._show(taken, one, wanted, f"image {wanted} of {film.count - 1}, {taken.picture.time:.2f} s")
         return list(self.shown)
 
     def _wanted(self, count: int, due: bool) -> int | None:
-        """The number of the picture that is to be shown, if it is another than the one that is."""
+        """Return the number of the image to be shown, if it is not the current one."""
         wanted, first = self.number, self.number < 0
         if self.sought:
             wanted = self.sought.pop()
@@ -171,14 +171,14 @@ class OverlayPage:
         return None if wanted == self.number else wanted
 
     def watch(self, pictures: Iterator[Named | None], seconds: float = np.inf) -> list[Shown]:
-        """Show what a camera sees until it ends, or the time is over; None stands for no picture that came.
+        """Show a camera's images until it ends, or the time is over; None stands for a missing image.
 
-        Returns what was shown last, without colours. What is no longer the view is dimmed, and said to be old.
+        Return the last results, without colours. An outdated image is dimmed, and marked as old.
 
         Raises
         ------
         ValueError
-            Pictures of another size than the camera's; the page says it, too.
+            Images of another size than the camera's; the page reports it, too.
         """
         came = clock.perf_counter()
         end, known = came + seconds, None
@@ -200,11 +200,11 @@ class OverlayPage:
         return list(self.shown)
 
     def _silent(self, seconds: float) -> None:
-        """Say that a camera gives no picture for so long."""
+        """Report that a camera has given no image for `seconds`."""
         if seconds < UNPLUGGED:
-            self._fade(f"no picture for {GAP:g} s")
+            self._fade(f"no image for {GAP:g} s")
         else:
-            self._fade(f"no picture for {seconds:.0f} s", f"Is {self.name} plugged in? This page waits for it.")
+            self._fade(f"no image for {seconds:.0f} s", f"Is {self.name} plugged in? This page waits for it.")
 
     @contextmanager
     def _failing(self, end: float) -> Iterator[None]:
@@ -218,11 +218,11 @@ class OverlayPage:
             raise
 
     def _painter(self) -> Painter:
-        """Who draws as visitors want it."""
+        """Return the painter with the requested style."""
         return replace(self.painter, style=self.style)
 
     def _show(self, taken: Timed, one: Shown, number: int, place: str) -> None:
-        """Show a picture, in words too, and note what was read of it."""
+        """Show an image with its report, and record its readings."""
         before = self.number
         self.taken, self.newest, self.number, self.place = taken, one, number, place
         self.shown.append(one.without_mesh())
@@ -239,7 +239,7 @@ class OverlayPage:
         return self.painter.gauge(known, self.painter.stage.tumour(known.motion.positions))
 
     def _draw(self, one: Shown) -> None:
-        """Put a picture, its words, bodies, slices and chart on the page."""
+        """Put an image, its text, bodies, slices and chart on the page."""
         known, look, painter = one.known, self.through, self.painter
         self.drawn = self.style, self.through
         said = report(one, self._gauge(known), self.tooled, self.place)
@@ -260,7 +260,7 @@ class OverlayPage:
             self.browser.tint(name, colour)
 
     def _restyle(self) -> None:
-        """Draw the same picture in another way, where that is asked for."""
+        """Draw the same image in another style, if requested."""
         if self.newest is None or self.taken is None or self.drawn == (self.style, self.through):
             return
         assert self.taken.picture.colour is not None
@@ -269,7 +269,7 @@ class OverlayPage:
         self._draw(self.newest)
 
     def _fade(self, why: str, hint: str = "") -> None:
-        """Show that the last picture is old, unless that is shown already."""
+        """Mark the last image as old, unless it is marked already."""
         said = f"{why}: what is shown is old"
         if self.drawn == (said, self.style, self.through):
             return
@@ -280,6 +280,6 @@ class OverlayPage:
             assert self.taken.picture.colour is not None
             known = replace(self.newest.known, state=State.STALE, words=said)
             dim = (FADED * self.taken.picture.colour).astype(np.uint8)
-            self.place = f"{hint} The last picture" if hint else "the last picture"
+            self.place = f"{hint} The last image" if hint else "the last image"
             self._draw(replace(self.newest, known=known, colour=self._painter().paint(dim, known).colour, latency=None))
         self.drawn = said, self.style, self.through

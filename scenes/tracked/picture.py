@@ -1,4 +1,4 @@
-"""The tumour over a real picture: as it is known, in grey what was known a moment ago, and never what is lost."""
+"""Tumour overlay on a real image: reliable position in colour, last known position in grey, nothing when lost."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from .tracked_tool import TrackedTool
 
 ABOVE = "the tool does not touch: as in the scan"
 SEEN_THROUGH = Opening((CORTEX,), (), "seen through bone or drape")
-"""Where the drape has its hole, the opening is; all else may be bone."""
+"""The opening is visible within the drape's hole; all else may be bone."""
 IN_GREY = (State.NO_TOOL, State.STALE, State.NO_REFERENCE)
 """States in which the tumour is drawn in grey, and dotted."""
 
 
 @dataclass(frozen=True, eq=False)
 class Painter:
-    """Draws what is known over pictures.
+    """Renderer of tracking results over images.
 
     Parameters
     ----------
     stage
-        The brain that is drawn.
+        Stage with the brain to draw.
     tool
-        What hides the tumour where it is seen; None: nothing does.
+        Tool that occludes the tumour; None: no tool.
     style
         As of `ar.overlay.composite.composite`.
     device
@@ -52,10 +52,11 @@ class Painter:
     device: str = "cpu"
 
     def paint(self, colour: np.ndarray, known: Known, covered: np.ndarray | None = None) -> Overlaid:
-        """A picture (H, W, 3) uint8 with what is known of it.
+        """Draw a tracking result on an image (H, W, 3) uint8.
 
-        covered (H, W) bool is what lies in front of the brain, as a hand. Nothing is drawn over it, and the picture
-        says how much of the tumour that hides.
+        covered (H, W) bool marks foreground in front of the brain, such as a hand. Nothing is drawn over it, and the
+        image
+        shows the share of the tumour that it hides.
         """
         if known.state in IN_GREY or known.camera is None:
             return self._grey(colour, known, covered)
@@ -77,7 +78,7 @@ class Painter:
         return composite(picture, camera, tumour, self.style, cover, Marks(band, gauge, before), words)
 
     def _hidden_words(self, camera: Camera, tumour: Layer, covered: np.ndarray | None) -> Sequence[str]:
-        """What a picture says of what lies in front of the tumour, where that hides a noticeable share of it."""
+        """Describe the foreground's share of the tumour in the image, if it is noticeable."""
         box = box_around(camera, tumour.vertices)
         if covered is None or box is None or self.style == "none":
             return ()
@@ -87,7 +88,7 @@ class Painter:
         return (f"{share:.0%} of the tumour is behind what lies in front",) if share >= NOTICED else ()
 
     def _layers(self, known: Known) -> list[Layer]:
-        """The open cortex, under which the tumour is seen, the drape round it as films have it, and the tool."""
+        """Build the open cortex, under which the tumour is seen, the surrounding drape as in videos, and the tool."""
         tool = self.held(known)
         return [*self.stage.layers(known.motion.positions, None), *([] if tool is None else [tool])]
 
@@ -127,13 +128,13 @@ class Painter:
 
 
 def head_lines(known: Known) -> Sequence[str]:
-    """What is known of the tumour's place and its error, for the picture's head."""
+    """Describe the tumour position and its error, for the top of the image."""
     if known.band is None:
         return ()
     largest = max(known.parts, key=lambda name: known.parts[name])
     lines = [ABOVE] if known.state is State.REST else []
     if known.relied:
-        lines.append(f"tumour: within {bound_words(known.band, 1)} across the view (95 %), above all {largest}")
+        lines.append(f"tumour: within {bound_words(known.band, 1)} across the view (95 %), mainly {largest}")
     motion = "; of motion: not known" if not known.motion.known else ""
     camera = "" if "camera" in known.parts else ", camera"
     return (*lines, f"error by tissue{camera} and segmentation: not known{motion}")

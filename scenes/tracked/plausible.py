@@ -1,4 +1,4 @@
-"""Whether a registration can be this patient's: where it has the opening, and where the tool is beside the head."""
+"""Plausibility of a registration for this patient: positions of the opening and of the tool relative to the head."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def implausible(registration: Registration, stage: Stage, camera: Camera) -> str
 
 
 def from_head(tip: np.ndarray, stage: Stage) -> float:
-    """How far a tool's tip (3,) [m] is from the box round the head's mesh [m]."""
+    """Compute the distance [m] of a tool's tip (3,) [m] from the bounding box of the head's mesh."""
     nodes = stage.anatomy.mesh.nodes
     return float(np.linalg.norm(tip - np.clip(tip, nodes.min(axis=0), nodes.max(axis=0))))
 

@@ -29,9 +29,9 @@ STATUS = "state", "valid", "visible", "tracked", "seen"
 SEEN = "ok", "good", "seen", "valid", "visible", "tracked", "tracking", "true", "yes", "1", "1.0"
 # Number of kinds of unseen rows that a warning names.
 MOST_WORDS = 3
-# By how much a quaternion's length may differ from 1, and a place be from the origin [m].
+# # Tolerance of a quaternion's length from 1, and maximum distance of a position from the origin [m].
 ROUNDED, FARTHEST = 0.01, 100.0
-# Of the covariance: from metres and radians to millimetres and radians.
+# # Conversion of the covariance from metres and radians to millimetres and radians.
 UNITS = np.repeat([1e3, 1.0], 3)
 USUAL = 0.25e-3, float(np.radians(0.1))
 """Deviations of a tracker that states none, along and about each axis [m], [rad]."""
@@ -64,14 +64,14 @@ def read_numbered_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def read_stream(path: str | Path) -> PoseStream:
-    """The poses of another tracker, in a file as of `read_poses`, whose clock may begin anew at midnight.
+    """Read the poses of an external tracker, in a file as of `read_poses`, whose clock may restart at midnight.
 
     Covariances are read where there are columns `cov_00` to `cov_55`, as `write_poses` has them; elsewhere `USUAL`.
 
     Raises
     ------
     InputError
-        As `read_poses`; no pose, or a covariance that is none.
+        As `read_poses`; no pose, or an invalid covariance.
     """
     times, poses, covariances = _read(path)
     kept = ~np.isnan(poses[:, 0, 0])
@@ -147,7 +147,7 @@ def _covariances(columns: dict[str, np.ndarray], count: int) -> np.ndarray:
 
 
 def _are_covariances(matrices: np.ndarray) -> bool:
-    """Whether symmetric matrices (n, 6, 6) are finite and nowhere negative, within their rounding in a file."""
+    """Return True if symmetric matrices (n, 6, 6) are finite and positive semi-definite, within file rounding."""
     if not np.isfinite(matrices).all():
         return False
     values = np.linalg.eigvalsh(matrices * np.outer(UNITS, UNITS))
@@ -156,9 +156,9 @@ def _are_covariances(matrices: np.ndarray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class TrackedRow:
-    """One picture: its time [s], what is known of the body, its pose if that is certain, and what it took [s].
+    """Result of an image: its time [s], verdict on the body, pose if it is certain, and processing time [s].
 
-    Where there is no pose, `lacks` names the target that the verdict is of.
+    Without a pose, `lacks` names the target of the verdict.
     """
 
     time: float
@@ -169,10 +169,10 @@ class TrackedRow:
 
 
 def write_poses(path: Path, rows: Iterable[TrackedRow], tip: np.ndarray) -> None:
-    """Write a row for each picture, which appear all or not at all; those without a pose have blanks.
+    """Write a row for each image, atomically; those without a pose have blanks.
 
-    `tip` (3,) [m] is the place of the tool's tip in its own frame. The covariance is of x, y, z [mm] and a small turn
-    about the body's origin in the axes of the frame [rad]: the upper triangle, row by row.
+    `tip` (3,) [m] is the position of the tool's tip in its own frame. The covariance is of x, y, z [mm] and a small
+    rotation about the body's origin in the axes of the frame [rad]: the upper triangle, row by row.
     """
     with written_whole(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
@@ -186,7 +186,7 @@ def write_poses(path: Path, rows: Iterable[TrackedRow], tip: np.ndarray) -> None
 
 
 def _of_pose(pose: Pose, tip: np.ndarray) -> list[str]:
-    """Place, turn, tip and how far off it is (root mean square), and covariance."""
+    """Format position, rotation, tip with its root mean square error, and covariance."""
     T = pose.T_camera_target
     at, spread = pose.point(tip)
     covariance = (pose.covariance * np.outer(UNITS, UNITS))[np.triu_indices(6)]

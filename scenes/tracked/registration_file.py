@@ -1,4 +1,4 @@
-"""How a scan lies in the frame of the patient's reference, as a JSON file: millimetres, radians."""
+"""Registration of the scan to the frame of the patient's reference, as a JSON file: millimetres, radians."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sim.runtime.outside_files import path_of, read_as
 
 FORMAT = "sulcus registration 1"
 WANTED = "Make one by `sulcus register`."
-# A file of more bytes is none of ours; a rotation's columns are so exactly of length 1, and at right angles.
+# # Maximum size of a valid file [bytes]; tolerance of a rotation's columns from length 1 and right angles.
 LARGEST, RIGID = 1 << 16, 1e-4
 # A covariance's eigenvalues may be below 0 by this share of the largest, by rounding.
 ROUNDING = 1e-9
@@ -70,7 +70,7 @@ def _scanned(stored: dict) -> Scanned:
 
 
 def scanned_of(anatomy: Anatomy) -> Scanned:
-    """What a registration to the scan of an anatomy is made for; without a tumour its middle stands for that."""
+    """Return the scan data of an anatomy for its registration; without a tumour the box's corners give the centre."""
     nodes = anatomy.mesh.nodes
     bounds = np.stack([nodes.min(axis=0), nodes.max(axis=0)])
     tumour = nodes[anatomy.tumour_nodes] if len(anatomy.tumour_nodes) else bounds
@@ -111,7 +111,7 @@ def _demand_covariance(covariance: np.ndarray) -> None:
 
 
 def as_stored(registration: Registration) -> dict[str, object]:
-    """What a file holds of a registration."""
+    """Build the file content of a registration."""
     T = registration.T_patient_scan.copy()
     T[:3, 3] *= 1e3
     made = registration.scanned

@@ -1,4 +1,4 @@
-"""The loop of a real picture: track, ask how the brain lies, draw; and how long after the picture that was ready."""
+"""Loop over real images: track, compute the brain's motion, draw; with the latency of each overlay."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .truth import Off
 
 # Edges of the histogram of latencies [ms].
 EDGES = (0, 20, 40, 60, 80, 100, 150, 200, 300, 500, 1000)
-# A picture that is so much older than its overlay is not the view any more [s].
+# # Age at which an image is stale [s].
 OLD = 0.2
 # A video's grey level from which something lies in front: black is not quite black there. In a file all above 0 does.
 FAINT = 32
@@ -35,22 +35,22 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A picture with its overlay.
+    """Image with its overlay.
 
     Parameters
     ----------
     known
-        What is drawn.
+        Drawn tracking result.
     colour
         (H, W, 3) uint8.
     seconds
-        What it took, from the picture's arrival.
+        Processing time from the image's arrival [s].
     middle
-        Of the tumour in the scan (3,) [m], as it is drawn.
+        Centroid of the drawn tumour in the scan (3,) [m].
     latency
-        From when the picture was taken to when its overlay was ready [s]: of pictures that come as time goes on.
+        Time from the image's acquisition to its overlay [s], for live images.
     stamped
-        Whether the time was read from the picture's pixels.
+        True if the time was read from the image's pixels.
     """
 
     known: Known
@@ -72,9 +72,9 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """A picture whose time [s] is read from its pixels, where it is written there, and from its source elsewhere.
+    """Image whose time [s] is read from its pixels, if it is written there, and from its source otherwise.
 
-    `covered` (H, W) bool is what lies in front of the brain, as a hand, where somebody says so.
+    `covered` (H, W) bool is the foreground in front of the brain, such as a hand, if a mask is given.
     """
 
     picture: Named
@@ -83,14 +83,14 @@ class Timed:
 
 
 def timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> Iterator[Timed]:
-    """Pictures with the times that they hold, and with their masks: all that is not black lies in front.
+    """Yield images with their time stamps, and with their masks: all that is not black is foreground.
 
-    A clock of 24 hours goes on at midnight.
+    A 24-hour clock is continued at midnight.
 
     Raises
     ------
     ValueError
-        A picture without a mask, a mask without a picture, or one of another size.
+        An image without a mask, a mask without an image, or one of another size.
     """
     before, days = -np.inf, 0.0
     for number, picture in enumerate(film):
@@ -102,23 +102,23 @@ def timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> Iterat
         before = time
         yield Timed(replace(picture, time=time), stamp is not None, covered)
     if masks is not None and next(masks, None) is not None:
-        raise ValueError("there are more masks than pictures. Give one for each picture, in order.")
+        raise ValueError("there are more masks than images. Give one for each image, in order.")
 
 
 def _mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
-    """What lies in front in the picture of a number."""
+    """Return the foreground mask of the image of a number."""
     mask = next(masks, None)
     if mask is None:
-        raise ValueError(f"{picture.name} has no mask: there are {number}. Give one for each picture, in order.")
+        raise ValueError(f"{picture.name} has no mask: there are {number}. Give one for each image, in order.")
     if mask.grey.shape != picture.grey.shape:
-        raise ValueError(f"the mask {mask.name} is {mask.grey.shape}, its picture {picture.grey.shape}.")
+        raise ValueError(f"the mask {mask.name} is {mask.grey.shape}, its image {picture.grey.shape}.")
     return mask.grey >= (1 if mask.name.lower().endswith(".png") else FAINT)
 
 
 def paced(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
-    """Pictures as a camera gives them: the newest that is taken by now, and the moment [s] that its time 0 was.
+    """Yield images like a live camera: the newest taken at the time of the request, and the moment [s] of its time 0.
 
-    Those that come while nobody asks are lost.
+    Images that arrive between requests are lost.
     """
     waiting = next(film, None)
     if waiting is None:
@@ -134,12 +134,12 @@ def paced(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
 
 
 def overlaid(film: Iterator[Timed], follower: Follower, painter: Painter, live: bool = False) -> Iterator[Shown]:
-    """Every picture with its overlay; `live`: as time goes on, so that late pictures are left out and old ones said.
+    """Yield every image with its overlay; `live`: in real time, so that late images are skipped and old ones marked.
 
     Raises
     ------
     ValueError
-        As `Follower.step`, and of the film.
+        As `Follower.step`, and of the video.
     """
     known: Known | None = None
     for taken, begun in paced(film) if live else ((each, None) for each in film):
@@ -151,9 +151,9 @@ def overlaid(film: Iterator[Timed], follower: Follower, painter: Painter, live: 
 def overlaid_one(
     taken: Timed, begun: float | None, before: Known | None, follower: Follower, painter: Painter
 ) -> Shown:
-    """One picture with its overlay, from what was known `before`.
+    """Compute one image with its overlay, from the result `before`.
 
-    `begun` is the moment [s] that the pictures' time 0 was, if they come as time goes on: one that is old is stale.
+    `begun` is the moment [s] of the images' time 0, if they are live: an old one is stale.
 
     Raises
     ------
@@ -172,20 +172,20 @@ def overlaid_one(
 
 
 def aged(known: Known, age: float) -> Known:
-    """What is known of a picture that is so old [s]: one that is too old is stale."""
+    """Return the result of an image of the given age [s]: it is stale beyond `OLD`."""
     if age <= OLD or not known.relied:
         return known
-    return replace(known, state=State.STALE, words=f"stale, the picture is {age:.1f} s old: do not rely on it")
+    return replace(known, state=State.STALE, words=f"stale, the image is {age:.1f} s old: do not rely on it")
 
 
 def latencies(shown: list[Shown]) -> dict[str, object]:
-    """Median, 95th percentile and histogram [ms], of pictures as time goes on, or else of what each took."""
+    """Compute median, 95th percentile and histogram [ms] of the latency of live images, or else of processing times."""
     live = [each.latency for each in shown if each.latency is not None]
     milliseconds = 1e3 * np.array(live or [each.seconds for each in shown])
     counts = np.histogram(milliseconds, [*EDGES, np.inf])[0]
     names = [*(f"{low}-{high}" for low, high in pairwise(EDGES)), f"over {EDGES[-1]}"]
     return {
-        "what": "from the picture's time to its overlay" if live else "from the picture's arrival to its overlay",
+        "what": "from the image's time to its overlay" if live else "from the image's arrival to its overlay",
         "time_from": "pixels" if all(each.stamped for each in shown) else "the source",
         "p50_ms": float(np.median(milliseconds)),
         "p95_ms": float(np.percentile(milliseconds, 95.0)),
@@ -194,10 +194,11 @@ def latencies(shown: list[Shown]) -> dict[str, object]:
 
 
 def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[Off | None]) -> None:
-    """Write a row for each picture, which appear all or not at all; what is not known is blank.
+    """Write a row for each image, atomically; unknown values are blank.
 
-    The place is that of the tumour's middle in the scan, RAS. `within_mm` holds with 95 %, across the line of sight.
-    Four columns hold it against the truth, if that is given; the last one names the space.
+    The position is that of the tumour's centroid in the scan, RAS. `within_mm` is the 95 % bound across the line of
+    sight.
+    Four columns compare with the ground truth, if that is given; the last one names the space.
     """
     with written_whole(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")

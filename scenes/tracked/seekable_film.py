@@ -1,4 +1,4 @@
-"""The pictures of a film by their numbers, for who goes to and fro in it."""
+"""Random access to the images of a video by number."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from .run import Timed, timed
 
 @dataclass(eq=False)
 class SeekableFilm:
-    """A video, or a folder of pictures.
+    """Video, or folder of images.
 
     Parameters
     ----------
     path
-        As `ar.tracking.pictures.film_of` has it; so are the errors.
+        Path, with errors, as of `ar.tracking.pictures.film_of`.
     rate
-        Pictures in a second, of a folder.
+        Frame rate of a folder [1/s].
     count
-        How many pictures there are, as far as is known.
+        Number of images, as far as known.
     """
 
     path: Path
@@ -40,7 +40,7 @@ class SeekableFilm:
         return timed(film_of(self.path, self.rate, colour=True, first=number))
 
     def at(self, number: int) -> Timed | None:
-        """A picture by its number; None where the film ends before it, which `count` says from then on."""
+        """Return an image by its number; None if the video ends before it, which `count` then gives."""
         if number != self.next:
             # From its start: a video's own leaps do not land on every frame.
             self.film = self._from(number)

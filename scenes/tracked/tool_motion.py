@@ -1,4 +1,4 @@
-"""How the brain lies under a tracked tool: what a model or finite elements make of its pose, and how far off."""
+"""Brain motion under a tracked tool: deformation by a model or FEM from its pose, with its error."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ REFUSED = "the tool is farther inside the brain than the model knows: do not rel
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Where the brain is.
+    """State of the brain.
 
     Parameters
     ----------
     positions
-        Of all mesh vertices (V, 3) [m]; of those that are not drawn, at rest.
+        Positions of all mesh vertices (V, 3) [m]; undeformed for those that are not drawn.
     known
-        Whether anybody answered for the tool's pose.
+        True if a deformer supports the tool's pose.
     moved
-        Mean distance of the tumour's surface from where the scan has it [m].
+        Mean distance of the tumour's surface from its position in the scan [m].
     model, tool
-        At 95 %: how far a vertex may be off by the model, and by the error of the tool's place [m].
+        95 % bounds on a vertex's error by the model, and by the error of the tool's position [m].
     doubt
-        Why it may not be relied on, in words for the picture; empty where it may.
+        Reason why it is unreliable, in words for the image; empty if it is reliable.
     answer
-        What was answered, from which the next one may start.
+        The solution, from which the next one may start.
     """
 
     positions: np.ndarray
@@ -50,13 +50,13 @@ class Motion:
 
     @property
     def error(self) -> float:
-        """Of the motion at 95 %, as far as it is known [m]."""
+        """Known error of the motion at 95 % [m]."""
         return float(np.hypot(self.model, self.tool))
 
 
 @dataclass(frozen=True, eq=False)
 class ToolMotion:
-    """What a deformer answers for the poses of a stage's tool; without a deformer the brain stays as in the scan."""
+    """Deformation for the poses of a stage's tool; without a deformer the brain stays as in the scan."""
 
     stage: Stage
     deformer: Deformer | None = None
@@ -67,9 +67,9 @@ class ToolMotion:
         return Motion(self.stage.anatomy.mesh.nodes)
 
     def under(self, T_scan_tool: np.ndarray, tip_covariance: np.ndarray, before: Motion | None = None) -> Motion:
-        """The brain under a tool at a pose (4, 4) [m], whose tip is off with a covariance (3, 3) [m^2].
+        """Compute the brain under a tool at a pose (4, 4) [m], whose tip has an error covariance (3, 3) [m^2].
 
-        How far that moves the tumour is found by a second answer, for a tool that is 1.96 standard deviations deeper.
+        Its influence on the tumour is found by a second solution, for a tool that is 1.96 standard deviations deeper.
         """
         if self.deformer is None:
             return self.rest
@@ -102,7 +102,7 @@ class ToolMotion:
     def _answers(
         self, pose: np.ndarray, deeper: np.ndarray, start: Deformation | None
     ) -> tuple[Deformation, Deformation]:
-        """Of both poses; finite elements start from the last one."""
+        """Compute the solutions of both poses; FEM starts from the last one."""
         assert self.deformer is not None
         if isinstance(self.deformer, Learned):
             both = self.deformer.deform(Loads((Touching(np.stack([pose, deeper])[:, None]),)), at=self.stage.nodes)

@@ -1,4 +1,4 @@
-"""What acts on the brain under a tracked tool, and who says how it lies then."""
+"""Scene of the brain under a tracked tool, and its deformer."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ REST = "rest"
 
 
 def tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
-    """What acts on the brain: the tool, moved by pose, and the skull."""
+    """Build the scene of the brain: the tool, moved by pose, and the skull."""
     from sim.effects import SKULLS, Elasticity, Held, ToolContact
 
     from ..script.scene import Scene
@@ -31,16 +31,16 @@ def tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
 
 
 def mover(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool) -> tuple[Deformer | None, str]:
-    """Who says how the brain lies under a tracked tool, if there is one, and that in words.
+    """Select the deformer of the brain under a tracked tool, if there is one, with its description.
 
     Raises
     ------
     InputError
-        A deformer that is not there, or does not know the scene.
+        A deformer that does not exist, or does not support the scene.
     """
     from ..play.deformers import GUARDED
 
-    still = "nobody: the brain stays as in the scan"
+    still = "none: the brain stays as in the scan"
     if not tooled:
         return None, still
     name = args.deformer

@@ -22,7 +22,7 @@ FORMAT = "sulcus tool 1"
 WANTED = "Give a tool of `sulcus film`, or one with format, shape, T_cube_tool and tip_covariance_mm2."
 # A file of a tool has no more bytes.
 LONGEST = 100_000
-# How far rows of a rotation may be from square [1], and a tool's tip from its cube [m].
+# # Tolerance of a rotation's rows from orthonormality [1], and maximum distance of a tool's tip from its cube [m].
 SQUARE, FARTHEST = 1e-3, 1.0
 
 
@@ -53,14 +53,14 @@ class TrackedTool:
 
     @cached_property
     def bare(self) -> tuple[np.ndarray, np.ndarray]:
-        """How it looks without its cube, which hides what lies behind: vertices (n, 3) [m], triangles (m, 3)."""
+        """Surface without the cube, which would occlude: vertices (n, 3) [m], triangles (m, 3)."""
         return shafted(self.shape, np.linalg.inv(self.T_cube_tool)[:3, 3])
 
     @cached_property
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """How it looks, as far as that is known, with its cube: vertices (n, 3) [m] in its own frame, triangles (m, 3).
+        """Surface, as far as known, with its cube: vertices (n, 3) [m] in its own frame, triangles (m, 3).
 
-        The faces with print alone are there, with their borders.
+        Only the printed faces are included, with their borders.
         """
         T_tool_cube, (vertices, triangles) = np.linalg.inv(self.T_cube_tool), self.bare
         box, sides = _cube()
@@ -68,7 +68,7 @@ class TrackedTool:
         return np.concatenate([vertices, at]), np.concatenate([triangles, sides + len(vertices)])
 
     def at(self, T_scan_tool: np.ndarray, cubed: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """How it looks at a pose (4, 4) [m], with its cube or without: vertices (n, 3) [m], triangles (m, 3)."""
+        """Return the surface at a pose (4, 4) [m], with or without its cube: vertices (n, 3) [m], triangles (m, 3)."""
         vertices, triangles = self.mesh if cubed else self.bare
         return vertices @ T_scan_tool[:3, :3].T + T_scan_tool[:3, 3], triangles
 

@@ -1,4 +1,4 @@
-"""Whether an overlay can be trusted when its markers are lost and found, and its pictures are old: by its pixels."""
+"""Verification of an overlay by its pixels, when markers are lost and found again, and images are late."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ from .picture import Painter
 from .run import OLD, Timed, overlaid_one
 from .tool_motion import ToolMotion
 
-# What is lost is looked for in every third picture, and then is found. A drawn outline may be so far off [pixel].
+# # Lost targets are searched in every third image, and then found. Maximum error of a drawn outline [pixel].
 BACK, OFF = 3, 2.0
-# So many pixels of an ink are no line.
+# # Number of pixels of an ink below which they are no line.
 NO_LINE = 5
-# What a picture must say, by what is covered.
+# # Text required in an image, by covered target.
 WORDS = {"reference": "reference lost", "tool": "tool lost"}
 STALE = "stale"
-# The picture that is repeated, and the one that is shown too late [s]; how late.
+# # Times of the repeated image and of the delayed one [s]; its delay.
 REPEATED, DELAYED, LATE = 0.1, 0.2, 2.5 * OLD
 
 
 @dataclass(frozen=True)
 class TrackingFigures:
-    """The worst of a film.
+    """Worst metrics of a video.
 
     Parameters
     ----------
     pictures
-        How many there are.
+        Number of images.
     confident
-        Pictures in which a place that is lost or old is drawn in the ink of a known one.
+        Number of images in which a lost or old position is drawn in the ink of a known one.
     unsaid
-        Such pictures that do not say in their own pixels why.
+        Number of images with a lost or old position that do not show the reason in their pixels.
     back
-        Pictures until the tumour is drawn as known again, at the film's begin and after what went wrong; infinite:
-        never.
+        Number of images until the tumour is drawn as known again, at the video's start and after disturbances;
+        infinite: never.
     off
-        How far the outline of a known place is from the true one [pixel].
+        Distance of the outline of a known position from the true one [pixel].
     """
 
     pictures: int
@@ -61,9 +61,9 @@ class TrackingFigures:
     def broken(self) -> list[str]:
         """A sentence for each bound that is not kept."""
         rules = {
-            f"{self.confident} pictures draw a lost or old place as if it were known": self.confident == 0,
-            f"{self.unsaid} pictures do not say that something is lost or old": self.unsaid == 0,
-            f"the tumour is back after {self.back:g} pictures, more than {BACK}": self.back <= BACK,
+            f"{self.confident} images draw a lost or old position as if it were known": self.confident == 0,
+            f"{self.unsaid} images do not say that something is lost or old": self.unsaid == 0,
+            f"the tumour is back after {self.back:g} images, more than {BACK}": self.back <= BACK,
             f"a place drawn as known is {self.off:.1f} pixels off, more than {OFF:g}": self.off <= OFF,
         }
         return [sentence for sentence, kept in rules.items() if not kept]
@@ -75,7 +75,7 @@ class TrackingFigures:
 
 @dataclass(frozen=True, eq=False)
 class Event:
-    """A picture as it comes: how old it is then [s], and what it must say; empty where all is well."""
+    """Image at its arrival: its age [s], and the required text; empty without a disturbance."""
 
     shot: Shot
     late: float = 0.0
@@ -83,7 +83,7 @@ class Event:
 
 
 def events_of(film: DrawnFilm) -> Iterator[Event]:
-    """The pictures of a film in order, of which one is repeated, one is old, and one comes after a gap."""
+    """Yield the images of a video in order: one is repeated, one is delayed, and one comes after a gap."""
     before = 0.0
     for shot in film.shots:
         covered = film.taking.happening(shot.time)
@@ -98,7 +98,7 @@ def events_of(film: DrawnFilm) -> Iterator[Event]:
 
 
 def usual(film: DrawnFilm, style: Style = "window") -> tuple[Follower, Painter]:
-    """Who follows a film with all that is known of it and an exact registration, and who draws that."""
+    """Build the default follower and painter for a video, with exact registration."""
     mounts, stage = film.mounts, film.stage
     exact = registered(stage.site, mounts, 0.0, 0.0, 0)
     follower = Follower(film.calibration, exact, mounts.tool, ToolMotion(stage, film.deformer))
@@ -106,7 +106,7 @@ def usual(film: DrawnFilm, style: Style = "window") -> tuple[Follower, Painter]:
 
 
 def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> TrackingFigures:
-    """Follow a film, draw what is known, and find in the pictures themselves what they show."""
+    """Track a video, draw the results, and detect in the images what they show."""
     known: Known | None = None
     confident, unsaid, waits, worst, waiting, count = 0, 0, [0], 0.0, True, 0
     for event in events_of(film):
@@ -130,13 +130,13 @@ def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> T
 
 
 def _says(colour: np.ndarray, words: str, wanted: str) -> bool:
-    """Whether words that begin as wanted stand in a picture."""
+    """Return True if text that begins as wanted is found in an image."""
     lines = doubt_lines(words, colour.shape[1])
     return words.startswith(wanted) and all(stands(colour, line, FINE, ink_of(WARNING)) for line in lines)
 
 
 def _off(film: DrawnFilm, shot: Shot, colour: np.ndarray) -> float:
-    """How far the outline in a picture is from the true one [pixel]."""
+    """Compute the distance between the outline in an image and the true one [pixel]."""
     camera, rest = film.calibration.camera(shot.T_camera_scan), film.stage.tumour_at_rest
     mask = silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
     tool = silhouette(camera, *film.mounts.tool.at(shot.T_scan_tool))

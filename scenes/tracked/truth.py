@@ -1,4 +1,4 @@
-"""Overlays held against what is true of a film: how far off outline and tumour are, and whether the band holds them."""
+"""Overlays compared with the ground truth of a video: errors of outline and tumour, and coverage of the band."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ WRONG = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """F pictures of a film.
+    """Ground truth of the F images of a video.
 
     Parameters
     ----------
     anatomy
-        The digest of the body that is filmed.
+        Digest of the anatomy in the video.
     times
         (F,) [s].
     T_camera_scan, T_scan_tool
@@ -53,7 +53,7 @@ class Truth:
     displacement: np.ndarray
 
     def at(self, time: float) -> int | None:
-        """The number of the picture that was taken at a time [s], to a millisecond; None: none was."""
+        """Return the number of the image taken at a time [s], to a millisecond; None: none was."""
         near = int(np.abs(self.times - time).argmin())
         return near if abs(self.times[near] - time) < 1e-3 else None
 
@@ -82,13 +82,13 @@ def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LAR
         A file that is missing or no such truth, or of another body.
     """
     path = path_of(path)
-    with read_as(path, "what is true of a film", WANTED), path.open("rb") as raw:
+    with read_as(path, "the ground truth of a video", WANTED), path.open("rb") as raw:
         archive = Archive(raw, WANTED, largest)
         header = json.loads(archive.text("header"))
         if header["format"] != FORMAT:
             raise InputError(f"its format is not {FORMAT!r}. {WANTED}")
         if header["anatomy"] != anatomy:
-            raise InputError("is of another anatomy: give the one that was filmed, by --anatomy.")
+            raise InputError("is of another anatomy: give the one in the video, by --anatomy.")
         arrays = archive.arrays(("times", "displacement", *COLUMNS))
         times, moved, cameras, tools = (arrays[name].astype(float) for name in ("times", "displacement", *COLUMNS))
     count = len(times)
@@ -101,7 +101,7 @@ def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LAR
 
 
 def write_table(path: Path, truth: Truth, rest: np.ndarray) -> None:
-    """Write a truth as a table for people, a row for each picture; rest (n, 3) [m]: the tumour's surface in the scan.
+    """Write a truth as a readable table, a row for each image; rest (n, 3) [m]: the tumour's surface in the scan.
 
     Poses are rows of 12 numbers, of the matrix from the scan to the camera, and from the tool to the scan [mm].
     """
@@ -119,16 +119,16 @@ def write_table(path: Path, truth: Truth, rest: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Off:
-    """How far off one overlay is.
+    """Error of one overlay.
 
     Parameters
     ----------
     outline, overlap
         Mean distance of the drawn outline from the true one [pixel]; intersection over union of the silhouettes.
     middle, worst
-        Of the tumour's middle, and of its worst surface point, across the true line of sight [m].
+        Error of the tumour's centroid, and maximum over its surface, across the true line of sight [m].
     held
-        Whether the worst is within the band.
+        True if the maximum is within the band.
     """
 
     outline: float
@@ -139,7 +139,7 @@ class Off:
 
 
 def off(known: Known, truth: Truth, calibration: Calibration, stage: Stage) -> Off | None:
-    """How far off what is known of a picture is; None where no place is drawn, or nothing is true of its time."""
+    """Compute the error of a tracking result; None if no position is drawn, or without ground truth at its time."""
     row = truth.at(known.time)
     if row is None or known.camera is None:
         return None
@@ -175,7 +175,7 @@ def _between(true: np.ndarray, drawn: np.ndarray) -> float:
 
 
 def summary(known: Sequence[Known], errors: Sequence[Off | None]) -> dict[str, object]:
-    """Medians and 95th percentiles over the pictures whose tumour is drawn as known; how many of these are wrong."""
+    """Compute medians and 95th percentiles over images whose tumour is drawn as known; number of wrong ones."""
     relied = [(each, error) for each, error in zip(known, errors, strict=True) if each.relied and error is not None]
     if not relied:
         return {"pictures": 0}

@@ -21,19 +21,19 @@ DRAWN = {
 
 
 def about(name: str, who: str, tooled: bool) -> str:
-    """What stands under the picture: what it is, what the lines mean, and who says how the brain lies."""
+    """Describe the image: its source, the meaning of the lines, and the deformation model."""
     now, doubt = stroked(TUMOUR_COLOUR), stroked(DOUBTFUL)
     keys = [
         (f'{now} stroke-width="3"', "tumour now"),
         (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone"),
-        (f'{now} stroke-width="1.5" stroke-dasharray="4 3"', "where it is, 95 of 100 times"),
+        (f'{now} stroke-width="1.5" stroke-dasharray="4 3"', "95 % error band"),
         ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan; lost or stale: where it was"),
         (f'{doubt} stroke-width="3" stroke-dasharray="5 3"', "not to be relied on"),
         *([('stroke="#fff" stroke-width="1.5"', "tip to tumour, in mm")] if tooled else []),
     ]
     seen = (
         f"What you see: {escape(name)}, with the tumour drawn into it that is hidden under the cortex. Reference and "
-        "tool are tracked in each picture."
+        "tool are tracked in each image."
     )
     return (
         f"<p>{seen} <b>{RESEARCH}</b></p>{keyed(keys)}<p>Motion of the brain by {escape(who)}.</p>"
@@ -42,9 +42,9 @@ def about(name: str, who: str, tooled: bool) -> str:
 
 
 def report(shown: Shown, gauge: Gauge | None, tooled: bool, place: str) -> str:
-    """What is said beside a picture: the distance first, then the state, both errors, and what it took.
+    """Build the report of an image: distance first, then state, both errors, and processing time.
 
-    `place` says which picture it is.
+    `place` names the image.
     """
     known = shown.known
     parts = [distance_words(gauge, known.relied)] if tooled else []
@@ -70,15 +70,15 @@ def distance_words(gauge: Gauge | None, relied: bool) -> str:
 
 
 def overlay_error(known: Known) -> str:
-    """How far off the outline may be across the view, and by what."""
+    """Describe the error of the outline across the view, by source."""
     if not known.relied or known.band is None:
         return "<p>Error of the overlay: not known.</p>"
     stated = [f"{name} {bound_words(length, 2)}" for name, length in known.parts.items() if length > 0.0]
     none = ", ".join(name for name, length in known.parts.items() if not length > 0.0 and name != "camera")
     off = known.parts.get("camera")
     camera = " What the camera's calibration adds is not known." if off is None else ""
-    camera = " The camera is stated to be exactly known." if off == 0.0 else camera
-    parts = ", ".join([*stated, *([f"none stated of {none}"] if none else [])])
+    camera = " The camera is reported to be exactly known." if off == 0.0 else camera
+    parts = ", ".join([*stated, *([f"not given: {none}"] if none else [])])
     return (
         f"<p>Error of the overlay: 95 of 100 times the tumour is within {bound_words(known.band, 1)} of where it is "
         f"drawn, across the view ({parts}).{camera}</p>"

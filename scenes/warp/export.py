@@ -32,17 +32,17 @@ LOOKS = {
 """Surfaces, and their colours."""
 # A vertex that goes farther moves [m].
 MOVED = 1e-4
-# What the grid costs the tumour is worth a warning above this share of the largest motion.
+# Grid error at the tumour, relative to the largest motion, above which a warning is given.
 COARSE = 0.1
-# A sequence has nodes so far apart [m], and no more numbers than so many.
+# Grid spacing of a sequence [m], and largest total number of values.
 SEQUENCE_SPACING, MOST_NUMBERS = 3e-3, 400_000_000
 
 
 @dataclass(frozen=True)
 class Asked:
-    """How fields and images are made: spacing of the fields [m] (None: as `fields_of`), and interpolation of images.
+    """Settings of fields and images: spacing of the fields [m] (None: as `fields_of`), and interpolation of images.
 
-    `source` is the name of the anatomy's file; `step` hears of how many more parts are done, whenever some are.
+    `source` is the name of the anatomy's file; `step` receives the number of newly finished parts.
     """
 
     spacing: float | None
@@ -156,7 +156,7 @@ def spaces(files: Sequence[str]) -> dict[str, str]:
 def figures(
     moment: Moment, fields: WarpFields, places: Places, warped: Sequence[Warped], frames: int
 ) -> dict[str, Any]:
-    """What a warp says of itself: millimetres, shares, counts of voxels, and warnings."""
+    """Collect the report of a warp: millimetres, shares, counts of voxels, and warnings."""
     error = 1e3 * places.errors(fields)
     moving = np.linalg.norm(places.moved, axis=1) > MOVED
     gap, largest = moment.gap(), 1e3 * float(np.linalg.norm(moment.displacement, axis=1).max())

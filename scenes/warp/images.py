@@ -23,17 +23,17 @@ from .nrrd_files import DIGITS
 
 # Less of the brain inside an image, or on voxels that are not empty, is worth a warning.
 ENOUGH = 0.98, 0.5
-# A voxel is dark below so much of the brightest but a few of 100: air, with the noise of a scanner.
+# Threshold of dark voxels (air with noise), relative to the brightest few per cent.
 BRIGHTEST, DARK = 99.0, 0.1
-# So much more of the brain on bright voxels, and so much of it at least, once x and y are negated.
+# Least gain of brain on bright voxels, and least share of it, when x and y are negated.
 BETTER, WELL = 0.05, 0.7
-# No more distinct whole values than so many are labels; one voxel in so many along an axis is looked at.
+# Largest number of distinct integers of a label map; sampling stride along each axis.
 FEW, SAMPLED = 120, 3
 # Labels fill areas: fewer neighbours of one value than this share are intensities.
 ALIKE = 0.5
 SUFFIXES = (".seg.nrrd", *READERS)
 ORDERS = {"nearest": 0, "linear": 1, "cubic": 3}
-"""How values between voxels are had, and the degree of the spline."""
+"""Interpolation between voxels, and the degree of its spline."""
 WHOLE = np.uint8, np.int16, np.uint16, np.int32
 """Types of whole numbers that every reader of NIfTI knows."""
 DISPLACEMENT = 1006
@@ -51,7 +51,7 @@ def shown(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float
 
 
 def doubts(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy: Anatomy) -> list[str]:
-    """Sentences without their subject about a picture (I, J, K) that shows some of a brain."""
+    """List warnings, as predicates, about an image (I, J, K) that shows a part of a brain."""
     found, middles, volumes = [], _middles(anatomy), anatomy.mesh.volumes
     index, inside = _voxels(affine, values.shape, middles)
     share = float(np.average(inside, weights=volumes))
@@ -109,7 +109,7 @@ def _alike(values: np.ndarray) -> float:
 
 
 def _middles(anatomy: Anatomy) -> np.ndarray:
-    """Of the tetrahedra (T, 3) [m]."""
+    """Return the centroids of the tetrahedra (T, 3) [m]."""
     return anatomy.mesh.nodes[anatomy.mesh.tets].mean(axis=1)
 
 
@@ -138,7 +138,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Warped:
-    """Of a warped image: its name, and voxels that moved, whose source lies outside of it, and that were cut away."""
+    """Name of a warped image, and its numbers of voxels that moved, came from outside, and were cut away."""
 
     name: str
     moved: int
@@ -213,7 +213,7 @@ def write_warped(folder: Path, picture: Picture, fields: WarpFields, order: str)
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """How many voxels moved, came from outside the image, or from what was cut away; those that are blank (I, J, K)."""
+    """Count the voxels that moved, came from outside the image, or from removed tissue; also return the blank ones (I, J, K)."""
 
     moved: int
     outside: int

@@ -22,8 +22,8 @@ SAID = {
     CORTEX: "tissue on the surface, nearest to the middle of the open cortex in the scan.",
     CENTROID: "of the displaced tumour's volume. The tissue there may be another than in the scan.",
 }
-"""What each of them is."""
-# A place that a tetrahedron leads back to within so much [m] lies in it.
+"""Description of each landmark."""
+# Tolerance [m] within which a point belongs to a tetrahedron.
 ROUNDING = 1e-9
 
 

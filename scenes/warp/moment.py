@@ -28,20 +28,20 @@ from ..play.stage import Stage
 from ..script.scene import Scene
 
 ENSEMBLE = "registration, segmentation, tissue and skull, as `sulcus uncertainty` has it"
-"""What the bound of a scene is of."""
+"""Description of the bound of a scene."""
 # Two meshes of one body have nodes so near [m].
 SAME = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """What moved a brain: words, and a record of its `kind` and of what is known of it."""
+    """Cause of a displacement: a description, and a record of its `kind` and properties."""
 
     words: str
     record: Mapping[str, Any]
 
     def by(self, solver: str) -> Cause:
-        """The same, as a solver answered it."""
+        """Return the same cause, solved by a solver."""
         return replace(self, words=f"{self.words}, by {solver}")
 
 
@@ -82,20 +82,20 @@ def _rounded(values: np.ndarray) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A body that has been displaced.
+    """Displaced anatomy.
 
     Parameters
     ----------
     cause
-        What moved it.
+        Cause of the displacement.
     anatomy, left
         The body, and what is left of it where some was cut.
     displacement
         (V, 3) [m].
     converged
-        Whether the answer may be relied on.
+        Whether the solution is reliable.
     bound, bound_words
-        With a probability of 95 % no point of the tumour's surface is farther off [m]; None: not known. What it is of.
+        95 % bound of the tumour's surface error [m], None if not known; and its description.
     tip
         Of the tool (3,) [m]; None without one.
     """
@@ -111,7 +111,7 @@ class Moment:
 
     @property
     def now(self) -> np.ndarray:
-        """Where the vertices are (V, 3) [m]."""
+        """Displaced vertices (V, 3) [m]."""
         return self.anatomy.mesh.nodes + self.displacement
 
     def gap(self) -> tuple[np.ndarray, float] | None:
@@ -126,7 +126,7 @@ class Moment:
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """A scene on a theatre, or a `load` that is one, and the finite elements that answer it."""
+    """Scene on a body, or a `load` as a scene, with the FEM that solves it."""
 
     theatre: Theatre
     scene: Scene

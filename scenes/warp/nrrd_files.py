@@ -14,10 +14,10 @@ from sim.fields.grid import Grid, grid_around
 from sim.fields.in_tetrahedra import in_tetrahedra
 
 TYPES = {"f4": "float", "u1": "unsigned char"}
-# Of the least effort: floats hardly get smaller by more.
+# Lowest compression level: more hardly reduces floats.
 LEVEL = 1
 DIGITS = 4
-"""Of displacements in millimetres: what lies behind has no meaning, and takes half of a file."""
+"""Decimals of displacements in millimetres: further ones have no meaning, and take half of a file."""
 TUMOUR, SHELL = 1, 2
 """The labels."""
 COLOURS = {TUMOUR: (0.20, 0.94, 0.42), SHELL: (0.95, 0.75, 0.20)}

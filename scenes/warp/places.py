@@ -1,4 +1,4 @@
-"""Where a warp's fields are compared with the finite elements, and where the finite elements are folded."""
+"""Comparison of a warp's fields with FEM, and places where FEM folds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ENOUGH = 0.05e-3
 """The error of tumour and landmarks that a spacing is looked for to reach [m]."""
 MOST, MOST_ASKED = 32_000_000, 96_000_000
 """Nodes of a field: where it is looked for, and where it is asked for. A million take 12 MB of memory."""
-# A spacing is looked for in steps of this [m]; the error falls with it, with so much to spare; so often it is tried.
+# Search for a spacing: step [m], safety factor, maximum number of trials.
 STEP, SPARE, TIMES = 0.05e-3, 0.95, 3
 
 
@@ -51,7 +51,7 @@ class Places:
     marks: tuple[Landmark, ...]
 
     def errors(self, fields: WarpFields) -> np.ndarray:
-        """How far [m] fields are from the finite elements at each (n,): the farther one of the two fields."""
+        """Return the distance [m] between fields and FEM at each place (n,): the larger one of the two fields."""
         grid, now = fields.grid, self.rest + self.moved
         forward = grid.read(fields.forward, self.rest) - self.moved
         backward = grid.read(fields.backward, now) + self.moved
@@ -91,7 +91,7 @@ class Folded:
 
 
 def folds_of(moment: Moment, fields: WarpFields) -> tuple[Folded, ...]:
-    """Where the finite elements are folded, the largest first."""
+    """Find places where FEM folds, largest first."""
     mesh = moment.left.mesh
     bad = mesh.tets[signed_volumes(mesh.nodes + moment.displacement, mesh.tets) <= 0.0]
     if not len(bad):
@@ -114,14 +114,14 @@ def folds_of(moment: Moment, fields: WarpFields) -> tuple[Folded, ...]:
 
 
 def steps_of(spacing: float | None) -> int:
-    """How many steps `fields_of` takes: two fields, as often as a spacing is tried."""
+    """Return the number of steps of `fields_of`: two fields for each tried spacing."""
     return 2 * (1 + (TIMES if spacing is None else 0))
 
 
 def fields_of(moment: Moment, spacing: float | None, step: Callable[[int], object]) -> WarpFields:
-    """The fields of a moment at a spacing [m]; None: at 1 mm, or finer where tumour or landmarks are off by more.
+    """Compute the fields of a moment at a spacing [m]; None: 1 mm, or finer until tumour and landmarks are accurate.
 
-    `step` hears of how many more of `steps_of` are done.
+    `step` receives the number of newly finished steps of `steps_of`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The page that lies beside a warp's files: what each is, how it is opened, and what it does not know."""
+"""README of a warp's files: content, how to open them, and limits."""
 
 from __future__ import annotations
 

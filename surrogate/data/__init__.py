@@ -1,1 +1,1 @@
-"""Loads that are drawn, the answers to them, and the files that keep both."""
+"""Sampled loads, their FEM results, and the files that store both."""

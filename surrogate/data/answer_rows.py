@@ -1,4 +1,4 @@
-"""Rows of a data set: one answer each, with a checksum that damage does not survive."""
+"""Rows of a data set: one result each, with a checksum that detects damage."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from sim.effects import Elasticity
 from sim.material import tissue_from_json, tissue_to_json
 
 BRAIN = "tissue"
-"""The key of the brain's tissue. A region that is made of what the brain is has none of its own."""
+"""Provenance key of the brain's tissue. A region of the same tissue as the brain has no entry."""
 TUMOUR, REGION = "tumour's tissue", "tissue of region "
-"""The key of the tumour's tissue, and how that of another region's begins, before its label."""
+"""Provenance key of the tumour's tissue; prefix of another region's key, before its label."""
 NAME_TYPE = f"S{max(len(outcome.name) for outcome in Outcome)}"
 
 CHECKSUM = np.dtype("<u4")
 
 
 def stating(tissue: Elasticity) -> dict[str, str]:
-    """What the provenance of data of this tissue states of it; nothing of a brain without law."""
+    """Return the provenance entries of this tissue; none for a brain without law."""
     stated = {} if tissue.default is None else {BRAIN: tissue_to_json(tissue.default)}
     return stated | {_key(label): tissue_to_json(tissue.regions[label]) for label in sorted(tissue.regions)}
 
 
 def stated_tissue(stated: Mapping[str, str]) -> Elasticity:
-    """What a provenance states, which must state the brain's.
+    """Read the tissue from a provenance, which must contain the brain's.
 
     Raises
     ------
     InputError
-        A text that is no tissue.
+        A text that is not a tissue.
     """
     numbers = (key.removeprefix(REGION) for key in stated if key.startswith(REGION))
     labels = {TUMOUR_LABEL, *(int(number) for number in numbers if number.lstrip("-").isdecimal())}
@@ -42,7 +42,7 @@ def stated_tissue(stated: Mapping[str, str]) -> Elasticity:
 
 
 def first_stated(statements: Iterable[Mapping[str, str]]) -> Elasticity | None:
-    """`stated_tissue` of the first statement that states the brain's; None where none does."""
+    """Return `stated_tissue` of the first provenance that contains the brain's; None without one."""
     stated = next((one for one in statements if BRAIN in one), None)
     return None if stated is None else stated_tissue(stated)
 
@@ -52,9 +52,10 @@ def _key(label: int) -> str:
 
 
 def row_type(vertices: int, tools: int = 0) -> np.dtype:
-    """One row: displacement (vertices, 3), how it came about, and the reaction (tools, 6) of tools moved by pose."""
-    # In the width of the file, 64 kB a load on a brain of 5,300 nodes: HDF5 converts at a third of the speed. It is not
-    # packed: deflate, with its bytes in the best order, saves a sixth and takes longer than a card takes to solve.
+    """Return the type of one row: displacement (vertices, 3), outcome, and reaction (tools, 6) of posed tools."""
+    # In the file's own number widths, 64 kB a load on a brain of 5,300 nodes: conversion by HDF5 takes three times as
+    # long. It is not compressed: deflate, with its bytes in the best order, saves a sixth and takes longer than the
+    # solve on a GPU.
     return np.dtype(
         [
             ("displacement", "<f4", (vertices, 3)),
@@ -67,9 +68,9 @@ def row_type(vertices: int, tools: int = 0) -> np.dtype:
 
 
 def rows_of(answer: Deformation, unit: float, tools: int = 0) -> np.ndarray:
-    """Rows (B,) of answers at every vertex, whose displacements are in units of `unit` [m].
+    """Convert results at every vertex to rows (B,), with displacements in units of `unit` [m].
 
-    The reactions of `tools` moved by pose are NaN where the answer does not know them.
+    The reactions of `tools` moved by pose are NaN if the result does not have them.
     """
     rows = np.empty(len(answer), row_type(answer.displacement.shape[1], tools))
     rows["displacement"] = answer.displacement / unit if unit != 1.0 else answer.displacement
@@ -82,11 +83,11 @@ def rows_of(answer: Deformation, unit: float, tools: int = 0) -> np.ndarray:
 
 
 def checksums(rows: np.ndarray) -> np.ndarray:
-    """CRC-32 (B,) uint32 of the bytes of each row."""
+    """Compute CRC-32 (B,) uint32 of the bytes of each row."""
     return np.array([zlib.crc32(row.data) for row in rows.view(np.uint8).reshape(len(rows), -1)], CHECKSUM)
 
 
 def numbered(rows: np.ndarray) -> str:
-    """Row numbers as a person reads them: a few, and how many there are."""
+    """Format row numbers: the first few, and their count."""
     shown = ", ".join(map(str, rows[:5]))
     return f"row {shown}" if len(rows) == 1 else f"rows {shown}{f' ... ({len(rows)} in all)' if len(rows) > 5 else ''}"

@@ -1,4 +1,4 @@
-"""What each array of a data set is: written beside it, so that the file is understood without this project."""
+"""Descriptions of the arrays of a data set, stored as attributes, so that the file is readable without this project."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import h5py
 
 TITLE = (
-    "Answers of a finite-element solver to loads of a tool on a brain. anatomy/ is the body; loads/CAUSE/ are the "
-    "loads, one row each; answers/ has the answer of each load, row by row; unit/ has responses to unit forces. SI "
+    "Results of a finite-element solver to loads of a tool on a brain. anatomy/ is the body; loads/CAUSE/ are the "
+    "loads, one row each; `answers/` has the result of each load, row by row; unit/ has responses to unit forces. SI "
     "units; coordinates are the anatomy's own, in RAS (x to the right, y to the front, z up)."
 )
 GROUPS = {
     "anatomy": "The body in its rest configuration, and how it is held. `digest` is a hash of all arrays here.",
     "loads": "What the tool does, one row a load case. `digest` is a hash of all arrays here.",
-    "answers": "The static answer to each row of loads/.",
+    "answers": "The static result for each row of loads/.",
     "unit": "Small-strain responses to a unit force of 1 N at one node of the open cortex: of each node in unit/node "
     "along x, then y, then z. They are scaled from 1e-6 N, and superpose. Empty where the loads are poses.",
 }
@@ -34,14 +34,14 @@ class Meaning:
     text: str
 
     def beside(self, array: h5py.Dataset) -> None:
-        """Write it."""
+        """Write the description to an array's attributes."""
         array.attrs.update(unit=self.unit, axes=self.axes, meaning=self.text)
         if "RAS" in self.axes:
             array.attrs["frame"] = "RAS"
 
 
 _ROWS = {
-    "outcome": Meaning("1", CASE, "how the answer came about; names that begin with CONVERGED may be relied on"),
+    "outcome": Meaning("1", CASE, "outcome of the solver; rows with names that begin with CONVERGED are reliable"),
     "iterations": Meaning("1", CASE, "steps that the solver took"),
     "residual": Meaning(
         "1", CASE, "norm of the forces left over, over that of the largest of elasticity, load and hold"
@@ -63,7 +63,7 @@ MEANINGS = {
     "loads/time": Meaning(
         "s",
         CASE,
-        "when the answer is wanted, in tissue that relaxes since the tool began to come; 0 where no time matters",
+        "time of the result; in relaxing tissue, since the tool began to arrive; 0 without time dependence",
     ),
     "loads/Pushed/point": Meaning("m", f"{CASE}; {RAS}", "centre of the tool's round footprint, on the body at rest"),
     "loads/Pushed/force": Meaning("N", f"{CASE}; {RAS}", "total force on the body, of fixed direction"),
@@ -94,7 +94,7 @@ MEANINGS = {
 
 
 def explain(file: h5py.File) -> None:
-    """Write beside every array and group what it is."""
+    """Write the description of every array and group to its attributes."""
     for name, text in GROUPS.items():
         file.require_group(name).attrs["meaning"] = text
 

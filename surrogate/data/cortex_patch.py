@@ -1,4 +1,4 @@
-"""The open cortex as a surface to draw from: areas, inward normals, and the rim that a footprint must not cross."""
+"""Open cortex as a surface for sampling: areas, inward normals, and the edge that a footprint must not cross."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def barycentric_lattice(rows: int) -> np.ndarray:
-    """Corner coordinates (rows^2, 3) of the centres of a triangle's equal pieces, `rows` along each edge."""
+    """Compute corner coordinates (rows^2, 3) of the centres of a triangle's equal pieces, `rows` along each edge."""
     upright = [(i + 1.0 / 3.0, j + 1.0 / 3.0) for i in range(rows) for j in range(rows - i)]
     turned = [(i + 2.0 / 3.0, j + 2.0 / 3.0) for i in range(rows - 1) for j in range(rows - 1 - i)]
     share = np.array(upright + turned) / rows
@@ -29,7 +29,7 @@ def barycentric_lattice(rows: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """The triangles of `Anatomy.open_surface`.
+    """Triangles of `Anatomy.open_surface`.
 
     Parameters
     ----------
@@ -57,8 +57,8 @@ class Patch:
 
     @cached_property
     def skin(self) -> Skin:
-        """The patch as tools press it."""
-        # Warp is loaded where a tool is pressed, not where a model is read.
+        """Contact surface of the patch."""
+        # Warp is imported only for pressing tools, not for reading a model.
         from sim.discretisation.footprint import Skin
         from sim.runtime.device import find_device
 
@@ -70,11 +70,11 @@ class Patch:
         return rim_of(self.points, self.triangles)
 
     def rim_distance(self, points: np.ndarray) -> np.ndarray:
-        """Distances (B,) [m] from `points` (B, 3) to the rim."""
+        """Compute distances (B,) [m] from `points` (B, 3) to the edge."""
         return distances_to(self.rim, points)
 
     def place(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (n, 3) [m] and their unit inward normals (n, 3) from uniform numbers (n, 3); uniform by area."""
+        """Map uniform numbers (n, 3) to points (n, 3) [m], uniform by area, and their unit inward normals (n, 3)."""
         total = np.cumsum(self.areas)
         triangle = self.triangles[np.searchsorted(total, uniform[:, 0] * total[-1], side="right")]
         root = np.sqrt(uniform[:, 1])
@@ -83,11 +83,11 @@ class Patch:
         return point, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def normal_near(self, points: np.ndarray) -> np.ndarray:
-        """Unit inward normals (B, 3) of the patch nodes nearest to `points` (B, 3) [m]."""
+        """Return unit inward normals (B, 3) of the patch nodes nearest to `points` (B, 3) [m]."""
         return taken(squared_distances(points, self.points).argmin(axis=1), self.inward)
 
     def covered(self, centres: np.ndarray, radius: float) -> float:
-        """Share of the area within `radius` [m] of one of the `centres` (k, 3) [m], by 16 points a triangle."""
+        """Compute the area share within `radius` [m] of one of the `centres` (k, 3) [m], by 16 points a triangle."""
         share = barycentric_lattice(4)
         samples = np.einsum("qc,scx->sqx", share, self.points[self.triangles])
         inside = nearest(samples.reshape(-1, 3), centres)[1].reshape(len(samples), -1) <= radius
@@ -95,12 +95,12 @@ class Patch:
 
 
 def open_patch(anatomy: Anatomy) -> Patch:
-    """The open cortex of an anatomy.
+    """Build the open cortex of an anatomy.
 
     Raises
     ------
     InputError
-        A craniotomy that holds no whole triangle.
+        A craniotomy without a whole triangle.
     """
     if not len(anatomy.open_surface):
         raise InputError("the anatomy has no open cortex for a tool to touch: make one with a wider --craniotomy.")
@@ -109,6 +109,6 @@ def open_patch(anatomy: Anatomy) -> Patch:
 
 
 def nearest(points: np.ndarray, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which of the `sites` (n, 3) is nearest to each of the `points` (B, 3), and how far it is: (B,), (B,)."""
+    """Find the nearest of the `sites` (n, 3) to each of the `points` (B, 3): its number (B,), and its distance (B,)."""
     squared = squared_distances(points, sites)
     return squared.argmin(axis=1), np.sqrt(squared.min(axis=1))

@@ -1,4 +1,4 @@
-"""Who solves the loads of a data set: finite elements here, or a process with its own on each of several devices."""
+"""Solvers of a data set's loads: FEM in this process, or a process with its own FEM on each of several devices."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from .tasks import Crew
 
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """Finite elements that are asked for, and made where they are first used: a `Deformer`.
+    """FEM that is built on first use: a `Deformer`.
 
     Parameters
     ----------
     anatomy, effects, accuracy, element, batch, device
-        As `Fem` has them.
+        As in `Fem`.
     loads
-        That will be solved.
+        Number of loads that will be solved.
     share
-        Processes that share the device.
+        Number of processes that share the device.
     """
 
     anatomy: Anatomy
@@ -48,16 +48,16 @@ class Asked:
 
     @cached_property
     def fem(self) -> Fem:
-        """They themselves."""
+        """FEM, built on first use."""
         return Fem(self.anatomy, self.effects, self.accuracy, self.device, self.batch, self.element)
 
     @property
     def needed(self) -> Needed | None:
-        """What they will take of a card; None on the CPU."""
+        """Required GPU memory; None on the CPU."""
         return foreseen(self.anatomy, self.element, self.accuracy, self.device, self.batch, self.loads, self.share)
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """As `Fem.deform`; poses in tissue that relaxes are histories, as `held` has them."""
+        """Solve as `Fem.deform`; poses in relaxing tissue are histories, as in `held`."""
         if start is None and series_of(self.effects) and loads.of(Touching) is not None:
             answer = held(self.fem, loads)
             return answer if at is None else answer.at(at)
@@ -66,7 +66,7 @@ class Asked:
 
 @dataclass(frozen=True, eq=False)
 class Solver:
-    """Who answers; its element, and all of it in words; the loads that are solved together."""
+    """Deformer of the loads, its element, its description, and the number of loads that are solved together."""
 
     deformer: Deformer | Crew
     element: str
@@ -76,17 +76,17 @@ class Solver:
 
 @contextmanager
 def solving(asked: Asked, devices: Sequence[str], said: Callable[[str], object]) -> Iterator[Solver]:
-    """Finite elements on each of the devices; on one device they are in this process.
+    """Open FEM solvers on each of the devices; with one device it is in this process.
 
-    Without a `batch` it is as large as fits. Of several cards each then gets as many batches. `said` hears first what
-    they will take of each card's memory.
+    Without a `batch` it is as large as fits. With several GPUs each then gets the same number of batches. `said` first
+    receives the required memory of each GPU.
 
     Raises
     ------
     InputError
-        As `Fem`; a card on which they would not fit.
+        As `Fem`; a GPU with too little memory.
     LostError
-        A process that was ended.
+        A process that was killed.
     """
     if len(devices) == 1:
         own = replace(asked, device=devices[0])
@@ -105,25 +105,25 @@ def solving(asked: Asked, devices: Sequence[str], said: Callable[[str], object])
 
 
 def placed(device: str, asked: Asked) -> Asked:
-    """The same on a device."""
+    """Return the FEM of a device."""
     return replace(asked, device=device)
 
 
 def memory_of(asked: Asked, task: None) -> Needed | None:
-    """What they will take of a card."""
+    """Return the GPU memory that the FEM needs."""
     return asked.needed
 
 
 def described(asked: Asked, task: None) -> tuple[str, str, int]:
-    """Their element, all of them in words, and the most loads that they solve together, which must fit."""
-    if asked.needed is None:  # on the CPU: before a file is begun that keeps its batch
+    """Return the FEM's element, description and batch size, after a check that it fits in memory."""
+    if asked.needed is None:  # on the CPU: before a file is created that keeps its batch
         fem = asked.fem
         check_fits(fem.problem.rows, fem.batch, min(fem.batch, asked.loads), fem.problem.device, fem.strategy.held)
     return asked.fem.space.element, asked.fem.description, asked.fem.batch
 
 
 def even_batch(most: int, loads: int, devices: int) -> int:
-    """The widest batch of at most `most` loads of which every device has as many, but for the last."""
+    """Compute the widest batch of at most `most` loads with which every device has equally many, but for the last."""
     rounds = -(-loads // (max(most, 1) * devices))
     return max(1, -(-loads // (max(rounds, 1) * devices)))
 

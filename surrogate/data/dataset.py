@@ -1,10 +1,10 @@
-"""Data sets: loads, the displacement of every vertex, and where they come from. HDF5, SI units, RAS.
+"""Data sets: loads, the displacement of every vertex, and their provenance. HDF5, SI units, RAS.
 
 Layout: `anatomy/` the body; `loads/CAUSE/` the arrays of each cause; `answers/` and `unit/`, each with `displacement`
 (n, V, 3) float32 [m], `outcome`, `iterations`, `residual`, `checksum`. `answers/` belongs to `loads/`. `unit/` holds
-the small-strain response [m/N] to a unit force at every node `unit/node` of the open cortex, along x, y and z in turn.
-Data of poses have none, but `answers/reaction` (n, tools, 6), which older files lack. What each array is, is written
-beside it (`array_meanings`).
+the small-strain response [m/N] to a unit force at every node `unit/node` of the open cortex, along x, then y, then z.
+Data of poses have none, but `answers/reaction` (n, tools, 6), which older files lack. The attributes of each array
+describe it (`array_meanings`).
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ CAUSES: dict[str, type[Cause]] = {
     kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed, Posture, Touching)
 }
 FORMAT = "sulcus data 2"
-# Without checksums, and with flags of the rows that were done: it is read, and not gone on with.
+# Format without checksums, with flags of the finished rows: can be read, but not resumed.
 UNCHECKED = "sulcus data 1"
-# The arrays of a mesh; linear ones have no `middles`.
+# Arrays of a mesh; linear ones have no `middles`.
 MESH = ("nodes", "tets", "region", "middles")
-# The name of the hash of all other texts.
+# Attribute that holds the hash of all other texts.
 SEAL = "digest of these attributes"
 # Rows read at once.
 CHUNK = 256
-# The greatest motion that can be, in body lengths; and the unit force that cannot move so far [N].
+# Largest valid displacement [body lengths]; force [N] that cannot cause it, to check unit responses.
 FARTHEST, FAINTEST = 1.0, 1e-3
 REMEDY = "Make it with `sulcus simulate`."
 
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A finished data set; displacements stay in the file until they are asked for.
+    """Finished data set; displacements stay in the file until they are read.
 
     Parameters
     ----------
     path
-        The HDF5 file.
+        HDF5 file.
     anatomy
-        The body that was deformed.
+        Anatomy that was deformed.
     loads
         n load cases.
     outcome
@@ -71,8 +71,8 @@ class Dataset:
     Raises
     ------
     InputError
-        Columns of another length than the loads, residuals of good cases that are no positive numbers, a tool that is
-        none.
+        Columns of another length than the loads, residuals of good cases that are not positive numbers, an invalid
+        tool.
     """
 
     path: Path
@@ -89,24 +89,24 @@ class Dataset:
             if len(getattr(self, name)) != len(self.loads):
                 raise InputError(
                     f"{self.path}: has {len(self.loads)} loads, but `{name}` of {len(getattr(self, name))}: it is "
-                    "damaged. Simulate anew."
+                    "damaged. Simulate again."
                 )
         if self.residual.dtype.kind != "f" or self.iterations.dtype.kind not in "iu":
-            raise InputError(f"{self.path}: its residuals or iterations are no numbers: it is damaged. Simulate anew.")
+            raise InputError(f"{self.path}: its residuals or iterations are no numbers: it is damaged. Simulate again.")
         wrong = np.flatnonzero(self.good & ~((self.residual >= 0.0) & (self.residual < np.inf)))
         if len(wrong):
             raise InputError(
                 f"{self.path}: {numbered(wrong)} of `answers` converged, but to a residual that is no number: it is "
-                "damaged. Simulate anew."
+                "damaged. Simulate again."
             )
         try:
             _ = self.tool
         except InputError as error:
-            raise InputError(f"{self.path}: {error} It is damaged: simulate anew.") from error
+            raise InputError(f"{self.path}: {error} It is damaged: simulate again.") from error
 
     @cached_property
     def tool(self) -> BuiltIn | None:
-        """The tool whose poses the loads are; None: they are pushes."""
+        """Tool of the poses; None for pushes."""
         return stated_tool(self.provenance.get("shape"), self.provenance.get("ball"))
 
     @property
@@ -115,7 +115,7 @@ class Dataset:
         return np.array([outcome.good for outcome in self.outcome], bool)
 
     def seconds(self, each: str, count: int) -> float | None:
-        """What `count` solves took of `each` kind, "load" or "unit response" [s]; None if not stated."""
+        """Return the time of `count` solves of `each` kind, "load" or "unit response" [s]; None if not recorded."""
         try:
             found = count * float(self.provenance[f"seconds a {each}"])
         except (KeyError, ValueError):
@@ -123,24 +123,24 @@ class Dataset:
         return found if 0.0 <= found < np.inf else None
 
     def displacement(self, nodes: np.ndarray) -> np.ndarray:
-        """Displacements (n, k, 3) float32 [m] of the vertices `nodes` (k,).
+        """Read displacements (n, k, 3) float32 [m] of the vertices `nodes` (k,).
 
         Raises
         ------
         InputError
-            Rows that were damaged, or that hold motions which no body has.
+            Damaged rows, or impossible displacements.
         """
         return self._rows("answers", nodes, self.good, 1.0)
 
     def reaction(self) -> np.ndarray | None:
-        """The force [N] and moment [N m] that each tool exerts, (n, tools, 6); None where these are not known.
+        """Read the force [N] and moment [N m] that each tool exerts, (n, tools, 6); None if not available.
 
-        That is of pushes, of files of earlier versions, and of deformers that do not know them.
+        They are missing for pushes, in files of earlier versions, and from deformers that do not compute them.
 
         Raises
         ------
         InputError
-            Rows that were damaged.
+            Damaged rows.
         """
         with read_as(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
             if "answers/reaction" not in file:
@@ -156,7 +156,7 @@ class Dataset:
         return found if np.isfinite(found[self.good]).all() else None
 
     def unit_response(self, nodes: np.ndarray) -> np.ndarray:
-        """Small-strain responses (3 m, k, 3) float32 [m/N] of the vertices `nodes` (k,).
+        """Read small-strain responses (3 m, k, 3) float32 [m/N] of the vertices `nodes` (k,).
 
         Raises
         ------
@@ -166,7 +166,7 @@ class Dataset:
         return self._rows("unit", nodes, self.unit_good, FAINTEST)
 
     def _rows(self, group: str, nodes: np.ndarray, good: np.ndarray, force: float) -> np.ndarray:
-        """Some vertices' displacements, of rows in which the `good` move less than they can under a `force`."""
+        """Read some vertices' displacements, and check that `good` rows move less than possible under a `force`."""
         size = float(np.linalg.norm(np.ptp(self.anatomy.mesh.nodes, axis=0)))
         chosen, damaged, absurd = [], [], []
         with read_as(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
@@ -183,7 +183,7 @@ class Dataset:
         if len(strange):
             raise InputError(
                 f"{self.path}: {numbered(strange)} of `{group}` move by more than the body measures, {size:.3g} m"
-                f"{'' if force == 1.0 else f', under {force:g} N'}: no solver made them. Simulate anew."
+                f"{'' if force == 1.0 else f', under {force:g} N'}: no solver made them. Simulate again."
             )
         return np.concatenate(chosen)
 
@@ -191,12 +191,12 @@ class Dataset:
 def _damaged(path: Path, lost: np.ndarray, group: str) -> str:
     return (
         f"{path}: {numbered(lost)} of `{group}` are damaged. Give its `sulcus simulate` again: it solves those alone; "
-        "data of an earlier version are made anew."
+        "simulate data of an earlier version again."
     )
 
 
 def read_dataset(path: str | Path) -> Dataset:
-    """Read what `simulate` wrote.
+    """Read a data set written by `simulate`.
 
     Raises
     ------
@@ -207,7 +207,7 @@ def read_dataset(path: str | Path) -> Dataset:
     if not path.is_file():
         unfinished = unfinished_path(path)
         remedy = (
-            f"{unfinished.name} is an unfinished run: give the same `sulcus simulate` again and it goes on"
+            f"{unfinished.name} is an unfinished run: give the same `sulcus simulate` again to resume it"
             if unfinished.exists()
             else "make one with `sulcus simulate`"
         )
@@ -222,11 +222,11 @@ def read_dataset(path: str | Path) -> Dataset:
         anatomy, loads = read_embedded(file), read_loads(file)
         nodes = open_patch(anatomy).nodes if loads.of(Touching) is None else np.zeros(0, int)
         if not np.array_equal(stored(file, "unit/node", "iu", (3 * len(nodes),))[:], np.repeat(nodes, 3)):
-            raise InputError(f"{path}: `unit/node` are not the nodes of the open cortex: it is damaged. Simulate anew.")
+            raise InputError(f"{path}: `unit/node` are not the open cortex's nodes: it is damaged. Simulate again.")
         for group, rows in (("answers", len(loads)), ("unit", 3 * len(nodes))):
             stored(file, f"{group}/displacement", "f", (rows, len(anatomy.mesh.nodes), 3))
             if stated["format"] == UNCHECKED and not stored(file, f"{group}/done", "b", (rows,))[:].all():
-                raise InputError(f"{path}: rows of `{group}` are not done, so it was never finished. Simulate anew.")
+                raise InputError(f"{path}: rows of `{group}` are not done, so it was never finished. Simulate again.")
         return Dataset(
             path,
             anatomy,
@@ -240,31 +240,31 @@ def read_dataset(path: str | Path) -> Dataset:
 
 
 def provenance_of(file: h5py.File) -> dict[str, str]:
-    """What the file states of itself, as text.
+    """Read the provenance of a file, as text.
 
     Raises
     ------
     InputError
-        Texts that do not have the digest written beside them.
+        Texts that do not match the stored digest.
     """
     stated = {name: str(value) for name, value in file.attrs.items()}
     if stated.get("format") == FORMAT and stated.pop(SEAL, None) != digest_of_texts(stated):
-        raise InputError(f"{file.filename}: what it states of itself was changed after it was written: simulate anew.")
+        raise InputError(f"{file.filename}: what it states of itself was changed after it was written: simulate again.")
     return stated
 
 
 def write_provenance(file: h5py.File, stated: Mapping[str, str]) -> None:
-    """Store what the file states of itself."""
+    """Store the provenance in a file."""
     file.attrs.update({**stated, SEAL: digest_of_texts(stated)})
 
 
 def digest_of_texts(stated: Mapping[str, str]) -> str:
-    """Hash of texts and their names."""
+    """Compute the hash of texts and their names."""
     return digest_of(np.frombuffer(repr(sorted(stated.items())).encode(), np.uint8))
 
 
 def read_rows(file: h5py.File, group: str, vertices: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows `first` to `last` (`row_type`) of answers or unit responses, and (B,) bool: whose checksums agree."""
+    """Read rows `first` to `last` (`row_type`) of `answers` or `unit`, and (B,) bool: True if the checksum agrees."""
     here = slice(first, last)
     displacement = stored(file, f"{group}/displacement", "f", (None, vertices, 3))
     known = f"{group}/reaction" in file
@@ -281,8 +281,8 @@ def read_rows(file: h5py.File, group: str, vertices: int, first: int, last: int)
 
 
 def write_embedded(file: h5py.File, anatomy: Anatomy) -> None:
-    """Store the body itself, so that learning needs no other file."""
-    group = file.create_group("anatomy")  # one that HDF5 makes by itself has a date
+    """Store the anatomy, so that training needs no other file."""
+    group = file.create_group("anatomy")  # groups that HDF5 creates implicitly have a date
     for name, array in zip(MESH, anatomy.mesh.arrays, strict=False):
         group[name] = array
     for name in ("held", "slide_normal", "craniotomy"):
@@ -291,18 +291,18 @@ def write_embedded(file: h5py.File, anatomy: Anatomy) -> None:
 
 
 def read_embedded(file: h5py.File) -> Anatomy:
-    """The body that a data set embeds.
+    """Read the anatomy that a data set embeds.
 
     Raises
     ------
     InputError
-        Arrays that do not have the digest written beside them.
+        Arrays that do not match the stored digest.
     """
     array = {name: stored(file, f"anatomy/{name}", "fiu")[:] for name in MESH if f"anatomy/{name}" in file}
     sets = {name: stored(file, f"anatomy/{name}", "fb")[:] for name in ("held", "slide_normal", "craniotomy")}
     anatomy = Anatomy(TetMesh(**array), **sets)
     if anatomy.digest != file["anatomy"].attrs["digest"]:
-        raise InputError(f"{file.filename}: the anatomy inside was changed after it was written: simulate anew.")
+        raise InputError(f"{file.filename}: the anatomy inside was changed after it was written: simulate again.")
     return anatomy
 
 
@@ -312,7 +312,7 @@ def write_loads(file: h5py.File, loads: Loads) -> None:
     Raises
     ------
     InputError
-        Causes that `read_loads` would not find again: of another kind, or several of one.
+        Causes that `read_loads` could not read: of another kind, or several of one.
     """
     group = file.create_group("loads")
     for cause in loads.causes:
@@ -327,12 +327,12 @@ def write_loads(file: h5py.File, loads: Loads) -> None:
 
 
 def read_loads(file: h5py.File) -> Loads:
-    """The loads that `write_loads` stored.
+    """Read the loads that `write_loads` stored.
 
     Raises
     ------
     InputError
-        Loads that do not have the digest written beside them.
+        Loads that do not match the stored digest.
     """
     causes = tuple(
         kind(**{item.name: stored(file, f"loads/{name}/{item.name}", "f")[:] for item in fields(kind)})
@@ -341,12 +341,12 @@ def read_loads(file: h5py.File) -> Loads:
     )
     loads = Loads(causes, stored(file, "loads/time", "f")[:])
     if file.attrs.get("format") != UNCHECKED and file["loads"].attrs["digest"] != digest_of_loads(loads):
-        raise InputError(f"{file.filename}: the loads inside were changed after they were written: simulate anew.")
+        raise InputError(f"{file.filename}: the loads inside were changed after they were written: simulate again.")
     return loads
 
 
 def digest_of_loads(loads: Loads) -> str:
-    """Hash of every cause's arrays, and of the time."""
+    """Compute the hash of every cause's arrays, and of the time."""
     names = ",".join(sorted(type(cause).__name__ for cause in loads.causes)).encode()
     ordered = sorted(loads.causes, key=lambda cause: type(cause).__name__)
     arrays = [getattr(cause, item.name) for cause in ordered for item in fields(cause)]
@@ -354,16 +354,16 @@ def digest_of_loads(loads: Loads) -> str:
 
 
 def read_outcomes(file: h5py.File, group: str) -> tuple[Outcome, ...]:
-    """How the cases of `answers` or `unit` came about."""
+    """Read the solver outcomes of `answers` or `unit`."""
     return tuple(Outcome[name.decode()] for name in stored(file, f"{group}/outcome", "S")[:])
 
 
 def stored(
     file: h5py.File, name: str, kinds: str, shape: tuple[int | None, ...] | None = None, largest: int = LARGEST_ARRAY
 ) -> h5py.Dataset:
-    """An array in the file, of one of the NumPy `kinds`, and of a shape where it is given (None: any length).
+    """Return an array in the file, of one of the NumPy `kinds`, and of a shape if given (None: any length).
 
-    Without a shape the file alone decides how long it is: then it has at most the `largest` bytes.
+    Without a shape, its length is given by the file alone: then it has at most `largest` bytes.
 
     Raises
     ------
@@ -373,7 +373,7 @@ def stored(
     found = file.get(name)
     if (
         not isinstance(found, h5py.Dataset)
-        or found.file.filename != file.filename  # of a link
+        or found.file.filename != file.filename  # link to another file
         or found.is_virtual
         or found.external
     ):

@@ -1,4 +1,4 @@
-"""Loads to features, and displacements to and from a reduced basis."""
+"""Features of loads, and a reduced basis of displacements."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ Encoder = Callable[[Patch, Pushed], np.ndarray]
 
 
 def directions(pushed: Pushed) -> tuple[np.ndarray, np.ndarray]:
-    """Force magnitudes (B,) [N] and unit directions (B, 3); the direction of no force is zero."""
+    """Return force magnitudes (B,) [N] and unit directions (B, 3); the direction of zero force is zero."""
     magnitude = np.sqrt(np.einsum("bi,bi->b", pushed.force, pushed.force))
-    # The root of the smallest number: squares of smaller forces are none.
+    # The root of the smallest number: squares of smaller forces underflow.
     return magnitude, pushed.force / np.maximum(magnitude, np.sqrt(np.finfo(float).tiny))[:, None]
 
 
 def nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """Forces (B, 3 m) at the patch's nodes, for one newton: the finite elements' own integral over the footprint."""
+    """Compute forces (B, 3 m) at the patch's nodes, for one newton, by the FEM's own integral over the footprint."""
     weights = patch.skin.press(pushed.point, pushed.footprint).rows(len(patch.points))
     return shared_out(weights.toarray(), pushed)
 
 
 def rooted_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """`nodal_shares` times the root of the force: products of two are those of forces, for one newton."""
+    """Compute `nodal_shares` times the root of the force: products of two are those of forces, for one newton."""
     return rooted(nodal_shares(patch, pushed), pushed)
 
 
 def rooted(shares: np.ndarray, pushed: Pushed) -> np.ndarray:
-    """Shares (B, 3 m) for one newton, times the root of each load's force."""
+    """Multiply shares (B, 3 m) for one newton by the root of each load's force."""
     return np.sqrt(directions(pushed)[0])[:, None] * shares
 
 
 def shared_out(weights: np.ndarray, pushed: Pushed) -> np.ndarray:
-    """Forces (B, 3 m) at m nodes, for one newton, of which each bears its weight (B, m)."""
+    """Compute forces (B, 3 m) at m nodes, for one newton, distributed by weights (B, m)."""
     return np.einsum("bm,bi->bmi", weights, directions(pushed)[1]).reshape(-1, 3 * weights.shape[1])
 
 
 def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """Point [m], unit direction, force [N] and footprint radius [m]: (B, 8).
+    """Compute point [m], unit direction, force [N] and footprint radius [m]: (B, 8).
 
-    Of a rod or a blade then its shaft, and products x_i x_j of its other axis, which are the same either way: (B, 17).
-    Last, of tissue that relaxes, the share of its resistance to a change of shape that is gone.
+    For a rod or a blade followed by its shaft, and products x_i x_j of its other axis, which do not depend on its sign:
+    (B, 17). Last, for relaxing tissue, the lost share of its resistance to a change of shape.
 
-    The published 13 features describe the load as one node sees it (its distance, its angles). A model of all nodes at
-    once needs the load alone, because the basis knows where the nodes are.
+    The published 13 features describe the load relative to one node (its distance, its angles). A model of all nodes at
+    once needs the load alone, because the basis holds the positions of the nodes.
     """
     magnitude, direction = directions(pushed)
     found = [pushed.point, direction, magnitude, pushed.footprint]
@@ -62,14 +62,14 @@ def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
 
 
 def core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """How a rod or a blade stands (B, 17): as `tool_features` of a ball, middle of its core [m], its axes x and z.
+    """Compute a rod's or blade's pose (B, 17): `tool_features` of a ball, centre of its core [m], its axes x and z.
 
-    Last, of tissue that relaxes, as `tool_features`.
+    Last, for relaxing tissue, as `tool_features`.
 
     Raises
     ------
     TypeError
-        What is no `Indented`.
+        Loads that are not `Indented`.
     """
     if not isinstance(pushed, Indented):
         raise TypeError("only rods and blades have a core that stands: give `Indented`.")
@@ -81,7 +81,7 @@ def core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
 
 
 def _relaxed(pushed: Pushed) -> list[np.ndarray]:
-    """How far tissue has relaxed (B,), if it does: one, or none."""
+    """Return the relaxed share of tissue (B,), if it relaxes: a list of one, or of none."""
     known = relaxed_of(pushed)
     return [] if known is None else [known]
 
@@ -110,18 +110,19 @@ class Basis:
     modes: np.ndarray
 
     def encode(self, response: np.ndarray) -> np.ndarray:
-        """Coefficients (B, r) of responses (B, n, 3) [m/N]."""
+        """Compute coefficients (B, r) of responses (B, n, 3) [m/N]."""
         return response.reshape(len(response), -1) @ self.modes.T
 
     def decode(self, coefficients: np.ndarray) -> np.ndarray:
-        """Responses (B, n, 3) [m/N] of coefficients (B, r)."""
+        """Compute responses (B, n, 3) [m/N] from coefficients (B, r)."""
         return (coefficients @ self.modes).reshape(len(coefficients), len(self.nodes), 3)
 
 
 def reduce(nodes: np.ndarray, response: np.ndarray, tolerance: float, most: int) -> Basis:
-    """The fewest modes, at most `most`, that leave `tolerance` of the responses (B, n, 3) in the Frobenius norm.
+    """Compute the fewest modes, up to `most`, that leave `tolerance` of responses (B, n, 3) in the Frobenius norm.
 
-    No mean is taken off: no force, no motion. Where as many are needed as there are components, these are the modes.
+    The mean is not subtracted: zero force must give zero motion. If as many are needed as there are components, the
+    modes are the components.
     """
     matrix = response.reshape(len(response), -1).astype(np.float64)
     _, size, modes = np.linalg.svd(matrix, full_matrices=False)

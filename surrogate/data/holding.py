@@ -1,7 +1,7 @@
-"""Tools that are brought in and then held: how tissue that relaxes is asked, and how far it has relaxed by then.
+"""Load histories in relaxing tissue: a tool is brought in and then held.
 
-A load of a pose at a time [s] is such a history. The tool comes within `BROUGHT`, or within the time if that is
-shorter, and stays where it is until the time.
+A load of a pose at a time [s] is such a history. The tool arrives within `BROUGHT`, or within the time if that is
+shorter, and stays in place until the time.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from sim.loads import Loads
 from sim.material import Pairs, tissue_from_json
 
 BROUGHT = 1.0
-"""The longest that a tool takes to where it is held [s]."""
+"""Maximum time that a tool takes to arrive [s]."""
 HISTORY = f"the tool came within {BROUGHT:g} s, or within the load's time if that is shorter, and stayed until then"
-"""What the rows of such a data set are, in words."""
+"""Description of the rows of such a data set."""
 SOONEST, LATEST = 0.05, 100.0
-"""Times that are drawn [s]."""
+"""Range of sampled times [s]."""
 
 
 def drawn_times(count: int, seed: int) -> np.ndarray:
-    """Times (count,) [s] at which histories are answered, uniform in their logarithm; time i does not depend on count.
+    """Sample times (count,) [s] of histories, uniform in their logarithm; time i does not depend on count.
 
-    Every scene is over after a few seconds, and what relaxes more slowly is seen by a tool that stays.
+    Scenes last a few seconds; slower relaxation matters for a tool that stays.
     """
     source = np.random.Generator(np.random.Philox(key=[seed, 1]))
     return SOONEST * (LATEST / SOONEST) ** source.random(count)
 
 
 def series_of(effects: Iterable[Effect]) -> Pairs:
-    """The series by which the tissue of some effects relaxes; () if it does not."""
+    """Return the Prony series of the effects' tissue; () if it does not relax."""
     defaults = (effect.default for effect in effects if isinstance(effect, Elasticity))
     return next((tissue.prony for tissue in defaults if tissue is not None), ())
 
 
 def held(deformer: Deformer, loads: Loads) -> Deformation:
-    """Answers to histories of B loads: two steps of time, of which the second is not taken where a tool still comes.
+    """Solve histories of B loads: two time steps, of which the second is skipped while a tool still arrives.
 
-    A tool that the first finds no equilibrium for is held no further, and its answer says so.
+    A tool without an equilibrium in the first step is not held further, and its result has that outcome.
     """
     first = deformer.deform(Loads(loads.causes, np.minimum(loads.times, BROUGHT)))
     stay = np.flatnonzero([good.good for good in first.outcome] & (loads.times > BROUGHT))
@@ -56,9 +56,9 @@ def held(deformer: Deformer, loads: Loads) -> Deformation:
 
 
 def unfaded(series: Pairs, times: np.ndarray) -> np.ndarray:
-    """What is left (B, n) of each g of a series at the end of histories of B times [s].
+    """Compute the remainder (B, n) of each g of a series at the end of histories of B times [s].
 
-    As the finite elements step: what comes within a step has been there for half of it.
+    As in the FEM's time steps: load that arrives within a step acts for half of it.
     """
     coming = np.minimum(times, BROUGHT)
     g, tau = np.array(series).T
@@ -66,9 +66,9 @@ def unfaded(series: Pairs, times: np.ndarray) -> np.ndarray:
 
 
 def stated_series(stated: Mapping[str, str]) -> Pairs:
-    """The series by which the tissue of a data set of histories relaxes, as its file states it; () of others."""
+    """Read the Prony series of a data set of histories from its provenance; () for other data."""
     if "history" not in stated or "tissue" not in stated:
         return ()
     if stated["history"] != HISTORY:
-        raise InputError(f"the histories here are others than this version knows ({stated['history']}): simulate anew.")
+        raise InputError(f"unsupported histories ({stated['history']}): simulate again.")
     return tissue_from_json(stated["tissue"]).prony

@@ -1,7 +1,7 @@
-"""Poses of a rigid tool as pushes: where on the cortex at rest it is deepest, and how deep.
+"""Poses of a rigid tool as pushes: deepest point on the undeformed cortex, and depth.
 
-A tool's pose is tracked where its force is not known. Without friction the answer depends on where the tool is, not on
-how it came there. To learners a depth is what a force is: both are nothing where nothing moves.
+A tool's pose is tracked while its force is unknown. Without friction the deformation depends on the tool's pose, not on
+its path. For the regressors depth replaces force: both are zero if nothing moves.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from sim.tools import Ball, BuiltIn, Capsule, Core, core_of, extent_of, named
 from .cortex_patch import Patch
 from .tool_loads import axes_about
 
-# A foot so near to the surface [m] has the surface's normal.
+# Distance of a foot from the surface [m] below which the surface's normal is used.
 ON_IT = 1e-6
-# A core is looked at in points so many of its radii apart; of a rod's so many, from its end on.
+# Spacing of a core's sample points [radii]; number of samples along a rod from its end.
 APART, ALONG = 1.0, 6
 
 
 @dataclass(frozen=True, eq=False)
 class Indented(Pushed):
-    """Indentations by a rod or a blade, whose answer depends on how it stands, too.
+    """Indentations by a rod or a blade, which depend on its orientation too.
 
     axes (B, 3, 3) are the tool's, as columns; offset (B, 3) [m] is from the indented point, point + force, to the
-    middle of the tool's core. The footprint is the rod's radius, or that of a ball round the blade.
+    centre of the tool's core. The footprint is the rod's radius, or that of a ball round the blade.
     """
 
     axes: np.ndarray
@@ -37,31 +37,31 @@ class Indented(Pushed):
 
 @dataclass(frozen=True, eq=False)
 class Relaxing(Pushed):
-    """Indentations of tissue whose resistance to a change of shape has lost the share relaxed (B,)."""
+    """Indentations of tissue that has lost the share relaxed (B,) of its resistance to a change of shape."""
 
     relaxed: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class RelaxingIndented(Indented):
-    """The same by a rod or a blade."""
+    """Indentations of relaxing tissue by a rod or a blade."""
 
     relaxed: np.ndarray
 
 
 def with_relaxed(pushed: Pushed, relaxed: np.ndarray) -> Pushed:
-    """The same indentations, of tissue that has relaxed by shares (B,)."""
+    """Return the same indentations in tissue relaxed by shares (B,)."""
     kind = RelaxingIndented if isinstance(pushed, Indented) else Relaxing
     return kind(**vars(pushed), relaxed=relaxed)
 
 
 def relaxed_of(pushed: Pushed) -> np.ndarray | None:
-    """How far tissue has relaxed (B,); None where it does not."""
+    """Return the relaxed share of tissue (B,); None if it does not relax."""
     return pushed.relaxed if isinstance(pushed, Relaxing | RelaxingIndented) else None
 
 
 def posed(loads: Loads, tool: BuiltIn) -> np.ndarray:
-    """T_world_tool (B, 4, 4) of one tool: of `Touching` of it alone, or of a blade's `Retracted`.
+    """Return T_world_tool (B, 4, 4) of one tool: of `Touching` of it alone, or of a blade's `Retracted`.
 
     Raises
     ------
@@ -83,9 +83,9 @@ def posed(loads: Loads, tool: BuiltIn) -> np.ndarray:
 
 
 def indented(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
-    """One tool's poses as pushes: point (B, 3) [m] nearest to its foot, depth along the normal for force [m], radius.
+    """Convert one tool's poses to pushes: point (B, 3) [m] nearest to its foot, normal depth as force [m], radius.
 
-    The foot is the middle of a ball, of a rod's lower end, or of a blade. A tool that touches nothing has no depth.
+    The foot is the centre of a ball, of a rod's lower end, or of a blade. A tool without contact has depth zero.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def indented(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     deepest = core.radius - off[len(pose) :].reshape(len(pose), -1).min(axis=1)
     force = np.maximum(deepest, 0.0)[:, None] * direction
     axes = pose[:, :3, :3]
-    if isinstance(tool, Capsule):  # which is round: however it is turned about its shaft, it is the same
+    if isinstance(tool, Capsule):  # a rod is round: its turn about the shaft does not matter
         axes = axes_about(axes[:, :, 2])
     middle = pose[:, :3, 3] + pose[:, :3, :3] @ core.centre
     wide = np.full(len(pose), core.radius if isinstance(tool, Capsule) else extent_of(tool))
@@ -114,14 +114,14 @@ def indented(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
 
 
 def _off(patch: Patch, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest places (n, 3) on the cortex at rest to points (n, 3), and how far outside these are (n,) [m]."""
+    """Find the nearest places (n, 3) on the undeformed cortex to points (n, 3), and their signed distances (n,) [m]."""
     near = patch.skin.nearest(points, np.full(len(points), np.inf))[0]
     away = near - points
     return near, np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, patch.normal_near(near)))
 
 
 def _places(core: Core) -> np.ndarray:
-    """Points (k, 3) [m] of a core in the tool's frame, its border among them; of a rod those near its lower end."""
+    """Sample points (k, 3) [m] of a core in the tool's frame, border included; of a rod, near its lower end."""
     steps = np.ceil(2.0 * core.half / (APART * core.radius)).astype(int)
     low, high = core.centre - core.half, core.centre + core.half
     if steps[2] > ALONG:

@@ -1,4 +1,4 @@
-"""Fill a data set with a deformer's answers, batch by batch, so that a killed run goes on where it stopped."""
+"""Simulation of a data set with a deformer, batch by batch, so that a killed run resumes."""
 
 from __future__ import annotations
 
@@ -43,20 +43,20 @@ from .dataset import (
 )
 from .tasks import Crew, Task, answered, posed_tools
 
-# Names of the file's groups where their seconds are reported.
+# Names of the file's groups in reports of their seconds.
 STAGES = {"unit": "unit responses", "answers": "loads"}
-# From this version of HDF5 on, the metadata of arrays have checksums.
+# HDF5 version from which the metadata of arrays have checksums.
 READERS = ("v108", "v108")
-UNTIMED = "not known"  # as wide as a number
+UNTIMED = "not known"  # same width as a number
 RATES = {"unit": "seconds a unit response", "answers": "seconds a load"}
 OF_ITS_MAKING = ("date", *RATES.values())
-"""What a data set states of itself that is another each time it is made."""
+"""Provenance entries that differ each time a data set is made."""
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Solved:
-    """What one call solved anew: rows of unit responses and of loads, and the seconds that each took, with writing."""
+    """Rows of unit responses and of loads that one call solved, and the seconds of each, with writing."""
 
     units: int = 0
     loads: int = 0
@@ -65,13 +65,13 @@ class Solved:
 
     @property
     def rows(self) -> int:
-        """All of them."""
+        """Total number of rows."""
         return self.units + self.loads
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What is asked: unit responses, then loads, in batches.
+    """Requested unit responses and loads, in batches.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class Work:
     loads
         As in `simulate`.
     nodes
-        (m,) vertices that are pushed by a unit force; none where the loads are poses.
+        (m,) vertices with a unit force; none if the loads are poses.
     batch
         Rows that are solved together.
     """
@@ -91,12 +91,12 @@ class Work:
     batch: int
 
     def row(self, group: str) -> np.dtype:
-        """What a row of a group is."""
+        """Return the row type of a group."""
         return row_type(len(self.anatomy.mesh.nodes), posed_tools(self.loads) if group == "answers" else 0)
 
     @property
     def counts(self) -> dict[str, int]:
-        """Rows of each group."""
+        """Number of rows of each group."""
         return {"unit": 3 * len(self.nodes), "answers": len(self.loads)}
 
     @property
@@ -105,12 +105,12 @@ class Work:
         return [(name, first) for name, rows in self.counts.items() for first in range(0, rows, self.batch)]
 
     def rows(self, batch: Batch) -> np.ndarray:
-        """The numbers of a batch's rows."""
+        """Return the numbers of a batch's rows."""
         name, first = batch
         return np.arange(first, min(first + self.batch, self.counts[name]))
 
     def task(self, batch: Batch) -> Task:
-        """A batch, as it is solved."""
+        """Build the task that solves a batch."""
         rows = self.rows(batch)
         return Task(batch, rows, None if batch[0] == "unit" else self.loads.rows(rows))
 
@@ -123,32 +123,32 @@ def simulate(
     batch: int = 64,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Solved:
-    """Answer every load, and the unit forces on the open cortex unless the loads are poses, into an HDF5 file.
+    """Solve every load, and the unit forces on the open cortex unless the loads are poses, into an HDF5 file.
 
-    Batches go to `PATH.partial` (`journal`), where a kill at any moment loses one at most. The same call goes on with
-    the same batches, so that the result has the same bytes but for its date. What is damaged there is solved anew. The
-    HDF5 file is written last, and whole. More loads of the same draw extend a finished file, and what is damaged in a
-    finished file is solved anew.
+    Batches are written to `PATH.partial` (`journal`), where a kill at any moment loses at most one. The same call
+    resumes with the same batches, so that the result has the same bytes but for its date. Damaged batches are solved
+    again. The HDF5 file is written last, atomically. More loads of the same sampling extend a finished file, and
+    damaged rows of a finished file are solved again.
 
     Parameters
     ----------
     deformer
-        Answers `loads` and `Nodal` loads at every vertex; a `Crew` has one on each of several devices.
+        Deformer of `loads` and `Nodal` loads at every vertex; a `Crew` has one on each of several devices.
     provenance
-        Texts that must agree for a run to go on.
+        Texts that must agree for a run to resume.
     progress
-        Called with the rows that are done and their total after every batch.
+        Called with the number of finished rows and their total after every batch.
 
     Raises
     ------
     InputError
         A batch below one, a file that holds something else or is being written, a folder that cannot be written to or
-        has too little room. A crew of which one is lost.
+        has too little space. A crew that lost a process.
 
     Warns
     -----
     DamageWarning
-        Rows that were done before, and are damaged.
+        Finished rows that are damaged.
     """
     path = Path(path)
     if batch < 1:
@@ -176,7 +176,7 @@ def simulate(
         try:
             solved = _fill(journal, work, deformer, finished, progress)
         except LostError as error:
-            raise InputError(f"{error} What was solved is kept: the same command goes on.") from error
+            raise InputError(f"{error} What was solved is kept: the same command resumes.") from error
         with stage(STAGES["answers"]):
             _write(path, work, {**stated, **_rates(path, solved, seconds)}, journal)
     partial.unlink(missing_ok=True)
@@ -186,7 +186,7 @@ def simulate(
 def _fill(
     journal: Journal, work: Work, deformer: Deformer | Crew, finished: set[Batch], progress: Callable[[int, int], None]
 ) -> dict[str, int]:
-    """Solve what is in neither file. A second thread writes a batch while the next is solved, one ahead."""
+    """Solve the batches that are in neither file. A second thread writes a batch while the next is solved."""
     known = [batch for batch in work.batches if batch in finished or batch in journal]
     total, done = sum(work.counts.values()), sum(len(work.rows(batch)) for batch in known)
     solved = dict.fromkeys(work.counts, 0)
@@ -209,9 +209,9 @@ def _fill(
 
 
 def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) -> dict[str, str]:
-    """Wall seconds a solve, of each kind that was solved just now; of others as the finished file has it.
+    """Compute wall seconds a solve, of each kind that was solved now; of others as in the finished file.
 
-    All of one width, so that files made in one run or in several are of one shape.
+    All of one width, so that files made in one run or in several have the same size.
     """
     before: dict[str, str] = {}
     if path.exists():
@@ -227,7 +227,7 @@ def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) 
 
 
 def _write(path: Path, work: Work, stated: Mapping[str, str], journal: Journal) -> None:
-    """Write the data set: batches of the journal, and those of the finished file that it takes the place of."""
+    """Write the data set: batches of the journal, and those of the finished file that it replaces."""
     with written_stream(path, path.suffix) as stream, h5py.File(stream, "w", libver=READERS) as file:
         facts = {
             "title": TITLE,
@@ -268,7 +268,7 @@ def _write(path: Path, work: Work, stated: Mapping[str, str], journal: Journal) 
 
 
 def _ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tuple[Batch, T]]:
-    """What is made of each batch, in order; a second thread makes the next meanwhile."""
+    """Yield the result of each batch, in order; a second thread computes the next meanwhile."""
     with ThreadPoolExecutor(1) as maker:
         coming = [maker.submit(made, batch) for batch in batches[:1]]
         for batch, following in zip(batches, [*batches[1:], None], strict=True):
@@ -279,29 +279,29 @@ def _ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tup
 
 
 def _kept(path: Path, work: Work, batch: Batch) -> np.ndarray:
-    """A batch's rows in a finished file, found undamaged before."""
+    """Read a batch's rows from a finished file, checked again for damage."""
     with h5py.File(path, "r") as before:
         rows, good = _batch(before, work, batch)
     if not good.all():
-        raise InputError(f"{path}: rows were damaged just now: give the same command again, and they are solved anew.")
+        raise InputError(f"{path}: corrupted rows were found: run the command again to recompute them.")
     return rows
 
 
 def _tool(loads: Loads, stated: Mapping[str, str]) -> str:
-    """What acts, in a sentence."""
+    """Describe the tool or force in a sentence."""
     if loads.of(Touching) is None:
         return "a force on a round footprint that stays with the tissue: see loads/Pushed"
     return f"the rigid tool {stated.get('shape', 'not stated')}, sizes in m, moved by pose: see loads/Touching"
 
 
 def _batch(file: h5py.File, work: Work, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
-    """A batch's rows in a finished file, and which of them are whole."""
+    """Read a batch's rows from a finished file, and the mask of undamaged rows."""
     rows = work.rows(batch)
     return read_rows(file, batch[0], len(work.anatomy.mesh.nodes), int(rows[0]), int(rows[-1]) + 1)
 
 
 def _earlier(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
-    """The loads of a finished file, which must be the first of `loads` or begin with them, and its texts the same."""
+    """Read the loads of a finished file; check that they and `loads` share their first rows, and the provenance."""
     with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
         recorded = provenance_of(file)
         if recorded.get("format") == UNCHECKED:
@@ -315,7 +315,7 @@ def _earlier(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
 
 
 def _same_body(path: Path, work: Work) -> bool:
-    """Whether the body in a finished file is undamaged."""
+    """Return True if the body in a finished file is undamaged."""
     with h5py.File(path, "r") as file:
         try:
             return read_embedded(file).digest == work.anatomy.digest
@@ -324,9 +324,9 @@ def _same_body(path: Path, work: Work) -> bool:
 
 
 def _whole_batches(path: Path, work: Work) -> set[Batch]:
-    """The batches that a finished file holds undamaged.
+    """Return the batches that a finished file holds undamaged.
 
-    A last short batch is none, unless it is the last again: it would have been solved in other company.
+    A last short batch is excluded, unless it is the last again: it would have been solved in another batch.
     """
     held, damaged = set(), []
     with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
@@ -340,7 +340,7 @@ def _whole_batches(path: Path, work: Work) -> set[Batch]:
     if damaged:
         more = f" and {len(damaged) - 5} more" if damaged[5:] else ""
         warnings.warn(
-            f"{path}: {', '.join(damaged[:5])}{more}: damaged. They are solved anew, and all else is kept.",
+            f"{path}: {', '.join(damaged[:5])}{more}: damaged. They are solved again, and all else is kept.",
             DamageWarning,
             stacklevel=3,
         )

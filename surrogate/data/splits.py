@@ -14,16 +14,16 @@ from .encode import directions
 from .tool_loads import across, spread
 
 FEWEST, MOST, SHARE = 6, 200, 0.15
-# One load in so many, and at most so many, is kept apart from every split, to calibrate bounds.
+# Fraction 1/n of the loads, and maximum number, set aside from every split to calibrate bounds.
 APART, MOST_APART = 4, 2000
 RADII = (6e-3, 5e-3, 4e-3, 3e-3, 2e-3, 1e-3)
-# Of so many sectors two are left out, which lie opposite; a force within so many degrees of the normal lies in none.
+# Number of sectors, of which two opposite ones are held out; angle to the normal below which a force is in none [deg].
 SECTORS, UPRIGHT = 8, 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Discs left out of the training.
+    """Held-out discs of the cortex.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class Split:
     radius
         Of each disc [m].
     disc
-        (B,) number of the disc that a load's point lies in, -1 for the training loads, -2 for those of no use.
+        (B,) number of the disc that a load's point is in, -1 for the training loads, -2 for unused ones.
     share
         Part of the patch's area that the discs cover.
     """
@@ -44,20 +44,20 @@ class Split:
 
     @property
     def test(self) -> np.ndarray:
-        """(B,) bool."""
+        """(B,) bool: mask of the test loads."""
         return self.disc >= 0
 
     @property
     def train(self) -> np.ndarray:
-        """(B,) bool."""
+        """(B,) bool: mask of the training loads."""
         return self.disc == -1
 
     def covers(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (n, 3) [m] lie in a disc: a scored model may be given nothing there. (n,) bool."""
+        """Return the mask (n,) of points (n, 3) [m] in a disc, where a scored model must not be given any data."""
         return nearest(points, self.centres)[1] <= self.radius
 
     def summary(self) -> str:
-        """What was left out, in one line for people (mm)."""
+        """Describe the held-out loads in one line [mm]."""
         return (
             f"{len(self.centres)} discs of {1e3 * self.radius:g} mm radius ({100 * self.share:.0f} % of the open "
             f"cortex) left out: {int(self.test.sum())} loads to test, {int(self.train.sum())} to train on"
@@ -65,11 +65,11 @@ class Split:
 
 
 def leave_discs_out(points: np.ndarray, patch: Patch) -> Split:
-    """Discs of 6 mm radius round load points (B, 3) [m] far from each other: at least 6, and 15 % of the patch.
+    """Hold out discs of 6 mm radius round distant load points (B, 3) [m]: at least 6, and 15 % of the patch.
 
-    No disc beyond the sixth is taken if it would leave fewer than half of the loads to train on. At a small
-    craniotomy, where six discs take more than half, the discs shrink, as far as that helps. Six of the few positions of
-    the preset `seed` are more than half in any case.
+    No disc beyond the sixth is taken if it would leave fewer than half of the loads to train on. At a small craniotomy,
+    where six discs take more than half, the discs shrink, as far as that helps. Six of the few positions of the preset
+    `seed` are more than half in any case.
 
     Raises
     ------
@@ -105,18 +105,18 @@ def _split(points: np.ndarray, centres: np.ndarray, patch: Patch, radius: float)
 
 @dataclass(frozen=True, eq=False)
 class Sectors(Split):
-    """Sectors of tangential direction left out.
+    """Held-out sectors of tangential direction.
 
     As `Split`, but `centres` are unit directions (k, 3), and `radius` is half the width of a sector [rad]. `disc` is
-    the number of the sector that a load's force lies in, and `share` a part of the circle.
+    the number of the sector that a load's force is in, and `share` a part of the circle.
     """
 
     def covers(self, points: np.ndarray) -> np.ndarray:
-        """No place is left out, but directions are. (n,) bool."""
+        """Return the mask (n,) of held-out points: none, as directions are held out."""
         return np.zeros(len(points), bool)
 
     def summary(self) -> str:
-        """What was left out, in one line for people (degrees)."""
+        """Describe the held-out loads in one line [degrees]."""
         return (
             f"{len(self.centres)} sectors of {2.0 * np.degrees(self.radius):g} degrees round the cortex's normal left "
             f"out: {int(self.test.sum())} loads to test, {int(self.train.sum())} to train on"
@@ -124,9 +124,9 @@ class Sectors(Split):
 
 
 def leave_sectors_out(pushed: Pushed, patch: Patch) -> Sectors:
-    """Two opposite sectors of 45 degrees of the direction in which forces point along the open cortex.
+    """Hold out two opposite sectors of 45 degrees of the tangential direction of forces on the open cortex.
 
-    Forces within 10 degrees of the mean inward normal are learnt from: they hardly point along it.
+    Forces within 10 degrees of the mean inward normal are training loads: they have almost no tangential direction.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def leave_sectors_out(pushed: Pushed, patch: Patch) -> Sectors:
     first, second = (side[0] for side in across(axis[None]))
     force = directions(pushed)[1]
     angle = np.arctan2(force @ second, force @ first) % (2.0 * np.pi)
-    # The first sector lies round `first`, so that a lattice of directions which begins there is not cut at its rim.
+    # The first sector is centred on `first`, so that a lattice of directions starting there is not cut at its edge.
     sector = np.rint(angle * SECTORS / (2.0 * np.pi)).astype(int) % SECTORS
     tilted = force @ axis < np.cos(np.radians(UPRIGHT))
     left_out = tilted & (sector % (SECTORS // 2) == 0)

@@ -1,4 +1,4 @@
-"""Batches of a data set, and who solves them: one deformer here, or one on each of several devices."""
+"""Batches of a data set, and their solution: by one deformer in this process, or one on each of several devices."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from .answer_rows import rows_of
 from .cortex_patch import open_patch
 
 # Far inside the small-strain range: 1 uN on one node of brain tissue strains its elements by some 1e-5, so that one
-# solve with the rest stiffness is the answer.
+# solve with the undeformed stiffness is exact enough.
 UNIT_FORCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A batch, the numbers of its rows (B,), and their loads; none of unit responses."""
+    """Batch, the numbers of its rows (B,), and their loads; None for unit responses."""
 
     batch: Batch
     rows: np.ndarray
@@ -32,14 +32,14 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Crew:
-    """Processes that have each made a deformer of the same body."""
+    """Processes that each have a deformer of the same body."""
 
     anatomy: Anatomy
     children: Sequence[Child]
 
 
 def answered(deformer: Deformer | Crew, tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
-    """Each task with its rows as `solved` has them: here one after the other, by a crew as they come."""
+    """Yield each task with its rows from `solved`: one after the other in this process, by a crew in any order."""
     if isinstance(deformer, Crew):
         yield from map_unordered(deformer.children, solved, tasks)
     else:
@@ -48,7 +48,7 @@ def answered(deformer: Deformer | Crew, tasks: Iterable[Task]) -> Iterator[tuple
 
 
 def solved(deformer: Deformer, task: Task) -> bytes:
-    """A batch's rows (`answer_rows.row_type`). Every batch starts from rest, whatever its deformer solved before."""
+    """Solve a batch (`answer_rows.row_type`). Every batch starts undeformed, independent of earlier ones."""
     anatomy = deformer.anatomy
     unit = task.loads is None
     loads = unit_loads(anatomy, task.rows) if task.loads is None else task.loads
@@ -57,13 +57,13 @@ def solved(deformer: Deformer, task: Task) -> bytes:
 
 
 def posed_tools(loads: Loads) -> int:
-    """How many tools the loads move by pose, whose reactions are kept; none of pushes."""
+    """Return the number of tools that the loads move by pose, whose reactions are stored; 0 for pushes."""
     touching = loads.of(Touching)
     return 0 if touching is None else touching.pose.shape[1]
 
 
 def unit_loads(anatomy: Anatomy, rows: np.ndarray) -> Loads:
-    """`UNIT_FORCE` at open-cortex node row // 3 along axis row % 3, for each of `rows` (B,)."""
+    """Build loads of `UNIT_FORCE` at open-cortex node row // 3 along axis row % 3, for each of `rows` (B,)."""
     force = np.zeros((len(rows), len(anatomy.mesh.nodes), 3))
     force[np.arange(len(rows)), open_patch(anatomy).nodes[rows // 3], rows % 3] = UNIT_FORCE
     return Loads((Nodal(force),))

@@ -1,4 +1,4 @@
-"""Loads as surgical tools make them: where a tool touches, how hard, in which direction."""
+"""Sampling of loads as made by surgical tools: position, force, direction and footprint."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from sim.material import BRAIN
 from .cortex_patch import Patch, nearest, open_patch
 
 ATTEMPTS = 2000
-# Loads drawn together: more would only take more memory. A load has so many random numbers at each attempt.
+# Loads sampled together (more only take memory); random numbers of a load in each attempt.
 BLOCK, NUMBERS = 8192, 8
-# Deeper than this the tool has gone through the tissue; tissue harm begins at 2.7-4 kPa mean contact pressure.
+# Largest depth [m] and mean contact pressure [Pa]: beyond, a tool perforates; tissue harm begins at 2.7-4 kPa.
 DEEPEST, HARDEST = 15e-3, 8e3
-# E* = E / (1 - nu^2) of the default tissue: Hertz's depth 3 F / (4 E* r) judges a load before it is solved.
+# E* = E / (1 - nu^2) of the default tissue: Hertz's depth 3 F / (4 E* r) estimates a load's depth before it is solved.
 PLANE_MODULUS = BRAIN.young / (1.0 - BRAIN.poisson**2)
 # Radii and forces of a tool at which its nominal loads are counted.
 LATTICE = 200
@@ -26,22 +26,22 @@ LATTICE = 200
 
 @dataclass(frozen=True)
 class Tool:
-    """The range of a surgical tool's loads.
+    """Range of a surgical tool's loads.
 
     Parameters
     ----------
     name
-        As `--preset` names it.
+        Name for `--preset`.
     footprint
-        Least and greatest radius [m], uniform between; a plate counts as the disc of its area.
+        Smallest and largest radius [m], uniform between; a plate counts as the disc of its area.
     force
-        Least and greatest force [N], log-uniform between unless `even`: then uniform.
+        Smallest and largest force [N], log-uniform between unless `even`: then uniform.
     pressure
-        Least and greatest mean contact pressure F / (pi r^2) [Pa]; a draw outside is repeated.
+        Smallest and largest mean contact pressure F / (pi r^2) [Pa]; a sample outside is repeated.
     depth
-        Greatest depth by Hertz's formula [m]; a deeper draw is repeated.
+        Largest depth by Hertz's formula [m]; a deeper sample is repeated.
     cone
-        Greatest angle [rad] between the force and the inward normal; uniform by solid angle.
+        Largest angle [rad] between the force and the inward normal; uniform by solid angle.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Tool:
     even: bool = False
 
     def admits(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-        """Whether (n,) pressure and estimated depth are those of surgery; forces (n,) [N], radii (n,) [m]."""
+        """Return the mask (n,) of surgical pressures and estimated depths; forces (n,) [N], radii (n,) [m]."""
         pressure = force / (np.pi * footprint**2)
         depth = 3.0 * force / (4.0 * PLANE_MODULUS * footprint)
         return (self.pressure[0] <= pressure) & (pressure <= self.pressure[1]) & (depth <= self.depth)
@@ -69,17 +69,17 @@ TOOLS = {
         Tool("spatula", (8e-3, 16e-3), (0.13, 3.2), pressure=(700.0, 4000.0)),
     )
 }
-# No surgery: a trial of the solver. 1 N on 3 mm would be a flat punch 40 mm deep.
+# Stress test of the solver, not surgery: 1 N on 3 mm would be a flat punch 40 mm deep.
 BRUTAL = Tool("brutal", (3e-3, 10e-3), (0.02, 1.05), pressure=(0.0, np.inf), depth=np.inf, even=True)
 PRESETS = (*TOOLS, "mixed", "seed", BRUTAL.name)
 BEYOND_TISSUE = ("seed", BRUTAL.name)
-"""Presets whose loads strain tissue beyond what was measured on brain: their equilibria are kept all the same."""
+"""Presets whose loads strain tissue beyond measurements on brain: their equilibria are stored all the same."""
 
 
 def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
-    """Draw `count` loads on the open cortex; load i depends on the preset, the anatomy, the seed and i alone.
+    """Sample `count` loads on the open cortex; load i depends on the preset, the anatomy, the seed and i alone.
 
-    `mixed` draws the tool first; `brutal` is far beyond surgery. `seed` is the protocol of Tonutti, Gras, Yang 2017,
+    `mixed` samples the tool first; `brutal` is far beyond surgery. `seed` is the protocol of Tonutti, Gras, Yang 2017,
     Artif. Intell. Med. 80:39-47, in an order shuffled by the seed: at most 6,600 loads, of which fewer are returned
     when `count` is larger.
 
@@ -102,23 +102,23 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
 
 
 def drawn_of(tool: Tool, patch: Patch, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where a tool presses, and its unit directions, (count, 3) each: as `draw` has them, of any force."""
+    """Sample positions of a tool, and its unit directions, (count, 3) each: as `draw`, for any force."""
     free = replace(tool, pressure=(0.0, np.inf), depth=np.inf)
     rows = _in_blocks([free], patch, count, seed)
     return rows[:, :3], rows[:, 3:6] / np.linalg.norm(rows[:, 3:6], axis=1, keepdims=True)
 
 
 def _in_blocks(tools: list[Tool], patch: Patch, count: int, seed: int) -> np.ndarray:
-    """Point [m], force [N] and footprint [m] of each load: (count, 7)."""
+    """Sample point [m], force [N] and footprint [m] of each load: (count, 7)."""
     key = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
     blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
     return np.concatenate([_drawn(tools, patch, key, block) for block in blocks])
 
 
 def refused_share(preset: str) -> float:
-    """The share of a preset's nominal loads, by radius and force, that are not drawn: they press too hard or too deep.
+    """Compute the share of a preset's nominal loads, by radius and force, that are not sampled: too strong or too deep.
 
-    No model is trained on them. Zero of what is no preset of tools.
+    No model is trained on them. Zero for other presets.
     """
     tools = {**{name: [tool] for name, tool in TOOLS.items()}, "mixed": list(TOOLS.values())}.get(preset, [])
     middles = (np.arange(LATTICE) + 0.5) / LATTICE
@@ -131,7 +131,7 @@ def refused_share(preset: str) -> float:
 
 
 def refused_words(preset: str) -> str:
-    """The same for people, empty where none are refused."""
+    """Describe that share; empty if it is zero."""
     share = refused_share(preset)
     return (
         f"{100.0 * share:.0f} % of the nominal loads of {preset} (its forces on its radii) have a pressure or depth "
@@ -142,7 +142,7 @@ def refused_words(preset: str) -> str:
 
 
 def _drawn(tools: list[Tool], patch: Patch, key: int, block: range) -> np.ndarray:
-    """Point [m], force [N] and footprint [m] of each load of a block: (n, 7)."""
+    """Sample point [m], force [N] and footprint [m] of each load of a block: (n, 7)."""
     kind = (len(tools) * _uniform(key, 0, block)[:, -1]).astype(int)
     out = np.zeros((len(block), 7))
     for number, tool in enumerate(tools):
@@ -152,18 +152,18 @@ def _drawn(tools: list[Tool], patch: Patch, key: int, block: range) -> np.ndarra
 
 
 def _uniform(key: int, attempt: int, block: range) -> np.ndarray:
-    """Numbers (n, NUMBERS) in [0, 1) of each load of a block.
+    """Generate numbers (n, NUMBERS) in [0, 1) of each load of a block.
 
-    Salmon, Moraes, Dror, Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3": its counter makes any load's
-    numbers without those before.
+    Salmon, Moraes, Dror, Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3": its counter gives any load's numbers
+    without those before.
     """
     source = np.random.Philox(key=np.array([key, attempt], np.uint64))
-    source.advance(block.start * NUMBERS // 4)  # each count of it makes four numbers
+    source.advance(block.start * NUMBERS // 4)  # each count gives four numbers
     return np.random.Generator(source).random((len(block), NUMBERS))
 
 
 def _drawn_of(tool: Tool, patch: Patch, key: int, block: range, rows: np.ndarray) -> np.ndarray:
-    """As `_drawn`, of one tool and some rows (k,) of the block: who does not fit draws again."""
+    """Sample as `_drawn`, for one tool and some rows (k,) of the block: loads that do not fit are sampled again."""
     out, waiting = np.zeros((len(block), 7)), rows
     for attempt in range(ATTEMPTS):
         if not len(waiting):
@@ -185,12 +185,12 @@ def _drawn_of(tool: Tool, patch: Patch, key: int, block: range, rows: np.ndarray
 
 
 def between(ends: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.ndarray:
-    """Between two ends, by uniform numbers (n,) in [0, 1)."""
+    """Interpolate between two ends, by uniform numbers (n,) in [0, 1)."""
     return ends[0] + (ends[1] - ends[0]) * uniform
 
 
 def _within_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndarray:
-    """Unit vectors (n, 3) within `angle` [rad] of unit vectors `axis` (n, 3), uniform by solid angle."""
+    """Sample unit vectors (n, 3) within `angle` [rad] of unit vectors `axis` (n, 3), uniform by solid angle."""
     cosine = (1.0 - uniform[:, 0] * (1.0 - np.cos(angle)))[:, None]
     around = (2.0 * np.pi * uniform[:, 1])[:, None]
     first, second = across(axis)
@@ -199,28 +199,28 @@ def _within_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndar
 
 
 def across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors (n, 3) each that stand upright on unit vectors `axis` (n, 3), and on each other."""
+    """Compute two unit vectors (n, 3) each, perpendicular to unit vectors `axis` (n, 3) and to each other."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(axis, first)
 
 
 def axes_about(shaft: np.ndarray) -> np.ndarray:
-    """Rotations (n, 3, 3) whose z are unit vectors `shaft` (n, 3), turned about them in some way."""
+    """Build rotations (n, 3, 3) whose z are unit vectors `shaft` (n, 3), with arbitrary turns about them."""
     return np.stack([*across(shaft), shaft], axis=2)
 
 
 POSITIONS, DIRECTIONS, MAGNITUDES = 11, 30, np.linspace(0.10, 1.05, 20)
-# The area behind one free surface node of the published mesh.
+# Radius [m] of the area of one free surface node of the published mesh.
 PUBLISHED_FOOTPRINT = 7e-3
 PUBLISHED_CONE = np.pi / 3.0
 
 
 def _published(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
-    """11 positions 20-28 mm from the tumour's centre x 30 directions x 20 magnitudes, shuffled.
+    """Build the published loads: 11 positions 20-28 mm from the tumour's centre x 30 directions x 20 sizes, shuffled.
 
     The authors do not print their directions: a spherical Fibonacci lattice within 60 degrees of the inward normal
-    stands for them.
+    replaces them.
     """
     if not len(anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour, so no position is 20-28 mm from it: choose another --preset.")
@@ -247,10 +247,10 @@ def _published(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
 
 
 def spread(points: np.ndarray, count: int) -> np.ndarray:
-    """Numbers (k,) of at most `count` of the `points` (n, 3), far from each other: farthest-point sampling.
+    """Select at most `count` of the `points` (n, 3) by farthest-point sampling; return their numbers (k,).
 
-    Starts at the point nearest to the mean, so that it depends on nothing but the points. Gonzalez 1985, Theor.
-    Comput. Sci. 38:293-306.
+    Starts at the point nearest to the mean, so that it depends on nothing but the points. Gonzalez 1985, Theor. Comput.
+    Sci. 38:293-306.
     """
     chosen = [int(nearest(points.mean(axis=0, keepdims=True), points)[0][0])]
     distance = np.linalg.norm(points - points[chosen[0]], axis=1)

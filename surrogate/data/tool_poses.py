@@ -1,4 +1,4 @@
-"""Poses of a rigid tool as surgery makes them: where it touches, in which direction, how deep."""
+"""Sampling of surgical poses of a rigid tool: position, direction and depth."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from sim.tools import Ball, BuiltIn, Capsule, Spatula, core_of, distances_to, ex
 from .cortex_patch import Patch, barycentric_lattice, open_patch
 from .tool_loads import TOOLS, across, axes_about, between, draw, drawn_of
 
-# What a ball may stand for.
+# Presets that a ball can represent.
 ROUND = ("palpation", "bipolar", "dissector")
-# Least depth as a share of the radius; a ball that goes deeper than this would be swallowed, having no shaft.
+# Smallest and largest depth of a ball as shares of its radius: deeper, a ball without shaft would be swallowed.
 SHALLOW, DEEP = 0.05, 0.9
-# Greatest depth of a rod in radii, and of a blade in widths; a blade leans by so much at most [rad].
+# Largest depth of a rod [radii] and of a blade [widths]; largest tilt of a blade [rad].
 ROD, BLADE, LEAN = 2.0, 2.0 / 3.0, np.radians(20.0)
-# A tool comes down until it is so near [m], in so many steps at most; triangles are seen at so many rows of points.
+# Lowering of a tool: distance that counts as contact [m], maximum number of steps, rows of sample points a triangle.
 TOUCHES, STEPS, ROWS = 1e-6, 200, 4
-# However small a tool is, the surface is looked at within three times this [m].
+# Smallest search radius of the surface, times three [m].
 AROUND = 10e-3
 
 
 def tool_of(preset: str) -> Ball:
-    """The ball that stands for a round tool: of the middle of the tool's own radii.
+    """Return the ball that represents a round tool, with the mean of the tool's radii.
 
     Raises
     ------
@@ -43,17 +43,18 @@ def tool_of(preset: str) -> Ball:
 
 
 def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, tool: BuiltIn | None = None) -> Loads:
-    """Draw `count` poses of a tool, pressed into the open cortex; load i depends as in `surrogate.draw`.
+    """Sample `count` poses of a tool, pressed into the open cortex; load i depends as in `surrogate.draw`.
 
-    Places are uniform by area, and the tool's end lies inside the rim. Of a ball, places and directions are those of
-    the preset's forces. Depths are uniform from 0.05 to 0.9 of the radius, and no deeper than the preset's tool goes.
-    Rods and blades go straight ahead from where they touch first. They are turned at random about their shaft. Rods
-    lean as the preset's tool does, and go to two radii. Blades lean by 20 degrees, and go to two thirds of their width.
+    Positions are uniform by area, and the tool's end is inside the edge. For a ball, positions and directions are those
+    of the preset's forces. Depths are uniform from 0.05 to 0.9 of the radius, and no deeper than the preset's tool
+    goes. Rods and blades move straight along their shaft from the first contact. They are turned at random about their
+    shaft. Rods tilt as the preset's tool does, and go to two radii. Blades tilt by up to 20 degrees, and go to two
+    thirds of their width.
 
     Parameters
     ----------
     tool
-        By default the ball that stands for the preset.
+        By default the ball that represents the preset.
 
     Raises
     ------
@@ -80,7 +81,7 @@ def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, tool: Built
 
 
 def poses_at(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.ndarray) -> Touching:
-    """Poses of a ball that touches first at point (B, 3) [m], of inward normal (B, 3), and goes on by motion (B, 3)."""
+    """Compute poses of a ball: first contact at point (B, 3) [m] with inward normal (B, 3), then motion (B, 3)."""
     shaft = -motion / np.linalg.norm(motion, axis=1, keepdims=True)
     pose = np.zeros((len(point), 1, 4, 4))
     pose[:, 0, 3, 3] = 1.0
@@ -90,7 +91,7 @@ def poses_at(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.ndarr
 
 
 def _turned(shaft: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Rotations (B, 3, 3) whose z is `shaft` (B, 3), turned about it by angles (B,) [rad]."""
+    """Build rotations (B, 3, 3) whose z is `shaft` (B, 3), turned about it by angles (B,) [rad]."""
     first, second = across(shaft)
     x = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
     return np.stack([x, np.cross(shaft, x), shaft], axis=2)
@@ -99,10 +100,10 @@ def _turned(shaft: np.ndarray, angle: np.ndarray) -> np.ndarray:
 def _lowered(
     tool: Capsule | Spatula, patch: Patch, point: np.ndarray, rotation: np.ndarray, depth: np.ndarray
 ) -> Touching:
-    """Poses of a tool that comes down its shaft over point (B, 3) until it touches, and goes on by depth (B,) [m].
+    """Lower a tool along its shaft over point (B, 3) until contact, and on by depth (B,) [m]; return the poses.
 
-    It may go at least as far as it is from the surface's nearest point (Hart 1996, "Sphere tracing", Visual Comput.
-    12:527-545). The surface is looked at in `ROWS`^2 points a triangle.
+    Each step is the distance to the surface's nearest point (Hart 1996, "Sphere tracing", Visual Comput. 12:527-545).
+    The surface is sampled by `ROWS`^2 points a triangle.
     """
     share = barycentric_lattice(ROWS)
     surface = np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)

@@ -1,1 +1,1 @@
-"""How far off models are, and whether they keep what they promise."""
+"""Errors of models, and the empirical coverage of their bounds."""

@@ -1,4 +1,4 @@
-"""Which deformer to take, given how far off it may be or how long it may take, and which of them no other beats."""
+"""Selection of a deformer by error limit or time limit, and the Pareto front of error and time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sim.errors import InputError
 
 @dataclass(frozen=True)
 class Offer:
-    """A deformer's name, the error that it states [mm], and the median time of one load [ms]."""
+    """Name of a deformer, its reported error [mm], and the median time of one load [ms]."""
 
     name: str
     error_mm: float
@@ -22,19 +22,21 @@ class Offer:
 
 @dataclass(frozen=True)
 class Choice:
-    """The offer taken, and a sentence that says why."""
+    """Selected deformer, and a sentence with the reason."""
 
     offer: Offer
     reason: str
 
 
 def choose(offers: Sequence[Offer], within_mm: float | None = None, within_ms: float | None = None) -> Choice:
-    """The fastest offer within an error; without one, the most accurate within a time. Both may be given.
+    """Select the fastest deformer within an error limit; without one, the most accurate within a time limit.
+
+    If both limits are given, both are satisfied.
 
     Raises
     ------
     InputError
-        No offer is within what is given, or nothing is given; an error or a time that is not positive.
+        No deformer within the limits, or no limit; an error or a time that is not positive.
     """
     given = {"mm": within_mm, "ms": within_ms}
     bounds = [f"{bound:g} {unit}" for unit, bound in given.items() if bound is not None]
@@ -64,7 +66,7 @@ def _time(offer: Offer) -> tuple[float, float]:
 
 
 def unbeaten(places: Mapping[str, tuple[float, float]]) -> frozenset[str]:
-    """Names whose two numbers no other equals or undercuts in both: the Pareto front, equals included."""
+    """Return the names on the Pareto front of two numbers (smaller is better), equals included."""
     return frozenset(
         name
         for name, (time, error) in places.items()

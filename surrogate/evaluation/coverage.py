@@ -1,4 +1,4 @@
-"""Whether a model keeps what it promises: its bounds against the errors on loads that it has never seen."""
+"""Empirical coverage of a model's bounds on loads that it was not trained on."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..model.learned import Learned
 
 TENTHS = 10
 Held = tuple[float | None, ...]
-"""For each of `conformal.LEVELS`, the share of loads within their bounds; None where bounds promise nothing."""
+"""Share of loads within their bounds for each of `conformal.LEVELS`; None where bounds give no guarantee."""
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,14 @@ class Coverage:
     loads
         n.
     held
-        Shares of the loads whose error lies below the bound, for `conformal.LEVELS`; None where too few loads
-        calibrated to promise anything. The error is the largest at the tumour, or that of the distance from tip to
-        tumour.
+        Empirical coverage for `conformal.LEVELS`; None if there were too few calibration loads for a guarantee. The
+        error is the maximum over the tumour, or that of the distance from tip to tumour.
     tenths
-        The same for the first level, by tenths of the force, from weak to strong.
+        Coverage at the first level, by deciles of the force, from weak to strong.
     bound_mm, error_mm
         Medians over the loads of the bound at the first level, and of the error [mm].
     extrapolated
-        Loads that the model marks as outside its training.
+        Number of loads that the model marks as outside its training.
     """
 
     loads: int
@@ -55,12 +54,12 @@ class Coverage:
 
 
 def coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
-    """How often a model's bounds held, against displacements `truth` (B, n, 3) [m] of the tumour's vertices.
+    """Compute the coverage of a model's bounds, by displacements `truth` (B, n, 3) [m] of the tumour's vertices.
 
     Raises
     ------
     InputError
-        A model without bounds, or fewer loads than tenths.
+        A model without bounds, or fewer loads than deciles.
     """
     if model.bounds is None:
         raise InputError("this model has no calibrated bounds: train it on a data set with more loads.")
@@ -71,15 +70,15 @@ def coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
 
 
 def distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
-    """How often the bound of a model's distance held, against the finite elements' distances `truth` (B,) [m].
+    """Compute the coverage of the bound of a model's distance, by the FEM distances `truth` (B,) [m].
 
     Raises
     ------
     InputError
-        A model without a bound of its distance, or fewer loads than tenths.
+        A model without a bound of its distance, or fewer loads than deciles.
     """
     if model.tip is None or model.tip.bound is None:
-        raise InputError("this model has no calibrated bound of its distance: train it anew, with enough loads.")
+        raise InputError("this model has no calibrated bound of its distance: train it again, with enough loads.")
     _demand_tenths(loads)
     answer = model.deform(loads, at=model.nodes)
     found = model.distance(loads, answer)
@@ -92,7 +91,7 @@ def _demand_tenths(loads: Loads) -> None:
 
 
 def held_by(error: np.ndarray, bound: np.ndarray) -> Held:
-    """Shares of errors (B,) within bounds (levels, B) of the same unit; infinite ones promise nothing."""
+    """Compute shares of errors (B,) within bounds (levels, B) of the same unit; None if all bounds are infinite."""
     promised = ~np.isposinf(bound)
     return tuple(
         float((error <= row)[some].mean()) if some.any() else None for row, some in zip(bound, promised, strict=True)
@@ -100,16 +99,16 @@ def held_by(error: np.ndarray, bound: np.ndarray) -> Held:
 
 
 def held_words(held: Held) -> str:
-    """How often bounds held, in words."""
+    """Describe the coverage at each level."""
     shares = zip(held, LEVELS, strict=True)
     return ", ".join(
-        f"nothing is promised at {100 * level:g} %" if share is None else f"{100 * share:.1f} % at {100 * level:g} %"
+        f"no guarantee at {100 * level:g} %" if share is None else f"{100 * share:.1f} % at {100 * level:g} %"
         for share, level in shares
     )
 
 
 def covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolated: int) -> Coverage:
-    """How often errors (B,) [m] lie below bounds (2, B) [m], under forces (B,) [N]; so many loads lie outside."""
+    """Compute the coverage of errors (B,) [m] by bounds (2, B) [m], overall and by deciles of force (B,) [N]."""
     held = error <= bound[0]
     by_force = np.array_split(np.argsort(force, kind="stable"), TENTHS)
     return Coverage(

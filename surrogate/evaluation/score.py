@@ -32,10 +32,10 @@ class SolveCounts:
     series
         Linear solves of the power series: places x radii x terms.
     inside
-        Those of them inside the discs left out that are of the tumour.
+        Those of them inside held-out discs that are of the tumour.
     seconds
-        Of all these solves, on the machine that made them; None where the data do not state it, and where a stopped run
-        went on.
+        Of all these solves, on the machine that ran them; None if the data do not record it, or if an interrupted run
+        was resumed.
     """
 
     loads: int
@@ -56,20 +56,20 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ForceScore:
-    """The error of a tool's force, the length of a vector, over n loads under which it presses.
+    """Error of a tool's force vector, over n loads under which it presses.
 
     Parameters
     ----------
     loads
         n.
     force
-        Mean of the finite elements' forces [N].
+        Mean of the FEM forces [N].
     mean
-        Of the errors [N].
+        Mean error [N].
     mean_percent, p95_percent
         Of each error divided by its load's force [%].
     held
-        Shares of the loads whose error lies below the bound, as in `Coverage`; None where none is promised.
+        Empirical coverage of the bound, as in `Coverage`; None without a bound.
     bound
         Median of the bound at the first level [N]; None as above.
     """
@@ -93,7 +93,7 @@ class ForceScore:
 
 
 def force_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Lengths (B,) [N] of the differences between forces (B, 3)."""
+    """Compute the norms (B,) [N] of the differences between forces (B, 3)."""
     return np.linalg.norm(found - truth, axis=1)
 
 
@@ -126,31 +126,31 @@ def force_score(error: np.ndarray, truth: np.ndarray, bound: np.ndarray | None =
 
 
 def judged_force(model: Learned, loads: Loads, truth: np.ndarray) -> ForceScore:
-    """Score a model's forces against the finite elements' (B, 3) [N]."""
+    """Score a model's forces relative to FEM forces (B, 3) [N]."""
     answer = model.deform(loads, at=model.anatomy.tumour_nodes)
     return force_score(force_errors(answer.reaction[:, 0, :3], truth), truth, answer.reaction_bound)
 
 
 @dataclass(frozen=True)
 class Score:
-    """Distances between prediction and reference over every load x vertex.
+    """Errors of a prediction relative to the reference over every load x vertex.
 
     Parameters
     ----------
     name
-        Of the deformer.
+        Name of the deformer.
     mean_mm, p95_mm, p999_mm, max_mm
-        [mm]; each p999 is None of fewer than `FEWEST_FOR_P999` loads.
+        [mm]; each p999 is None for fewer than `FEWEST_FOR_P999` loads.
     mean_percent, p95_percent, p999_percent, max_percent
-        Each distance divided by its load's motion, which is the mean displacement of the vertices in the reference [%].
+        Each error divided by its load's motion, which is the mean displacement of the vertices in the reference [%].
     worst_mean_mm, worst_p95_mm, worst_p999_mm
-        Of the worst vertex of each load, over the loads [mm]; the largest is `max_mm`.
+        Of the maximum vertex error of each load, over the loads [mm]; the largest is `max_mm`.
     microseconds
-        Median wall time of the whole answer to one load at a time, its bound and limits included, warm-up excluded.
+        Median wall time of `deform` for one load at a time, its bound and limits included, warm-up excluded.
     bare_microseconds
-        The same of the model alone in NumPy, which compares learners; None of what is no model of this project.
+        Median wall time of the model alone in NumPy, which compares model types; None for other deformers.
     solves
-        The finite-element solves that the deformer was given, where that is known.
+        Number of FEM solves that the deformer depends on, if known.
     """
 
     name: str
@@ -171,14 +171,14 @@ class Score:
 
 
 def errors(deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Distances (B, n) [m] between the deformer's answers and `truth` (B, n, 3) [m] at `nodes` (n,)."""
+    """Compute errors (B, n) [m] of a deformer relative to `truth` (B, n, 3) [m] at `nodes` (n,)."""
     return np.linalg.norm(deformer.deform(loads, at=nodes).displacement - truth, axis=2)
 
 
 def score(
     name: str, deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray, solves: SolveCounts | None = None
 ) -> Score:
-    """Hold a deformer to `truth` (B, n, 3) [m] at the vertices `nodes` (n,)."""
+    """Score a deformer relative to `truth` (B, n, 3) [m] at the vertices `nodes` (n,)."""
     distance = errors(deformer, loads, truth, nodes)
     motion = np.linalg.norm(truth, axis=2).mean(axis=1, keepdims=True)
     return Score(
@@ -193,12 +193,12 @@ def score(
 
 
 def microseconds(deformer: Deformer, loads: Loads, nodes: np.ndarray) -> float:
-    """Median wall time [us] of one load at a time."""
+    """Measure the median wall time [us] of one load at a time."""
     return 1e6 * float(np.median(single_seconds(deformer, loads, nodes, TIMED)))
 
 
 def bare_microseconds(deformer: Deformer, loads: Loads) -> float | None:
-    """Median wall time [us] of a learned model alone, of one load at a time; None of other deformers."""
+    """Measure the median wall time [us] of a trained model alone, of one load at a time; None for other deformers."""
     if not isinstance(deformer, Learned):
         return None
     single = [deformer.asked(loads.rows(slice(row, row + 1))) for row in np.arange(WARM_UP + TIMED) % len(loads)]
@@ -208,13 +208,13 @@ def bare_microseconds(deformer: Deformer, loads: Loads) -> float | None:
 
 
 def single_seconds(deformer: Deformer, loads: Loads, nodes: np.ndarray, count: int) -> list[float]:
-    """Wall times [s] of `count` answers to one load at a time, the loads in turns, warm-up excluded."""
+    """Measure wall times [s] of `count` solves of one load at a time, cycling through the loads, warm-up excluded."""
     single = [loads.rows(slice(row, row + 1)) for row in np.arange(WARM_UP + count) % len(loads)]
     return _timed(lambda one: deformer.deform(one, at=nodes), single)
 
 
 def _timed(answer: Callable[[T], object], single: Iterable[T]) -> list[float]:
-    """Wall times [s] of one answer after the other, without the warm-up."""
+    """Measure wall times [s] of one call after the other, without the warm-up."""
     seconds = []
     for one in single:
         begun = time.perf_counter()
@@ -224,12 +224,12 @@ def _timed(answer: Callable[[T], object], single: Iterable[T]) -> list[float]:
 
 
 def winner(scores: Sequence[Score]) -> Score:
-    """The score of least mean error."""
+    """Return the score with the smallest mean error."""
     return min(scores, key=lambda row: row.mean_mm)
 
 
 def table(scores: Sequence[Score], motion_mm: float) -> str:
-    """The scores for people, then the winner of several, then the solves that learners were given, if known."""
+    """Format the scores, the best of several, and the solves that model types depend on, if known."""
     head = (
         "          mm, all vertices                | mm, a load's worst vertex  | % of motion                 "
         "| us, NumPy model\n"
@@ -252,12 +252,12 @@ def table(scores: Sequence[Score], motion_mm: float) -> str:
 
 
 def _known(value: float | None, form: str) -> str:
-    """A number, or a dash in its column."""
+    """Format a number, or a dash in its column."""
     return f"{'-':>{form.split('.')[0]}}" if value is None else f"{value:{form}}"
 
 
 def _solve_lines(scores: Sequence[Score]) -> list[str]:
-    """The solves that each learner was given, as lines."""
+    """Format the solves of each model type, as lines."""
     known = [(row.name, row.solves) for row in scores if row.solves is not None]
     if not known:
         return []
@@ -275,7 +275,7 @@ def _solve_lines(scores: Sequence[Score]) -> list[str]:
 
 
 def spread(values: np.ndarray) -> tuple[float, float, float | None, float]:
-    """Mean, 95 and 99.9 percentile, and maximum of values (B, ...) of B loads; no 99.9 percentile of too few loads."""
+    """Compute mean, 95th and 99.9th percentile (None for too few loads), and maximum of values (B, ...) of B loads."""
     p95, p999 = np.percentile(values, (95.0, 99.9))
     return (
         float(values.mean()),

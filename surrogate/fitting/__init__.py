@@ -1,1 +1,1 @@
-"""What tissue a patient has, from what is seen of the open cortex in several frames."""
+"""Estimation of a patient's tissue from observations of the open cortex in several frames."""

@@ -1,4 +1,4 @@
-"""Fit a patient's tissue to several frames: their evidence in each tissue, added up."""
+"""Estimation of a patient's tissue from several frames: sum of their log evidence in each tissue."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from .tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
 from .weighing import errors, of_drained, of_pressed, seen_of, unsupported, white, without
 
 EXPONENTS = (9.5, 19.0)
-"""-m of Ogden's law, as probable each: tissue stiffens as it is dented, so that a dent alone tells no modulus."""
+"""Candidate -m of Ogden's law, equally probable: tissue stiffens with indentation, so a dent alone gives no E."""
 YOUNGS = np.geomspace(300.0, 12000.0, 300)
-"""Young's moduli [Pa] that are as probable, at small strain."""
-# Forces that are solved, over what linear tissue would need.
+"""Candidate Young's moduli [Pa] at small strain, equally probable."""
+# Solved forces relative to the force needed for linear tissue.
 TIMES = (0.6, 1.2, 2.2, 3.6, 5.5)
 # A command's mesh and elements are dented as deep as finer or quadratic ones by a force that is so many times less: on
 # the template 1.08 to 1.16 times (docs/notes/fit_experiments.md).
 SOFT = 1.11
-# What the logarithm of a modulus is off by beside that.
+# Standard deviation of the logarithm of a modulus by further errors.
 OFF = 0.45
-# How often errors are made anew, by the dent that is believed.
+# Number of times that errors are recomputed from the estimated dent.
 ROUNDS = 3
-# Of a reading: normal numbers, as probable each. Samples of a modulus.
+# Normal quantiles of a force reading, equally probable; number of samples of a modulus.
 READINGS, SAMPLES = np.array([-1.4, -0.7, 0.0, 0.7, 1.4]), 101
 
 
@@ -53,12 +53,12 @@ def young_moduli(
     device: str = "auto",
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> np.ndarray:
-    """Young's moduli (k,) [Pa] of the brain, as probable each; none where no force was read.
+    """Sample Young's moduli (k,) [Pa] of the brain, equally probable; empty if no force was measured.
 
     Raises
     ------
     InputError
-        A force that no answer of the finite elements reaches.
+        A force that FEM cannot reach.
     """
     columns = np.cumsum([0, *[3 * len(frame.tools) for frame in frames]])
     read = [number for number, frame in enumerate(frames) if any(tool.force is not None for tool in frame.tools)]
@@ -79,7 +79,7 @@ def young_moduli(
 def _weighed(
     anatomy: Anatomy, tool: Tool, evidence: Evidence, tissue: FittedTissue, pressed: Responses, own: slice, device: str
 ) -> np.ndarray:
-    """Logarithms of how probable one reading is by each of `YOUNGS`."""
+    """Compute the log-likelihood of one force reading for each of `YOUNGS`."""
     name = max(tissue.skulls, key=lambda skull: tissue.skulls[skull])
     skull, (_, poisson, _), (_, ratio, _) = "slide" if name == LETS_GO else name, tissue.poisson, tissue.ratio
     nearest = int(np.abs(POISSONS - poisson).argmin()), int(np.abs(np.log(RATIOS / ratio)).argmin())
@@ -101,7 +101,7 @@ def _weighed(
         off = white(lower, (evidence.value - shape).reshape(-1, len(value)).T)
         logs = -0.5 * (off**2).sum(axis=0).reshape(shape.shape[:-1])
         logs = np.where(inside, logs, logs.min() - 50.0)
-        # What tissue lacks is a share of the dent that is now believed.
+        # The model error is a share of the estimated dent.
         lower, _ = errors(evidence, shape.reshape(-1, len(value))[logs.argmax()])
     return np.asarray(logsumexp(logs, axis=(0, 1)))
 
@@ -110,7 +110,7 @@ def _dents(
     anatomy: Anatomy, tool: Tool, group: Group, evidence: Evidence, pressed: Responses, sizes: np.ndarray,
     direction: np.ndarray, device: str,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Forces (k,) [N] that have an equilibrium in tissue of modulus `YOUNG`, and what is seen of each (k, m) [m]."""
+    """Solve forces in tissue of modulus `YOUNG`; return converged ones (k,) [N] and their observations (k, m) [m]."""
     loads = force_loads(anatomy, foot(anatomy, tool)[None], np.array([tool.radius]), sizes[:, None] * direction)
     answer = Fem(anatomy, group.effects((0.01,)), ACCURACY, device).deform(loads)
     good = np.array([outcome.good for outcome in answer.outcome])
@@ -128,10 +128,10 @@ def fit_tissue(
     progress: Callable[[str, int, int], object] = lambda stage, done, total: None,
     left_out: Sequence[np.ndarray] | None = None,
 ) -> FittedTissue:
-    """What is known of the tissue of a locator's anatomy, from some frames of it.
+    """Estimate the tissue of a locator's anatomy from some frames.
 
-    Points that no other supports are left out: `left_out`, or what is found now. Finite elements that a `folder` keeps
-    are read. `progress` hears a stage, how many of its parts are done, and of how many.
+    Points that no other supports are removed: `left_out`, or those found now. FEM results in `folder` are read.
+    `progress` receives a stage, the number of its parts done, and their total.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def fitted(
     device: str = "auto",
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> FittedTissue:
-    """What frames say of the tissue, as `fit_tissue`, of what is solved; `progress` hears of forces that were read."""
+    """Estimate the tissue as `fit_tissue`, from solved responses; `progress` receives the number of forces done."""
     with one_thread():  # products are small
         probability = probability_of(weighed(locator, frames, drained, pressed))
     tissue = FittedTissue(locator.anatomy.digest, len(frames), probability, np.zeros(0))
@@ -181,14 +181,14 @@ def fitted(
 
 
 def beside_tumour(locator: Locator) -> tuple[Region, ...]:
-    """The regions that a locator knows, but the tumour, whose stiffness a fit finds."""
+    """Return the regions of a locator other than the tumour, whose stiffness is estimated."""
     return tuple(one for one in locator.regions if one.label != TUMOUR_LABEL)
 
 
 def weighed(
     locator: Locator, frames: Sequence[Frame], drained: Responses | None, pressed: Responses | None
 ) -> np.ndarray:
-    """Logarithms (skulls, poissons, ratios) of how probable all frames are in the tissues that were solved."""
+    """Compute the log-likelihood (skulls, poissons, ratios) of all frames in the solved tissues."""
     total, first = np.zeros((1, len(POISSONS), len(RATIOS))), 0
     for frame in frames:
         evidence, last = placed(locator.anatomy, frame.observation), first + 3 * len(frame.tools)
@@ -201,7 +201,7 @@ def weighed(
 
 
 def probability_of(total: np.ndarray) -> np.ndarray:
-    """Probabilities on the fine grid: logarithms are smooth in that of the ratio, and in how compressible it is."""
+    """Interpolate probabilities to the fine grid: logarithms are smooth in log ratio and in compressibility."""
     fine = CubicSpline(np.log(RATIOS), total, axis=2)(np.log(FINE_RATIOS))
     order = np.argsort(1.0 - 2.0 * POISSONS)
     x, want = (1.0 - 2.0 * POISSONS)[order], 1.0 - 2.0 * FINE_POISSONS

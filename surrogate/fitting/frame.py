@@ -18,13 +18,13 @@ from ..locating.observation import FAR_NOW, Observation, placed
 from ..locating.observed_files import PLACE, SIGMA, read_columns
 
 RADIUS = 6e-3
-"""Of the disc on which a tool presses, if nothing else is known [m]."""
-# Radii of tools [m], and forces [N] beyond which no tool presses on a brain.
+"""Default radius of the disc on which a tool presses [m]."""
+# Range of tool radii [m], and largest force of a tool on a brain [N].
 RADII, HARDEST = (0.5e-3, 30e-3), 10.0
 FORCE_SIGMA = 0.1
-"""Standard deviation of a force that is read, as a share of it, if nothing else is known."""
+"""Default standard deviation of a measured force, relative to it."""
 FRAME, WIDE, FORCE = "frame", "radius", "force"
-# What may follow the place, and which columns cells may be empty of.
+# Allowed columns after the position, and columns with optional cells.
 ALLOWED = {
     (FRAME, *PLACE, *more) for more in ((), (WIDE,), (FORCE,), (WIDE, FORCE), (FORCE, SIGMA), (WIDE, FORCE, SIGMA))
 }
@@ -33,16 +33,16 @@ EMPTY = (WIDE, FORCE, SIGMA)
 
 @dataclass(frozen=True)
 class Tool:
-    """A tool that presses on the open cortex.
+    """Tool that presses on the open cortex.
 
     Parameters
     ----------
     tip
-        (3,) [m], RAS: where it touches.
+        (3,) [m], RAS: contact position.
     radius
         [m] of the disc on which it presses.
     force, sigma
-        How hard it presses [N], and that reading's standard deviation; None: nobody read it.
+        Force [N], and its standard deviation; None: not measured.
     """
 
     tip: tuple[float, float, float]
@@ -53,20 +53,20 @@ class Tool:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What was seen, and the tools that pressed meanwhile; without any, fluid has drained."""
+    """Observation, and the tools that pressed during it; without tools, fluid has drained."""
 
     observation: Observation
     tools: tuple[Tool, ...] = ()
 
 
 def check_frames(anatomy: Anatomy, frames: Sequence[Frame]) -> None:
-    """Refuse frames that say nothing of a body.
+    """Check that frames are usable for an anatomy.
 
     Raises
     ------
     InputError
-        No frames; the same frame twice; what `placed` refuses; clouds; tools that are off the open cortex, too wide,
-        or whose force is none.
+        No frames; the same frame twice; errors of `placed`; clouds; tools that are off the open cortex, too wide, or
+        with an invalid force.
     """
     if not frames:
         raise InputError("there is no frame to fit tissue to: give what was seen of the open cortex, a file a frame.")
@@ -89,7 +89,7 @@ def check_frames(anatomy: Anatomy, frames: Sequence[Frame]) -> None:
 
 
 def foot(anatomy: Anatomy, tool: Tool) -> np.ndarray:
-    """The point (3,) [m] of the open cortex at rest that is nearest to a tool's tip."""
+    """Return the point (3,) [m] of the undeformed open cortex nearest to a tool's tip."""
     return closest(np.array([tool.tip]), open_cortex(anatomy).corners).point[0]
 
 
@@ -100,7 +100,7 @@ def _check(anatomy: Anatomy, tool: Tool) -> None:
     away = float(np.linalg.norm(foot(anatomy, tool) - tool.tip))
     if away > FAR_NOW:
         raise InputError(
-            f"a tool lies {1e3 * away:.0f} mm off the open cortex, so that it cannot press on it: give millimetres, "
+            f"a tool is {1e3 * away:.0f} mm from the open cortex, so that it cannot press on it: give millimetres, "
             "RAS, or leave it out."
         )
     if not RADII[0] <= tool.radius <= RADII[1]:
@@ -115,14 +115,14 @@ def _check(anatomy: Anatomy, tool: Tool) -> None:
 
 
 def read_tools(path: str | Path, frames: int) -> tuple[tuple[Tool, ...], ...]:
-    """Read `frame,x,y,z[,radius][,force[,sigma]]`: the tools of each of so many frames, which count from 1.
+    """Read `frame,x,y,z[,radius][,force[,sigma]]`: the tools of each of `frames` frames, which count from 1.
 
-    Cells of radius, force and sigma may be empty: the usual radius, and a force that nobody read.
+    Cells of radius, force and sigma may be empty: the default radius, and a force that was not measured.
 
     Raises
     ------
     InputError
-        A file that is missing or no such table; a frame that there is not.
+        A file that is missing or not such a table; a frame that does not exist.
     """
     columns = read_columns(path, ALLOWED, EMPTY)
     found: list[list[Tool]] = [[] for _ in range(frames)]

@@ -1,4 +1,4 @@
-"""How linear tissue moves under drained fluid and under forces, tissue by tissue: what frames are held against."""
+"""Responses of linear tissue to drained fluid and to forces, for each tissue, as basis of the likelihood."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from ..locating.regions import Region, beside
 from ..model.kept_arrays import kept_arrays, kept_path
 
 RATIOS = np.geomspace(0.4, 3.2, 4)
-"""Stiffness of the tumour over the brain's, in the tissues that are solved."""
+"""Candidate ratios of tumour to brain stiffness, for which FEM is solved."""
 POISSONS = np.array([0.45, 0.47, 0.4945])
-"""Poisson's ratio of brain and tumour in them."""
+"""Candidate Poisson's ratios of brain and tumour."""
 LINEAR = ("bonded", "slide")
-"""Skulls in which they are solved; one that lets go holds what tools press against it as one that lets it slide."""
+"""Skulls for which FEM is solved; one that separates keeps contact under a tool, as sliding contact does."""
 FORCE = 0.01
-"""Of a tool, along each axis [N]."""
-# Ways that the head lies, and shares of the fluid that are left in each.
+"""Tool force along each axis [N]."""
+# Number of head positions, shares of the remaining fluid in each, random seed.
 POSTURES, LEVELS, SEED = 6, (0.7, 0.4, 0.15), 5
 ACCURACY = Accuracy(tolerance=1e-3)
 
@@ -48,7 +48,7 @@ class Responses:
     motion
         By skull: (poissons, ratios, loads, n, 3) [m], of tissue as stiff as that of `locating.causes`.
     regions
-        Beside which it was solved.
+        Known regions that were included.
     """
 
     nodes: np.ndarray
@@ -57,7 +57,7 @@ class Responses:
 
 
 def drained_loads(anatomy: Anatomy) -> Loads:
-    """Fluid that drains while the head lies in some ways."""
+    """Build loads of drained fluid for sampled head positions."""
     down = directions(np.random.default_rng(SEED), open_cortex(anatomy).axis, replace(USUAL, drainages=POSTURES))
     every = [(way, fluid_level(anatomy.mesh.nodes, way, left)) for left in LEVELS for way in down]
     way, level = (np.array(each) for each in zip(*every, strict=True))
@@ -67,7 +67,7 @@ def drained_loads(anatomy: Anatomy) -> Loads:
 
 
 def force_loads(anatomy: Anatomy, point: np.ndarray, radius: np.ndarray, force: np.ndarray | None = None) -> Loads:
-    """Forces (n, 3) [N] on discs round points (k, 3) of some radii (k,) [m]; None: along each axis of each point."""
+    """Build forces (n, 3) [N] on discs round points (k, 3) with radii (k,) [m]; None: along each axis of each point."""
     some = FORCE * np.tile(np.eye(3), (len(point), 1)) if force is None else force
     each, count = len(some) // len(point), len(some)
     pushed = Pushed(np.repeat(point, each, axis=0), some, np.repeat(radius, each))
@@ -84,9 +84,9 @@ def responses(
     progress: Callable[[int, int], object] = lambda done, total: None,
     regions: tuple[Region, ...] = (),
 ) -> Responses:
-    """Solve each tissue, beside known `regions`. Those that a `folder` keeps, of the same loads, are read.
+    """Solve each tissue, with known `regions`. Results that a `folder` holds for the same loads are read.
 
-    `progress` hears how many tissues are done, and of how many.
+    `progress` receives the number of tissues done and their total.
     """
     nodes, found = telling_nodes(anatomy), []
     every = list(product(LINEAR, POISSONS, RATIOS))
@@ -106,7 +106,7 @@ def _kept(
     device: str,
     folder: Path | None,
 ) -> np.ndarray:
-    """Motions (loads, n, 3) [m] of one tissue, from the folder if they are there."""
+    """Read motions (loads, n, 3) [m] of one tissue from the folder, or compute and store them."""
     numbers = [array for cause in loads.causes for array in vars(cause).values()]
     stated = anatomy.digest, recommended(anatomy.mesh), tissue, ACCURACY, digest_of(*numbers)
     path = kept_path(folder, "", device, *stated)

@@ -14,13 +14,14 @@ from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
 
 FINE_RATIOS = np.geomspace(0.4, 3.2, 33)
-"""Stiffness of the tumour over the brain's, equally probable before anything is seen."""
+"""Ratios of tumour to brain stiffness, equally probable a priori."""
 FINE_POISSONS = np.linspace(0.45, 0.4945, 13)
-"""Poisson's ratios, equally probable before."""
+"""Poisson's ratios, equally probable a priori."""
 CLASSES = {"compressible": (0.0, 0.4725), "nearly incompressible": (0.4725, 0.5)}
-"""Poisson's ratios in two classes, as probable before."""
+"""Two classes of Poisson's ratio, equally probable a priori."""
 INTERVAL = (0.025, 0.5, 0.975)
-# An interval that is wider than this share of the prior's says nothing new; so do probabilities nearer to the prior's.
+# Width of an interval, relative to the prior's, and distance of probabilities from the prior's, that count as
+# uninformative.
 AS_WIDE, AS_PROBABLE = 0.85, 0.15
 FORMAT = "sulcus tissue 1"
 SUFFIX = ".tissue.json"
@@ -28,18 +29,18 @@ SUFFIX = ".tissue.json"
 
 @dataclass(frozen=True, eq=False)
 class FittedTissue:
-    """Probabilities of a patient's tissue.
+    """Posterior of a patient's tissue.
 
     Parameters
     ----------
     anatomy
-        Digest of the body.
+        Digest of the anatomy.
     frames
-        How many it was fitted to.
+        Number of frames.
     probability
         (skulls, poissons, ratios), which sum to 1: of `sim.effects.SKULLS`, `FINE_POISSONS` and `FINE_RATIOS`.
     young
-        (k,) Young's moduli of the brain [Pa], as probable each; empty: no force was read, and nothing is known of it.
+        (k,) samples of the brain's Young's modulus [Pa], equally probable; empty if no force was measured.
     """
 
     anatomy: str
@@ -49,7 +50,7 @@ class FittedTissue:
 
     @property
     def ratio(self) -> tuple[float, float, float]:
-        """Tumour's stiffness over the brain's: 2.5 %, 50 % and 97.5 % of the probability lie below."""
+        """Stiffness of the tumour over the brain's: 2.5, 50 and 97.5 % quantiles."""
         low, middle, high = np.exp(_quantiles(np.log(FINE_RATIOS), self.probability.sum(axis=(0, 1))))
         return float(low), float(middle), float(high)
 
@@ -67,13 +68,13 @@ class FittedTissue:
 
     @property
     def poisson(self) -> tuple[float, float, float]:
-        """Poisson's ratio, as `ratio`."""
+        """Poisson's ratio: quantiles as in `ratio`."""
         low, middle, high = _quantiles(FINE_POISSONS, self.probability.sum(axis=(0, 2)))
         return float(low), float(middle), float(high)
 
     @property
     def stiffness(self) -> tuple[float, float, float] | None:
-        """Young's modulus of the brain at small strain [Pa], as `ratio`; None: no force was read."""
+        """Young's modulus of the brain at small strain [Pa]: quantiles as in `ratio`; None if no force was measured."""
         if not len(self.young):
             return None
         low, middle, high = np.quantile(self.young, INTERVAL)
@@ -81,7 +82,7 @@ class FittedTissue:
 
     @property
     def not_known(self) -> list[str]:
-        """What the frames say nothing of."""
+        """Quantities that the frames do not determine."""
         low, _, high = self.ratio
         found = (
             []
@@ -96,7 +97,7 @@ class FittedTissue:
     def drawn(
         self, count: int, seed: int = 0, skulls: tuple[str, ...] = tuple(SKULLS)
     ) -> tuple[list[str], np.ndarray, np.ndarray]:
-        """So many skulls, Poisson's ratios and ratios, which go together, where only some skulls may be."""
+        """Sample `count` triples of skull, Poisson's ratio and stiffness ratio, restricted to some skulls."""
         random = np.random.default_rng([seed, 2])
         allowed = np.array([name in skulls for name in SKULLS])
         share = (self.probability * allowed[:, None, None]).ravel()
@@ -113,12 +114,12 @@ def _quantiles(values: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def tissue_path(anatomy: str | Path) -> Path:
-    """Where the fitted tissue of an anatomy file is looked for: MESH.tissue.json beside MESH.vtu."""
+    """Return the path of an anatomy's fitted tissue: MESH.tissue.json next to MESH.vtu."""
     return Path(anatomy).with_suffix(SUFFIX)
 
 
 def save_tissue(path: str | Path, tissue: FittedTissue) -> None:
-    """Write fitted tissue; the file appears whole or not at all."""
+    """Write fitted tissue atomically."""
     stored = {
         "format": FORMAT, "anatomy": tissue.anatomy, "frames": tissue.frames, "skull": list(SKULLS),
         "poisson": FINE_POISSONS.tolist(), "ratio": FINE_RATIOS.tolist(),
@@ -134,16 +135,16 @@ def load_tissue(path: str | Path, digest: str) -> FittedTissue:
     Raises
     ------
     InputError
-        A file that is missing, none of this version, damaged, or of another anatomy.
+        A file that is missing, not of this version, damaged, or of another anatomy.
     """
-    with read_as(path, "fitted tissue", "Make it anew by `sulcus fit`."):
+    with read_as(path, "fitted tissue", "Make it again by `sulcus fit`."):
         stored = json.loads(Path(path).read_text(encoding="utf-8-sig"))
         if stored["format"] != FORMAT or stored["skull"] != list(SKULLS):
-            raise InputError(f"{path}: is no fitted tissue of this version: make it anew by `sulcus fit`.")
+            raise InputError(f"{path}: is not a fitted tissue of this version: make it again by `sulcus fit`.")
         if stored["anatomy"] != digest:
             raise InputError(f"{path}: was fitted to another anatomy: give that one, or fit tissue to this one.")
         probability, young = (np.array(stored[name], float) for name in ("probability", "young"))
         fits = probability.shape == (len(SKULLS), len(FINE_POISSONS), len(FINE_RATIOS)) and young.ndim == 1
         if not fits or not (probability >= 0.0).all() or abs(probability.sum() - 1.0) > 1e-6 or not (young > 0.0).all():
-            raise InputError(f"{path}: holds no probabilities: make it anew by `sulcus fit`.")
+            raise InputError(f"{path}: holds no probabilities: make it again by `sulcus fit`.")
         return FittedTissue(stored["anatomy"], int(stored["frames"]), probability, young)

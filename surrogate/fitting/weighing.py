@@ -1,4 +1,4 @@
-"""How probable one frame is in each tissue: a Gaussian of unknown sizes of the tissue's own motions, and of errors."""
+"""Likelihood of one frame in each tissue: Gaussian in the unknown sizes of the tissue's own motions, and in errors."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from .frame import Frame
 from .responses import LINEAR, Responses
 
 LACK, LACK_LENGTH = 0.05, 10e-3
-"""What linear tissue is off by where a point moves, as a share: white, and smooth over a length [m]."""
-# A point that hardly moves is off by that share of so much of the mean motion.
+"""Model error of linear tissue as a share of a point's motion: independent and correlated part; length [m]."""
+# Lower bound of a point's motion in the model error, relative to the mean motion.
 LEAST = 0.1
-# Sizes that motions may have, as shares of what is seen.
+# Candidate sizes of motions, relative to the observation.
 SIZES = (0.3, 1.0, 3.0)
-# Evidence counts as one part in so many: of drained fluid, and of tools, whose dents are far from linear.
+# Coarsening of evidence (exponent 1 / this): of drained fluid, and of tools, whose dents are nonlinear.
 COARSENED, COARSENED_TOOLS = 2.0, 8.0
 
 
 def of_drained(drained: Responses, prior: Prior, evidence: Evidence) -> np.ndarray:
-    """Logarithms (skulls, poissons, ratios) of how probable a frame is in which fluid has drained."""
+    """Compute the log-likelihood (skulls, poissons, ratios) of a frame with drained fluid."""
     lower, seen = errors(evidence)
     rows = {name: seen_of(drained, name, evidence) for name in LINEAR}
     own = (prior.kind == DRAINAGE) & (prior.skull == list(SKULLS).index("contact"))
@@ -44,9 +44,10 @@ def of_drained(drained: Responses, prior: Prior, evidence: Evidence) -> np.ndarr
 
 
 def of_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
-    """Logarithms (skulls, 1, 1) of how probable a frame is in which tools press: its `columns` (k,) of the responses.
+    """Compute the log-likelihood (skulls, 1, 1) of a frame with tools: its `columns` (k,) of the responses.
 
-    Dents of tools say which skull there is. What they seem to say of the rest is mostly how they stiffen tissue.
+    Dents of tools determine the skull only. Their information on Poisson's ratio and stiffness ratio is mostly that on
+    how they stiffen tissue.
     """
     lower, seen = errors(evidence)
     rows = {name: seen_of(pressed, name, evidence)[:, :, columns] for name in LINEAR}
@@ -58,7 +59,7 @@ def of_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -> n
 
 
 def seen_of(responses: Responses, skull: str, evidence: Evidence) -> np.ndarray:
-    """What is seen (poissons, ratios, loads, m) [m] of responses."""
+    """Compute the observed displacements (poissons, ratios, loads, m) [m] of responses."""
     column = np.searchsorted(responses.nodes, evidence.place.vertices)
     return np.einsum(
         "prlmki,mk,mi->prlm",
@@ -74,10 +75,10 @@ def _size(rows: np.ndarray) -> float:
 
 
 def errors(evidence: Evidence, believed: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-    """Cholesky factor (m, m) of the covariance of all errors, and the root mean square that is seen [m].
+    """Compute the Cholesky factor (m, m) of the covariance of all errors, and the root mean square observation [m].
 
-    What tissue lacks is a share of the motion that is `believed` (m,) [m]; None: of what is seen. That has errors, too:
-    points that seem to move farther then count less, so that motions seem smaller than they are.
+    The model error is a share of the motion that is `believed` (m,) [m]; None: of the observation. That includes noise:
+    points that seem to move farther are then down-weighted, so that motions are underestimated.
     """
     value = evidence.value if believed is None else believed
     length = np.sqrt(np.bincount(evidence.point, value**2))[evidence.point]
@@ -93,12 +94,12 @@ def errors(evidence: Evidence, believed: np.ndarray | None = None) -> tuple[np.n
 
 
 def white(lower: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Columns (m,) or (m, k) in units of errors whose covariance has the Cholesky factor `lower` (m, m)."""
+    """Whiten columns (m,) or (m, k) by errors whose covariance has the Cholesky factor `lower` (m, m)."""
     return solve_triangular(lower, columns, lower=True, check_finite=False)
 
 
 def _weighed(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: float) -> np.ndarray:
-    """Logarithms (poissons, ratios) of evidence for motions (poissons, ratios, loads, m) of size 1 together."""
+    """Compute log evidence (poissons, ratios) of motions (poissons, ratios, loads, m) of joint size 1."""
     motion = seen * white(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
     gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ white(lower, evidence.value)
     logs = []
@@ -110,12 +111,12 @@ def _weighed(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: floa
 
 
 def unsupported(locator: Locator, frames: Sequence[Frame]) -> tuple[np.ndarray, ...]:
-    """Of each frame the numbers (k,) of points, from 0, that `Locator.locate` leaves out.
+    """Return the point numbers (k,), from 0, that `Locator.locate` rejects in each frame.
 
     Raises
     ------
     InputError
-        A frame that no cause explains, or of which more than a third is left out.
+        A frame that no cause explains, or of which more than a third is rejected.
     """
     found = []
     for number, frame in enumerate(frames, start=1):
@@ -127,7 +128,7 @@ def unsupported(locator: Locator, frames: Sequence[Frame]) -> tuple[np.ndarray, 
 
 
 def without(frames: Sequence[Frame], left_out: Sequence[np.ndarray]) -> list[Frame]:
-    """Frames of points that have names, without those of some numbers (k,) in each."""
+    """Remove points of given numbers (k,) from each frame of points with correspondences."""
     return [
         _without(frame, numbers) if len(numbers) else frame for frame, numbers in zip(frames, left_out, strict=True)
     ]

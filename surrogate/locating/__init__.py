@@ -1,1 +1,1 @@
-"""Where the tumour is, from what is seen of the brain: causes, their ensemble, and what an observation says."""
+"""Tumour position from observations of the brain's surface: causes, their ensemble, prior and posterior."""

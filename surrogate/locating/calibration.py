@@ -1,4 +1,4 @@
-"""Covariances that hold: the estimator is tried on members of tissues and skulls that its prior does not know."""
+"""Calibration of covariances on ensemble members whose tissue and skull group are not in the prior."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from .prior import Prior, middle_of, prior_of
 from .rounds import settled
 
 LEVEL = 0.95
-"""Probability with which ellipsoids are made to hold."""
+"""Nominal coverage of ellipsoids."""
 RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
-"""The squared radius of a Gaussian's ellipsoid of that probability, in deviations: of chi-squared of three numbers."""
-# Trials in all. So many of those most like an observation say how far its covariance must grow.
+"""Squared radius of the 95 % ellipsoid of a Gaussian [standard deviations^2]: chi-squared, 3 degrees of freedom."""
+# Number of trials, and number of nearest trials (by `likeness`) that calibrate the covariance of an observation.
 TRIALS, NEAREST = 960, 120
-# What makes a cloud unlike all named points, in logarithms; and how much more than others that of the extent counts.
+# Feature offset that separates clouds from named points (log units); weight of the extent feature.
 UNLIKE, EXTENT = 1e3, 4.0
-# An observation may lie so far beyond all trials, in these logarithms: 400 points, the most that are looked at, do.
+# Tolerance beyond the largest trial features (log units), so that 400 points, the maximum used, are covered.
 MARGIN = 0.05
-# What moves the brain in a trial.
+# Causes that move the brain in a trial.
 ALONE = (TOOL, DRAINAGE, SWELLING, OEDEMA)
-# Points of a trial, the share of the open cortex that they lie on, how much softer its tissue is than the ensemble's,
-# and errors as shares of the usual. Rigid errors along each axis [m], and how often there is none.
+# Ranges of a trial: number of points, share of the open cortex, tissue compliance relative to the ensemble, errors
+# relative to `SIGMA`. Rigid error along each axis [m], probability of none.
 POINTS, COVER, SOFTER, ERRORS = (20, 400), (0.1, 1.0), (0.7, 2.0), (0.05, 1.0)
 SHIFTS, UNSHIFTED = (0.05e-3, 3e-3), 0.25
-# Of motion over error, so that its logarithm is finite.
+# Lower bound of motion over error, so that its logarithm is finite.
 LITTLE = 1e-3
-# A member that moves the open cortex by less [m] is in no trial.
+# Minimum RMS motion of the open cortex [m] for a member to be used in a trial.
 LEAST_SEEN = 0.5e-3
 
 
@@ -48,16 +48,17 @@ def trials(
     progress: Callable[[int, int], object] = lambda done, total: None,
     count: int = TRIALS,
 ) -> np.ndarray:
-    """What came of `count` trials (k, 5): `likeness` of each, and its error's square by its own covariance.
+    """Run `count` trials: features (`likeness`) and squared Mahalanobis error of each (k, 5).
 
-    Groups are left out in turn, so that a trial's tissue, tumour and directions are unknown to its estimator. A motion
-    in three is two causes' together. Rigid errors are as large as is stated, from none to 3 mm. In half of them the
-    points have no names, and are a cloud. What is refused is no trial. None has a tip: with one, errors are smaller.
+    Groups are held out one at a time, so that a trial's tissue, tumour and directions are not in its prior. One motion
+    in three combines two causes. Rigid errors have exactly the reported size, from 0 to 3 mm. Half of the trials use
+    point clouds (no correspondences). Rejected observations are skipped. No trial has a tip: with one, errors are
+    smaller.
 
     Raises
     ------
     InputError
-        No skull has two groups, of which one could be left out.
+        No skull has two groups, of which one could be held out.
     """
     fold, found = left_out(ensemble), []
     if fold.max() < 0:
@@ -78,7 +79,7 @@ def trials(
 
 
 def left_out(ensemble: Ensemble) -> np.ndarray:
-    """Turns (N,), from 0, in which members are left out: one group of each skull in each. -1: a skull's only group."""
+    """Compute the fold (N,), from 0, in which members are held out: one group per skull; -1: only group of a skull."""
     turn = np.full(len(ensemble.group), -1)
     for skull in np.unique(ensemble.skull):
         own = ensemble.skull == skull
@@ -89,7 +90,7 @@ def left_out(ensemble: Ensemble) -> np.ndarray:
 
 
 def covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
-    """By how much covariances must grow for ellipsoids of the tumour's middle to hold in 95 of 100 trials like this."""
+    """Compute the factor on covariances for tumour-centroid ellipsoids to cover 95 % of similar trials."""
     away = ((tried[:, :-1] - likeness(evidence)) ** 2).sum(axis=1)
     square = np.sort(tried[np.argsort(away, kind="stable")[:NEAREST], -1])
     rank = min(int(np.ceil(LEVEL * (len(square) + 1))), len(square))
@@ -97,7 +98,7 @@ def covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
 
 
 def was_tried(tried: np.ndarray, evidence: Evidence) -> bool:
-    """Whether such an observation lies within the range of the trials. They have the largest patch that there is."""
+    """Return True if the features are in the range of the trials, which include the largest extent."""
     own = likeness(evidence)
     alike = tried[tried[:, -2] == own[-1], :-1]
     within = len(alike) and (own >= alike.min(axis=0)).all()
@@ -105,11 +106,11 @@ def was_tried(tried: np.ndarray, evidence: Evidence) -> bool:
 
 
 def likeness(evidence: Evidence) -> np.ndarray:
-    """What trials are compared by (4,): three logarithms, then 0, or `UNLIKE` for a cloud.
+    """Compute the features (4,) by which trials are compared: three logarithms, then 0, or `UNLIKE` for a cloud.
 
-    They are of the seen motion over its error, the rigid one too, of the number of points, and of how large the seen
-    patch is. That is their root mean square distance [m] from their middle, which counts `EXTENT` times. Of named
-    points each gives three numbers, of a cloud one.
+    Logarithms of the observed motion over its error (rigid error included), of the number of points, and of the extent
+    of the observed patch: root mean square distance [m] from its centroid, weighted by `EXTENT`. A named point gives
+    three numbers, a point of a cloud one.
     """
     first = np.unique(evidence.point, return_index=True)[1]
     count, at = len(first), evidence.at[first]
@@ -123,7 +124,7 @@ def likeness(evidence: Evidence) -> np.ndarray:
 def _trial(
     ensemble: Ensemble, members: np.ndarray, number: int, random: np.random.Generator
 ) -> tuple[Observation, np.ndarray]:
-    """What is seen of some member's motion, or of two; and how that moves the tumour's middle (3,) [m]."""
+    """Simulate the observation of one or two motions, and the true motion (3,) [m] of the tumour centroid."""
     anatomy = ensemble.anatomy
     here = members[ensemble.skull[members] == random.choice(np.unique(ensemble.skull[members]))]
     several = np.intersect1d(ALONE, ensemble.kind[here])
@@ -146,7 +147,7 @@ def _trial(
 
 
 def seen_patch(anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator, count: int, cover: float) -> Evidence:
-    """So many points on a round share `cover` of the open cortex, without error, of a motion (V, 3) [m]."""
+    """Sample `count` error-free points of a motion (V, 3) [m] on a round share `cover` of the open cortex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     corners = nodes[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -163,6 +164,6 @@ def seen_patch(anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator
 
 
 def _square(prior: Prior, found: Posterior, middle: np.ndarray) -> float:
-    """The square of an estimate's error (3,) [m], by its own covariance."""
+    """Squared Mahalanobis distance of an estimate's error (3,) [m] by its own covariance."""
     off = found.weight @ prior.middle - middle
     return float(off @ np.linalg.solve(found.covariance(prior.middle[:, None])[0], off))

@@ -1,7 +1,7 @@
-"""Which causes moved the cortex, as far as what is seen separates them.
+"""Causes of the cortex motion, as far as the observation separates them.
 
-Shares are those of draws from the posterior. Causes whose own shares scatter widely are not separable. Of all ways to
-group them, the finest is taken in which the joint share of each group is known.
+Shares are computed from posterior samples. Causes whose own shares scatter widely are not separable. The finest
+grouping is chosen in which the joint share of each group is determined.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from .causes import KINDS
 from .posterior import Posterior
 from .prior import Prior
 
-# Draws; the probability that a share's interval leaves out at either end; and how wide one is of a share that is known.
+# Number of posterior samples; probability outside a share's interval at each end; max. width of a determined interval.
 DRAWS, BEYOND, KNOWN = 400, 0.05, 0.5
-# A brain that swells may do so by less than nothing.
+# Swelling shares may be negative.
 WORDS = {"swelling": "swelling or shrinking"}
-# A share that is less is not named.
+# Smallest share that is reported.
 LEAST_NAMED = 0.005
 
 
 @dataclass(frozen=True)
 class CauseShare:
-    """What causes that are not separable move together.
+    """Joint share of causes that are not separable from each other.
 
     Parameters
     ----------
     causes
-        Of `KINDS`; one, where it is separable from all others.
+        Names from `KINDS`; a single one if separable from all others.
     share, low, high
-        Their joint share in what causes move the open cortex by, in mean square: mean, and an interval of 90 %.
+        Joint share of the mean square motion of the open cortex: mean, bounds of a 90 % interval.
     """
 
     causes: tuple[str, ...]
@@ -48,9 +48,9 @@ class CauseShare:
 
 
 def cause_shares(drawn: np.ndarray) -> tuple[CauseShare, ...]:
-    """Groups of `KINDS` that drawn shares (n, kinds) separate, the largest first, without those of next to nothing.
+    """Group `KINDS` as finely as sampled shares (n, kinds) determine; largest share first, negligible ones dropped.
 
-    Of several finest ways to group them, the one whose intervals are narrowest together.
+    Among several finest groupings, the one with the smallest sum of interval widths is chosen.
     """
     ways = []
     for groups in _partitions(range(drawn.shape[1])):
@@ -67,7 +67,7 @@ def cause_shares(drawn: np.ndarray) -> tuple[CauseShare, ...]:
 
 
 def _partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
-    """Every way to group items."""
+    """Generate all partitions of items."""
     if not items:
         yield []
         return
@@ -79,7 +79,7 @@ def _partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
 
 
 def drawn_shares(prior: Prior, posterior: Posterior) -> np.ndarray:
-    """Shares (n, kinds) of causes in what they move the open cortex by, in mean square, of draws from a posterior."""
+    """Sample shares (n, kinds) of causes in the mean square motion of the open cortex from the posterior."""
     ends = np.round(DRAWS * np.cumsum([answer.share for answer in posterior.answers])).astype(int)
     normal = np.random.default_rng(0).standard_normal((DRAWS, len(prior.kind)))
     squares, begin = np.zeros((DRAWS, len(KINDS))), 0

@@ -1,4 +1,4 @@
-"""What may have moved a brain that is only seen: tools, drained fluid and swelling, in tissue that nobody measured."""
+"""Causes of brain motion to be located from an observation: tools, CSF drainage and swelling, in unmeasured tissue."""
 
 from __future__ import annotations
 
@@ -20,45 +20,45 @@ from ..data.tool_loads import draw
 from .regions import Region, beside
 
 KINDS = ("tool", "drainage", "swelling", "tumour swelling", "oedema")
-"""The causes of an ensemble, by name."""
+"""Names of the causes of an ensemble."""
 TOOL, DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA = range(len(KINDS))
-# Swelling is one rising wave, and another that does nothing.
+# Swelling is one rising wave; the second wave is zero.
 RISE = Wave(0.25, 0.0)
-# Points of the open cortex, and tissues: Poisson's ratio of the brain, tumour stiffness over the brain's.
+# Number of points on the open cortex; tissues: Poisson's ratio of the brain, tumour stiffness over the brain's.
 POINTS, TISSUES = 70, ((0.45, 2.0), (0.49, 0.7))
 ACCURACY = Accuracy(tolerance=1e-3)
 
 
 @dataclass(frozen=True)
 class Causes:
-    """From what the members of an ensemble are drawn. Ranges are those of the brain-shift literature.
+    """Sampling configuration of an ensemble. Ranges are those of the brain-shift literature.
 
     Parameters
     ----------
     poisson
         Poisson's ratios; drained tissue gives 0.45, brain within seconds 0.49 (`sim.MATERIALS`).
     poisson_let_go
-        The greatest one in a skull that lets go: beyond, swelling is solved for minutes, and explains no more.
+        Largest one for a skull that separates: beyond, swelling takes minutes to solve and explains no more.
     stiffness
-        Least and greatest tumour stiffness over the brain's, log-uniform.
+        Smallest and largest ratio of tumour to brain stiffness, log-uniform.
     exponent
-        Least and greatest -m of Ogden's law, log-uniform: -4.7 of Miller, Chinzei 2002, -19 of `sim.MATERIALS`.
+        Smallest and largest -m of Ogden's law, log-uniform: -4.7 of Miller, Chinzei 2002, -19 of `sim.MATERIALS`.
     tools
-        Members of this kind in one group; of a skull that lets go, whose loads are solved one by one.
+        Tool members in one group; second value for a skull that separates, whose loads are solved one by one.
     drainages
         Directions of gravity in one group.
     levels
-        Shares of the fluid that are left, one after the other, in each drainage.
+        Shares of the fluid that remain, one after the other, in each drainage.
     cone
-        Greatest angle [rad] between gravity and the open cortex's inward axis: surgeons turn the opening up.
+        Largest angle [rad] between gravity and the open cortex's inward axis: surgeons turn the opening up.
     swellings, tumour_swellings, oedema
-        Changes of volume in each group: of the brain's, of the tumour's alone, and of the brain's round the tumour.
+        Volume changes in each group: of the brain, of the tumour alone, and of the brain round the tumour.
     reach
-        Least and greatest distance [m] from the tumour that oedema has, log-uniform.
+        Smallest and largest extent of oedema from the tumour [m], log-uniform.
     reaches
-        Such distances in one group; of a skull that lets go, as of tools.
+        Number of such extents in one group; second value for a skull that separates, as in `tools`.
     regions
-        Those whose stiffness is known: it is no draw.
+        Regions of known stiffness: it is not sampled.
     """
 
     poisson: tuple[float, ...] = (0.45, 0.47, 0.49)
@@ -78,37 +78,37 @@ class Causes:
 
 
 USUAL = Causes()
-# Young's modulus [Pa] at small strain; motions are made equally large, so that it hardly matters.
+# Young's modulus [Pa] at small strain; motions are normalised in magnitude, so it hardly matters.
 YOUNG = 3000.0
-# Radius [m] over which a force is spread on the cortex.
+# Radius of the disc on which a force acts on the cortex [m].
 SPREAD = 7e-3
-# The one of the skulls that lets go.
+# Skull model that separates from the brain.
 LETS_GO = "contact"
-# Which way gravity pulls in the scan, as `Gravity` has it.
+# Direction of gravity in the scan, as in `Gravity`.
 SUPINE = np.array(Gravity().direction)
 
 
 def linear(times: float, poisson: float) -> Material:
-    """Linear tissue so many times as stiff as the brain, at small strain."""
+    """Build linear tissue `times` as stiff as the brain at small strain."""
     return Material("linear", YOUNG * times, poisson)
 
 
 @dataclass(frozen=True)
 class Group:
-    """Members that share tissue and skull.
+    """Ensemble members that share tissue and skull.
 
     Parameters
     ----------
     number
-        From 0: what is drawn depends on it and the seed alone.
+        Number from 0; samples depend on it and the seed alone.
     skull
         One of `sim.effects.SKULLS`.
     poisson, ratio, exponent
-        Of the brain; tumour stiffness over the brain's; -m of Ogden's law, by which both stiffen.
+        Poisson's ratio of the brain; tumour stiffness over the brain's; -m of Ogden's law, by which both stiffen.
     regions
-        Others whose stiffness is known.
+        Other regions of known stiffness.
     reach
-        How far [m] from the tumour oedema reaches, in turn.
+        Extents [m] of oedema from the tumour, one load set each.
     """
 
     number: int
@@ -120,22 +120,21 @@ class Group:
     reach: tuple[float, ...] = ()
 
     def effects(self, swelling: tuple[float, ...], regions: tuple[int, ...] | None = None) -> tuple[Effect, ...]:
-        """What its finite elements are made of, if these regions (None: all) swell by at most such shares."""
+        """Build the effects of the FEM, with up to these volume changes in these regions (None: all)."""
         swells = Pulsation(Wave(RISE.frequency, max(map(abs, swelling))), RISE, regions)
         tissue = beside(self._tissue, self.poisson, self.ratio, self.regions)
         return (tissue, Held(), SKULLS[self.skull], ToolForce(), Gravity(), swells)
 
     def _tissue(self, times: float, poisson: float) -> Ogden:
-        """Tissue so many times as stiff as the brain at small strain."""
+        """Build Ogden tissue `times` as stiff as the brain at small strain."""
         mu, lam = Material("neo-hookean", YOUNG * times, poisson).lame
         return Ogden(((2.0 * mu, -self.exponent),), lam + 2.0 * mu / 3.0)
 
 
 def groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Group, ...]:
-    """Groups with each skull and each Poisson's ratio; skulls only where the anatomy has one.
+    """Build groups with each skull and each Poisson's ratio; none if the anatomy has no skull.
 
-    Each skull has soft and stiff tumours, tissue that stiffens little and much, and oedema that reaches near and far:
-    a group in every part of each range.
+    In each skull, tumour stiffness, exponent and oedema extent are stratified: one group in every part of each range.
     """
     made: list[Group] = []
     for number, skull in enumerate(SKULLS if anatomy.slide_normal.any() else ()):
@@ -150,14 +149,14 @@ def groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Gro
 
 
 def _all_over(random: np.random.Generator, count: int, limits: tuple[float, float]) -> list[float]:
-    """Numbers, one in each of `count` parts of a range that have equal ratios, in an order by chance."""
+    """Sample one number in each of `count` log-equal parts of a range, in random order."""
     low, high = np.log(limits)
     share = (random.permutation(count) + random.uniform(size=count)) / max(count, 1)
     return np.exp(low + share * (high - low)).tolist()
 
 
 def pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> Loads:
-    """What tools do in a group."""
+    """Sample the tool loads of a group."""
     count = causes.tools[group.skull == LETS_GO]
     pushed = draw("mixed", anatomy, count, seed * 1000 + group.number).of(Pushed)
     assert pushed is not None
@@ -165,14 +164,14 @@ def pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL
 
 
 def swellings(anatomy: Anatomy, shares: tuple[float, ...]) -> Loads:
-    """Changes of volume by such shares of what `Group.effects` was given the same of."""
-    # The wave says by which time the volume has changed so much.
+    """Build loads of these volume changes; `Group.effects` must have been given the same ones."""
+    # The wave gives the time at which each volume change is reached.
     time = np.arcsin(np.array(shares) / max(map(abs, shares))) / (2.0 * np.pi * RISE.frequency)
     return Loads((_idle(anatomy, len(time)), _posture(anatomy, np.tile(SUPINE, (len(time), 1)), 1.0)), time)
 
 
 def drainages(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Loads, ...]:
-    """Fluid that leaves, level by level, under heads that lie in some ways."""
+    """Build loads of drained fluid, level by level, for sampled head directions."""
     random = np.random.default_rng([seed, group.number, 1])
     down = directions(random, open_cortex(anatomy).axis, causes)
     idle = _idle(anatomy, len(down))
@@ -180,18 +179,18 @@ def drainages(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = US
 
 
 def _idle(anatomy: Anatomy, count: int) -> Pushed:
-    """So many pushes of no force, for loads in which no tool takes part."""
+    """Build `count` zero-force pushes, for loads without a tool."""
     return Pushed(np.tile(open_cortex(anatomy).origin, (count, 1)), np.zeros((count, 3)), np.full(count, SPREAD))
 
 
 def _posture(anatomy: Anatomy, down: np.ndarray, left: float) -> Posture:
-    """Gravity along `down` (n, 3), with a share of the fluid left."""
+    """Build postures with gravity along `down` (n, 3) and a share of the fluid left."""
     level = np.array([fluid_level(anatomy.mesh.nodes, one, left) for one in down])
     return Posture(down, level, np.ones(len(down)))
 
 
 def directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:
-    """Ways that gravity pulls (n, 3): evenly by solid angle within a cone round the inward axis."""
+    """Sample directions of gravity (n, 3), uniform by solid angle in a cone round the inward axis."""
     cosine = random.uniform(np.cos(causes.cone), 1.0, causes.drainages)
     angle = random.uniform(0.0, 2.0 * np.pi, causes.drainages)
     side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
@@ -202,14 +201,14 @@ def directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) ->
 
 @dataclass(frozen=True, eq=False)
 class Presses:
-    """Motions by forces of one size.
+    """Motions by forces of equal size.
 
     Parameters
     ----------
     points
-        (p, 3) [m] of the open cortex.
+        (p, 3) [m] on the open cortex.
     motion
-        By name of the skull: (tissues, p, 3, V, 3) float32 [m], by a force along each axis.
+        By name of the skull: (tissues, p, 3, V, 3) float32 [m], for a force along each axis.
     """
 
     points: np.ndarray
@@ -219,7 +218,7 @@ class Presses:
 def pressed(
     anatomy: Anatomy, skulls: tuple[str, ...], device: str = "auto", regions: tuple[Region, ...] = ()
 ) -> Presses:
-    """Solve linear tissue under forces of 0.01 N, spread over 7 mm, in each of some skulls, with known `regions`."""
+    """Solve linear tissue under forces of 0.01 N on discs of 7 mm radius, for each of some skulls, with `regions`."""
     nodes = anatomy.mesh.nodes[np.unique(anatomy.open_surface)]
     points = nodes[spaced(nodes, POINTS)]
     force = np.tile(0.01 * np.eye(3), (len(points), 1))
@@ -233,7 +232,7 @@ def pressed(
 
 
 def spaced(points: np.ndarray, count: int) -> np.ndarray:
-    """Numbers of `count` of the points (n, 3), each as far as can be from those before."""
+    """Select `count` of the points (n, 3) by farthest-point sampling, starting next to the centroid; return indices."""
     found = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmin())]
     away = np.full(len(points), np.inf)
     while len(found) < min(count, len(points)):

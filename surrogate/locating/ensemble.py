@@ -1,4 +1,4 @@
-"""Motions of a brain by every cause, in many tissues and skulls: what an observation is held against."""
+"""Ensemble of brain motions by every cause, in many tissues and skulls, from which the prior is built."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from .causes import (
     swellings,
 )
 
-# Thousandths of the motion: far below what is seen.
+# Relative tolerance: far below observation errors.
 ACCURACY = Accuracy(tolerance=3e-3)
-# A member that moves the open cortex by less than this [m] tells shapes of rounding.
+# Smallest RMS motion [m] of the open cortex: below it, a member is mainly round-off.
 LEAST_MOTION = 2e-5
 
 
 def round_tumour(anatomy: Anatomy, reach: float) -> tuple[Anatomy, tuple[int, ...]]:
-    """The body with brain that lies within `reach` [m] of its tumour as a region of its own, and labels of what swells.
+    """Make brain within `reach` [m] of the tumour a region of its own; return the body and the labels that swell.
 
-    These are that region's, and that of oedema which the anatomy marks, as far as they are there. Tissue stays as it
-    is where laws name no region but those of the anatomy.
+    These are the new region's label and that of oedema in the anatomy, if present. Tissue is unchanged if the material
+    laws name only regions of the anatomy.
     """
     mesh = anatomy.mesh
     tumour = KDTree(mesh.nodes[anatomy.tumour_nodes])
@@ -65,7 +65,7 @@ class Ensemble:
     motion
         (N, V, 3) float32 [m].
     kind, skull, group
-        (N,) indices into `KINDS` and into the names of `sim.effects.SKULLS`, and number of the group.
+        (N,) indices into `KINDS` and into the names of `sim.effects.SKULLS`; number of the group.
     """
 
     anatomy: Anatomy
@@ -83,20 +83,20 @@ def solved(
     folder: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Ensemble:
-    """Solve an ensemble, group by group. Groups that a `folder` keeps from a run that was stopped are read.
+    """Solve an ensemble, group by group. Finished groups of an interrupted run are read from `folder`.
 
-    `progress` hears how many groups are done, and of how many.
+    `progress` receives the number of groups done and their total.
 
     Raises
     ------
     InputError
-        An anatomy without open cortex, tumour or skull; a group of which nothing converged.
+        An anatomy without open cortex, tumour or skull; a group without a converged member.
     """
     if not len(anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour to locate: make one that has.")
     made = groups(anatomy, seed, causes)
     if not made:
-        raise InputError("the anatomy has no skull (`slide_normal`) that brackets what it does: make it anew.")
+        raise InputError("the anatomy has no skull (`slide_normal`) that brackets what it does: make it again.")
     parts = []
     progress(0, len(made))
     for done, group in enumerate(made, start=1):
@@ -112,7 +112,7 @@ def solved(
 def _kept(
     anatomy: Anatomy, group: Group, seed: int, device: str, causes: Causes, folder: Path | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The motions and kinds of a group, from the folder if they are there, of the same draw."""
+    """Read the motions and kinds of a group from the folder, or compute and keep them; the key holds all inputs."""
     stated = anatomy.digest, recommended(anatomy.mesh), group, seed, causes, ACCURACY
     path = kept_path(folder, f"{group.number:03d}-", device, *stated)
     names = "motion", "kind"
@@ -128,7 +128,7 @@ def _kept(
 def members(
     anatomy: Anatomy, group: Group, seed: int = 0, device: str = "auto", causes: Causes = USUAL
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Motions (n, V, 3) float32 [m] and kinds (n,) of one group: those that converged and move the open cortex."""
+    """Compute motions (n, V, 3) float32 [m] and kinds (n,) of one group: converged ones that move the open cortex."""
     fem = Fem(anatomy, group.effects(causes.swellings), ACCURACY, device)
     tumour = tuple(np.unique(anatomy.mesh.region[anatomy.in_tumour]).tolist())
     answers = [
@@ -158,12 +158,12 @@ def members(
 def _swollen(
     anatomy: Anatomy, group: Group, shares: tuple[float, ...], regions: tuple[int, ...], device: str, fem: Fem
 ) -> Deformation:
-    """Answers of a body of which some regions change their volume by such shares; it is as stiff as that of `fem`."""
+    """Solve for given volume changes of some regions; the stiffness, and so its factor, is that of `fem`."""
     swells = Fem(anatomy, group.effects(shares, regions), ACCURACY, device, stiff_as=fem)
     return swells.deform(swellings(anatomy, shares))
 
 
 def surface_size(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
-    """Root mean square motion (n,) [m] of the open cortex's vertices in motions (n, V, 3) [m]."""
+    """Compute root mean square motions (n,) [m] of the open cortex's vertices for motions (n, V, 3) [m]."""
     nodes = np.unique(anatomy.open_surface)
     return np.sqrt((motion[:, nodes] ** 2).sum(axis=2).mean(axis=1))

@@ -1,4 +1,4 @@
-"""What is seen of a brain, as numbers that a motion predicts: along which axis, at which material point, how surely."""
+"""Observations as linear data: displacement of material points along given axes, with error covariance."""
 
 from __future__ import annotations
 
@@ -11,44 +11,43 @@ from sim.geometry.locate import Located
 
 from ..array_functions import squared_distances
 
-# How the share of an error that is not rigid is made: white, and smooth over the surface.
+# Non-rigid error of a point [m]: independent noise, spatially correlated noise.
 WHITE, SMOOTH = 0.3e-3, 0.5e-3
 SIGMA = float(np.hypot(WHITE, SMOOTH))
-"""What a point that is seen is off by, of what is not rigid [m]: white and smooth errors together."""
-# Length of the smooth one [m].
+"""Standard deviation of a point's non-rigid error along each axis [m]: independent and correlated noise together."""
+# Correlation length of the correlated noise [m].
 LENGTH = 15e-3
-# What no sum of shapes is nearer than to a true motion: white and smooth errors as shares of what is seen, and the
-# length of the smooth one [m].
+# Model error of the shapes: independent and correlated part as shares of the observed motion, correlation length [m].
 LACK_WHITE, LACK_SMOOTH, LACK_LENGTH = 0.08, 0.1, 5e-3
 SHIFT = 0.8e-3
-"""What all points together are off by along each axis, if nothing else is known [m]: a standard deviation."""
-# How far they are turned about each axis [rad], for each metre of that.
+"""Default standard deviation of the rigid error (registration shift) along each axis [m]."""
+# Rotation error about each axis [rad], per metre of shift.
 TURN = float(np.radians(0.3)) / SHIFT
 
-# The rigid error of a registration that slipped [m], along each axis; and one that any has, whatever is stated.
+# Rigid error of a failed registration along each axis [m]; smallest rigid error of any registration [m].
 SLIPPED, LEAST_SHIFT = 10e-3, 1e-5
 
-# Triangular matrices that are inverted at once have fewer rows than twice this.
+# Block size: triangular matrices with fewer than twice this many rows are inverted directly.
 SMALL = 48
 (trtri,) = get_lapack_funcs(("trtri",), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """m numbers, each what a material point's motion is seen to be along an axis.
+    """Observed displacements (m,) of material points, each along one axis.
 
     Parameters
     ----------
     place
-        The material points of the rows, in the mesh.
+        Material points of the rows, in the mesh.
     at
-        (m, 3) [m] where they are at rest.
+        (m, 3) [m] undeformed positions.
     axis
         (m, 3) unit vectors.
     value
         (m,) [m].
     sigma
-        (m,) [m]: standard deviation of what is not rigid in the error.
+        (m,) [m]: standard deviation of the non-rigid error.
     point
         (m,) number of the observed point that each row belongs to.
     shift
@@ -67,24 +66,24 @@ class Evidence:
         return len(self.value)
 
     def rows(self, chosen: np.ndarray) -> Evidence:
-        """Some rows (m,) bool or numbers."""
+        """Select rows by a mask (m,) or by numbers."""
         place = Located(self.place.vertices[chosen], self.place.weights[chosen])
         arrays = {name: getattr(self, name)[chosen] for name in ("at", "axis", "value", "sigma", "point")}
         return replace(self, place=place, **arrays)
 
     @property
     def middle(self) -> np.ndarray:
-        """(3,) [m] about which rotations are meant."""
+        """(3,) [m]: centroid of the undeformed positions; centre of rotations."""
         return self.at.mean(axis=0)
 
     @property
     def rigid(self) -> np.ndarray:
-        """What a rigid error does (m, 6), by translation [m] and rotation [rad] about the middle."""
+        """Matrix (m, 6) from a rigid error, translation [m] and rotation [rad] about the centroid, to rows."""
         return np.concatenate([self.axis, np.cross(self.at - self.middle, self.axis)], axis=1)
 
     @property
     def rigid_alone(self) -> np.ndarray:
-        """The rigid error (6,) [m, rad] that explains most with a body at rest, by least squares, however large."""
+        """Rigid error (6,) [m, rad] that explains most of the observation by least squares, if nothing deformed."""
         return np.linalg.lstsq(self.rigid, self.value, rcond=None)[0]
 
     @property
@@ -94,16 +93,16 @@ class Evidence:
 
     @property
     def beyond(self) -> float:
-        """How many times as large as is stated `rigid_alone` is: its shift or its turn, whichever is more."""
+        """Size of `rigid_alone` over the reported rigid error: larger ratio of translation and rotation."""
         return float((np.linalg.norm(self.rigid_alone.reshape(2, 3), axis=1) / self.rigid_scale[[0, 3]]).max())
 
     @property
     def slip(self) -> float:
-        """Standard deviation of the rigid error of a registration that slipped, as a share of the stated one."""
+        """Standard deviation of the rigid error of a slipped registration, relative to the reported one."""
         return max(SLIPPED / max(self.shift, LEAST_SHIFT), 1.0)
 
     def noise(self, scale: float = 0.0) -> np.ndarray:
-        """Covariance (m, m) [m^2] of errors that are not rigid, and of what shapes lack where `scale` [m] is seen."""
+        """Covariance (m, m) [m^2] of non-rigid errors, and of the shapes' model error for motions of `scale` [m]."""
         share, square = (WHITE / SIGMA) ** 2, squared_distances(self.at, self.at)
         out = alike(square, LENGTH) * self.sigma * ((1.0 - share) * self.sigma)[:, None]
         out += alike(square, LACK_LENGTH) * (LACK_SMOOTH * scale) ** 2
@@ -113,20 +112,20 @@ class Evidence:
 
     @property
     def named(self) -> bool:
-        """Whether points have names: each gives three rows then, and one of a cloud. So do tips."""
+        """True if points have correspondences: three rows each (a cloud's points, and tips, give one)."""
         return len(self) >= 2 * len(np.unique(self.point))
 
     @property
     def copies(self) -> int:
-        """3 where rows are of motions along three axes, point after point; else 1."""
+        """3 if rows are of motions along three axes, point after point; else 1."""
         threefold = len(self) % 3 == 0 and np.array_equal(self.axis, np.tile(np.eye(3), (len(self) // 3, 1)))
         return 3 if threefold else 1
 
     @property
     def weights(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (v,) that rows are seen at, and what of their motions makes rows.
+        """Vertices (v,) that rows depend on, and the matrix from their motions to rows.
 
-        That is (m / 3, v) where rows are of three axes, one after the other, else (m, 3 v): of all axes of a vertex.
+        (m / 3, v) if rows are of three axes, one after the other, else (m, 3 v): of all axes of a vertex.
         """
         copies = self.copies
         place = Located(self.place.vertices[::copies], self.place.weights[::copies])
@@ -139,7 +138,7 @@ class Evidence:
         return vertices, weights
 
     def whitening(self, scale: float) -> Whitening:
-        """What makes errors independent and of variance 1, where `scale` [m] is seen."""
+        """Build the transform to independent errors of variance 1, for observed motions of `scale` [m]."""
         copies = self.copies
         lower = cholesky(self.rows(np.arange(0, len(self), copies)).noise(scale), lower=True)
         return Whitening(triangular_inverse(lower), copies)
@@ -147,41 +146,41 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """The inverse R of the Cholesky factor of a covariance of errors, which is R^-1 R^-T.
+    """Inverse R of the Cholesky factor of an error covariance, which is R^-1 R^-T.
 
     Parameters
     ----------
     root
         (m / copies, m / copies).
     copies
-        3 where the errors along three axes are alike and independent, row after row; else 1.
+        3 if the errors along three axes are equally distributed and independent, row after row; else 1.
     """
 
     root: np.ndarray
     copies: int
 
     def white(self, rows: np.ndarray) -> np.ndarray:
-        """R rows, (m, k) or (m,)."""
+        """Compute R rows, (m, k) or (m,)."""
         return (self.root @ rows.reshape(len(self.root), -1)).reshape(rows.shape)
 
     def back(self, rows: np.ndarray) -> np.ndarray:
-        """R^T rows, (m, k) or (m,)."""
+        """Compute R^T rows, (m, k) or (m,)."""
         return (self.root.T @ rows.reshape(len(self.root), -1)).reshape(rows.shape)
 
     @property
     def logarithm(self) -> float:
-        """Of the determinant of R."""
+        """Logarithm of the determinant of R."""
         return self.copies * float(np.log(np.diag(self.root)).sum())
 
     def precision(self, table: np.ndarray) -> np.ndarray:
-        """Blocks (n, c, c) of the inverse covariance, for rows (n, c): of all axes of points, where `copies` is 3."""
+        """Compute blocks (n, c, c) of the inverse covariance for rows (n, c); all axes of points if `copies` is 3."""
         columns = self.root.T[table[:, :: self.copies] // self.copies]
         alike = columns @ columns.transpose(0, 2, 1)
         return np.kron(alike, np.eye(self.copies))
 
 
 def triangular_inverse(lower: np.ndarray) -> np.ndarray:
-    """Inverse of a lower triangular matrix (n, n), by halves: products are what a library does fastest."""
+    """Invert a lower triangular matrix (n, n) by recursive halving: matrix products are fastest."""
     half = len(lower) // 2
     if half < SMALL:
         return trtri(lower.T, lower=0)[0].T
@@ -193,18 +192,18 @@ def triangular_inverse(lower: np.ndarray) -> np.ndarray:
 
 
 def alike(square: np.ndarray, length: float) -> np.ndarray:
-    """Correlation (n, n) of smooth errors at squared distances (n, n) [m^2], which fades over a length [m]."""
+    """Compute correlations (n, n) of smooth noise: Gaussian of squared distances (n, n) [m^2] and a length [m]."""
     return np.exp(square * (-0.5 / length**2))
 
 
 def smooth_root(points: np.ndarray, length: float = LENGTH) -> np.ndarray:
-    """What makes (n, n) smooth errors at points (n, 3) [m] of independent ones, all of variance 1."""
+    """Compute the factor (n, n) from independent noise at points (n, 3) [m] to smooth noise of variance 1."""
     value, vector = np.linalg.eigh(alike(squared_distances(points, points), length))
     return vector * np.sqrt(np.maximum(value, 0.0))
 
 
 def of_motions(place: Located, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray, shift: float = SHIFT) -> Evidence:
-    """Points (n, 3) [m] at rest and how each was seen to move (n, 3) [m]; three rows a point."""
+    """Build evidence from undeformed points (n, 3) [m] and their motions (n, 3) [m]; three rows a point."""
     count = len(at)
     point = np.repeat(np.arange(count), 3)
     return Evidence(

@@ -1,4 +1,4 @@
-"""Where the tumour is, from what is seen of the brain's surface, with what is not known of it."""
+"""Posterior of the tumour's position, from observations of the brain's surface."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .prior import Prior
 from .regions import Region
 from .rounds import settled
 
-# More points than this share are no outliers, and no cause of the ensemble moves what this is more surprised by.
+# Largest share of outliers; largest `surprise` that a cause of the ensemble can explain.
 MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
 # The registration may have slipped where that makes what is seen so many times as probable, as a logarithm. On twins it
 # does so for one of 432 motions, and for all slips of 8 to 20 mm along the cortex (docs/notes/locate_experiments.md).
@@ -30,26 +30,26 @@ DOUBTFUL = -2.0
 # Least logarithm of a slip's probability over that of a motion for which a warning names the slip. True motions have
 # -7 in the median (docs/notes/locate_experiments.md).
 ALIKE = -2.5
-# A rigid error is wide if it exceeds the reported one by this factor.
+# Ratio to the reported error above which a rigid error counts as wide.
 WIDE = 2.0
-# What is said where swelling has a greater share than this.
+# Share of swelling above which `OEDEMA_WORDS` is reported.
 SWELLS = 0.5
 OEDEMA_WORDS = (
     "The brain swells or shrinks, by what was seen. If that is oedema round the tumour alone, the tumour moves about "
     "half as far, and ellipsoids often miss it: look for it in the scan."
 )
-# Normal numbers by which a radius is found that holds 95 in 100.
+# Normal samples by which the 95 % radius is estimated.
 DRAWS = 4000
 
 
 @dataclass(frozen=True)
 class RigidAlone:
-    """The rigid error that explains most of what was seen, with a body at rest: of least squares, however large.
+    """Rigid error that explains most of the observation by least squares, with the brain undeformed.
 
     Parameters
     ----------
     share
-        Of what was seen, in mean square, that it explains.
+        Share of the observation, in mean square, that it explains.
     shift, turn
         Its size [m], [rad].
     """
@@ -61,27 +61,27 @@ class RigidAlone:
 
 @dataclass(frozen=True, eq=False)
 class Location:
-    """Where a tumour is, of the tumour and not of a model: Gaussian, in RAS.
+    """Posterior of the tumour's position: Gaussian, in RAS.
 
     Parameters
     ----------
     prior
-        What motions are made of.
+        Prior of motions.
     posterior
-        The weights of its shapes and the rigid error, with covariances that were made to hold.
+        Posterior of the shapes' weights and of the rigid error, with calibrated covariances.
     p95
-        [m]: with probability 0.95 the middle of the tumour is no farther from `centroid`.
+        [m]: with probability 0.95 the centroid of the tumour is within this distance of `centroid`.
     outliers, tips_left_out
-        Numbers of points, and of tips, from 0. They lie off the open cortex, or no other point supports them.
+        Numbers of points, and of tips, from 0. They are away from the open cortex, or no other point supports them.
     slipped
-        Whether the registration may have slipped, by far more than is stated. Then the answer holds that too.
+        True if the registration may have slipped, by far more than reported. Then the posterior includes a slip.
     checked
-        Whether it was said that the registration was checked, so that no slip is suspected.
+        True if the user checked the registration, so that no slip is suspected.
     calibrated
-        Whether covariances were tried on observations like this: named points or a cloud, so many, and motions so far
-        above errors, from a registration that did not slip.
+        True if covariances were calibrated on similar observations: named points or a cloud, number of points, motion
+        over error; and the registration did not slip.
     seconds
-        What this took, set-up and tables that all observations share apart.
+        Time taken, without set-up and tables that all observations share.
     """
 
     prior: Prior
@@ -95,36 +95,36 @@ class Location:
     seconds: float
 
     def at(self, nodes: np.ndarray) -> np.ndarray:
-        """Mean motion (n, 3) [m] of vertices (n,)."""
+        """Compute the mean motion (n, 3) [m] of vertices (n,)."""
         return np.tensordot(self.posterior.weight, self.prior.at(nodes), 1)
 
     def covariance(self, nodes: np.ndarray) -> np.ndarray:
-        """Covariances (n, 3, 3) [m^2] of the motion of vertices (n,)."""
+        """Compute covariances (n, 3, 3) [m^2] of the motion of vertices (n,)."""
         return self.posterior.covariance(self.prior.at(nodes))
 
     @property
     def centroid(self) -> np.ndarray:
-        """(3,) [m]: how far the middle of the tumour's volume has moved, as a mean."""
+        """(3,) [m]: mean motion of the centroid of the tumour's volume."""
         return self.posterior.weight @ self.prior.middle
 
     @property
     def centroid_covariance(self) -> np.ndarray:
-        """(3, 3) [m^2] of that."""
+        """(3, 3) [m^2]: covariance of that motion."""
         return self.posterior.covariance(self.prior.middle[:, None])[0]
 
     @property
     def bias(self) -> np.ndarray:
-        """(3,) [m]: how far the observation as a whole seems shifted, at the middle of its points."""
+        """(3,) [m]: mean registration shift of the observation, at the centroid of its points."""
         return self.posterior.rigid[:3]
 
     @property
     def rotation(self) -> np.ndarray:
-        """(3,) [rad]: how far it seems turned about that."""
+        """(3,) [rad]: mean registration rotation about that centroid."""
         return self.posterior.rigid[3:]
 
     @property
     def explained(self) -> float:
-        """Share of the seen motion, in mean square, that the mean motion and the rigid error explain."""
+        """Share of the observed motion, in mean square, that the mean motion and the rigid error explain."""
         evidence, found = self.posterior.evidence, self.posterior
         left = evidence.value - self.prior.seen(*evidence.weights) @ found.weight
         left -= evidence.rigid @ found.rigid
@@ -133,7 +133,7 @@ class Location:
 
     @property
     def rigid_alone(self) -> RigidAlone:
-        """What another rigid error would explain of what was seen, if nothing had moved."""
+        """Part of the observation that another rigid error would explain, with the brain undeformed."""
         evidence = self.posterior.evidence
         found = evidence.rigid_alone
         left, whole = evidence.value - evidence.rigid @ found, float(evidence.value @ evidence.value)
@@ -142,22 +142,22 @@ class Location:
 
     @cached_property
     def within_errors(self) -> bool:
-        """Whether nothing need have moved for what was seen: it is no more than errors that are stated."""
+        """True if the observation is within its reported errors, so that no motion is significant."""
         return within_errors(self.posterior)
 
     @cached_property
     def cause_shares(self) -> tuple[CauseShare, ...]:
-        """What moved the open cortex, as far as causes are separable, the largest share first.
+        """Causes of the open cortex's motion, as far as separable, largest share first.
 
-        None where what was seen is within its errors, or the registration may have slipped.
+        Empty if the observation is within its errors, or the registration may have slipped.
         """
         return () if self.slipped or self.within_errors else cause_shares(self._drawn_shares)
 
     @property
     def causes(self) -> dict[str, float]:
-        """Mean share of each of `KINDS` in what they move the open cortex by, in mean square; they sum to 1.
+        """Mean share of each of `KINDS` in the mean square motion of the open cortex; they sum to 1.
 
-        All are 0 where no cause is named. Single shares are guesses where causes are not separable.
+        All are 0 if no cause is named. Single shares are rough estimates if causes are not separable.
         """
         share = self._drawn_shares.mean(axis=0) if self.cause_shares else np.zeros(len(KINDS))
         return dict(zip(KINDS, share.tolist(), strict=True))
@@ -168,7 +168,7 @@ class Location:
 
     @property
     def doubt(self) -> str:
-        """Why ellipsoids may not hold, in sentences; none if they were tried."""
+        """Reasons why ellipsoids may be unreliable, in sentences; empty if calibrated."""
         if self.slipped:
             return (
                 f"It is a guess, as the registration may have slipped. {self._rigid_words} explains what was seen "
@@ -189,28 +189,28 @@ class Location:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What else must be known of the answer, in sentences: what would look alike, and `doubt`."""
+        """Warnings about this result, in sentences: alternative explanations, and `doubt`."""
         named = self.is_registration_suspect and not self.slipped
         rigid = (
             f"{self._rigid_words} would explain {self.rigid_alone.share:.0%}, with a brain at rest. The two cannot be "
-            "distinguished. If it may be off so far, say so by --rigid."
+            "distinguished. If such an error is possible, give it by --rigid."
         )
         swells = self.causes["swelling"] + self.causes["oedema"] > SWELLS
         return tuple(said for said in (rigid if named else "", OEDEMA_WORDS if swells else "", self.doubt) if said)
 
     @property
     def _rigid_words(self) -> str:
-        """The rigid error that explains most with a body at rest, and what was stated."""
+        """Description of the best rigid error with the brain undeformed, and of the reported one."""
         alone = self.rigid_alone
         stated = self.posterior.evidence.rigid_scale
         return (
-            f"A registration that is off by {1e3 * alone.shift:.1f} mm and {np.degrees(alone.turn):.1f} degrees, where "
-            f"{1e3 * stated[0]:.2g} mm and {np.degrees(stated[3]):.2g} degrees are stated,"
+            f"A registration error of {1e3 * alone.shift:.1f} mm and {np.degrees(alone.turn):.1f} degrees, where "
+            f"{1e3 * stated[0]:.2g} mm and {np.degrees(stated[3]):.2g} degrees are reported,"
         )
 
     @property
     def named_causes(self) -> str:
-        """The same in words, or why none is named."""
+        """Description of `cause_shares`, or the reason why no cause is named."""
         if self.slipped:
             return "not said, as the registration may have slipped"
         if self.within_errors:
@@ -220,16 +220,16 @@ class Location:
 
 @dataclass(frozen=True, eq=False)
 class Locator:
-    """Answers observations of one anatomy; made once (`make_locator`), it answers any number of them.
+    """Estimator of tumour motion for one anatomy, built once (`make_locator`) for any number of observations.
 
     Parameters
     ----------
     prior
-        What is believed of motions before they are seen.
+        Prior of motions.
     tried
-        (k, 5): what came of trials (`calibration.trials`).
+        (k, 5): results of trials (`calibration.trials`).
     regions
-        Those whose stiffness was known.
+        Regions whose stiffness was known.
     """
 
     prior: Prior
@@ -238,23 +238,23 @@ class Locator:
 
     @property
     def anatomy(self) -> Anatomy:
-        """The body."""
+        """Anatomy of the prior."""
         return self.prior.anatomy
 
     def small(self) -> Locator:
-        """The same, of the vertices alone that tell of the open cortex and of the tumour: a tenth of the size.
+        """Return this locator restricted to vertices at the open cortex and of the tumour: a tenth of the size.
 
-        It locates what is seen on the open cortex itself, and cannot say how other tissue moved.
+        It accepts observations on the open cortex alone, and gives no motion of other tissue.
         """
         return replace(self, prior=self.prior.restricted(telling_nodes(self.anatomy)))
 
     def locate(self, observation: Observation) -> Location:
-        """Where the tumour is by one observation.
+        """Locate the tumour by one observation.
 
         Raises
         ------
         InputError
-            An observation that is too small, lies elsewhere, or that no cause of the ensemble explains.
+            An observation that is too small, is elsewhere, or that no cause of the ensemble explains.
         """
         with one_thread():  # products are small
             return self._located(observation)
@@ -285,29 +285,29 @@ class Locator:
 
 
 def telling_nodes(anatomy: Anatomy) -> np.ndarray:
-    """Sorted vertices (n,) of the tumour, and of all tetrahedra at the open cortex."""
+    """Select the sorted vertices (n,) of the tumour and of all tetrahedra at the open cortex."""
     mesh = anatomy.mesh
     at_cortex = np.isin(mesh.tets, anatomy.open_surface).any(axis=1)
     return np.union1d(mesh.tets[at_cortex], anatomy.tumour_nodes)
 
 
 def radius_of(covariance: np.ndarray) -> float:
-    """How far [m] 95 in 100 draws of a Gaussian of some covariance (3, 3) [m^2] are from its mean, at most."""
+    """Compute the radius [m] round the mean of a Gaussian, covariance (3, 3) [m^2], that holds 95 % of samples."""
     drawn = _normal() @ np.linalg.cholesky(covariance).T
     return float(np.quantile(np.sqrt((drawn**2).sum(axis=1)), 0.95))
 
 
 @cache
 def _normal() -> np.ndarray:
-    """Normal numbers (DRAWS, 3)."""
+    """Sample standard normal numbers (DRAWS, 3), the same each time."""
     return np.random.default_rng(0).standard_normal((DRAWS, 3))
 
 
 def _may_have_slipped(anatomy: Anatomy, found: Posterior) -> bool:
-    """Whether a slip beyond what is stated makes what is seen nearly as probable as a motion does, and does not sink.
+    """Return True if an excessive slip explains the observation nearly as well as a motion does, and is no sinking.
 
-    A brain that sinks by a centimetre moves as rigidly as one whose registration is off, but mostly along its opening's
-    axis, and all of it alike. A slip shifts it across, or turns it.
+    A brain that sinks by a centimetre resembles a registration shift, but moves uniformly and mostly along the
+    craniotomy's axis. A slip shifts it across, or turns it.
     """
     if found.slipped < DOUBTFUL or found.evidence.beyond <= WIDE:
         return False
@@ -319,12 +319,12 @@ def _may_have_slipped(anatomy: Anatomy, found: Posterior) -> bool:
 
 
 def _demand_explained(found: Posterior, outliers: int, points: int) -> None:
-    """Refuse an observation that the ensemble does not know.
+    """Check that the ensemble explains the observation.
 
     Raises
     ------
     InputError
-        Too many outliers, or residuals that are no noise.
+        Too many outliers, or residuals larger than noise.
     """
     if outliers > MOST_OUTLIERS * points:
         raise InputError(
@@ -333,6 +333,6 @@ def _demand_explained(found: Posterior, outliers: int, points: int) -> None:
         )
     if found.surprise > MOST_SURPRISE:
         raise InputError(
-            f"the observation fits no cause: its points are off by {np.sqrt(found.surprise):.1f} times their sigma. "
+            f"the observation fits no cause: point errors of {np.sqrt(found.surprise):.1f} times their sigma. "
             "Check units, frame (RAS) and sigma, or that nothing was cut out."
         )

@@ -27,18 +27,18 @@ from .prior import NOWHERE, PRESSED, Prior, prior_of
 from .regions import Region, check_regions
 
 FORMAT = "sulcus locator 6"
-REMEDY = "Move it away, and `sulcus locate` makes it anew."
+REMEDY = "Move it away, and `sulcus locate` makes it again."
 LABELS = ("kind", "skull", "place")
 ARRAYS = ("shape", *LABELS, "centre")
 
 
 def locator_path(anatomy: str | Path) -> Path:
-    """Where the locator of an anatomy file is looked for: MESH.locator.npz beside MESH.vtu."""
+    """Return the path of an anatomy's locator: MESH.locator.npz next to MESH.vtu."""
     return Path(anatomy).with_suffix(".locator.npz")
 
 
 def save_locator(path: str | Path, locator: Locator) -> None:
-    """Write a locator; the file appears whole or not at all.
+    """Write a locator atomically.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
     Raises
     ------
     InputError
-        A file that is missing, no locator of this version, damaged, or of another anatomy.
+        A file that is missing, not a locator of this version, damaged, or of another anatomy.
     """
     with read_as(path, "a locator", REMEDY), Path(path).open("rb") as raw:
         archive = Archive(raw, REMEDY)
@@ -80,12 +80,12 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
 
 
 def _names(header: dict[str, Any]) -> tuple[str, ...]:
-    """The arrays of a prior that is whole, or known at some vertices."""
+    """Return the array names of a prior that is complete, or restricted to some vertices."""
     return ARRAYS if header.get("whole", True) else (*ARRAYS, "nodes")
 
 
 def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) -> None:
-    """Raise InputError where arrays do not fit the anatomy or each other."""
+    """Raise InputError if arrays do not fit the anatomy or each other."""
     shape, tried, every = arrays["shape"], arrays["tried"], np.arange(len(anatomy.mesh.nodes))
     nodes = arrays.get("nodes", every)
     fits = nodes.dtype.kind == "i" and np.array_equal(nodes, np.intersect1d(nodes, every))
@@ -108,16 +108,16 @@ def make_locator(
     progress: Callable[[str, int, int], object] = lambda stage, done, total: None,
     count: int = TRIALS,
 ) -> Locator:
-    """A locator of one anatomy. Groups that a `folder` keeps from a run that was stopped are read.
+    """Build a locator of one anatomy. Finished groups of an interrupted run are read from `folder`.
 
-    Regions that the `causes` know belong to the locator. `progress` hears a stage, how many of its parts are done, and
-    of how many. `count` trials calibrate it.
+    Regions of the `causes` belong to the locator. `progress` receives a stage, the number of its parts done, and their
+    total. `count` trials calibrate it.
 
     Raises
     ------
     InputError
-        An anatomy without open cortex, tumour or skull, or without a region that the causes know; causes of which
-        nothing converged.
+        An anatomy without open cortex, tumour or skull, or without a region of the causes; causes without a converged
+        member.
     """
     check_regions(causes.regions, anatomy)
     ensemble = solved(anatomy, seed, device, causes, folder, lambda done, total: progress("causes", done, total))

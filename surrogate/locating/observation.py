@@ -1,4 +1,4 @@
-"""What was seen of a brain, checked against it: points that moved, a cloud of where its surface is, tips of tools."""
+"""Observations of a brain, validated against the anatomy: moved points, a point cloud of the surface, tool tips."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from ..array_functions import squared_distances
 from .evidence import SHIFT, SIGMA, Evidence, of_motions
 
 FEWEST = 6
-# Spread of points across a line, as a share of that along it: less is a line.
+# Smallest ratio of the spread of points across a line to that along it.
 THIN = 0.05
-# How far [m] half of the points may lie off the surface they are said to be of, and how far any may.
+# Distance [m] from the surface: limit of half of the points, limit of any point.
 NEAR, FAR = 6e-3, 12e-3
-# The same of a cloud and of tips: they lie where the surface is now, and drained brains sink by over a centimetre.
+# Limits for a cloud and for tips: they are on the current surface, and drained brains sink by over a centimetre.
 NEAR_NOW, FAR_NOW = 18e-3, 30e-3
-# Points nearer than this are one place [m]; farther away than that nothing is [m].
+# Distance below which points count as one [m]; largest coordinate [m].
 ONE_PLACE, FARTHEST = 1e-3, 1e6
-# Motions [m] beyond which no brain goes, and rigid errors that no tracker has.
+# Largest median motion of a brain [m]; largest rigid error of a tracker [m].
 LONGEST_MOTION, FARTHEST_OFF = 0.025, 0.02
-# Smaller errors of a point [m] no tracker has: they are metres in a file of millimetres. Less is no motion at all [m].
+# Smallest error of a point [m] (below: metres in a file of millimetres); smallest motion that is not zero [m].
 LEAST_SIGMA, STILL = 0.01e-3, 1e-9
-# Larger errors of half of the points [m] say nothing of a brain, which moves by a few millimetres.
+# Largest median error [m]: with more, points give no information about motions of a few millimetres.
 LARGEST_SIGMA = 0.01
-# What points may be by mistake: times which scale they would lie on the cortex, and with axes turned how.
+# Likely unit and axis errors: factor that brings the points to the cortex, hint to the user.
 UNITS = (
     (1.0, ""),
     (1e-3, "if they were a thousandth of that: files are in mm, arrays in metres"),
@@ -43,31 +43,31 @@ UNITS = (
     (25.4, "if they were 25.4 times of that: they look like inches"),
 )
 FRAMES = (((1.0, 1.0, 1.0), ""), ((-1.0, -1.0, 1.0), "if x and y were turned: they are LPS"))
-# So many times as wide as the open cortex, or as narrow, points have other units.
+# Largest ratio of the span of points to that of the open cortex, and its inverse: beyond, units are wrong.
 SPANS = 6.0
 MOST = 400
-"""Points that are looked at, spread over those that are given: more tell no more, as neighbours share errors."""
+"""Maximum number of points used, spread over those given: more add nothing, as neighbours share errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What was seen, in RAS and metres.
+    """Observed points, in RAS and metres.
 
     Parameters
     ----------
     now
-        (n, 3): where points are seen, rigid error included.
+        (n, 3): observed positions, rigid error included.
     rest
-        (n, 3): where the same points are in the scan; None: a cloud of the surface, whose points have no names.
+        (n, 3): positions of the same points in the scan; None: a cloud of the surface, without correspondences.
     sigma
-        (n,): standard deviation of each point's error, of what is not rigid.
+        (n,): standard deviation of each point's non-rigid error.
     tips
-        (k, 3): where tips of tools touch the surface.
+        (k, 3): positions of tool tips that touch the surface.
     rigid
-        Standard deviation of the rigid error along each axis: how far all points may be off together.
+        Standard deviation of the rigid error along each axis, common to all points.
     checked
-        Whether the registration was checked by what does not move, as landmarks of the skull: then no slip beyond
-        `rigid` is suspected.
+        True if the registration was checked on structures that do not move, as landmarks of the skull: then no slip
+        beyond `rigid` is suspected.
     """
 
     now: np.ndarray
@@ -79,19 +79,19 @@ class Observation:
 
     @property
     def sigmas(self) -> np.ndarray:
-        """(n,) [m]."""
+        """(n,) [m]: standard deviations of the points, `SIGMA` by default."""
         return np.full(len(self.now), SIGMA) if self.sigma is None else self.sigma
 
 
 def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
-    """The observation as evidence about a body, before anything is known of its motion.
+    """Convert an observation to evidence, with the body undeformed.
 
     Raises
     ------
     InputError
-        Numbers that are not finite or beyond any place, too few points, points on a line, a sigma that is smaller than
-        any tracker's, or sigmas that say nothing. A rigid error beyond any tracker's, motions beyond any brain's or too
-        small to be seen. Points that lie off the brain's surface, with the likely reason: units, LPS for RAS, another
+        Values that are not finite or out of range, too few points, points on a line, a sigma below any tracker's, or
+        sigmas too large to be informative. A rigid error beyond any tracker's, motions beyond any brain's or too small
+        to be observed. Points away from the brain's surface, with the likely reason: units, LPS for RAS, another
         anatomy.
     """
     _check(observation)
@@ -109,7 +109,7 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
     for number, away in enumerate(_off_surface(anatomy, observation.tips), start=1):
         if away > FAR_NOW:
             raise InputError(
-                f"tip {number} lies {1e3 * away:.0f} mm off the open cortex, so that it cannot touch it: give "
+                f"tip {number} is {1e3 * away:.0f} mm from the open cortex, so that it cannot touch it: give "
                 "millimetres, RAS, or leave it out."
             )
     here = np.zeros_like(anatomy.mesh.nodes)
@@ -117,7 +117,7 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
 
 
 def looked_at(count: int) -> np.ndarray:
-    """Numbers (k,) of those of `count` points that are looked at: all, or `MOST` that are spread over them."""
+    """Select the numbers (k,) of at most `MOST` points, evenly spread over `count`."""
     return np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
 
 
@@ -128,11 +128,11 @@ def placed_anew(
     motion: np.ndarray,
     bias: Callable[[np.ndarray], np.ndarray],
 ) -> Evidence:
-    """The observation as evidence where the body is believed to have moved by `motion` (V, 3) [m].
+    """Convert an observation to evidence, with the body deformed by `motion` (V, 3) [m].
 
-    Of points only those count that are `near` (k,) the cortex, by number. Points without a place at rest, and tips, are
-    those of the surface that are nearest to them; they tell of its motion along its normal. `bias` gives the rigid
-    error (n, 3) [m] that is believed in at places (n, 3). Tips are numbered after the points.
+    Only points `near` (k,) the cortex count, by number. Points without an undeformed position, and tips, are matched to
+    the closest point of the surface and give its motion along its normal. `bias` gives the estimated rigid error (n, 3)
+    [m] at positions (n, 3). Tips are numbered after the points.
     """
     parts, count = [], len(observation.now)
     cloud, number = observation.tips, count + np.arange(len(observation.tips))
@@ -160,15 +160,15 @@ def _along_normals(
     motion: np.ndarray,
     bias: Callable[[np.ndarray], np.ndarray],
 ) -> Evidence:
-    """One row a point, of its `number` (n,): how far along the moved surface's normal the surface moved to be there."""
+    """Build one row a point, with its `number` (n,): displacement of the surface along its deformed normal."""
     triangles, nodes = anatomy.open_surface, anatomy.mesh.nodes
     corners = (nodes + motion)[triangles]
     _, triangle, weights = closest(cloud - bias(cloud), corners)
     vertices = triangles[triangle]
-    # Over an edge two triangles are equally near: normals of vertices do not depend on the one that is found.
+    # At an edge two triangles are equally near: normals of vertices do not depend on which one is found.
     normal = unit(np.einsum("nc,nci->ni", weights, vertex_normals(nodes + motion, triangles)[vertices]))
     at = np.einsum("nc,nci->ni", weights, nodes[vertices])
-    # A fourth vertex of no weight makes it a place of the mesh.
+    # A fourth vertex of weight 0 gives the layout of a tetrahedron.
     place = Located(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(len(at))]))
     value = np.einsum("ni,ni->n", cloud - at, normal)
     return Evidence(place, at, normal, value, sigma, number)
@@ -222,9 +222,9 @@ def _check(observation: Observation) -> None:
 
 
 def _demand_motions(length: np.ndarray) -> None:
-    """Raise InputError where lengths (n,) [m] of motions are no brain's, or where a brain's were given in metres.
+    """Raise InputError for lengths (n,) [m] of motions beyond any brain's, or given in metres.
 
-    Where none of them is anything, nothing moved.
+    Lengths of 0 are accepted: nothing moved.
     """
     if np.median(length) > LONGEST_MOTION:
         raise InputError(
@@ -233,13 +233,13 @@ def _demand_motions(length: np.ndarray) -> None:
         )
     if STILL < length.max() < 1e-3 * LONGEST_MOTION:
         raise InputError(
-            f"no point moves by more than {1e3 * length.max():.2g} mm, which nobody sees: give motions in millimetres, "
+            f"no point moves by more than {1e3 * length.max():.2g} mm, below any noise: give motions in millimetres, "
             "rather than metres. If nothing moved, give zeros."
         )
 
 
 def _demand_spread(where: np.ndarray, near: np.ndarray) -> None:
-    """Raise InputError where points (n, 3) [m] are of few places, or those that are `near` (n,) of a line."""
+    """Raise InputError if points (n, 3) [m] have too few distinct positions, or those `near` (n,) are on a line."""
     places = len(np.unique(np.round(where / ONE_PLACE), axis=0))
     if places < FEWEST:
         raise InputError(
@@ -252,7 +252,7 @@ def _demand_spread(where: np.ndarray, near: np.ndarray) -> None:
 
 
 def _off_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
-    """Distances (n,) [m] from the open cortex; of points within `NEAR` of a vertex, from the nearest one."""
+    """Compute distances (n,) [m] from the open cortex; within `NEAR` of a vertex, from the nearest vertex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     away = np.sqrt(squared_distances(points, nodes[np.unique(triangles)]).min(axis=1))
     far = np.flatnonzero(away > NEAR)
@@ -262,13 +262,13 @@ def _off_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
 
 
 def _mostly_off(off: np.ndarray, near: float) -> bool:
-    """Whether more than half of distances (n,) [m] are larger than is `near` [m]."""
+    """Return True if more than half of distances (n,) [m] exceed `near` [m]."""
     return bool(np.count_nonzero(off > near) > 0.5 * len(off))
 
 
 def _elsewhere(anatomy: Anatomy, points: np.ndarray, off: float, near: float) -> str:
-    """Why half of some points (n, 3) [m] may be so far `off` the open cortex, farther than is `near` [m]."""
-    start = f"half of the points lie more than {1e3 * off:.3g} mm off the open cortex"
+    """Describe why half of the points (n, 3) [m] may be at `off` from the open cortex, farther than `near` [m]."""
+    start = f"half of the points lie more than {1e3 * off:.3g} mm from the open cortex"
     for (scale, unit_meant), (turned, frame_meant) in product(UNITS, FRAMES):
         if not _mostly_off(_off_surface(anatomy, scale * points * turned), near):
             meant = " and ".join(filter(None, (unit_meant, frame_meant)))

@@ -1,4 +1,4 @@
-"""Observations in CSV files: millimetres, RAS, a header that says what each column is."""
+"""Observations in CSV files: millimetres, RAS, a header that names the columns."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from .observation import Observation
 
 PLACE, MOTION, SIGMA = ("x", "y", "z"), ("dx", "dy", "dz"), "sigma"
 NAMES = ("label", "name", "id")
-"""Columns that name a point, and that are passed over."""
-# Rows, characters of a line, and numbers beyond which a file is no list of points.
+"""Columns that name a point; they are ignored."""
+# Limits of a list of points: rows, characters of a line, largest number.
 MOST_ROWS, LONGEST_LINE, LARGEST = 1_000_000, 1000, 1e9
 
 
 def read_observation(path: str | Path, tips: str | Path | None = None) -> Observation:
     """Read `x,y,z,dx,dy,dz[,sigma]`, points in the scan and how they moved, or `x,y,z[,sigma]`, a cloud of the surface.
 
-    `tips` is a file of `x,y,z`: where tips of tools touch the surface. All in millimetres, RAS.
+    `tips` is a file of `x,y,z`: contact positions of tool tips. All in millimetres, RAS.
 
     Raises
     ------
     InputError
-        A file that is missing or no such table, columns that are missing, unknown or named twice, no rows, cells that
-        are no finite numbers or too large ones.
+        A file that is missing or not such a table, columns that are missing, unknown or duplicated, no rows, cells that
+        are not finite numbers or too large.
     """
     columns = read_columns(path, {(*PLACE, *MOTION), (*PLACE, *MOTION, SIGMA), PLACE, (*PLACE, SIGMA)})
     touched = np.zeros((0, 3)) if tips is None else _points(read_columns(tips, {PLACE}), PLACE)
@@ -41,7 +41,7 @@ def read_observation(path: str | Path, tips: str | Path | None = None) -> Observ
 
 
 def _points(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
-    """Columns [mm] as points (n, 3) [m]."""
+    """Convert columns [mm] to points (n, 3) [m]."""
     return 1e-3 * np.column_stack([columns[name] for name in names])
 
 
@@ -51,10 +51,10 @@ def read_columns(
     empty: tuple[str, ...] = (),
     blank: Callable[[Mapping[str, str]], bool] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Columns of a table by name, whose header is one of those allowed; in some columns cells may be `empty`: NaN.
+    """Read columns of a table by name, with an allowed header; in `empty` columns cells may be empty (NaN).
 
-    With `blank`, further columns are allowed. It is given all cells of a row by column; where it returns True, the
-    `empty` columns of that row are NaN.
+    With `blank`, further columns are allowed. It is called with all cells of a row by column; where it returns True,
+    the `empty` columns of that row are NaN.
 
     Raises
     ------

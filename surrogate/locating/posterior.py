@@ -1,9 +1,9 @@
-"""The Gaussian that is left of a prior on motions, once some of them are seen.
+"""Posterior of motions: a mixture of Gaussians.
 
 A prior motion is a sum of shapes with independent weights (Rasmussen, Williams 2006, "Gaussian Processes for Machine
-Learning", section 2.1). What takes part is a hypothesis; hypotheses are weighed by their evidence (equation 5.8).
+Learning", section 2.1). A hypothesis is a set of causes; hypotheses are weighed by their evidence (equation 5.8).
 Shapes only resemble tissue, so that evidence counts less than its formula says: Miller, Dunson 2019, "Robust Bayesian
-inference via coarsening", J. Am. Stat. Assoc. 114:1113-1125. Leaving points out: Sundararajan, Keerthi 2001,
+inference via coarsening", J. Am. Stat. Assoc. 114:1113-1125. Leave-one-out residuals: Sundararajan, Keerthi 2001,
 "Predictive approaches for choosing hyperparameters in Gaussian processes", Neural Comput. 13:1103-1118.
 """
 
@@ -23,27 +23,27 @@ from .evidence import SHIFT, SLIPPED, Evidence, triangular_inverse
 from .prior import RIGIDS, SETS, WITH_PLACE, Hypothesis, Prior
 from .whitened import Equations, Whitened, whitened, with_places
 
-# So improbable by errors alone is what is seen where something moved, by each of three tests.
+# Significance level of a motion, for each of three tests.
 MOVED = 0.005
-# A point is taken for an outlier if a better one is so improbable; so few points are not tested against each other.
+# Significance level of an outlier; number of points up to which none is tested.
 IMPROBABLE, FEWEST = 1e-4, 4
 NO_TIPS, NO_ROWS = np.zeros((0, 3)), np.zeros(0, int)
-# Evidence counts as one part in so many: hypotheses are seldom as wrong as they look.
+# Coarsening: evidence is raised to the power of one over this, as model errors make hypotheses look too improbable.
 COARSENED = 2.0
-# The kind of the rigid error's unknowns, beside those of causes.
+# Kind of the rigid error's unknowns, next to those of causes.
 RIGID = -1
-# So many of the most probable hypotheses make a mixture.
+# Number of the most probable hypotheses in the mixture.
 MIXED = 24
 (potrs,) = get_lapack_funcs(("potrs",), dtype=np.float64)
 
 
 def within_errors(posterior: Posterior) -> bool:
-    """Whether what is seen is no more than its errors, the rigid one as large as is stated: nothing need have moved.
+    """Return True if the observation is within its errors, the reported rigid error included: no motion is significant.
 
-    Two tests are of its size: the square Mahalanobis distance has a part of what is rigid, by generalised least
-    squares, and one of the rest. Both are chi-squared. The third is of its form: how many times as probable motions of
-    the prior make it, by their mean evidence, as errors alone do. By Markov's inequality errors alone exceed 1 / p with
-    a probability of p at most. So a dent is seen that is no larger in all than errors might be.
+    Two tests are of its size: the square Mahalanobis distance has a rigid part, by generalised least squares, and a
+    remainder. Both are chi-squared. The third is of its form: the ratio of the mean evidence of motions of the prior to
+    that of errors alone. By Markov's inequality errors alone exceed 1 / p with a probability of p at most. So a dent is
+    detected that is no larger in all than errors might be.
     """
     evidence = posterior.evidence
     whitening, scale = evidence.whitening(0.0), evidence.rigid_scale
@@ -61,7 +61,7 @@ def within_errors(posterior: Posterior) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Answer of one hypothesis about k unknowns.
+    """Posterior of k unknowns under one hypothesis.
 
     Parameters
     ----------
@@ -89,27 +89,26 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """What is known after seeing: a mixture of what hypotheses say.
+    """Posterior of motions: mixture over hypotheses.
 
     Parameters
     ----------
     evidence
-        What it was conditioned on: without outliers.
+        Evidence without outliers.
     answers
-        Of hypotheses; their shares sum to 1.
+        Posteriors of hypotheses; their shares sum to 1.
     unknown
         Mean (r + 6,) of the shapes' weights, and of the rigid error in its prior's standard deviations.
     surprise
-        Mean over points of how improbable each is by all others, as a share of what is expected: 1 where all fits.
+        Mean over rows of the leave-one-out square Mahalanobis distance: 1 if the observation fits.
     outliers
-        Numbers of the points that were left out.
+        Numbers of the points that were removed.
     slipped
-        Logarithm of how many times more probable what is seen is, if the registration slipped, than if it did not: of
-        the best hypothesis of each.
+        Log-odds of a slipped registration against one that did not slip: of the best hypothesis of each.
     moving
-        As that of a `SeenPrior`.
+        `moving` of a `SeenPrior`.
     factor
-        What covariances are larger by than the mixture's.
+        Calibration factor on the mixture's covariances.
     """
 
     evidence: Evidence
@@ -123,7 +122,7 @@ class Posterior:
 
     @property
     def weight(self) -> np.ndarray:
-        """Mean (r,) of the shapes' weights."""
+        """(r,): mean of the shapes' weights."""
         return self.unknown[:-6]
 
     @property
@@ -132,11 +131,11 @@ class Posterior:
         return self.unknown[-6:] * self.evidence.rigid_scale
 
     def bias_at(self, places: np.ndarray) -> np.ndarray:
-        """The mean rigid error (n, 3) [m] at places (n, 3) [m]."""
+        """Compute the mean rigid error (n, 3) [m] at positions (n, 3) [m]."""
         return self.rigid[:3] + np.cross(self.rigid[3:], places - self.evidence.middle)
 
     def covariance(self, shape: np.ndarray) -> np.ndarray:
-        """Covariances (q, 3, 3) [m^2] of motions that shapes (r, q, 3) [m] make."""
+        """Compute covariances (q, 3, 3) [m^2] of motions from shapes (r, q, 3) [m]."""
         flat = np.pad(shape.reshape(len(shape), -1), ((0, 6), (0, 0)))  # a rigid error moves no tissue
         mean, found = self.unknown @ flat, np.zeros((shape.shape[1], 3, 3))
         for answer in self.answers:
@@ -149,22 +148,22 @@ class Posterior:
 
 @dataclass(frozen=True, eq=False)
 class SeenPrior:
-    """A prior as it is seen at some points, whitened by their errors.
+    """Prior at the observed points, whitened by their errors.
 
     Parameters
     ----------
     prior
-        What is believed.
+        Prior of motions.
     scale
-        Size that motions may have [mm], in root mean square.
+        Prior size of motions [mm], root mean square.
     rows
-        What unit weights, and a rigid error of one standard deviation, do where something is seen.
+        Whitened effect of unit weights, and of a rigid error of one standard deviation, on the observation.
     odds
         As `Prior.odds`.
     slip
         As `Evidence.slip`.
     named
-        Whether points have names. Oedema is not among the causes of a cloud: its errors look like it.
+        True if points have correspondences. A cloud excludes oedema: its errors look like it.
     """
 
     prior: Prior
@@ -176,15 +175,15 @@ class SeenPrior:
 
     @property
     def slipped(self) -> float:
-        """As that of a `Posterior`."""
+        """Log-odds of a slip, as in `Posterior`."""
         best = self.logs.max(axis=1)
         return COARSENED * float(best[self._slips].max() - best[~self._slips].max())
 
     @property
     def moving(self) -> float:
-        """Logarithm of the mean evidence of motions under a registration that is no more off than is stated.
+        """Logarithm of the mean evidence of motions, for a registration within its reported error.
 
-        Odds do not count: a tip tells of no motion.
+        Odds do not count: a tip gives no information on motion.
         """
         logs = COARSENED * (self.logs - self.odds)[~self._slips]
         logs, rows = logs[np.isfinite(logs)], self.rows
@@ -192,13 +191,13 @@ class SeenPrior:
 
     @property
     def _slips(self) -> np.ndarray:
-        """Which of the hypotheses (h,) are of a registration that slipped."""
+        """Mask of the hypotheses (h,) with a slipped registration."""
         return np.isinf([hypothesis.rigid for hypothesis in self.prior.hypotheses])
 
     def answers(self, free: bool = False) -> list[Answer]:
-        """Of the most probable hypotheses, the best first; their shares sum to 1.
+        """Compute the posteriors of the most probable hypotheses, the best first; their shares sum to 1.
 
-        Those of a registration that slipped are among them if it is `free`.
+        Hypotheses of a slipped registration are included if it is `free`.
         """
         logs = self.logs if free else np.where(self._slips[:, None], -np.inf, self.logs)
         best = np.argsort(-logs, axis=None, kind="stable")[: min(MIXED, np.isfinite(logs).sum())]
@@ -213,11 +212,11 @@ class SeenPrior:
 
     @cached_property
     def logs(self) -> np.ndarray:
-        """Logarithms (h, 1 + p) of odds and coarsened evidence of hypotheses, less what all share.
+        """Logarithms (h, 1 + p) of odds and coarsened evidence of hypotheses, up to a common constant.
 
-        First without a tool, then with one on each place; -inf where none may press.
+        First without a tool, then with one at each place; -inf where none may press.
         """
-        # Tools all over the cortex and the rigid error take part in all hypotheses, and a set extends an earlier one.
+        # All hypotheses include tools all over the cortex and the rigid error, and each set extends an earlier one.
         rigid = self._equations().eliminated(TOOL).varied(RIGID, np.minimum(RIGIDS, self.slip)).eliminated(RIGID)
         found: dict[tuple[int, ...], Equations] = {}
         extended = {some[:-1] for some in SETS}
@@ -233,12 +232,12 @@ class SeenPrior:
         return self.odds + evidence.swapaxes(1, 2).reshape(-1, len(self.odds)) / COARSENED
 
     def _equations(self) -> Equations:
-        """In each skull, of all unknowns, each over its prior standard deviation."""
+        """Build the normal equations of all unknowns in each skull, each over its prior standard deviation."""
         shared, products = self.prior.together, self.rows.products
         skulls, places = len(shared.rows), shared.places
         rows = np.concatenate([shared.rows, np.tile(self._rigid, (skulls, 1))], axis=1)
         size = np.concatenate([self.scale * shared.size, np.ones((skulls, 6))], axis=1)
-        # Of each place, and the data beside them.
+        # Unknowns of each place, followed by the data.
         beside = np.concatenate([places, np.full((*places.shape[:2], 1), len(products) - 1)], axis=2)
         beside_size = np.append(np.full(places.shape[2], self.scale), 1.0)
         columns = np.concatenate([rows, beside.reshape(skulls, -1)], axis=1)
@@ -251,11 +250,11 @@ class SeenPrior:
 
     @property
     def _rigid(self) -> np.ndarray:
-        """Rows (6,) of the rigid error."""
+        """Row numbers (6,) of the rigid error."""
         return np.arange(-7, -1) + len(self.rows.products)
 
     def answer(self, hypothesis: Hypothesis, place: np.ndarray, share: float) -> Answer:
-        """What a hypothesis says with some more rows (q,), those of one place."""
+        """Compute the posterior of a hypothesis with the additional rows (q,) of one place."""
         own = np.concatenate([hypothesis.rows, self._rigid, place])
         size = np.full(len(own), self.scale)
         size[: len(hypothesis.rows)] *= hypothesis.size
@@ -268,9 +267,9 @@ class SeenPrior:
 
 
 def seen_prior(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> SeenPrior:
-    """How a prior is seen by some evidence, where tips of tools (k, 3) [m] touch the cortex."""
+    """Whiten a prior at the points of some evidence; tips of tools (k, 3) [m] touch the cortex."""
     seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
-    # A motion and a rigid error may cancel, so that little is seen of either; and noise hides what is smaller.
+    # A motion and a rigid error may cancel, so that the observation is small; and noise hides smaller motions.
     scale = 1e3 * max(float(np.hypot(seen, np.sqrt(3.0) * evidence.shift)), float(np.median(evidence.sigma)))
     return SeenPrior(prior, scale, whitened(prior, evidence, seen), prior.odds(tips), evidence.slip, evidence.named)
 
@@ -278,12 +277,12 @@ def seen_prior(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> 
 def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS, free: bool = False) -> Posterior:
     """Condition a prior on evidence, without points that no other supports. Tips (k, 3) [m] touch the cortex.
 
-    The rigid error is as large as is stated, or `free`: then it may be that of a registration that slipped.
+    The rigid error is of the reported size, or `free`: then it may be that of a slipped registration.
 
     Raises
     ------
     InputError
-        Points of which hardly any agree.
+        Fewer points that agree than needed.
     """
     kept, point = np.ones(len(evidence), bool), evidence.point
     while True:
@@ -308,7 +307,7 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS, fr
 
 
 def _oddness(rows: Whitened, answer: Answer, point: np.ndarray) -> np.ndarray:
-    """Square Mahalanobis distance of each point (n,) from what all others predict of it, by one hypothesis."""
+    """Compute square Mahalanobis distances (n,) of points from their leave-one-out predictions by one hypothesis."""
     data = len(rows.products) - 1
     precise = rows.precise(np.append(answer.rows, data))
     known = precise[:, :-1] @ answer.root.T

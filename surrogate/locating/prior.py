@@ -1,7 +1,8 @@
-"""What is believed of a motion before it is seen: shapes of every cause in every skull, and which may take part.
+"""Prior of brain motions: shapes of every cause in every skull, and sets of causes that may act together.
 
-A motion is a sum of shapes with independent weights. Shapes of drainage and swelling are the principal ones of an
-ensemble. Those of tools are what smooth forces on the open cortex do to linear tissue, all over it or round one place.
+A motion is a sum of shapes with independent weights. Shapes of drainage and swelling are the principal components of an
+ensemble. Those of tools are responses of linear tissue to smooth forces on the open cortex, all over it or round one
+place.
 """
 
 from __future__ import annotations
@@ -19,46 +20,46 @@ from sim.errors import InputError
 from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, TUMOUR_SWELLING, Presses, spaced
 from .ensemble import Ensemble, surface_size
 
-# Shapes of each kind in each skull, at most; the least share of the variance that one of them has.
+# Maximum number of shapes of each kind in each skull; smallest share of the variance of one of them.
 MOST = {DRAINAGE: 12, SWELLING: 12, TUMOUR_SWELLING: 4, OEDEMA: 8, TOOL: 40}
 SMALLEST_SHARE = 1e-6
-# Places that one tool may press on, shapes of each, and how far [m] its forces reach round it.
+# Places that one tool may press on, shapes of each, and radius [m] of its forces.
 PLACES, PLACE_SHAPES, REACH = 30, 6, 6e-3
-# Sizes as shares of the seen motion: of what takes part; of a tumour's swelling where a brain swells; of forces all
-# over the cortex, which make good what the other shapes lack.
+# Prior sizes as shares of the observed motion: of each cause; of a tumour's swelling with a swelling brain; of forces
+# all over the cortex, which compensate for missing shapes.
 SIZE = {DRAINAGE: 1.0, SWELLING: 1.0, TUMOUR_SWELLING: 0.3, OEDEMA: 1.0, TOOL: 0.15}
-# The rigid error, as shares of what an observation states: a brain that sinks looks much like one. The last is that of
-# a registration that slipped, which nobody states.
+# Rigid error relative to the reported one (a brain that sinks looks much like one); the last, inf, is a slipped
+# registration.
 RIGIDS = (0.1, 1.0, np.inf)
-# A skull that lets go holds what tools press against it, as one does in which the brain slides.
+# Skull whose tool shapes are used: one that separates keeps contact under a tool, so sliding contact applies.
 PRESSED = {"bonded": "bonded", "slide": "slide", "contact": "slide"}
-# Causes beside tools, and which of them may take part.
+# Causes other than tools, and the sets of them that may act together.
 BESIDE = (DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA)
 SETS = (
     (), (DRAINAGE,), (SWELLING,), (OEDEMA,), (DRAINAGE, SWELLING), (SWELLING, OEDEMA),
     (DRAINAGE, SWELLING, TUMOUR_SWELLING),
 )  # fmt: skip
-# With one of these a tool may press on one place.
+# Sets with which a tool may press on one place.
 WITH_PLACE = SETS[:6]
 NOWHERE = -1
-# A tip that touches presses on a place so near [m] as a standard deviation, and so seldom on none.
+# Standard deviation [m] of the pressed place about a touching tip; probability that it presses on none.
 TOUCHED, UNTOUCHED = 4e-3, 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """What takes part in a motion.
+    """Set of causes that act together, with prior sizes.
 
     Parameters
     ----------
     rows
         (k,) of the prior's shapes.
     size
-        (k,) standard deviations of their weights, as shares of the seen motion.
+        (k,) standard deviations of their weights, as shares of the observed motion.
     rigid
-        That of the rigid error, as a share of what an observation states; inf of a registration that slipped.
+        Size of the rigid error relative to the reported one; inf for a slipped registration.
     places
-        (p, q) rows of shapes, of which those of one line may take part too: of a tool that presses on one place.
+        (p, q) rows of shapes; those of one line may be added: a tool that presses on one place.
     """
 
     rows: np.ndarray
@@ -69,18 +70,18 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """What may take part in each of s skulls, in tables whose columns are of one kind.
+    """Shapes that may act in each of s skulls, as tables with one kind per column.
 
     Parameters
     ----------
     rows
-        (s, k) of the prior's shapes. A skull with fewer of a kind has some row instead, of size 0.
+        (s, k) of the prior's shapes. A skull with fewer of a kind is padded with row 0, of size 0.
     size
-        (s, k), as of a `Hypothesis`.
+        (s, k), as in `Hypothesis`.
     kind
         (k,) of the columns; tools all over the cortex.
     places
-        (s, p, q), as of a `Hypothesis`.
+        (s, p, q), as in `Hypothesis`.
     """
 
     rows: np.ndarray
@@ -91,7 +92,7 @@ class Together:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Shapes of one anatomy.
+    """Prior of motions of one anatomy: its shapes.
 
     Parameters
     ----------
@@ -103,11 +104,11 @@ class Prior:
     kind, skull
         (r,) indices into `KINDS` and into the names of `sim.effects.SKULLS`.
     place
-        (r,) number of the place that a tool presses on, or `NOWHERE`.
+        (r,) number of the place under the tool, or `NOWHERE`.
     centre
-        (p, 3) [m] of these places, at rest.
+        (p, 3) [m] undeformed positions of these places.
     nodes
-        (n,) sorted mesh vertices that shapes are known at; None: at all.
+        (n,) sorted mesh vertices of the shapes; None: all.
     """
 
     anatomy: Anatomy
@@ -119,7 +120,7 @@ class Prior:
     nodes: np.ndarray | None = None
 
     def at(self, nodes: np.ndarray) -> np.ndarray:
-        """The shapes (r, k, 3) [m] at some vertices (k,).
+        """Return the shapes (r, k, 3) [m] at some vertices (k,).
 
         Raises
         ------
@@ -129,31 +130,31 @@ class Prior:
         return self.shape[:, self._columns(nodes)]
 
     def restricted(self, nodes: np.ndarray) -> Prior:
-        """The same, known at some vertices (k,) alone; it raises InputError as `at` does.
+        """Return this prior restricted to some vertices (k,); it raises InputError as `at` does.
 
-        Answers stay the same wherever they can be given. An observation that touches other vertices is refused.
+        Results are unchanged where available. An observation that touches other vertices is rejected.
         """
         some = np.unique(nodes)
         return replace(self, shape=self.at(some), nodes=some)
 
     def prepare(self) -> None:
-        """Compute the tables that all observations share, unless they are there."""
+        """Compute the tables that all observations share, once."""
         _ = self.middle, self.hypotheses, self.together, self._by_vertex
 
     @cached_property
     def middle(self) -> np.ndarray:
-        """(r, 3) [m]: how each shape moves the middle of the tumour's volume."""
+        """(r, 3) [m]: motion of the centroid of the tumour's volume by each shape."""
         tumour = self.anatomy.tumour_nodes
         return np.einsum("v,rvi->ri", tumour_share(self.anatomy)[tumour], self.at(tumour))
 
     @cached_property
     def on_cortex(self) -> np.ndarray:
-        """(r, r) [m^2]: products of the shapes with each other, summed over the open cortex's vertices."""
+        """(r, r) [m^2]: inner products of the shapes, summed over the open cortex's vertices."""
         flat = self.at(np.unique(self.anatomy.open_surface)).reshape(len(self.shape), -1).astype(float)
         return flat @ flat.T
 
     def _columns(self, nodes: np.ndarray) -> np.ndarray:
-        """Where vertices (k,) are among those that are known."""
+        """Return the column numbers of vertices (k,) among the available ones."""
         if self.nodes is None:
             return nodes
         column = np.searchsorted(self.nodes, nodes).clip(max=len(self.nodes) - 1)
@@ -166,27 +167,27 @@ class Prior:
 
     @cached_property
     def _by_vertex(self) -> np.ndarray:
-        """(n, 3, r) float32 [m]: the shapes, so that those at a few places are near each other."""
+        """(n, 3, r) float32 [m]: the shapes, with those of one vertex contiguous in memory."""
         return np.ascontiguousarray(self.shape.transpose(1, 2, 0))
 
     def at_vertices(self, nodes: np.ndarray) -> np.ndarray:
-        """The shapes (k, 3, r) float32 [m] at some vertices (k,); it raises InputError as `at` does."""
+        """Return the shapes (k, 3, r) float32 [m] at some vertices (k,); it raises InputError as `at` does."""
         return self._by_vertex[self._columns(nodes)]
 
     def seen(self, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """What would be seen (m, r) [m] of each shape, by vertices and weights as `Evidence.weights` has them."""
+        """Compute displacements (m, r) [m] of each shape, by vertices and weights as in `Evidence.weights`."""
         shape = self.at_vertices(vertices)
         return (weights @ shape.reshape(weights.shape[1], -1)).reshape(-1, shape.shape[2])
 
     def odds(self, tips: np.ndarray) -> np.ndarray:
-        """Logarithms (1 + p,) of how likely no tool presses, or one on each place, where tips (k, 3) [m] touch."""
+        """Compute log-odds (1 + p,) of no tool, or one pressing on each place, where tips (k, 3) [m] touch."""
         if not len(tips):
             return np.zeros(1 + len(self.centre))
         away = ((self.centre[:, None] - tips) ** 2).sum(axis=2).min(axis=1)
         return np.append(np.log(UNTOUCHED), -away / (2.0 * TOUCHED**2))
 
     def _in_skull(self, number: int) -> tuple[dict[int, np.ndarray], np.ndarray]:
-        """Rows by kind in a skull, of tools those all over the cortex; and (p, q), those of a tool on each place."""
+        """Return rows by kind in a skull (tools: all over the cortex), and (p, q), those of a tool on each place."""
         rows = {kind: np.flatnonzero((self.kind == kind) & (self.skull == number)) for kind in BESIDE}
         pressed = (self.kind == TOOL) & (self.skull == list(SKULLS).index(PRESSED[list(SKULLS)[number]]))
         places = [np.flatnonzero(pressed & (self.place == place)) for place in range(self.place.max() + 1)]
@@ -194,7 +195,7 @@ class Prior:
 
     @cached_property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """Every set of causes in every skull, with little of a rigid error, with much, and where it slipped."""
+        """Every set of causes in every skull, with a small, a reported and a slipped rigid error."""
         made = []
         for number in range(len(SKULLS)):
             rows, places = self._in_skull(number)
@@ -207,7 +208,7 @@ class Prior:
 
     @cached_property
     def together(self) -> Together:
-        """What may take part in each skull, in tables."""
+        """Tables of the shapes that may act in each skull."""
         found, places = zip(*map(self._in_skull, range(len(SKULLS))), strict=True)
         rows, size, kinds = [], [], []
         for kind in (TOOL, *BESIDE):
@@ -219,7 +220,7 @@ class Prior:
 
 
 def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = None) -> Prior:
-    """The prior of an ensemble, or of some of its members (N,) bool, and of forces on the open cortex."""
+    """Build the prior of an ensemble, or of some of its members (N,) bool, and of forces on the open cortex."""
     anatomy, parts = ensemble.anatomy, []
     chosen = np.ones(len(ensemble.kind), bool) if members is None else members
     for kind, skull in product(BESIDE, range(len(SKULLS))):
@@ -248,9 +249,9 @@ def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = 
 
 
 def unit(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
-    """Motions (n, V, 3) [m], made so large that they move the open cortex or the tumour by 1 mm, what moves farther.
+    """Scale motions (n, V, 3) [m] to 1 mm root mean square, on the open cortex or in the tumour (the larger).
 
-    A motion that leaves the cortex nearly still says little of what is seen.
+    Scaling by the cortex alone would magnify motions that leave it nearly undeformed.
     """
     tumour = np.sqrt((motion[:, anatomy.tumour_nodes] ** 2).sum(axis=2).mean(axis=1))
     size = np.maximum(surface_size(anatomy, motion), tumour)
@@ -258,12 +259,12 @@ def unit(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
 
 
 def alike(anatomy: Anatomy, shape: np.ndarray) -> np.ndarray:
-    """Shapes (k, V, 3) [m] that together move the open cortex by 1 mm."""
+    """Scale shapes (k, V, 3) [m] so that together they move the open cortex by 1 mm."""
     return shape * np.float32(1e-3 / np.sqrt((surface_size(anatomy, shape) ** 2).sum()))
 
 
 def principal(motion: np.ndarray, most: int) -> np.ndarray:
-    """At most so many principal parts (k, V, 3) of motions (n, V, 3): their products sum to those of the motions."""
+    """Compute up to `most` principal components (k, V, 3) of motions (n, V, 3), with the same Gram matrix."""
     flat = motion.reshape(len(motion), -1)
     value, vector = np.linalg.eigh((flat @ flat.T).astype(float))
     chosen = np.argsort(-value)[:most]
@@ -272,12 +273,12 @@ def principal(motion: np.ndarray, most: int) -> np.ndarray:
 
 
 def middle_of(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
-    """How motions (n, V, 3) [m] move the middle of the tumour's volume (n, 3) [m]."""
+    """Compute the motion (n, 3) [m] of the centroid of the tumour's volume for motions (n, V, 3) [m]."""
     return np.einsum("v,nvi->ni", tumour_share(anatomy), motion)
 
 
 def tumour_share(anatomy: Anatomy) -> np.ndarray:
-    """Share (V,) of each vertex in the middle of the tumour's volume."""
+    """Compute the weight (V,) of each vertex in the centroid of the tumour's volume."""
     mesh = anatomy.mesh
     inside = anatomy.in_tumour
     share = np.zeros(len(mesh.nodes))

@@ -1,4 +1,4 @@
-"""Regions whose stiffness is known, in a brain whose stiffness is not."""
+"""Regions of known stiffness, in a brain of unknown stiffness."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import Material, Tissue
 
-# Ratios of stiffness that differ by less are alike.
+# Relative tolerance for equal stiffness ratios.
 ALIKE = 1e-6
 
 
 @dataclass(frozen=True)
 class Region:
-    """What is known of a region's tissue.
+    """Known tissue of a region.
 
     Parameters
     ----------
     label
-        As the mesh has it.
+        Label in the mesh.
     ratio
         Its Young's modulus over the brain's.
     poisson
@@ -32,7 +32,7 @@ class Region:
     Raises
     ------
     InputError
-        A label that is no whole number, or numbers that no tissue has.
+        A label that is not a whole number, or parameters outside the range of tissue.
     """
 
     label: int
@@ -48,21 +48,22 @@ class Region:
 def beside(
     tissue: Callable[[float, float], Tissue], poisson: float, ratio: float, regions: tuple[Region, ...]
 ) -> Elasticity:
-    """Brain, tumour and known regions of `tissue(times, poisson)`, `times` as stiff as the brain.
+    """Build the elasticity of brain, tumour and known regions from `tissue(times, poisson)`.
 
-    `poisson` is the brain's, and `ratio` the tumour's stiffness over it, unless the tumour is a known region.
+    `times` is the stiffness over the brain's. `poisson` is the brain's, and `ratio` the tumour's stiffness over it,
+    unless the tumour is a known region.
     """
     known = {one.label: tissue(one.ratio, poisson if one.poisson is None else one.poisson) for one in regions}
     return Elasticity(tissue(1.0, poisson), {TUMOUR_LABEL: tissue(ratio, poisson), **known})
 
 
 def known_regions(elasticity: Elasticity) -> tuple[Region, ...]:
-    """Regions that have a tissue of their own beside the brain's.
+    """Return the regions that have a tissue of their own.
 
     Raises
     ------
     InputError
-        Tissue that states no Young's modulus.
+        Tissue without a Young's modulus.
     """
     brain = elasticity.default
     if not elasticity.regions:
@@ -85,9 +86,10 @@ def check_regions(regions: tuple[Region, ...], anatomy: Anatomy) -> None:
 
 
 def differing(elasticity: Elasticity, known: tuple[Region, ...]) -> tuple[int, ...]:
-    """Labels of regions that tissue has otherwise than is known of it, or that are as the brain in one alone.
+    """Return the labels of regions whose tissue differs from the known one.
 
-    The tumour is none: its stiffness may be unknown. Of tissue that states no Young's modulus none is.
+    Regions without an entry count as brain. The tumour is excluded: its stiffness may be unknown. Empty if a tissue has
+    no Young's modulus.
     """
     if not all(isinstance(tissue, Material) for tissue in (elasticity.default, *elasticity.regions.values())):
         return ()
@@ -103,7 +105,7 @@ def differing(elasticity: Elasticity, known: tuple[Region, ...]) -> tuple[int, .
 
 
 def regions_words(regions: tuple[Region, ...]) -> str:
-    """What regions are known, in words; empty where none are."""
+    """Describe the known regions; empty if there are none."""
     return "; ".join(
         f"{region_words(one.label)} {one.ratio:.3g} times as stiff as the brain"
         + ("" if one.poisson is None else f", Poisson's ratio {one.poisson:g}")

@@ -1,7 +1,7 @@
-"""Points without a place at rest find one: on the surface as it is believed to be, which they then tell of.
+"""Iterated conditioning of clouds and tips: points without an undeformed position are matched to the estimated surface.
 
-This is iterated conditioning with the closest points renewed, as in Besl, McKay 1992, "A method for registration of
-3-D shapes", IEEE Trans. Pattern Anal. Mach. Intell. 14:239-256.
+The closest points are recomputed in each iteration, as in Besl, McKay 1992, "A method for registration of 3-D shapes",
+IEEE Trans. Pattern Anal. Mach. Intell. 14:239-256.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from .observation import Observation, placed, placed_anew
 from .posterior import Posterior, conditioned
 from .prior import Prior
 
-# Rounds at most. They end sooner where the tumour's middle moves by less than this [m]: later ones then come no nearer.
+# Maximum number of iterations; they end once the tumour's centroid moves by less than this [m].
 ROUNDS, STEADY = 6, 0.2e-3
 
 
 def settled(prior: Prior, observation: Observation, free: bool = False) -> tuple[Posterior, np.ndarray]:
-    """What an observation leaves of a prior, and the numbers (k,) of its points that are near the cortex.
+    """Compute the posterior of an observation, and the numbers (k,) of its points near the cortex.
 
     The rigid error may be `free`, as in `conditioned`.
 

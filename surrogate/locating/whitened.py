@@ -1,10 +1,10 @@
-"""What unknowns do at the points that are seen, in rows whose errors are independent and of variance 1.
+"""Whitened effect of the unknowns on observed points: rows with independent errors of variance 1.
 
-Unknowns are scaled to a prior variance of 1, and data d are whitened. The normal equations have the matrix
-M = 1 + A^T A and the right side b = A^T d. But for what all sets share, the logarithm of a set's evidence is
-b^T M^-1 b / 2 - log(det M) / 2. Source: Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equation
-5.8. Both terms are sums over blocks that are eliminated one after another, each from the Schur complement that is
-left. Source: Golub, Van Loan 2013, "Matrix Computations", section 4.2.
+Unknowns are scaled to a prior variance of 1, and data d are whitened. The normal equations have the matrix M = 1 + A^T
+A and the right side b = A^T d. Up to a constant that all sets share, the logarithm of a set's evidence is b^T M^-1 b /
+2 - log(det M) / 2. Source: Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equation 5.8. Both
+terms are sums over blocks that are eliminated one after another, each from the Schur complement that is left. Source:
+Golub, Van Loan 2013, "Matrix Computations", section 4.2.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from .prior import Prior
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Stacks (...) of normal equations whose unknowns were eliminated in part. Some of p places may join each.
+    """Stacks (...) of partly eliminated normal equations, to which the unknowns of one of p places may be added.
 
     Parameters
     ----------
     kind
-        (k,) of the unknowns that are left; those of one kind are adjacent.
+        (k,) of the remaining unknowns; those of one kind are adjacent.
     table
-        (..., k, k + p (q + 1)): their products with each other, and with what stands in `place`.
+        (..., k, k + p (q + 1)): their products with each other, and with the columns of `place`.
     place
         (..., p, q, q + 1): products of the q unknowns of each place with each other and with the data, which come last.
     evidence
-        (...): logarithm of that of the unknowns that were eliminated.
+        (...): log evidence of the eliminated unknowns.
     """
 
     kind: np.ndarray
@@ -62,7 +62,7 @@ class Equations:
         return Equations(left, table, place, evidence)
 
     def varied(self, kind: int, sizes: np.ndarray) -> Equations:
-        """The same (..., b) where unknowns of one kind have b prior standard deviations in turn, in place of 1."""
+        """Return equations (..., b) in which unknowns of one kind have b prior standard deviations, instead of 1."""
         own = np.flatnonzero(self.kind == kind)
         size = np.ones((len(sizes), self.table.shape[-1]))
         size[:, own] = sizes[:, None]
@@ -73,8 +73,8 @@ class Equations:
 
 
 def with_places(several: Sequence[Equations]) -> np.ndarray:
-    """Logarithms (n, ..., p) of the evidence of n equations with one place each, of the unknowns eliminated so far."""
-    # Blocks are small and many: Gaussian elimination of all at once takes a tenth of the time of a library's calls.
+    """Compute logarithms (n, ..., p) of the evidence of n equations with one place each, of the eliminated unknowns."""
+    # Blocks are small and many: Gaussian elimination of all at once takes a tenth of the time of library calls.
     table = np.ascontiguousarray(np.moveaxis(np.stack([each.place for each in several]), (-2, -1), (0, 1)))
     found = np.stack([each.evidence for each in several])[..., None]
     for row in range(len(table)):
@@ -91,21 +91,21 @@ def _logarithm(gain: np.ndarray, block: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """Rows (m,) of unknowns, which are weights of r shapes and a rigid error, and of what is seen.
+    """Whitened rows (m,) of unknowns (weights of r shapes, rigid error) and of the data.
 
-    A shape's rows are `weights` times its motions at the vertices: many points see few vertices, so that products
-    of rows are had from fewer numbers.
+    A shape's rows are `weights` times its motions at the vertices: many points depend on few vertices, so that products
+    of rows need fewer numbers.
 
     Parameters
     ----------
     whitening
-        What made errors independent.
+        Transform to independent errors.
     weights
-        (m / c, v c'), as those of `Evidence.weights` and whitened. Rows of c = 3 axes see c' = 1 axis at once.
+        (m / c, v c'), as those of `Evidence.weights` and whitened. Rows of c = 3 axes use c' = 1 axis at once.
     shape
         (v c', c r) [m]: motions of the vertices.
     rest
-        (m, 7): what a rigid error of one standard deviation does, and what is seen.
+        (m, 7): rows of a rigid error of one standard deviation, and the data.
     """
 
     whitening: Whitening
@@ -114,7 +114,7 @@ class Whitened:
     rest: np.ndarray
 
     def precise(self, columns: np.ndarray) -> np.ndarray:
-        """The errors' inverse covariance times rows (m, k) of some of the unknowns and of what is seen (k,)."""
+        """Compute the errors' inverse covariance times rows (m, k) of some of the unknowns and of the data (k,)."""
         shapes = columns < self._shapes
         found, back = np.empty((len(self.rest), len(columns))), self.whitening.back
         some = self.shape.reshape(-1, self._shapes)[:, columns[shapes]].reshape(len(self.shape), -1)
@@ -129,7 +129,7 @@ class Whitened:
 
     @cached_property
     def products(self) -> np.ndarray:
-        """(r + 7, r + 7): of the rows of unknowns, and of what is seen as the last, with each other."""
+        """(r + 7, r + 7): inner products of the rows of unknowns and of the data, which come last."""
         count, tall = self._shapes, len(self.weights) > 2 * len(self.shape)
         few = np.linalg.qr(self.weights, mode="r") if tall else self.weights
         rows = (few @ self.shape).reshape(-1, count)
@@ -143,7 +143,7 @@ class Whitened:
 
 
 def whitened(prior: Prior, evidence: Evidence, seen: float) -> Whitened:
-    """Rows of a prior's shapes and of evidence, where shapes lack what belongs to motions of `seen` [m]."""
+    """Build whitened rows of a prior's shapes and of evidence, with their model error for motions of `seen` [m]."""
     whitening = evidence.whitening(seen)
     vertices, weights = evidence.weights
     shape = prior.at_vertices(vertices).reshape(weights.shape[1], -1).astype(float)

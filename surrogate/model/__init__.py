@@ -1,1 +1,1 @@
-"""Learned models: a deformer, its bounds, its range, and its file."""
+"""Trained models: a deformer, its bounds, its training range, and its file."""

@@ -1,4 +1,4 @@
-"""Which scenes a learnt model may answer: those of the effects that it was trained under."""
+"""Applicability check: scenes that a trained model supports, by the effects that it was trained under."""
 
 from __future__ import annotations
 
@@ -30,37 +30,37 @@ from ..data.answer_rows import stated_tissue
 from ..data.holding import series_of
 from .learned import Learned
 
-# Effects that do nothing until a load calls for them: a model's training may have more of them than a scene.
+# Effects that do nothing without a load of their kind: training may include them although a scene does not.
 ON_CALL = {kind.__name__ for kind in (ToolForce, ToolDisplacement, NodalForce, Gravity)}
-# Sizes of tools that differ by less, as a share, are the same: 26 mm are 0.026 m or 1e-3 * 26.
+# Relative tolerance for equal tool sizes: 26 mm are 0.026 m or 1e-3 * 26.
 SAME = 1e-9
-# The training effects of models whose file does not state them.
+# Training effects of models whose file does not give them.
 UNSAID = frozenset(kind.__name__ for kind in (Elasticity, Held, Slide, ToolForce))
 
 
 def trained_effects(stated: Mapping[str, str]) -> frozenset[str]:
-    """Names of the effects that a model was trained under, or a data set was made under, as its file states them."""
+    """Return the names of the effects that a model was trained under, or a data set was made under, by its file."""
     if "effects" not in stated:
         return UNSAID
     with suppress(SyntaxError):
-        match ast.parse(stated["effects"], mode="eval").body:  # what `repr` of a tuple of effects gave
+        match ast.parse(stated["effects"], mode="eval").body:  # `repr` of a tuple of effects
             case ast.Tuple(elts):
                 return frozenset(ast.unparse(one.func) for one in elts if isinstance(one, ast.Call))
     return frozenset()
 
 
 def trained_skull(stated: Mapping[str, str]) -> str:
-    """What the skull did while a data set was made: one of `sim.effects.SKULLS`."""
+    """Return the skull model of a data set: one of `sim.effects.SKULLS`."""
     names = trained_effects(stated)
     return next((name for name, effect in SKULLS.items() if type(effect).__name__ in names), "bonded")
 
 
 def refusal(model: Learned, effects: Iterable[Effect], element: str | None = None) -> str | None:
-    """Why a model may not answer under these effects, on this element, or None if it may.
+    """Return the reason why a model does not support these effects or this element, or None if it does.
 
-    A model of poses answers where its tool touches, one of pushes where a tool's force acts. Where its
-    anatomy has no skull it is all one whether `Bonded` or `Slide` is asked for. Tissue and element must be those that
-    it learned from; an `element` of None is not compared, nor what the model's file does not state.
+    A model of poses needs contact with its tool, one of pushes a tool's force. If its anatomy has no skull, `Bonded`
+    and `Slide` are equivalent. Tissue and element must be those of the training; an `element` of None is not compared,
+    nor is anything missing in the model's file.
     """
     effects = tuple(effects)
     trained, asked = trained_effects(model.training), frozenset(type(effect).__name__ for effect in effects)
@@ -83,21 +83,21 @@ def refusal(model: Learned, effects: Iterable[Effect], element: str | None = Non
 
 
 def _alike(one: Tool, other: BuiltIn) -> bool:
-    """Whether tools are of one kind and size, but for round-off."""
+    """Return True if tools are of one kind and size, within round-off."""
     if not isinstance(one, BuiltIn) or type(one) is not type(other):
         return False
     return bool(np.allclose(astuple(one), astuple(other), rtol=SAME, atol=0.0))
 
 
 def _moved(effect: Effect) -> tuple[Tool, ...]:
-    """The tools that an effect moves by pose."""
+    """Return the tools that an effect moves by pose."""
     if isinstance(effect, Retraction):
         return (effect.blade,)
     return effect.tools if isinstance(effect, ToolContact) else ()
 
 
 def _other_series(trained: Elasticity, here: Elasticity) -> str | None:
-    """Why tissues of one law and stiffness relax in different ways; None where they do not, or differ otherwise."""
+    """Return the difference between the relaxation of tissues that are otherwise equal; None without one."""
     learned, asked = series_of([trained]), series_of([here])
     if learned == asked or here.default is None or replace(cast(Any, here.default), prony=learned) != trained.default:
         return None
@@ -105,13 +105,13 @@ def _other_series(trained: Elasticity, here: Elasticity) -> str | None:
 
 
 def _relaxes(series: Pairs) -> str:
-    """A Prony series in words."""
+    """Describe a Prony series."""
     each = " and ".join(f"{100.0 * g:g} % in {tau:g} s" for g, tau in series)
     return f"relaxes by {each}" if each else "does not relax"
 
 
 def _other_body(model: Learned, effects: tuple[Effect, ...], element: str | None) -> str | None:
-    """Why a model's finite elements are others than these: tissue, or element."""
+    """Return the difference in tissue or element between a model's FEM and this one; None without one."""
     stated, here = model.training, next((effect for effect in effects if isinstance(effect, Elasticity)), None)
     if "tissue" in stated and here is not None:
         trained = stated_tissue(stated)

@@ -1,9 +1,9 @@
-"""How far a prediction may be from the finite elements: split conformal bounds with a scale for each load.
+"""Bounds on the error of a prediction relative to FEM: split conformal prediction with a scale for each load.
 
 Lei, G'Sell, Rinaldo, Tibshirani, Wasserman 2018, "Distribution-free predictive inference for regression", J. Am. Stat.
 Assoc. 113:1094-1111, section 5.2. The quantiles are by classes as in Vovk, Lindsay, Nouretdinov, Gammerman 2003,
-"Mondrian confidence machine". Every class of force has quantiles of its own, so that weak loads do not vouch for strong
-ones.
+"Mondrian confidence machine". Every class of force has its own quantiles, so that errors of weak loads do not determine
+the bounds of strong ones.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from ..regressors.protocol import standardisation
 from .training_range import Measured, Outside
 
 LEVELS = (0.95, 0.99)
-# So many calibration loads make a class of force, of which there are at most so many.
+# Calibration loads in a class of force; maximum number of classes.
 CLASS, CLASSES = 200, 10
-# Of the squared weights, beside the squared misfit of logarithms of unit variance a load.
+# Weight of the squared coefficients relative to the squared misfit of logarithms, per load.
 RIDGE = 1e-2
-# The first features describe the load: force, radius, angle, overhang. The rest are its place.
+# Number of features of the load itself: force, radius, angle, overhang. The others are its position.
 LOAD = 4
-# Fewer errors than ten a term determine no curvature.
+# Minimum number of errors for a quadratic scale: ten per term.
 BENDS = 150
-# Standard deviations beyond which a feature counts no further; and the share of the mean below which no error counts.
+# Limit of standardised features [standard deviations]; smallest error as a share of the mean.
 FARTHEST, LEAST = 4.0, 1e-3
-# How much a bound grows beyond the range of training loads, for each unit of `Outside.beyond`. With the distance from
-# the nearest training load it grows by so much [1/m] where no loads tell how much, and never by more than the last.
+# Growth of a bound beyond the training range, per unit of `Outside.beyond`. Growth with the distance from the nearest
+# training load [1/m]: default without loads that determine it; maximum.
 GROWTH, USUAL_GROWTH, MOST_GROWTH = 4.0, 1e3, 2e4
 
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """With probability 0.95 (0.99) the largest error over the tumour's vertices is below quantile x scale(load).
+    """Bound on the largest error over the tumour's vertices: quantile x scale(load), with probability 0.95 (0.99).
 
-    Promised for loads drawn as the calibration loads were; elsewhere it grows, and promises nothing.
+    Guaranteed for loads distributed as the calibration loads; elsewhere it grows, without a guarantee.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class Bound:
     quantile
         (2, k): of error over scale, for `LEVELS` and each class.
     growth, near
-        () [1/m], with the distance from the nearest training load, of which the first part () [m] does not count.
+        () [1/m] growth with the distance from the nearest training load, and () [m] the distance from which it grows.
     """
 
     mean: np.ndarray
@@ -64,7 +64,7 @@ class Bound:
     near: np.ndarray
 
     def of(self, features: np.ndarray, force: np.ndarray, outside: Outside) -> np.ndarray:
-        """Bounds (2, B) [m] for `LEVELS`, of features (B, f), forces (B,) [N], and where the B loads lie."""
+        """Compute bounds (2, B) [m] for `LEVELS`, of features (B, f), forces (B,) [N], and the loads' `outside`."""
         scale = np.exp(_monomials(_standard(features, self.mean, self.deviation)) @ self.weights)
         away = np.maximum(outside.away - self.near, 0.0)
         scale = scale * (1.0 + self.growth * away) * (1.0 + GROWTH * outside.beyond)
@@ -82,23 +82,24 @@ def fitted_bound(
     away: np.ndarray | float = 0.0,
     growth: float = 0.0,
 ) -> Bound:
-    """A bound whose scale follows what was `seen`, calibrated on other loads.
+    """Fit a bound whose scale follows the errors of `seen` loads, and calibrate it on other loads.
 
-    The scale depends on the load, not on its place. Where `seen` loads lie in few discs of the cortex, a scale that
-    follows the place runs away between them. One that did bounded a distance that was 0.05 mm off by 4.2 mm.
+    The scale depends on the load, not on its position. If `seen` loads cover few regions of the cortex, a scale that
+    follows the position diverges between them. One such scale gave a bound of 4.2 mm for a distance with an error of
+    0.05 mm.
 
     Parameters
     ----------
     seen
-        Features (m, f) and largest errors (m,) [m] of loads that are not of the model's training.
+        Features (m, f) and largest errors (m,) [m] of loads that are not in the model's training.
     features, force, error
         (n, f), (n,) [N] and largest errors (n,) [m], of the calibration loads.
     each
-        Calibration loads of a class of force, at least: fewer than 99 promise nothing at 0.99.
+        Minimum number of calibration loads in a class of force: fewer than 99 give no guarantee at 0.99.
     curved
-        Whether the scale's logarithm is quadratic in the load's features, if `BENDS` loads were seen, or linear.
+        True if the scale's logarithm is quadratic in the load's features, given `BENDS` seen loads; else linear.
     away, growth
-        (n,) [m] of the calibration loads from the nearest training load, and how much the bound grows with that [1/m].
+        (n,) [m] distances of the calibration loads from the nearest training load; growth of the bound with it [1/m].
     """
     mean, deviation = standardisation(seen[0])
     used = _used(len(mean), LOAD if curved and len(seen[1]) >= BENDS else 0)
@@ -119,13 +120,13 @@ def fitted_bound(
 
 
 def fitted_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.ndarray]) -> float:
-    """The growth [1/m] by which the first of `LEVELS` is met as well far from training loads as near them.
+    """Compute the growth [1/m] with which the first of `LEVELS` is covered equally far from and near training loads.
 
     Parameters
     ----------
     near, far
-        Errors over a bound that does not grow (n,), and distances (n,) [m] from the nearest training load: of loads
-        drawn as the training loads, and of others. Fewer than 19 of these tell nothing: `USUAL_GROWTH`.
+        Errors over a bound without growth (n,), and distances (n,) [m] from the nearest training load: of loads drawn
+        as the training loads, and of others. Fewer than 19 others do not determine it: `USUAL_GROWTH`.
     """
 
     def larger(growth: float) -> bool:
@@ -142,9 +143,9 @@ def fitted_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np
 
 
 def features_of(pushed: Pushed, known: Measured) -> np.ndarray:
-    """The features of an error's size (B, 7): logarithms of force and radius, angle, overhang and point [mm].
+    """Compute features (B, 7) of an error's size: logarithms of force and radius, angle, overhang and point [mm].
 
-    Of tissue that relaxes, where all loads have one tool, the share that is gone stands for the radius.
+    For relaxing tissue, where all loads have one tool, the relaxed share replaces the radius.
     """
     force, relaxed = np.log(np.maximum(known.magnitude, np.finfo(float).tiny)), relaxed_of(pushed)
     second = np.log(pushed.footprint) if relaxed is None else relaxed
@@ -152,7 +153,7 @@ def features_of(pushed: Pushed, known: Measured) -> np.ndarray:
 
 
 def conformal(ratio: np.ndarray, level: float) -> float:
-    """The ceil(level (n + 1))-th smallest of `ratio` (n,): infinite, where n is too small for the level."""
+    """Return the ceil(level (n + 1))-th smallest of `ratio` (n,): infinite if n is too small for the level."""
     rank = int(np.ceil(level * (len(ratio) + 1)))
     return float(np.sort(ratio)[rank - 1]) if rank <= len(ratio) else np.inf
 
@@ -162,11 +163,11 @@ def _standard(features: np.ndarray, mean: np.ndarray, deviation: np.ndarray) -> 
 
 
 def _monomials(x: np.ndarray) -> np.ndarray:
-    """1, x_i and x_i x_j of (B, f): (B, t)."""
+    """Compute monomials 1, x_i and x_i x_j of (B, f): (B, t)."""
     first, second = np.triu_indices(x.shape[1])
     return np.concatenate([np.ones_like(x[:, :1]), x, x[:, first] * x[:, second]], axis=1)
 
 
 def _used(count: int, curved: int) -> np.ndarray:
-    """Which monomials (t,) bool are fitted: 1, x_i of the load, and x_i x_j of the first `curved` features."""
+    """Return the mask (t,) of fitted monomials: 1, x_i of the load, and x_i x_j of the first `curved` features."""
     return np.concatenate([[True], np.arange(count) < LOAD, np.triu_indices(count)[1] < curved])

@@ -1,4 +1,4 @@
-"""A trained model that hands the loads of which it is not sure enough to the finite elements it learned from."""
+"""Trained model with FEM fallback: loads with too large an error bound are solved by FEM."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from .tool_contact import HELD
 
 @dataclass(frozen=True, eq=False)
 class Guarded:
-    """A `Deformer`: the model where it promises enough, and finite elements where it does not.
+    """`Deformer` that uses the model where its bound is small enough, and FEM elsewhere.
 
     Parameters
     ----------
     model
-        What answers first.
+        Model that is evaluated first.
     fem
-        Finite elements of the model's body, effects and element. They answer loads that the model calls extrapolated,
-        of which it promises nothing, or for which its bound is above the limit.
+        FEM of the model's body, effects and element. It solves loads that the model marks as extrapolated, loads
+        without a bound, and loads whose bound is above the limit.
     limit
-        Of the worst tumour vertex, at 95 % [m].
+        Limit of the largest error over the tumour's vertices, at 95 % [m].
 
     Raises
     ------
     InputError
-        A model that follows tissue that relaxes: finite elements would need the frames that they did not answer.
+        A model that follows relaxing tissue: FEM would need the frames that it did not solve.
     """
 
     model: Learned
@@ -47,25 +47,26 @@ class Guarded:
     def __post_init__(self) -> None:
         if self.model.series:
             raise InputError(
-                "the model follows tissue that relaxes, and finite elements behind it would need every frame before: "
-                "let one of them answer alone."
+                "the model follows tissue that relaxes, and FEM fallback would need every earlier frame: "
+                "use one of them alone."
             )
 
     @property
     def anatomy(self) -> Anatomy:
-        """The body that is deformed."""
+        """Anatomy of the model."""
         return self.model.anatomy
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Answer `loads` at mesh vertices `at` (n,): by default at those that the model knows.
+        """Solve `loads` at mesh vertices `at` (n,): by default at those of the model.
 
-        Where the finite elements answer every load, and `at` is not given, the answer has every vertex. They start from
-        such a `start`, and else from rest. Where they find no equilibrium the model's answer stands, with its bound.
+        If FEM solves every load, and `at` is not given, the result has every vertex. FEM starts from a `start` with
+        every vertex, else from the undeformed configuration. If it finds no equilibrium, the model's result and bound
+        are kept.
 
         Raises
         ------
         InputError
-            Loads, or a start, that the model refuses.
+            Loads, or a start, that the model rejects.
         """
         predicted = self.model.deform(loads, start, at)
         unsure = np.flatnonzero(self.unsure(predicted))
@@ -80,39 +81,39 @@ class Guarded:
         return _replaced(predicted, unsure[good], solved.rows(np.flatnonzero(good)), pushed)
 
     def unsure(self, predicted: Deformation) -> np.ndarray:
-        """(B,) bool: which of the model's answers are not good enough."""
+        """Return the mask (B,) of predictions that need FEM."""
         bound = np.where(np.isnan(predicted.bound[0]), self.model.bound, predicted.bound[0])
         return handed_over(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
 
 
 def off_by(model: Learned) -> OffBy:
-    """What a model states of its errors on cortex left out of a training."""
+    """Return a model's reported errors on held-out cortex."""
     return OffBy(model.bound, model.left_out)
 
 
 def judged(model: Learned) -> str:
-    """How far off that is, in words, and who plays scenes for it: see `Guarded`."""
+    """Describe a model's reported errors, and the deformer used in scenes: see `Guarded`."""
     stated = off_by(model)
     guarded = "it plays alone nevertheless, as its tissue relaxes" if model.series else "scenes play it guarded"
     return f"{model.left_out or stated}: {guarded if stated.weak else 'it may answer alone'}"
 
 
 def model_of(deformer: Deformer) -> Learned | None:
-    """The model that a deformer is, or asks first; None of finite elements."""
+    """Return the model that a deformer is, or evaluates first; None for FEM."""
     if isinstance(deformer, Guarded):
         return deformer.model
     return deformer if isinstance(deformer, Learned) else None
 
 
 def answering(deformer: Deformer, answer: Deformation) -> Learned | None:
-    """The model that gave the first answer of a deformer; None if finite elements did."""
+    """Return the model that computed the first result of a deformer; None if FEM did."""
     return model_of(deformer) if answer.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
 
 
 def _replaced(predicted: Deformation, rows: np.ndarray, solved: Deformation, pushed: bool) -> Deformation:
-    """Answers of which some `rows` (k,) are solved; the force of a push is what the load says, whoever answers.
+    """Replace some `rows` (k,) of predictions by FEM solutions; the reaction of a push always comes from the load.
 
-    So is that of a pose unknown in all of them, if the model does not know it.
+    The reaction of a pose is unknown in all rows if the model does not predict it.
     """
     pick = np.arange(len(predicted))
     pick[rows] = len(predicted) + np.arange(len(rows))
@@ -128,28 +129,28 @@ def _replaced(predicted: Deformation, rows: np.ndarray, solved: Deformation, pus
 
 
 def tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> np.ndarray:
-    """Mean pressure (B, k) [Pa] of the tool round each vertex that it may touch, of the bare surface: force by area.
+    """Compute the tool's mean pressure (B, k) [Pa] at each vertex of the bare surface: force by area.
 
-    Forces of contact are those on linear tissue, made as large together as the force that the model answers. Areas are
-    thirds of the deformed surface's triangles at a vertex, as in `sim.contact_pressure.pressure`.
+    Contact forces are those on linear tissue, scaled so that their sum is the model's predicted force. Areas are thirds
+    of the deformed surface's triangles at a vertex, as in `sim.contact_pressure.pressure`.
 
     Parameters
     ----------
     answer
-        What `model` answered the loads with, of all vertices that it knows.
+        Result of `model` for the loads, at all its vertices.
 
     Raises
     ------
     InputError
-        A model without a part of contact, or that does not know its tool's force; an answer of another size.
+        A model without a contact part, or without its tool's force; a result of another size.
     """
     part = _contact_of(model)
     if part is None:
         raise InputError("this model knows no forces of contact: train the learner contact or contact-gp on poses.")
     if answer.displacement.shape[:2] != (len(loads), len(model.nodes)):
         raise InputError(
-            f"the answer has {len(answer)} load cases at {len(answer.nodes)} vertices, the loads have {len(loads)} and "
-            f"the model {len(model.nodes)}: give the whole answer to these loads."
+            f"the result has {len(answer)} load cases at {len(answer.nodes)} vertices, the loads have {len(loads)} and "
+            f"the model {len(model.nodes)}: give the complete result for these loads."
         )
     patch, mesh, contact = open_patch(model.anatomy), model.anatomy.mesh, part.regressor
     assert isinstance(contact, Contact)
@@ -168,7 +169,7 @@ def tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> np.ndarr
 
 
 def knows_pressure(model: Learned) -> bool:
-    """Whether `tool_pressure` can be had of a model."""
+    """Return True if `tool_pressure` is available for a model."""
     return _contact_of(model) is not None
 
 

@@ -1,4 +1,4 @@
-"""Arrays that a folder keeps while they are computed, so that a run that was stopped continues."""
+"""Cache of computed arrays in a folder, so that an interrupted run continues."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from sim.runtime.versions import version_of
 
 from .npz_archive import Archive
 
-REMADE = "Delete it: it is made anew."
-"""What to do about a kept file that is damaged."""
+REMADE = "Delete it: it is computed again."
+"""Remedy for a damaged cache file."""
 
 
 def kept_path(folder: Path | None, stem: str, device: str, *stated: object) -> Path | None:
-    """Path of arrays that this version computes on a kind of device; None without a folder.
+    """Return the cache path of arrays that this version computes on a kind of device; None without a folder.
 
-    `stated` is all else that decides their bytes, the element among it: each with a `repr` that tells it from others.
+    `stated` lists all other inputs that determine their bytes, the element included: each with a distinctive `repr`.
     """
     if folder is None:
         return None
@@ -38,14 +38,14 @@ def kept_arrays(
     make: Callable[[], Mapping[str, np.ndarray]],
     check: Callable[[Mapping[str, np.ndarray]], object] = lambda arrays: None,
 ) -> Mapping[str, np.ndarray]:
-    """Arrays of some names from a file, if it is there; else they are made, and kept there. No path: only made.
+    """Read arrays by name from a file if it exists; else compute and store them. Without a path: compute only.
 
-    `kind` is what the file holds, with its article; `check` refuses arrays that were read.
+    `kind` describes the file's content, with its article; `check` rejects invalid arrays.
 
     Raises
     ------
     InputError
-        A file that cannot be read, or that the check refuses.
+        A file that cannot be read, or that the check rejects.
     """
     if path is not None and path.exists():
         with read_as(path, kind, REMADE), path.open("rb") as raw:

@@ -1,4 +1,4 @@
-"""A deformer that answers from its training, for the tumour and the open cortex."""
+"""Trained deformer, for the tumour and the open cortex."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from .tip_distance import Distance, TipModel
 from .tool_contact import ForceModel, going_on, held_of, wrench
 from .training_range import Envelope, Measured, Outside, measured
 
-# Times the strongest force, or the widest footprint, of the training. Of three loads so strong on the template's brain
-# the finite elements find an equilibrium of none, and at twice the force a prediction is off by up to 31 %.
+# Largest force or footprint relative to the training's. On the template's brain FEM finds no equilibrium for three
+# loads of this size, and at twice the force the error of a prediction is up to 31 %.
 FARTHEST = 3.0
-# Training points are stored in single precision [m].
+# Rounding error of training points, stored in single precision [m].
 STORED = 1e-6
 
 
@@ -49,11 +49,11 @@ class Part:
     Parameters
     ----------
     encoder
-        A name in `ENCODERS`.
+        Name in `ENCODERS`.
     regressor
-        From features to coefficients, fitted to responses to one newton.
+        Map from features to coefficients, fitted to responses to one newton.
     basis
-        From coefficients to responses.
+        Map from coefficients to responses.
     """
 
     encoder: str
@@ -61,39 +61,39 @@ class Part:
     basis: Basis
 
     def response(self, features: np.ndarray) -> np.ndarray:
-        """Responses (B, n, 3) [m/N] of `basis.nodes` to the encoder's features (B, f)."""
+        """Compute responses (B, n, 3) [m/N] of `basis.nodes` to the encoder's features (B, f)."""
         return self.basis.decode(self.regressor.predict(features))
 
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """A sum of parts, as a `Deformer`.
+    """Sum of parts, as a `Deformer`.
 
-    Every part predicts the response to one newton, which is multiplied by the force. No force gives no motion, and a
-    weak load is answered as exactly, in proportion, as a strong one.
+    Every part predicts the response to one newton, which is multiplied by the force. Zero force gives zero motion, and
+    the relative error of a weak load is that of a strong one.
 
     Parameters
     ----------
     anatomy
-        The body that it was trained on.
+        Anatomy that it was trained on.
     parts
-        Added where they overlap.
+        Parts, which are summed where they overlap.
     envelope
-        The range of its training loads.
+        Range of its training loads.
     bound
-        Of 95 in 100 held-out loads the worst tumour vertex was within this distance [m] of the finite elements.
+        95th percentile of the maximum vertex error of the tumour on held-out loads, relative to FEM [m].
     bounds
-        What it promises of each load, if loads were kept apart to calibrate it.
+        Conformal bounds of each load, if calibration loads were set aside.
     training
-        What it was trained with, as text.
+        Training settings, as text.
     tool
-        The one whose poses it answers; None: it answers pushes. Depth [m] then stands for force.
+        Tool of the poses that it supports; None: it supports pushes. Depth [m] then replaces force.
     tip
-        What it has learned of the distance from tip to tumour, if anything.
+        Model of the distance from tip to tumour, if trained.
     left_out
-        How far it was off on cortex left out of a training; None where none was left out, or in older files.
+        Errors on held-out cortex; None if none was held out, or for older files.
     force
-        What it has learned of the force that its tool exerts, if anything.
+        Model of the tool's force, if trained.
     """
 
     anatomy: Anatomy
@@ -109,20 +109,20 @@ class Learned:
 
     @cached_property
     def source(self) -> str:
-        """Its learner, and what it learned from, in words: every answer carries them."""
+        """Description of its model type and training, for `source` of results."""
         stated = self.training
-        tissue = str(stated_tissue(stated)) if "tissue" in stated else "tissue not stated"
-        element = stated.get("element", "not stated")
+        tissue = str(stated_tissue(stated)) if "tissue" in stated else "tissue not given"
+        element = stated.get("element", "not given")
         return f"{stated.get('learner', 'learned')}, from finite elements ({element}; {tissue})"
 
     @cached_property
     def series(self) -> Pairs:
-        """The Prony series of its tissue, if it follows that in time; () if its answers know no time."""
+        """Prony series of its tissue, if it follows relaxation in time; else ()."""
         return () if self.tool is None else stated_series(self.training)
 
     @cached_property
     def nodes(self) -> np.ndarray:
-        """Sorted mesh vertices (n,) that it knows."""
+        """Sorted mesh vertices (n,) that it predicts."""
         return np.unique(np.concatenate([part.basis.nodes for part in self.parts]))
 
     @cached_property
@@ -135,7 +135,7 @@ class Learned:
 
     @cached_property
     def _modes_at(self) -> Callable[[bytes], tuple[tuple[list[Part], np.ndarray], ...]]:
-        """Parts of one basis, and its modes (r, 3 n) at mesh vertices, zero at those that it does not know."""
+        """Function from vertices to parts by basis, with its modes (r, 3 n) there, zero outside the basis."""
         groups: dict[int, list[Part]] = {}
         for part in self.parts:
             groups.setdefault(id(part.basis.modes), []).append(part)
@@ -155,15 +155,15 @@ class Learned:
 
     @cached_property
     def _knows(self) -> np.ndarray:
-        """(V,) bool."""
+        """(V,) bool: mask of the predicted vertices."""
         known = np.zeros(len(self.anatomy.mesh.nodes), bool)
         known[self.nodes] = True
         return known
 
     def _demand_answerable(self, pushed: Pushed, doubtful: np.ndarray) -> None:
-        """Refuse what has no answer to be near to: a footprint off the open cortex, a size far beyond the training.
+        """Raise InputError for loads off the open cortex, or far beyond the training range.
 
-        Of the `doubtful` (k,) rows alone: a load inside the envelope is neither, unless its radius is less than the
+        Checks the `doubtful` (k,) rows alone: a load inside the envelope is neither, unless its radius is below the
         reach.
         """
         if not len(doubtful):
@@ -181,7 +181,7 @@ class Learned:
                     "elements."
                 )
         away = nearest(pushed.point[doubtful], self._patch.points)[1]
-        if (away > pushed.footprint[doubtful]).any():  # off all nodes of the cortex, if not off its triangles
+        if (away > pushed.footprint[doubtful]).any():  # away from nodes, but perhaps not from triangles
             self._patch.skin.demand_touch(pushed.point, pushed.footprint)
 
     def _demand_known(self, nodes: np.ndarray) -> None:
@@ -194,17 +194,18 @@ class Learned:
             )
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Predict the static answer to `Pushed` loads, or to the poses of its tool.
+        """Predict the static deformation by `Pushed` loads, or by poses of its tool.
 
-        From a start a rod or a blade goes on, which is faster; without one it comes straight in. Where tissue relaxes
-        the time between counts; without a start the tool was held until the loads' time, as `data.holding` says.
+        With a start, a rod's or blade's contact search continues from it, which is faster; without, it approaches
+        straight. For relaxing tissue the time between counts; without a start the tool was held until the loads' time,
+        see `data.holding`.
 
         Raises
         ------
         InputError
             Loads of another kind, or that do not touch the open cortex, or are more than `FARTHEST` times as strong or
             as wide as any of the training. A start with other rows, or as `relaxation.followed`; a vertex in `at` that
-            the model does not know.
+            the model does not predict.
         """
         check_loads(loads)
         if start is not None and not isinstance(start, Deformation):
@@ -225,7 +226,7 @@ class Learned:
         self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float, past: Relaxed | None,
         encoders: Mapping[str, Encoder],
     ) -> Deformation:  # fmt: skip
-        """The sum of the parts, asked at `begun` [s]."""
+        """Sum the parts; the computation began at `begun` [s]."""
         known = measured(self._patch, pushed)
         outside = self.envelope.outside(pushed, known)
         far, small = outside.excess > 0.0, pushed.footprint < self.envelope.reach + STORED
@@ -249,9 +250,9 @@ class Learned:
         )
 
     def motion(self, pushed: Pushed, nodes: np.ndarray, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
-        """Displacements (B, n, 3) [m] of mesh vertices `nodes` (n,) by the model alone, without limits and bound.
+        """Predict displacements (B, n, 3) [m] of mesh vertices `nodes` (n,), without range checks and bound.
 
-        Beyond the forces of the training the response stays what it was at the nearest of them.
+        Beyond the training's forces the response per newton is that at the nearest training force.
         """
         magnitude, asked = self.within(pushed)
         if not len(nodes):
@@ -266,20 +267,20 @@ class Learned:
         return magnitude[:, None, None] * reduce(add, responses).reshape(-1, len(nodes), 3)
 
     def within(self, pushed: Pushed) -> tuple[np.ndarray, Pushed]:
-        """Sizes (B,) of forces [N] or depths [m], and the same loads no weaker and no stronger than any in training."""
+        """Return sizes (B,) of forces [N] or depths [m], and the loads with sizes clipped to the training range."""
         magnitude, direction = directions(pushed)
         return magnitude, replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
 
     def exerted(self, pushed: Pushed, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
-        """Forces (B, 3) [N] that the tool exerts at indentations; as `motion`, in proportion beyond the training.
+        """Predict forces (B, 3) [N] of the tool at indentations; as `motion`, in proportion beyond the training.
 
         Raises
         ------
         InputError
-            A model that has not learned them.
+            A model without a trained force.
         """
         if self.force is None:
-            raise InputError("this model does not know its tool's force: train it anew, on newly simulated poses.")
+            raise InputError("this model does not know its tool's force: train it again, on newly simulated poses.")
         magnitude, asked = self.within(pushed)
         found = np.zeros(pushed.force.shape) + self.force.added(self._patch, asked)
         for part in self.parts:
@@ -288,10 +289,10 @@ class Learned:
         return magnitude[:, None] * found
 
     def promised(self, bound: Bound | None, pushed: Pushed, known: Measured, outside: Outside) -> np.ndarray:
-        """The bounds (2, B) of loads, [m], or [N] of a force; NaN where there is none."""
+        """Compute the bounds (2, B) of loads, [m], or [N] for a force; NaN without one."""
         if bound is None:
             return np.stack([np.nan * outside.excess] * len(LEVELS))
-        # As the motion, so its error: in proportion to a force weaker than any of the training.
+        # The error, like the motion, is in proportion to a force below the training's smallest.
         weaker = np.minimum(known.magnitude / self.envelope.force[0], 1.0)
         features = features_of(pushed, self.envelope.within(known))
         return np.where(weaker > 0.0, bound.of(features, known.magnitude, outside), 0.0) * weaker
@@ -302,16 +303,16 @@ class Learned:
         Parameters
         ----------
         answer
-            What this model answered the loads with, if that is known: of the open cortex and the tumour at least.
+            This model's result for the loads, if available: at least at the open cortex and the tumour.
         apart
-            (B,) [m]: the distance in that answer, where it is measured already, as of a tool that is lifted off again.
+            (B,) [m]: the distance in that result, if already measured, as for a tool that is lifted off again.
 
         Raises
         ------
         InputError
-            Loads of another kind, or an answer that does not know the open cortex and the tumour.
+            Loads of another kind, or a result without the open cortex and the tumour.
         """
-        # From an answer to just these loads no time goes by.
+        # With the result of these very loads as start, no time passes.
         pushed = self._followed(loads, answer)[0]
         if apart is None:
             if answer is None:
@@ -324,7 +325,7 @@ class Learned:
         return Distance(found, self.promised(tip.bound, pushed, known, self.envelope.outside(pushed, known)))
 
     def asked(self, loads: Loads) -> Pushed:
-        """What the model is asked: pushes, or the poses of its tool as `indentation.indented` has them.
+        """Convert loads to the model's input: pushes, or indentations of its tool's poses (`indentation.indented`).
 
         Raises
         ------
@@ -334,7 +335,7 @@ class Learned:
         return self._followed(loads)[0]
 
     def _followed(self, loads: Loads, start: Deformation | None = None) -> tuple[Pushed, Relaxed | None]:
-        """The same from a start, and how far the tissue has relaxed, if it does."""
+        """Convert loads as `asked`, from a start, and return the state of relaxation, if tissue relaxes."""
         if self.tool is None:
             return only_pushed(loads), None
         pushed = indented(loads, self.tool, self._patch)
@@ -353,13 +354,13 @@ def predicted(
     bound: np.ndarray,
     source: str,
 ) -> Deformation:
-    """The answer of a trained model asked at `begun` [s]; `outside` (B,): whether loads lie outside its training.
+    """Build the result of a trained model called at `begun` [s]; `outside` (B,): True for loads outside its training.
 
     displacement (B, n, 3) [m] of `nodes` (n,); bound and source as in `Deformation`.
     """
     count = len(loads)
     pushed, unknown = loads.of(Pushed), np.full(count, np.nan)
-    reaction = np.zeros((count, 0 if pushed is None else 1, 6))  # of a pose, who asks adds it
+    reaction = np.zeros((count, 0 if pushed is None else 1, 6))  # for a pose, the caller adds it
     if pushed is not None:
         reaction[:, 0, :3] = pushed.force
     return Deformation(
@@ -379,7 +380,7 @@ def predicted(
 
 
 def only_pushed(loads: Loads) -> Pushed:
-    """The pushes of loads that are nothing else.
+    """Return the pushes of loads without other causes.
 
     Raises
     ------

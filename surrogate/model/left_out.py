@@ -1,4 +1,4 @@
-"""How far a model is off where it was given no load, and whether it may answer alone."""
+"""Errors of a model on held-out cortex, and the test whether it needs FEM fallback."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ from dataclasses import dataclass
 import numpy as np
 
 LIMIT = 0.2e-3
-"""How far off a tumour's vertex may be, in 95 of 100 loads, before finite elements behind a model answer [m]."""
+"""Limit of the maximum vertex error of the tumour, at 95 %, beyond which FEM is used instead of a model [m]."""
 LIMITS = (LIMIT, 0.1e-3, 0.05e-3, 0.02e-3, 0.01e-3, 0.0)
-"""A model has the widest of these that keeps it within what it may be off by; at the last, nothing is left to it."""
+"""Candidate limits: a model gets the largest one that satisfies `MEAN` and `WORST`; with 0, FEM solves all loads."""
 MEAN, WORST = 0.01, 0.2e-3
-"""What a model may be off by and still answer alone: mean share of the motion; vertices at 99.9 % [m]."""
+"""Error limits of a model without FEM fallback: mean share of the motion; 99.9th percentile of vertices [m]."""
 FEWEST_FOR_P999 = 1000
-"""Fewer loads do not determine the greatest of a thousand."""
+"""Minimum number of loads for a 99.9th percentile."""
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Errors on cortex left out of the training, of a model alone and with finite elements behind it.
+    """Errors on held-out cortex, of a model alone and with FEM fallback.
 
     Parameters
     ----------
     mean, guarded
-        Distance over the motion of its load, mean over loads and tumour vertices: alone, and as `Guarded` answers. What
-        finite elements answer counts as exact.
+        Error over the motion of its load, mean over loads and tumour vertices: of the model alone, and as `Guarded`.
+        Loads solved by FEM count as exact.
     p999
-        Of the model alone, over loads and vertices [m]; None of fewer than `FEWEST_FOR_P999` loads.
+        99.9th percentile of the model alone, over loads and vertices [m]; None for fewer than `FEWEST_FOR_P999` loads.
     solved
-        Share of these loads that finite elements answer.
+        Share of these loads that FEM solves.
     limit
-        Of `LIMITS` [m], at which they do; older files have the first.
+        Limit of `LIMITS` [m] in use; older files have the first.
     """
 
     mean: float
@@ -41,42 +41,42 @@ class LeftOut:
 
     @property
     def enough(self) -> bool:
-        """Whether the model may answer alone."""
+        """True if the model does not need FEM fallback."""
         return _enough(self.mean, self.p999)
 
     def __str__(self) -> str:
-        """In words."""
+        """Return a description of the errors."""
         behind = (
-            f"with finite elements behind it for {100 * self.solved:.0f} % of the loads, those that it may have over "
-            f"{1e3 * self.limit:g} mm off, {100 * self.guarded:.2f} %"
+            f"with FEM for {100 * self.solved:.0f} % of the loads (bound above "
+            f"{1e3 * self.limit:g} mm) {100 * self.guarded:.2f} %"
         )
-        return f"{100 * self.mean:.2f} % of the motion off alone, {behind}"
+        return f"mean error {100 * self.mean:.2f} % of the motion alone; {behind}"
 
 
 @dataclass(frozen=True)
 class OffBy:
-    """What a model states of its errors on cortex left out of a training: `bound` and `left_out` as in `Learned`."""
+    """Reported errors of a model on held-out cortex: `bound` and `left_out` as in `Learned`."""
 
     bound: float
     left_out: LeftOut | None
 
     @property
     def weak(self) -> bool:
-        """Whether that is too much to answer alone; where it is not known in the mean, of the worst vertex."""
+        """True if the model needs FEM fallback: by mean error, or by maximum vertex error if that is missing."""
         return not (self.bound <= LIMIT if self.left_out is None else self.left_out.enough)
 
     def __str__(self) -> str:
-        """In words."""
+        """Return a description of the errors and their limits."""
         if self.left_out is None:
-            return f"{1e3 * self.bound:.2g} mm off at most in 95 of 100 loads, where {1e3 * LIMIT:g} mm are enough"
-        mean = f"{100 * self.left_out.mean:.2g} % of the motion off in the mean, where {100 * MEAN:g} % are enough"
+            return f"maximum error up to {1e3 * self.bound:.2g} mm in 95 % of loads (limit {1e3 * LIMIT:g} mm)"
+        mean = f"mean error {100 * self.left_out.mean:.2g} % of the motion (limit {100 * MEAN:g} %)"
         if self.left_out.p999 is None:
             return mean
-        return f"{mean}; {1e3 * self.left_out.p999:.2g} mm off at 99.9 %, where {1e3 * WORST:g} mm are enough"
+        return f"{mean}; 99.9th percentile {1e3 * self.left_out.p999:.2g} mm (limit {1e3 * WORST:g} mm)"
 
 
 def handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np.ndarray:
-    """Which loads (B,) bool finite elements answer behind a model: of no bound within the limit, or `outside`.
+    """Return the mask (B,) of loads that need FEM: no bound within the limit, or `outside`.
 
     `bound` (B,) and `limit` are in metres, `outside` (B,) bool.
     """
@@ -84,18 +84,18 @@ def handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np.ndar
 
 
 def left_out_of(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, outside: np.ndarray) -> LeftOut:
-    """Errors on B loads; the limit is the widest of `LIMITS` that keeps the guarded model within `MEAN` and `WORST`.
+    """Compute errors on B loads, with the largest of `LIMITS` that keeps the guarded model within `MEAN` and `WORST`.
 
     Parameters
     ----------
     distance
-        From the finite elements (B, n) [m], at the tumour's vertices.
+        Error relative to FEM (B, n) [m], at the tumour's vertices.
     motion
         Mean displacement of these (B,) [m].
     bound
-        Of the worst vertex, at 95 % (B,) [m].
+        Bound of the maximum vertex error, at 95 % (B,) [m].
     outside
-        Which loads (B,) bool lie outside the training range.
+        Mask (B,) of loads outside the training range.
     """
     share, left, solved, limit = distance.mean(axis=1) / motion, 0.0, outside, LIMIT
     for limit in LIMITS:
@@ -107,7 +107,7 @@ def left_out_of(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, out
 
 
 def _p999(distance: np.ndarray) -> float | None:
-    """Of errors (B, n) [m], if so many loads determine it."""
+    """Compute the 99.9th percentile of errors (B, n) [m]; None for fewer than `FEWEST_FOR_P999` loads."""
     return float(np.percentile(distance, 99.9)) if len(distance) >= FEWEST_FOR_P999 else None
 
 

@@ -1,4 +1,4 @@
-"""Arrays in an `.npz` from outside: only those asked for are read, and none that is larger than it may be."""
+"""Arrays of an untrusted `.npz` file: only requested ones are read, up to a size limit."""
 
 from __future__ import annotations
 
@@ -16,61 +16,61 @@ from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from sim.runtime.file_limits import LARGEST_HEADER, LARGEST_MODEL
 
-# Of an array's own header.
+# Maximum size of an array's header [bytes].
 LONGEST = 10_000
 
 
 def seal_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    """Digest of a file's header, but for its own `seal`, and of all its arrays."""
+    """Compute the digest of a file's header, without its own `seal`, and of all its arrays."""
     names = sorted(arrays)
     stated = json.dumps([names, {name: value for name, value in header.items() if name != "seal"}], sort_keys=True)
     return digest_of(np.frombuffer(stated.encode(), np.uint8), *(arrays[name] for name in names))
 
 
 def write_archive(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays as `np.savez_compressed` does, by bzip2: faster and a quarter smaller than Deflate."""
+    """Write arrays as `np.savez_compressed` does, with bzip2: faster and a quarter smaller than Deflate."""
     with zipfile.ZipFile(path, "w") as archive:
         for name, array in arrays.items():
-            entry = zipfile.ZipInfo(f"{name}.npy")  # without the time, so that the same arrays are the same bytes
+            entry = zipfile.ZipInfo(f"{name}.npy")  # without a time stamp: equal arrays give equal bytes
             entry.compress_type = zipfile.ZIP_BZIP2
             with archive.open(entry, "w", force_zip64=True) as member:
                 npy.write_array(member, array, allow_pickle=False)
 
 
 class Archive:
-    """The arrays of an open `.npz` file, of at most `largest` bytes together.
+    """Arrays of an open `.npz` file, of at most `largest` bytes in total.
 
-    Every message ends with a `remedy`. Reading the wrong kind of file raises what `zipfile` and NumPy raise.
+    Every message ends with a `remedy`. Files of the wrong kind raise the exceptions of `zipfile` and NumPy.
     """
 
     def __init__(self, file: BinaryIO, remedy: str = "", largest: int = LARGEST_MODEL) -> None:
         self._zip, self._remedy, self._largest = zipfile.ZipFile(file), remedy, largest
 
     def text(self, name: str) -> str:
-        """An array of one text.
+        """Read an array with a single text.
 
         Raises
         ------
         InputError
-            A text that is longer than it may be.
+            A text that is longer than allowed.
         """
         self._demand([name], LARGEST_HEADER)
         return str(self._array(name))
 
     def arrays(self, names: Iterable[str]) -> dict[str, np.ndarray]:
-        """Arrays by name.
+        """Read arrays by name.
 
         Raises
         ------
         InputError
-            Arrays that are missing, or larger in all than they may be.
+            Arrays that are missing, or larger in total than allowed.
         """
         wanted = sorted(set(names))
         self._demand(wanted, self._largest)
         return {name: self._array(name) for name in wanted}
 
     def addressed(self, digests: Iterable[str]) -> dict[str, np.ndarray]:
-        """Arrays that are stored under the digest of their content.
+        """Read arrays that are stored under the digest of their content.
 
         Raises
         ------
@@ -84,12 +84,12 @@ class Archive:
         return found
 
     def sealed(self, header: Mapping[str, Any], names: Iterable[str]) -> dict[str, np.ndarray]:
-        """Arrays by name that belong to a header with a `seal`.
+        """Read arrays by name, and verify the header's `seal` of header and arrays.
 
         Raises
         ------
         InputError
-            As `arrays`; header or arrays that are not those of the seal.
+            As `arrays`; header or arrays that do not match the seal.
         """
         found = self.arrays(names)
         if seal_of(header, found) != header["seal"]:
@@ -112,7 +112,7 @@ class Archive:
     def _array(self, name: str) -> np.ndarray:
         info = self._zip.getinfo(f"{name}.npy")
         with self._zip.open(info) as member:
-            # Its size is declared here and in the archive: memory is taken where both agree.
+            # The size is given here and in the archive: memory is allocated only if both agree.
             version = npy.read_magic(member)
             read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
             shape, _, kind = read(member, max_header_size=LONGEST)

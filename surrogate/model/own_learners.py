@@ -1,4 +1,4 @@
-"""Learners of a user's own: registered from their file or package, trained, stored and read like the built-in ones."""
+"""User-defined learners: registered from a file or package; trained, stored and read like the built-in ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..data.encode import ENCODERS, Encoder
 from ..regressors.protocol import Regressor
 
 GROUP = "sulcus.learners"
-"""The entry points of packages that bring learners, by the learner's name."""
+"""Entry-point group of packages that provide learners, by the learner's name."""
 RESERVED = frozenset(
     [
         "ann",
@@ -31,14 +31,14 @@ RESERVED = frozenset(
         "svr",
     ]
 )
-"""Names of what comes with sulcus."""
+"""Names of built-in learners."""
 PLAYERS = frozenset(["auto", "fem", "guarded"])
-"""Other names that can be asked to play a scene."""
+"""Names of deformers that are not learners."""
 
 
 @dataclass(frozen=True)
 class Own:
-    """A learner that somebody registered: a name in `ENCODERS`, and who makes its regressor."""
+    """Registered user-defined learner: a name in `ENCODERS`, and the class of its regressor."""
 
     encoder: str
     regressor: type[Regressor]
@@ -49,15 +49,14 @@ K = TypeVar("K", bound=type[Regressor])
 
 
 def learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K], K]:
-    """Register a class of `Regressor` under a name; it is made without arguments.
+    """Register a class of `Regressor` under a name; it is instantiated without arguments.
 
-    `encoder`: which features of a load it learns from, a name in `encode.ENCODERS` or a function (Patch, Pushed) ->
-    (B, f).
+    `encoder`: features of a load to train on, a name in `encode.ENCODERS` or a function (Patch, Pushed) -> (B, f).
 
     Raises
     ------
     InputError
-        A name that is taken, an encoder that there is not, a class that lacks what a `Regressor` has.
+        A name that is taken, an unknown encoder, a class without the methods of a `Regressor`.
     """
     if callable(encoder):
         ENCODERS[name], encoder = encoder, name
@@ -77,7 +76,7 @@ def learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K], K]:
 
 
 def find_own(name: str) -> Own | None:
-    """A learner that was registered, if need be by the package whose entry point has its name; None without one.
+    """Find a registered learner, loading the package with an entry point of its name if necessary; None without one.
 
     Raises
     ------
@@ -98,10 +97,10 @@ def find_own(name: str) -> Own | None:
 
 
 def name_of(kind: type) -> str | None:
-    """The name under which a class was registered."""
+    """Return the name under which a class was registered."""
     return next((name for name, own in OWN.items() if own.regressor is kind), None)
 
 
 def _file(kind: type) -> str | None:
-    """Where a class is written: a mended file may register its learner again."""
+    """Return the file of a class: an edited file may register its learner again."""
     return getattr(sys.modules.get(kind.__module__), "__file__", None)

@@ -1,8 +1,7 @@
-"""How far tissue has relaxed under a tool that a model follows, and whether its training knows such a past.
+"""Relaxation of tissue under a tool that a model follows, and the test whether its training covers that history.
 
-The finite elements carry the part of the stress that fades, for each pair (g, tau) of a Prony series
-(`sim/terms/viscoelastic.py`). A model carries the same of one number, the tool's depth d:
-
+FEM stores the decaying part of the stress, for each pair (g, tau) of a Prony series (`sim/terms/viscoelastic.py`). A
+model stores the same for one number, the tool's depth d:
     h <- exp(-dt / tau) h + g exp(-dt / (2 tau)) (d - its last value).
 
 The resistance to a change of shape has then lost the share r = sum_i (g_i - h_i / d), which all else depends on.
@@ -23,24 +22,24 @@ from ..data.encode import directions
 from ..data.holding import unfaded
 
 MEMORY = "relaxation"
-"""Its name in `Deformation.memory`: depth [m], where the tool touched first [m], then each h [m]; (B, 4 + pairs)."""
-# A tool that goes back leaves tissue that pushes less than it would at rest, h below zero: by more than this share of
-# g d no training row is like it. Nor is one where a tool has slid by more than this share of its footprint's radius.
+"""Key in `Deformation.memory`: depth [m], position of first contact [m], then each h [m]; (B, 4 + pairs)."""
+# Limits of the training: a tool moving back makes h negative, by at most this share of g d; a tool slides by at most
+# this share of its footprint's radius.
 BACK, SLID = 0.02, 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Relaxed:
-    """B tools in tissue that relaxes.
+    """State of relaxation under B tools.
 
     Parameters
     ----------
     share
-        (B,): r, of the resistance to a change of shape.
+        (B,): r, lost share of the resistance to a change of shape.
     strange
-        (B,) bool: whether no history of the training is like theirs.
+        (B,) bool: True if the history is outside the training.
     memory
-        What the next moment needs, as `MEMORY` has it.
+        State for the next time step, in the layout of `MEMORY`.
     """
 
     share: np.ndarray
@@ -49,7 +48,7 @@ class Relaxed:
 
 
 def followed(series: Pairs, pushed: Pushed, times: np.ndarray, start: Deformation | None, shallowest: float) -> Relaxed:
-    """Tools at indentations, from the answer before; without one, each is a history of `holding`.
+    """Advance relaxation at indentations from the previous result; without one, each is a history of `holding`.
 
     Parameters
     ----------
@@ -58,9 +57,9 @@ def followed(series: Pairs, pushed: Pushed, times: np.ndarray, start: Deformatio
     times
         (B,) [s].
     start
-        An answer of a model of the same series, of earlier or the same times.
+        Result of a model of the same series, at earlier or the same times.
     shallowest
-        Depth [m] under which tissue is taken to be free.
+        Depth [m] below which tissue counts as free.
 
     Raises
     ------
@@ -74,11 +73,11 @@ def followed(series: Pairs, pushed: Pushed, times: np.ndarray, start: Deformatio
     past = start.memory.get(MEMORY)
     if past is None or past.shape != (len(depth), 4 + len(series)):
         raise InputError(
-            "the start does not say how far the tissue has relaxed: start from this model's own answer, or from none."
+            "the start does not say how far the tissue has relaxed: start from this model's own result, or from none."
         )
     steps = times - start.time
     if (steps < 0.0).any():
-        raise InputError(f"the start is {-steps.min():g} s later than the loads: time goes on.")
+        raise InputError(f"the start is {-steps.min():g} s later than the loads: times must not decrease.")
     half = np.exp(-steps[:, None] / (2.0 * tau))
     left = half * (half * past[:, 4:] + g * (depth - past[:, 0])[:, None])
     first = np.where((past[:, 0] > 0.0)[:, None], past[:, 1:4], pushed.point)
@@ -88,7 +87,7 @@ def followed(series: Pairs, pushed: Pushed, times: np.ndarray, start: Deformatio
 def _relaxed(
     g: np.ndarray, pushed: Pushed, depth: np.ndarray, first: np.ndarray, left: np.ndarray, shallowest: float
 ) -> Relaxed:
-    """From what is left (B, n) [m] of each pair, and where tools touched first (B, 3) [m]."""
+    """Compute the state from h (B, n) [m] of each pair, and the tools' positions of first contact (B, 3) [m]."""
     touching = depth > 0.0
     share = (g - left / np.where(touching, depth, 1.0)[:, None]).sum(axis=1)
     back = (left < -BACK * g * np.maximum(depth, shallowest)[:, None]).any(axis=1)

@@ -1,4 +1,4 @@
-"""Models on disk: one `.npz` of plain arrays with a JSON header, no pickle."""
+"""Model files: one `.npz` of plain arrays with a JSON header, no pickle."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from .vetting import demand_finite, demand_sound
 FORMAT = "sulcus model 2"
 REMEDY = "Make one with `sulcus train`."
 REGRESSORS: dict[str, type[Regressor]] = {"linear": Linear, "pcr": Pcr, "ann": Ann, "svr": Svr, "gp": Gp}
-# These know the tool's features, and their meaning.
+# Regressors that depend on the tool features and their meaning.
 FITTED: dict[str, type[Fitted]] = {
     **REGRESSORS,
     "pairs": Pairs,
@@ -51,13 +51,13 @@ FITTED: dict[str, type[Fitted]] = {
 
 
 def save(path: str | Path, models: Mapping[str, Learned]) -> None:
-    """Write models of one anatomy under their names; the file appears whole or not at all.
+    """Write models of one anatomy under their names, atomically.
 
     Raises
     ------
     InputError
         No model, models of different anatomies, a name that does not end in .npz, or a folder that cannot be written. A
-        state that is more than arrays of numbers or text, or a regressor that nobody registered.
+        state that is more than arrays of numbers or text, or a regressor that is not registered.
     """
     digests = {model.anatomy.digest for model in models.values()}
     if len(digests) != 1:
@@ -78,7 +78,7 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
         "versions": {name: version_of(name) for name in ("sulcus", "numpy")},
         "models": {name: _described(model, put) for name, model in models.items()},
     }
-    header["seal"] = seal_of(header, {})  # of the arrays, their names are the digests
+    header["seal"] = seal_of(header, {})  # array names are their digests
     with written_whole(path, ".npz") as partial:
         write_archive(partial, {"header": np.array(json.dumps(header)), **arrays})
 
@@ -90,7 +90,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
     ------
     InputError
         A file that is missing or not a model file of this project, that was trained on another anatomy, or that holds
-        a model which cannot be.
+        an invalid model.
     """
     path = path_of(path)
     if not path.is_file():
@@ -99,7 +99,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
         archive = Archive(raw, REMEDY)
         header = _header(archive)
         if header["format"] != FORMAT:
-            raise InputError(f"{path}: has the format {str(header['format'])[:40]!r}, not {FORMAT!r}: train it anew.")
+            raise InputError(f"{path}: has the format {str(header['format'])[:40]!r}, not {FORMAT!r}: train it again.")
         if header["anatomy"] != anatomy.digest:
             raise InputError(
                 f"{path}: was trained on the anatomy {str(header['anatomy'])[:40]}, but this one is {anatomy.digest}: "
@@ -113,26 +113,26 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
 
 
 def stated_errors(path: str | Path) -> dict[str, OffBy]:
-    """What the models of a file state of their errors, by name; their arrays are not read.
+    """Read the reported errors of a file's models, by name; their arrays are not read.
 
     Raises
     ------
     InputError
-        A file that is missing, or no model file of this project.
+        A file that is missing, or not a model file of this project.
     """
     with _described_in(path) as header:
         return {name: OffBy(about["bound"], _left_out(about)) for name, about in header["models"].items()}
 
 
 def learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
-    """The tissue that the models of a file learned, with that of regions; their arrays are not read.
+    """Read the tissue that a file's models were trained on, regions included; their arrays are not read.
 
-    None where none states it, or where they are of another anatomy.
+    None if the file does not give it, or for models of another anatomy.
 
     Raises
     ------
     InputError
-        As `stated_errors`; a statement that is no tissue.
+        As `stated_errors`; an invalid tissue.
     """
     with _described_in(path) as header:
         if header["anatomy"] != anatomy.digest:
@@ -142,14 +142,14 @@ def learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
 
 @contextmanager
 def _described_in(path: str | Path) -> Iterator[dict[str, Any]]:
-    """The header of a model file; whatever fails in the block is said of the file."""
+    """Open the header of a model file; errors within the block are reported with the file's name."""
     path = path_of(path)
     with read_as(path, "a model", REMEDY), path.open("rb") as raw:
         yield _header(Archive(raw, REMEDY))
 
 
 def _header(archive: Archive) -> dict[str, Any]:
-    """Header of a model file; older files have no seal."""
+    """Read the header of a model file; older files have no seal."""
     header = json.loads(archive.text("header"))
     if "seal" in header:
         archive.sealed(header, ())
@@ -157,13 +157,13 @@ def _header(archive: Archive) -> dict[str, Any]:
 
 
 def _left_out(description: dict[str, Any]) -> LeftOut | None:
-    """Older files do not have it."""
+    """Read the errors on held-out cortex; None for older files."""
     stated = description.get("left_out")
     return None if stated is None else LeftOut(**stated)
 
 
 def _keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
-    """The names of all arrays that models refer to."""
+    """Yield the names of all arrays that models refer to."""
     for description in descriptions:
         for part in description["parts"]:
             yield from (part["nodes"], part["modes"], *part["state"].values())
@@ -182,7 +182,7 @@ def _own_name(regressor: Fitted) -> str:
 
 
 def _kind(name: str) -> type[Fitted]:
-    """The class that a model file names: a built-in one, or one that the user has registered or installed."""
+    """Return the class named in a model file: a built-in one, or one that the user has registered or installed."""
     if name in FITTED:
         return FITTED[name]
     own = find_own(name)
@@ -269,7 +269,7 @@ def _put_bound(bound: Bound | None, put: Any) -> dict[str, str] | None:
 
 
 def _rebuilt_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray], reach: float) -> Bound | None:
-    """A bound; those of older files grow beyond the reach of the training loads alone, and hold each vertex's share."""
+    """Rebuild a bound; those of older files grow only beyond the training loads' reach; their profile is ignored."""
     if names is None:
         return None
     older = {"growth": np.array(1e3 * GROWTH), "near": np.array(reach)}
@@ -292,7 +292,7 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
         bound=description["bound"],
         bounds=_rebuilt_bound(description["bounds"], arrays, envelope["reach"]),
         training=description["training"],
-        # Older files do not have these.
+        # Missing in older files.
         tool=stated_tool(description.get("tool"), description.get("ball")),
         tip=_rebuilt_tip(description.get("tip"), arrays, envelope["reach"]),
         left_out=_left_out(description),

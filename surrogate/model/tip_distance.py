@@ -1,4 +1,4 @@
-"""The distance from tip to tumour by a trained model: its mean error is corrected, and it has a bound."""
+"""Distance from tip to tumour by a trained model: corrected for its mean error, with a bound."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..regressors.force_series import with_pressing
 from ..regressors.gp import Gp
 from .conformal import Bound
 
-# Training loads at most: those that fit the process's lengths, and those that it is conditioned on.
+# Maximum number of training loads: to fit the Gaussian process's lengths, and to condition it.
 ROWS, MOST = 300, 2000
 
 
@@ -27,8 +27,7 @@ class Distance:
     value
         (B,) [m].
     bound
-        (2, B) [m]: with probability 0.95, and 0.99, the finite elements' distance is no farther off; NaN where nothing
-        is promised.
+        (2, B) [m]: error bound relative to FEM, with probability 0.95 and 0.99; NaN without a guarantee.
     """
 
     value: np.ndarray
@@ -37,24 +36,24 @@ class Distance:
 
 @dataclass(frozen=True)
 class TipModel:
-    """The learned correction and bound of the distance itself.
+    """Trained correction and bound of the distance itself.
 
-    The tip rests on the predicted cortex, and learners know the cortex less well than the tumour. A Gaussian process
-    learns how far the distance between the two predictions is off, for each newton.
+    The tip is on the predicted cortex, where errors are larger than at the tumour. A Gaussian process predicts the
+    error of the distance between the two, per newton.
 
     Parameters
     ----------
     correction
-        From `tool_features` and force over radius to what must be added [m/N]; None where that did not help.
+        Map from `tool_features` and force over radius to the correction [m/N]; None if that did not help.
     bound
-        Of the corrected distance, if loads were kept apart to calibrate it.
+        Bound of the corrected distance, if calibration loads were set aside.
     """
 
     correction: Gp | None = None
     bound: Bound | None = None
 
     def corrected(self, distance: np.ndarray, patch: Patch, asked: Pushed, magnitude: np.ndarray) -> np.ndarray:
-        """Distances (B,) [m] corrected for loads `asked` within the training forces, of true magnitude (B,) [N]."""
+        """Correct distances (B,) [m] for loads `asked` within the training forces, of true magnitude (B,) [N]."""
         if self.correction is None:
             return distance
         off = self.correction.predict(correction_features(patch, asked))[:, 0]
@@ -62,12 +61,12 @@ class TipModel:
 
 
 def correction_features(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """The features of a correction (B, 9): `tool_features`, and force over radius."""
+    """Compute the features of a correction (B, 9): `tool_features`, and force over radius."""
     return with_pressing(tool_features(patch, pushed))
 
 
 def fitted_correction(patch: Patch, pushed: Pushed, off: np.ndarray) -> Gp | None:
-    """Learn how far distances are `off` (B,) [m] under loads; None where none of them presses."""
+    """Fit the error `off` (B,) [m] of distances under loads; None if no load presses."""
     magnitude = directions(pushed)[0]
     some = magnitude > 0.0
     if not some.any():

@@ -20,17 +20,17 @@ from .conformal import Bound
 
 @dataclass(frozen=True, eq=False)
 class ForceModel:
-    """What a model of poses has learned of its tool's force.
+    """Trained model of a tool's force.
 
     Parameters
     ----------
     encoder
-        A name in `ENCODERS`: what the regressor is given.
+        Name in `ENCODERS`: features for the regressor.
     learned
-        From features of an indentation to the force (B, 3) [N/m] by one metre of depth. Of a model with a part of
-        contact it is what that leaves; None: nothing is added.
+        Map from features of an indentation to the force (B, 3) [N/m] per metre of depth. With a contact part it
+        predicts the remainder; None: nothing is added.
     bound
-        Of the force's error [N], if loads were kept apart to calibrate it.
+        Bound of the force's error [N], if calibration loads were set aside.
     """
 
     encoder: str = "tool"
@@ -38,14 +38,14 @@ class ForceModel:
     bound: Bound | None = None
 
     def added(self, patch: Patch, asked: Pushed) -> np.ndarray | float:
-        """What the regressor says to indentations (B, 3) [N/m]."""
+        """Predict the regressor's contribution (B, 3) [N/m] at indentations."""
         return 0.0 if self.learned is None else self.learned.predict(ENCODERS[self.encoder](patch, asked))
 
 
 def wrench(force: np.ndarray, pose: np.ndarray, tool: BuiltIn) -> np.ndarray:
-    """Force [N] and moment about the tool's origin [N m] of one tool at poses (B, 4, 4): (B, 1, 6), of forces (B, 3).
+    """Compute force [N] and moment about the tool's origin [N m] at poses (B, 4, 4): (B, 1, 6), from forces (B, 3).
 
-    What presses on a ball without friction goes through its middle. The moment of other tools is not known: NaN.
+    Frictionless pressure on a ball acts through its centre. The moment of other tools is not available: NaN.
     """
     known = isinstance(tool, Ball)
     moment = np.cross(tool.radius * pose[:, :3, 2], force) if known else np.full(force.shape, np.nan)
@@ -53,11 +53,11 @@ def wrench(force: np.ndarray, pose: np.ndarray, tool: BuiltIn) -> np.ndarray:
 
 
 HELD = "where a blade touches"
-"""What is warm in an answer: rows of `Contact.held`."""
+"""Key of the contact in the warm data of a result: rows of `Contact.held`."""
 
 
 def going_on(regressors: Sequence[Fitted], start: Deformation | None) -> Mapping[str, Encoder]:
-    """Encoders whose features of rods and blades hold where a start had them, where it says so."""
+    """Return encoders that start rods and blades from the contact stored in `start`, if there is one."""
     contact, held = _contact(regressors), None if start is None else start.warm.get(HELD)
     if contact is None or held is None or held.shape[1:] != (contact.held_width,) or not np.isfinite(held).all():
         return ENCODERS
@@ -72,11 +72,11 @@ def going_on(regressors: Sequence[Fitted], start: Deformation | None) -> Mapping
 def held_of(
     regressors: Sequence[Fitted], patch: Patch, asked: Pushed, encoders: Mapping[str, Encoder]
 ) -> dict[str, np.ndarray]:
-    """What an answer to indentations keeps warm for the next one: rows (B, h), or nothing."""
+    """Return the contact to store with a result for the next warm start: rows (B, h), or nothing."""
     contact = _contact(regressors)
     return {} if contact is None else {HELD: contact.held(encoders["core"](patch, asked))}
 
 
 def _contact(regressors: Sequence[Fitted]) -> Contact | None:
-    """That of a rod or a blade; a ball's search is short."""
+    """Return the contact regressor of a rod or a blade; a ball's search is short."""
     return next((each for each in regressors if isinstance(each, Contact) and len(each.core)), None)

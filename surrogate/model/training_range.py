@@ -1,4 +1,4 @@
-"""The range of a model's training loads: outside it, an answer is marked as extrapolated."""
+"""Range of a model's training loads: outside it, a prediction is marked as extrapolated."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from ..data.cortex_patch import Patch
 from ..data.encode import directions
 from ..data.indentation import Indented
 
-# Round-off must not put a training load outside.
+# Relative tolerance, so that round-off puts no training load outside.
 SLACK = 1e-6
 
 
 class Measured(NamedTuple):
-    """Force [N], angle to the inward normal [rad], footprint beyond the rim [m]: (B,) each."""
+    """Force [N], angle to the inward normal [rad], footprint beyond the edge of the craniotomy [m]: (B,) each."""
 
     magnitude: np.ndarray
     angle: np.ndarray
@@ -28,12 +28,11 @@ class Measured(NamedTuple):
 
 
 class Outside(NamedTuple):
-    """Where loads lie to the training range, (B,) each.
+    """Position of loads relative to the training range, (B,) each.
 
-    `away` is the distance from the nearest training load [m]. `beyond` says how far a load leaves the range otherwise.
-    That is the largest of millimetres over the rim, radians beyond the angle, and three shares. They are those by which
-    force, radius and force over radius are too large or too small. `excess` counts millimetres beyond the reach too,
-    and is zero inside.
+    `away` is the distance from the nearest training load [m]. `beyond` measures how far a load leaves the range
+    otherwise: the largest of millimetres over the edge, radians beyond the angle, and three relative excesses, of
+    force, radius and force over radius. `excess` includes millimetres beyond the reach, and is zero inside.
     """
 
     away: np.ndarray
@@ -42,7 +41,7 @@ class Outside(NamedTuple):
 
     @property
     def here(self) -> Outside:
-        """The same loads, if they were training loads."""
+        """The same with all distances 0, as for training loads."""
         return Outside(*(0.0 * each for each in self))
 
 
@@ -55,17 +54,17 @@ class Envelope:
     points
         (n, 3) points of the training loads [m].
     reach
-        The greatest distance of a training point from the nearest other one [m]: how densely they cover the cortex.
+        Largest distance of a training point from its nearest neighbour [m]: how densely they cover the cortex.
     overhang
-        Greatest footprint radius less distance to the rim [m].
+        Largest footprint radius minus distance to the edge [m].
     angle
-        Greatest angle [rad] between force and inward normal.
+        Largest angle [rad] between force and inward normal.
     force
-        Least and greatest [N]. Below the least the response is in proportion, so weaker loads lie inside.
+        Smallest and largest [N]. Below the smallest the response is in proportion, so weaker loads are inside.
     footprint
-        Least and greatest radius [m].
+        Smallest and largest radius [m].
     line_force
-        Greatest force over radius [N/m], to which the indentation of a round tool is in proportion.
+        Largest force over radius [N/m], to which the indentation of a round tool is in proportion.
     """
 
     points: np.ndarray
@@ -77,23 +76,23 @@ class Envelope:
     line_force: float
 
     def holds(self, patch: Patch, pushed: Pushed) -> np.ndarray:
-        """(B,) bool: whether each load lies inside."""
+        """Return the mask (B,) of loads inside the range."""
         return self.outside(pushed, measured(patch, pushed)).excess == 0.0
 
     def repeats(self, point: np.ndarray, corners: np.ndarray) -> bool:
-        """Whether some of the points (B, 3) [m] are points of the training, to the last bit.
+        """Return True if any of the points (B, 3) [m] is exactly a training point.
 
-        The surface's corners (n, 3) [m] do not count: many different poses have the same corner nearest to them.
+        The surface's corners (n, 3) [m] do not count: many different poses have the same nearest corner.
         """
         asked, known, free = (set(map(tuple, place.astype(np.float32))) for place in (point, self.points, corners))
         return bool((asked & known) - free)
 
     def within(self, known: Measured) -> Measured:
-        """Loads with the nearest force of the training."""
+        """Return loads with forces clipped to the training range."""
         return known._replace(magnitude=np.clip(known.magnitude, *self.force))
 
     def outside(self, pushed: Pushed, known: Measured) -> Outside:
-        """Where loads lie to the range."""
+        """Compute the position of loads relative to the range."""
         magnitude, angle, overhang = known
         away = np.sqrt(squared_distances(pushed.point, self.points).min(axis=1))
         beyond = np.stack(
@@ -111,7 +110,7 @@ class Envelope:
 
 
 def envelope_of(patch: Patch, trained: Pushed) -> Envelope:
-    """The envelope of the training loads, which follows from these loads alone."""
+    """Compute the envelope of the training loads, from these loads alone."""
     magnitude, angle, overhang = measured(patch, trained)
     return Envelope(
         trained.point.astype(np.float32),
@@ -125,14 +124,14 @@ def envelope_of(patch: Patch, trained: Pushed) -> Envelope:
 
 
 def _reach(point: np.ndarray) -> float:
-    """The greatest distance [m] of a point (n, 3) from the nearest other one: zero of one alone."""
+    """Compute the largest distance [m] of a point (n, 3) from its nearest neighbour: zero for a single point."""
     if len(point) < 2:
         return 0.0
     return float(KDTree(point).query(point, 2)[0][:, 1].max())
 
 
 def measured(patch: Patch, pushed: Pushed) -> Measured:
-    """Measure loads as the envelope compares them; of a rod or a blade the shaft counts, where it leans more."""
+    """Measure loads for the envelope; for a rod or a blade the shaft's angle counts if it is larger."""
     (magnitude, direction), inward = directions(pushed), patch.normal_near(pushed.point)
     cosine = np.einsum("bi,bi->b", direction, inward)
     if isinstance(pushed, Indented):

@@ -1,4 +1,4 @@
-"""Models that come from a file: what no training makes is refused before anything is answered by it."""
+"""Validation of models from files: models that no training can produce are rejected before use."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from .learned import Learned, Part
 from .left_out import LeftOut
 from .training_range import Envelope
 
-# Of tool features, and so of the features of bounds.
+# Number of tool features, and so of the features of bounds.
 FEATURES = 7
 
 
 def demand_sound(name: str, model: Learned) -> None:
-    """Refuse a model that cannot be.
+    """Check that a model is valid.
 
     Raises
     ------
     InputError
-        Parts, an envelope or bounds that no training makes; the text names which.
+        Parts, an envelope or bounds that no training can produce; the message names them.
     """
     try:
         _demand(len(model.parts) > 0, "it has no parts")
@@ -52,12 +52,12 @@ def demand_sound(name: str, model: Learned) -> None:
 
 
 def demand_finite(state: Mapping[str, np.ndarray]) -> None:
-    """Refuse what a regressor cannot have learnt.
+    """Check that a regressor's state is valid.
 
     Raises
     ------
     InputError
-        Arrays that are no finite numbers.
+        Arrays that are not finite numbers.
     """
     for name, array in state.items():
         _demand(
@@ -73,7 +73,7 @@ def _check_part(part: Part, model: Learned) -> None:
     found = part.regressor.predict(features)
     _demand(
         found.shape == (len(features), len(part.basis.modes)) and bool(np.isfinite(found).all()),
-        "it answers no load of its training",
+        "it gives no result for a load of its training",
     )
 
 
@@ -81,7 +81,7 @@ def _check_basis(basis: Basis, anatomy: Anatomy) -> None:
     nodes, modes = basis.nodes, basis.modes
     _demand(nodes.ndim == 1 and nodes.dtype.kind in "iu" and len(nodes) > 0, "its nodes are no vertex numbers")
     _demand(nodes.min() >= 0 and nodes.max() < len(anatomy.mesh.nodes), "its nodes lie outside the mesh")
-    # They rise; where one basis has the tumour and the cortex, once more from the start.
+    # They increase; if one basis has the tumour and the cortex, once more from the start.
     rises = np.diff(nodes.astype(np.int64)) > 0
     _demand(
         bool(np.sum(~rises) <= 1) and len(np.unique(nodes)) == len(nodes), "its nodes are not sorted, or come twice"
@@ -93,7 +93,7 @@ def _check_basis(basis: Basis, anatomy: Anatomy) -> None:
 
 
 def _probe(encoder: str, model: Learned) -> np.ndarray:
-    """Features of a training load, made without a tool's footprint integral."""
+    """Compute features of a training load, without a tool's footprint integral."""
     if encoder in ("nodal", "rooted"):
         return np.ones((1, 3 * len(open_patch(model.anatomy).nodes)))
     envelope = model.envelope
@@ -120,7 +120,7 @@ def _check_force(model: Learned) -> None:
     _demand(all(grip.shape == (terms,) for grip in grips), "what it knows of its tool's force is none")
     if model.force.learned is not None:
         found = model.force.learned.predict(_probe(model.force.encoder, model))
-        _demand(found.shape == (1, 3) and bool(np.isfinite(found).all()), "it answers no force")
+        _demand(found.shape == (1, 3) and bool(np.isfinite(found).all()), "it gives no force")
     if model.force.bound is not None:
         _check_bounds(model.force.bound)
 
@@ -163,7 +163,7 @@ def _check_bounds(bounds: Bound) -> None:
 
 
 def _sound(stated: LeftOut) -> bool:
-    """Whether errors on left-out cortex can be."""
+    """Return True if errors on held-out cortex have valid values."""
     sizes = (stated.mean, stated.guarded, stated.solved, *([] if stated.p999 is None else [stated.p999]))
     return all(type(size) is float and 0.0 <= size < np.inf for size in sizes) and stated.solved <= 1.0
 

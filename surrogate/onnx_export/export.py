@@ -1,6 +1,6 @@
-"""Learned models as ONNX files: one graph from loads to displacements and bounds, for programs without this project.
+"""Export of trained models to ONNX: one graph from loads to displacements and bounds, for use in other programs.
 
-The graph is what the model's own formulas do with wires in place of arrays: no formula is written a second time.
+The graph is traced: the model's own formulas run with wires instead of arrays, so that no formula is written twice.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ from .graph import Port, Sheet
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-# Regressors whose formulas use nothing but what a wire knows.
+# Regressors whose formulas use only operations that a wire supports.
 TRACEABLE = (Linear, Pcr, Ann, Svr, Gp, Remainder, Series, Pairs)
-# Of names, shapes and meaning of inputs, outputs and metadata.
+# Version of the names, shapes and meanings of inputs, outputs and metadata.
 FORMAT = "sulcus onnx 1"
 TEXT = (
-    "Displacements of a brain under a pressing tool, and how far they may be off, as sulcus learnt them from finite "
+    "Displacements of a brain under a pressing tool, and how far they may be off, as sulcus learned them from finite "
     "elements. Loads are not checked: give finite numbers and positive radii. Research only; not a medical device."
 )
 
 
 def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
-    """The graph of a model: of the tumour, or of all that it knows.
+    """Build the graph of a model: of the tumour, or of all its vertices.
 
     Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.Pushed` has them.
-    Where an answer stands on a compliance table, that of the cortex always, also `weight` (B, m). It is the share of
-    the force that each of the nodes `pressed` (m,) of the open cortex bears. `footprint_weights` of
+    If the result depends on a compliance matrix, which that of the cortex always does, also `weight` (B, m). It is the
+    share of the force on each of the nodes `pressed` (m,) of the open cortex. `footprint_weights` of
     `sim.discretisation.footprint` integrates it over `Patch`: no operator of a graph could.
 
-    Outputs, as `Learned.deform` answers: `displacement` (B, n, 3) [m] of the mesh vertices `nodes` (n,), which lie at
-    `rest` (n, 3) [m]. `bound` (B, 2) [m] of the tumour, at the metadata's levels, is NaN where nothing was calibrated.
-    Then come `excess` (B,), that of `Outside`; and `extrapolated` (B,), whether it is more than zero. All in single
-    precision, but in between in the precision that the model has.
+    Outputs, as in `Learned.deform`: `displacement` (B, n, 3) [m] of the mesh vertices `nodes` (n,), whose undeformed
+    positions are `rest` (n, 3) [m]. `bound` (B, 2) [m] of the tumour, at the metadata's levels, is NaN if nothing was
+    calibrated. Then come `excess` (B,), that of `Outside`; and `extrapolated` (B,), True if it is above zero. All in
+    single precision, but in between in the precision of the model.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
         if np.isin(part.basis.nodes, nodes).any() and type(part.regressor) not in TRACEABLE:
             kind = type(part.regressor).__name__
             raise InputError(f"{name} has a part of the kind {kind}, which has no ONNX graph: export another learner.")
-    # Any two loads of the training range show the formulas which kinds and shapes their arrays have.
+    # Any two loads of the training range give the formulas the types and shapes of their arrays.
     down = np.array([0.0, 0.0, -envelope.force[1]])
     pushed = Pushed(
         sheet.input("point", np.tile(patch.points[0], (2, 1)), "where the tool touches the resting tissue [m], RAS"),
@@ -76,7 +76,7 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
 
     @cache
     def weight() -> Any:
-        """The integral over the footprint, which is given, once for all that ask."""
+        """Create the input of the footprint integral, once for all uses."""
         sample = np.full((2, len(patch.nodes)), 1.0 / len(patch.nodes))
         sheet.output(sheet.constant(patch.nodes), Port("pressed", np.int64, patch.nodes.shape, "of the mesh"))
         return sheet.input("weight", sample, "share of the force on each of the nodes `pressed`")
@@ -102,7 +102,7 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
 
 
 def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False) -> None:
-    """Write `onnx_model`; the file appears whole or not at all.
+    """Write `onnx_model` atomically.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False
 
 
 def _notes(name: str, model: Learned) -> dict[str, str]:
-    """Metadata: what the numbers mean, and all that is known of the training."""
+    """Return the metadata: units, levels, and all provenance of the training."""
     return {
         **model.training,
         "format": FORMAT,

@@ -1,4 +1,4 @@
-"""ONNX graphs that are traced: NumPy's own functions, given a wire, write the operator that they stand for."""
+"""Tracing of ONNX graphs: NumPy's own functions, called with a wire, write the corresponding operator."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ..array_functions import Rounded, columns_in_use, product_of, squared_dista
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-# Of 2021 and 2022: every runtime of today reads them.
+# Operator set and format version of 2021 and 2022: all current runtimes read them.
 OPSET, FORMAT_VERSION = 17, 8
-# As `onnx.TensorProto` numbers them.
+# Type numbers of `onnx.TensorProto`.
 KINDS = {np.dtype(kind): number for kind, number in (("f4", 1), ("i8", 7), ("?", 9), ("f8", 11))}
 OPERATORS = {
     np.add: "Add",
@@ -38,21 +38,21 @@ OPERATORS = {
     np.log: "Log",
     np.tanh: "Tanh",
 }
-"""NumPy's universal functions and their operators."""
+"""Operators of NumPy's universal functions."""
 
 
 class Wire(NDArrayOperatorsMixin):
-    """A named array of a graph, whose first axis is the batch. Operators and functions of NumPy write on its sheet.
+    """Named array of a graph, whose first axis is the batch. Operators and functions of NumPy write to its sheet.
 
     Parameters
     ----------
     sheet
-        Where it is written.
+        Graph that it belongs to.
     name
-        Its own there.
+        Its name there.
     sample
-        What it is for a batch of sample loads: its kind and shape are NumPy's own. No formula may keep the batch's
-        length, which is another in use.
+        Its value for a batch of sample loads: its type and shape are NumPy's own. No formula may depend on the length
+        of the batch, which differs in use.
     """
 
     def __init__(self, sheet: Sheet, name: str, sample: np.ndarray):
@@ -62,7 +62,7 @@ class Wire(NDArrayOperatorsMixin):
         return len(self.sample)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *operands: Operand, **_: object) -> Wire:
-        """Write a universal function; assignment in place makes another wire."""
+        """Write a universal function; in-place assignment gives another wire."""
         if method == "__call__" and ufunc is np.arccos:
             return _arccos(self)
         if method != "__call__" or ufunc not in OPERATORS:
@@ -74,7 +74,7 @@ class Wire(NDArrayOperatorsMixin):
         return FUNCTIONS[function](self.sheet, *args, **kwargs) if function in FUNCTIONS else NotImplemented
 
     def __getitem__(self, key: Any) -> Wire:
-        """Take rows of axes, or add axes of length one; the batch is taken whole."""
+        """Select along axes, or add axes of length one; the batch axis must be taken whole."""
         out, axis = self, 0
         for each in key if isinstance(key, tuple) else (key,):
             if each is None:
@@ -88,39 +88,39 @@ class Wire(NDArrayOperatorsMixin):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the sample."""
+        """Shape of the sample."""
         return self.sample.shape
 
     @property
     def T(self) -> Wire:
-        """With its axes in reverse."""
+        """Wire with its axes reversed."""
         return self.sheet.put("Transpose", self.sample.T, self)
 
     def astype(self, kind: type) -> Wire:
-        """The same numbers of another kind."""
+        """Convert to another type."""
         if self.sample.dtype == kind:
             return self
         return self.sheet.put("Cast", self.sample.astype(kind), self, to=KINDS[np.dtype(kind)])
 
     def reshape(self, *shape: int) -> Wire:
-        """In another shape, of which the batch is -1."""
+        """Change the shape; the batch axis is -1."""
         return self.sheet.put("Reshape", self.sample.reshape(shape), self, np.array(shape))
 
     def argmin(self, axis: int) -> Wire:
-        """Where an axis is least (whole numbers)."""
+        """Return the position of the minimum along an axis (whole numbers)."""
         return self.sheet.put("ArgMin", self.sample.argmin(axis), self, axis=axis, keepdims=0)
 
     def sum(self, axis: int, keepdims: bool = False) -> Wire:
-        """Over an axis."""
+        """Sum over an axis."""
         sample = self.sample.sum(axis, keepdims=keepdims)
         return self.sheet.put("ReduceSum", sample, self, np.array([axis]), keepdims=int(keepdims))
 
     def min(self, axis: int) -> Wire:
-        """Over an axis."""
+        """Return the minimum over an axis."""
         return self.sheet.put("ReduceMin", self.sample.min(axis), self, axes=(axis,), keepdims=0)
 
     def max(self, axis: int) -> Wire:
-        """Over an axis."""
+        """Return the maximum over an axis."""
         return self.sheet.put("ReduceMax", self.sample.max(axis), self, axes=(axis,), keepdims=0)
 
 
@@ -128,7 +128,7 @@ Operand = Wire | np.ndarray | float
 
 
 class Port(NamedTuple):
-    """An input or output: its name, kind and shape, and a sentence on it."""
+    """Input or output: its name, type and shape, and a description."""
 
     name: str
     kind: type
@@ -137,7 +137,7 @@ class Port(NamedTuple):
 
 
 class Node(NamedTuple):
-    """An operator, its inputs, its output, and its attributes."""
+    """Operator, its inputs, its output, and its attributes."""
 
     kind: str
     inputs: tuple[str, ...]
@@ -146,7 +146,7 @@ class Node(NamedTuple):
 
 
 class Sheet:
-    """A graph that is being written. The same operator on the same wires is one node, equal arrays are one constant."""
+    """Graph under construction. The same operator on the same wires is one node, equal arrays are one constant."""
 
     def __init__(self) -> None:
         self._inputs: list[Port] = []
@@ -156,7 +156,7 @@ class Sheet:
         self._made: dict[object, Wire] = {}
 
     def put(self, kind: str, sample: np.ndarray, *inputs: Wire | np.ndarray, **attributes: Any) -> Wire:
-        """Write an ONNX operator on wires and constants; `sample` is its outcome for the sample loads."""
+        """Write an ONNX operator on wires and constants; `sample` is its result for the sample loads."""
         names = tuple((each if isinstance(each, Wire) else self.constant(each)).name for each in inputs)
         key = kind, names, tuple(attributes.items())
         if key not in self._made:
@@ -165,13 +165,13 @@ class Sheet:
         return self._made[key]
 
     def alike(self, operands: Sequence[Operand]) -> list[Wire]:
-        """Operands in the kind that NumPy brings them to: its operators mix kinds, those of graphs do not."""
+        """Convert operands to their common NumPy type: NumPy's operators mix types, those of graphs do not."""
         kind = np.result_type(*map(_sample, operands))
         wires = (each if isinstance(each, Wire) else self.constant(np.asarray(each, kind)) for each in operands)
         return [wire.astype(kind.type) for wire in wires]
 
     def constant(self, array: np.ndarray) -> Wire:
-        """An array of its own kind; whole numbers in 64 bits."""
+        """Add a constant of the array's own type; whole numbers in 64 bits."""
         array = np.asarray(array, np.int64) if array.dtype.kind in "iu" else array
         key = array.dtype.str, array.shape, array.tobytes()
         if key not in self._made:
@@ -180,22 +180,22 @@ class Sheet:
         return self._made[key]
 
     def input(self, name: str, sample: np.ndarray, text: str) -> Any:
-        """A wire of numbers (B, ...), given in single precision; formulas, which compute in double, know arrays."""
+        """Add an input (B, ...) of single precision; formulas compute in double precision."""
         self._inputs.append(Port(name, np.float32, ("B", *sample.shape[1:]), text))
         return Wire(self, name, sample.astype(np.float32)).astype(np.float64)
 
     def output(self, wire: Wire, port: Port) -> None:
-        """What the graph answers, as the port's kind."""
+        """Add an output, of the port's type."""
         self._nodes.append(Node("Identity", (wire.astype(port.kind).name,), port.name, {}))
         self._outputs.append(port)
 
     def model(self, name: str, text: str, version: str, notes: Mapping[str, str]) -> ModelProto:
-        """The graph as ONNX has it; `notes` are its metadata.
+        """Build the ONNX model; `notes` are its metadata.
 
         Raises
         ------
         InputError
-            Where the package `onnx` is not installed.
+            The package `onnx` is not installed.
         """
         with needed_from("onnx", "an ONNX graph needs"):
             from onnx import helper, numpy_helper
@@ -250,14 +250,14 @@ def _where(sheet: Sheet, condition: Wire, yes: Operand, no: Operand) -> Wire:
 
 def _einsum(sheet: Sheet, equation: str, *operands: Any) -> Wire:
     (first, second), out = equation.partition("->")[0].split(","), equation.partition("->")[2]
-    if first == out + second[-1] and first.endswith(second):  # a product and a sum, which runtimes do ten times as fast
+    if first == out + second[-1] and first.endswith(second):  # product and sum: ten times as fast in runtimes
         return (operands[0] * operands[1]).sum(axis=len(out))
     sample = np.einsum(equation, *map(_sample, operands))
     return sheet.put("Einsum", sample, *sheet.alike(operands), equation=equation)
 
 
 def _searchsorted(_: Sheet, sites: np.ndarray, values: Wire) -> Wire:
-    # With infinity at its end: no operator reads an empty array.
+    # Infinity at the end: no operator reads an empty array.
     return (values[:, None] > np.append(sites, np.inf)).astype(np.int64).sum(axis=1)
 
 
@@ -271,11 +271,11 @@ FUNCTIONS: dict[Callable, Callable[..., Wire]] = {
     np.clip: lambda _, x, least, most: np.minimum(np.maximum(x, least), most),
     np.ones_like: lambda _, x: 0.0 * x + 1.0,
 }
-"""Other functions of NumPy, given the sheet and what they were called with."""
+"""Other functions of NumPy, called with the sheet and their arguments."""
 
 
 def _arccos(cosine: Wire) -> Wire:
-    """By the arc over the chord: runtimes have no arc functions but those of single precision."""
+    """Compute the arc cosine by the half-chord: runtimes have arc functions in single precision only."""
     half = np.sqrt(0.5 * np.maximum(1.0 - np.absolute(cosine), 0.0)).astype(np.float32)
     arc = 2.0 * cosine.sheet.put("Asin", np.arcsin(half.sample), half).astype(np.float64)
     return np.where(cosine < 0.0, np.pi - arc, arc)
@@ -283,7 +283,7 @@ def _arccos(cosine: Wire) -> Wire:
 
 @squared_distances.register
 def _(points: Wire, sites: np.ndarray) -> Any:
-    """|x|^2 - 2 x y + |y|^2, thus in double precision: differences would take the memory of B n f numbers."""
+    """Compute |x|^2 - 2 x y + |y|^2, in double precision: differences would take the memory of B n f numbers."""
     x, y = points.astype(np.float64), sites.astype(np.float64)
     return np.maximum((x * x).sum(axis=1, keepdims=True) - x @ (2.0 * y.T) + (y * y).sum(axis=1), 0.0)
 
@@ -303,5 +303,5 @@ def _(rows: Wire, table: Rounded, index: np.ndarray) -> Any:
 
 @columns_in_use.register
 def _(rows: Wire) -> np.ndarray:
-    """All: which are zero, a graph does not know before it runs."""
+    """Return all columns: zeros are unknown before the graph runs."""
     return np.arange(rows.shape[1])

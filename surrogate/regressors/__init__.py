@@ -1,1 +1,1 @@
-"""One file per regressor: features in, coefficients out."""
+"""Regressors, one per file: features in, coefficients out."""

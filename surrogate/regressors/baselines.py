@@ -17,7 +17,7 @@ import numpy as np
 from ..array_functions import squared_distances
 from .protocol import Stored, standardisation
 
-# A component smaller than this against the largest is rounding.
+# Smallest singular value relative to the largest: below is round-off.
 RANK = 1e-9
 
 
@@ -25,9 +25,9 @@ RANK = 1e-9
 class Pcr(Stored):
     """Least squares on the principal components of the features, with intercept.
 
-    Jolliffe 2002, "Principal Component Analysis", chapter 8. The features are taken as they are: give such as share one
-    unit (forces at the nodes). Components are kept until `share` of the features' variance is: the rest would be fitted
-    to places that few loads touch.
+    Jolliffe 2002, "Principal Component Analysis", chapter 8. The features are not scaled, so they must share one unit
+    (forces at the nodes). Components are kept until they explain `share` of the features' variance: others would be
+    fitted to places that few loads touch.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class Pcr(Stored):
         components, size, axes = np.linalg.svd(X - self.mean_, full_matrices=False)
         kept = 1 + int(np.searchsorted(np.cumsum(size**2), self.share * np.sum(size**2)))
         kept = min(kept, int(np.sum(size > RANK * size[0])))
-        # Components are orthogonal: each has its own least squares.
+        # Components are orthogonal: each has its own least-squares problem.
         slopes = components[:, :kept].T @ (Y - self.offset_) / size[:kept, None]
         self.map_ = axes[:kept].T @ slopes
         return self
@@ -57,7 +57,7 @@ class Pcr(Stored):
 
 @dataclass(eq=False)
 class Svr(Stored):
-    """Gaussian kernel exp(-gamma |x - x'|^2), gamma = 1 / f, of standardised features.
+    """Support vector regression with a Gaussian kernel exp(-gamma |x - x'|^2), gamma = 1 / f, of standardised features.
 
     By default C = iqr(y) / 1.349 and epsilon = iqr(y) / 13.49 per output. These are MATLAB's defaults, which Tonutti,
     Gras, Yang 2017 used (Artif. Intell. Med. 80:39-47); they trained one machine per tumour node and component, which
@@ -66,7 +66,7 @@ class Svr(Stored):
     Parameters
     ----------
     penalty, tube
-        C and epsilon, in quartile ranges of the output.
+        C and epsilon, in interquartile ranges of the output.
     """
 
     kept = ("mean", "deviation", "support", "dual", "intercept")
@@ -85,7 +85,7 @@ class Svr(Stored):
         intercept = np.zeros(Y.shape[1])
 
         def trained(mode: int) -> SVR:
-            # In units of its quartile range an output meets libsvm's absolute stopping tolerance at any scale.
+            # In units of its interquartile range an output meets libsvm's absolute stopping tolerance at any scale.
             return SVR(C=self.penalty, epsilon=self.tube, gamma=1.0 / X.shape[1]).fit(scaled, Y[:, mode] / spread[mode])
 
         modes = np.flatnonzero(spread > 0.0)
@@ -109,7 +109,7 @@ class Svr(Stored):
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one core: for layers this small its threads wait for each other, for minutes on a busy machine."""
+    """Limit torch to one thread: with layers this small its threads mostly wait, for minutes on a loaded machine."""
     import torch
 
     before = torch.get_num_threads()
@@ -121,7 +121,7 @@ def one_thread() -> Iterator[None]:
 
 
 def forward(x: Any, weights: Sequence[Any], biases: Sequence[Any], tanh: Callable[[Any], Any]) -> Any:
-    """Outputs (B, r) of the layers, of inputs x (B, f): arrays of NumPy or of torch, whose `tanh` is given."""
+    """Compute the layers' outputs (B, r) for inputs x (B, f): arrays of NumPy or of torch, with its `tanh`."""
     for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
         x = tanh(x @ weight + bias)
     return x @ weights[-1] + biases[-1]
@@ -131,7 +131,7 @@ def forward(x: Any, weights: Sequence[Any], biases: Sequence[Any], tanh: Callabl
 class Ann:
     """Two hidden layers of tanh units, fitted by L-BFGS with weight decay.
 
-    One network serves all vertices. A quasi-Newton method fits it on the whole set, with a fixed weight decay.
+    One network is used for all vertices. A quasi-Newton method fits it on the whole set, with a fixed weight decay.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ class Ann:
 
         self.mean_, self.deviation_ = standardisation(X)
         self.offset_ = Y.mean(axis=0)
-        # One scale for all outputs: an error in any mode counts as the displacement that it is.
+        # One scale for all outputs: an error in any mode is weighted as the displacement that it is.
         self.scale_ = np.sqrt(np.mean(np.sum((Y - self.offset_) ** 2, axis=1)) + np.finfo(float).tiny)
         inputs = torch.from_numpy((X - self.mean_) / self.deviation_)
         targets = torch.from_numpy((Y - self.offset_) / self.scale_)
@@ -199,7 +199,7 @@ class Ann:
         return y * np.float32(self.scale_) + self.offset_.astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Standardisation, and the weights and biases of each layer."""
+        """Return the standardisation, and the weights and biases of each layer."""
         state = {name: np.asarray(getattr(self, f"{name}_")) for name in ("mean", "deviation", "offset", "scale")}
         state |= {f"weight{number}": weight for number, weight in enumerate(self.weights_)}
         return state | {f"bias{number}": bias for number, bias in enumerate(self.biases_)}

@@ -1,4 +1,4 @@
-"""Power series of the force: single forces, pairs of forces, and a Gaussian process for the remainder."""
+"""Power series in the force: single forces, pairs of forces, and a Gaussian process for the remainder."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ from ..array_functions import Rounded, columns_in_use, in_chunks, product_of, ta
 from .gp import Gp
 
 ORDERS = 3
-# Which components of the direction are multiplied, order by order: 3, 6 and 10 products.
+# Products of direction components, order by order: 3, 6 and 10 products.
 FACTORS = [np.array(list(combinations_with_replacement(range(3), order))).T for order in range(1, ORDERS + 1)]
-# Which of them are each order's.
+# Columns of each order.
 SPANS = (slice(0, 3), slice(3, 9), slice(9, 19))
 TERMS = SPANS[-1].stop
-# So many radii carry a parabola.
+# Number of radii of a parabola.
 STENCIL = 3
-# What a share of -1 counts for, as a height [m].
+# Height [m] equivalent to a barycentric coordinate of -1.
 BESIDE = 1e-2
 # Share of the largest training force, below which the remainder is smaller than the table's own errors.
 FAINT = 0.4
-# What the process's dual coefficients are rounded to [m], at the largest force: a file then takes a third of the bytes.
+# Rounding step [m] of the Gaussian process's dual coefficients at the largest force: a file then takes a third of the
+# bytes.
 DUAL_STEP = 2e-6
-# Those of `tool_features`, and force over radius.
+# Number of features: `tool_features`, and force over radius.
 FEATURES = 9
-# Axes along which places spread by less than this share of the widest are none: a flat cortex has two.
+# Smallest spread of places along an axis relative to the largest: a flat cortex has two axes.
 FLAT = 1e-6
 
 
 def forms(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """The products (B, 19) of the components of directions (B, 3), times force^(order - 1) of forces (B,) [N]."""
+    """Compute products (B, 19) of the components of directions (B, 3), times force^(order - 1) of forces (B,) [N]."""
     columns = [direction[:, FACTORS[0][0]]]
     for order, factors in enumerate(FACTORS[1:], start=1):
         products = direction[:, factors[0]]
@@ -49,7 +50,7 @@ def forms(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
 
 @dataclass(eq=False)
 class Series:
-    """A regressor that predicts the response to one newton by the first orders of the power series in the force.
+    """Regressor of the response to one newton: first orders of the power series in the force, from a table.
 
     Between tabulated places and radii it interpolates: parabolas on each triangle, and through three radii. In the
     direction every order is a form of its degree, so that the table is exact there.
@@ -59,9 +60,9 @@ class Series:
     corners
         (V, 3) [m], of the open cortex.
     triangles
-        (S, 6): three corners, then the middles of the edges that lie opposite, as numbers of places.
+        (S, 6): three corners, then the midpoints of the opposite edges, as numbers of places.
     radii
-        (R,) [m], rising.
+        (R,) [m], increasing.
     table
         (places R, 19 r): coefficients of the basis's modes.
     """
@@ -80,7 +81,7 @@ class Series:
         return cls(corners, triangles, radii, Rounded.of(table.reshape(-1, len(steps)), steps))
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Coefficients (B, r) float32 of `tool_features` (B, 8)."""
+        """Predict coefficients (B, r) float32 of `tool_features` (B, 8)."""
         return in_chunks(self._predicted, X)
 
     def _predicted(self, X: np.ndarray) -> np.ndarray:
@@ -93,20 +94,20 @@ class Series:
         return (forms(X[:, 3:6], X[:, 6]).astype(np.float32)[:, None] @ mixed)[:, 0]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Places, radii, and the table: whole numbers of steps, `share`, and the step of each column, `unit`."""
+        """Return places, radii, and the table: whole numbers of steps, `share`, and the step of each column, `unit`."""
         known = {name: getattr(self, name) for name in ("corners", "triangles", "radii")}
         return {**known, "unit": self.table.step, "share": self.table.whole}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`; files of earlier versions have float16 in place of whole numbers, and more axes."""
+        """Rebuild from `state`; files of earlier versions have float16 instead of whole numbers, and more axes."""
         step = state["unit"].ravel()
         table = Rounded(state["share"].reshape(-1, len(step)), step)
         return cls(state["corners"], state["triangles"], state["radii"], table)
 
     @cached_property
     def _frames(self) -> np.ndarray:
-        """(S, 4, 4): from (point, 1) to the shares of a triangle's three corners and the height over it [m]."""
+        """(S, 4, 4): maps (point, 1) to the barycentric coordinates in a triangle and the height over it [m]."""
         a, b, c = (self.corners[self.triangles[:, corner]] for corner in range(3))
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -117,11 +118,11 @@ class Series:
 
     @cached_property
     def _columns(self) -> np.ndarray:
-        """The frames as one matrix (4, 4 S)."""
+        """Frames as one matrix (4, 4 S)."""
         return np.ascontiguousarray(self._frames.transpose(2, 1, 0).reshape(4, -1))
 
     def _located(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Six places (B, 6) of the triangle nearest to each point (B, 3) [m], and their shares of it (B, 6)."""
+        """Find six places (B, 6) of the triangle nearest to each point (B, 3) [m], and their weights (B, 6)."""
         local = (point @ self._columns[:3] + self._columns[3]).reshape(-1, 4, len(self.triangles))
         miss = np.absolute(local[:, 3]) - BESIDE * np.minimum(local[:, :3].min(axis=1), 0.0)
         best = miss.argmin(axis=1)
@@ -132,7 +133,7 @@ class Series:
         return taken(best, self.triangles), np.concatenate(share, axis=1)
 
     def _between_radii(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which radii (B, k), and their weights (B, k): the parabola through the three about each radius (B,) [m]."""
+        """Return radii (B, k) and weights (B, k): the parabola through the three radii about each radius (B,) [m]."""
         width = min(STENCIL, len(self.radii))
         inside = np.clip(radius, self.radii[0], self.radii[-1])
         first = np.clip(np.searchsorted(self.radii, inside) - 2, 0, len(self.radii) - width)
@@ -146,9 +147,9 @@ class Series:
 
 
 class Remainder:
-    """A Gaussian process of the response's remainder in units of force^3 + faint^3.
+    """Gaussian process of the response's remainder in units of force^3 + faint^3.
 
-    The first neglected order goes with force^3, so that the rows of strong loads weigh no more than those of weak ones.
+    The first neglected order is in proportion to force^3, so that the rows of strong and weak loads have equal weight.
     Its features are `tool_features` and force over radius, to which indentation is in proportion.
     """
 
@@ -156,7 +157,7 @@ class Remainder:
     faint_: np.ndarray
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
-        """Learn from `tool_features` X (n, 8) and remainders Y (n, r)."""
+        """Fit to `tool_features` X (n, 8) and remainders Y (n, r)."""
         self.faint_ = np.array(FAINT * X[:, 6].max())
         self.gp_ = Gp().fit(with_pressing(X), Y / self._unit(X))
         strongest = X[[X[:, 6].argmax()]]
@@ -165,34 +166,34 @@ class Remainder:
         return self
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Coefficients (B, r) float32 of `tool_features` (B, 8)."""
+        """Predict coefficients (B, r) float32 of `tool_features` (B, 8)."""
         return (self.gp_.predict(with_pressing(X)) * self._unit(X)).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
-        """The process's, and `faint` [N]."""
+        """Return the Gaussian process's state, and `faint` [N]."""
         return {**self.gp_.state(), "faint": self.faint_}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`."""
+        """Rebuild the regressor from `state`."""
         model = cls()
         model.faint_ = state["faint"]
         model.gp_ = Gp.restored({name: array for name, array in state.items() if name != "faint"})
         return model
 
     def _unit(self, X: np.ndarray) -> np.ndarray:
-        """(n, 1) [N^3]."""
+        """Return the units (n, 1) [N^3] of rows."""
         return X[:, 6:7] ** ORDERS + self.faint_**ORDERS
 
 
 def with_pressing(X: np.ndarray) -> np.ndarray:
-    """`tool_features` (n, 8), and force over radius: (n, 9)."""
+    """Append force over radius to `tool_features` (n, 8): (n, 9)."""
     return np.column_stack([X, X[:, 6] / X[:, 7]])
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """A regressor that predicts what the second order adds to the response, from `rooted_shares`.
+    """Regressor of the second-order contribution to the response, from `rooted_shares`.
 
     Parameters
     ----------
@@ -206,7 +207,7 @@ class Pairs:
     table: Rounded
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Coefficients (B, r) float32 of `rooted_shares` (B, 3 m)."""
+        """Predict coefficients (B, r) float32 of `rooted_shares` (B, 3 m)."""
         return in_chunks(self._predicted, X)
 
     def _predicted(self, X: np.ndarray) -> np.ndarray:
@@ -218,23 +219,23 @@ class Pairs:
 
     @cached_property
     def _rows(self) -> np.ndarray:
-        """The row (n, n) int32 of each pair of components, or -1."""
+        """Row (n, n) int32 of each pair of components, or -1."""
         out = np.full((self.pairs.max(initial=-1) + 1,) * 2, -1, np.int32)
         out[self.pairs[:, 0], self.pairs[:, 1]] = np.arange(len(self.pairs))
         return out
 
     def state(self) -> dict[str, np.ndarray]:
-        """Pairs, and the table: whole numbers of steps, `share`, and the step of each mode, `unit`."""
+        """Return pairs, and the table: whole numbers of steps, `share`, and the step of each mode, `unit`."""
         return {"pairs": self.pairs.astype(np.int32), "unit": self.table.step, "share": self.table.whole}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`; files of earlier versions have float16 in place of whole numbers."""
+        """Rebuild from `state`; files of earlier versions have float16 instead of whole numbers."""
         return cls(state["pairs"], Rounded(state["share"], state["unit"]))
 
 
 def filled(points: np.ndarray, table: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-    """A table without the rows of the places that are `left_out`: there the others are interpolated.
+    """Replace the rows of the `left_out` places of a table by interpolation of the others.
 
     By cubic radial basis functions with a linear polynomial (Duchon 1977, "Splines minimizing rotation-invariant
     semi-norms"), which reproduce fields that are linear in the place.

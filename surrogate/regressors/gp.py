@@ -1,4 +1,4 @@
-"""A Gaussian process from a load to the coefficients of a reduced basis: it also predicts its own deviation."""
+"""Gaussian process from a load to the coefficients of a reduced basis, with its own standard deviation."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from sim.runtime.threads import one_thread
 from ..array_functions import squared_distances
 from .protocol import Stored, standardisation
 
-# Lengths in standard deviations of a feature, and noise against the variance of an output.
+# Bounds of lengths [standard deviations of a feature], and of the noise relative to the variance of an output.
 LENGTHS, NOISE = (0.05, 1e3), (1e-8, 1.0)
 START_LENGTH, START_NOISE = 3.0, 1e-4
 
 
 @dataclass(eq=False)
 class Gp(Stored):
-    """Matern 5/2 kernel with a length for each feature; all outputs share it and the noise.
+    """Gaussian process with a Matern 5/2 kernel and a length for each feature; all outputs share lengths and noise.
 
     Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equations 2.25, 2.26, 4.17, 5.9. The
-    hyperparameters maximise the likelihood of at most `rows` rows, of the `strongest` outputs. Every row is conditioned
-    on, up to `most`, beyond which a random subset stands for the data.
+    hyperparameters maximise the likelihood of at most `rows` rows, of the `strongest` outputs. It is conditioned on
+    every row, up to `most`, beyond which a random subset is used.
 
     Parameters
     ----------
     rows, most
         Cost grows with their cubes.
     strongest
-        Outputs of largest variance that count in the likelihood, each in units of a variance of its own.
+        Number of outputs of largest variance in the likelihood, each in units of its own variance.
     seed
         Of the subsets.
     """
 
     kept = ("mean", "deviation", "offset", "length", "noise", "scaled", "dual")
-    """Standardisation, lengths (f,), noise, the standardised rows (n, f) seen, and their dual coefficients (n, r)."""
+    """Standardisation, lengths (f,), noise, standardised training rows (n, f), their dual coefficients (n, r)."""
     rows: int = 600
     most: int = 4000
     strongest: int = 20
     seed: int = 0
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
-        """Learn from rows X (n, f), Y (n, r)."""
+        """Fit to rows X (n, f), Y (n, r)."""
         for name in ("_factor", "seen_"):
             vars(self).pop(name, None)
         order = np.random.default_rng(self.seed).permutation(len(X))[: self.most]
@@ -78,7 +78,7 @@ class Gp(Stored):
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`; files of earlier versions have the rows in lengths, `seen`."""
+        """Rebuild from `state`; files of earlier versions have the rows in lengths, `seen`."""
         known = dict(state)
         if "seen" in known:
             known["scaled"] = known.pop("seen") * known["length"]
@@ -86,15 +86,15 @@ class Gp(Stored):
 
     @cached_property
     def seen_(self) -> np.ndarray:
-        """The rows seen (n, f) in lengths."""
+        """Training rows (n, f) in lengths."""
         return self.scaled_ / self.length_
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Coefficients (B, r) float32 of features (B, f): the mean of the posterior."""
+        """Predict coefficients (B, r) float32 of features (B, f): the mean of the posterior."""
         return (matern(self._distance(X)) @ self.dual_ + self.offset_).astype(np.float32)
 
     def deviation(self, X: np.ndarray) -> np.ndarray:
-        """Standard deviation (B,) of the posterior, noise included, against that of the prior."""
+        """Predict the posterior standard deviation (B,), noise included, relative to that of the prior."""
         near = matern(self._distance(X))
         known = solve_triangular(self._factor[0], near.T, lower=True, check_finite=False)
         return np.sqrt(np.maximum(1.0 - np.einsum("nb,nb->b", known, known), 0.0) + self.noise_)
@@ -104,20 +104,20 @@ class Gp(Stored):
 
     @cached_property
     def _factor(self) -> tuple[np.ndarray, bool]:
-        """Cholesky factor of the covariance of the rows seen: not stored, it is made from them when it is asked for."""
+        """Cholesky factor of the covariance of the training rows: computed from them on first use, not stored."""
         covariance = matern(cdist(self.seen_, self.seen_))
         covariance.flat[:: len(covariance) + 1] += self.noise_
         return cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
 
 
 def matern(distance: np.ndarray) -> np.ndarray:
-    """(1 + s + s^2/3) exp(-s), s = sqrt(5) distance: equation 4.17."""
+    """Compute (1 + s + s^2/3) exp(-s), s = sqrt(5) distance: equation 4.17."""
     s = np.sqrt(5.0) * distance
     return (1.0 + s + s * s / 3.0) * np.exp(-s)
 
 
 def negative_likelihood(log: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
-    """Minus the log marginal likelihood of x (n, f), y (n, r), less a constant, and its gradient (f + 1,).
+    """Compute minus the log marginal likelihood of x (n, f), y (n, r), up to a constant, and its gradient (f + 1,).
 
     `log` (f + 1,) holds the logarithms of the lengths and of the noise. Each output's variance is the most likely one,
     y^T K^-1 y / n, so that one K serves them all.
@@ -132,7 +132,7 @@ def negative_likelihood(log: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[
     dual = cho_solve(factor, y, check_finite=False)
     misfit = np.einsum("nr,nr->r", y, dual)
     value = 0.5 * count * np.log(misfit / count).sum() + outputs * np.log(np.diagonal(factor[0])).sum()
-    # The derivative by K, of which every other is a trace with dK (equation 5.9).
+    # Derivative by K, of which every other is a trace with dK (equation 5.9).
     (inverted,) = get_lapack_funcs(("potri",), factor[:1])
     lower, _ = inverted(factor[0], lower=True)
     slope = outputs * (np.tril(lower) + np.tril(lower, -1).T)

@@ -1,13 +1,13 @@
-"""A rigid tool on linear tissue: what needs no learning where the tool's pose is known.
+"""Contact of a rigid tool with linear tissue: a model for known tool poses that needs almost no training.
 
-The body is condensed to the nodes that a tool may touch: u = C f, C their compliance at rest. Of all frictionless
-forces that keep the tool out of every facet it bears those of least energy f.Cf / 2 (Signorini's problem). A tool is
-all within a radius of a point, a line or a rectangle, and enters a flat facet first where that is nearest. So
+The body is condensed to the nodes that a tool may touch: u = C f, C their compliance, undeformed. Of all frictionless
+forces that keep the tool out of every facet, the solution has the least energy f.Cf / 2 (Signorini's problem). A tool
+is all points within a radius of a point, a line or a rectangle, and enters a flat facet first where that is nearest. So
 constraints are added where a facet is entered, until none is (the exchange method: Hettich, Kortanek 1993,
-"Semi-infinite programming", SIAM Rev. 35:380-429). Each is linearised where its point has come to: a distance from
-something convex is convex, so that what satisfies the linear ones satisfies all. Their multipliers are a nonnegative
-least-squares problem (Lawson, Hanson 1974, "Solving Least Squares Problems", chapter 23). Stiffness cancels: how stiff
-tissue is need not be known.
+"Semi-infinite programming", SIAM Rev. 35:380-429). Each is linearised at the present position of its point: a distance
+from a convex set is convex, so that a solution of the linear constraints satisfies all. Their multipliers are a
+nonnegative least-squares problem (Lawson, Hanson 1974, "Solving Least Squares Problems", chapter 23). Stiffness
+cancels: the tissue's stiffness need not be known.
 """
 
 from __future__ import annotations
@@ -29,43 +29,44 @@ from sim.tools import Ball
 if TYPE_CHECKING:
     from sim.discretisation.nearest_places import Placed
 
-# Finite elements keep tissue within a gap of the ball [m]: on average half of it.
+# FEM keeps tissue within a gap of the ball [m]: on average half of it.
 THICKER = 0.5 * ToolContact((Ball(1.0),)).gap
-# Facets within so many radii of what a tool lies round may come to touch.
+# Facets within this distance of a tool's core are contact candidates [radii].
 REACH = 1.5
-# A facet entered by less [m], and motions smaller than so many times that, end the search, which so many rounds bound.
+# Contact search: penetration tolerance [m], smallest motion that continues [tolerances], maximum number of iterations.
 TOLERANCE, SETTLED, MOST = 1e-6, 3.0, 60
-# A rod or a blade goes in by so many radii at once, so that tissue stays before it; there a facet is entered by more.
+# Step of a rod or a blade [radii], so that tissue stays before it; its penetration tolerance [m].
 STRIDE, COARSER = 0.5, 1e-5
-# Where it only goes through, so many rounds do: more change the answer by less than what it is off, in twice the time.
+# Iterations at intermediate steps: more change the result by less than its error, in twice the time.
 PASSING = 3
-# So many places that bear a force are known of a tool that goes on: the strongest.
+# Maximum number of contact points stored for a warm start: the strongest.
 MOST_HELD = 128
-# Constraints that bear nothing are dropped, which is faster; after so many rounds they stay: nothing goes in circles.
+# Constraints without force are dropped, which is faster; after this many iterations they stay, so that there are no
+# cycles.
 FORGETFUL = 15
-# Places that give less than this share of what nodes do on average are bone's, which the tool enters: no force, or one
-# beyond all bounds, would keep it out.
+# Compliance of a point relative to the nodes' mean, below which it counts as bone, which the tool enters: no force, or
+# an unbounded one, would keep it out.
 LEAST = 0.02
-# Straight from LAPACK: the problems are so small that a wrapper takes longer than the work.
+# LAPACK directly: the problems are so small that a wrapper takes longer than the work.
 FACTORED, SOLVED_BY, SOLVED = get_lapack_funcs(("potrf", "trtrs", "posv"), dtype=np.float64)
-# Places are let go and taken up again so often at most; one that is let go may be entered by so much [m].
+# Maximum number of exchanges of the active set; penetration of an inactive point that is tolerated [m].
 TURNS, ENTERED = 10, 1e-8
-# Points of neighbouring facets on a common edge are one: of the mean diagonal, so that their forces are distinct. The
-# first that makes single precision positive definite.
+# Regularisation relative to the mean diagonal, as points of neighbouring facets on a common edge coincide. The first
+# one that gives a positive definite matrix in single precision is used.
 APART = (1e-6, 1e-5, 1e-4)
-# Features of a ball, and of a rod or a blade.
+# Number of features of a ball, and of a rod or a blade.
 LYING, STANDING = 8, 17
 
 
 @dataclass(eq=False)
 class Contact:
-    """A regressor that predicts the response to one metre of indentation.
+    """Regressor of the response to one metre of indentation.
 
-    It is given `tool_features` of a ball, and `core_features` of a rod or a blade. Behind those may stand what
-    `held` gave where the rod or blade stood last: it then goes on from there, which takes a fraction of the time.
+    Its input is `tool_features` of a ball, or `core_features` of a rod or a blade, optionally followed by `held` of the
+    previous pose of the rod or blade: the search then starts there, which takes a fraction of the time.
 
-    What nonlinearity adds far from the tool is nearly a factor of the force, that grows with depth over radius: a line,
-    which is all that is learned. Where tissue relaxes there is another line, in proportion to the share that is gone.
+    The nonlinear contribution far from the tool is nearly a factor on the force that is linear in depth over radius:
+    this line is all that is fitted. For relaxing tissue there is another line, in proportion to the relaxed share.
 
     Parameters
     ----------
@@ -76,13 +77,13 @@ class Contact:
     compliance
         (3 k, 3 k) [m/N] float32.
     answers
-        (3 k, r) [1/N] float32: coefficients of the basis's modes that unit forces have.
+        (3 k, r) [1/N] float32: coefficients of the basis's modes by unit forces.
     line
-        (2, r): at no depth, and what a depth of one radius adds. (4, r): then what both add once all has relaxed.
+        (2, r): value at depth 0, and slope per radius of depth. (4, r): then the change of both at full relaxation.
     grip
-        (2,) or (4,): the same factor of the force that the tool exerts; (0,) where none was learned.
+        (2,) or (4,): the same factor of the force that the tool exerts; (0,) if not fitted.
     core
-        (4,) [m]: half sizes of what a rod or a blade lies round, and its radius. (0,): a ball, its radius a feature.
+        (4,) [m]: half sizes of a rod's or blade's core, and its radius. (0,): a ball, its radius a feature.
     """
 
     points: np.ndarray
@@ -92,62 +93,62 @@ class Contact:
     line: np.ndarray
     grip: np.ndarray = field(default_factory=lambda: np.zeros(0))
     core: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    # Features that were last asked for, and what was found: motion and reaction of one load are had from one search.
+    # Last features and their result: motion and reaction of one load share one search.
     _last: tuple[bytes, np.ndarray] = field(default=(b"", np.zeros(0)), init=False, repr=False)
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Coefficients (B, r) float32 of features (B, f), whose force is depth [m]."""
+        """Predict coefficients (B, r) float32 of features (B, f), whose force is depth [m]."""
         found = self.linear(X)
         return (found * (self._terms(X)[:, : len(self.line)] @ self.line)).astype(np.float32)
 
     def linear(self, X: np.ndarray) -> np.ndarray:
-        """The same (B, r) of tissue that is linear."""
+        """Compute the coefficients (B, r) for linear tissue."""
         return self.force(X).astype(np.float32) @ self.answers / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
 
     def exerted(self, X: np.ndarray) -> np.ndarray:
-        """The force (B, 3) [N/m] that the tool exerts, by one metre of depth; `grip` must have been learned."""
+        """Predict the force (B, 3) [N/m] that the tool exerts, per metre of depth; `grip` must have been fitted."""
         return self._resultant(X) * (self._terms(X) @ self.grip)[:, None]
 
     @property
     def held_width(self) -> int:
-        """How many numbers `held` has a row."""
+        """Number of columns of `held`."""
         return self._width + len(self.compliance) + 4 * MOST_HELD
 
     def held(self, X: np.ndarray) -> np.ndarray:
-        """Where rods or blades stand, what they exert, and where (B, h): what the next pose may go on from."""
+        """Return poses of rods or blades, forces and contact points (B, h): a warm start for the next pose."""
         return np.hstack([X[:, : self._width], self._found(X)])
 
     def held_force(self, held: np.ndarray) -> np.ndarray:
-        """The forces (B, 3 k) [N] in rows of `held`."""
+        """Extract the forces (B, 3 k) [N] from rows of `held`."""
         return held[:, self._width : self._width + len(self.compliance)]
 
     def _terms(self, X: np.ndarray) -> np.ndarray:
-        """What lines are of (B, 2), or of tissue that relaxes (B, 4)."""
+        """Compute the terms of lines (B, 2), or for relaxing tissue (B, 4)."""
         depth, relaxed = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]]), self._parted(X)[1]
         return np.hstack([depth, relaxed * depth]) if relaxed.shape[1] else depth
 
     def _parted(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of features: how the tool stands, how far tissue has relaxed, and what was `held`: both may be none."""
+        """Split features: pose of the tool, relaxed share, and `held`; the last two may be empty."""
         more = X[:, self._width :]
         relaxed, held = np.split(more, [more.shape[1] % self.held_width], axis=1)
         return X[:, : self._width], relaxed, held
 
     @property
     def _width(self) -> int:
-        """How many features say where the tool stands."""
+        """Number of features of the tool's pose."""
         return STANDING if len(self.core) else LYING
 
     def _resultant(self, X: np.ndarray) -> np.ndarray:
-        """The same (B, 3) of tissue that is linear."""
+        """Compute the tool's force (B, 3) [N/m] on linear tissue, per metre of depth."""
         whole = self.force(X).reshape(len(X), -1, 3).sum(axis=1)
         return whole / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
 
     def force(self, X: np.ndarray) -> np.ndarray:
-        """What the tool does to linear tissue at the nodes that it may touch (B, 3 k) [N]."""
+        """Compute the tool's forces (B, 3 k) [N] on linear tissue at the nodes that it may touch."""
         return self._found(X)[:, : len(self.compliance)]
 
     def _found(self, X: np.ndarray) -> np.ndarray:
-        """Forces (B, 3 k) [N], and then triangles and corner coordinates (4,) of the places that bear them, or -1."""
+        """Compute forces (B, 3 k) [N], then triangles and barycentric coordinates (4,) of the contact points, or -1."""
         stands, _, held = self._parted(X)
         X = np.ascontiguousarray(np.hstack([stands, held]))
         asked, (known, found) = X.tobytes(), self._last
@@ -162,9 +163,9 @@ class Contact:
         return out
 
     def fitted(self, X: np.ndarray, Y: np.ndarray, alike: np.ndarray, exerted: np.ndarray | None = None) -> Self:
-        """With the lines that fit coefficients Y (B, r) best; `alike` (r,) numbers those that share one.
+        """Fit the lines to coefficients Y (B, r); `alike` (r,) numbers the columns that share one.
 
-        `exerted` (B, 3) [N/m] is the tool's force by one metre of depth, where it is known.
+        `exerted` (B, 3) [N/m] is the tool's force per metre of depth, if available.
         """
         found, terms = self.linear(X), self._terms(X)
         line = np.zeros((terms.shape[1], found.shape[1]))
@@ -175,26 +176,26 @@ class Contact:
         return replace(self, line=line, grip=grip)
 
     def state(self) -> dict[str, np.ndarray]:
-        """All that it has."""
+        """Return all fields."""
         return {item.name: getattr(self, item.name) for item in fields(self) if item.init}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`."""
+        """Rebuild the regressor from `state`."""
         return cls(**state)
 
     @cached_property
     def _rounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Middles (S, 3) and radii (S,) [m] of balls that hold a triangle each."""
+        """Centres (S, 3) and radii (S,) [m] of the triangles' bounding balls."""
         return bounding_balls(self.points[self.triangles])
 
     def _way(self, x: np.ndarray) -> tuple[list[Placed], float, np.ndarray | None]:
-        """Where the tool of a row of features goes through, its radius [m], and a row of `_found`, or None.
+        """Compute the tool's path for a row of features, its radius [m], and a row of `_found`, or None.
 
-        The first place is where it stood last, if that is nearer than where it came in; then the row is what was found
-        there. Else it is the first on the way in.
+        The path starts at the previous pose, if that is nearer than the first contact; then the row is the result
+        there. Else it starts at the first step of the approach.
         """
-        # Warp is loaded where a tool is pressed, not where a model is read.
+        # Warp is imported only for pressing tools, not for reading a model.
         from sim.discretisation.nearest_places import Placed
 
         point, direction, depth, radius = x[:3], x[3:6], x[6], x[7]
@@ -219,9 +220,9 @@ class Contact:
         return Placed(x[8:11], axes, self.core[:3])
 
     def _pressed(self, stations: list[Placed], radius: float, begun: np.ndarray | None) -> np.ndarray:
-        """Of a tool of a radius [m] at the last of the stations that it goes through: a row of `_found`.
+        """Solve the contact of a tool of a radius [m] at the last of the stations of its path: a row of `_found`.
 
-        begun is that of the first of them; None: nothing is touched before.
+        begun is the result at the first of them; None: no contact before.
         """
         from sim.discretisation.nearest_places import Nearest
 
@@ -270,7 +271,7 @@ class Contact:
     def _touchable(
         self, stations: list[Placed], radius: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Facets (S,) that a tool may touch; their nodes (n,), positions there (S, 3), and rows of the compliance."""
+        """Select facets (S,) within reach of a tool; return their nodes (n,), positions (S, 3), compliance rows."""
         around, wide = self._rounds
         reach = REACH * radius
         far = wide + reach + np.linalg.norm(stations[0].half)
@@ -283,18 +284,18 @@ class Contact:
 
 
 def _line(terms: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The factor (k,), a sum of terms (B, k), of rows `found` (B, r) that fits `wanted` (B, r) best."""
+    """Fit the factor (k,), a sum of terms (B, k), of rows `found` (B, r) to `wanted` (B, r) by least squares."""
     factor = np.einsum("br,br->b", found, wanted) / np.square(found).sum(axis=1)
     return np.linalg.lstsq(terms, factor, rcond=None)[0]
 
 
 def _bearing(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m], gain positive semi-definite.
+    """Compute least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m], gain semi-definite.
 
-    Most places bear a force as before. Those that would pull are let go. Those that are entered then are taken up
-    again, until neither is left. Where that does not end soon it is a nonnegative least-squares problem. (Portugal,
-    Judice, Vicente 1994, "A comparison of block pivoting and interior-point algorithms for linear least squares
-    problems with nonnegative variables", Math. Comput. 63:625-643.)
+    Block pivoting: most points stay active. Those with tension are released, and released ones that are penetrated
+    become active again, until neither remains. If this does not end soon, a nonnegative least-squares problem is
+    solved. (Portugal, Judice, Vicente 1994, "A comparison of block pivoting and interior-point algorithms for linear
+    least squares problems with nonnegative variables", Math. Comput. 63:625-643.)
     """
     count = len(gain)
     if not count:

@@ -1,1 +1,1 @@
-"""From a data set to models."""
+"""Training of models from a data set."""

@@ -30,23 +30,23 @@ SCALE, ENOUGH = 3, CLASS
 
 @dataclass(frozen=True, eq=False)
 class KnownDistances:
-    """Loads, and the finite elements' distances (B,) [m] from tip to tumour under them."""
+    """Loads, and the FEM distances (B,) [m] from tip to tumour under them."""
 
     loads: Loads
     distance: np.ndarray
 
     def rows(self, index: np.ndarray | slice) -> KnownDistances:
-        """Some of them: numbers, a slice, or (B,) bool."""
+        """Select loads by numbers, a slice, or (B,) bool."""
         return KnownDistances(self.loads.rows(index), self.distance[index])
 
 
 def distance_errors(model: Learned, known: KnownDistances) -> np.ndarray:
-    """How far (B,) [m] a model's distances are from the finite elements'."""
+    """Compute absolute errors (B,) [m] of a model's distances relative to FEM."""
     return np.abs(model.distance(known.loads).value - known.distance)
 
 
 def with_correction(model: Learned, patch: Patch, known: KnownDistances) -> Learned:
-    """The model with a correction of its distances, learned from its training loads or some of them."""
+    """Add a correction of distances to a model, trained on its training loads or some of them."""
     plain, some = replace(model, tip=TipModel()), known.rows(slice(None, None, -(-len(known.loads) // MOST)))
     off = some.distance - plain.distance(some.loads).value
     return replace(model, tip=TipModel(fitted_correction(patch, model.asked(some.loads), off)))
@@ -55,7 +55,7 @@ def with_correction(model: Learned, patch: Patch, known: KnownDistances) -> Lear
 def corrected_if_better(
     model: Learned, patch: Patch, trained: KnownDistances, held_out: KnownDistances
 ) -> tuple[Learned, np.ndarray]:
-    """The model with a correction, if that brings held-out distances nearer on average; and their errors (B,) [m]."""
+    """Add a correction if it reduces the mean error of held-out distances; return the model and errors (B,) [m]."""
     candidates = [replace(model, tip=TipModel()), with_correction(model, patch, trained)]
     error = [distance_errors(each, held_out) for each in candidates]
     best = int(error[1].mean() < error[0].mean())
@@ -64,33 +64,33 @@ def corrected_if_better(
 
 @dataclass(frozen=True)
 class Way:
-    """How a bound is fitted: calibration loads of a class of force, and whether its scale is quadratic in the load."""
+    """Settings of a bound: calibration loads in a class of force, and whether its scale is quadratic in the load."""
 
     each: int
     curved: bool
 
 
 TUMOUR = Way(CLASS, True)
-# A tip snaps through with the cortex here and there, so that the tail of its errors grows with the force: classes are
-# as small as 99 in 100 allows, and the scale's logarithm is linear.
+# The tip sometimes snaps through with the cortex, so that the tail of its errors grows with the force: classes are as
+# small as a 99 % bound allows, and the scale's logarithm is linear.
 TIP = Way(100, False)
-# Of the force that a tool moved by pose exerts.
+# Bound of the force of a tool moved by pose.
 FORCE = Way(CLASS, True)
 WAYS = {"tumour": TUMOUR, "tip": TIP, "force": FORCE}
 
 
 @dataclass(frozen=True, eq=False)
 class Missed:
-    """How far a model is off on loads that no fit of it has seen.
+    """Errors of a model on loads that none of its fits has used.
 
     Parameters
     ----------
     pushed, known, outside
-        B loads, and how they lie to the model's training range.
+        B loads, and their position relative to the model's training range.
     features
         (B, f), of the scale of its bounds.
     error
-        (B,) [m]: the largest at the tumour's vertices, or of the distance; [N]: of the tool's force.
+        (B,) [m]: maximum over the tumour's vertices, or of the distance; [N]: of the tool's force.
     """
 
     pushed: Pushed
@@ -100,32 +100,32 @@ class Missed:
     error: np.ndarray
 
     def rows(self, some: np.ndarray) -> Missed:
-        """Some of them, by number or (B,) bool."""
+        """Select loads by number or (B,) bool."""
         known, outside = Measured(*(each[some] for each in self.known)), Outside(*(each[some] for each in self.outside))
         return Missed(rows_of(self.pushed, some), known, outside, self.features[some], self.error[some])
 
     @property
     def extrapolated(self) -> np.ndarray:
-        """Which loads (B,) bool lie outside the training range."""
+        """Mask (B,) of loads outside the training range."""
         return self.outside.excess > 0.0
 
     @property
     def force(self) -> np.ndarray:
-        """(B,) [N]."""
+        """(B,) [N]: force magnitudes."""
         return self.known.magnitude
 
 
 def missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarray) -> Missed:
-    """Errors (B,) [m] of a model on loads as it is asked them."""
+    """Combine errors (B,) [m] of a model with its input loads."""
     known, envelope = measured(patch, pushed), model.envelope
     return Missed(pushed, known, envelope.outside(pushed, known), features_of(pushed, envelope.within(known)), error)
 
 
 def bound_by(near: Missed, way: Way, growth: float, seen: Missed | None = None) -> Bound:
-    """A bound calibrated `near` the training loads, of a `growth` [1/m] by distance from these.
+    """Calibrate a bound on loads `near` the training loads, with a `growth` [1/m] by distance from these.
 
-    One in `SCALE` of these loads fits its scale, and the others its quantiles: they are drawn as what is promised. Of
-    fewer than `ENOUGH` loads all calibrate, and its scale follows what was `seen`, if anything.
+    One in `SCALE` of these loads fits its scale, and the others its quantiles: they have the distribution of the
+    guarantee. With fewer than `ENOUGH` loads all calibrate, and its scale follows the errors of `seen`, if given.
     """
     if seen is None or len(near.error) >= ENOUGH:
         fits = _fits(near)
@@ -137,12 +137,12 @@ def bound_by(near: Missed, way: Way, growth: float, seen: Missed | None = None) 
 
 
 def growth_by(near: Missed, far: Missed, way: Way) -> float:
-    """The growth [1/m] by which a bound holds as often `far` from training loads as near them."""
+    """Compute the growth [1/m] with which a bound has equal coverage `far` from training loads and near them."""
     return fitted_growth(*_over_plain(near, far, way))
 
 
 def bounds_on_discs(model: Learned, near: Missed, far: Missed, split: Split, way: Way) -> np.ndarray:
-    """Bounds (2, B) [m] of loads on discs left out, each of a growth that the other discs tell."""
+    """Compute bounds (2, B) [m] of loads on held-out discs, each with the growth estimated from the other discs."""
     known, (ratio, away) = _over_plain(near, far, way)
     disc, bound = split.disc[split.test], np.empty((2, len(far.error)))
     for each in np.unique(disc):
@@ -154,12 +154,12 @@ def bounds_on_discs(model: Learned, near: Missed, far: Missed, split: Split, way
 
 
 def covered_by(bound: np.ndarray, far: Missed) -> Coverage:
-    """How often bounds (2, B) [m] hold."""
+    """Compute the empirical coverage of bounds (2, B) [m]."""
     return covered(far.force, far.error, bound, int(far.extrapolated.sum()))
 
 
 def _over_plain(near: Missed, far: Missed, way: Way) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Errors over a bound that does not grow, and distances [m] from training loads: of what calibrates, of `far`."""
+    """Compute errors over a bound without growth, and distances [m] from training loads: calibration loads, `far`."""
     plain = bound_by(near, way, 0.0)
     return [
         (each.error / plain.of(each.features, each.force, each.outside.here)[0], each.outside.away)
@@ -168,15 +168,15 @@ def _over_plain(near: Missed, far: Missed, way: Way) -> list[tuple[np.ndarray, n
 
 
 def _fits(near: Missed) -> np.ndarray:
-    """Which of the loads fit the scale: (B,) bool."""
+    """Select the loads that fit the scale: (B,) bool."""
     return np.arange(len(near.error)) % SCALE == 0
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors of a model on B loads: at the tumour's worst vertex, of the distance from tip to tumour, of the force.
+    """Errors of a model on B loads: maximum vertex error of the tumour, of the tip-tumour distance, of the force.
 
-    The force is that of a tool moved by pose; None where it is not known.
+    The force is that of a tool moved by pose; None if not available.
     """
 
     tumour: Missed
@@ -184,19 +184,19 @@ class Errors:
     force: Missed | None = None
 
     def known(self) -> dict[str, Missed]:
-        """Errors that are known, by the names of `WAYS`."""
+        """Return the available errors, by the names of `WAYS`."""
         found = {"tumour": self.tumour, "tip": self.tip}
         return found if self.force is None else {**found, "force": self.force}
 
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """Answers of the finite elements to the B loads of a data set that converged.
+    """FEM results for the B converged loads of a data set.
 
     Parameters
     ----------
     loads, pushed
-        As the data set has them, and as a model is asked them.
+        As in the data set, and as input of a model.
     patch, nodes
         Open cortex, and the tumour's vertices (n,).
     tumour, cortex
@@ -204,7 +204,7 @@ class Answers:
     distances
         From tip to tumour.
     force
-        (B, 3) [N] of a tool moved by pose; None where it is not known.
+        (B, 3) [N] of a tool moved by pose; None if not available.
     """
 
     loads: Loads
@@ -217,18 +217,18 @@ class Answers:
     force: np.ndarray | None
 
     def examples(self, rows: np.ndarray) -> Examples:
-        """The chosen rows (B,) bool, to fit models on."""
+        """Select rows (B,) bool as examples, to fit models on."""
         force = None if self.force is None else self.force[rows]
         return Examples(rows_of(self.pushed, rows), self.tumour[rows], self.cortex[rows], force)
 
     def vertex_errors(self, model: Learned, rows: np.ndarray) -> np.ndarray:
-        """Errors (k, n) [m] of a model at the tumour's vertices, on the chosen rows (B,) bool."""
+        """Compute errors (k, n) [m] of a model at the tumour's vertices, on selected rows (B,) bool."""
         return errors(model, self.loads.rows(np.flatnonzero(rows)), self.tumour[rows], self.nodes)
 
     def errors_of(
         self, model: Learned, rows: np.ndarray, tumour: np.ndarray | None = None, tip: np.ndarray | None = None
     ) -> Errors:
-        """Errors of a model on the chosen rows (B,) bool; those at the tumour or of the tip (k,) [m] may be known."""
+        """Compute a model's errors on rows (B,) bool; those at the tumour or of the tip (k,) [m] may be given."""
         asked = rows_of(self.pushed, rows)
 
         def of(error: np.ndarray) -> Missed:
@@ -242,18 +242,18 @@ class Answers:
 
 
 def answers_of(data: Dataset, shared: Expansion) -> Answers:
-    """Read the answers to the loads of a data set that converged.
+    """Read the FEM results for the converged loads of a data set.
 
     Raises
     ------
     InputError
-        Unit responses that did not converge; an anatomy without tumour; loads other than `Pushed`, or the `Touching`
-        of one tool.
+        Unit responses that did not converge; an anatomy without tumour; loads other than `Pushed`, or the `Touching` of
+        one tool.
     """
     if not data.unit_good.all():
         raise InputError(
             f"{data.path}: {int((~data.unit_good).sum())} unit responses did not converge, so there is no compliance "
-            "table: simulate anew with a looser --tolerance."
+            "table: simulate again with a looser --tolerance."
         )
     loads = data.loads.rows(np.flatnonzero(data.good))
     pushed, nodes = _asked(data, loads, shared.patch), shared.tumour
@@ -269,7 +269,7 @@ def answers_of(data: Dataset, shared: Expansion) -> Answers:
 
 
 def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
-    """Loads of a data set as a model is asked them, like `Learned.asked`."""
+    """Convert loads of a data set to a model's input, like `Learned.asked`."""
     if data.tool is not None:
         pushed, series = indented(loads, data.tool, patch), stated_series(data.provenance)
         if not series:

@@ -1,4 +1,4 @@
-"""Loads and what they did, and what models leave of it."""
+"""Loads with their responses, and residuals of models."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..model.learned import Part
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """Loads and what they did to the tumour and to the rest of the open cortex.
+    """Loads and their responses at the tumour and at the remaining open cortex.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class Examples:
     tumour, cortex
         Displacements (B, n, 3) [m].
     force
-        (B, 3) [N] that a tool moved by pose exerts, where it is known.
+        (B, 3) [N] of a tool moved by pose, if available.
     """
 
     loads: Pushed
@@ -35,7 +35,7 @@ class Examples:
 
 
 def left_by(parts: Sequence[Part], patch: Patch, loads: Pushed, moved: np.ndarray) -> np.ndarray:
-    """Responses (B, n, 3) [m/N] that parts leave of motions `moved` (B, n, 3) [m]."""
+    """Compute residual responses (B, n, 3) [m/N]: motions `moved` (B, n, 3) [m] per newton minus the parts."""
     response = moved / directions(loads)[0][:, None, None]
     for part in parts:
         response = response - part.response(ENCODERS[part.encoder](patch, loads))

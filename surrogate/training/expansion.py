@@ -1,4 +1,4 @@
-"""What a data set's finite elements give without learning: compliance, power series, contact."""
+"""Inputs computed from the FEM of a data set without training: compliance, power series, contact."""
 
 from __future__ import annotations
 
@@ -39,49 +39,49 @@ from ..regressors.rigid_contact import Contact
 from .examples import Examples, left_by
 from .fem_tables import condensed, in_one_disc, radii_between, side_by_side, tabulated, with_middles
 
-# Share of the responses that a learner's basis may lose, and its most modes; the same of what the series adds to the
-# exact orders, a fiftieth of the motion, and of compliance.
+# Truncation tolerance and maximum number of modes of a model's basis; of the series' contribution beyond the exact
+# orders, a fiftieth of the motion; tolerance of compliance.
 COARSE = (1e-3, 60)
 ADDED = (5e-3, 160)
 TABLE_TOLERANCE = 1e-4
-# What the modes of the second order may leave of it: of the motion, one in 1,000.
+# Truncation tolerance of the second order's modes: of the motion, one in 1,000.
 SECOND = 3e-3
-# The same of the bases that series are tabulated in, made of what is had at so many places far from each other.
+# Truncation tolerance and maximum number of modes of the series' table; number of places, far apart, that span it.
 WIDE, FEW = (1e-5, 192), 40
-# Learners that ask the finite elements how linear tissue gives; the second learns what that leaves.
+# Models that use the contact on linear tissue; the second is trained on its residual.
 TOUCHED = ("contact", "contact-gp")
-# Those that ask the finite elements for their series, of which the second learns what it leaves.
+# Models that use the power series; the second is trained on its residual.
 EXPANDED = ("series", "series-gp")
-# What tables are rounded to, as a share of their largest motion at the largest force. On the template this moves the
-# worst vertex of the tumour by 0.01 mm at most in 95 of 100 loads, a ninth of the model's error.
+# Rounding of tables relative to their largest motion at the largest force. On the template this moves the tumour's
+# worst vertex by at most 0.01 mm in 95 % of loads, a ninth of the model's error.
 PAIR_STEP, SERIES_STEP = 1e-3, 2e-3
-# Components of motion that are read at once there: bounds the memory that it takes.
+# Components of motion that are read at once: limits memory.
 STRIP = 1536
 
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """What a data set's finite elements give without learning: compliance, power series, contact; made when asked for.
+    """Compliance, power series and contact from the FEM of a data set; computed on first use.
 
-    It does not depend on answers to the data's loads. The series is tabulated in wide bases, of its own values at a
-    few places, so that a table grows neither with the tumour nor with the cortex.
+    It does not depend on the data's results. The series is tabulated in wide bases, spanned by its own values at a few
+    places, so that the table's size does not depend on the size of tumour and cortex.
 
     Parameters
     ----------
     data
         Its anatomy, tissue and element; its loads give the widths of tools.
     device
-        Where the finite elements work.
+        Device of the FEM.
     progress
-        Hears which place is done, and of how many.
+        Receives the number of places done and their total.
     kept
-        Where the series' table is read from, and written to where there is none: of these data, as the caller knows.
+        File of the series' table, read if it exists, else written; the caller ensures that it belongs to these data.
     most_pairs
-        Of force components, for which the second order is had: so many take minutes, and 60 MB of a model.
+        Maximum number of pairs of force components for the second order: this many take minutes, and 60 MB of a model.
     batch
-        Most load cases that are solved together; None: as many as fit now, on a card that is nobody else's.
+        Maximum number of load cases solved together; None: as many as fit now, on a GPU that no other process uses.
     begun
-        Where the table's rows are kept while it is made, so that a stopped run goes on; the caller removes it.
+        Journal of the table's rows while it is computed, so that an interrupted run resumes; the caller removes it.
     """
 
     data: Dataset
@@ -94,7 +94,7 @@ class Expansion:
 
     @cached_property
     def patch(self) -> Patch:
-        """The open cortex."""
+        """Open cortex."""
         return open_patch(self.data.anatomy)
 
     @cached_property
@@ -104,30 +104,30 @@ class Expansion:
 
     @cached_property
     def cortex(self) -> np.ndarray:
-        """Vertices of the open cortex beside the tumour's."""
+        """Vertices of the open cortex that are not the tumour's."""
         return np.setdiff1d(self.patch.nodes, self.tumour)
 
     @cached_property
     def places(self) -> np.ndarray:
-        """Where the series is tabulated (P, 3) [m]: nodes of the open cortex, and middles of its edges."""
+        """Places (P, 3) [m] of the series' table: nodes of the open cortex, and midpoints of its edges."""
         return with_middles(self.patch)[1]
 
     @cached_property
     def tables(self) -> tuple[Part, ...]:
-        """The tumour's compliance, and the cortex's, if there is more: exact at every node of the open cortex.
+        """Compliance of the tumour, and of the cortex if there is more: exact at every node of the open cortex.
 
-        In as many modes as the unit responses need.
+        With as many modes as the unit responses need.
         """
         return tuple(self._compliance(nodes) for nodes in self._known)
 
     @cached_property
     def pairs(self) -> Part:
-        """The second order of the tumour: exact for forces on the nodes of the open cortex, wherever they are.
+        """Second order of the tumour: exact for forces at any nodes of the open cortex.
 
         Raises
         ------
         InputError
-            Data that do not state what tissue they are of.
+            Data without a tissue.
         """
         known = self.tabulated
         table = Rounded.of(known.second, PAIR_STEP * np.abs(known.second).max())
@@ -135,18 +135,18 @@ class Expansion:
 
     @cached_property
     def exact(self) -> list[tuple[Part, ...]]:
-        """What needs neither learning nor interpolation: two orders of the tumour, and the first of the cortex.
+        """Parts without training or interpolation: two orders of the tumour, and the first of the cortex.
 
-        Where pairs of nodes are too many, the tumour's second order is in the table.
+        With too many pairs of nodes, the tumour's second order is in the table.
         """
         paired = (self.pairs,) if len(self.tabulated.pairs) else ()
         return [(table, *paired) if k == 0 else (table,) for k, table in enumerate(self.tables)]
 
     def bases(self, examples: Examples, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
-        """What a set of examples does to the tumour, and to the cortex, if there is more, beyond what is exact.
+        """Compute bases of the examples' motion beyond the exact parts, at the tumour and the cortex if there is more.
 
-        A dent as small as its tool is no sum of a few modes, but what nonlinearity adds to it is. `tumour` and `cortex`
-        are what may be left of it, as a share, and the most modes.
+        A dent as small as its tool is not a sum of a few modes, but its nonlinear part is. `tumour` and `cortex` are
+        the truncation tolerance and the maximum number of modes.
         """
         both = zip(self.exact, (examples.tumour, examples.cortex), (tumour, cortex), strict=False)
         return [
@@ -155,12 +155,12 @@ class Expansion:
         ]
 
     def on(self, bases: list[Basis], left_out: np.ndarray) -> list[Series]:
-        """What the series adds to what is exact, as coefficients of the `bases` of examples, without some places (P,).
+        """Return the series beyond the exact parts, as coefficients of the examples' `bases`, without some places (P,).
 
         Raises
         ------
         InputError
-            Data that do not state what tissue they are of.
+            Data without a tissue.
         """
         triangles = with_middles(self.patch)[0]
         inside = self.patch.rim_distance(self.places)[:, None] > self.radii
@@ -168,7 +168,8 @@ class Expansion:
         unit = strongest ** np.repeat([1, 2, 3], [factors.shape[1] for factors in FACTORS])
         found = []
         for added, parts, wide, basis in zip(self._beyond, self.exact, self.tabulated.bases, bases, strict=True):
-            # Footprints over the rim press on nodes beyond the open cortex. Of others nothing is left.
+            # Footprints across the edge press on nodes beyond the open cortex. For others the exact parts leave no
+            # residual.
             every = filled(self.places, added @ (wide.modes @ basis.modes.T), left_out)
             for order in SPANS[: len(parts)]:
                 every[inside, order] = 0.0
@@ -178,7 +179,7 @@ class Expansion:
 
     @cached_property
     def _beyond(self) -> list[np.ndarray]:
-        """The tables (P, R, 19, r) less what is exact."""
+        """Tables (P, R, 19, r) minus the exact parts."""
         known, found = self.tabulated, []
         for table, parts, wide in zip(known.tables, self.exact, known.bases, strict=True):
             added = table.copy()
@@ -190,7 +191,7 @@ class Expansion:
 
     @cached_property
     def _unit_shares(self) -> np.ndarray:
-        """Forces (P R, 3, 3 m) at the patch's nodes of one newton along each axis, at each place and radius."""
+        """Forces (P R, 3, 3 m) at the patch's nodes by one newton along each axis, at each place and radius."""
         point = np.repeat(self.places, 3 * len(self.radii), axis=0)
         radius = np.tile(np.repeat(self.radii, 3), len(self.places))
         shares = nodal_shares(self.patch, Pushed(point, np.tile(np.eye(3), (len(point) // 3, 1)), radius))
@@ -198,12 +199,12 @@ class Expansion:
 
     @cached_property
     def contact(self) -> tuple[Contact, list[Basis], float]:
-        """The tool on linear tissue, the bases of tumour and cortex whose coefficients it answers with, and seconds.
+        """Contact of the tool on linear tissue, the bases of tumour and cortex of its results, and its time [s].
 
         Raises
         ------
         InputError
-            Data that do not state what tissue they are of.
+            Data without a tissue.
         """
         begun = time.perf_counter()
         contact, bases = condensed(self.fem(), self._known, self.data.tool)
@@ -216,12 +217,12 @@ class Expansion:
 
     @cached_property
     def tabulated(self) -> Tabulated:
-        """The series at every place.
+        """Series at every place.
 
         Raises
         ------
         InputError
-            Data that do not state what tissue they are of.
+            Data without a tissue.
         """
         if self.kept is not None and self.kept.exists():
             with read_as(self.kept, "a table of the series", REMADE), self.kept.open("rb") as raw:
@@ -246,7 +247,7 @@ class Expansion:
         return found
 
     def _paired(self, fem: Fem, basis: Basis) -> tuple[np.ndarray, np.ndarray, Basis]:
-        """Pairs that one footprint may press, the tumour's second order of each, and the modes of a basis for it."""
+        """Compute pairs within one footprint, the tumour's second order of each, and a basis of modes for it."""
         near = in_one_disc(self.patch, float(self.radii[-1]))
         if 4.5 * near.sum() > self.most_pairs:
             return np.zeros((0, 2), int), np.zeros((0, 0), np.float32), Basis(basis.nodes, basis.modes[:0])
@@ -258,9 +259,9 @@ class Expansion:
         return pairs, table @ turn.T, Basis(basis.nodes, half_precision(turn @ basis.modes))
 
     def _tabulate(self, fem: Fem) -> tuple[list[Basis], np.ndarray, bool]:
-        """Every motion at a few places, the bases that these span, and what is at all places as their coefficients.
+        """Compute motions at a few places, the bases that they span, and the table of all places as their coefficients.
 
-        Last whether all of it was made now.
+        The last value is True if the whole table was computed now.
         """
         count = len(self.places)
         few = np.sort(spread(self.places, FEW))
@@ -271,7 +272,7 @@ class Expansion:
             motions.append(tabulated(fem, self.places[few], self.radii, reading, lambda n, _: self.progress(n, count)))
         cuts = 3 * np.cumsum([len(nodes) for nodes in self._known])[:-1]
         parts = np.split(np.concatenate(motions, axis=-1), cuts, axis=-1)
-        # The cortex's first order is in its compliance.
+        # The cortex's first order is given by its compliance.
         orders = (SPANS, SPANS[1:])
         bases = [_spanned(*each) for each in zip(self._known, parts, orders, strict=False)]
         whole = side_by_side(bases)
@@ -297,23 +298,23 @@ class Expansion:
 
     @cached_property
     def radii(self) -> np.ndarray:
-        """At which the series is tabulated (R,) [m]: from the narrowest tool of the data to the widest."""
+        """Radii (R,) [m] of the series' table: from the narrowest tool of the data to the widest."""
         footprint = only_pushed(self.data.loads).footprint
         return radii_between(float(footprint.min()), float(footprint.max()))
 
     def fem(self) -> Fem:
-        """Make the data's finite elements, in double precision.
+        """Build the data's FEM, in double precision.
 
         Raises
         ------
         InputError
-            Data that do not state what tissue they are of.
+            Data without a tissue.
         """
         stated = self.data.provenance
         if "tissue" not in stated:
             raise InputError(
-                f"{self.data.path}: does not state its tissue, so no series or contact can be had of it: "
-                "choose other learners, or simulate anew."
+                f"{self.data.path}: does not state its tissue, so series and contact are not available: "
+                "choose other learners, or simulate again."
             )
         effects = pushed_effects(self.data.anatomy, stated_tissue(stated), trained_skull(stated))
         return Fem(self.data.anatomy, effects, REFERENCE, self.device, self.batch, stated.get("element"))
@@ -321,7 +322,7 @@ class Expansion:
 
 @dataclass(frozen=True, eq=False)
 class Tabulated:
-    """A table of the series: bases of tumour and cortex, what all places have of both, and the seconds it took.
+    """Table of the series: bases of tumour and cortex, coefficients at all places, and computing time.
 
     Parameters
     ----------
@@ -332,7 +333,7 @@ class Tabulated:
     pairs, second, pair_basis
         Pairs of nodal forces (P, 2), and the tumour's second order of each (P, r) float32 in a basis.
     seconds
-        [s]; NaN where a stopped run went on.
+        [s]; NaN if an interrupted run was resumed.
     """
 
     bases: list[Basis]
@@ -344,17 +345,17 @@ class Tabulated:
 
     @property
     def tables(self) -> list[np.ndarray]:
-        """The part of each basis."""
+        """Table columns of each basis."""
         return np.split(self.table, np.cumsum([len(basis.modes) for basis in self.bases])[:-1], axis=-1)
 
 
 def _linear_form(part: Part, shares: np.ndarray) -> np.ndarray:
-    """Coefficients (n, 3, r) of unit forces with shares (n, 3, 3 m)."""
+    """Compute coefficients (n, 3, r) of unit forces with shares (n, 3, 3 m)."""
     return part.regressor.predict(shares.reshape(-1, shares.shape[2])).reshape(*shares.shape[:2], -1)
 
 
 def _square_form(part: Part, shares: np.ndarray) -> np.ndarray:
-    """Coefficients (n, 6, r) of the products in `FACTORS` of a direction's components, for shares (n, 3, 3 m)."""
+    """Compute coefficients (n, 6, r) of the products of direction components in `FACTORS`, for shares (n, 3, 3 m)."""
     own = [part.regressor.predict(shares[:, axis]) for axis in range(3)]
     both = [
         own[a] if a == b else part.regressor.predict(shares[:, a] + shares[:, b]) - own[a] - own[b]
@@ -364,7 +365,7 @@ def _square_form(part: Part, shares: np.ndarray) -> np.ndarray:
 
 
 def _spanned(nodes: np.ndarray, motions: np.ndarray, orders: Sequence[slice]) -> Basis:
-    """The wide basis of motions (F, R, 19, 3 n) of vertices (n,): of some of the orders, which count alike."""
+    """Compute the wide basis of motions (F, R, 19, 3 n) of vertices (n,), with equal weight for each of some orders."""
     rows = [motions[:, :, order].reshape(-1, len(nodes), 3) for order in orders]
     tiny = np.finfo(np.float32).tiny
     return reduce(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *WIDE)

@@ -20,17 +20,17 @@ from ..data.encode import Basis, reduce
 from ..regressors.force_series import FACTORS, ORDERS, STENCIL, TERMS
 from ..regressors.rigid_contact import Contact
 
-# Nodes whose unit responses are asked for together: bounds the memory that they take.
+# Nodes whose unit responses are computed together: limits memory.
 STRIP = 64
-# Share of the unit responses that a basis may lose.
+# Truncation tolerance of a basis, as a share of the unit responses.
 TOLERANCE = 1e-4
 
 
 def condensed(fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None) -> tuple[Contact, list[Basis]]:
-    """Contact of a tool with a body at rest, answered for `parts` of its vertices, and a basis of each of them.
+    """Condense the contact of a tool with an undeformed body; return it with a basis for each of `parts`, vertex sets.
 
-    Without a `tool` it is a ball of the radius that features have. The answers are coefficients of the bases, one after
-    the other.
+    Without a `tool` it is a ball of the radius in the features. The contact returns coefficients of the bases, one
+    after the other.
     """
     surface = fem.anatomy.mesh.surface[fem.anatomy.bare]
     nodes, triangles = np.unique(surface, return_inverse=True)
@@ -51,19 +51,19 @@ def condensed(fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None) ->
 
 
 def _sizes(tool: BuiltIn) -> np.ndarray:
-    """Half sizes of what a tool lies round, and its radius (4,) [m]."""
+    """Return the half sizes of a tool's core, and its radius (4,) [m]."""
     core = core_of(tool)
     return np.append(core.half, core.radius)
 
 
 def side_by_side(bases: list[Basis]) -> Basis:
-    """One basis of the vertices of all of them."""
+    """Combine bases of different vertices into one."""
     modes = np.asarray(block_diag(*(basis.modes for basis in bases)))
     return Basis(np.concatenate([basis.nodes for basis in bases]), modes)
 
 
 def unit_responses(fem: Fem, nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Motions (3 n, k, 3) float32 [m/N] of the vertices `at` (k,) of unit forces on `nodes` (n,) at rest."""
+    """Compute displacements (3 n, k, 3) float32 [m/N] of vertices `at` (k,) by small unit forces on `nodes` (n,)."""
     found = []
     for first in range(0, len(nodes), STRIP):
         some = nodes[first : first + STRIP]
@@ -72,12 +72,12 @@ def unit_responses(fem: Fem, nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.concatenate(found)
 
 
-# Neighbouring radii differ by this factor at most.
+# Maximum ratio of neighbouring radii.
 RATIO = 1.5
 
 
 def radii_between(least: float, greatest: float) -> np.ndarray:
-    """Radii [m] at which to tabulate footprints from `least` to `greatest`: one, or at least three."""
+    """Compute radii [m] at which to tabulate footprints from `least` to `greatest`: one, or at least three."""
     if greatest <= least * (1.0 + 1e-9):
         return np.array([least])
     steps = int(np.ceil(np.log(greatest / least) / np.log(RATIO)))
@@ -92,10 +92,10 @@ def tabulated(
     progress: Callable[[int, int], object] = lambda done, total: None,
     journal: Journal | None = None,
 ) -> np.ndarray:
-    """What `forms` are multiplied by at each of the places (P, 3) [m] and each radius: (P, R, 19, r) float32.
+    """Compute the coefficients of `forms` at each of the places (P, 3) [m] and each radius: (P, R, 19, r) float32.
 
-    Of the r shares that a `reading` takes of the answers; `progress` hears places done and all. Places that the
-    `journal` has are not asked again.
+    Each has r components, by `reading`; `progress` receives places done and their total. Places in the `journal` are
+    not solved again.
     """
     table = np.empty((len(places), len(radii), TERMS, reading.count), np.float32)
     some = max(1, fem.batch // (len(radii) * FACTORS[-1].shape[1]))
@@ -120,16 +120,17 @@ def tabulated(
 
 
 def in_one_disc(patch: Patch, radius: float) -> np.ndarray:
-    """Which nodes (m, m) bool a disc of a radius [m], or a triangle and its neighbours, may bear at once.
+    """Return the mask (m, m) of node pairs that a disc of a radius [m], or adjacent triangles, may load at once.
 
-    Triangles reach into a disc from nodes that are farther apart, but of the tumour's motion these do 1 in 100,000.
+    Triangles extend into a disc from nodes that are farther apart, but these contribute 1 in 100,000 of the tumour's
+    motion.
     """
     longest = edge_lengths(patch.points[patch.triangles]).max()
     return squared_distances(patch.points, patch.points) <= (2.0 * max(radius, longest)) ** 2
 
 
 def with_middles(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (S, 6) with the middle of the edge opposite each corner, and the places (P, 3) [m] that they number."""
+    """Build triangles (S, 6) with the midpoint of the edge opposite each corner, and their places (P, 3) [m]."""
     edges = np.sort(patch.triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
     ends, middle = np.unique(edges, axis=0, return_inverse=True)
     triangles = np.column_stack([patch.triangles, len(patch.points) + middle.reshape(-1, 3)])

@@ -31,20 +31,20 @@ from .fem_tables import side_by_side
 
 @dataclass(frozen=True, eq=False)
 class SharedInputs:
-    """What every learner of a data set is given, made when it is asked for.
+    """Common inputs of all model types on a data set, computed on first use.
 
-    Answers to loads inside the discs left out are not among it, nor is the series tabulated there. How linear tissue
-    gives is given at every node: a dent is no sum of dents elsewhere, and what lies under one follows it. The second
-    order of the tumour follows from that and the law, so that it is given too.
+    Results and series within held-out discs are excluded. The response of linear tissue is included at every node: a
+    dent is no sum of dents elsewhere, and the motion below follows it. The second order of the tumour follows from that
+    response and the material law, so that it is included too.
 
     Parameters
     ----------
     basis_from
-        The examples whose responses the series' bases span.
+        Examples whose responses span the series' bases.
     expansion
-        Of the same data.
+        Expansion of the same data.
     split
-        What was left out, if anything.
+        Held-out loads, if any.
     """
 
     basis_from: Examples
@@ -53,13 +53,13 @@ class SharedInputs:
 
     @cached_property
     def series(self) -> tuple[Part, ...]:
-        """What the finite elements' series adds to compliance, at the tumour and at the cortex, if there is more."""
+        """Contribution of the FEM series beyond compliance, at the tumour and at the cortex, if there is more."""
         bases = self.expansion.bases(self.basis_from, ADDED, COARSE)
         found = self.expansion.on(bases, self._left_out(self.expansion.places))
         return tuple(Part("tool", part, basis) for part, basis in zip(found, bases, strict=True))
 
     def solve_counts(self, name: str, examples: Examples) -> SolveCounts:
-        """The solves that a learner of `LEARNERS` or `OF_POSES` is given, a user's own too."""
+        """Count the FEM solves that a model of `LEARNERS` or `OF_POSES`, or a user-defined one, depends on."""
         known, data, loads = self.expansion, self.expansion.data, len(examples.loads.point)
         units = series = inside = 0
         seconds = [data.seconds("load", loads)]
@@ -84,32 +84,32 @@ class SharedInputs:
         return np.zeros(len(points), bool) if self.split is None else self.split.covers(points)
 
 
-# The loads nearest to so many places far apart are left out of the inner fits: about this share of all.
+# Held-out discs of inner fits: number of centres, far apart; share of the loads that they hold.
 CENTRES, SHARE = 6, 0.2
-# Fewer loads choose nothing: the first settings are taken. So many choose, and of the outputs the strongest decide.
+# Minimum number of loads for a selection of settings; maximum number used; number of outputs, the strongest, used.
 FEWEST, MOST, STRONGEST = 40, 600, 8
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """Settings of a regressor, of which those are taken that are nearest on discs left out of the training rows.
+    """Regressor that selects its settings by the error on discs held out of the training rows.
 
     One fit for each of the settings, to the strongest outputs of four fifths of the first rows, then one to all rows.
 
     Parameters
     ----------
     settings
-        Regressors to choose from; the first is taken where there are few rows.
+        Regressors to select from; the first is used with few rows.
     """
 
     settings: tuple[Callable[[], Teachable], ...]
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:
-        """The best of the regressors, trained on rows X (n, f) of `tool_features`, Y (n, r)."""
+        """Fit the best of the regressors to rows X (n, f) of `tool_features`, Y (n, r)."""
         return self.settings[self.best(X, Y)]().fit(X, Y)
 
     def best(self, X: np.ndarray, Y: np.ndarray) -> int:
-        """Which of the settings has the least squared error on the discs; the same rows choose the same."""
+        """Return the index of the settings with the smallest squared error on the discs; deterministic."""
         if len(X) < FEWEST or len(self.settings) == 1:
             return 0
         X, Y = X[:MOST], Y[:MOST]
@@ -123,15 +123,16 @@ class Tuned:
 
 
 def inner_discs(points: np.ndarray) -> np.ndarray:
-    """Which rows (n,) bool lie in discs round `CENTRES` of the points (n, 3) far from each other."""
+    """Return the mask (n,) of points in discs round `CENTRES` of the points (n, 3), far from each other."""
     distance = nearest(points, points[spread(points, CENTRES)])[1]
     return distance <= np.quantile(distance, SHARE)
 
 
-# Settings to choose from, the usual ones first: units in a layer and weight decay; C and epsilon in quartile ranges.
+# Candidate settings, the default first: units in a layer and weight decay; C and epsilon in quartile ranges.
 ANN = tuple(partial(Ann, hidden, decay) for hidden in (64, 128) for decay in (1e-2, 3e-3))
 SVR = tuple(partial(Svr, c, tube) for c in (1.0 / 1.349, 10.0, 100.0) for tube in (1.0 / 13.49, 1e-2, 3e-3, 1e-3))
-# Encoder and regressor of each but the table itself; principal components are those of the forces at the nodes.
+# Encoder and regressor of each model type but the compliance matrix; principal components are those of the nodal
+# forces.
 LEARNT: dict[str, tuple[str, Callable[[], Teachable]]] = {
     "pcr": ("nodal", Pcr),
     "ann": ("tool", partial(Tuned, ANN)),
@@ -139,12 +140,12 @@ LEARNT: dict[str, tuple[str, Callable[[], Teachable]]] = {
     "gp": ("tool", Gp),
     "residual": ("tool", partial(Tuned, ANN)),
 }
-# Learners of poses: the tool's place stands for its force.
+# Model types for poses: the tool's position replaces its force.
 POSED = ("gp", "ann", "svr")
 
 
 def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part, ...]:
-    """The summands of one learner, trained on examples: for the tumour, and for the cortex beside it."""
+    """Fit the summands of one model type to examples: for the tumour, and for the remaining open cortex."""
     known = inputs.expansion
     trained = partial(_trained, known.patch, examples.loads)
     if name in EXPANDED:
@@ -172,7 +173,7 @@ def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part,
 
 
 def force_of(name: str, parts: Sequence[Part], patch: Patch, examples: Examples) -> ForceModel | None:
-    """What one learner of poses knows of its tool's force, with the `parts` that it has learned; None if untold."""
+    """Fit one pose model's tool force, given its trained motion `parts`; None if the examples have no force."""
     if examples.force is None:
         return None
     if name == "contact":
@@ -190,16 +191,16 @@ def force_of(name: str, parts: Sequence[Part], patch: Patch, examples: Examples)
 
 
 def _learnt(name: str) -> tuple[str, Callable[[], Teachable]]:
-    """Encoder and regressor of a learner, a user's own too."""
+    """Return encoder and regressor of a model type, user-defined ones included."""
     if name in LEARNT:
         return LEARNT[name]
     own = find_own(name)
-    assert own is not None, name  # who trains has looked
+    assert own is not None, name  # checked by the caller
     return own.encoder, own.regressor
 
 
 def _touched(known: Expansion, examples: Examples) -> tuple[Part, list[tuple[np.ndarray, np.ndarray]]]:
-    """The tool on tissue that stiffens as examples have it, and what that leaves of it: vertices, and (B, n, 3) [m]."""
+    """Fit the contact on stiffening tissue to examples; return its part, and its residuals: vertices, (B, n, 3) [m]."""
     contact, bases, _ = known.contact
     encoder = "core" if len(contact.core) else "tool"
     features, size = ENCODERS[encoder](known.patch, examples.loads), directions(examples.loads)[0][:, None, None]
@@ -220,7 +221,7 @@ def _trained(
     on: Basis | np.ndarray,
     truth: np.ndarray,
 ) -> Part:
-    """A part for what those `before` leave of `truth` (B, n, 3) [m]: `on` a basis, or on vertices (n,)."""
+    """Fit a part to the residual of `truth` (B, n, 3) [m] after parts `before`: `on` a basis, or on vertices (n,)."""
     response = left_by(before, patch, loads, truth)
     basis = on if isinstance(on, Basis) else reduce(on, response, *COARSE)
     encoder, make = kind
@@ -232,10 +233,10 @@ def _trained(
 
 
 def _check_own(regressor: Fitted, X: np.ndarray, Y: np.ndarray) -> None:
-    """Refuse a user's regressor that does not answer what it was trained on finite coefficients of its shape."""
+    """Check that a user-defined regressor returns finite coefficients of the right shape on its training loads."""
     found = np.asarray(regressor.predict(X))
     if found.shape != Y.shape or not np.isfinite(found).all():
         raise InputError(
-            f"the learner {name_of(type(regressor))} answers {X.shape[0]} loads with numbers of shape {found.shape}: "
+            f"the learner {name_of(type(regressor))} returns shape {found.shape} for {X.shape[0]} loads: "
             f"let `predict` give {Y.shape}, all finite."
         )

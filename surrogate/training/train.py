@@ -1,4 +1,4 @@
-"""From a data set to models, their scores, and what they promise."""
+"""Training: from a data set to models, their scores and bounds."""
 
 from __future__ import annotations
 
@@ -38,23 +38,23 @@ from .examples import Examples
 from .expansion import EXPANDED, TOUCHED, Expansion
 from .learners import LEARNT, POSED, SharedInputs, force_of, parts_of
 
-# Of pushes, and of poses.
+# Model types for pushes, and for poses.
 LEARNERS = ("linear", *LEARNT, *EXPANDED)
 OF_POSES = (*TOUCHED, *POSED)
-# Fewer could not promise 95 in 100.
+# Minimum number of calibration loads for a 95 % bound.
 FEWEST_APART = 19
 
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """Models by learner, how they scored on the discs left out, and what those were.
+    """Models by type, their scores on held-out discs, and the split.
 
-    `motion` is the mean displacement [m] of the tumour over the held-out loads. `calibrated` counts the loads that
-    calibrated the models' bounds, and the field after it counts the training loads. `left_out` gives by learner how
-    often bounds held on the discs left out. These are bounds of the scored model, from loads outside the discs. By how
-    much they grow with the distance from training loads, the other discs tell. `distance_left_out` gives the same
-    for the distance from tip to tumour, and `force` how well the tool's force was known there, of poses whose
-    data has it.
+    `motion` is the mean displacement [m] of the tumour over the held-out loads. `calibrated` is the number of loads
+    that calibrated the models' bounds, and `training_loads` the number of training loads. `left_out` gives by model
+    type the empirical coverage of bounds on held-out discs. These are bounds of the scored model, calibrated on loads
+    outside the discs; their growth with the distance from training loads is estimated from the other discs.
+    `distance_left_out` gives the same for the distance from tip to tumour, and `force` the errors of the tool's force
+    there, for poses whose data has it.
     """
 
     models: dict[str, Learned]
@@ -69,14 +69,14 @@ class Trained:
 
 
 def learners_for(data: Dataset) -> tuple[str, ...]:
-    """All learners that a data set can train: series and contact need finite elements of a stated tissue."""
+    """Return the model types that a data set can train: series and contact need FEM of a known tissue."""
     stated = "tissue" in data.provenance
     kinds = LEARNERS if data.tool is None else OF_POSES
     return tuple(name for name in kinds if stated or name not in (*EXPANDED, *TOUCHED))
 
 
 def check_learners(names: Sequence[str], of_poses: bool, where: str) -> None:
-    """Refuse learners that data of pushes, or of poses, cannot train. `where` names the data in the sentence.
+    """Check that data of pushes, or of poses, can train the model types. `where` names the data in the message.
 
     Raises
     ------
@@ -106,29 +106,29 @@ def train(
     most: int | None = None,
     expansion: Expansion | None = None,
 ) -> Trained:
-    """Fit `learners`, by default all that the data can train: first to be scored, then to be used.
+    """Fit `learners`, by default all that the data can train: first for the scores, then for use.
 
-    Scored models are trained outside discs of the cortex, and scored inside. Those returned are trained on all
-    those loads; their bounds are calibrated on others, which no fit has seen. Another `split`, with a row for each
-    load that converged, calibrates nothing and returns what was trained on it.
+    Scored models are trained outside discs of the cortex, and scored inside. Returned models are trained on all those
+    loads; their bounds are calibrated on further ones, held out of all fits. Another `split`, with a row for each
+    converged load, calibrates nothing and returns the models trained on it.
 
-    Every model knows the tumour and the open cortex; the cortex is not scored, and the compliance table's where the
-    learner is not one of `EXPANDED`. Cases that did not converge are left aside.
+    Every model predicts the tumour and the open cortex; the cortex is not scored, and comes from the compliance matrix
+    if the model type is not in `EXPANDED`. Cases that did not converge are ignored.
 
     Parameters
     ----------
     progress
-        Hears the name of each learner that is done.
+        Receives the name of each model type that is done.
     most
-        Training loads, at most; those that calibrate or test are not counted.
+        Maximum number of training loads, without those for calibration or test.
     expansion
-        The series of these data, by default made anew wherever there is a device: minutes on a CPU, so that whoever
-        trains on them again hands it on.
+        Expansion of these data, by default a new one on any available device: minutes on a CPU, so pass it on for
+        further trainings on these data.
 
     Raises
     ------
     InputError
-        Unknown learners, or such as loads of the data's kind do not train; nothing to train on. Data with other causes
+        Unknown model types, or such as loads of the data's kind do not train; no training loads. Data with other causes
         than `Pushed` or the `Touching` of one tool, an anatomy without tumour, too few loads, or unit responses that
         did not converge.
     """
@@ -164,7 +164,7 @@ def train(
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What models are fitted on: rows (B,) bool of the answers, these as examples, and what learners share of them."""
+    """Inputs of a fit: rows (B,) bool of the results, these as examples, and common inputs of all model types."""
 
     rows: np.ndarray
     examples: Examples
@@ -172,7 +172,7 @@ class Fit:
     envelope: Envelope
 
     def parts(self, name: str, patch: Patch) -> tuple[tuple[Part, ...], ForceModel | None]:
-        """Fit a learner: the parts of its model, and its model of a tool's force."""
+        """Fit a model type: the parts of its model, and its model of a tool's force."""
         with stage(f"learn {name}"):
             parts = parts_of(name, self.inputs, self.examples)
             return parts, force_of(name, parts, patch, self.examples)
@@ -180,7 +180,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A learner's model, its score on the discs left out, and how often its bounds held there."""
+    """Model of one type, its score on held-out discs, and the empirical coverage of its bounds there."""
 
     model: Learned
     score: Score
@@ -195,7 +195,7 @@ def _fit_of(answers: Answers, rows: np.ndarray, shared: Expansion, left: Split |
 
 
 def _learn(name: str, data: Dataset, answers: Answers, split: Split, apart: np.ndarray, fits: Sequence[Fit]) -> Result:
-    """Fit one learner outside the discs and score it inside, then fit it on all that calibrates no bound."""
+    """Fit one model type outside the discs and score it inside, then fit it to all loads not used for calibration."""
     outside, patch = fits[0], answers.patch
     parts, force = outside.parts(name, patch)
     training = {"learner": name, **data.provenance}
@@ -233,7 +233,7 @@ def _learn(name: str, data: Dataset, answers: Answers, split: Split, apart: np.n
 
 
 def _fitted_on_all(name: str, model: Learned, answers: Answers, fit: Fit) -> Learned:
-    """The model fitted on further loads, with a correction of its distances where it had one."""
+    """Fit the model to further loads, with a correction of its distances if it had one."""
     parts, force = fit.parts(name, answers.patch)
     fitted = replace(model, parts=parts, envelope=fit.envelope, force=force)
     if model.tip is None or model.tip.correction is None:
@@ -243,7 +243,7 @@ def _fitted_on_all(name: str, model: Learned, answers: Answers, fit: Fit) -> Lea
 
 
 def _calibrated(model: Learned, near: Errors, growth: Mapping[str, float], far: Errors) -> Learned:
-    """The model with bounds from errors `near` its training loads; they grow by `growth` [1/m] to those `far` off."""
+    """Add bounds, calibrated on errors `near` training loads, to a model; they grow by `growth` [1/m] towards `far`."""
     seen = far.known()
     bounds = {way: bound_by(here, WAYS[way], growth[way], seen[way]) for way, here in near.known().items()}
     tip, force = model.tip or TipModel(), model.force
@@ -256,17 +256,17 @@ def _calibrated(model: Learned, near: Errors, growth: Mapping[str, float], far: 
 
 
 def _motion(answers: Answers, rows: np.ndarray) -> np.ndarray:
-    """Mean displacement [m] of the tumour under the chosen rows (B,) bool."""
+    """Compute the tumour's mean displacement [m] under selected rows (B,) bool."""
     return np.linalg.norm(answers.tumour[rows], axis=2).mean(axis=1)
 
 
 def _first(rows: np.ndarray, most: int | None) -> np.ndarray:
-    """The first `most` of the chosen rows (B,) bool."""
+    """Select the first `most` of rows (B,) bool."""
     return rows if most is None else rows & (np.cumsum(rows) <= most)
 
 
 def _without(split: Split, apart: np.ndarray) -> Split:
-    """A split of the rows that are not `apart` (B,), as one of all rows."""
+    """Extend a split of the rows that are not `apart` (B,) to all rows."""
     disc = np.full(len(apart), -2)
     disc[~apart] = split.disc
     return replace(split, disc=disc)

@@ -1,1 +1,1 @@
-"""Episodes in the formats of others: LeRobot, robomimic, folders of pictures, XDMF; and the card of a data set."""
+"""Episodes in other formats: LeRobot, robomimic, folders of images, XDMF; and the card of a data set."""

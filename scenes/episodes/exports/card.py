@@ -28,7 +28,7 @@ TABLE = "episodes.csv"
 NAMES = (TABLE, "croissant.json", SHEET, LICENCE_NAME)
 """Files of a card."""
 MOST_EPISODES = 5000
-"""Of larger data sets a run does not write the card by itself: 20 to 50 ms are needed for each episode."""
+"""Number of episodes above which a run does not write the card automatically: each takes 20 to 50 ms."""
 LICENCE = f"""# Licence of this data set
 
 {MARK}
@@ -93,9 +93,9 @@ def write_card(
 def keep_card(
     folder: Path, numbers: Set[int], changed: bool, progress: Callable[[Iterable], Iterable] = iter
 ) -> str | None:
-    """Write the card of a run's folder anew, where it is not that of the episodes there; why not, in words.
+    """Rewrite the card of a run's folder if it does not match the episodes; return the reason if this failed.
 
-    Nothing is written where no episode is whole. Files that are of no card stay.
+    Nothing is written if no episode is complete. Files that are of no card stay.
 
     Parameters
     ----------
@@ -110,13 +110,13 @@ def keep_card(
         return f"No data sheet of more than {MOST_EPISODES} episodes: `sulcus convert {folder} --to card` writes it."
     try:
         write_card(folder, progress=progress)
-    except (InputError, OSError) as error:  # what a run has made is none the worse for it
+    except (InputError, OSError) as error:  # the episodes of the run are unaffected
         return f"No data sheet was written: {error}"
     return None
 
 
 def _differs(folder: Path, names: set[str]) -> bool:
-    """Whether a folder's card lists other episodes than these; of many, sizes are not asked for."""
+    """Return True if a folder's card lists other episodes than these; for many, sizes are not compared."""
     listed = listed_files(folder) if has_card(folder) else {}
     if listed.keys() != names or len(names) > MOST_EPISODES:
         return listed.keys() != names
@@ -124,7 +124,7 @@ def _differs(folder: Path, names: set[str]) -> bool:
 
 
 def has_card(folder: Path) -> bool:
-    """Whether all files of a card are there."""
+    """Return True if all files of a card exist."""
     return all((folder / name).is_file() for name in NAMES)
 
 
@@ -146,7 +146,7 @@ def run_of(folder: Path) -> Run | None:
 
 
 def is_card(path: Path) -> bool:
-    """Whether a file is of an earlier card."""
+    """Return True if a file belongs to an earlier card."""
     head = path.read_text(encoding="utf-8", errors="replace")[:4096]
     return MARK in head or head.startswith(",".join(COLUMNS)) or ("mlcommons.org/croissant" in head and NAME in head)
 

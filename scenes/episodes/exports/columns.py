@@ -27,7 +27,7 @@ TASKS = {
     "drain": "Drain fluid and turn the head, while the brain sinks.",
     "debulk": "Cut the tumour out in shares.",
 }
-# Of so many bodies, or episodes where there are fewer bodies, one is held out.
+# One of this many bodies (or episodes, if there are fewer bodies) is held out.
 HELD_OUT = 10
 
 
@@ -37,9 +37,10 @@ def task_of(contents: Contents) -> str:
 
 
 def held_out(episodes: Sequence[Contents]) -> list[bool]:
-    """Which episodes are for validation: every tenth body; of fewer than ten bodies, every tenth episode.
+    """Return which episodes are held out for validation: every tenth body, or every tenth episode if there are fewer
+    than ten bodies.
 
-    Of two to nine episodes it is the last.
+    Of two to nine episodes, the last one is held out.
     """
     bodies = list(dict.fromkeys(str(one.said.get("anatomy")) for one in episodes))
     if len(bodies) < HELD_OUT:
@@ -57,9 +58,9 @@ NUMBERS = (
     "force", "force_read", "tip", "contact", "distance", "K", "T_camera_world", "T_camera_world_tracked",
     "T_world_tool_tracked", "tumour_predicted",
 )  # fmt: skip
-"""Arrays that go into other formats as they are, a row for each frame, beside the tool's pose."""
+"""Arrays that are exported unchanged, one row per frame, next to the tool's pose."""
 SPACE = "world: RAS [m]; camera: x right, y down, z forward [m]"
-"""Where all places are."""
+"""Coordinate system of all positions."""
 STATE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 ACTION = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
 SHEET, LICENCE = "DATASHEET.md", "LICENSE.md"
@@ -67,12 +68,12 @@ SHEET, LICENCE = "DATASHEET.md", "LICENSE.md"
 
 
 def shared_pictures(episodes: Sequence[Contents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:
-    """Those of the wanted pictures that every episode has.
+    """List the requested images that every episode has.
 
     Raises
     ------
     InputError
-        Episodes whose pictures differ in size.
+        Episodes whose images differ in size.
     """
     for one in episodes:
         if one.size != episodes[0].size:

@@ -51,7 +51,7 @@ COLUMNS: Mapping[str, tuple[str, str]] = {
     "bytes": ("sc:Integer", "Size of the file."),
     "sha256": ("sc:Text", "Checksum that the file states of its arrays; empty where it states none."),
 }
-"""Of the table of episodes: kind and meaning of each column."""
+"""Columns of the table of episodes: type and meaning."""
 
 
 def croissant(name: str, description: str, date: str, table: str, sha256: str, inside: str) -> dict[str, Any]:

@@ -18,9 +18,9 @@ MOST_DRAWN = 100
 
 
 def parameters_of(contents: Contents) -> dict[str, Any]:
-    """What an episode says was drawn for it, by dotted names; nothing where it does not say, or not as JSON.
+    """Return the sampled parameters of an episode by dotted names; empty if not recorded as JSON.
 
-    Tumours are drawn for anatomies that are drawn: those of others are left out, as nothing came of them.
+    Tumours are sampled for synthetic anatomies only; those of others have no effect and are excluded.
     """
     try:
         found = dict(leaves(json.loads(contents.said.get("parameters", "{}"))))
@@ -59,7 +59,7 @@ def range_row(key: str, found: Sequence[Any]) -> str:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a number, which true and false are not here."""
+    """Return True if a value is a number; booleans are not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -82,11 +82,11 @@ def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 TEMPLATE, DRAWN, UNSTATED = "template", "drawn", ""
-"""Whose an anatomy is: the one that ships, the same brain with another tumour, or not said; else the name of an own."""
+"""Origin of an anatomy: the shipped one, the same brain with another tumour, or unknown; else the name of an own one."""
 
 
 def origin_of(contents: Contents) -> str:
-    """Whose an episode's anatomy is: `TEMPLATE`, `DRAWN`, the name of an own one, or `UNSTATED`."""
+    """Return the origin of an episode's anatomy: `TEMPLATE`, `DRAWN`, the name of an own one, or `UNSTATED`."""
     stated = parameters_of(contents).get("bodies.anatomies")
     if stated is not None:
         return str(stated)
@@ -94,14 +94,14 @@ def origin_of(contents: Contents) -> str:
 
 
 def notice_of_template() -> str:
-    """What those who made the template ask to appear in all copies, as Markdown."""
+    """Return the notice that the template's authors require in all copies, as Markdown."""
     lines = template_path().with_suffix(".notice.txt").read_text(encoding="utf-8").splitlines()
     head = "The template's brain, also in `bodies`, is made from the ICBM 152 template of 2009 (MNI152). Its notice:"
     return "\n".join(["", head, "", *(f"> {line}" for line in lines), ""])
 
 
 def of_template(episodes: Sequence[Contents]) -> bool:
-    """Whether any of them is of the template's brain."""
+    """Return True if any episode uses the template's brain."""
     return any(origin_of(one) in (TEMPLATE, DRAWN) for one in episodes)
 
 
@@ -159,7 +159,7 @@ def datasheet(
 
 
 def motivation() -> str:
-    """Why it was made."""
+    """Describe the motivation."""
     return (
         "## Motivation\n\nA tool that presses moves the brain, and the tumour in it. Where the tumour is at each "
         "moment is not known of real surgery. Here it is, because the surgery is simulated.\n"
@@ -167,7 +167,7 @@ def motivation() -> str:
 
 
 def composition(episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> str:
-    """What it consists of: counts, sizes, arrays."""
+    """Describe the composition: counts, sizes, arrays."""
     lines = ["## Composition\n", "| family | episodes | frames | solved | seconds | GB |", "|---|---|---|---|---|---|"]
     for family in [*sorted({row["family"] for row in rows}), None]:
         those = [row for row in rows if family in (None, row["family"])]
@@ -196,7 +196,7 @@ def composition(episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]],
 
 
 def bodies_said(episodes: Sequence[Contents]) -> str:
-    """How many anatomies and pictures' sizes there are."""
+    """Describe the numbers of anatomies and image sizes."""
     bodies = len({one.said.get("anatomy") for one in episodes})
     sizes = sorted({one.size for one in episodes})
     said_sizes = ", ".join(f"{width} x {height}" for width, height in sizes)
@@ -204,7 +204,7 @@ def bodies_said(episodes: Sequence[Contents]) -> str:
 
 
 def collection(episodes: Sequence[Contents], run: Run | None) -> str:
-    """How it came about, and what was drawn at random."""
+    """Describe the collection process, and the random variation."""
     lines = ["## Collection\n", "A scripted tool moved on a simulated brain, and a camera drew what it would see.\n"]
     tools = [str(tool).partition("(")[0] for tool in said(episodes, "tool")]  # sizes are among what was drawn
     lines += [*listed("what moved the tissue", said(episodes, "answered_by"))]

@@ -1,6 +1,6 @@
-"""Episodes as a LeRobot data set, v3.0: Parquet tables with the pictures' own bytes in them, and JSON.
+"""Episodes as a LeRobot data set, v3.0: Parquet tables with the encoded images, and JSON.
 
-Pictures are features of the kind `image`, as they are stored: JPEG, and PNG of 8 or 16 bits. Depth is exact.
+Images are features of the kind `image`, as they are stored: JPEG, and PNG of 8 or 16 bits. Depth is exact.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from .columns import (
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Of `count` rows: each a float64 array of one row's shape. What is not known, NaN, counts nowhere."""
+    """Statistics of `count` rows: each a float64 array of one row's shape. NaN values are excluded."""
 
     least: np.ndarray
     greatest: np.ndarray
@@ -49,7 +49,7 @@ class Spread:
 
     @classmethod
     def of(cls, rows: np.ndarray) -> Spread:
-        """Of rows (T, ...)."""
+        """Compute the statistics of rows (T, ...)."""
         rows = np.asarray(rows, np.float64)
         known = ~np.isnan(rows)
         filled = np.where(known, rows, 0.0)
@@ -63,7 +63,7 @@ class Spread:
         )
 
     def __add__(self, other: Spread) -> Spread:
-        """Of both."""
+        """Return the statistics of both sets."""
         return Spread(
             np.minimum(self.least, other.least),
             np.maximum(self.greatest, other.greatest),
@@ -74,7 +74,7 @@ class Spread:
         )
 
     def said(self) -> dict[str, list]:
-        """As lists: min, max, mean, std and count; zeros where nothing is known."""
+        """Return lists of min, max, mean, std and count; zeros without data."""
         known = np.maximum(self.known, 1)
         mean = self.total / known
         deviation = np.sqrt(np.maximum(self.squares / known - np.square(mean), 0.0))
@@ -85,11 +85,11 @@ class Spread:
 
 VERSION = "v3.0"
 DEPTH_RANGE = (0.1, 0.6)
-"""What a reader that must scale depth should scale to [m]: tools, cortex and drape of all scenes lie within."""
+"""Depth range for readers that scale depth [m]: contains tools, cortex and drape of all scenes."""
 EXPORTED = ("colour", "colour_right", "depth", "segmentation", "tumour_mask")
 # Megabytes of one table, and tables of one folder, as LeRobot has them.
 FILE_MEGABYTES, FOLDER_FILES = 100, 1000
-# Pictures of an episode that its statistics are taken of, and pixels along a side from one to the next.
+# Number of images of an episode used for statistics, and pixel stride along each side.
 LOOKED_AT, SPARSE = 5, 4
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES = Path("meta/episodes/chunk-000/file-000.parquet")
@@ -214,7 +214,7 @@ class Tables:
 
 
 def coded(file: h5py.File, contents: Contents, name: str, frames: range) -> Iterator[dict[str, Any]]:
-    """Pictures as LeRobot stores them."""
+    """Yield images as LeRobot stores them."""
     suffix = suffix_of(name)
     return ({"bytes": code_of(file, contents, name, frame), "path": f"{name}_{frame:06d}.{suffix}"} for frame in frames)
 
@@ -233,7 +233,7 @@ def column_of(array: np.ndarray) -> pa.Array:
 
 
 def looks(file: h5py.File, contents: Contents, name: str) -> Spread:
-    """Statistics of a few pictures: colour and labels as shares of 255, depth in its own steps."""
+    """Compute statistics of a few images: colour and labels relative to 255, depth in its own steps."""
     found = []
     for frame in np.unique(np.linspace(0, contents.frames - 1, LOOKED_AT).round().astype(int)).tolist():
         picture = picture_of(file, contents, name, frame)[::SPARSE, ::SPARSE]
@@ -243,7 +243,7 @@ def looks(file: h5py.File, contents: Contents, name: str) -> Spread:
 
 
 def shaped(name: str, spread: Spread) -> dict[str, list]:
-    """Statistics as LeRobot has them: of a picture (channels, 1, 1)."""
+    """Convert statistics to LeRobot's form: of an image (channels, 1, 1)."""
     said = spread.said()
     if not name.startswith("observation.images."):
         return said
@@ -279,7 +279,7 @@ def features_of(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
 
 
 def picture_features(contents: Contents, pictures: Sequence[str]) -> dict[str, Any]:
-    """Pictures as `info.json` describes them; of depth its step, and the range to scale to [m]."""
+    """Describe images for `info.json`; for depth its step, and its range [m]."""
     width, height = contents.size
     found = {}
     for name in pictures:
@@ -300,7 +300,7 @@ def picture_features(contents: Contents, pictures: Sequence[str]) -> dict[str, A
 
 
 def info(episodes: int, frames: int, tasks: int, rate: float, features: Mapping[str, Any]) -> dict[str, Any]:
-    """What `info.json` holds."""
+    """Return the contents of `info.json`."""
     return {
         "codebase_version": VERSION,
         "robot_type": "simulated hand-held tool",

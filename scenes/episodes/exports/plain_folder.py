@@ -1,4 +1,4 @@
-"""Episodes as folders: pictures as JPEG and PNG files, numbers as CSV, and what they are as JSON."""
+"""Episodes as folders: images as JPEG and PNG files, numbers as CSV, and their description as JSON."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def write_folder(
 
 
 def write_pictures(place: Path, file: h5py.File, contents: Contents) -> None:
-    """Write the pictures' own bytes, one file each: `colour/000000.jpg`."""
+    """Write the encoded images, one file each: `colour/000000.jpg`."""
     for name in PICTURES:
         if name in contents.shapes:
             (place / name).mkdir()

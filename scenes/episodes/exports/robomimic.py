@@ -30,7 +30,7 @@ from .columns import (
 )
 
 EXPORTED = ("colour", "colour_right", "depth", "segmentation")
-# Decoded pictures, packed by gzip, against the episodes' JPEG and PNG.
+# Size of decoded images compressed by gzip, relative to the episodes' JPEG and PNG.
 SWELLS = 4
 GYM = 2
 """robomimic's number for environments of Gymnasium's kind."""
@@ -39,12 +39,12 @@ GYM = 2
 def write_robomimic(
     episodes: Sequence[Contents], path: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
-    """Write the file; it appears whole. Returns what it holds. `progress` passes the episodes on.
+    """Write the file, whole or not at all; return its contents. `progress` wraps the episodes.
 
     Raises
     ------
     InputError
-        Episodes without a tool, of different picture sizes, or damaged; a file that cannot be written.
+        Episodes without a tool, of different image sizes, or damaged; a file that cannot be written.
     """
     pictures, names = shared_pictures(episodes, EXPORTED), shared_numbers(episodes)
     demand_space(path, SWELLS * stored_size(episodes))
@@ -71,7 +71,7 @@ def write_robomimic(
 
 
 def write_demo(demo: h5py.Group, obs: h5py.Group, contents: Contents, numbers: dict[str, np.ndarray]) -> None:
-    """Write all but the pictures of one episode: a state is the tool's, then the tumour's where all have as many."""
+    """Write all but the images of one episode: a state is the tool's, then the tumour's where all have as many."""
     actions, state = numbers.pop("action"), numbers.pop("state")
     tumour = [numbers[name].reshape(contents.frames, -1) for name in ("tumour_predicted",) if name in numbers]
     dones = np.zeros(contents.frames, np.int64)
@@ -88,7 +88,7 @@ def write_demo(demo: h5py.Group, obs: h5py.Group, contents: Contents, numbers: d
 def write_pictures(
     obs: h5py.Group, file: h5py.File, contents: Contents, pictures: Sequence[str], stream: Stream
 ) -> None:
-    """Write pictures decoded, (T, H, W, channels): uint8, and depth as float32 [m]."""
+    """Write decoded images, (T, H, W, channels): uint8, and depth as float32 [m]."""
     width, height = contents.size
     for name in pictures:
         kind = np.float32 if name == "depth" else np.uint8
@@ -106,7 +106,7 @@ def write_pictures(
 
 
 def environment(episodes: Sequence[Contents], rates: Sequence[float]) -> dict[str, Any]:
-    """What robomimic asks of an environment: there is none to replay actions in, so it names what was played."""
+    """Return the environment metadata of robomimic: no environment replays the actions, so the scenes are named."""
     families = sorted({one.family for one in episodes})
     return {
         "env_name": "sulcus",

@@ -19,7 +19,7 @@ from ..reading.windows import numbers_in
 from .columns import SPACE, file_names, stored_size, write_along
 
 SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
-"""What is written, and the surface of the anatomy that it is of."""
+"""Contents to write, and the surface of their anatomy."""
 
 
 def write_xdmf(
@@ -27,8 +27,8 @@ def write_xdmf(
 ) -> dict[str, Any]:
     """Write two files an episode, `.xdmf` to open and `.h5` with its numbers; the folder appears whole.
 
-    Positions are metres. Beside them are the displacement from the scan, and the distance to the finite elements' own
-    answer where they solved the frame. Without the anatomy there are points alone: `points_only` counts such episodes.
+    Positions are metres. Further arrays are the displacement from the scan, and the distance to the FEM solution where
+    FEM solved the frame. Without the anatomy there are points alone: `points_only` counts such episodes.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def add_series(domain: Element, group: h5py.Group, name: str, times: np.ndarray)
 
 
 def add_item(above: Element, array: h5py.Dataset, name: str) -> None:
-    """Refer to an array of the HDF5 file beside."""
+    """Refer to an array of the HDF5 file."""
     kind, size = ("Int", "4") if array.dtype.kind == "i" else ("Float", "4")
     shape = " ".join(map(str, array.shape))
     item = SubElement(above, "DataItem", Dimensions=shape, NumberType=kind, Precision=size, Format="HDF")

@@ -25,7 +25,7 @@ from .contents import REMEDY, contents_of, said_by_validate
 from .validation import Report, validate_episode
 from .windows import numbers_in
 
-# How far two answers may be apart [mm]: at training accuracy; of frames that were played, at the live one.
+# Largest difference of two solutions [mm]: at training accuracy; of played frames, at live accuracy.
 SAME_MM, LIVE_MM = 0.02, 0.2
 # Bytes that looking at one file may take.
 MOST_BYTES = 8 * 1024**3
@@ -98,7 +98,7 @@ def validated(
 
 
 def _looked_at(look: Callable[[Path], Report], path: Path) -> Report:
-    find_device("cpu", "float32")  # which keeps Warp's notes out of what is reported
+    find_device("cpu", "float32")  # keeps Warp's notes out of the report
     try:
         with at_most(MOST_BYTES):
             return look(path)

@@ -1,4 +1,4 @@
-"""The anatomies that episodes were played on: the template, or what lies beside the episodes."""
+"""Anatomies of episodes: the template, or files next to the episodes."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .contents import Contents
 
 
 def anatomy_of(contents: Contents) -> Anatomy | None:
-    """The anatomy whose digest an episode has; None where it is neither the template nor in a folder beside.
+    """Find the anatomy with an episode's digest; None if it is neither the template nor in a nearby folder.
 
-    It is looked for in `bodies/*/anatomy.vtu` of the episode's folder, and of the folder above.
+    It is searched in `bodies/*/anatomy.vtu` of the episode's folder, and of the folder above.
     """
     return _known(str(contents.said.get("anatomy")), contents.path.resolve().parent)
 
 
 def is_template(digest: str) -> bool:
-    """Whether an anatomy's digest is that of the template."""
+    """Return True if an anatomy's digest is that of the template."""
     template = _read(template_path())
     return template is not None and template.digest == digest
 

@@ -29,7 +29,7 @@ def opened(path: Path) -> h5py.File:
 
 
 def said_by_validate(error: InputError, path: Path) -> str:
-    """What is wrong with an episode, without its path, and without the hint to the command that says it."""
+    """Return the fault of an episode, without its path, and without the hint to the command that reports it."""
     return str(error).removeprefix(f"{path}: ").replace(f"{HINT}make", "Make")
 
 
@@ -80,7 +80,7 @@ class OpenFiles:
 DEEPEST, MOST_NAMES = 3, 500
 # Frames of one episode: hours.
 MOST_FRAMES = 1_000_000
-# Pixels along a picture's side.
+# Largest number of pixels along an image's side.
 LARGEST_SIDE = 16384
 # Bytes of a text that heads a file: a plan, or what was drawn.
 LONGEST_TEXT = 1 << 20
@@ -89,7 +89,7 @@ FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLE
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """One episode as its file describes it.
+    """Contents of one episode, as its file describes them.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class Contents:
     said
         Attributes of the file: texts, numbers.
     shapes
-        Of all arrays that are known, by name; pictures by their own, without the group's.
+        Shapes of all known arrays, by name; images without the group's name.
     fem_frames
         (F,) sorted numbers of the frames that finite elements solved.
     """
@@ -110,17 +110,17 @@ class Contents:
 
     @property
     def frames(self) -> int:
-        """How many."""
+        """Number of frames."""
         return self.shapes["time"][0]
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of its pictures [pixel]."""
+        """Width and height of its images [pixel]."""
         return int(self.said["width"]), int(self.said["height"])
 
     @property
     def family(self) -> str:
-        """What happens in it; of the former format its scene."""
+        """Family of the episode; in the former format its scene."""
         return str(self.said.get("family", self.said.get("scene", "episode")))
 
     @property
@@ -144,7 +144,7 @@ def read_contents(path: str | Path) -> Contents:
 
 
 def contents_of(file: h5py.File, path: Path) -> Contents:
-    """What an open file holds.
+    """Read the contents of an open file.
 
     Raises
     ------
@@ -209,7 +209,7 @@ def _arrays(file: h5py.Group, inside: str = "", depth: int = 0) -> Iterator[tupl
 
 
 def _demand_inside(name: str, array: h5py.Dataset) -> None:
-    """Refuse an array whose numbers lie elsewhere, or are declared and not there."""
+    """Reject an array whose data are in another file, or are declared but missing."""
     if array.external or array.is_virtual:
         raise InputError(f"{name!r} lies in another file: episodes that refer to others are not read. {REMEDY}")
     pipeline = array.id.get_create_plist()
@@ -247,7 +247,7 @@ def _checked(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ...]]:
 
 
 def _fit(name: str, shape: tuple[int, ...], wanted: Array, sizes: dict[str, int]) -> None:
-    """Refuse a shape with other lengths than those known; learn those that are not."""
+    """Reject a shape that contradicts known lengths; record new ones."""
     axes = wanted.axes
     if axes[-1] is None:
         axes = (*axes[:-1], *shape[len(axes) - 1 :])

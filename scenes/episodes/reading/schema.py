@@ -1,4 +1,4 @@
-"""What arrays an episode may hold: their axes, kinds and units, of today's format and of the one before."""
+"""Arrays of an episode: axes, kinds and units, in the current and in the former format."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Array:
     axes
         A length, or the name of one that all arrays share; `None` last: as many axes more as there are.
     kind
-        Of its numbers, as NumPy's `dtype.kind`: any of these letters; "O" are texts or pictures.
+        Allowed letters of NumPy's `dtype.kind`; "O" for texts or images.
     unit
         As the array's own attribute has it; None: no unit is asked for.
     known
@@ -36,7 +36,7 @@ class Array:
 
     @property
     def framed(self) -> bool:
-        """Whether there is a row for each frame."""
+        """True if there is a row for each frame."""
         return bool(self.axes) and self.axes[0] == FRAMES
 
 
@@ -48,11 +48,11 @@ PICTURES: Mapping[str, str] = {
     "segmentation": LABELS,
     "tumour_mask": LABELS,
 }
-"""Pictures, one a frame in the group `pictures`, and how each is decoded."""
+"""Images, one per frame in the group `pictures`, and the decoder of each."""
 
 
 def suffix_of(name: str) -> str:
-    """How files of a picture's bytes end: colour is JPEG, all else PNG."""
+    """Return the file ending of an image's bytes: colour is JPEG, all else PNG."""
     return "jpg" if PICTURES[name] == COLOUR else "png"
 
 
@@ -104,6 +104,6 @@ ARRAYS: Mapping[str, Array] = {
     "cortex_nodes": Array(("cortex",), "iu", "1"),
     "cortex_rest": Array(("cortex", 3)),
 }
-"""Arrays that are no pictures, by name. Only `time` must be there."""
+"""Arrays other than images, by name. Only `time` is required."""
 
 NEEDED = ("time",)

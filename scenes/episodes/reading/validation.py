@@ -1,4 +1,4 @@
-"""What is wrong with an episode, found out without trusting it: each finding is a sentence."""
+"""Faults of an untrusted episode: each finding is a sentence."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .windows import numbers_in, picture_of
 
 # Frames that are drawn again, spread evenly.
 LOOKED_AT = 12
-# Share of a silhouette's pixels that single precision and another machine may turn over, and so many always.
+# Share of a silhouette's pixels that may differ by rounding or machine, and the least number.
 TURNED, FEW = 1e-3, 4
 # Rows that are held in memory at once.
 BLOCK = 256
@@ -34,7 +34,7 @@ POSES = ("T_camera_world", "T_camera_world_right", "T_camera_world_tracked", "T_
 
 
 def mask_findings(file: h5py.File, contents: Contents, anatomy: Anatomy | None) -> tuple[list[str], list[str]]:
-    """What is wrong with `tumour_mask`, and what could not be looked at, each a sentence."""
+    """List the faults of `tumour_mask`, and what could not be checked, as sentences."""
     shapes = contents.shapes
     missing = [
         name
@@ -85,16 +85,16 @@ def camera_of(file: h5py.File, contents: Contents, frame: int) -> Camera:
 
 @dataclass(frozen=True)
 class Report:
-    """What was found of one file.
+    """Findings of one file.
 
     Parameters
     ----------
     path
         The file.
     problems
-        What is wrong: none, if the file is whole.
+        Faults; none if the file is complete.
     skipped
-        What could not be looked at, and why.
+        Skipped checks, and the reasons.
     frames, solved
         How many there are, and how many of them finite elements solved.
     unsolved
@@ -142,7 +142,7 @@ def validate_episode(path: Path) -> Report:
 
 
 def unit_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
-    """Units that are missing or are others than ours; arrays that nobody knows."""
+    """Yield findings on missing or unexpected units, and on unknown arrays."""
     for name in contents.shapes:
         if name in PICTURES:
             continue
@@ -192,7 +192,7 @@ def pose_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
 
 
 def picture_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
-    """Pictures that cannot be decoded, are of another size than the file says, or have labels that it does not name."""
+    """Yield findings on images that cannot be decoded, have another size than declared, or have undeclared labels."""
     labels = {int(word.split()[0]) for word in str(contents.said.get("segmentation", "")).split(",") if word.strip()}
     for name, kind in PICTURES.items():
         if name not in contents.shapes:
@@ -210,9 +210,9 @@ def picture_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
 
 
 def solved_figures(file: h5py.File, contents: Contents) -> tuple[int, int, tuple[float, float] | None]:
-    """How many frames were solved, how many of them did not converge, and how far the prediction was off [mm].
+    """Return the numbers of solved and of unconverged frames, and the errors of the prediction [mm].
 
-    Where finite elements played, nothing was predicted, and None says so.
+    The errors are None if FEM played the scene.
     """
     solved = len(contents.fem_frames)
     unsolved = 0

@@ -23,7 +23,7 @@ Rows = np.ndarray | list[str]
 
 
 def rows_of(file: h5py.File, contents: Contents, name: str, frames: range | None = None) -> Rows:
-    """The rows of some frames, or of all: (frames, ...) numbers or decoded pictures, or a list of texts.
+    """Read the rows of some frames, or of all: (frames, ...) numbers or decoded images, or a list of texts.
 
     An array without frames is read whole.
 
@@ -46,12 +46,12 @@ def rows_of(file: h5py.File, contents: Contents, name: str, frames: range | None
 
 
 def numbers_in(file: h5py.File, contents: Contents, name: str, frames: range | None = None) -> np.ndarray:
-    """As `rows_of`, of an array that holds no texts."""
+    """Read rows as `rows_of`, from an array without texts."""
     return np.asarray(rows_of(file, contents, name, frames))
 
 
 def picture_of(file: h5py.File, contents: Contents, name: str, frame: int) -> np.ndarray:
-    """One picture, decoded.
+    """Read and decode one image.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def picture_of(file: h5py.File, contents: Contents, name: str, frame: int) -> np
 
 
 def code_of(file: h5py.File, contents: Contents, name: str, frame: int) -> bytes:
-    """The bytes of one picture as they are stored; InputError of a file that is damaged."""
+    """Read the stored bytes of one image; InputError if the file is damaged."""
     with read_as(contents.path, "an episode", REMEDY):
         return np.asarray(array_in(file, f"pictures/{name}")[frame], np.uint8).tobytes()
 
@@ -104,7 +104,7 @@ def _solved(array: h5py.Dataset, contents: Contents, frames: range) -> Rows:
 
 
 FEM_KNOWN = "fem_known"
-"""(T,) bool beside arrays of finite elements: which frames they solved."""
+"""(T,) bool for arrays of FEM: solved frames."""
 
 
 def episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
@@ -138,7 +138,7 @@ def episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
 class Episodes(Sequence[dict[str, Any]]):
     """Windows of frames, each a dictionary by key: (T, ...) arrays, or what an episode has once.
 
-    Pictures are decoded: colour (T, H, W, 3) uint8, depth (T, H, W) float32 [m], segmentation (T, H, W) uint8. Rows of
+    Images are decoded: colour (T, H, W, 3) uint8, depth (T, H, W) float32 [m], segmentation (T, H, W) uint8. Rows of
     finite elements are NaN where they solved nothing, and `fem_known` (T,) says where. `episode` and `frame` (T,) are
     there always. Files are opened when they are read, in each process its own.
 
@@ -177,7 +177,7 @@ class Episodes(Sequence[dict[str, Any]]):
 
     @cached_property
     def ends(self) -> list[int]:
-        """How many windows there are up to each episode's last."""
+        """Cumulative number of windows at the end of each episode."""
         counts = (
             (one.frames - self.span) // self.stride + 1 if one.frames >= self.span else 0 for one in self.contents
         )
@@ -208,7 +208,7 @@ class Episodes(Sequence[dict[str, Any]]):
         Raises
         ------
         InputError
-            A window that the episode does not have, a file that is damaged, or a picture that cannot be decoded.
+            A window that the episode does not have, a damaged file, or an image that cannot be decoded.
         """
         contents = self.contents[episode]
         if not 0 <= first <= contents.frames - self.span:
@@ -249,7 +249,7 @@ def read_episodes(
     Parameters
     ----------
     keys
-        Arrays and pictures by name; None: all numbers and pictures that every episode has.
+        Arrays and images by name; None: all numbers and images that every episode has.
     window, step, stride
         As of `Episodes`.
     most_open
