@@ -21,7 +21,7 @@ import numpy as np
 from sim import Bonded, Elasticity, Fem, Held, Slide, ToolForce, open_cortex, push
 from sim.bodies.healthy_heads import fsaverage_head, masked_head
 from sim.bodies.subject import MeshPlan, Subject, make_anatomy
-from sim.bodies.template import SITES, Head, Healthy, Tumour, drawn_subject, template_subject
+from sim.bodies.template import SITES, Head, HealthyHead, Tumour, drawn_subject, template_subject
 from sim.errors import InputError
 
 FORCE, FOOTPRINT = 0.3, 7e-3  # [N], [m]
@@ -39,7 +39,7 @@ def heads(mask: Path | None) -> dict[str, Callable[[Tumour], Subject]]:
     return found
 
 
-def _drawn(healthy: Healthy, tumour: Tumour) -> Subject:
+def _drawn(healthy: HealthyHead, tumour: Tumour) -> Subject:
     return drawn_subject(tumour, healthy)
 
 

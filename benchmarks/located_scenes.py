@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.play.deformers import Theatre, open_theatre
-from scenes.play.observer import Estimate, Observer
+from scenes.play.observer import Observer, TumourEstimate
 from scenes.script.scene import find_scene
 from scenes.script.shipped_files import template_path
 from scenes.script.sight import Sight
@@ -29,7 +29,7 @@ ERRORS = {"none": Sight(white=2e-5, smooth=2e-5, shift=0.0, turn=0.0), "of sag":
 """An error of 0.02 mm is none: an observation cannot state less than it can mean."""
 
 
-def estimates(theatre: Theatre, name: str, sights: int) -> dict[str, list[Estimate]]:
+def estimates(theatre: Theatre, name: str, sights: int) -> dict[str, list[TumourEstimate]]:
     """What is answered of a scene, by the errors of what is seen."""
     scene = find_scene(name)
     player, last, found = theatre.player("fem", scene), None, {error: [] for error in ERRORS}
@@ -43,7 +43,7 @@ def estimates(theatre: Theatre, name: str, sights: int) -> dict[str, list[Estima
     return found
 
 
-def row(answers: list[Estimate]) -> list[str]:
+def row(answers: list[TumourEstimate]) -> list[str]:
     """Figures of answers to one scene."""
     given = [answer for answer in answers if answer.location is not None]
     moved = 1e3 * np.mean([answer.truly for answer in answers])

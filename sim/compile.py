@@ -18,7 +18,7 @@ from .anatomy import Anatomy, region_words
 from .discretisation.body import Body
 from .discretisation.constraint import Constraint
 from .discretisation.element import Elements
-from .discretisation.footprint import Skin
+from .discretisation.footprint import ContactSurface
 from .discretisation.problem import Imposed, Problem
 from .discretisation.rigid_modes import check_held
 from .discretisation.space import Discretisation, discretise
@@ -77,7 +77,7 @@ def compile_problem(
     anatomy: Anatomy,
     device: Device,
     space: Discretisation | None = None,
-    skin: Skin | None = None,
+    skin: ContactSurface | None = None,
 ) -> Problem:
     """Build the terms and constraints that `effects` ask for, and nothing else; on linear tetrahedra without `space`.
 
@@ -91,7 +91,7 @@ def compile_problem(
     """
     effects = _compatible(effects)
     space = space or discretise(anatomy.mesh, "p1")
-    skin = skin or Skin(space.nodes, space.surface, device)
+    skin = skin or ContactSurface(space.nodes, space.surface, device)
     terms: list[Term] = []
     own: list[Term] = []
     barriers: list[Barrier] = []
@@ -121,7 +121,7 @@ def compile_problem(
 
                 terms.append(change_of_weight(effect, space, device))
             case Inertia():
-                from .terms.inertia import Inertia as InertiaTerm
+                from .terms.inertia import InertiaTerm as InertiaTerm
                 from .terms.inertia import lumped_mass
 
                 terms.append(InertiaTerm(lumped_mass(effect.density, space), effect.damping, space.marks, device))
@@ -207,7 +207,7 @@ def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
             raise InputError(f"loads hold {type(cause).__name__}, which nothing answers: add the effect {needed}.")
 
 
-def _impose(space: Discretisation, skin: Skin, loads: Loads) -> Imposed:
+def _impose(space: Discretisation, skin: ContactSurface, loads: Loads) -> Imposed:
     prescribed, displaced = loads.of(Prescribed), loads.of(Displaced)
     value = None
     if prescribed is not None:
@@ -220,7 +220,7 @@ def _impose(space: Discretisation, skin: Skin, loads: Loads) -> Imposed:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class LocalProblem:
     """A problem on some of a body's nodes, and what puts a force (3n, b) [N] on it, or none."""
 
     problem: Problem
@@ -236,7 +236,7 @@ def compile_part(
     return Problem(tuple(_elasticity(effect, space, whole.device, chosen, nodes)), constraint, whole.device)
 
 
-def surrounded(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> Part:
+def surrounded(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> LocalProblem:
     """A part and a stiffness (m, m) [N/m] around it, which its rows (m,) of 3n touch."""
     from .terms.schur_stiffness import Exterior
 
@@ -245,7 +245,7 @@ def surrounded(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> Part:
 
 def rimmed(
     effects: Iterable[Effect], space: Discretisation, whole: Problem, chosen: np.ndarray, nodes: np.ndarray
-) -> tuple[Part, Callable[[], sp.csc_array]]:
+) -> tuple[LocalProblem, Callable[[], sp.csc_array]]:
     """As `compile_part`, whose nodes that other tetrahedra touch are held.
 
     And its curvature (3n, 3n) [N/m], assembled, where the problem of one column was last linearised.
@@ -258,13 +258,13 @@ def rimmed(
     return part, lambda: reduce(add, [term.curvature() for term in terms])
 
 
-def _loaded(problem: Problem) -> Part:
+def _loaded(problem: Problem) -> LocalProblem:
     from .terms.dead_force import DeadForce, Forces
 
     device = problem.device
     load, nodes = DeadForce("load", lambda _: None, device), device.array(np.arange(problem.rows // 3), wp.int32)
     problem = replace(problem, terms=(*problem.terms, load))
-    return Part(problem, lambda force: load.take(None if force is None else Forces(nodes, force)))
+    return LocalProblem(problem, lambda force: load.take(None if force is None else Forces(nodes, force)))
 
 
 def _elasticity(
@@ -326,7 +326,7 @@ def _obeying(
 
     `swelling`: the effect, and which elements (T,) bool it swells.
     """
-    from .terms.elasticity import Elasticity as ElasticityTerm
+    from .terms.elasticity import ElasticTerm as ElasticityTerm
 
     law = functions_of(tissues)
     lame = np.array([portion(tissue, carries) for tissue in tissues])[which]

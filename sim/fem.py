@@ -18,7 +18,7 @@ from .arguments import at_least, vertex_numbers
 from .compile import check_causes, compile_problem
 from .deformation import Cost, Deformation, check_start, joined
 from .diagnostics.deformed_tissue import Diagnostics
-from .discretisation.footprint import Skin
+from .discretisation.footprint import ContactSurface
 from .discretisation.inverted_elements import Inversion
 from .discretisation.problem import Problem
 from .discretisation.space import discretise
@@ -26,10 +26,10 @@ from .discretisation.term import Cases
 from .effects import Effect, Elasticity
 from .errors import InputError
 from .linalg.preconditioner import choose_preconditioner
-from .linalg.rest_solver import Resting
+from .linalg.rest_solver import RestStiffnessSolver
 from .loads import Displaced, Loads, Nodal, Pushed
 from .minimisers.lbfgs import CARRIED
-from .minimisers.power_series import Reading, factors, taylor, terms_of
+from .minimisers.power_series import SeriesReading, factors, taylor, terms_of
 from .minimisers.residual import shortfall
 from .runtime.columns import unstacked
 from .runtime.device import find_device
@@ -39,9 +39,9 @@ from .runtime.threads import one_thread
 from .strategy.bone import solve_off_bone
 from .strategy.extrapolation import moved_on, pushes_of, way_of
 from .strategy.frame_sequence import FrameSequence, frame_sequence
-from .strategy.plan import Plan, Step, local_solvers, plan_for
-from .strategy.strategy import Answer, Strategy
-from .strategy.time_steps import KEPT, Still, alike
+from .strategy.plan import SolverPlan, SolverStep, local_solvers, plan_for
+from .strategy.strategy import SolverResult, Strategy
+from .strategy.time_steps import KEPT, NoMotionStep, alike
 
 # The memory's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
 MIDDLES = "mid-edge nodes"
@@ -90,7 +90,7 @@ class Fem:
         batch: int | None = None,
         element: str | None = None,
         live: bool = False,
-        avoid: Collection[Step] = (),
+        avoid: Collection[SolverStep] = (),
         stiff_as: Fem | None = None,
     ):
         if not isinstance(anatomy, Anatomy):
@@ -104,7 +104,7 @@ class Fem:
         self.effects = tuple(effects)
         self.accuracy = accuracy
         self.space = discretise(anatomy.mesh, element)
-        self._skin = Skin(self.space.nodes, self.space.surface, find_device(device, accuracy.precision))
+        self._skin = ContactSurface(self.space.nodes, self.space.surface, find_device(device, accuracy.precision))
         problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
         shared = stiff_as and stiff_as.strategy.preconditioner
         preconditioner = shared or choose_preconditioner(problem, self.space, self._unsmoothed)
@@ -119,10 +119,10 @@ class Fem:
         self.strategy = Strategy(problem, preconditioner, inversion, accuracy, plan, *parts)
         """What solves a load: the plan's solvers, one after the other."""
         self._paced = lru_cache(KEPT)(self._strategy_over)
-        self._resting = Resting(problem, preconditioner, accuracy.inner)
+        self._resting = RestStiffnessSolver(problem, preconditioner, accuracy.inner)
 
     @property
-    def plan(self) -> Plan:
+    def plan(self) -> SolverPlan:
         """Which solvers are tried, and in which order."""
         return self.strategy.plan
 
@@ -180,10 +180,10 @@ class Fem:
         answer = _joined(parts)
         return answer.rows(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
 
-    def _strategy_at(self, step: float) -> Strategy | Still:
+    def _strategy_at(self, step: float) -> Strategy | NoMotionStep:
         """Whose preconditioner knows the step in time [s]; of an infinite one, that of statics."""
         if step == 0.0 or step == math.inf:
-            return self.strategy if step else Still(self.problem, self.strategy.inversion)
+            return self.strategy if step else NoMotionStep(self.problem, self.strategy.inversion)
         return self._paced(step)
 
     def _strategy_over(self, step: float) -> Strategy:
@@ -228,7 +228,7 @@ class Fem:
         return shortfall(self.problem, self.problem.device.array(self.guess(loads, answer)))
 
     @alone
-    def reading(self, nodes: np.ndarray, modes: np.ndarray) -> Reading:
+    def reading(self, nodes: np.ndarray, modes: np.ndarray) -> SeriesReading:
         """What `series` is asked for: the shares that modes (r, n, 3) have in the motion of vertices `nodes` (n,).
 
         Raises
@@ -246,10 +246,10 @@ class Fem:
             on_device = device.array(force)
             self.problem.constraint.project(on_device)
             answers[some] = self._resting.answer(on_device).numpy().T
-        return Reading(answers, device)
+        return SeriesReading(answers, device)
 
     @alone
-    def series(self, loads: Loads, orders: int, reading: Reading, sizes: int = 1) -> np.ndarray:
+    def series(self, loads: Loads, orders: int, reading: SeriesReading, sizes: int = 1) -> np.ndarray:
         """Power series (G, terms, r) of what is read of the answers, in the sizes of the loads, as far as it converges.
 
         Each `sizes` successive loads are one group of G. Under s_1 times the first, ... s_m times the last of a group,
@@ -298,7 +298,7 @@ class Fem:
         return full.reshape(len(loads), self.problem.rows).T
 
     def _solve(
-        self, strategy: Strategy | Still, cases: Cases, last: np.ndarray | None, at: np.ndarray | None
+        self, strategy: Strategy | NoMotionStep, cases: Cases, last: np.ndarray | None, at: np.ndarray | None
     ) -> Deformation:
         clock = time.perf_counter()
         guesses = () if last is None else (moved_on(cases.loads, last, cases.warm), last)
@@ -310,7 +310,7 @@ class Fem:
     def _answered(
         self,
         cases: Cases,
-        found: Answer,
+        found: SolverResult,
         more: Mapping[str, np.ndarray],
         at: np.ndarray | None,
         seconds: Mapping[str, float],

@@ -12,7 +12,7 @@ import numpy as np
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
 from .deformation import Deformation, check_start, joined
-from .discretisation.resected_body import Remains, bodies
+from .discretisation.resected_body import RemainingBody, bodies
 from .discretisation.term import Remembering
 from .effects import Effect, Elasticity, Held, Pulsation, Resection
 from .errors import InputError
@@ -26,7 +26,7 @@ DONE = "resection"
 POSE = (4, 4)
 
 
-class Operated:
+class OperatedFem:
     """A Deformer: each load case is answered by the finite elements of what is left of the body.
 
     Vertices of which nothing is left stay where they were in the scan. Memories are those of the whole body, whose
@@ -44,7 +44,9 @@ class Operated:
         Of the latter, how many stay in memory.
     """
 
-    def __init__(self, bodies: tuple[Remains, ...], make: Callable[[Anatomy], Fem], ahead: bool = False, kept: int = 4):
+    def __init__(
+        self, bodies: tuple[RemainingBody, ...], make: Callable[[Anatomy], Fem], ahead: bool = False, kept: int = 4
+    ):
         self.lock = RLock()
         self._bodies = bodies
         self._solver = lru_cache(len(bodies) if ahead else kept)(lambda done: make(bodies[done].anatomy))
@@ -58,7 +60,7 @@ class Operated:
         """The whole body."""
         return self._bodies[0].anatomy
 
-    def remains(self, done: int) -> Remains:
+    def remains(self, done: int) -> RemainingBody:
         """What is left after so many steps."""
         return self._bodies[done]
 
@@ -168,7 +170,7 @@ def finite_elements(
     batch: int | None = None,
     element: str | None = None,
     live: bool = False,
-) -> Fem | Operated:
+) -> Fem | OperatedFem:
     """The finite elements that effects ask for, `Resection` among them; else as `Fem`.
 
     Raises
@@ -186,7 +188,7 @@ def finite_elements(
     def make(body: Anatomy) -> Fem:
         return Fem(body, (*_of(others, anatomy, body), Held()), accuracy, device, batch, element, live)
 
-    return Operated(bodies(anatomy, effects), make, ahead=live)
+    return OperatedFem(bodies(anatomy, effects), make, ahead=live)
 
 
 def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.intrinsics import View
+from ar.tracking.intrinsics import BoardView
 from ar.tracking.targets import calibration_board
 
 FACE = calibration_board().faces[0]
@@ -67,5 +67,5 @@ def views(places, noise, seed=0):
         pixels, _ = CAMERA.project(points @ T[:3, :3].T + T[:3, 3])
         inside = ((pixels > 0.0) & (pixels < [WIDTH - 1, HEIGHT - 1])).all(axis=1)
         pixels = pixels + noise * rng.standard_normal(pixels.shape)
-        found.append(View(f"view {number}", points[inside], pixels[inside], 1.0))
+        found.append(BoardView(f"view {number}", points[inside], pixels[inside], 1.0))
     return found

@@ -7,14 +7,14 @@ from contextlib import asynccontextmanager
 
 import numpy as np
 
-from scenes.link.answer import Answering
+from scenes.link.answer import PoseResponder
 from scenes.link.frame import HEADER, framed, read_header, stamp_of
-from scenes.link.heard import Heard, Names
+from scenes.link.heard import ReceivedTransforms, TransformNames
 from scenes.link.outgoing import Outgoing
-from scenes.link.session import Session
+from scenes.link.session import LinkSession
 
 HOST = "127.0.0.1"
-NAMES = Names()
+NAMES = TransformNames()
 NOW = stamp_of(time.time())
 
 
@@ -59,9 +59,9 @@ async def peers(port, count=1):
 async def linked(
     follower, registration=None, eye=None, tracking=1e-4, names=NAMES, source=None, stale=2.0, note=lambda line: None
 ):
-    answering = Answering(follower.motion, follower.tool, tracking, registration)
+    answering = PoseResponder(follower.motion, follower.tool, tracking, registration)
     speaks = Outgoing(follower.motion.stage, registration is not None)
-    session = Session(answering, speaks, Heard(names, stale), eye, note=note)
+    session = LinkSession(answering, speaks, ReceivedTransforms(names, stale), eye, note=note)
     ready = asyncio.get_running_loop().create_future()
     serving = asyncio.create_task(session.serve(HOST, 0, np.inf, ready, source))
     try:

@@ -6,11 +6,11 @@ from dataclasses import asdict
 import msgspec
 
 from scenes.commands.report import QUICK
-from scenes.report.finite_elements import Elements
-from scenes.report.learner import Learner
+from scenes.report.finite_elements import FemVariant
+from scenes.report.learner import LearnerSpec
 from scenes.report.reference import solve_beyond, solve_reference
-from scenes.report.row import Row
-from scenes.report.study import Study
+from scenes.report.row import ReportRow
+from scenes.report.study import ReportStudy
 from sim.accuracy import TRAIN
 from sim.effects import NodalForce, pushed_effects
 from sim.fem import Fem
@@ -19,7 +19,7 @@ from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
-SPECS = (Elements("FEM"), Elements("linear law", law="linear"), Learner("linear"))
+SPECS = (FemVariant("FEM"), FemVariant("linear law", law="linear"), LearnerSpec("linear"))
 
 
 def nothing(count):
@@ -31,7 +31,7 @@ def study_of(folder, box, count):
     fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
     said = {"tissue": tissue_to_json(TISSUE), "element": "p1", "preset": "palpation"}
     simulate(folder / "data.h5", fem, draw("palpation", box, count, 0), said)
-    study = Study(folder / "data.h5", folder, "cpu", loads=2, beyond=QUICK[2], timed=30)
+    study = ReportStudy(folder / "data.h5", folder, "cpu", loads=2, beyond=QUICK[2], timed=30)
     solve_reference(study, nothing)
     solve_beyond(study, nothing)
     return study
@@ -39,4 +39,4 @@ def study_of(folder, box, count):
 
 def read_back(row):
     """A row as a report keeps it and reads it again."""
-    return msgspec.convert(json.loads(json.dumps(asdict(row))), Row)
+    return msgspec.convert(json.loads(json.dumps(asdict(row))), ReportRow)

@@ -11,8 +11,8 @@ from visitor import Visitor, free_port, wait_for
 
 from ar.page.browser import Browser
 from ar.page.elements import PICTURE, SAID, SLICES, STYLE, coded, unparted
-from ar.page.guard import LIMITS, Limits
-from ar.page.parts import Body, Choice, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
+from ar.page.guard import LIMITS, ConnectionLimits
+from ar.page.parts import Dropdown, Fold, Note, Playback, SceneSurface, SceneViewpoint, Sign, Slider, Toggle
 from ar.page.recording import RECORDS, STOPS
 from ar.page.style import NOTE, PAGE, STATUS, style
 
@@ -24,17 +24,17 @@ def heard():
     return {"force": [], "deformer": [], "play": [], "frame": []}
 
 
-def open_page(heard: dict[str, list], port: int, host: str = "127.0.0.1", limits: Limits = LIMITS) -> Browser:
+def open_page(heard: dict[str, list], port: int, host: str = "127.0.0.1", limits: ConnectionLimits = LIMITS) -> Browser:
     bodies = [
-        Body("tumour", TRIANGLE, np.array([[0, 1, 2]]), (0.2, 0.9, 0.3)),
-        Body("brain", TRIANGLE, np.array([[0, 1, 2]]), opacity=0.3),
+        SceneSurface("tumour", TRIANGLE, np.array([[0, 1, 2]]), (0.2, 0.9, 0.3)),
+        SceneSurface("brain", TRIANGLE, np.array([[0, 1, 2]]), opacity=0.3),
     ]
     return Browser(
         bodies,
-        Viewpoint(np.array([0.0, -0.3, 0.2]), np.zeros(3), np.array([0.0, 0.0, 1.0])),
+        SceneViewpoint(np.array([0.0, -0.3, 0.2]), np.zeros(3), np.array([0.0, 0.0, 1.0])),
         Playback(100, heard["play"].append, heard["frame"].append),
         [
-            Choice("deformer", ("FEM", "ANN"), "ANN", heard["deformer"].append, key=STYLE),
+            Dropdown("deformer", ("FEM", "ANN"), "ANN", heard["deformer"].append, key=STYLE),
             Slider("force [N]", 0.0, 1.0, 0.01, 0.2, heard["force"].append),
         ],
         host=host,
@@ -249,7 +249,7 @@ def test_slices_and_the_last_seconds_arrive_together_and_not_too_often(page):
 
 
 def test_what_a_visitor_sets_is_heard_while_the_page_sets_the_same(heard):
-    page = open_page(heard, free_port(), limits=Limits(sendings=2000.0))
+    page = open_page(heard, free_port(), limits=ConnectionLimits(sendings=2000.0))
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
     sought = list(range(50, 100)) * 4
@@ -287,7 +287,7 @@ def test_the_page_is_filled_anew(page, heard):
     page.put("force [N]", 0.9)
     hidden: list[bool] = []
     fold = Fold("more", (Toggle("Gravity", True, hidden.append, "gravity and fluid", "off?"),))
-    body = Body("blade", TRIANGLE, np.array([[0, 1, 2]]))
+    body = SceneSurface("blade", TRIANGLE, np.array([[0, 1, 2]]))
     page.fill(
         [body], Playback(30, heard["play"].append, heard["frame"].append), [fold], "sulcus: retract", "<p>seen</p>"
     )

@@ -17,7 +17,7 @@ from scenes.play.player import Player
 from scenes.script.camera_paths import HandHeld
 from scenes.script.scene import find_scene
 from scenes.tracked.filming import USUAL, VIEW, Taking, mounted, registered, shots_of
-from scenes.tracked.follower import Follower, State
+from scenes.tracked.follower import Follower, TumourState
 from scenes.tracked.tool_motion import ToolMotion
 from sim.anatomy import Anatomy
 from surrogate.model.learned import predicted
@@ -295,7 +295,7 @@ def test_a_film_rolls_and_what_is_drawn_into_it_says_how_far_off_that_makes_it(p
         known = follower.step(cv2.cvtColor(shot.colour, cv2.COLOR_RGB2GRAY), shot.time, known)
         all_known.append(known)
     # How the camera moves is not known from one picture.
-    assert all_known[0].state is State.UNSURE and "rolling shutter" in all_known[0].words
+    assert all_known[0].state is TumourState.UNSURE and "rolling shutter" in all_known[0].words
     assert all(each.relied and each.parts["shutter"] > 0.0 for each in all_known[1:])
     at_once = replace(follower, calibration=replace(calibration, readout=0.0))
     alike = at_once.step(cv2.cvtColor(shots[1].colour, cv2.COLOR_RGB2GRAY), shots[1].time)

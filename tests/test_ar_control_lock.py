@@ -1,11 +1,11 @@
 """Who leads a page."""
 
-from ar.page.control_lock import IDLE, Lead
+from ar.page.control_lock import IDLE, ControlLock
 
 
 class TestLead:
     def test_the_lead_passes_to_who_asked_first_and_else_to_who_is_here_longest(self):
-        lead = Lead()
+        lead = ControlLock()
         lead.see({2, 3, 4}, 0.0)
         assert lead.leader == 2 and lead.act(2, 1.0) and not lead.act(3, 1.0)
         for visitor in (4, 3):
@@ -19,7 +19,7 @@ class TestLead:
         assert lead.leader == 4 and not lead.words(4, {4})
 
     def test_who_does_nothing_for_long_hands_over_on_being_asked(self):
-        lead = Lead()
+        lead = ControlLock()
         lead.see({1, 2}, 0.0)
         lead.act(1, 10.0)
         lead.ask(2, 10.0 + IDLE)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_ar_styles import CAMERA, CORTEX, GREEN, seen, tumour
 
-from ar.overlay.cut import EMPTY, Plane, plane_through, profile, section
+from ar.overlay.cut import EMPTY, CutPlane, plane_through, profile, section
 from ar.overlay.hud import WHITE
 from ar.overlay.outlines import ink_of, key_of, of_ink
 from ar.overlay.window import SHUT, Roles
@@ -25,7 +25,7 @@ def test_a_cut_holds_camera_tip_and_middle():
 
 def test_a_cut_shows_the_surface_the_section_and_nothing_in_the_air():
     picture, at = seen(0.0), tumour()
-    plane: Plane = plane_through(CAMERA, at.vertices.mean(axis=0), None)
+    plane: CutPlane = plane_through(CAMERA, at.vertices.mean(axis=0), None)
     roles = Roles((), (CORTEX,)).of(picture.segmentation)
     places, what = profile(CAMERA, plane, picture.depth, roles, 0.04)
     assert np.abs(plane.points(places)[:, 2]).max() < 2e-4  # the sheet lies at z = 0

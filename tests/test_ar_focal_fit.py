@@ -6,7 +6,7 @@ import numpy as np
 from films import FILM
 
 from ar.tracking.focal_fit import focal_fit
-from ar.tracking.targets import Corners, tool_cube
+from ar.tracking.targets import DetectedCorners, tool_cube
 from scenes.tracked.calibration_file import read_calibration
 
 CUBE = tool_cube()
@@ -23,7 +23,7 @@ def corners_of(camera, noise, seed, faces=(0, 1)):
     points = np.concatenate([CUBE.faces[face].corners for face in faces])
     face = np.repeat(faces, [len(CUBE.faces[number].corners) for number in faces])
     pixels = camera.project((points - middle) @ turn.T + [0.0, 0.0, 0.4])[0]
-    return Corners(points, pixels + noise * np.random.default_rng(seed).standard_normal(pixels.shape), face)
+    return DetectedCorners(points, pixels + noise * np.random.default_rng(seed).standard_normal(pixels.shape), face)
 
 
 def test_a_focal_length_is_found_by_the_relief_of_a_target():

@@ -19,7 +19,7 @@ from websockets.sync.client import connect
 from ar.page import guard
 from ar.page.browser import Browser
 from ar.page.messages import MessageError, checked
-from ar.page.parts import Choice, Playback, Slider, Toggle, Viewpoint
+from ar.page.parts import Dropdown, Playback, SceneViewpoint, Slider, Toggle
 
 PROTOCOL = [f"viser-v{viser.__version__}"]
 
@@ -31,17 +31,17 @@ class Page(Browser):
         self.heard = []
         super().__init__(
             [],
-            Viewpoint(np.array([0.0, -0.3, 0.2]), np.zeros(3), np.array([0.0, 0.0, 1.0])),
+            SceneViewpoint(np.array([0.0, -0.3, 0.2]), np.zeros(3), np.array([0.0, 0.0, 1.0])),
             Playback(100, self.heard.append, self.heard.append),
             [
-                Choice("deformer", ("FEM", "ANN"), "ANN", self.heard.append),
+                Dropdown("deformer", ("FEM", "ANN"), "ANN", self.heard.append),
                 Slider("force [N]", 0.0, 0.4, 0.01, 0.2, self.heard.append),
                 Toggle("gravity", True, self.heard.append),
             ],
             host=host,
             port=free_port() if port is None else port,
             size=(64, 48),
-            limits=guard.Limits(**limits),
+            limits=guard.ConnectionLimits(**limits),
             origins=origins,
         )
 
@@ -208,18 +208,20 @@ def far():
 class TestToken:
     def test_a_page_on_this_machine_asks_for_none(self, page):
         assert (
-            page.token is None and guard.Door.of("localhost").token is None and guard.Door.of("127.0.0.2").token is None
+            page.token is None
+            and guard.AccessPolicy.of("localhost").token is None
+            and guard.AccessPolicy.of("127.0.0.2").token is None
         )
 
     def test_a_host_that_others_reach_too_asks_for_one(self, monkeypatch):
         found = [(0, 0, 0, "", (address, 0)) for address in ("127.0.0.1", "192.0.2.1")]
         monkeypatch.setattr(socket, "getaddrinfo", lambda *words: found)
-        assert guard.Door.of("both.example").token is not None
+        assert guard.AccessPolicy.of("both.example").token is not None
 
     def test_the_address_carries_the_token_and_nothing_else_gets_in(self, far):
         token = far.token
         assert len(token) >= 32 and far.address == f"http://localhost:{far.port}/?token={token}"
-        assert guard.Door.of("0.0.0.0").token != token
+        assert guard.AccessPolicy.of("0.0.0.0").token != token
         for path in ("/", "/?token=", f"/?token={token[:-1]}", "/?token=%C3%A9", f"/?other={token}"):
             assert ask(far, path)[0] == 403, path
             assert knock(far, path) == 403, path

@@ -5,19 +5,19 @@ from test_ar_styles import CAMERA, DRAPE, GREEN, OPENING, seen, tumour
 
 from ar.overlay.composite import composite
 from ar.overlay.hud import HEAD
-from ar.overlay.legend import SHEET, Names
+from ar.overlay.legend import SHEET, LegendNames
 from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.outlines import ink_of, of_ink
 
 
 def test_the_legend_names_lines_without_their_ink_and_leaves_the_cortex_in_sight():
     picture, at = seen(0.0), tumour()
-    names = Names("it", "its error", "before")
+    names = LegendNames("it", "its error", "before")
     plain, named = (
         composite(
             picture, CAMERA, at, cover=Cover(opening=OPENING), marks=Marks(0.003, before=at), words=Words(names=each)
         ).colour
-        for each in (Names(), names)
+        for each in (LegendNames(), names)
     )
     changed = (plain != named).any(axis=2)
     assert changed.sum() > 500 and (picture.segmentation[changed] == DRAPE).all()

@@ -11,7 +11,7 @@ from ar.optics.camera import Camera
 from ar.optics.lens import Lens
 from ar.tracking.drawn import drawn
 from ar.tracking.pose import Tracker, Verdict, pose_of
-from ar.tracking.targets import TIP, Corners, Detector, Target, calibration_board, patient_reference, tool_cube
+from ar.tracking.targets import TIP, DetectedCorners, Detector, Target, calibration_board, patient_reference, tool_cube
 
 CUBE, PLATE = tool_cube(), patient_reference()
 K = np.array([[1000.0, 0.0, 410.0], [0.0, 1000.0, 295.0], [0.0, 0.0, 1.0]])
@@ -59,7 +59,7 @@ def angle(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.degrees(Rotation.from_matrix(one[:3, :3] @ other[:3, :3].T).magnitude()))
 
 
-def seen_from_front(T: np.ndarray, noise: float, rng: np.random.Generator, target: Target = PLATE) -> Corners:
+def seen_from_front(T: np.ndarray, noise: float, rng: np.random.Generator, target: Target = PLATE) -> DetectedCorners:
     """All corners of a target's faces that look at the camera, with white noise [pixel]."""
     rows = [
         (face.corners, np.full(len(face.corners), number))
@@ -68,7 +68,7 @@ def seen_from_front(T: np.ndarray, noise: float, rng: np.random.Generator, targe
     ]
     points = np.concatenate([row[0] for row in rows])
     pixels = pixels_of(points, T) + rng.normal(0.0, noise, (len(points), 2))
-    return Corners(points, pixels, np.concatenate([row[1] for row in rows]))
+    return DetectedCorners(points, pixels, np.concatenate([row[1] for row in rows]))
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def test_the_last_pose_tells_two_apart_and_a_far_one_does_not():
 
 def test_what_fits_nothing_is_lost():
     corners = seen_from_front(flat((20.0, 15.0, 5.0), (-0.05, 0.0, 0.3)), 0.1, np.random.default_rng(4))
-    few = Corners(corners.points[:5], corners.pixels[:5], corners.face[:5])
+    few = DetectedCorners(corners.points[:5], corners.pixels[:5], corners.face[:5])
     assert pose_of(CAMERA, PLATE, few) == pose_of(CAMERA, PLATE, None) == (Verdict.LOST, None)
     strewn = replace(corners, pixels=corners.pixels[::-1] + np.random.default_rng(5).normal(0.0, 20.0, (16, 2)))
     assert pose_of(CAMERA, PLATE, strewn) == (Verdict.POOR, None)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ar.tracking.pose_stream import Clock, stream_of
-from scenes.tracked.elsewhere import Elsewhere
+from scenes.tracked.elsewhere import ExternalTracker
 
 
 @pytest.mark.parametrize(("error", "expected"), [(0.0, 0.0), (0.01, 2e-3)])
@@ -14,7 +14,7 @@ def test_tracker_clock_error_is_in_the_covariance(error, expected):
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     still, none = stream_of(times, poses.copy(), np.zeros((len(times), 6, 6))), np.zeros((len(times), 6, 6))
     poses[:, 0, 3] = 0.2 * times
-    found = Elsewhere(stream_of(times, poses, none), still, Clock(0.0, error)).beside(0.5)
+    found = ExternalTracker(stream_of(times, poses, none), still, Clock(0.0, error)).beside(0.5)
     assert found.covariance[0, 0] == pytest.approx(expected**2, abs=1e-12)
     assert np.abs(found.covariance[1:, 1:]).max() < 1e-12
 

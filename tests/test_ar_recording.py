@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ar.page.elements import coded
-from ar.page.recording import LONGEST, RATE, Recording, played
+from ar.page.recording import LONGEST, RATE, PageRecording, played
 
 
 class TestRecording:
@@ -15,7 +15,7 @@ class TestRecording:
         assert [round(float(picture.mean()), -2) for picture in shown] == [0.0] * 10 + [100.0] * 2 + [200.0] * 8
 
     def test_it_is_an_mp4_that_can_be_read_and_of_bounded_length(self, tmp_path):
-        recording = Recording(0.0)
+        recording = PageRecording(0.0)
         for number in range(20):
             recording.take(coded(np.full((48, 64, 3), 10 * number, np.uint8)), 0.1 * number)
         recording.take(coded(np.zeros((48, 64, 3), np.uint8)), LONGEST + 1.0)
@@ -27,4 +27,4 @@ class TestRecording:
 
     def test_of_nothing_there_is_no_film(self):
         with pytest.raises(ValueError, match="at least one image"):
-            Recording(0.0).film(1.0)
+            PageRecording(0.0).film(1.0)

@@ -37,7 +37,7 @@ from sim.loads import Loads, Nodal, Posture, Pushed
 from sim.material import Material
 from surrogate.locating import locator_store
 from surrogate.locating.locator import Locator
-from surrogate.locating.prior import NOWHERE, Prior, middle_of
+from surrogate.locating.prior import NOWHERE, MotionPrior, middle_of
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def locator(body):
     force = random.standard_normal((len(labels), 3))
     shape = np.einsum("nivj,ni->nvj", kelvinlets(nodes, source, 25e-3), force)
     shape *= 1e-3 / np.sqrt((shape**2).sum(axis=2).mean(axis=1))[:, None, None]
-    prior = Prior(body, shape.astype(np.float32), *np.array(labels).T, centre=np.zeros((2, 3)))
+    prior = MotionPrior(body, shape.astype(np.float32), *np.array(labels).T, centre=np.zeros((2, 3)))
     return Locator(prior, np.tile([[0.0, 3.0, -20.0, 0.0, 3.0], [3.0, 6.0, -10.0, 0.0, 3.0]], (20, 1)))
 
 

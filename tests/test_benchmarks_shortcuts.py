@@ -17,7 +17,7 @@ from sim.anatomy import Anatomy
 from sim.effects import pushed_effects
 from sim.fem import Fem
 from sim.material import BRAIN
-from sim.strategy.plan import Step
+from sim.strategy.plan import SolverStep
 from surrogate.data.tool_loads import draw
 
 
@@ -30,7 +30,7 @@ def some(site: Site, **more) -> Work:
     loads = draw("palpation", site.anatomy, 3, 0)
     single = [loads.rows(np.array([row])) for row in range(3)]
     effects = pushed_effects(site.anatomy, BRAIN)
-    return replace(Work("a", "b", Step.LBFGS, single, effects, TRAIN, "p1"), **more)
+    return replace(Work("a", "b", SolverStep.LBFGS, single, effects, TRAIN, "p1"), **more)
 
 
 def test_with_and_without_are_timed_in_turn(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,14 +62,14 @@ def test_frames_follow_and_what_is_warm_is_dropped(site: Site, monkeypatch: pyte
     assert all(len(start.warm) > 0 for start in starts[2::2]) and not any(start.warm for start in starts[3::2])
 
 
-@pytest.mark.parametrize("step", [Step.FRAME, Step.CONTACT, Step.CLAMPED, Step.STRAINED])
-def test_a_shortcut_that_is_not_taken_has_no_row(site: Site, step: Step) -> None:
+@pytest.mark.parametrize("step", [SolverStep.FRAME, SolverStep.CONTACT, SolverStep.CLAMPED, SolverStep.STRAINED])
+def test_a_shortcut_that_is_not_taken_has_no_row(site: Site, step: SolverStep) -> None:
     assert measure(some(site, step=step), site, "cpu") is None
 
 
 def test_every_step_but_newton_is_some_work(site: Site) -> None:
     found = list(works(site, 2, False))
-    assert {work.step for work in found} == {None, *Step} - {Step.NEWTON}
+    assert {work.step for work in found} == {None, *SolverStep} - {SolverStep.NEWTON}
     assert all(len(work.loads) == 3 for work in found)
     assert {len(work.loads[0]) for work in found} == {1, shortcuts.BATCH, shortcuts.POSES}
 

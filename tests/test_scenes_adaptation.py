@@ -5,7 +5,7 @@ import pytest
 from studies import nothing
 
 from scenes.report.adaptation import debulked, debulked_study, simulate_debulked, simulating_seconds
-from scenes.report.learner import Learner
+from scenes.report.learner import LearnerSpec
 from scenes.report.rows import measured
 from surrogate.training.train import train
 
@@ -35,7 +35,7 @@ class TestAdapting:
         simulate_debulked(study, reported.append)
         rows_in_all = len(study.dataset.loads) + len(study.dataset.unit_good)
         assert sum(reported) == 2 * rows_in_all
-        row = measured(study, Learner("linear"), study.folder / "adapted.png")
+        row = measured(study, LearnerSpec("linear"), study.folder / "adapted.png")
         after = debulked_study(study)
         model = train(after.dataset, ["linear"], split=after.discs).models["linear"]
         test = np.flatnonzero(after.discs.test)

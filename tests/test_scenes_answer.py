@@ -7,10 +7,10 @@ import pytest
 from links import NAMES, NOW, corners_of, in_mm, linked, peers, played
 
 from ar.overlay.gauge import Gauge
-from scenes.link.answer import NOT_SEEN, Answer, late
+from scenes.link.answer import NOT_SEEN, PoseResult, late
 from scenes.link.messages import points, transform
-from scenes.tracked.follower import Known, State
-from scenes.tracked.tool_motion import Motion
+from scenes.tracked.follower import TrackingResult, TumourState
+from scenes.tracked.tool_motion import BrainMotion
 
 
 def test_the_tumour_comes_where_it_is_with_the_time_of_its_pose(follower, registration, truth, beside):
@@ -120,12 +120,14 @@ def test_a_tool_that_was_near_and_is_then_too_far_for_any_tracker_is_doubtful(fo
     played(scene())
 
 
-@pytest.mark.parametrize("state", [State.GOOD, State.UNSURE])
+@pytest.mark.parametrize("state", [TumourState.GOOD, TumourState.UNSURE])
 def test_an_answer_with_a_bound_is_stale_when_it_is_old(stage, state):
-    known = Known(0.0, state, "words", NOT_SEEN, Motion(stage.anatomy.mesh.nodes), band=1e-3)
-    assert late(Answer(NOW, known), 0.2, 0.3).known is known
-    old = late(Answer(NOW, known, Gauge(np.zeros(3), np.ones(3))), 0.4, 0.3)
-    assert old.known.state is State.STALE and old.known.band is old.gauge is None and "0.4 s old" in old.known.words
+    known = TrackingResult(0.0, state, "words", NOT_SEEN, BrainMotion(stage.anatomy.mesh.nodes), band=1e-3)
+    assert late(PoseResult(NOW, known), 0.2, 0.3).known is known
+    old = late(PoseResult(NOW, known, Gauge(np.zeros(3), np.ones(3))), 0.4, 0.3)
+    assert (
+        old.known.state is TumourState.STALE and old.known.band is old.gauge is None and "0.4 s old" in old.known.words
+    )
 
 
 def test_a_tool_where_none_can_be_is_doubtful(follower, registration, beside):

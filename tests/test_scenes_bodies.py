@@ -16,7 +16,7 @@ from scenes.episodes.make import body_path, make_body
 from scenes.episodes.plan import load_plan
 from sim.anatomy import PART_LABELS, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
-from surrogate.model.left_out import LIMIT, LeftOut, OffBy
+from surrogate.model.left_out import LIMIT, HeldOutError, LeftOut
 from surrogate.model.store import load, stated_errors
 
 PLAN = """title = "A box"
@@ -89,21 +89,25 @@ def made(tmp_path_factory):
 
 def test_a_model_is_weak_by_what_it_states():
     def left_out(mean, p999=None):
-        return OffBy(1.0, LeftOut(mean, 0.0, p999, 0.0))
+        return HeldOutError(1.0, LeftOut(mean, 0.0, p999, 0.0))
 
-    assert not OffBy(LIMIT, None).weak and OffBy(1.1 * LIMIT, None).weak and OffBy(math.nan, None).weak
+    assert (
+        not HeldOutError(LIMIT, None).weak
+        and HeldOutError(1.1 * LIMIT, None).weak
+        and HeldOutError(math.nan, None).weak
+    )
     assert not left_out(0.01).weak and left_out(0.02).weak and left_out(0.01, 3e-4).weak
-    assert str(OffBy(4e-4, None)) == "maximum error up to 0.4 mm in 95 % of loads (limit 0.2 mm)"
+    assert str(HeldOutError(4e-4, None)) == "maximum error up to 0.4 mm in 95 % of loads (limit 0.2 mm)"
     assert str(left_out(0.042)) == "mean error 4.2 % of the motion (limit 1 %)"
     assert str(left_out(0.042, 3e-4)).endswith("); 99.9th percentile 0.3 mm (limit 0.2 mm)")
 
 
 def test_the_worst_are_named_first_and_not_all_of_many():
-    many = {number: OffBy(1e-5 * number, None) for number in range(35)}
+    many = {number: HeldOutError(1e-5 * number, None) for number in range(35)}
     first, *named = said_of_weak(many)
     assert first.startswith("14 of 35 bodies with a model have a weak one")
     assert named[0] == f"- body 34: {many[34]}" and len(named) == 11 and named[-1] == "- and 4 more"
-    assert said_of_weak({0: OffBy(0.0, None)}) == [] == weak_as_json({0: OffBy(0.0, None)})
+    assert said_of_weak({0: HeldOutError(0.0, None)}) == [] == weak_as_json({0: HeldOutError(0.0, None)})
 
 
 def test_files_say_what_their_models_state(made):
@@ -111,8 +115,8 @@ def test_files_say_what_their_models_state(made):
     path = body_path(folder, 0) / "anatomy.model.npz"
     (model,) = load(path, anatomy).values()
     (body_path(folder, 1)).mkdir()  # of a body that plays by another's model there is none
-    assert stated_errors(path) == {"linear": OffBy(model.bound, model.left_out)} and model.bound > LIMIT
-    assert models_of(folder) == {0: OffBy(model.bound, None)}
+    assert stated_errors(path) == {"linear": HeldOutError(model.bound, model.left_out)} and model.bound > LIMIT
+    assert models_of(folder) == {0: HeldOutError(model.bound, None)}
     body_path(folder, 1).rmdir()
 
 

@@ -11,7 +11,7 @@ from conftest import make_box
 from visitor import Visitor, free_port, wait_for
 
 from scenes.page.demo import Demo
-from scenes.page.referee import Referee
+from scenes.page.referee import FemWorker
 from scenes.play.deformers import AtRest, Theatre
 from scenes.play.player import Player
 from scenes.script.scene import Viewpoint, find_scene
@@ -261,7 +261,7 @@ def test_a_question_that_is_taken_back_is_not_prepared_for(gated, monkeypatch):
     theatre, turn = Theatre(gated.anatomy, None, {}, "cpu"), threading.Lock()
     gated.let(2)
     with turn:
-        referee = Referee(theatre, ordered(), turn)
+        referee = FemWorker(theatre, ordered(), turn)
         referee.ask(0, None)
         time.sleep(0.1)
         referee.drop()

@@ -13,7 +13,7 @@ from ar.overlay.hud import millimetres
 from ar.overlay.marks import Cover, Marks
 from ar.rendering.renderer import Picture
 from scenes.cli import main
-from scenes.play.checks import Figures, measure
+from scenes.play.checks import SceneFigures, measure
 from scenes.play.player import annotate, gauged
 from scenes.play.reference import truth_of
 from scenes.play.stage import OPENING, TOOL
@@ -21,7 +21,7 @@ from scenes.script.scene import SCENES, Bounds, find_scene
 from scenes.script.tool_paths import press
 from sim.deformation import Outcome
 
-GOOD = Figures(
+GOOD = SceneFigures(
     overlap=0.99, error_mm=0.1, motion_mm=1.0, pixels=1e-9, drawn=0.5, printed=True, labelled=True, honest=True,
     finite=True, answered=True, in_step=True, leaked=0.0, bond=0.1, covered=0.95, removed=0.5,
 )  # fmt: skip

@@ -10,7 +10,7 @@ from theatres import put, theatre_of
 from visitor import free_port
 
 from scenes.cli import limit_threads, main
-from scenes.page.cast import Cast
+from scenes.page.cast import SceneSolvers
 from scenes.page.demo import Demo
 from scenes.play.waiting_notice import Busy
 
@@ -31,7 +31,7 @@ def test_help_texts_come_without_warp_and_scipy():
 @pytest.mark.parametrize("name", ["linear", "fem"])
 def test_the_page_opens_while_kernels_are_compiled_and_plays_when_they_are(name, box, tmp_path, monkeypatch):
     """A model's first answer belongs to what is made ready."""
-    done, predicted = [], Cast.predicted
+    done, predicted = [], SceneSolvers.predicted
     opened = threading.Event()
 
     def slow():
@@ -40,7 +40,7 @@ def test_the_page_opens_while_kernels_are_compiled_and_plays_when_they_are(name,
 
     monkeypatch.setattr("ar.overlay.composite.load_kernels", slow)
     monkeypatch.setattr(Busy, "on", lambda busy, what: done.append(what) or opened.set())
-    monkeypatch.setattr(Cast, "predicted", lambda *words: done.append("answered") or predicted(*words))
+    monkeypatch.setattr(SceneSolvers, "predicted", lambda *words: done.append("answered") or predicted(*words))
     monkeypatch.setattr(Demo, "run", lambda page, seconds: done.append("plays"))
     path = put(theatre_of(box), tmp_path / "box.vtu")
     assert main(["demo", "--anatomy", str(path), "--deformer", name, "--port", str(free_port())]) == 0

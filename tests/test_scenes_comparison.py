@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from theatres import short
 
-from scenes.page.comparison import RECENT, Judged, Row, Tally, judge, verdict_words
-from scenes.page.referee import Truth
+from scenes.page.comparison import RECENT, AccuracyTimeTable, Comparison, ComparisonRow, judge, verdict_words
+from scenes.page.referee import FemResult
 from scenes.page.text import table
 from scenes.play.frame_text import doubt_of
 from scenes.play.player import Player
@@ -15,14 +15,14 @@ from sim.accuracy import LIVE
 from sim.deformation import Outcome
 
 
-def shown(tally: Tally, name: str, loads: Iterable[str], milliseconds: float, millimetres: float) -> None:
+def shown(tally: AccuracyTimeTable, name: str, loads: Iterable[str], milliseconds: float, millimetres: float) -> None:
     for load in loads:
         tally.took(name, load, 1e-3 * milliseconds)
         tally.missed(name, load, 1e-3 * millimetres)
 
 
 def test_deformers_are_ranked_over_the_loads_that_all_of_them_had():
-    tally = Tally()
+    tally = AccuracyTimeTable()
     assert tally.rows == [] and table(tally.rows) == ""
     shown(tally, "quick", "abc", 1.0, 0.2)
     shown(tally, "quick", "z", 90.0, 90.0)  # a load that nobody else had does not count against it
@@ -38,7 +38,7 @@ def test_deformers_are_ranked_over_the_loads_that_all_of_them_had():
 
 def test_without_a_common_load_nobody_is_ranked():
     """One on frames without force, the other at full force: the medians are no comparison."""
-    tally = Tally()
+    tally = AccuracyTimeTable()
     shown(tally, "resting", "ab", 1.0, 0.002)
     assert [row.best for row in tally.rows] == [None]
     shown(tally, "pressing", "c", 1.0, 0.2)
@@ -48,22 +48,22 @@ def test_without_a_common_load_nobody_is_ranked():
 
 
 def test_a_load_shown_again_counts_once_and_old_loads_are_forgotten():
-    tally = Tally()
+    tally = AccuracyTimeTable()
     for load in range(RECENT):
         shown(tally, "a", [str(load)], 9.0, 9.0)
     for load in (*range(1000, 1000 + RECENT - 1), 1000, 1000):
         shown(tally, "a", [str(load)], 4.0, 1.0)
-    assert tally.rows == [Row("a", 4.0, 1.0, RECENT, None)]
+    assert tally.rows == [ComparisonRow("a", 4.0, 1.0, RECENT, None)]
 
 
 def test_an_error_too_small_to_print_is_not_reported_as_none():
-    rows = [Row("a", 1.0, 4e-4, 3, None), Row("b", 1.0, 1.234e-3, 3, None)]
+    rows = [ComparisonRow("a", 1.0, 4e-4, 3, None), ComparisonRow("b", 1.0, 1.234e-3, 3, None)]
     assert "error under 0.001 mm" in table(rows) and "error 0.001 mm</td><td>3 loads" in table(rows)
     assert "0.000" not in table(rows)
 
 
 class TestVerdict:
-    JUDGED = Judged(28, 0.35, "", 1e-3, 1e-4, 2e-4)
+    JUDGED = Comparison(28, 0.35, "", 1e-3, 1e-4, 2e-4)
 
     def test_of_the_present_load_it_stands_plainly(self):
         said = verdict_words(self.JUDGED, False, "waits")
@@ -95,7 +95,7 @@ def test_a_verdict_is_the_error_in_millimetres(theatre):
             found = whole.deformer.deform(loads, at=at)
             return replace(found, displacement=found.displacement + [0.0, 0.2e-3, 0.0])
 
-    found = judge(Truth(3, loads, answer, 0.5), replace(whole, deformer=Off()), own=False)
+    found = judge(FemResult(3, loads, answer, 0.5), replace(whole, deformer=Off()), own=False)
     said = verdict_words(found, stale=False, waits="")
     assert "error against FEM: mean 0.200, largest 0.200 mm; tip to tumour " in said
     tip = whole.drawn(3, whole.touch(3), loads, answer, 0.0).distance

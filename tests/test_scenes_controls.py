@@ -2,10 +2,10 @@
 
 from theatres import short, sinking, small
 
-from ar.page.parts import Choice, Fold, Slider
+from ar.page.parts import Dropdown, Fold, Slider
 from scenes.page.beside import TIP
 from scenes.page.controls import clocked, controls
-from scenes.page.requests import Wish
+from scenes.page.requests import Requests
 from scenes.script.scene import find_scene
 from scenes.script.tool_paths import Touch
 
@@ -14,7 +14,7 @@ class TestControls:
     def test_the_sliders_end_where_the_bone_stops_the_tool(self, theatre):
         scene, site = short(), theatre.site
         assert scene.tool is not None
-        found = controls(scene, site, ("svr", "fem"), Wish("svr", Touch()), print, print)
+        found = controls(scene, site, ("svr", "fem"), Requests("svr", Touch()), print, print)
         places = [control for control in found if isinstance(control, Slider) and control.label.startswith("place")]
         room = site.clearance - scene.tool.radius
         assert len(places) == 2 and all(0.5 <= control.high <= max(0.5, 1e3 * room) for control in places)
@@ -23,20 +23,21 @@ class TestControls:
 
     def test_no_code_name_is_shown(self, theatre):
         for name in ("press", "palpate", "retract", "brain_shift", "pulsation"):
-            found = controls(small(name), theatre.site, ("fem",), Wish("fem", Touch()), print, print)
+            found = controls(small(name), theatre.site, ("fem",), Requests("fem", Touch()), print, print)
             switches = [inner for control in found if isinstance(control, Fold) for inner in control.controls]
             assert switches and all(inner.words and inner.words != inner.label for inner in switches)
 
     def test_the_overlay_comes_before_the_tool_s_sliders(self, theatre):
         labels = [
-            control.label for control in controls(short(), theatre.site, ("fem",), Wish("fem", Touch()), print, print)
+            control.label
+            for control in controls(short(), theatre.site, ("fem",), Requests("fem", Touch()), print, print)
         ]
         assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-4] == "slices"
 
     def test_every_overlay_style_is_offered(self, theatre):
-        wish = Wish("fem", Touch())
+        wish = Requests("fem", Touch())
         found = controls(short(), theatre.site, ("fem",), wish, print, print)
-        overlay = next(control for control in found if isinstance(control, Choice) and control.label == "overlay")
+        overlay = next(control for control in found if isinstance(control, Dropdown) and control.label == "overlay")
         seen = []
         for option in overlay.options:
             overlay.changed(option)
@@ -44,10 +45,10 @@ class TestControls:
         assert seen[:3] == ["window", "contour", "fill"] and overlay.start == overlay.options[0]
 
     def test_each_way_of_the_camera_and_each_place_of_the_slices_is_offered(self, theatre):
-        wish = Wish("fem", Touch())
+        wish = Requests("fem", Touch())
         found = {control.label: control for control in controls(short(), theatre.site, ("fem",), wish, print, print)}
         camera, slices = found["camera"], found["slices"]
-        assert isinstance(camera, Choice) and isinstance(slices, Choice)
+        assert isinstance(camera, Dropdown) and isinstance(slices, Dropdown)
         seen = []
         for option in camera.options:
             camera.changed(option)
@@ -64,14 +65,14 @@ class TestControls:
 
 class TestHand:
     def test_a_still_hand_pauses_the_script_and_play_takes_the_tool_back(self):
-        wish = Wish("svr", Touch())
+        wish = Requests("svr", Touch())
         wish.hand(force=0.2)
         assert not wish.plays and wish.now()[2] == Touch(force=0.2)
         wish.play(True)
         assert wish.plays and wish.now()[2] is None
 
     def test_where_time_goes_on_the_hand_keeps_the_tool(self):
-        wish = Wish("fem", Touch(), clocked=True)
+        wish = Requests("fem", Touch(), clocked=True)
         wish.hand(depth=1e-3)
         wish.play(True)
         assert wish.plays and wish.now()[2] == Touch(depth=1e-3)

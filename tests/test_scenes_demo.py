@@ -10,7 +10,7 @@ from visitor import Visitor, report, run_until, wait_for
 from ar.overlay.hud import FINE
 from ar.overlay.outlines import stands
 from ar.page.browser import Browser
-from scenes.page.comparison import Moment
+from scenes.page.comparison import PageState
 from scenes.page.controls import PLAN
 from scenes.page.demo import Demo
 from scenes.page.requests import HAND, SCRIPT
@@ -199,7 +199,7 @@ def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
         asked.append(loads)
         return answer(model, loads, start, at)
 
-    moment = Moment()
+    moment = PageState()
     demo.answer(moment)
     before = moment.picture
     monkeypatch.setattr(Learned, "deform", counted)

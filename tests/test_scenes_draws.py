@@ -8,9 +8,9 @@ from typing import Annotated, get_args, get_origin, get_type_hints
 import msgspec
 import pytest
 
-from scenes.episodes.draws import Limits, Spread
-from scenes.episodes.families import Motions
-from scenes.episodes.plan import Contents, plan_from
+from scenes.episodes.draws import Distribution, ValueLimits
+from scenes.episodes.families import FamilyMotions
+from scenes.episodes.plan import PlanContents, plan_from
 from sim.errors import InputError
 
 PAGE = Path(__file__).parents[1] / "docs/reference/plan_keys.md"
@@ -21,13 +21,13 @@ class Key:
     """A key by its full name; its limits, or the words that are known, and its default."""
 
     name: str
-    about: Limits | tuple[str, ...] | None
+    about: ValueLimits | tuple[str, ...] | None
     default: object
 
     @property
     def cells(self) -> tuple[str, str, str, str]:
         """Its row, without what it means."""
-        if not isinstance(self.about, Limits):
+        if not isinstance(self.about, ValueLimits):
             return f"`{self.name}`", "", ", ".join(self.about or ()), self.said
         unit = "" if self.about.unit == "1" else self.about.unit
         return f"`{self.name}`", unit, f"{self.about.low:,g} to {self.about.high:,g}", self.said
@@ -57,7 +57,7 @@ def keys_of(table: type[msgspec.Struct], above: str = "") -> Iterator[Key]:
     for field in msgspec.structs.fields(table):
         kind = hints[field.name]
         tables = [one for one in (kind, *get_args(kind)) if isinstance(one, type) and issubclass(one, msgspec.Struct)]
-        if tables and tables != [Spread]:
+        if tables and tables != [Distribution]:
             yield from keys_of(tables[0], f"{above}{field.name}.")
             continue
         made = field.default is msgspec.NODEFAULT and field.default_factory is not msgspec.NODEFAULT
@@ -65,14 +65,14 @@ def keys_of(table: type[msgspec.Struct], above: str = "") -> Iterator[Key]:
         yield Key(above + field.name, about, field.default_factory() if made else field.default)
 
 
-KEYS = list(keys_of(Contents))
-LIMITED = [key for key in KEYS if isinstance(key.about, Limits)]
+KEYS = list(keys_of(PlanContents))
+LIMITED = [key for key in KEYS if isinstance(key.about, ValueLimits)]
 
 
 def test_the_page_has_every_key_as_the_code_has_it():
     """To mend the page, copy what this prints of the row that differs."""
     assert len(KEYS) > 70 and {key.name.split(".")[1] for key in KEYS if "motion." in key.name} == set(
-        Motions.__struct_fields__
+        FamilyMotions.__struct_fields__
     )
     rows = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
     found = [tuple(cell.strip() for cell in row.strip("|").split("|")) for row in rows]

@@ -26,8 +26,8 @@ from scenes.tracked.calibration_file import (
     read_intrinsic_covariance,
     write_exactly_known,
 )
-from scenes.tracked.elsewhere import Elsewhere, Eye
-from scenes.tracked.follower import Follower, State
+from scenes.tracked.elsewhere import CameraMount, ExternalTracker
+from scenes.tracked.follower import Follower, TumourState
 from scenes.tracked.picture import head_lines
 from scenes.tracked.plausible import buried
 from scenes.tracked.pose_file import TrackedRow, read_stream, write_poses
@@ -98,7 +98,9 @@ def test_gaps_have_no_pose_and_the_last_one_goes_on_for_a_moment_only():
     assert stream.at(1.3) is not None and stream.at(1.31) is not None
     assert stream.at(1.3 - 5e-5) is not None and stream.at(1.29) is None  # files round times
     assert stream.age(1.2) == pytest.approx(1.2 - last) and LONGEST < 0.3
-    assert Elsewhere(stream, sampled(swung, times[:10])).age(2.5) == pytest.approx(2.5 - times[9])  # of the older one
+    assert ExternalTracker(stream, sampled(swung, times[:10])).age(2.5) == pytest.approx(
+        2.5 - times[9]
+    )  # of the older one
     with pytest.raises(ValueError, match="pose 3 is not later"):
         stream_of(np.array([0.0, 2.0, 1.0]), np.tile(np.eye(4), (3, 1, 1)), np.tile(NONE, (3, 1, 1)))
 
@@ -180,12 +182,12 @@ def test_a_tool_in_a_film_is_where_another_tracker_has_it(follower, stage, bodie
     rng, late = np.random.default_rng(0), 0.06
     times = np.arange(-0.5, 3.5, 1.0 / 30.0)
     streams = [sampled(bodies[name], times, rng, DAY - 1.0 + late) for name in ("tool", "patient")]
-    right = Elsewhere(*streams, Clock(DAY - 1.0 + late, 2e-3))
+    right = ExternalTracker(*streams, Clock(DAY - 1.0 + late, 2e-3))
     wrong = replace(right, clock=Clock(DAY - 1.0))
     (off, spread), (late_off, _) = tips(follower, right, truth), tips(follower, wrong, truth)
     assert len(off) == len(truth.times) and off.max() < 6e-4 and (off < 3.0 * spread).all()
     assert late_off.max() > 5e-4 and late_off.max() > 2.0 * off.max()
-    eye = Eye(np.linalg.inv(truth.T_camera_scan[0] @ np.linalg.inv(bodies["head"](0.0))), 1e-2 * NOISE)
+    eye = CameraMount(np.linalg.inv(truth.T_camera_scan[0] @ np.linalg.inv(bodies["head"](0.0))), 1e-2 * NOISE)
     looked = replace(right, eye=eye).reference(0.0)
     true = truth.T_camera_scan[0] @ np.linalg.inv(follower.registration.T_patient_scan)
     step = twist(looked.T_camera_target, true)
@@ -196,7 +198,7 @@ def test_a_tool_in_a_film_is_where_another_tracker_has_it(follower, stage, bodie
 
 def test_a_picture_without_poses_is_stale(follower, bodies):
     times = np.arange(0.0, 0.45, 0.025)
-    other = Elsewhere(*(sampled(bodies[name], times) for name in ("tool", "patient")))
+    other = ExternalTracker(*(sampled(bodies[name], times) for name in ("tool", "patient")))
     one, known, said = replace(follower, elsewhere=other), None, []
     one = replace(one, motion=replace(one.motion, deformer=Still()))
     for each in timed(film_of(FILM / "film.mp4", 30.0)):
@@ -204,9 +206,9 @@ def test_a_picture_without_poses_is_stale(follower, bodies):
             break
         known = one.step(each.picture.grey, each.picture.time, known)
         said.append((known.state, known.words))
-    assert [state for state, _ in said[:4]] == [State.REST] * 4
-    assert said[5] == (State.NO_TOOL, "tool stale, no pose for 0.2 s: the tumour as 0.3 s ago")
-    assert said[4][0] is State.NO_REFERENCE  # the film is over-exposed there
+    assert [state for state, _ in said[:4]] == [TumourState.REST] * 4
+    assert said[5] == (TumourState.NO_TOOL, "tool stale, no pose for 0.2 s: the tumour as 0.3 s ago")
+    assert said[4][0] is TumourState.NO_REFERENCE  # the film is over-exposed there
 
 
 def followed(follower, other, until=1.0):
@@ -218,18 +220,18 @@ def followed(follower, other, until=1.0):
             break
         known = one.step(each.picture.grey, each.picture.time, known)
         out.append(known)
-    return [known for known in out if known.state is not State.NO_REFERENCE]
+    return [known for known in out if known.state is not TumourState.NO_REFERENCE]
 
 
 def test_poses_are_held_against_the_targets_that_pictures_show(follower, bodies, stage):
     times = np.arange(-0.5, 3.5, 0.025)
     tool, patient = (sampled(bodies[name], times) for name in ("tool", "patient"))
-    right = Elsewhere(tool, patient)
+    right = ExternalTracker(tool, patient)
     known = followed(follower, right)
-    assert {each.state for each in known} <= {State.GOOD, State.REST} and len(known) > 5
+    assert {each.state for each in known} <= {TumourState.GOOD, TumourState.REST} and len(known) > 5
     np.testing.assert_allclose(known[-1].agreement.places["tool"], 0.0, atol=1.5e-3)
     for each in followed(follower, right.swapped):
-        assert each.state is State.UNSURE and each.band is None
+        assert each.state is TumourState.UNSURE and each.band is None
         assert "mm from its poses: are the two files of --poses swapped?" in each.words
     aside = moved_about(
         np.eye(4), np.zeros(3), np.array([0.05, 0.0, -0.03, 0.4, 0.0, 0.0])
@@ -248,7 +250,7 @@ def test_poses_are_held_against_the_targets_that_pictures_show(follower, bodies,
     assert "is seen 400 mm from its poses" in followed(follower, far, 0.2)[-1].words
     quick = replace(right, tool=sampled(lambda time: bodies["tool"](0.8 + 8.0 * (time - 0.8)), times))
     assert "moves by" in followed(follower, quick)[-1].words
-    eye = Eye(np.linalg.inv(truth_of_camera(stage) @ np.linalg.inv(bodies["head"](0.0))), NOISE)
+    eye = CameraMount(np.linalg.inv(truth_of_camera(stage) @ np.linalg.inv(bodies["head"](0.0))), NOISE)
     looked = replace(right, eye=eye)
     agreed = looked.agreed(0.0, known[0].tracked.poses, Agreement())
     assert not agreed.doubt and set(agreed.places) == {"patient", "tool"}
@@ -264,13 +266,16 @@ def test_poses_of_another_clock_say_by_how_much_it_differs(follower, bodies):
     tool, patient = (
         sampled(bodies[name], times, offset=offset) for name, offset in (("tool", 0.0), ("patient", 100.0))
     )
-    last = followed(follower, Elsewhere(tool, patient), 0.2)[-1]
-    assert last.state is State.NO_TOOL
+    last = followed(follower, ExternalTracker(tool, patient), 0.2)[-1]
+    assert last.state is TumourState.NO_TOOL
     assert last.words.startswith("tool not known, the patient's poses begin 99.4 s after this image (see --clock)")
-    late = followed(follower, Elsewhere(tool, replace(patient, times=times - 100.0)), 0.2)[-1]
+    late = followed(follower, ExternalTracker(tool, replace(patient, times=times - 100.0)), 0.2)[-1]
     assert "the patient's poses end 96." in late.words
     assert (
-        followed(follower, Elsewhere(tool, patient, Clock(100.0)), 0.2)[-1].words.count("the tool's poses end 96.") == 1
+        followed(follower, ExternalTracker(tool, patient, Clock(100.0)), 0.2)[-1].words.count(
+            "the tool's poses end 96."
+        )
+        == 1
     )
 
 
@@ -321,7 +326,7 @@ def test_the_command_takes_poses_and_finds_their_clock(bodies, tmp_path, capsys)
     out, err = capsys.readouterr()
     said = json.loads(out)
     assert said["tool_seen_percent"] == said["reference_seen_percent"] > 70.0
-    assert said["states"][State.UNKNOWN.value] == 11
+    assert said["states"][TumourState.UNKNOWN.value] == 11
     offset, error = (float(part.split()[0]) for part in (err.split("clock is ")[1], err.split("+- ")[1]))
     assert abs(offset - (DAY - 1.0)) < 5.0 * error < 0.05
     for more, why in (

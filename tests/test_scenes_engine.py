@@ -14,7 +14,7 @@ import pytest
 from distributed import Client, Scheduler, Security, SpecCluster
 from tiny_work import Trouble, body_path, held, played, tiny_run, tried
 
-from scenes.episodes.engine import Tally, still_missing
+from scenes.episodes.engine import RunStatistics, still_missing
 from scenes.episodes.run_folder import (
     Failure,
     begin,
@@ -42,7 +42,7 @@ def workers():
 @pytest.fixture(scope="module")
 def undisturbed(workers, tmp_path_factory):
     folder = tmp_path_factory.mktemp("undisturbed")
-    assert played(folder, workers, 12) == Tally(made=12, frames=36, bytes=sum(map(len, held(folder).values())))
+    assert played(folder, workers, 12) == RunStatistics(made=12, frames=36, bytes=sum(map(len, held(folder).values())))
     return held(folder)
 
 
@@ -52,7 +52,7 @@ def test_what_is_there_is_skipped_and_any_order_gives_the_same_bytes(workers, un
     assert played(tmp_path, workers, 12).made == 9  # in a random order
     assert held(tmp_path) == undisturbed
     before = len(tried(tmp_path))
-    assert played(tmp_path, workers, 12) == Tally(skipped=12) and len(tried(tmp_path)) == before
+    assert played(tmp_path, workers, 12) == RunStatistics(skipped=12) and len(tried(tmp_path)) == before
     assert (tmp_path / "plan.toml").read_text() == PLAN and read_run(tmp_path) == tiny_run()
 
 
@@ -209,10 +209,10 @@ def test_what_is_missing_is_known_by_name_alone(tmp_path):
     for number in (1, 3, 1234567):
         (tmp_path / f"episode_{number:06d}.h5").touch()
     (tmp_path / ".sulcus-0-0-episode_000002.h5").touch()
-    assert still_missing(tmp_path, finished(tmp_path), range(5), True) == (Tally(skipped=2), [0, 2, 4])
+    assert still_missing(tmp_path, finished(tmp_path), range(5), True) == (RunStatistics(skipped=2), [0, 2, 4])
     assert still_missing(tmp_path, finished(tmp_path), range(1234567, 1234568), True)[1] == []
     there, shuffled = still_missing(tmp_path, finished(tmp_path), range(100, 200), False)
-    assert sorted(shuffled) == list(range(100, 200)) != shuffled and there == Tally()
+    assert sorted(shuffled) == list(range(100, 200)) != shuffled and there == RunStatistics()
     assert not body_path(tmp_path, 0).exists()
 
 

@@ -12,14 +12,14 @@ from theatres import template_theatre
 
 from ar.tracking.pose_stream import stream_of
 from ar.tracking.rigid import moved_about
-from scenes.link.answer import Answering
-from scenes.link.heard import Heard, Names
+from scenes.link.answer import PoseResponder
+from scenes.link.heard import ReceivedTransforms, TransformNames
 from scenes.script.scene import find_scene
-from scenes.tracked.elsewhere import Elsewhere, Eye
-from scenes.tracked.follower import State
+from scenes.tracked.elsewhere import CameraMount, ExternalTracker
+from scenes.tracked.follower import TumourState
 from scenes.tracked.run import Shown, write_rows
-from scenes.tracked.tool_motion import UNBOUND, Motion, ToolMotion
-from scenes.tracked.truth import Off
+from scenes.tracked.tool_motion import UNBOUND, BrainMotion, ToolMotion
+from scenes.tracked.truth import OverlayError
 from sim.loads import Touching
 from surrogate.model.learned import predicted
 
@@ -40,11 +40,11 @@ def six(shift):
 @pytest.mark.parametrize("shift", [1e-6 * np.eye(3), np.diag([1e-6, 0.0, 0.0])])
 def test_link_bound_of_registration_is_2_80_sigma(shift):
     """The ball that holds 95 % of an isotropic error of 1 mm along each axis."""
-    follower, names = follower_of(template_theatre().stage(find_scene("palpate"))), Names()
+    follower, names = follower_of(template_theatre().stage(find_scene("palpate"))), TransformNames()
     given = replace(follower.registration, covariance=six(shift))
     pose = truth_of(follower.motion.stage).T_scan_tool[10] @ np.linalg.inv(follower.tool.T_cube_tool)
-    heard = Heard(names, 1.0).hearing(names.tool, in_mm(given.T_patient_scan @ pose), 1, 0.0, 0)
-    found = Answering(follower.motion, follower.tool, 5e-4, given).answer(heard, 0.0, 0.0)
+    heard = ReceivedTransforms(names, 1.0).hearing(names.tool, in_mm(given.T_patient_scan @ pose), 1, 0.0, 0)
+    found = PoseResponder(follower.motion, follower.tool, 5e-4, given).answer(heard, 0.0, 0.0)
     assert found.known.parts["registration"] == pytest.approx(2.7955e-3, rel=1e-4)
     assert found.known.band == pytest.approx(np.hypot(2.7955e-3, found.known.motion.error), rel=1e-4)
 
@@ -54,7 +54,8 @@ def test_hand_eye_error_is_that_of_a_camera_moved_by_it():
     times, step = np.zeros(1), 1e-4 * np.array([1.0, -2.0, 3.0, 5.0, -3.0, 2.0])
     T, far = turned("zx", [30.0, 50.0]) @ shifted(0.3), stream_of(times, shifted(0.5, 0.8)[None], np.zeros((1, 6, 6)))
     right, other = (
-        Elsewhere(far, far, eye=Eye(each, np.outer(step, step))) for each in (T, moved_about(T, np.zeros(3), step))
+        ExternalTracker(far, far, eye=CameraMount(each, np.outer(step, step)))
+        for each in (T, moved_about(T, np.zeros(3), step))
     )
     found, there = right.reference(0.0), other.reference(0.0).T_camera_target
     turn = Rotation.from_matrix(there[:3, :3] @ found.T_camera_target[:3, :3].T).as_rotvec()
@@ -107,14 +108,14 @@ def test_rows_of_an_overlay_are_in_millimetres(tmp_path):
     parts = {name: 1e-3 * (number + 7) for number, name in enumerate(names)}
     known = SimpleNamespace(
         camera=0,
-        motion=Motion(np.zeros(0), True, 4e-3, 3e-3, 4e-3),
+        motion=BrainMotion(np.zeros(0), True, 4e-3, 3e-3, 4e-3),
         band=6e-3,
         parts=parts,
         time=1.0,
-        state=State.GOOD,
+        state=TumourState.GOOD,
         words="",
     )
     shown = Shown(known, np.zeros(0), 0.013, 1e-3 * np.arange(1, 4), 0.014)
-    write_rows(tmp_path / "rows.csv", [shown], [Off(15.0, 16.0, 17e-3, 18e-3, True)])
+    write_rows(tmp_path / "rows.csv", [shown], [OverlayError(15.0, 16.0, 17e-3, 18e-3, True)])
     cells = (tmp_path / "rows.csv").read_text().splitlines()[1].split(",")
     assert [float(cell) for cell in cells[2:16] + cells[17:21]] == pytest.approx([*range(1, 19)])

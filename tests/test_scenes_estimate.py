@@ -5,7 +5,7 @@ import pytest
 
 from scenes.episodes.estimate import estimated, lines
 from scenes.episodes.rates import Rate, read_rates, written_rates
-from scenes.episodes.tasks import Outcome
+from scenes.episodes.tasks import TaskOutcome
 from sim.errors import InputError
 
 
@@ -13,11 +13,11 @@ def test_a_run_is_planned_from_what_was_measured(tmp_path):
     (tmp_path / "rates").mkdir()
     with written_rates(tmp_path) as note:
         for number, (seconds, first) in enumerate(((30.0, "process"), (10.0, "no"), (40.0, "process"), (14.0, "no"))):
-            note("episode", Outcome(number, 100, 5000, seconds, first=first))
-        note("body", Outcome(0, 0, 2000, 60.0, first="process"))
-        note("episode", Outcome(9, failed="no"))
-        note("episode", Outcome(8, skipped=True))
-        note("body", Outcome(7, 0, 2000, 9.0, resumed=True))
+            note("episode", TaskOutcome(number, 100, 5000, seconds, first=first))
+        note("body", TaskOutcome(0, 0, 2000, 60.0, first="process"))
+        note("episode", TaskOutcome(9, failed="no"))
+        note("episode", TaskOutcome(8, skipped=True))
+        note("body", TaskOutcome(7, 0, 2000, 9.0, resumed=True))
     with next((tmp_path / "rates").glob("*.csv")).open("a") as file:
         file.write("episode,7,100,50")  # torn by a kill
     rates = read_rates(tmp_path)

@@ -1,6 +1,6 @@
 """Families of episodes in the plans that ship."""
 
-from scenes.episodes.families import FAMILIES, Motions
+from scenes.episodes.families import FAMILIES, FamilyMotions
 from scenes.episodes.plan import load_plan, shipped
 from scenes.episodes.scripted import drawn_episode
 
@@ -13,4 +13,4 @@ def test_the_plans_that_ship_can_be_drawn_from():
         drawn = [drawn_episode(plan.contents, 0, number) for number in range(60)]
         assert {each.body for each in drawn} == set(range(plan.contents.bodies.count))
         families |= {each.family for each in drawn}
-    assert families == set(FAMILIES) == set(Motions.__struct_fields__)
+    assert families == set(FAMILIES) == set(FamilyMotions.__struct_fields__)

@@ -11,7 +11,7 @@ from scenes.gym.fem_answers import CutElements
 from scenes.gym.scripted import scripted
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK
-from scenes.gym.touched import Asked
+from scenes.gym.touched import TissueRequest
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome
 
@@ -30,7 +30,7 @@ def test_cut_elements_are_reliable_where_both_levels_are(box, tmp_path):
     pose = DEBULK.tool.pose(setting.site.origin, setting.site.axis, setting.site.right)
     for fluid, good in ((1.0, True), (0.95, False)):
         answers = CutElements(setting.site, fem, setting.answers.ball)
-        assert answers.answer([Asked(pose, fluid=fluid, done=1)])[0].good == good
+        assert answers.answer([TissueRequest(pose, fluid=fluid, done=1)])[0].good == good
         solved.clear()
 
 

@@ -11,10 +11,10 @@ from test_scenes_error_parts import shifted, six, turned
 from test_scenes_overlay import pictures
 from theatres import template_theatre
 
-from ar.tracking.pose import Pose, Tracked
+from ar.tracking.pose import Pose, TrackedTargets
 from ar.tracking.registration import Registration
 from scenes.script.scene import find_scene
-from scenes.tracked.follower import HELD, PATIENT, State, tip_covariance
+from scenes.tracked.follower import HELD, PATIENT, TumourState, tip_covariance
 from scenes.tracked.picture import Painter
 from scenes.tracked.run import aged
 from scenes.tracked.tracked_tool import TrackedTool
@@ -23,20 +23,20 @@ from sim.tools import Ball
 
 def test_a_registration_that_is_not_sure_is_in_the_band_and_beyond_a_limit_not_to_be_relied_on(follower):
     first = next(iter(pictures())).picture
-    for shift, state in ((1e-3, State.REST), (3e-3, State.UNSURE)):
+    for shift, state in ((1e-3, TumourState.REST), (3e-3, TumourState.UNSURE)):
         covariance = np.diag(np.repeat([shift**2, 0.0], 3))
         other = replace(follower, registration=replace(follower.registration, covariance=covariance))
         known = other.step(first.grey, 0.0)
         assert known.state is state and known.parts["registration"] == pytest.approx(2.448 * shift, rel=1e-3)
         assert known.band == pytest.approx(2.448 * shift, rel=0.02)
-        assert ("do not rely" in known.words) is (state is State.UNSURE)
+        assert ("do not rely" in known.words) is (state is TumourState.UNSURE)
 
 
 def test_a_registration_that_does_not_say_whose_it_is_is_not_relied_on(follower):
     first = next(iter(pictures())).picture
     other = replace(follower, registration=replace(follower.registration, scanned=None))
     known = other.step(first.grey, 0.0)
-    assert known.state is State.UNSURE and "not checked whose registration" in known.words
+    assert known.state is TumourState.UNSURE and "not checked whose registration" in known.words
     assert known.band == follower.step(first.grey, 0.0).band
 
 
@@ -44,16 +44,16 @@ def test_a_camera_that_repeats_a_picture_or_stops_is_stale(follower):
     few = [each.picture for each in islice(pictures(), 2)]
     known = follower.step(few[0].grey, 0.0)
     assert follower.step(few[0].grey, 0.0, known).words.startswith("stale, the camera repeats an image")
-    assert follower.step(few[1].grey, 0.5, replace(known, interval=0.1)).state is State.STALE
-    assert follower.step(few[1].grey, 0.1, known).state is State.REST
+    assert follower.step(few[1].grey, 0.5, replace(known, interval=0.1)).state is TumourState.STALE
+    assert follower.step(few[1].grey, 0.1, known).state is TumourState.REST
     old = aged(known, 0.5)
-    assert old.state is State.STALE and "0.5 s old" in old.words and aged(known, 0.1) is known
+    assert old.state is TumourState.STALE and "0.5 s old" in old.words and aged(known, 0.1) is known
 
 
 def test_a_reference_that_was_never_seen_has_no_overlay(follower, stage):
     blank = np.full((720, 960, 3), 120, np.uint8)
     known = follower.step(blank[..., 0], 0.0)
-    assert known.state is State.NO_REFERENCE and known.camera is None and "not seen yet" in known.words
+    assert known.state is TumourState.NO_REFERENCE and known.camera is None and "not seen yet" in known.words
     painted = Painter(stage).paint(blank, known).colour
     foot = painted[600:]
     assert np.array_equal(painted[:600], blank[:600]) and not np.array_equal(foot, blank[600:])
@@ -71,8 +71,8 @@ def test_a_slow_film_is_stale_where_its_own_pictures_are_missing(follower):
     for moment in (0.0, 0.3, 0.6, 0.9, 1.8, 2.1):
         known = follower.step(first, moment, known)
         states.append(known.state)
-    assert [each is State.STALE for each in states] == [False, False, False, False, True, False]
-    assert follower.step(blank, 2.4, known).state is State.NO_REFERENCE
+    assert [each is TumourState.STALE for each in states] == [False, False, False, False, True, False]
+    assert follower.step(blank, 2.4, known).state is TumourState.NO_REFERENCE
     assert follower.step(first, 1.5).interval == follower.step(first, 4.0, follower.step(first, 1.5)).interval == 1.0
 
 
@@ -98,7 +98,7 @@ def looking(motion, **given):
     """Return what is known of pictures every 40 ms: `motion` moves the reference before the camera, from the first."""
     follower = replace(follower_of(template_theatre().stage(find_scene("palpate"))), tool=None, **given)
     first = truth_of(follower.motion.stage).T_camera_scan[0] @ np.linalg.inv(follower.registration.T_patient_scan)
-    seen = [Tracked(0, {}, {PATIENT: Pose(T @ first, np.zeros((6, 6)), 0.0, 4)}, {}) for T in motion]
+    seen = [TrackedTargets(0, {}, {PATIENT: Pose(T @ first, np.zeros((6, 6)), 0.0, 4)}, {}) for T in motion]
     vars(follower)["tracker"] = SimpleNamespace(track=lambda grey, before: seen[int(grey[0, 0])])
     known = [None]
     for number in range(len(motion)):

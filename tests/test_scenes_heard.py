@@ -5,7 +5,7 @@ import pytest
 from test_scenes_messages import STAMP, matrix
 
 from scenes.link.frame import BadMessageError
-from scenes.link.heard import Heard, Names, rigid
+from scenes.link.heard import ReceivedTransforms, TransformNames, rigid
 
 
 def changed(row, column, value):
@@ -36,8 +36,8 @@ def test_a_rigid_matrix_of_single_precision_is_taken_in_metres():
 
 
 def test_bodies_in_the_trackers_frame_are_brought_to_the_reference():
-    names = Names(tool="StylusTipToTracker")
-    heard = Heard(names, 0.3).hearing(names.tool, matrix(), STAMP, 1.0, 0)
+    names = TransformNames(tool="StylusTipToTracker")
+    heard = ReceivedTransforms(names, 0.3).hearing(names.tool, matrix(), STAMP, 1.0, 0)
     assert heard.beside(names.tool, 1.0) == "no ReferenceToTracker yet"
     heard = heard.hearing(names.reference, matrix((0.0, 0.0, 100.0)), STAMP, 0.9, 0)
     found = heard.beside(names.tool, 1.0)

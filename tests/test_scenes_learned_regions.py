@@ -13,7 +13,7 @@ from scenes.analysis.uncertainty import changed, tissue_of
 from scenes.builtin.retract import RELAXING
 from scenes.options.tissue_options import add_element_argument, add_tissue_arguments, dressed
 from scenes.play.deformers import open_theatre
-from scenes.script.priors import Draw
+from scenes.script.priors import PatientSample
 from scenes.script.scene import find_scene
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.effects import Elasticity
@@ -89,7 +89,7 @@ class TestScenes:
     def test_draw_bodies_that_are_as_many_times_as_stiff(self):
         scene = small().with_regions({NECROSIS_LABEL: SOFT})
         assert tissue_of(scene) == BRAIN
-        draw = Draw(stiffness=2.0, poisson=0.45, ratio=3.0, skull=0.5, tip=(0.0, 0.0, 0.0), mesh=0.0)
+        draw = PatientSample(stiffness=2.0, poisson=0.45, ratio=3.0, skull=0.5, tip=(0.0, 0.0, 0.0), mesh=0.0)
         found = changed(scene, draw).elasticity
         assert found.of(TUMOUR_LABEL) == replace(BRAIN, young=6.0 * BRAIN.young, poisson=0.45)
         assert found.of(NECROSIS_LABEL) == replace(BRAIN, young=1000.0, poisson=0.45)

@@ -8,7 +8,7 @@ from conftest import make_box
 from poison import poisoned
 from studies import study_of
 
-from scenes.report.learner import Learner, measure_learner
+from scenes.report.learner import LearnerSpec, measure_learner
 from sim.runtime.threads import one_thread
 from surrogate.training.expansion import Expansion
 
@@ -31,7 +31,7 @@ def test_no_answer_to_a_load_of_the_discs_reaches_a_row(study, tmp_path, name, m
         kept = tmp_path / folder / "series.npz"
         vars(here)["expansion"] = Expansion(here.dataset, "cpu", kept=kept)
         with one_thread():
-            found.append(measure_learner(here, Learner(name)))
+            found.append(measure_learner(here, LearnerSpec(name)))
     (row, field), (wild, again) = found
     assert np.array_equal(field, again)
     assert wild.own_fem["discs"].mm.mean > 1.0 > row.own_fem["discs"].mm.mean

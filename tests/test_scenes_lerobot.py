@@ -17,7 +17,7 @@ from tiny_episodes import HEIGHT, WIDTH
 from scenes import read_episodes
 from scenes.cli import main
 from scenes.episodes.exports.columns import TASKS
-from scenes.episodes.exports.lerobot import Spread
+from scenes.episodes.exports.lerobot import RowStatistics
 
 READ = """
 import sys
@@ -96,7 +96,7 @@ def test_without_pyarrow_lerobot_names_what_to_install(folder, tmp_path):
 def test_statistics_of_parts_are_those_of_the_whole():
     rows = np.random.default_rng(0).normal(size=(20, 3))
     rows[3, 1] = np.nan
-    said = (Spread.of(rows[:7]) + Spread.of(rows[7:])).said()
+    said = (RowStatistics.of(rows[:7]) + RowStatistics.of(rows[7:])).said()
     for name, of in (("min", np.nanmin), ("max", np.nanmax), ("mean", np.nanmean), ("std", np.nanstd)):
         assert np.allclose(said[name], of(rows, axis=0))
-    assert said["count"] == [20] and Spread.of(np.full((2, 1), np.nan)).said()["mean"] == [0.0]
+    assert said["count"] == [20] and RowStatistics.of(np.full((2, 1), np.nan)).said()["mean"] == [0.0]

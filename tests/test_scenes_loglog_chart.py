@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from scenes.analysis.loglog_chart import HEIGHT, PALE, WIDTH, Curve, Dot, Panel, drawn
+from scenes.analysis.loglog_chart import HEIGHT, PALE, WIDTH, ChartPanel, Curve, Dot, drawn
 from scenes.cli import main
 
 FULL = np.array([31, 119, 180])
@@ -14,7 +14,7 @@ FULL = np.array([31, 119, 180])
 
 def panel(*points, marks=()):
     """Panel without a legend, as its curve has no name."""
-    return Panel("title", "nodes", "seconds", (Curve("", points),), marks)
+    return ChartPanel("title", "nodes", "seconds", (Curve("", points),), marks)
 
 
 def ink(picture, colour):
@@ -49,7 +49,7 @@ def test_what_has_no_logarithm_is_refused(points):
 def test_dots_lie_where_curves_do_and_pale_ones_are_pale():
     points = ((1e1, 1e0), (1e2, 1e1), (1e3, 1e2))
     dots = tuple(Dot("", "", x, y, pale=x == 1e2) for x, y in points)
-    picture = drawn([Panel("title", "x", "y", dots=dots)])
+    picture = drawn([ChartPanel("title", "x", "y", dots=dots)])
     full, pale = ink(picture, FULL), ink(picture, PALE * FULL + (1.0 - PALE) * 255.0)
     centre = (full.min(axis=0) + full.max(axis=0)) / 2.0
     assert np.allclose(np.median(pale, axis=0), centre, atol=1.5)
@@ -61,7 +61,7 @@ def test_names_of_dots_near_each_other_do_not_cover_each_other():
 
     def dark(*names):
         dots = tuple(Dot(name, "g", 10.0 + 0.5 * k, 1.0) for k, name in enumerate(names))
-        return int((drawn([Panel("t", "x", "y", dots=dots)]) < 110).all(axis=-1).sum())
+        return int((drawn([ChartPanel("t", "x", "y", dots=dots)]) < 110).all(axis=-1).sum())
 
     bare = dark("", "")
     assert dark("horse", "tiger") - bare > 0.95 * (dark("horse", "") - bare + dark("", "tiger") - bare)
@@ -72,7 +72,7 @@ def test_a_pale_dot_without_room_has_no_name():
 
     def picture(pale, full, crowd=60):
         pales = [Dot(pale, "g", 10.0 + 0.01 * k, 1.0 + 0.01 * k, pale=True) for k in range(crowd)]
-        return drawn([Panel("t", "x", "y", dots=(*pales, Dot(full, "g", 10.3, 1.3)))])
+        return drawn([ChartPanel("t", "x", "y", dots=(*pales, Dot(full, "g", 10.3, 1.3)))])
 
     def changed(one, other):
         return (one != other).any(axis=-1).sum()
@@ -82,7 +82,7 @@ def test_a_pale_dot_without_room_has_no_name():
 
 
 def test_a_panel_has_its_size():
-    panels = [Panel("t", "x", "y", dots=(Dot("one", "g", 1.0, 2.0),), size=(300 + 100 * k, 360)) for k in range(2)]
+    panels = [ChartPanel("t", "x", "y", dots=(Dot("one", "g", 1.0, 2.0),), size=(300 + 100 * k, 360)) for k in range(2)]
     assert drawn(panels).shape == (360, 700, 3)
 
 

@@ -15,7 +15,7 @@ from scenes.play.effect_ablation import device_arrays, without
 from scenes.script.scene import SCENES, Scene, find_scene
 from scenes.script.site import site_of
 from sim.compile import compile_problem
-from sim.discretisation.footprint import Skin
+from sim.discretisation.footprint import ContactSurface
 from sim.discretisation.space import discretise
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Pulsation, Resection
@@ -57,7 +57,7 @@ def kept(scene: Scene) -> dict[str, int]:
     """Bytes of the arrays that each term of the scene's problem keeps, by name, after one look at a frame."""
     effects = tuple(effect for effect in scene.effects_on(BODY) if not isinstance(effect, Resection))
     device, space = find_device("cpu", "float32"), discretise(BODY.mesh, scene.element)
-    skin, time = Skin(space.nodes, space.surface, device), 0.45 * scene.duration
+    skin, time = ContactSurface(space.nodes, space.surface, device), 0.45 * scene.duration
     loads = scene.loads(SITE, scene.path(time), time).but(Resected)
     u, out = device.zeros(3 * space.count, 1), device.zeros(3 * space.count, 1)
     flags = device.array(np.zeros(1), wp.int32)

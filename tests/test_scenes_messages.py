@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenes.link.frame import HEADER, BadMessageError, content_of, framed, metadata_of, read_header, stamp_of, time_of
-from scenes.link.heard import Heard, Names
+from scenes.link.heard import ReceivedTransforms, TransformNames
 from scenes.link.messages import (
     Code,
-    Mesh,
+    SentMesh,
     image,
     points,
     polydata,
@@ -88,7 +88,7 @@ def test_what_pyigtl_sends_is_what_we_read(version):
 
 def test_polydata_and_status_have_the_layout_of_the_protocol():
     corners = RANDOM.normal(size=(4, 3)).astype(np.float32)
-    body = polydata(corners, Mesh.of(np.array([[0, 1, 2], [0, 2, 3]])))
+    body = polydata(corners, SentMesh.of(np.array([[0, 1, 2], [0, 2, 3]])))
     assert struct.unpack(">10I", body[:40]) == (4, 0, 0, 0, 0, 2, 32, 0, 0, 0)
     assert np.array_equal(np.frombuffer(body, ">f4", 12, 40).reshape(4, 3), corners)
     assert struct.unpack(">8I", body[88:]) == (3, 0, 1, 2, 3, 0, 2, 3)
@@ -157,8 +157,8 @@ def test_what_is_no_message_is_refused(read, why):
 
 
 def test_a_body_is_known_while_its_transforms_are_new():
-    names = Names()
-    heard = Heard(names, 0.3)
+    names = TransformNames()
+    heard = ReceivedTransforms(names, 0.3)
     assert heard.beside(names.tool, 0.0) == "no StylusTipToReference yet"
     heard = heard.hearing(names.tool, matrix(), STAMP, 1.0, 0)
     found = heard.beside(names.tool, 1.2)

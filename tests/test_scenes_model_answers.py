@@ -9,7 +9,7 @@ from gym_examples import SIZE
 from scenes.gym.model_answers import Hertz
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT
-from scenes.gym.touched import Asked
+from scenes.gym.touched import TissueRequest
 from sim.material import MATERIALS
 
 
@@ -21,7 +21,7 @@ def test_the_model_has_the_force_of_the_finite_elements():
     for physics in ("model", "fem"):
         answers, last = open_setting(PALPATE, "template", physics, "cpu", SIZE).answers, None
         for pose in poses:
-            (last,) = answers.answer([Asked(pose, last)])
+            (last,) = answers.answer([TissueRequest(pose, last)])
         assert last is not None and last.good
         motion = np.zeros((len(site.anatomy.mesh.nodes), 3))
         motion[last.nodes] = last.motion
@@ -35,7 +35,7 @@ def test_many_answered_together_are_as_each_alone():
     setting = open_setting(PALPATE, "template", "model", "cpu", SIZE)
     site = setting.site
     tips = [site.origin + 1e-3 * depth * site.axis for depth in (-3.0, 0.5, 2.0, 4.0)]
-    asked = [Asked(PALPATE.tool.pose(tip, site.axis, site.right)) for tip in tips]
+    asked = [TissueRequest(PALPATE.tool.pose(tip, site.axis, site.right)) for tip in tips]
     together = replace(setting.answers, together=True).answer(asked)
     for one, each in zip(setting.answers.answer(asked), together, strict=True):
         assert np.allclose(one.force, each.force, atol=1e-4) and np.allclose(one.motion, each.motion, atol=1e-5)
@@ -48,7 +48,7 @@ def test_an_aspirator_presses_on_healthy_tissue_by_hertz(boxed):
     site, ball = setting.site, Hertz(DEBULK.tool.radius, MATERIALS["drained"].tissue)
     for depth in (1e-3, DEBULK.tool.radius + 1e-3):  # its middle above a flat top, and below it
         tip = site.origin + 0.012 * site.right + depth * site.axis  # beside the corridor
-        (touched,) = setting.answers.answer([Asked(DEBULK.tool.pose(tip, site.axis, site.right), done=1)])
+        (touched,) = setting.answers.answer([TissueRequest(DEBULK.tool.pose(tip, site.axis, site.right), done=1)])
         force = float(ball.force(np.array(depth)))
         assert touched.force @ site.axis == pytest.approx(force, rel=1e-6)
         assert touched.pressure == pytest.approx(1.5 * force / (np.pi * DEBULK.tool.radius * depth))
@@ -59,7 +59,7 @@ def test_a_pose_that_the_model_refuses_ends_an_episode():
     setting = open_setting(RETRACT, "template", "model", "cpu", SIZE)
     site, tool = setting.site, RETRACT.tool
     poses = [tool.pose(site.origin + depth * site.axis, site.axis, site.right) for depth in (2e-3, 40e-3)]
-    (first,) = setting.answers.answer([Asked(poses[0])])
-    (second,) = setting.answers.answer([Asked(poses[1], first)])
+    (first,) = setting.answers.answer([TissueRequest(poses[0])])
+    (second,) = setting.answers.answer([TissueRequest(poses[1], first)])
     assert first.good and not second.good and second.error == np.inf
     assert np.array_equal(second.motion, first.motion)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from links import NAMES, NOW, linked, peers, played
 
-from scenes.link.answer import NOT_SEEN, Answer
+from scenes.link.answer import NOT_SEEN, PoseResult
 from scenes.link.frame import HEADER
 from scenes.link.messages import points, read_points, transform
 from scenes.link.outgoing import Outgoing
-from scenes.tracked.follower import Known, State
-from scenes.tracked.tool_motion import Motion
+from scenes.tracked.follower import TrackingResult, TumourState
+from scenes.tracked.tool_motion import BrainMotion
 from sim.loads import Loads, Touching
 from surrogate.model.learned import predicted
 
@@ -24,15 +24,15 @@ def test_places_inside_the_tumour_move_with_its_volume(stage):
     at = rest[tets[np.isin(tets, inner).any(axis=1)][:3]].mean(axis=1)
     # A stretch is no rigid motion and is linear: the volume's interpolation is exact, a surface point's is not.
     stretched = stage.nodes, 0.3 * (rest[stage.nodes] - rest[stage.nodes].mean(axis=0))
-    moved = Known(0.0, State.GOOD, "", NOT_SEEN, motion_of(rest, *stretched), band=1e-3)
+    moved = TrackingResult(0.0, TumourState.GOOD, "", NOT_SEEN, motion_of(rest, *stretched), band=1e-3)
     assert len(at) == 3
-    body = outgoing.messages(Answer(NOW, moved), outgoing.placed(["a", "b", "c"], at))[-2]
+    body = outgoing.messages(PoseResult(NOW, moved), outgoing.placed(["a", "b", "c"], at))[-2]
     found = 1e-3 * read_points(body[HEADER.size :])[1]
     assert found == pytest.approx(at + 0.3 * (at - rest[stage.nodes].mean(axis=0)), abs=1e-6)
     # A place on the cortex is not sent for a model that knows the tumour alone.
     tumour = replace(moved, motion=motion_of(rest, anatomy.tumour_nodes, 0.0 * rest[anatomy.tumour_nodes]))
     both = outgoing.placed(["a", "c"], np.vstack([at[:1], rest[anatomy.open_surface[:1, 0]]]))
-    assert read_points(outgoing.messages(Answer(NOW, tumour), both)[-2][HEADER.size :])[0] == ["a"]
+    assert read_points(outgoing.messages(PoseResult(NOW, tumour), both)[-2][HEADER.size :])[0] == ["a"]
 
 
 def motion_of(rest, nodes, displacement):
@@ -40,7 +40,7 @@ def motion_of(rest, nodes, displacement):
     positions[nodes] += displacement
     nothing = Loads((Touching(np.eye(4)[None, None]),))
     answer = predicted(displacement[None], nodes, nothing, [False], 0.0, np.full((2, 1), np.nan), "")
-    return Motion(positions, True, answer=answer)
+    return BrainMotion(positions, True, answer=answer)
 
 
 def test_places_on_the_tumour_move_with_it_and_a_million_points_are_passed_over(follower, registration, truth, beside):

@@ -17,7 +17,7 @@ from ar.tracking.pictures import Named, film_of
 from scenes.cli import main
 from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
 from scenes.tracked.calibration_file import read_calibration
-from scenes.tracked.follower import State
+from scenes.tracked.follower import TumourState
 from scenes.tracked.picture import Painter
 from scenes.tracked.run import Timed, overlaid, paced, timed
 from scenes.tracked.tool_motion import ToolMotion
@@ -27,7 +27,13 @@ from sim.loads import Touching
 from surrogate.model.learned import predicted
 
 GIVEN = ["--camera", str(FILM / "camera.yaml"), "--registration", str(FILM / "registration.json")]
-GOOD, REST, LOST, TOOL, STALE = State.GOOD, State.REST, State.NO_REFERENCE, State.NO_TOOL, State.STALE
+GOOD, REST, LOST, TOOL, STALE = (
+    TumourState.GOOD,
+    TumourState.REST,
+    TumourState.NO_REFERENCE,
+    TumourState.NO_TOOL,
+    TumourState.STALE,
+)
 # Of a film of palpate that is over-exposed at 0.53 s, hides the cube from 0.93 to 1.07 s and the reference from
 # 1.33 to 1.73 s, and lacks a picture at 2 s. The ball lies on the cortex from 0.4 s on.
 STATES = [REST, REST, REST, GOOD, LOST, GOOD, GOOD, TOOL, TOOL, GOOD, LOST, LOST, LOST, LOST, GOOD, STALE, GOOD]
@@ -141,7 +147,7 @@ def test_the_command_draws_a_film_and_says_how_it_went(tmp_path, capsys):
     printed = capsys.readouterr()
     said = json.loads(printed.out)
     assert "camera.json states no covariance of the camera" in printed.err
-    assert said["pictures"] == 17 and said["states"][State.UNKNOWN.value] == 11
+    assert said["pictures"] == 17 and said["states"][TumourState.UNKNOWN.value] == 11
     assert said["reference_seen_percent"] == pytest.approx(100.0 * 12 / 17)
     assert said["tool_seen_percent"] == 0.0 and "as in the scan" in said["motion_by"]
     assert said["latency"]["time_from"] == "pixels" and sum(said["latency"]["histogram_ms"].values()) == 17

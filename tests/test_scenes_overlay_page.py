@@ -15,7 +15,7 @@ from visitor import Visitor, free_port, wait_for
 from ar.page.elements import HISTORY, KEYS, PICTURE, SAID, SLICES, TABS
 from ar.tracking.pictures import film_of
 from scenes.cli import main
-from scenes.tracked.follower import State
+from scenes.tracked.follower import TumourState
 from scenes.tracked.page import OverlayPage
 from scenes.tracked.picture import Painter
 from scenes.tracked.seekable_film import SeekableFilm
@@ -59,16 +59,16 @@ def seek(page, number):
 @pytest.mark.parametrize(
     ("number", "state", "words"),
     [
-        (6, State.GOOD, "The tumour is drawn where it is now."),
-        (8, State.NO_TOOL, "tool not seen yet: the tumour as in the scan"),
-        (12, State.NO_REFERENCE, "reference not seen yet: nothing is drawn"),
+        (6, TumourState.GOOD, "The tumour is drawn where it is now."),
+        (8, TumourState.NO_TOOL, "tool not seen yet: the tumour as in the scan"),
+        (12, TumourState.NO_REFERENCE, "reference not seen yet: nothing is drawn"),
     ],
 )
 def test_each_state_is_said_with_both_errors(page, number, state, words):
     assert seek(page, number)
     said = page.browser.shown[2]
     assert page.newest.known.state is state and words in said and "Error of the tumour: not known" in said
-    if state is State.GOOD:
+    if state is TumourState.GOOD:
         assert re.search(r'"number">tip to tumour \d+\.\d&nbsp;±&nbsp;\d\.\d&nbsp;mm<', said)
         assert "within 0.2 mm of where it is drawn" in said and "not given:" in said
         assert "What the camera's calibration adds is not known." in said
@@ -111,9 +111,12 @@ def test_a_film_plays_on_and_after_its_end_anew(follower, stage):
                 page.play(film, 1.5)  # what is known of a picture is so for one call
             return [each.known.state for each in list(page.shown)[before : before + count]]
 
-        assert played(14, 4) == [State.GOOD, State.GOOD, State.GOOD, State.REST] and film.count == 17
+        assert (
+            played(14, 4) == [TumourState.GOOD, TumourState.GOOD, TumourState.GOOD, TumourState.REST]
+            and film.count == 17
+        )
         # By now it is known how far apart its pictures are.
-        assert played(14, 2) == [State.GOOD, State.STALE]
+        assert played(14, 2) == [TumourState.GOOD, TumourState.STALE]
         one = page.shown[0]
     assert one.colour.size == one.known.motion.positions.size == 0 and one.middle.shape == (3,)
 
@@ -138,7 +141,7 @@ def test_a_camera_s_picture_is_dimmed_once_it_is_old_and_goes_on_when_it_is_back
     with opened(follower, stage) as page:
         shown = page.watch(pictures())
         assert not page.browser.frame.visible and len(page.browser.controls.commands) == len(KEYS) - 2
-        assert len(shown) == 2 and {each.known.state for each in shown} <= {State.REST, State.STALE}
+        assert len(shown) == 2 and {each.known.state for each in shown} <= {TumourState.REST, TumourState.STALE}
         assert all(each.latency > 0.0 for each in shown)
         silent, unplugged, back, paused = fades
         assert "no image for 0.2 s" in silent[2] and silent[1].mean() < 0.4 * first.colour.mean()

@@ -26,7 +26,7 @@ from sim.tools import Ball, distances_to
 from surrogate.data.cortex_patch import open_patch
 from surrogate.model.applicability import refusal
 from surrogate.model.guarded import answering
-from surrogate.model.learned import Learned, Part
+from surrogate.model.learned import Learned, ModelPart
 from surrogate.model.tool_contact import ForceModel
 from surrogate.model.training_range import Envelope
 from surrogate.training.fem_tables import condensed, side_by_side
@@ -54,7 +54,7 @@ def untrained(anatomy: Anatomy, scene: Scene) -> Learned:
     contact, bases = condensed(fem, [anatomy.tumour_nodes, np.setdiff1d(patch.nodes, anatomy.tumour_nodes)])
     envelope = Envelope(patch.points, 1.0, 1.0, np.pi, (1e-6, 1.0), (ball.radius, ball.radius), np.inf)
     said = {"effects": repr(scene.effects)}
-    parts = (Part("tool", replace(contact, grip=np.array([1.0, 0.0])), side_by_side(bases)),)
+    parts = (ModelPart("tool", replace(contact, grip=np.array([1.0, 0.0])), side_by_side(bases)),)
     return Learned(anatomy, parts, envelope, training=said, tool=ball, force=ForceModel())
 
 

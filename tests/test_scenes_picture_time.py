@@ -10,7 +10,7 @@ from scenes.commands.link import address_of
 from scenes.link.answer import placed_at
 from scenes.link.console import address_words
 from scenes.link.frame import stamp_of
-from scenes.link.heard import Heard, Names
+from scenes.link.heard import ReceivedTransforms, TransformNames
 from sim.errors import InputError
 
 BEGUN, STEP = 1e9, 1.0 / 30.0
@@ -28,8 +28,8 @@ def camera(time):
 
 def heard_of(times, stamped=True, sender=0):
     """A camera's transforms as they came, each 5 ms after its time."""
-    names = Names()
-    heard = Heard(names, 0.3)
+    names = TransformNames()
+    heard = ReceivedTransforms(names, 0.3)
     for time in times:
         stamp = stamp_of(BEGUN + time) if stamped else 0
         heard = heard.hearing(names.camera, camera(time), stamp, time + 5e-3, sender)

@@ -8,7 +8,7 @@ import pytest
 
 from scenes.cli import main
 from scenes.warp.landmarks import landmarks_of
-from scenes.warp.moment import Cause, Moment
+from scenes.warp.moment import Cause, DeformedAnatomy
 from scenes.warp.places import ENOUGH, FINEST, fields_of, finer_spacing, folds_of, places_of
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy, write_mesh
@@ -18,7 +18,7 @@ from sim.geometry.tetmesh import signed_volumes
 
 
 def moment_of(body, displacement):
-    return Moment(Cause("a test", {}), body, body, displacement)
+    return DeformedAnatomy(Cause("a test", {}), body, body, displacement)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 from test_scenes_overlay import INK, pictures
 
 from ar.overlay.outlines import of_ink
-from scenes.tracked.follower import State
+from scenes.tracked.follower import TumourState
 from scenes.tracked.picture import Painter
 from scenes.tracked.plausible import implausible
 
@@ -17,7 +17,7 @@ def test_a_registration_of_another_patient_is_noticed(follower, stage):
     T[:3, 3] += [0.0, 0.0, -0.4]
     other = replace(follower, registration=replace(follower.registration, T_patient_scan=T))
     known = other.step(first.grey, 0.0)
-    assert known.state is State.UNSURE and known.band is None and "mm from the reference" in known.words
+    assert known.state is TumourState.UNSURE and known.band is None and "mm from the reference" in known.words
     painted = Painter(stage, follower.tool).paint(first.colour, known).colour
     assert np.count_nonzero(of_ink(painted, INK)) < 5
     near = follower.step(first.grey, 0.0)
@@ -26,6 +26,6 @@ def test_a_registration_of_another_patient_is_noticed(follower, stage):
     long = follower.tool.T_cube_tool @ [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.4], [0, 0, 0, 1.0]]
     away = replace(follower, tool=replace(follower.tool, T_cube_tool=long))
     known = away.step(first.grey, 0.0)
-    assert known.state is State.UNSURE and "never nearer than 200" in known.words and not known.near
+    assert known.state is TumourState.UNSURE and "never nearer than 200" in known.words and not known.near
     assert near.near and away.step(first.grey, 0.1, near).near  # it has been there
     assert "head" not in away.step(first.grey, 0.1, near).words

@@ -14,12 +14,12 @@ from scenes.analysis.uncertainty import (
     skull_of,
     skulls_of,
 )
-from scenes.script.priors import POISSON, PRIORS, STIFFNESS, Draw, drawn
+from scenes.script.priors import POISSON, PRIORS, STIFFNESS, PatientSample, drawn
 from scenes.script.scene import find_scene
 from sim.effects import SKULLS
 from sim.material import BRAIN
 
-SAME = Draw(1.0, BRAIN.poisson, 1.0, 0.0, (0.0, 0.0, 0.0), 0.0)
+SAME = PatientSample(1.0, BRAIN.poisson, 1.0, 0.0, (0.0, 0.0, 0.0), 0.0)
 
 
 class TestPriors:

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 from visitor import run_until, wait_for
 
-from scenes.page.referee import Referee
+from scenes.page.referee import FemWorker
 
 
 def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypatch):
@@ -21,7 +21,7 @@ def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypat
     def moved():
         seen.append(demo.referee.truth)
         if len(seen) == 5:
-            Referee.ask(demo.referee, *asked[0])
+            FemWorker.ask(demo.referee, *asked[0])
         return np.linalg.norm(fem.vertices - rest, axis=1).max() > 5e-4
 
     run_until(demo, monkeypatch, moved)
@@ -29,7 +29,7 @@ def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypat
 
 
 def test_the_referee_answers_the_newest_question(theatre, scene):
-    referee = Referee(theatre, scene, threading.Lock())
+    referee = FemWorker(theatre, scene, threading.Lock())
     for number in range(60):
         referee.ask(number, None)
     assert wait_for(lambda: referee.truth is not None and referee.truth.number == 59)

@@ -14,7 +14,7 @@ from theatres import small
 from scenes.builtin.retract import RELAXING
 from scenes.play.deformers import Theatre
 from scenes.play.reference import truth_of
-from scenes.report.reference import Truth, beyond_of, reference_of, solve_reference
+from scenes.report.reference import ReferenceSolutions, beyond_of, reference_of, solve_reference
 from scenes.report.row import against_reference
 from sim.accuracy import TRAIN
 from sim.effects import Elasticity, Held, Slide, ToolForce
@@ -25,7 +25,7 @@ from surrogate.model.training_range import envelope_of
 
 
 def test_only_loads_that_both_converged_for_are_compared(study, study_box, monkeypatch):
-    truth = Truth(np.full((2, len(study.drawn), 3), 1e-3), np.array([True, False]), np.ones(2))
+    truth = ReferenceSolutions(np.full((2, len(study.drawn), 3), 1e-3), np.array([True, False]), np.ones(2))
     monkeypatch.setattr("scenes.report.row.reference_of", lambda study: truth)
     answer = np.full((2, len(study_box.tumour_nodes), 3), [[[1e-3, 1e-3, 3e-3]], [[np.nan] * 3]])
     for good, loads in (([True, True], 1), ([True, False], 1)):

@@ -11,7 +11,7 @@ from test_sim_necrosis import hollowed, necrotic_labels
 
 from scenes.cli import main
 from scenes.report.finite_elements import tissue_of as tissue_of_law
-from scenes.report.study import Study
+from scenes.report.study import ReportStudy
 from sim.accuracy import TRAIN
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
@@ -50,7 +50,7 @@ class TestData:
         assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
 
     def test_are_reported_in_every_law_of_it(self, data):
-        study = Study(data, data.parent)
+        study = ReportStudy(data, data.parent)
         assert study.tissue == TISSUE
         linear = tissue_of_law(study.tissue, "linear")
         assert linear.of(NECROSIS_LABEL) == Material("linear", 500.0, BRAIN.poisson)

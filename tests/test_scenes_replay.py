@@ -14,13 +14,13 @@ from theatres import sinking
 from visitor import free_port
 
 from scenes.page.demo import Demo
-from scenes.page.referee import Referee
+from scenes.page.referee import FemWorker
 from scenes.page.requests import HAND, SCRIPT
 from scenes.page.view import move_bodies
 from scenes.play.deformers import AtRest, Theatre
 from scenes.play.effect_ablation import without
 from scenes.play.player import Frame, Player
-from scenes.play.replay import IN_ORDER, Course, Reel, Session, course_of
+from scenes.play.replay import IN_ORDER, FrameCache, ReplayOrder, ReplaySession, course_of
 from scenes.script.debulking import Debulking
 from scenes.script.head_posture import drained
 from scenes.script.scene import SCENES, Scene, Viewpoint, find_scene
@@ -76,7 +76,7 @@ def straight(player: Player) -> list[Deformation]:
     return found
 
 
-def answer(session: Session, number: int, touch: Touch | None = None) -> Deformation:
+def answer(session: ReplaySession, number: int, touch: Touch | None = None) -> Deformation:
     """What it comes to, step by step."""
     reached, found = session.towards(number, touch)
     while reached < number:
@@ -93,7 +93,7 @@ class TestReel:
             ran[number] += 1
             return (*(before or ()), number)
 
-        reel = Reel(100, step)
+        reel = FrameCache(100, step)
         for number in (99, *np.random.default_rng(0).integers(0, 100, 300).tolist()):
             before, reached = ran.total(), -1
             while reached != number:
@@ -104,13 +104,15 @@ class TestReel:
 
     def test_one_call_takes_one_step_at_most(self) -> None:
         ran: list[int] = []
-        reel = Reel(50, lambda number, before: ran.append(number))
+        reel = FrameCache(50, lambda number, before: ran.append(number))
         for calls in range(1, 20):
             assert reel.towards(40)[0] == calls - 1 and ran == list(range(calls))
 
     def test_a_long_way_goes_by_frames_between_from_wherever_is_nearest(self) -> None:
         ran: list[tuple[int, int | None]] = []
-        reel = Reel(50, lambda number, before: ran.append((number, before)) or number, Course(6, back=True, kept=64))
+        reel = FrameCache(
+            50, lambda number, before: ran.append((number, before)) or number, ReplayOrder(6, back=True, kept=64)
+        )
 
         def way(number: int) -> list[tuple[int, int | None]]:
             ran.clear()
@@ -122,7 +124,9 @@ class TestReel:
         assert way(15) == [(15, 14)] and way(17) == [(17, 15)] and way(12) == []
         assert way(40) == [(18, 12), (24, 18), (30, 24), (36, 30), (40, 36)]
         assert way(20) == [(20, 18)] and way(5) == [(5, 6)]
-        reel = Reel(50, lambda number, before: ran.append((number, before)) or number, Course(6, back=True, kept=1))
+        reel = FrameCache(
+            50, lambda number, before: ran.append((number, before)) or number, ReplayOrder(6, back=True, kept=1)
+        )
         assert way(48)[-1] == (48, 42) and way(29) == [(42, 48), (36, 42), (30, 36), (29, 30)]
         assert list(reel.kept) == [0]
 
@@ -134,12 +138,12 @@ def test_jumps_go_by_frames_between_where_the_brain_comes_off_the_skull(theatre)
     normal = np.where(sides[:, None], [1.0, 0.0, 0.0], 0.0)
     sliding = replace(box, held=box.held & ~sides[:, None], slide_normal=normal)
 
-    def course(name: str, anatomy: Anatomy, **values: object) -> Course | None:
+    def course(name: str, anatomy: Anatomy, **values: object) -> ReplayOrder | None:
         scene = replace(find_scene(name), **values)
         return course_of(Player(Theatre(anatomy, None, {}, "cpu").stage(scene), AtRest(anatomy)))
 
-    assert course("brain_shift", sliding) == Course(6, back=True, kept=64)
-    assert course("brain_shift", sliding, frames_per_second=10.0) == Course(2, back=True, kept=64)
+    assert course("brain_shift", sliding) == ReplayOrder(6, back=True, kept=64)
+    assert course("brain_shift", sliding, frames_per_second=10.0) == ReplayOrder(2, back=True, kept=64)
     assert course("brain_shift", box) is course("press", box) is None
     assert course("retract", box) is course("pulsation", sliding) is IN_ORDER
 
@@ -150,7 +154,7 @@ def test_frames_in_any_order_are_those_of_the_straight_run(theatre, name):
     player = theatre.player("fem", REMEMBERING[name])
     assert player.remembers
     run = straight(player)
-    one, other = Session(player), Session(player)
+    one, other = ReplaySession(player), ReplaySession(player)
     for number in ASKED:
         for session, wanted in ((one, number), (other, 12 - number)):
             assert same(answer(session, wanted), run[wanted])
@@ -173,7 +177,7 @@ def test_a_hand_goes_on_from_the_last_answer_a_frame_later(theatre):
     It stays where it is in a frame that begins within the tolerance.
     """
     player = theatre.player("fem", REMEMBERING["tissue that relaxes under a blade"])
-    session = Session(player)
+    session = ReplaySession(player)
     run = answer(session, 12)
     held, reads = player.touch(12), [np.linalg.norm(run.reaction[0, 0, :3])]
     for number in (12, 12, 3, 0, 9):
@@ -182,7 +186,7 @@ def test_a_hand_goes_on_from_the_last_answer_a_frame_later(theatre):
         reads.append(np.linalg.norm(found.reaction[0, 0, :3]))
     assert (np.diff(reads) <= 0.0).all() and reads[-1] < 0.97 * reads[0]
     once = replace(run, time=run.time - 1.0 / player.scene.frames_per_second)
-    assert same(answer(Session(player), 12), run)
+    assert same(answer(ReplaySession(player), 12), run)
     first = player.answer(player.loads(12, held), once)
     assert np.linalg.norm(first.reaction[0, 0, :3]) == reads[1]
 
@@ -193,7 +197,7 @@ def test_plain_statics_are_not_run_again(theatre, monkeypatch):
     asked: list[Deformation | None] = []
     solve = player.deformer.deform
     monkeypatch.setattr(player.deformer, "deform", lambda loads, start=None: asked.append(start) or solve(loads, start))
-    session, last = Session(player), None
+    session, last = ReplaySession(player), None
     assert not player.remembers
     for number in ASKED:
         reached, found = session.towards(number)
@@ -264,7 +268,7 @@ class TestPages:
 def test_the_referee_answers_the_straight_run_too(theatre):
     scene = REMEMBERING["tissue that relaxes under a blade"]
     full = straight(theatre.player("fem", scene))
-    referee = Referee(theatre, scene, threading.Lock())
+    referee = FemWorker(theatre, scene, threading.Lock())
     for number in (12, 3, 8):
         referee.ask(number, None)
         while referee.truth is None or referee.truth.number != number:

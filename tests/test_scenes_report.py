@@ -11,9 +11,9 @@ from studies import SPECS, TISSUE
 
 from ar.screen import read_png
 from scenes.cli import main
-from scenes.report.finite_elements import HALVED, OWN, Elements, against
+from scenes.report.finite_elements import HALVED, OWN, FemVariant, against
 from scenes.report.page import Section, write_report
-from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row
+from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, ReportRow
 from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import pushed_effects
 from sim.fem import Fem
@@ -88,13 +88,13 @@ def test_the_page_needs_nothing_but_itself(page, study_rows):
 def test_what_has_the_reference_s_own_elements_is_off_by_its_tolerance_alone(study, fine):
     here = replace(study, fine=fine)
     said = {
-        (element, mesh): against(here, Elements("it", element=element, mesh=mesh))
+        (element, mesh): against(here, FemVariant("it", element=element, mesh=mesh))
         for element in ("p1", "p2")
         for mesh in (OWN, HALVED)
     }
     alone = ("p2", HALVED if fine else OWN)
     assert said.pop(alone) == TOLERANCE_ALONE and set(said.values()) == {ERROR}
-    assert against(here, Elements("it", "linear", *alone)) == DIFFERENCE
+    assert against(here, FemVariant("it", "linear", *alone)) == DIFFERENCE
 
 
 def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, study_rows, monkeypatch, capsys):
@@ -106,7 +106,9 @@ def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, study
     said = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in said["sections"][0]["rows"]] == [row.name for row in study_rows]
     assert "quadratic tetrahedra (p2) on the same mesh" in (study.folder / "index.html").read_text()
-    monkeypatch.setattr("scenes.report.rows.rows", lambda study, specs: iter([Row("odd", "f", state="no memory")]))
+    monkeypatch.setattr(
+        "scenes.report.rows.rows", lambda study, specs: iter([ReportRow("odd", "f", state="no memory")])
+    )
     assert main(words) == 1
     assert "no memory" in capsys.readouterr().out
 

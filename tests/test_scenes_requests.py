@@ -9,8 +9,8 @@ from theatres import Silent
 from visitor import Visitor, report, wait_for
 
 from scenes.page.demo import READING
-from scenes.page.referee import Referee
-from scenes.page.requests import HAND, SCRIPT, Wish, holding
+from scenes.page.referee import FemWorker
+from scenes.page.requests import HAND, SCRIPT, Requests, holding
 from scenes.play.deformers import Theatre
 from scenes.play.player import Player
 from scenes.script.tool_paths import Touch
@@ -19,7 +19,7 @@ from sim.errors import InputError
 
 class TestWish:
     def test_playing_goes_round(self):
-        wish = Wish("linear", Touch(force=0.1))
+        wish = Requests("linear", Touch(force=0.1))
         assert [self.played(wish) for _ in range(5)] == [0, 1, 2, 0, 1]
         wish.set(plays=False)
         assert [self.played(wish) for _ in range(3)] == [2, 2, 2]
@@ -32,13 +32,13 @@ class TestWish:
         return number
 
     def test_who_seeks_is_not_overruled_by_the_frame_that_is_being_drawn(self):
-        wish = Wish("linear", Touch())
+        wish = Requests("linear", Touch())
         wish.set(number=2)
         wish.go_on(0, 3)
         assert wish.now()[0] == 2
 
     def test_the_hand_holds_what_it_does_not_change(self):
-        wish = Wish("linear", Touch(force=0.1))
+        wish = Requests("linear", Touch(force=0.1))
         assert wish.now()[2] is None
         wish.hand(x=0.01)
         assert wish.now()[2] == Touch(x=0.01, force=0.1)
@@ -49,7 +49,7 @@ class TestWish:
 
     def test_two_sliders_at_once_both_count(self):
         """The page calls each slider on a thread of its own."""
-        wish = Wish("linear", Touch(force=0.1))
+        wish = Requests("linear", Touch(force=0.1))
         hands = [threading.Thread(target=wish.hand, kwargs=turn) for turn in ({"right": 0.2}, {"up": -0.3})]
         with wish.lock:  # both are under way before either is heard
             for hand in hands:
@@ -131,7 +131,7 @@ def test_loads_that_the_finite_elements_refuse_are_left_out_alone(theatre, scene
     refuse(monkeypatch, lambda number, touch: number == 7, InputError("7 is refused."))
     player = theatre.player("linear", scene)  # as quick to have, and asked the same way
     monkeypatch.setattr(Theatre, "player", lambda *words: player)
-    referee = Referee(theatre, scene, threading.Lock())
+    referee = FemWorker(theatre, scene, threading.Lock())
     referee.ask(7, None)
     assert wait_for(lambda: str(referee.failure) == "7 is refused.")
     referee.ask(8, None)

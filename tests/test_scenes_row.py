@@ -12,7 +12,7 @@ from studies import read_back
 from scenes.cli import main
 from scenes.commands.report import QUICK
 from scenes.report.page import Section, against_time, front, write_report
-from scenes.report.row import Row, figures_of, of_times
+from scenes.report.row import ReportRow, figures_of, of_times
 from sim.bodies.meshfile import write_anatomy
 from surrogate.data.dataset import read_dataset
 
@@ -35,11 +35,11 @@ def test_the_front_is_what_nobody_beats():
 
     def row(name, time, error, against="error"):
         mm = replace(figures.mm, mean=error)
-        return Row(name, "f", against=against, reference=replace(figures, mm=mm), median=time)
+        return ReportRow(name, "f", against=against, reference=replace(figures, mm=mm), median=time)
 
     rows = [row("fast", 1.0, 9.0), row("near", 9.0, 1.0), row("between", 3.0, 3.0), row("beaten", 4.0, 3.0)]
     rows += [row("slow", 10.0, 10.0), row("other law", 0.5, 0.5, "model difference")]
-    rows += [Row("none", "f", state="it has no bound")]
+    rows += [ReportRow("none", "f", state="it has no bound")]
     assert front(rows) == {"fast", "near", "between"}
     assert against_time(rows).std() > 5.0 and against_time(rows[-1:]) is None
 
@@ -58,7 +58,9 @@ def test_every_figure_stands_under_its_head(tmp_path):
         for name, mean, loads in (("discs", 0.1, 7), ("sectors", 0.2, 8), ("beyond", 0.3, 9))
     }
     shares = {"flagged": {"discs": 0.01, "sectors": 0.02, "beyond": 1.0}, "covered": {"discs": 0.94, "beyond": 0.53}}
-    row = Row("svr", "learnt", reference=one, own_fem=sets, **shares, median=1.5, p99=2.5, set_up=3.5, memory=0.25)
+    row = ReportRow(
+        "svr", "learnt", reference=one, own_fem=sets, **shares, median=1.5, p99=2.5, set_up=3.5, memory=0.25
+    )
     row = replace(row, loads=600, units=60, series=9000, inside=12, solving=180.0, learning=120.0, timed=1000)
     row = replace(row, bare=0.0125, reference=replace(one, worst=replace(one.worst, mean=7.5)))
     solved = replace(row, name="FEM", plan=("First this.", "Then <that>."))

@@ -9,8 +9,8 @@ from poison import poisoned
 from studies import SPECS, TISSUE, read_back
 
 from scenes.analysis.measurement import peak_memory
-from scenes.report.finite_elements import OWN, Elements
-from scenes.report.learner import Learner, counts, measure_learner
+from scenes.report.finite_elements import OWN, FemVariant
+from scenes.report.learner import LearnerSpec, counts, measure_learner
 from scenes.report.rows import every, learners, measured, rows, star
 from scenes.report.study import series_seconds, tabulate_series
 from sim.accuracy import TRAIN
@@ -32,7 +32,7 @@ def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, study_box,
     monkeypatch.setattr("scenes.report.learner.counts", lambda most: [])
     monkeypatch.setattr("scenes.report.learner.coverage_of", lambda *known: {})
     with one_thread():
-        row, field = measure_learner(replace(study, data=path), Learner("svr"))
+        row, field = measure_learner(replace(study, data=path), LearnerSpec("svr"))
     lesson = Pushed(pushed.point[training], pushed.force[training], pushed.footprint[training])
     size, (every, direction) = directions(lesson)[0], directions(pushed)
     basis = reduce(nodes, truth[training] / size[:, None, None], *COARSE)
@@ -89,7 +89,7 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatc
     monkeypatch.setattr("surrogate.training.expansion.Expansion.fem", None)
     tabulate_series(study, lambda done, total: reported.append(None))
     assert None not in reported
-    row = measured(replace(study), Learner("series"), tmp_path / "series.png")
+    row = measured(replace(study), LearnerSpec("series"), tmp_path / "series.png")
     assert row.state == "measured" and row.solving > 0.1 * series_seconds(study, "series") > 0.0
     assert row.series > 19 and row.inside > 0  # unit responses
     assert series_seconds(study, "linear") == 0.0
@@ -139,5 +139,5 @@ def test_plans(study):
 
 
 def test_what_cannot_be_had_is_a_row_that_says_why(study, tmp_path):
-    row = measured(study, Elements("odd", element="cube"), tmp_path / "odd.png")
+    row = measured(study, FemVariant("odd", element="cube"), tmp_path / "odd.png")
     assert "no element is called 'cube'" in row.state and row.reference is None and row.family == "finite elements"

@@ -12,7 +12,7 @@ from scenes.episodes.engine import still_missing
 from scenes.episodes.rates import written_rates
 from scenes.episodes.reading.contents import opened
 from scenes.episodes.reading.validation import validate_episode
-from scenes.episodes.run_folder import Run, begin, episode_name, finished, read_run
+from scenes.episodes.run_folder import RunSettings, begin, episode_name, finished, read_run
 from sim.errors import InputError
 from sim.runtime.partial_files import remove_left_overs
 
@@ -36,7 +36,7 @@ def test_a_file_that_another_holds_is_said_to_be_locked(box, tmp_path):
 
 
 def test_a_folder_that_takes_no_files_is_named(tmp_path, monkeypatch):
-    run = Run("own", "0", 1, "cpu", {})
+    run = RunSettings("own", "0", 1, "cpu", {})
     begin(tmp_path / "set", run, PLAN)
     with monkeypatch.context() as held:
         held.setattr(Path, "open", fails)
@@ -48,7 +48,7 @@ def test_a_folder_that_takes_no_files_is_named(tmp_path, monkeypatch):
 
 
 def test_times_of_files_decide_nothing(tmp_path, monkeypatch):
-    run = Run("own", "0", 1, "cpu", {})
+    run = RunSettings("own", "0", 1, "cpu", {})
     monkeypatch.setattr("time.time", lambda: 0.0)  # a clock that was set back
     assert begin(tmp_path, run, PLAN) and not begin(tmp_path, run, PLAN) and read_run(tmp_path) == run
     left = tmp_path / ".sulcus-00000000-1-episode_000001.h5"  # another machine's, unfinished

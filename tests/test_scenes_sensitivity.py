@@ -11,7 +11,7 @@ import pytest
 from conftest import make_box
 from theatres import knowing_nothing
 
-from scenes.analysis.sensitivity import Aim, Body, Study, aimed, change, moved_alike, rows, variants
+from scenes.analysis.sensitivity import Aim, BodyVariant, SensitivityStudy, aimed, change, moved_alike, rows, variants
 from scenes.cli import main
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL
@@ -28,7 +28,7 @@ from surrogate.data.tool_loads import draw
 from surrogate.model.store import save
 
 TIGHT = Accuracy(tolerance=1e-9)
-LINEAR = Body(Material("linear", 3000.0, 0.45), element="p1")
+LINEAR = BodyVariant(Material("linear", 3000.0, 0.45), element="p1")
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def anatomy():
 @pytest.fixture(scope="module")
 def found(anatomy):
     """All rows of the linear law, by what and now."""
-    study = Study(anatomy, draw("palpation", anatomy, 4, 0), LINEAR, TIGHT, "cpu")
+    study = SensitivityStudy(anatomy, draw("palpation", anatomy, 4, 0), LINEAR, TIGHT, "cpu")
     all_rows = list(rows(study, variants(anatomy, LINEAR, ["smoothed"])))
     return {(row.variant.what, row.variant.now): row for row in all_rows}
 
@@ -120,7 +120,7 @@ def test_a_stiff_tumour_lies_in_the_same_brain(found, anatomy, now, times):
 def test_what_does_not_converge_is_counted_and_left_out(anatomy):
     """With a budget that suffices for none."""
     few = Accuracy(tolerance=1e-9, outer=1, inner=1, steps=0)
-    study = Study(anatomy, draw("palpation", anatomy, 3, 0), Body(element="p1"), few, "cpu")
+    study = SensitivityStudy(anatomy, draw("palpation", anatomy, 3, 0), BodyVariant(element="p1"), few, "cpu")
     one = next(rows(study, []))
     assert (one.force.solves, one.force.failed) == (0, 3)
     assert np.isnan(one.force.mean_mm)
@@ -184,7 +184,7 @@ def test_a_known_motion_is_the_footprints_mean(box, pretender):
 def test_a_body_without_tumour_is_refused(anatomy):
     whole = replace(anatomy, mesh=replace(anatomy.mesh, region=np.ones_like(anatomy.mesh.region)))
     with pytest.raises(InputError, match="no tumour"):
-        next(rows(Study(whole, draw("palpation", anatomy, 1, 0), Body()), []))
+        next(rows(SensitivityStudy(whole, draw("palpation", anatomy, 1, 0), BodyVariant()), []))
 
 
 def trained(anatomy):

@@ -17,9 +17,9 @@ from links import HOST, NAMES, in_mm, linked, peers, played
 from ar.overlay.outlines import ink_of, of_ink, outline_gap, silhouette
 from ar.tracking.pictures import film_of
 from scenes.link.frame import stamp_of
-from scenes.link.heard import Names
+from scenes.link.heard import TransformNames
 from scenes.link.messages import image, read_image, transform
-from scenes.link.session import Eye
+from scenes.link.session import OverlayCamera
 from scenes.play.stage import TUMOUR_COLOUR
 from scenes.tracked.picture import Painter
 
@@ -104,7 +104,7 @@ def test_the_c_library_reads_what_is_sent(built, follower, registration, beside)
 
 def test_the_c_library_sends_what_is_read(built, follower, registration):
     sender, server = built("Tracker/TrackerClient.cxx"), built("Tracker/TrackerServer.cxx")
-    names = Names(tool="Tracker")
+    names = TransformNames(tool="Tracker")
     with socket.socket() as free:
         free.bind((HOST, 0))
         other = free.getsockname()[1]
@@ -124,7 +124,7 @@ def test_the_c_library_sends_what_is_read(built, follower, registration):
     [("Status", "MISSING"), ("TransformStatus", "OUT_OF_VIEW"), ("StylusToTrackerTransformStatus", "")],
 )
 def test_link_tool_not_seen_by_tracker_is_counted(follower, registration, beside, key, value):
-    names = Names(tool="StylusTipToReferenceOfSpine")  # a message carries 20 bytes of it
+    names = TransformNames(tool="StylusTipToReferenceOfSpine")  # a message carries 20 bytes of it
 
     async def scene():
         async with linked(follower, registration, names=names) as port, peers(port) as (tracker,):
@@ -169,7 +169,7 @@ def test_a_cameras_picture_comes_back_with_the_tumour_in_it(follower, registrati
     rest = in_mm(registration.T_patient_scan @ truth.T_scan_tool[0] @ np.linalg.inv(follower.tool.T_cube_tool))
 
     async def scene():
-        eye = Eye(follower.calibration, Painter(stage, follower.tool, "contour"), 1e-4)
+        eye = OverlayCamera(follower.calibration, Painter(stage, follower.tool, "contour"), 1e-4)
         async with linked(follower, registration, eye) as port, peers(port) as (tracker,):
             tracker.send("IMAGE", "Camera", image(picture[:100]))
             assert "another size than the camera's: 960 x 100" in await tracker.said()

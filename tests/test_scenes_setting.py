@@ -9,7 +9,7 @@ from gym_examples import SIZE, made, played
 from programs import main
 from theatres import put, theatre_of
 
-from scenes.gym.episode import ENDED, FAR, OVER_LIMIT, SHARE, STEP, Judged, earned
+from scenes.gym.episode import ENDED, FAR, OVER_LIMIT, SHARE, STEP, EpisodeScore, earned
 from scenes.gym.model_answers import PressedModel
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT
@@ -24,13 +24,13 @@ STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: replace(BRAIN, young=9000.0)})
 
 
 def test_a_reward_is_a_difference_of_potentials_and_its_limits():
-    near, far = Judged(0.002, 0.1, 0, 0.5), Judged(0.012, 0.6, 0, 0.5)
+    near, far = EpisodeScore(0.002, 0.1, 0, 0.5), EpisodeScore(0.012, 0.6, 0, 0.5)
     assert earned(far, near, False, False) == pytest.approx(1.0 + 0.5 - STEP)
     assert earned(near, near, False, False) == pytest.approx(-STEP)
     assert earned(near, replace(near, load=1.1), False, False) == pytest.approx(-STEP - OVER_LIMIT)
     assert earned(near, near, False, True) == pytest.approx(ENDED - STEP)
     assert earned(near, replace(near, cut=2), False, False) == pytest.approx(2.0 * SHARE - STEP)
-    lost, farther = Judged(FAR, 1.0, 0, 0.5), Judged(2.0 * FAR, 5.0, 0, 0.5)  # beyond, all count alike
+    lost, farther = EpisodeScore(FAR, 1.0, 0, 0.5), EpisodeScore(2.0 * FAR, 5.0, 0, 0.5)  # beyond, all count alike
     assert earned(farther, lost, False, False) == pytest.approx(-STEP) != earned(lost, near, False, False)
 
 

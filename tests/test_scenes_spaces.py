@@ -22,7 +22,7 @@ from theatres import short
 from ar.tracking.pose import Verdict
 from ar.tracking.registration import Registration
 from scenes.cli import main
-from scenes.episodes.episode import Recording, collect
+from scenes.episodes.episode import EpisodeRecording, collect
 from scenes.play.deformers import Theatre
 from scenes.play.player import Player
 from scenes.play.stage import Stage
@@ -30,7 +30,7 @@ from scenes.tracked.pose_file import TrackedRow, write_poses
 from scenes.tracked.registration_file import scanned_of, write_registration
 from scenes.tracked.run import write_rows
 from scenes.tracked.tracked_tool import TrackedTool, read_tool, write_tool
-from scenes.tracked.truth import Truth, write_table, write_truth
+from scenes.tracked.truth import VideoGroundTruth, write_table, write_truth
 from sim.bodies.meshfile import read_anatomy, write_mesh
 from sim.tools import Ball
 from surrogate.data.simulate import simulate
@@ -161,7 +161,9 @@ def test_an_episode_shows_the_tumour_where_it_says_it_is(folder, pretender):
     anatomy = read_anatomy(folder / "patient.vtu")
     theatre = Theatre(anatomy, None, {}, "cpu")
     play = Player(Stage(short(), theatre.site, None), replace(pretender, anatomy=anatomy))
-    collect(folder / "press.h5", theatre, play, "fem", iter, recording=Recording(None, overlay=False, dated=False))
+    collect(
+        folder / "press.h5", theatre, play, "fem", iter, recording=EpisodeRecording(None, overlay=False, dated=False)
+    )
     with h5py.File(folder / "press.h5") as file:
         assert file.attrs["world_frame"] == "RAS [m]" and file.attrs["camera_frame"].startswith("OpenCV: x right")
         assert file["tumour_rest"].attrs["unit"] == "m"
@@ -179,7 +181,7 @@ def test_an_episode_shows_the_tumour_where_it_says_it_is(folder, pretender):
 def test_tables_and_headers_name_their_spaces(tmp_path):
     """Rows are of two pictures of a tumour of one vertex; what places are is held by tests of who writes them."""
     poses, still = np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 1, 3))
-    truth = Truth("digest", np.arange(2.0), poses, poses, still)
+    truth = VideoGroundTruth("digest", np.arange(2.0), poses, poses, still)
     write_truth(tmp_path / "truth.npz", truth)
     assert json.loads(str(np.load(tmp_path / "truth.npz")["header"]))["spaces"]["scan"] == "RAS [m]"
     write_table(tmp_path / "truth.csv", truth, 1e-3 * TUMOUR[None])

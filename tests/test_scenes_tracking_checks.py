@@ -9,7 +9,7 @@ from theatres import template_theatre
 
 from scenes.cli import main
 from scenes.tracked.drawn_film import drawn_film
-from scenes.tracked.follower import Follower, State
+from scenes.tracked.follower import Follower, TumourState
 from scenes.tracked.picture import Painter
 from scenes.tracked.tracking_checks import TrackingFigures, measure_tracking, usual
 
@@ -25,7 +25,7 @@ def parts(film):
 
 
 def as_known(known):
-    return replace(known, state=State.GOOD, words="")
+    return replace(known, state=TumourState.GOOD, words="")
 
 
 def made(kind, whole):
@@ -38,14 +38,14 @@ class Sure(Follower):
 
     def step(self, grey, time, before=None):
         known = super().step(grey, time, before)
-        return as_known(known) if known.state in (State.NO_REFERENCE, State.NO_TOOL) else known
+        return as_known(known) if known.state in (TumourState.NO_REFERENCE, TumourState.NO_TOOL) else known
 
 
 class Blind(Follower):
     """Finds nothing again that it lost."""
 
     def step(self, grey, time, before=None):
-        lost = before is not None and before.state is State.NO_REFERENCE
+        lost = before is not None and before.state is TumourState.NO_REFERENCE
         return super().step(np.full_like(grey, 120) if lost else grey, time, before)
 
 
@@ -61,7 +61,7 @@ class Fresh(Painter):
     """Draws what is stale as if it were known."""
 
     def paint(self, colour, known, covered=None):
-        return super().paint(colour, as_known(known) if known.state is State.STALE else known, covered)
+        return super().paint(colour, as_known(known) if known.state is TumourState.STALE else known, covered)
 
 
 class Silent(Painter):

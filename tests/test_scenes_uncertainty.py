@@ -10,8 +10,8 @@ from theatres import put, short, small
 from ar.overlay.hud import FINE, NARROW, folded, millimetres
 from ar.overlay.outlines import stands
 from scenes.analysis.uncertainty import (
-    Motions,
-    Solved,
+    SolvedMotions,
+    SurfaceMotions,
     causes,
     changed,
     coverage,
@@ -24,7 +24,7 @@ from scenes.analysis.uncertainty import (
 from scenes.cli import main
 from scenes.play.frame_text import NOT_KNOWN_WORDS, error_lines, worst
 from scenes.play.scene_costs import labelled
-from scenes.script.priors import POISSON, SKULL, STIFFNESS, TOOL, Draw, drawn
+from scenes.script.priors import POISSON, SKULL, STIFFNESS, TOOL, PatientSample, drawn
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.tool_paths import Touch
 from scenes.script.uncertainty import (
@@ -42,7 +42,7 @@ from sim.effects import SKULLS, Elasticity
 from sim.errors import InputError
 from sim.material import BRAIN
 
-SAME = Draw(1.0, BRAIN.poisson, 1.0, 0.0, (0.0, 0.0, 0.0), 0.0)
+SAME = PatientSample(1.0, BRAIN.poisson, 1.0, 0.0, (0.0, 0.0, 0.0), 0.0)
 """As the scene has it."""
 
 
@@ -76,7 +76,7 @@ def stated(scene, theatre, worst=(2e-3, 4e-3), **values):
 class TestEnsemble:
     def test_a_drawn_scene_has_what_was_drawn(self):
         scene = find_scene("palpate")
-        found = changed(scene, Draw(2.0, 0.47, 0.5, 0.5, (1e-3, 2e-3, 3e-3), 0.1))
+        found = changed(scene, PatientSample(2.0, 0.47, 0.5, 0.5, (1e-3, 2e-3, 3e-3), 0.1))
         elasticity, _, skull, _ = found.effects
         assert isinstance(elasticity, Elasticity) and skull == SKULLS["slide"]
         brain = replace(BRAIN, young=2.0 * BRAIN.young, poisson=0.47)
@@ -122,10 +122,10 @@ class TestEnsemble:
         normals = random.normal(size=(9, 3))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         field = 3e-3 * random.normal(size=(9, 3))
-        still = Motions((0.0, 1.0), (0.0 * field, field), (normals, normals))
+        still = SurfaceMotions((0.0, 1.0), (0.0 * field, field), (normals, normals))
 
         def answers(draws):
-            return [Solved((0.0 * field, field / one.stiffness)) for one in draws]
+            return [SolvedMotions((0.0 * field, field / one.stiffness)) for one in draws]
 
         draws, twins = drawn(300, 0), drawn(300, 1)
         found = uncertainty(theatre, scene, still, draws, answers(draws))
@@ -141,8 +141,8 @@ class TestEnsemble:
 
     def test_draws_without_equilibrium_are_counted_and_too_many_refused(self, theatre):
         field = np.ones((9, 3))
-        still, draws = Motions((0.0,), (field,), (field,)), drawn(10, 0)
-        answers = [Solved((field,), inverted) for inverted in [0, 0, 5, 1, 0, 0, 0, 0, 0]]
+        still, draws = SurfaceMotions((0.0,), (field,), (field,)), drawn(10, 0)
+        answers = [SolvedMotions((field,), inverted) for inverted in [0, 0, 5, 1, 0, 0, 0, 0, 0]]
         found = uncertainty(theatre, short(), still, draws, iter([*answers, None]))
         assert (found.failed, found.folded) == (1, 2)
         with pytest.raises(InputError, match="too few"):

@@ -3,7 +3,7 @@
 import numpy as np
 from visitor import report, wait_for
 
-from scenes.page.referee import Referee
+from scenes.page.referee import FemWorker
 from scenes.page.view import FEM_COLOUR, STALE_COLOUR
 
 
@@ -38,6 +38,6 @@ def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
     said = demo.browser.shown[2]
     assert '<p class="stale">previous load: error against FEM' in said and "<p>error against FEM" not in said
     assert tints[-1] == STALE_COLOUR and len(asked) == 1
-    Referee.ask(demo.referee, *asked[0])
+    FemWorker.ask(demo.referee, *asked[0])
     assert wait_for(lambda: demo.run(0.3) and "<p>error against FEM" in demo.browser.shown[2])
     assert "previous load" not in report(demo) and tints[-1] == FEM_COLOUR

@@ -20,10 +20,10 @@ from sim.fem import Fem
 from sim.linalg.preconditioner import rest_solver
 from sim.linalg.schur import condensed
 from sim.local_solvers.batch_elimination import BatchElimination, batch_elimination, near_tetrahedra
-from sim.local_solvers.outer_loop import Limits
+from sim.local_solvers.outer_loop import CycleLimits
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from sim.runtime.device import find_device
-from sim.strategy.plan import Step
+from sim.strategy.plan import SolverStep
 from sim.terms.schur_stiffness import Exterior
 from surrogate.data.tool_loads import draw
 
@@ -110,13 +110,15 @@ def test_the_condensed_surroundings_are_the_schur_complement() -> None:
 def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves() -> None:
     anatomy, space = body()
     effects = (Elasticity(tissue("stable-neo-hookean")), *EFFECTS)
-    fem, without = (Fem(anatomy, effects, Accuracy(FINE), "cpu", None, "p1", False, out) for out in ((), (Step.NEAR,)))
+    fem, without = (
+        Fem(anatomy, effects, Accuracy(FINE), "cpu", None, "p1", False, out) for out in ((), (SolverStep.NEAR,))
+    )
     many = np.repeat(TOTAL, 4, axis=0)
     plain = without.deform(loads_of(many))
     near = batch_elimination(fem.problem, rest_solver(fem.problem), effects, space)
     assert near is not None
     for cycles in (12, 3):
-        some = replace(near, limits=Limits(cycles=cycles))
+        some = replace(near, limits=CycleLimits(cycles=cycles))
         fem.strategy = replace(fem.strategy, near=lambda some=some: some)
         found = fem.deform(loads_of(many))
         assert all(outcome.good for outcome in found.outcome)
@@ -174,4 +176,4 @@ def test_what_gets_no_nearer_is_left_to_others() -> None:
         problem.device.zeros(problem.rows, 1), np.zeros(1), 100
     )
     assert found.status[0] == LIVE and found.residual[0] < 1e-12
-    assert found.steps[0] <= Limits().cycles and found.steps[0] < 20 + Limits().patience
+    assert found.steps[0] <= CycleLimits().cycles and found.steps[0] < 20 + CycleLimits().patience

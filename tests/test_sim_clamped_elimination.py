@@ -16,8 +16,8 @@ from sim.local_solvers.clamped_elimination import ClampedElimination
 from sim.local_solvers.clamped_part import ClampedPart
 from sim.minimisers.lbfgs_kernels import DONE, LIVE
 from sim.minimisers.residual import constants_of
-from sim.strategy.plan import Step
-from sim.terms.elasticity import Elasticity as ElasticityTerm
+from sim.strategy.plan import SolverStep
+from sim.terms.elasticity import ElasticTerm as ElasticityTerm
 
 BODY = base_held(box((4, 4, 4), 0.1))
 EFFECTS = (Elasticity(tissue("stable-neo-hookean")), Held(), ToolForce())
@@ -37,7 +37,7 @@ def test_finds_the_equilibrium() -> None:
     fem, elimination = fem_and_elimination()
     load = pressed(0.6)
     answer = fem.deform(load)
-    expected = Fem(BODY, EFFECTS, Accuracy(1e-8), "cpu", element="p2", avoid=(Step.CLAMPED,)).deform(load)
+    expected = Fem(BODY, EFFECTS, Accuracy(1e-8), "cpu", element="p2", avoid=(SolverStep.CLAMPED,)).deform(load)
     moved = np.abs(expected.displacement).max()
     assert answer.outcome[0].good and moved > 5e-3
     np.testing.assert_allclose(answer.displacement, expected.displacement, atol=1e-5 * moved)
@@ -102,7 +102,7 @@ def test_a_law_that_forbids_inversion_is_taken_as_far_as_it_goes(law: str, down:
     effects = (Elasticity(tissue(law)), Held(), ToolForce())
     answer, expected = (
         Fem(body, effects, Accuracy(1e-6, limit_strain=False), "cpu", element="p2", avoid=avoid).deform(load)
-        for avoid in ((), (Step.CLAMPED,))
+        for avoid in ((), (SolverStep.CLAMPED,))
     )
     assert answer.outcome[0].good and expected.outcome[0].good and answer.inverted[0] == 0
     moved = np.abs(expected.displacement).max()

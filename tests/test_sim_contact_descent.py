@@ -19,13 +19,13 @@ from sim.linalg.compliance import Columns, Compliance
 from sim.linalg.pcg import Preconditioner
 from sim.loads import Loads, Touching
 from sim.local_solvers.contact_descent import ContactDescent
-from sim.local_solvers.contact_forces import ForceLimits, Softness, scratch_of, settled
+from sim.local_solvers.contact_forces import ContactCompliance, ForceLimits, scratch_of, settled
 from sim.local_solvers.contact_preconditioner import ContactPreconditioner
 from sim.material import Material
-from sim.minimisers.compact_lbfgs import Pairs, PairsOfColumns, no_pairs
+from sim.minimisers.compact_lbfgs import CurvaturePairs, PairsOfColumns, no_pairs
 from sim.minimisers.lbfgs_kernels import PAIRS
 from sim.runtime.device import Device
-from sim.strategy.plan import Step
+from sim.strategy.plan import SolverStep
 from sim.tools import Ball
 
 SIDE, HEIGHT, RADIUS = 0.06, 0.03, 6e-3
@@ -82,7 +82,7 @@ def bfgs(inverse: np.ndarray, steps: np.ndarray, changes: np.ndarray) -> np.ndar
     return inverse
 
 
-def learnt_pairs(count: int) -> tuple[Pairs, np.ndarray, np.ndarray]:
+def learnt_pairs(count: int) -> tuple[CurvaturePairs, np.ndarray, np.ndarray]:
     """Pairs of random steps (the last PAIRS count), the inverse they began with and the one that BFGS has."""
     rng, size = np.random.default_rng(5), 30
     stiffness, change = (matrix @ matrix.T for matrix in rng.normal(size=(2, size, size)))
@@ -230,7 +230,7 @@ def test_contact_solved_apart_is_what_newton_finds() -> None:
     """Of deep poses too, where the model of the tissue misleads."""
     effects = [Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held(), ToolContact((Ball(RADIUS),))]
     poses = touching(DOWN, at(0.031, 0.028, HEIGHT - 6e-3), at(0.012, 0.045, HEIGHT - 5e-3))
-    newton = Fem(BODY, effects, Accuracy(1e-7), "cpu", element="p1", avoid=(Step.CONTACT,)).deform(poses)
+    newton = Fem(BODY, effects, Accuracy(1e-7), "cpu", element="p1", avoid=(SolverStep.CONTACT,)).deform(poses)
     found = solver(Accuracy(1e-7)).deform(poses)
     assert all(outcome.good for outcome in (*newton.outcome, *found.outcome))
     np.testing.assert_allclose(found.displacement, newton.displacement, atol=1e-8)
@@ -252,7 +252,7 @@ def test_forces_are_those_of_tools_where_nodes_go_under_them(drag: float, rough:
     barrier = descent.barrier.reduced(np.arange(3))
     assert barrier is not None
     here, known = np.zeros((3 * n, 3)), np.zeros((3 * n, 3))
-    model, few = Softness(soft, device, partial(scratch_of, device)), ForceLimits(iterations=20)
+    model, few = ContactCompliance(soft, device, partial(scratch_of, device)), ForceLimits(iterations=20)
     force, found = settled(barrier, model, here, here + 1e-4, known, np.full(3, 1e-6), np.full(3, drag), few)
     assert found.all() and not force[:, 2].any()
     between = soft.between(np.ones(n, bool))

@@ -18,7 +18,7 @@ from sim.loads import Loads, Touching
 from sim.local_solvers.contact_descent import ContactDescent
 from sim.local_solvers.contact_limits import ContactLimits
 from sim.local_solvers.contact_steps import ContactSteps
-from sim.local_solvers.strained_part import Strains
+from sim.local_solvers.strained_part import StrainLimits
 from sim.material import Material
 from sim.minimisers.lbfgs import Descended
 from sim.tools import Ball
@@ -87,7 +87,7 @@ def test_replayed_steps_are_those_of_the_descent(
     fem = solver(material, radius)
     found = fem.strategy.contact
     assert found is not None
-    strains = Strains(least=least, cut=np.inf)
+    strains = StrainLimits(least=least, cut=np.inf)
     ordinary, replayed = (replace(found, limits=limits, strains=strains, replays=which) for which in (False, True))
     expected = followed(fem, ordinary, many)
     taken = counted(monkeypatch, ContactSteps, "accept")

@@ -10,7 +10,7 @@ import warp as wp
 from boxes import box
 from scipy.spatial import Delaunay
 
-from sim.discretisation.footprint import CHUNK, Division, Skin, footprint_weights, nearest_on
+from sim.discretisation.footprint import CHUNK, ContactSurface, EdgeSubdivision, footprint_weights, nearest_on
 from sim.errors import InputError
 from sim.runtime.device import find_device
 
@@ -74,7 +74,7 @@ def test_a_small_tool_on_large_triangles() -> None:
 
 def test_what_was_pressed_last_is_kept_for_the_same_place_and_radius_alone() -> None:
     nodes, triangles = sheet(300)
-    skin = Skin(nodes, triangles, find_device("cpu", "float64"))
+    skin = ContactSurface(nodes, triangles, find_device("cpu", "float64"))
     for point, radius in ((POINT, RADIUS), (POINT, 0.5 * RADIUS), (-POINT, 0.5 * RADIUS), (POINT, RADIUS)):
         found = skin.press(point[None], np.array([radius])).rows(len(nodes)).toarray()[0]
         np.testing.assert_allclose(found, weights(nodes, triangles, point, radius), atol=1e-15)
@@ -203,7 +203,7 @@ def test_the_nearest_point_is_found_in_any_chunk() -> None:
     nodes, triangles = sheet(400)
     assert len(triangles) > 8 * CHUNK
     above = nodes[triangles].mean(axis=1) + [0.0, 0.0, 1e-3]
-    skin = Skin(nodes, triangles, find_device("cpu", "float64"))
+    skin = ContactSurface(nodes, triangles, find_device("cpu", "float64"))
     found, distance = skin.nearest(above, np.full(len(above), 2e-3))
     np.testing.assert_allclose(found, above * [1.0, 1.0, 0.0], atol=1e-15)
     np.testing.assert_allclose(distance, 1e-3, rtol=1e-12)
@@ -215,24 +215,30 @@ def test_finer_pieces_find_nearly_the_same_weights() -> None:
     nodes, triangles = sheet(60)
     device, point, radius = find_device("cpu", "float64"), np.zeros((1, 3)), np.array([5e-3])
     coarse, fine = (
-        Skin(nodes, triangles, device, division=Division(fineness=share)).press(point, radius).rows(len(nodes))
+        ContactSurface(nodes, triangles, device, division=EdgeSubdivision(fineness=share))
+        .press(point, radius)
+        .rows(len(nodes))
         for share in (0.12, 0.03)
     )
     assert 0.0 < np.abs((coarse - fine).toarray()).max() < 2e-3
     with pytest.raises(InputError, match="too small"):
-        Skin(nodes, triangles, device, division=Division(most=1)).press(point, radius)
+        ContactSurface(nodes, triangles, device, division=EdgeSubdivision(most=1)).press(point, radius)
 
 
 @pytest.mark.parametrize("mesh", [sheet(300), quadratic_sheet(60)], ids=["linear", "quadratic"])
 def test_the_centre_is_where_the_force_acts(mesh: tuple[np.ndarray, np.ndarray]) -> None:
     points, radii = np.array([POINT, [0.03, 0.0, 0.0]]), np.array([RADIUS, 0.007])
-    pressed = Skin(*mesh, find_device("cpu", "float64")).press(points, radii)
+    pressed = ContactSurface(*mesh, find_device("cpu", "float64")).press(points, radii)
     np.testing.assert_allclose(pressed.centres(), pressed.rows(len(mesh[0])) @ mesh[0], atol=1e-16)
 
 
 def test_arrays_that_change_in_place_are_pressed_anew() -> None:
     nodes, triangles = sheet(300)
-    skin, points, radii = Skin(nodes, triangles, find_device("cpu", "float64")), POINT[None].copy(), np.array([RADIUS])
+    skin, points, radii = (
+        ContactSurface(nodes, triangles, find_device("cpu", "float64")),
+        POINT[None].copy(),
+        np.array([RADIUS]),
+    )
     before = skin.press(points, radii)
     assert skin.press(points.copy(), radii) is before  # nothing is integrated twice
     points[0, 0] += 0.01
@@ -246,7 +252,7 @@ def test_a_graphics_card_gives_the_same_weights(mesh: tuple[np.ndarray, np.ndarr
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(-0.03, 0.03, (200, 2)), rng.uniform(-3e-4, 3e-4, 200)])
     radii = rng.uniform(5e-4, 0.016, 200)
-    here, there = (Skin(*mesh, find_device(name, "float64")).press(points, radii) for name in ("cpu", "cuda"))
+    here, there = (ContactSurface(*mesh, find_device(name, "float64")).press(points, radii) for name in ("cpu", "cuda"))
     shares = (one.rows(len(mesh[0])).toarray() for one in (there, here))
     np.testing.assert_allclose(*shares, atol=1e-12)
     np.testing.assert_allclose(there.centres(), here.centres(), atol=1e-14)

@@ -17,7 +17,7 @@ from sim.fem import Fem
 from sim.loads import Loads, push, stacked
 from sim.minimisers.lbfgs import LEARNT
 from sim.strategy import frame_sequence
-from sim.strategy.captured_frame import FRAME_EVALUATIONS, Frame
+from sim.strategy.captured_frame import FRAME_EVALUATIONS, CapturedFrame
 from sim.strategy.frame_sequence import Kept
 from sim.strategy.plan import can_follow
 
@@ -154,14 +154,14 @@ def test_a_body_of_another_element_or_a_small_budget_is_not_followed():
 def test_a_start_that_cannot_be_taken_leaves_no_state_behind(fem, monkeypatch):
     first, middle, last = ride(fem, 3)
     expected, here = fem.deform(pushed(2.1e-3), last), fem.deform(pushed(1.4e-3), middle)
-    take = Frame.take
+    take = CapturedFrame.take
 
     def interrupted(frame, *given):
         take(frame, *given)
         raise MemoryError
 
     with monkeypatch.context() as patch, pytest.raises(MemoryError):
-        patch.setattr(Frame, "take", interrupted)
+        patch.setattr(CapturedFrame, "take", interrupted)
         fem.deform(pushed(2.1e-3), replace(first))
     np.testing.assert_array_equal(here.displacement, last.displacement)
     assert same(fem.deform(pushed(2.1e-3), here), expected)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.bodies.head_masks import Sources, head_masks
 from sim.bodies.label_volume import masked_subject, volume_subject
-from sim.bodies.subject import MeshPlan, Part, make_anatomy
+from sim.bodies.subject import MeshPlan, SubjectPart, make_anatomy
 from sim.bodies.volume import read_volume
 from sim.bodies.voxels import Voxels
 from sim.errors import InputError
@@ -306,7 +306,7 @@ def test_oedema_and_ventricles_become_regions(tmp_path):
         marked = (labels == label).sum() * (1e-3 * EDGE) ** 3
         assert mesh.volumes[mesh.region == region].sum() == pytest.approx(marked, rel=off)
     assert set(np.unique(mesh.region)) == {1, 2, 3, 4}
-    everywhere = make_anatomy(replace(subject, parts=(Part(3, subject.brain, 1.0),)), MeshPlan(nodes=2500)).mesh
+    everywhere = make_anatomy(replace(subject, parts=(SubjectPart(3, subject.brain, 1.0),)), MeshPlan(nodes=2500)).mesh
     assert ((everywhere.region == 2) == (mesh.region == 2)).all()  # a tumour stays one
     with pytest.raises(
         InputError, match=r"marks no necrosis.*\. Choose from oedema, ventricles, or name .* by --necrosis"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.bodies.bcc_lattice import graded_lattice
-from sim.bodies.isosurface_stuffing import Stuffing, cut, whole
+from sim.bodies.isosurface_stuffing import IsosurfaceStuffingOptions, cut, whole
 from sim.geometry.tetmesh import dihedral_angles, faces_once, row_keys, signed_volumes
 
 RADIUS, INNER, MIDDLE = 0.06, 0.015, np.array([0.02, 0.01, 0.0])
@@ -70,7 +70,7 @@ def test_pinned_nodes_stay():
 
 def test_nothing_is_snapped_where_no_share_of_an_edge_is():
     lattice = graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
-    body = cut(whole(lattice), ball, settings=Stuffing(snap_shortest=0.0))
+    body = cut(whole(lattice), ball, settings=IsosurfaceStuffingOptions(snap_shortest=0.0))
     np.testing.assert_array_equal(body.nodes[: len(lattice.nodes)], lattice.nodes)
 
 

@@ -10,15 +10,15 @@ import pytest
 from sim.errors import InputError
 from sim.runtime.columns import widest_within, width_of
 from sim.runtime.device import Device, find_device
-from sim.runtime.memory import Budget, check_fits, column_bytes, fitting_batch, host_bytes
+from sim.runtime.memory import MemoryBudget, check_fits, column_bytes, fitting_batch, host_bytes
 
 ROWS = 3_000
 
 
-def group(folder: Path, most: str, used: int, cached: int) -> Budget:
+def group(folder: Path, most: str, used: int, cached: int) -> MemoryBudget:
     for name, text in (("max", most), ("current", str(used)), ("stat", f"anon 5\ninactive_file {cached}\nfile 9\n")):
         (folder / f"memory.{name}").write_text(f"{text}\n")
-    return Budget(group=folder)
+    return MemoryBudget(group=folder)
 
 
 def test_a_control_group_bounds_what_is_free(tmp_path: Path) -> None:
@@ -26,7 +26,7 @@ def test_a_control_group_bounds_what_is_free(tmp_path: Path) -> None:
     plain = host_bytes()
     assert host_bytes(group(tmp_path, "50000000", 20_000_000, 3_000_000)) == 33_000_000
     assert host_bytes(group(tmp_path, "max", 20_000_000, 0)) == pytest.approx(plain, rel=0.2)
-    assert host_bytes(Budget(group=tmp_path / "none")) == pytest.approx(plain, rel=0.2)
+    assert host_bytes(MemoryBudget(group=tmp_path / "none")) == pytest.approx(plain, rel=0.2)
 
 
 @pytest.mark.parametrize(("batch", "count"), [(64, 2_000), (512, 400)])
@@ -71,4 +71,4 @@ def test_a_batch_that_fits_a_card_fills_its_room() -> None:
     """As many loads as are worth it, and at least one."""
     column = column_bytes(ROWS, CARD)
     batches = [fitting_batch(ROWS, CARD, free * column) for free in (0, 2, 9, 100, 200, 10**9)]
-    assert batches == [1, 1, 4, 4, 96, Budget.widest_on_cuda]
+    assert batches == [1, 1, 4, 4, 96, MemoryBudget.widest_on_cuda]

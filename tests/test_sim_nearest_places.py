@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.discretisation.nearest_places import Placed
+from sim.discretisation.nearest_places import PlacedBox
 
 
 @pytest.mark.parametrize("half", [[0.0, 0.0, 0.0], [0.0, 0.0, 0.4], [0.3, 0.5, 1e-9], [0.2, 0.3, 0.4]])
@@ -14,7 +14,7 @@ def test_the_place_nearest_to_a_core_is_nearest(half: list[float]) -> None:
     rng = np.random.default_rng(1)
     corners = rng.normal(size=(150, 3, 3)) * rng.uniform(0.3, 1.0, (150, 1, 3))
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    core = Placed(np.array([0.3, -0.2, 0.1]), axes, np.array(half))
+    core = PlacedBox(np.array([0.3, -0.2, 0.1]), axes, np.array(half))
     share, far, way = core.nearest(corners)
     assert share.min() >= 0.0
     again, direction = core.distances(corners, share)
@@ -29,7 +29,7 @@ def test_the_place_nearest_to_a_core_is_nearest(half: list[float]) -> None:
 
 def test_what_came_through_a_blade_is_pushed_down_again() -> None:
     """The farther above, the deeper inside; beside the blade the nearest edge counts."""
-    blade = Placed(np.zeros(3), np.eye(3), np.array([4.0, 6.0, 0.0]))
+    blade = PlacedBox(np.zeros(3), np.eye(3), np.array([4.0, 6.0, 0.0]))
     flat = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     tilted = flat + [[0.0, 0.0, 0.1], [0.0, 0.0, 0.7], [0.0, 0.0, -0.2]]
     near = blade.nearest(np.array([flat + [0.0, 0.0, 0.5], tilted, flat - [0.0, 0.0, 0.5], flat + [8.0, 0.0, 0.5]]))

@@ -18,7 +18,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Resected, push
 from sim.material import BRAIN
-from sim.resected_fem import Operated, finite_elements
+from sim.resected_fem import OperatedFem, finite_elements
 
 STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=300.0)
 
@@ -138,7 +138,7 @@ def test_what_is_left_of_a_tumour_keeps_its_law(small_box):
     cut = Resection((tuple(np.flatnonzero(halved.within(TUMOUR_LABEL)).tolist()),))
     effects = (*pushed_effects(small_box, Elasticity(BRAIN, {TUMOUR_LABEL: STIFF})), cut)
     operated = finite_elements(replace(small_box, mesh=halved), effects, element="p1")
-    assert isinstance(operated, Operated)
+    assert isinstance(operated, OperatedFem)
     left = operated.remains(1).anatomy
     assert set(left.mesh.region.tolist()) == {1, NECROSIS_LABEL}
     place = open_cortex(small_box).nearest(np.zeros(3))

@@ -19,62 +19,62 @@ from sim.local_solvers.clamped_elimination import ClampedElimination
 from sim.local_solvers.strained_descent import StrainedDescent
 from sim.minimisers.lbfgs import Lbfgs
 from sim.strategy import strategy
-from sim.strategy.plan import EVALUATIONS, FEWEST, WORTH, Plan, Step
-from sim.terms.elasticity import Elasticity as ElasticityTerm
+from sim.strategy.plan import EVALUATIONS, FEWEST, WORTH, SolverPlan, SolverStep
+from sim.terms.elasticity import ElasticTerm as ElasticityTerm
 from sim.tools import Ball, Spatula
 
 BODY, PUSHED = body()[0], (Elasticity(), *EFFECTS)
 WIDE = {"anatomy": base_held(box((3, 3, 3), 0.1)), "effects": (Elasticity(), Held(), ToolForce())}
 POSED = {"anatomy": make_box(), "effects": (Elasticity(), Held(), ToolContact((Ball(7e-3),)))}
-LAST = (Step.LBFGS, Step.NEWTON)
+LAST = (SolverStep.LBFGS, SolverStep.NEWTON)
 
 
-def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accuracy = TRAIN, **more) -> Plan:
+def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accuracy = TRAIN, **more) -> SolverPlan:
     return Fem(anatomy, effects, accuracy, "cpu", **{"element": "p1", **more}).plan
 
 
 @pytest.mark.parametrize(
     ("more", "one", "few", "many"),
     [
-        ({}, LAST, LAST, (Step.NEAR, *LAST)),
-        ({"element": "smoothed"}, LAST, LAST, (Step.NEAR, *LAST)),
-        ({"live": True}, LAST, LAST, (Step.NEAR, *LAST)),
-        ({"element": "smoothed", "live": True}, (Step.STRAINED, *LAST), LAST, (Step.NEAR, *LAST)),
-        ({"element": "p2"}, (Step.CLAMPED, *LAST), LAST, LAST),
-        ({"element": "p2", "live": True}, (Step.CLAMPED, *LAST), LAST, LAST),
+        ({}, LAST, LAST, (SolverStep.NEAR, *LAST)),
+        ({"element": "smoothed"}, LAST, LAST, (SolverStep.NEAR, *LAST)),
+        ({"live": True}, LAST, LAST, (SolverStep.NEAR, *LAST)),
+        ({"element": "smoothed", "live": True}, (SolverStep.STRAINED, *LAST), LAST, (SolverStep.NEAR, *LAST)),
+        ({"element": "p2"}, (SolverStep.CLAMPED, *LAST), LAST, LAST),
+        ({"element": "p2", "live": True}, (SolverStep.CLAMPED, *LAST), LAST, LAST),
         ({**WIDE, "live": True}, LAST, LAST, LAST),
         ({"effects": (*PUSHED, Inertia()), "live": True}, LAST, LAST, LAST),
-        ({"accuracy": replace(TRAIN, outer=FEWEST - 1)}, *3 * [(Step.NEWTON,)]),
-        (POSED, *3 * [(Step.NEWTON,)]),
+        ({"accuracy": replace(TRAIN, outer=FEWEST - 1)}, *3 * [(SolverStep.NEWTON,)]),
+        (POSED, *3 * [(SolverStep.NEWTON,)]),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
 def test_the_table(more, one, few, many):
     plan = planned(**more)
     assert [plan.steps(count) for count in (1, 2, WORTH)] == [one, few, many]
-    assert plan.steps(WORTH, imposed=True) == (Step.NEWTON,) and not plan.frames
+    assert plan.steps(WORTH, imposed=True) == (SolverStep.NEWTON,) and not plan.frames
 
 
 def test_contact_is_settled_apart_where_one_kind_of_tool_is_all_that_touches():
-    assert planned(**POSED).contact is Step.CONTACT and planned().contact is None
+    assert planned(**POSED).contact is SolverStep.CONTACT and planned().contact is None
     both = (*POSED["effects"], Retraction(Spatula(12e-3, 20e-3, 1e-3)))
-    assert planned(**{**POSED, "effects": both}).contact is Step.NEWTON
+    assert planned(**{**POSED, "effects": both}).contact is SolverStep.NEWTON
 
 
 @pytest.mark.parametrize(
     ("avoid", "steps"),
     [
-        (Step.NEAR, {WORTH: LAST}),
-        (Step.STRAINED, {1: LAST}),
-        (Step.LBFGS, {1: (Step.NEWTON,), WORTH: (Step.NEWTON,)}),
-        (Step.NEWTON, {1: (Step.STRAINED, *LAST), WORTH: (Step.NEAR, *LAST)}),
+        (SolverStep.NEAR, {WORTH: LAST}),
+        (SolverStep.STRAINED, {1: LAST}),
+        (SolverStep.LBFGS, {1: (SolverStep.NEWTON,), WORTH: (SolverStep.NEWTON,)}),
+        (SolverStep.NEWTON, {1: (SolverStep.STRAINED, *LAST), WORTH: (SolverStep.NEAR, *LAST)}),
     ],
 )
 def test_what_is_avoided_is_not_tried(avoid, steps):
     plan = planned(live=True, element="smoothed", avoid=(avoid,))
     assert {count: plan.steps(count) for count in steps} == steps
-    assert planned(**POSED, avoid=(Step.CONTACT,)).contact is Step.NEWTON
-    assert planned(element="p2", avoid=(Step.CLAMPED,)).single is None
+    assert planned(**POSED, avoid=(SolverStep.CONTACT,)).contact is SolverStep.NEWTON
+    assert planned(element="p2", avoid=(SolverStep.CLAMPED,)).single is None
 
 
 @pytest.mark.parametrize("evaluations", [0, 1, 7])
@@ -126,10 +126,10 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
     """Each step that is asked passes every load on, so that all are heard."""
     tried, left = [], [EVALUATIONS]
     kinds = {
-        BatchElimination: Step.NEAR,
-        StrainedDescent: Step.STRAINED,
-        ClampedElimination: Step.CLAMPED,
-        Lbfgs: Step.LBFGS,
+        BatchElimination: SolverStep.NEAR,
+        StrainedDescent: SolverStep.STRAINED,
+        ClampedElimination: SolverStep.CLAMPED,
+        Lbfgs: SolverStep.LBFGS,
     }
 
     def deaf(kind):
@@ -147,7 +147,7 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
         return descend
 
     def newton(*given):
-        tried.append(Step.NEWTON)
+        tried.append(SolverStep.NEWTON)
         return found(*given)
 
     fem, found = Fem(BODY, PUSHED, TRAIN, "cpu", **{"element": "p1", **more}), strategy.find_equilibrium

@@ -12,7 +12,7 @@ from sim.discretisation.footprint import footprint_weights
 from sim.effects import Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.linalg.rest_solver import Resting
+from sim.linalg.rest_solver import RestStiffnessSolver
 from sim.loads import Displaced, Loads, Nodal, Pushed
 from sim.material import LAWS, Material
 from sim.minimisers.power_series import mixed, mixing_kernel, products, telling, terms_of
@@ -61,7 +61,7 @@ def test_without_an_inverse_of_the_rest_stiffness_linear_answers_are_the_same():
     problem, preconditioner = built("smoothed", 0.45, (2, 2, 3))
     free = problem.constraint.basis()
     force = free @ np.random.default_rng(0).normal(size=(len(free.indptr) - 1, 3))
-    direct, iterated = (Resting(problem, preconditioner, 400, largest_factor=most) for most in (10**6, 0))
+    direct, iterated = (RestStiffnessSolver(problem, preconditioner, 400, largest_factor=most) for most in (10**6, 0))
     assert direct.exact is not None and iterated.exact is None
     one, other = (resting.answer(problem.device.array(force)).numpy() for resting in (direct, iterated))
     np.testing.assert_allclose(one, other, atol=1e-7 * np.abs(one).max())

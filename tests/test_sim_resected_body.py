@@ -21,7 +21,7 @@ from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal, Posture, Resected, Touching, posture, push
 from sim.material import Material
-from sim.resected_fem import Operated, finite_elements
+from sim.resected_fem import OperatedFem, finite_elements
 from sim.runtime.device import find_device
 from sim.tools import Ball
 
@@ -35,14 +35,14 @@ def compact(anatomy: Anatomy) -> tuple[Anatomy, np.ndarray]:
     return Anatomy(fresh, anatomy.held[used], anatomy.slide_normal[used], anatomy.craniotomy[used]), used
 
 
-def solver(steps: Resection = STEPS, element: str | None = "p1", **values: object) -> Operated:
+def solver(steps: Resection = STEPS, element: str | None = "p1", **values: object) -> OperatedFem:
     made = finite_elements(BODY, (*EFFECTS, steps), TIGHT, "cpu", element=element, **values)  # type: ignore
-    assert isinstance(made, Operated)
+    assert isinstance(made, OperatedFem)
     return made
 
 
 @pytest.fixture(scope="module")
-def operated() -> Operated:
+def operated() -> OperatedFem:
     return solver()
 
 
@@ -66,7 +66,7 @@ def test_a_mesh_with_middles_of_its_own_loses_them_too() -> None:
     curved = quadratic(box((2, 2, 2), 0.04, distortion=0.1), curved=0.05)
     body, effects = base_held(curved), EFFECTS[:3]
     made = finite_elements(body, (*effects, Resection((within((1, 1, 1), (2, 2, 2), curved),))), TIGHT, "cpu")
-    assert isinstance(made, Operated)
+    assert isinstance(made, OperatedFem)
     left, used = compact(made.remains(1).anatomy)
     alone = Fem(left, effects, TIGHT, "cpu").deform(posture(DOWN, -1.0))
     answer = made.deform(posture(DOWN, -1.0))
@@ -76,18 +76,18 @@ def test_a_mesh_with_middles_of_its_own_loses_them_too() -> None:
     )
 
 
-def test_without_a_cause_all_steps_are_done(operated: Operated) -> None:
+def test_without_a_cause_all_steps_are_done(operated: OperatedFem) -> None:
     silent = operated.deform(posture(DOWN, -1.0))
     said = operated.deform(lying([2]))
     np.testing.assert_array_equal(silent.displacement, said.displacement)
 
 
-def test_no_step_is_the_whole_body(operated: Operated) -> None:
+def test_no_step_is_the_whole_body(operated: OperatedFem) -> None:
     plain = Fem(BODY, EFFECTS, TIGHT, "cpu", element="p1").deform(posture(DOWN, -1.0))
     np.testing.assert_array_equal(operated.deform(lying([0])).displacement, plain.displacement)
 
 
-def test_each_row_has_its_own_body(operated: Operated) -> None:
+def test_each_row_has_its_own_body(operated: OperatedFem) -> None:
     done = [2, 0, 1, 0, 2]
     together = operated.deform(lying(done))
     for row, one in enumerate(done):
@@ -96,12 +96,12 @@ def test_each_row_has_its_own_body(operated: Operated) -> None:
     assert together.time.shape == (5,) and len(together.outcome) == 5
 
 
-def test_without_weight_nothing_moves(operated: Operated) -> None:
+def test_without_weight_nothing_moves(operated: OperatedFem) -> None:
     at_rest = Loads((Posture(np.array([[0.0, 0.0, -1.0]]), np.array([1.0]), np.ones(1)), Resected(np.array([1]))))
     assert not operated.deform(at_rest).displacement.any()
 
 
-def test_a_wall_is_free(operated: Operated) -> None:
+def test_a_wall_is_free(operated: OperatedFem) -> None:
     """Forces on the cavity's own wall are answered: it is no longer inside."""
     wall = np.setdiff1d(np.unique(operated.remains(2).anatomy.mesh.surface), np.unique(MESH.surface))
     force = np.zeros((1, len(MESH.nodes), 3))
@@ -123,7 +123,7 @@ class TestAcrossCuts:
             size = np.abs(cold[done].displacement).max()
             np.testing.assert_allclose(last.displacement, cold[done].displacement, atol=1e-7 * size)
 
-    def test_answers_are_pure(self, operated: Operated) -> None:
+    def test_answers_are_pure(self, operated: OperatedFem) -> None:
         start = operated.deform(lying([1]))
         first = operated.deform(lying([2]), start)
         operated.deform(lying([0]))
@@ -131,14 +131,14 @@ class TestAcrossCuts:
         np.testing.assert_array_equal(first.displacement, again.displacement)
         np.testing.assert_array_equal(start.displacement, operated.deform(lying([1])).displacement)
 
-    def test_rows_start_from_their_own(self, operated: Operated) -> None:
+    def test_rows_start_from_their_own(self, operated: OperatedFem) -> None:
         start = operated.deform(lying([0, 1, 2]))
         answer = operated.deform(lying([1, 1, 0]), start)
         for row, done in enumerate((1, 1, 0)):
             alone = operated.deform(lying([done]))
             np.testing.assert_allclose(answer.displacement[row], alone.displacement[0], atol=1e-10)
 
-    def test_somebodys_guess_is_a_start(self, operated: Operated) -> None:
+    def test_somebodys_guess_is_a_start(self, operated: OperatedFem) -> None:
         """It moves vertices of which nothing is left."""
         wild = guess(1e-4 * np.random.default_rng(1).normal(size=(1, len(MESH.nodes), 3)))
         answer = operated.deform(lying([2]), wild)
@@ -216,7 +216,7 @@ class TestHardCases:
         cut = Resection((within((0, 0, 0), (1, 1, 4)),))
         effects = (Elasticity(SOFT), Held(), Slide(), Gravity(direction=(0.0, 0.0, -1.0)))
         made = finite_elements(body, (*effects, cut), TIGHT, "cpu", element="p1")
-        assert isinstance(made, Operated)
+        assert isinstance(made, OperatedFem)
         left = made.remains(1).anatomy
         gone = left.orphaned
         assert (gone & BODY.held[:, 0]).any() and (gone & normal.any(axis=1)).any() and (gone & opened).any()
@@ -276,7 +276,7 @@ class TestHardCases:
         with pytest.raises(InputError, match="whole numbers from 0 up"):
             Loads((Resected(np.array([done])),))
 
-    def test_more_steps_than_there_are_is_a_sentence(self, operated: Operated) -> None:
+    def test_more_steps_than_there_are_is_a_sentence(self, operated: OperatedFem) -> None:
         with pytest.raises(InputError, match="done is 3, but Resection has 2 steps"):
             operated.deform(lying([1, 3]))
 

@@ -24,19 +24,19 @@ from sim.local_solvers.strained_descent import (
     SINGLE,
     Renewal,
     StiffenedPreconditioner,
-    Stiffening,
+    StiffnessUpdate,
     StrainedDescent,
     strained_part,
 )
-from sim.local_solvers.strained_part import Strains
+from sim.local_solvers.strained_part import StrainLimits
 from sim.minimisers.lbfgs import Lbfgs
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE
 from sim.minimisers.lbfgs_kernels import LIVE as GOING
-from sim.strategy.plan import Step
+from sim.strategy.plan import SolverStep
 
 LAW, HARD = "neo-hookean", np.array([[1.0, 0.5, -5.0]])
 RENEWAL = Renewal()
-EVERY = Strains(least=0.0, nodes=10**4, cut=np.inf, near=10**4)
+EVERY = StrainLimits(least=0.0, nodes=10**4, cut=np.inf, near=10**4)
 
 
 def factor_of(problem: Problem) -> Factor:
@@ -46,7 +46,7 @@ def factor_of(problem: Problem) -> Factor:
 
 
 def descent_on(
-    problem: Problem, space: Discretisation, strains: Strains = SINGLE, renewal: Renewal = RENEWAL
+    problem: Problem, space: Discretisation, strains: StrainLimits = SINGLE, renewal: Renewal = RENEWAL
 ) -> StrainedDescent:
     factor = factor_of(problem)
     return StrainedDescent(problem, factor, strained_part(problem, factor, space, strains), renewal)
@@ -93,7 +93,7 @@ def test_the_preconditioner_is_the_inverse_of_what_is_stiffer(monkeypatch: pytes
     force = basis @ np.random.default_rng(0).normal(size=(basis.shape[1], 1))
     exact = basis @ sp.linalg.spsolve(sp.csc_array(basis.T @ now @ basis), basis.T @ force)
     at_rest = basis @ sp.linalg.spsolve(sp.csc_array(basis.T @ problem.rest_curvature() @ basis), basis.T @ force)
-    kept: list[Stiffening] = []
+    kept: list[StiffnessUpdate] = []
     inside = StiffenedPreconditioner.apply
     monkeypatch.setattr(
         StiffenedPreconditioner, "apply",
@@ -162,7 +162,9 @@ def test_where_the_model_is_not_positive_the_rest_stands_in() -> None:
     factor.apply(g, np.ones(1, bool), plain)
     size = len(rows)
     added = 1e6 * np.eye(size, dtype=np.float32)
-    preconditioner.stiffening = Stiffening(rows, added, np.eye(size, dtype=np.float32), np.arange(size, dtype=np.int32))
+    preconditioner.stiffening = StiffnessUpdate(
+        rows, added, np.eye(size, dtype=np.float32), np.arange(size, dtype=np.int32)
+    )
     preconditioner.apply(g, np.ones(1, bool), out)
     np.testing.assert_array_equal(out.numpy(), plain.numpy())
 
@@ -178,7 +180,7 @@ def test_the_budget_leaves_a_finite_state_and_says_so() -> None:
     assert broken.status[0] == BROKEN
 
 
-def live(*avoid: Step) -> Fem:
+def live(*avoid: SolverStep) -> Fem:
     effects = (Elasticity(tissue(LAW)), *EFFECTS)
     return Fem(body()[0], effects, replace(LIVE, tolerance=1e-4), "cpu", element="smoothed", live=True, avoid=avoid)
 
@@ -192,7 +194,7 @@ def frames(fem: Fem) -> list[Deformation]:
 
 
 def test_live_frames_go_the_short_way_to_the_same_place() -> None:
-    found, expected = frames(live()), frames(live(Step.STRAINED))
+    found, expected = frames(live()), frames(live(SolverStep.STRAINED))
     assert {answer.outcome[0] for answer in found} == {Outcome.CONVERGED}
     size = np.abs(expected[-1].displacement).max()
     for mine, other in zip(found, expected, strict=True):

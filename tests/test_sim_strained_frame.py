@@ -17,7 +17,7 @@ from sim.fem import Fem
 from sim.linalg.multifrontal import Factor
 from sim.loads import Loads, push
 from sim.local_solvers.strained_descent import SINGLE, Renewal, StiffenedPreconditioner, StrainedDescent, strained_part
-from sim.local_solvers.strained_frame import MATRIX, NODES, BentPreconditioner, bent_at
+from sim.local_solvers.strained_frame import MATRIX, NODES, UpdatedPreconditioner, bent_at
 from sim.strategy.captured_frame import SERVED
 from sim.strategy.frame_sequence import Kept
 
@@ -120,7 +120,7 @@ def test_the_matrix_does_what_the_factors_do(fem: Fem) -> None:
     g = problem.device.array(force)
     problem.constraint.project_nodes(g)
     mine, plain, other = (problem.device.zeros(problem.rows, 1) for _ in range(3))
-    knowing = BentPreconditioner(factor, problem, part.size)
+    knowing = UpdatedPreconditioner(factor, problem, part.size)
     knowing.apply(g, np.ones(1, bool), plain)
     knowing.load(bent)
     knowing.apply(g, np.ones(1, bool), mine)

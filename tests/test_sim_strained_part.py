@@ -17,14 +17,14 @@ from sim.effects import Elasticity, Held, ToolContact
 from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.local_solvers.contact_descent import ContactDescent
-from sim.local_solvers.strained_part import STRAINS, Model, StrainedPart, Strains
+from sim.local_solvers.strained_part import STRAINS, StrainedModel, StrainedPart, StrainLimits
 from sim.material import Material
-from sim.terms.elasticity import Elasticity as ElasticityTerm
+from sim.terms.elasticity import ElasticTerm as ElasticityTerm
 from sim.tools import Ball
 
 SIDE, HEIGHT, RADIUS = 0.06, 0.03, 6e-3
 BODY = base_held(box((6, 6, 3), SIDE))
-EVERY = Strains(least=0.0, nodes=10**4)
+EVERY = StrainLimits(least=0.0, nodes=10**4)
 BOTH = np.arange(2)
 TISSUES = {
     "plain": Material("neo-hookean", 3000.0, 0.45),
@@ -41,7 +41,7 @@ def down(*depths: float) -> Loads:
 
 @cache
 def solver(
-    element: str = "p1", tissue: str = "plain", strains: Strains = STRAINS, tolerance: float = 1e-8
+    element: str = "p1", tissue: str = "plain", strains: StrainLimits = STRAINS, tolerance: float = 1e-8
 ) -> tuple[Fem, ContactDescent]:
     """Finite elements under a ball, in double precision, whose descent has these settings."""
     effects = [Elasticity(TISSUES[tissue]), Held(), ToolContact((Ball(RADIUS),))]
@@ -118,7 +118,7 @@ def test_strain_is_the_largest_round_each_node() -> None:
     np.testing.assert_allclose(found.numpy()[:, 0], expected, rtol=1e-9)
 
 
-def model_of(strains: Strains) -> tuple[Fem, ContactDescent, wp.array, Model]:
+def model_of(strains: StrainLimits) -> tuple[Fem, ContactDescent, wp.array, StrainedModel]:
     """Of two columns that are bent."""
     fem, descent = solver(strains=strains)
     u = bent(fem.problem, 4e-4)
@@ -151,7 +151,7 @@ def test_the_model_is_the_inverse_of_the_stiffness_now() -> None:
 
 def test_those_are_chosen_that_are_strained_most() -> None:
     """As many as there is room for, and none that is hardly strained."""
-    fem, descent, u, model = model_of(Strains(least=0.08, nodes=20, cut=1.0))
+    fem, descent, u, model = model_of(StrainLimits(least=0.08, nodes=20, cut=1.0))
     strain = fem.problem.device.zeros(fem.space.count, 2)
     every, columns = np.ones(fem.space.count, bool), fem.problem.device.array(BOTH, wp.int32)
     for term in fem.problem.terms:
@@ -169,7 +169,7 @@ def test_those_are_chosen_that_are_strained_most() -> None:
 
 
 def test_columns_of_different_widths_go_together() -> None:
-    _, _, _, narrow = model_of(Strains(least=0.08, nodes=20, cut=1.0))
+    _, _, _, narrow = model_of(StrainLimits(least=0.08, nodes=20, cut=1.0))
     _, _, _, wide = model_of(EVERY)
     both = narrow.with_columns(np.array([1]), wide.rows(np.array([0])))
     size = narrow.matrix.shape[1]
@@ -184,7 +184,7 @@ def test_columns_of_different_widths_go_together() -> None:
 def test_there_is_no_model_where_it_would_be_right_in_patches_only() -> None:
     """Where its room leaves out tissue that is strained far more than what counts as strained."""
     fem, descent = solver()
-    u, few = bent(fem.problem, 4e-4), Strains(least=0.08, nodes=5, cut=0.1)
+    u, few = bent(fem.problem, 4e-4), StrainLimits(least=0.08, nodes=5, cut=0.1)
     part = StrainedPart(fem.problem, descent.compliance, len(descent.barrier.touchable), few)
     assert part.model(u, BOTH) is None and part.model(u, BOTH[1:]) is not None
 
@@ -192,7 +192,7 @@ def test_there_is_no_model_where_it_would_be_right_in_patches_only() -> None:
 def test_deep_poses_take_fewer_steps_to_the_same_end() -> None:
     """Than as stiff as at rest: a ball goes down step by step, each from where the last one ended."""
     ends, steps = [], []
-    for strains in (STRAINS, Strains(least=np.inf)):
+    for strains in (STRAINS, StrainLimits(least=np.inf)):
         fem, _ = solver("smoothed", "plain", strains, 1e-3)
         answers = [fem.deform(down(1e-3))]
         for depth in np.arange(2, 9) * 1e-3:

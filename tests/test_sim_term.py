@@ -13,7 +13,7 @@ from term_examples import LOGARITHMIC, MESH, ROWS, Example
 from sim.discretisation.term import Term
 from sim.geometry.tetmesh import signed_volumes
 from sim.runtime.device import Device
-from sim.terms.contact.tool_contact import Contact
+from sim.terms.contact.tool_contact import ToolContactTerm
 from sim.terms.element_kernels import VOLUME_KEPT
 
 EXAMPLES = OTHERS | CONTACTS
@@ -248,7 +248,7 @@ def test_every_tool_of_the_examples_is_felt(name: str, device: Device) -> None:
     """In every column, else what is tested of contact would be nothing; what tools exert is what the tissue bears."""
     example = EXAMPLES[name]
     term = example.build(device)
-    assert isinstance(term, Contact)
+    assert isinstance(term, ToolContactTerm)
     term.begin(example.cases)
     force = term.reaction(device.array(example.u))[:, :, :3]
     assert (np.linalg.norm(force, axis=2) > 0.0).all()

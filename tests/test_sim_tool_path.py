@@ -7,16 +7,18 @@ from test_sim_contact_descent import BODY, HEIGHT, RADIUS, at, solver, touching
 
 from sim.accuracy import TRAIN
 from sim.discretisation.term import Cases
-from sim.terms.contact.tool_path import Touch, Way
+from sim.terms.contact.tool_path import ContactSampling, ToolPath
 from sim.tools import Ball
 
 
 def test_a_way_is_as_long_as_it_is_clear() -> None:
     tool = Ball(RADIUS)
     begin, end = at(0.0, 0.0, 0.1)[None, None], at(0.1, 0.0, 0.1)[None, None]
-    way = Way(begin, end)
-    np.testing.assert_allclose(way.stride((tool,), np.zeros((1, 1))), Touch.stride * RADIUS / 0.1)
-    np.testing.assert_allclose(way.stride((tool,), np.full((1, 1), 0.04)), (0.04 + Touch.stride * RADIUS) / 0.1)
+    way = ToolPath(begin, end)
+    np.testing.assert_allclose(way.stride((tool,), np.zeros((1, 1))), ContactSampling.stride * RADIUS / 0.1)
+    np.testing.assert_allclose(
+        way.stride((tool,), np.full((1, 1), 0.04)), (0.04 + ContactSampling.stride * RADIUS) / 0.1
+    )
     np.testing.assert_allclose(way.stride((tool,), np.full((1, 1), 0.2)), 1.0)
 
 
@@ -28,4 +30,4 @@ def test_a_tool_flies_in_few_strides() -> None:
     there = fem.deform(touching(poses[0]))
     cases = Cases(touching(poses[1]), np.zeros(1), there.memory, np.zeros((1, len(BODY.mesh.nodes), 3)), np.zeros(1))
     stride = term.stride(cases, fem.problem.device.zeros(fem.problem.rows, 1))
-    assert stride[0] > 0.07 / 0.24 > 10.0 * Touch.stride * RADIUS / 0.24
+    assert stride[0] > 0.07 / 0.24 > 10.0 * ContactSampling.stride * RADIUS / 0.24

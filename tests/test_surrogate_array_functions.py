@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surrogate.array_functions import Rounded, half_precision, product_of, taken
-from surrogate.regressors.force_series import Pairs, Series
+from surrogate.regressors.force_series import ForcePairs, Series
 from surrogate.regressors.gp import Gp
 
 TABLE = np.random.default_rng(0).normal(size=(50, 4)) * [1.0, 10.0, 1e-3, 0.0]
@@ -42,7 +42,7 @@ def test_tables_of_earlier_versions_are_read():
     """They have shares in half precision, and the rows of a Gaussian process in lengths."""
     share = (TABLE[:, :3] / TABLE[:, :3].max(axis=0)).astype(np.float16)
     unit = TABLE[:, :3].max(axis=0).astype(np.float32)
-    pairs = Pairs.restored({"pairs": np.zeros((50, 2), int), "share": share, "unit": unit})
+    pairs = ForcePairs.restored({"pairs": np.zeros((50, 2), int), "share": share, "unit": unit})
     np.testing.assert_allclose(pairs.table.values, TABLE[:, :3], rtol=1e-3)
     table = {"share": share.reshape(5, 10, 1, 3), "unit": unit[None]}
     places = {"corners": np.zeros((3, 3)), "triangles": np.zeros((1, 6), int), "radii": np.ones(10)}

@@ -21,10 +21,10 @@ from sim.effects import NodalForce, pushed_effects
 from sim.errors import InputError
 from sim.material import BRAIN
 from sim.runtime.processes import process_pool
-from surrogate.data.crew import Asked, even_batch, solving
+from surrogate.data.crew import LazyFem, even_batch, solving
 from surrogate.data.dataset import SEAL, read_dataset
 from surrogate.data.simulate import simulate
-from surrogate.data.tasks import Crew
+from surrogate.data.tasks import SolverPool
 from surrogate.data.tool_loads import draw
 
 SAID = {"preset": "palpation", "seed": "0"}
@@ -60,7 +60,7 @@ def test_a_file_does_not_depend_on_how_many_devices_made_it(tmp_path, body, batc
     effects, loads = (*pushed_effects(body, BRAIN), NodalForce()), draw("palpation", body, COUNT, 0)
     counts = []
     for devices in (["cpu"], ["cpu", "cpu"]):
-        with solving(Asked(body, effects, TRAIN, "smoothed", batch, COUNT), devices, print) as solver:
+        with solving(LazyFem(body, effects, TRAIN, "smoothed", batch, COUNT), devices, print) as solver:
             assert (solver.element, solver.batch) == ("smoothed", batch)
             seen = []
             path = tmp_path / f"{len(devices)}.h5"
@@ -79,7 +79,7 @@ def test_two_processes_on_one_card_answer_as_one(tmp_path, body):
     effects, loads = (*pushed_effects(body, BRAIN), NodalForce()), draw("palpation", body, 64, 0)
     found = []
     for devices in (["cuda:0"], ["cuda:0", "cuda:0"]):
-        with solving(Asked(body, effects, TRAIN, None, 8, 64), devices, print) as solver:
+        with solving(LazyFem(body, effects, TRAIN, None, 8, 64), devices, print) as solver:
             simulate(tmp_path / f"{len(devices)}.h5", solver.deformer, loads, SAID, 8)
         found.append(read_dataset(tmp_path / f"{len(devices)}.h5"))
     every = np.arange(len(body.mesh.nodes))
@@ -100,7 +100,7 @@ def test_a_killed_process_is_a_sentence_and_loses_no_finished_case(tmp_path, bod
         process_pool(["cpu", "cpu"], mortal, COUNT, 11, tmp_path / "mark") as children,
         pytest.raises(InputError, match=sentence),
     ):
-        simulate(path, Crew(body, children), loads, SAID, 2, lambda *now: done.append(now[0]))
+        simulate(path, SolverPool(body, children), loads, SAID, 2, lambda *now: done.append(now[0]))
     assert not path.exists() and path.with_name("data.h5.partial").stat().st_size > 0
     left = 3 * int(body.craniotomy.sum()) + COUNT - max(done)
     assert 2 <= left <= 10  # what came after the sixth, and it
@@ -111,7 +111,7 @@ def test_a_killed_process_is_a_sentence_and_loses_no_finished_case(tmp_path, bod
 @pytest.mark.parametrize("devices", [("cpu",), ("cpu", "cpu")])
 def test_a_batch_that_no_memory_holds_begins_no_file(body, devices):
     """A file keeps its batch, so that a smaller one would be refused beside it."""
-    asked = Asked(body, (*pushed_effects(body, BRAIN), NodalForce()), TRAIN, "p1", 10**9, 2 * 10**9)
+    asked = LazyFem(body, (*pushed_effects(body, BRAIN), NodalForce()), TRAIN, "p1", 10**9, 2 * 10**9)
     refused = pytest.raises(InputError, match=r"the answers to 1000000000 loads take about .* are free: solve at most")
     with refused, solving(asked, devices, print):
         pytest.fail("it would begin")

@@ -19,7 +19,7 @@ from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import ENCODERS, directions, tool_features
 from surrogate.data.simulate import simulate
-from surrogate.data.splits import Split
+from surrogate.data.splits import DiscSplit
 from surrogate.model.store import load, save
 from surrogate.regressors.force_series import ORDERS, SPANS, Series
 from surrogate.training.examples import Examples
@@ -180,7 +180,7 @@ def test_on_known_cortex_the_process_beats_the_series_by_a_factor_of_two(tmp_pat
     small = make_box(cells=(6, 6, 4), spacing=9e-3, tumour=12e-3, depth=20e-3, opening=15e-3)
     data = simulated(tmp_path / "data.h5", small, 300)
     fourth = np.where(np.arange(data.good.sum()) % 4 == 3, 0, -1)
-    nowhere = Split(np.full((1, 3), 1.0), 1e-3, fourth, 1.0)
+    nowhere = DiscSplit(np.full((1, 3), 1.0), 1e-3, fourth, 1.0)
     series, learnt = train(data, EXPANDED, split=nowhere, expansion=Expansion(data, "cpu")).scores
     assert learnt.mean_percent < 0.5 * series.mean_percent and learnt.mean_mm < 0.5 * series.mean_mm
 

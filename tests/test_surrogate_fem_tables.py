@@ -25,7 +25,7 @@ from surrogate.data.tool_poses import draw_poses, poses_at, tool_of
 from surrogate.evaluation.score import errors, judged_force
 from surrogate.model.store import load, save
 from surrogate.model.tool_contact import wrench
-from surrogate.regressors.rigid_contact import THICKER, Contact
+from surrogate.regressors.rigid_contact import THICKER, RigidContact
 from surrogate.training.expansion import TOUCHED
 from surrogate.training.fem_tables import condensed, unit_responses
 from surrogate.training.train import learners_for, train
@@ -138,7 +138,7 @@ class Stiffening:
     """Answers poses as the ball on linear tissue does, whose forces grow with depth, and with place a little."""
 
     anatomy: Anatomy
-    contact: Contact
+    contact: RigidContact
     bases: list[Basis]
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
@@ -185,7 +185,7 @@ def test_contact_learns_how_forces_grow_and_a_process_the_rest(trained, elements
     """On discs left out and on fresh poses; and bounds hold about as often as they say."""
     contact, both = (trained.models[name] for name in TOUCHED)
     regressor = contact.parts[0].regressor
-    assert isinstance(regressor, Contact)
+    assert isinstance(regressor, RigidContact)
     np.testing.assert_allclose(regressor.line[:, 0], LINE, atol=0.1)
     scores = {row.name: row.mean_percent for row in trained.scores}
     assert scores["contact"] < 9.0
@@ -204,7 +204,7 @@ def test_contact_learns_how_forces_grow_and_a_process_the_rest(trained, elements
 def test_the_tool_s_force_is_answered_with_a_bound_of_its_own(data, trained, elements, box):
     contact, both = (trained.models[name] for name in TOUCHED)
     regressor = contact.parts[0].regressor
-    assert isinstance(regressor, Contact)
+    assert isinstance(regressor, RigidContact)
     np.testing.assert_allclose(regressor.grip, GRIP, atol=0.1)
     fresh = draw_poses("palpation", box, 60, 77)
     truth = elements.deform(fresh).reaction

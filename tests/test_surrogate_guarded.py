@@ -9,7 +9,7 @@ import pytest
 from theatres import player, small
 
 from scenes.options.theatre_options import add_theatre, theatre_asked
-from scenes.page.cast import ALL, Cast
+from scenes.page.cast import ALL, SceneSolvers
 from scenes.play.deformers import GUARDED, AtRest
 from scenes.script.tool_paths import Touch
 from sim.deformation import Outcome
@@ -107,7 +107,7 @@ def test_a_frame_says_who_answered(theatre, limit):
 
 
 def test_on_a_page_each_solve_starts_from_the_last_answer(theatre):
-    cast = Cast(theatre, small(), GUARDED, threading.Lock())
+    cast = SceneSolvers(theatre, small(), GUARDED, threading.Lock())
     play = cast.player(GUARDED)
     cast.players[GUARDED, ALL] = replace(play, deformer=replace(play.deformer, limit=0.0))
     question = (0, Touch(force=0.1))

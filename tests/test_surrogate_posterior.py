@@ -11,8 +11,8 @@ from sim.geometry.locate import Located
 from surrogate.locating.causes import SWELLING, TOOL
 from surrogate.locating.evidence import SHIFT, SIGMA, SLIPPED, TURN, of_motions
 from surrogate.locating.observation import Observation, placed_anew
-from surrogate.locating.posterior import COARSENED, MIXED, Posterior, SeenPrior, conditioned, seen_prior
-from surrogate.locating.prior import BESIDE, NOWHERE, RIGIDS, SETS, WITH_PLACE, Prior
+from surrogate.locating.posterior import COARSENED, MIXED, ObservedPrior, Posterior, conditioned, seen_prior
+from surrogate.locating.prior import BESIDE, NOWHERE, RIGIDS, SETS, WITH_PLACE, MotionPrior
 from surrogate.locating.whitened import whitened
 
 POINTS = 30
@@ -29,7 +29,7 @@ def prior():
     shape = np.sin(box.mesh.nodes @ wave.T + random.uniform(0, 6, len(kind))).T[:, :, None]
     shape = 1e-3 * shape * random.normal(size=(len(kind), 1, 3))
     centre = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
-    return Prior(box, shape.astype(np.float32), kind, skull, place, centre)
+    return MotionPrior(box, shape.astype(np.float32), kind, skull, place, centre)
 
 
 def seen(prior, motion, count=POINTS):
@@ -172,7 +172,7 @@ def test_ellipsoids_hold_what_is_drawn(prior):
     for _ in range(200):
         truth, evidence = drawn(prior, random, 3)
         # What shapes lack is no part of these draws, and their size is known.
-        sight = SeenPrior(prior, 3.0, whitened(prior, evidence, 0.0), np.zeros(3))
+        sight = ObservedPrior(prior, 3.0, whitened(prior, evidence, 0.0), np.zeros(3))
         answer = sight.answer(hypothesis, hypothesis.places[0], 1.0)
         scale = np.append(np.ones(len(prior.kind)), RIGID)
         off = answer.mean - (truth / scale)[answer.rows]

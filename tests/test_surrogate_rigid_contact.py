@@ -26,7 +26,7 @@ from surrogate.evaluation.score import errors
 from surrogate.model.applicability import refusal
 from surrogate.model.store import load, save
 from surrogate.model.tool_contact import wrench
-from surrogate.regressors.rigid_contact import THICKER, Contact
+from surrogate.regressors.rigid_contact import THICKER, RigidContact
 from surrogate.training.fem_tables import condensed
 from surrogate.training.train import train
 
@@ -36,7 +36,7 @@ TOOLS = {"dissector": ROD_OF_4, "spatula": SMALL_BLADE}
 SOFT = Material("linear", 3000.0, 0.45)
 
 
-def condensed_box(box: Anatomy, tool: BuiltIn | None) -> tuple[Contact, list[Basis]]:
+def condensed_box(box: Anatomy, tool: BuiltIn | None) -> tuple[RigidContact, list[Basis]]:
     fem = Fem(box, pushed_effects(box, SOFT), REFERENCE, "cpu", element="p1")
     return condensed(fem, [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)], tool)
 

@@ -20,7 +20,7 @@ from surrogate.data.encode import Basis
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.model.conformal import GROWTH, Bound
-from surrogate.model.learned import Part
+from surrogate.model.learned import ModelPart
 from surrogate.model.store import learned_tissue, load, save, stated_errors
 from surrogate.model.training_range import Outside
 from surrogate.training.train import train
@@ -43,7 +43,7 @@ def stored(models, tmp_path_factory):
 
 
 def part_with(part, **changes):
-    return Part(part.encoder, part.regressor, Basis(**{**vars(part.basis), **changes}))
+    return ModelPart(part.encoder, part.regressor, Basis(**{**vars(part.basis), **changes}))
 
 
 def put(array, place, value):

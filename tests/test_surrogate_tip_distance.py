@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from scenes.play.deformers import open_theatre
-from scenes.play.tip_reading import Reading, reading
+from scenes.play.tip_reading import TipDistance, reading
 from scenes.play.tip_reading import measured as drawn_distance
 from scenes.script.scene import find_scene
 from scenes.script.tool import Blade, Probe
@@ -216,14 +216,14 @@ def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender,
     answer, truth = model.deform(loads), pretender.deform(loads)
     predicted = model.distance(loads)
     apart = gauge.distances(loads, answer.displacement, answer.nodes)[0]
-    assert reading(model, loads, answer, tool, apart) == Reading(predicted.value[0], predicted.bound[0, 0])
-    assert reading(pretender, loads, truth, tool, fresh[1][2]) == Reading(fresh[1][2], None)
+    assert reading(model, loads, answer, tool, apart) == TipDistance(predicted.value[0], predicted.bound[0, 0])
+    assert reading(pretender, loads, truth, tool, fresh[1][2]) == TipDistance(fresh[1][2], None)
     high = gauge.distances(loads, truth.displacement, truth.nodes, lift=2e-3)[0]
     assert drawn_distance(model.anatomy, loads, truth, tool, 2e-3).distance == high > fresh[1][2] + 1e-3
     assert reading(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(predicted.value[0] + 2e-3)
     plain = replace(model, tip=None).distance(loads).value[0]
     outside = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
-    assert reading(model, loads, outside, tool, apart) == Reading(predicted.value[0], None)
-    assert reading(replace(model, tip=None), loads, answer, tool, apart) == Reading(plain, None)
+    assert reading(model, loads, outside, tool, apart) == TipDistance(predicted.value[0], None)
+    assert reading(replace(model, tip=None), loads, answer, tool, apart) == TipDistance(plain, None)
     assert reading(model, loads, answer, Blade(), apart) is None and reading(model, loads, answer, None, apart) is None
-    assert str(Reading(5.53e-3, 0.62e-3)) == "5.5 +- 0.7 mm" and str(Reading(5.53e-3, None)) == "5.5 mm"
+    assert str(TipDistance(5.53e-3, 0.62e-3)) == "5.5 +- 0.7 mm" and str(TipDistance(5.53e-3, None)) == "5.5 mm"

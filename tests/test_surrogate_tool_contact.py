@@ -20,7 +20,7 @@ from sim.tools import Spatula
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.indentation import indented
 from surrogate.model.guarded import knows_pressure, tool_pressure
-from surrogate.model.learned import Learned, Part
+from surrogate.model.learned import Learned, ModelPart
 from surrogate.model.store import load
 from surrogate.model.tool_contact import HELD, ForceModel
 from surrogate.model.training_range import envelope_of
@@ -48,7 +48,7 @@ def model(box):
     contact = replace(contact, grip=np.array([1.0, 0.0]))
     asked = indented(over(box, (0.0, 0.2), (1.0, 4.0)), BLADE, open_patch(box))
     known = envelope_of(open_patch(box), asked)
-    part = Part("core", contact, side_by_side(bases))
+    part = ModelPart("core", contact, side_by_side(bases))
     return Learned(box, (part,), known, tool=BLADE, force=ForceModel())
 
 

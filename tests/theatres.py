@@ -31,7 +31,7 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import Basis
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.model.learned import Learned, Part
+from surrogate.model.learned import Learned, ModelPart
 from surrogate.model.store import load, save
 from surrogate.model.training_range import envelope_of
 from surrogate.regressors.protocol import Linear
@@ -50,7 +50,9 @@ def knowing_nothing(anatomy: Anatomy, training: dict[str, str]) -> Learned:
     """A model that answers rest, and knows but its bound and what it states of its training."""
     patch, nodes = open_patch(anatomy), anatomy.tumour_nodes
     width = 3 * len(patch.nodes)
-    part = Part("nodal", Linear().fit(np.eye(width), np.zeros((width, 1))), Basis(nodes, np.zeros((1, 3 * len(nodes)))))
+    part = ModelPart(
+        "nodal", Linear().fit(np.eye(width), np.zeros((width, 1))), Basis(nodes, np.zeros((1, 3 * len(nodes))))
+    )
     pushed = draw("palpation", anatomy, 2, 0).of(Pushed)
     return Learned(anatomy, (part,), envelope_of(patch, pushed), 1.23e-4, training=training)
 

@@ -10,8 +10,8 @@ import h5py
 import numpy as np
 
 from scenes.episodes.engine import make_all, still_missing
-from scenes.episodes.run_folder import BODIES, Run, begin, episode_name, finished, versions_here
-from scenes.episodes.tasks import Made, Work
+from scenes.episodes.run_folder import BODIES, RunSettings, begin, episode_name, finished, versions_here
+from scenes.episodes.tasks import Made, RunWork
 from sim.runtime.atomic_files import written_stream
 
 PER_BODY = 5
@@ -80,12 +80,12 @@ def tried(folder):
 
 def tiny_work(folder, trouble=None, seed=1):
     given = folder, seed, trouble or Trouble()
-    return Work(body_of, partial(make_body, *given), partial(make_episode, *given))
+    return RunWork(body_of, partial(make_body, *given), partial(make_episode, *given))
 
 
 def tiny_run(seed=1, device="cpu", **changed):
     usual = {"digest": "0123456789abcdef", "seed": seed, "device": device, "versions": versions_here()}
-    return Run("tiny", **{**usual, **changed})
+    return RunSettings("tiny", **{**usual, **changed})
 
 
 def played(folder, workers, count, trouble=None, heard=lambda *words: None, again=False):

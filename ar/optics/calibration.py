@@ -60,9 +60,7 @@ class Calibration:
     def __post_init__(self) -> None:
         for what, pixels in (("width", self.width), ("height", self.height)):
             if not 1 <= pixels <= LARGEST_SIDE:
-                raise ValueError(
-                    f"an image_{what} of 1 to {LARGEST_SIDE}, not {pixels}: calibrate again."
-                )
+                raise ValueError(f"an image_{what} of 1 to {LARGEST_SIDE}, not {pixels}: calibrate again.")
         if not 0.0 <= self.readout <= LONGEST_READOUT:
             raise ValueError(
                 f"an image's rows are read in 0 to {LONGEST_READOUT:g} s, not in {self.readout:g}: give another "

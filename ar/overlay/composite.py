@@ -12,7 +12,7 @@ from ..optics.camera import Camera
 from ..rendering import rasteriser, real_picture, shade, surfaces
 from ..rendering.layer import Layer, vertex_normals
 from ..rendering.parallel import load
-from ..rendering.rasteriser import Seen, seen
+from ..rendering.rasteriser import RasterisedSurface, seen
 from ..rendering.renderer import Picture
 from . import distances, window
 from .distances import lines_of
@@ -260,7 +260,7 @@ def _check(picture: Picture, camera: Camera, style: str, covered: np.ndarray | N
         raise ValueError(f"covered is {given}: give a mask (H, W) of bool as large as the image, {shape}.")
 
 
-def ground_over(segmentation: np.ndarray, role: np.ndarray, found: Seen, opening: Opening) -> Ground:
+def ground_over(segmentation: np.ndarray, role: np.ndarray, found: RasterisedSurface, opening: Opening) -> Ground:
     """Determine the ground over a surface in a box, from the segmentation and roles (h, w) uint8."""
     mask = found.mask
     counts = np.bincount(segmentation[mask & (role != FRONT)], minlength=256)
@@ -269,7 +269,7 @@ def ground_over(segmentation: np.ndarray, role: np.ndarray, found: Seen, opening
 
 
 def draw_broken(
-    sheet: np.ndarray, found: Seen, ink: tuple[float, float, float], ground: Ground | None, doubtful: bool
+    sheet: np.ndarray, found: RasterisedSurface, ink: tuple[float, float, float], ground: Ground | None, doubtful: bool
 ) -> None:
     """Draw the broken parts of an outline, in place: all of an unreliable one, and those under closed ground."""
     if doubtful:

@@ -40,7 +40,7 @@ WIDE = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class CutPlane:
     """Plane through `middle` (3,) [m]: `along` (3,) the line of sight and, at right angles, `across` (3,)."""
 
     middle: np.ndarray
@@ -56,7 +56,7 @@ class Plane:
         return self.middle + coordinates @ np.stack([self.across, self.along])
 
 
-def plane_through(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) -> Plane:
+def plane_through(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) -> CutPlane:
     """Build the plane of a camera's centre, a centre (3,) [m] and a tip (3,) [m], which is on its right in the image.
 
     Without a tip, or with one on the line of sight, the plane is horizontal in the image.
@@ -68,11 +68,11 @@ def plane_through(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) ->
     if np.linalg.norm(across) < ASTRAY:
         across = level - (level @ along) * along
     across /= np.linalg.norm(across)
-    return Plane(middle, across if across @ level >= 0.0 else -across, along)
+    return CutPlane(middle, across if across @ level >= 0.0 else -across, along)
 
 
 def profile(
-    camera: Camera, plane: Plane, depth: np.ndarray, roles: np.ndarray, reach: float
+    camera: Camera, plane: CutPlane, depth: np.ndarray, roles: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Extract the visible surface along the plane: positions (n, 2) [m], in order across, and their roles (n,).
 
@@ -93,7 +93,7 @@ def profile(
 def section(
     camera: Camera,
     hidden: Layer,
-    plane: Plane,
+    plane: CutPlane,
     seen: tuple[np.ndarray, np.ndarray],
     size: tuple[int, int],
     ink: tuple[float, ...],
@@ -155,7 +155,7 @@ def captioned(inset: np.ndarray, lines: list[str]) -> np.ndarray:
 
 
 def _frame(
-    plane: Plane, hidden: Layer, surface: np.ndarray, tip: np.ndarray | None, size: tuple[int, int]
+    plane: CutPlane, hidden: Layer, surface: np.ndarray, tip: np.ndarray | None, size: tuple[int, int]
 ) -> tuple[np.ndarray, float]:
     """Compute the position (2,) [m] of the inset's upper left corner, and pixels per metre."""
     places = plane.coordinates(hidden.vertices)

@@ -24,7 +24,7 @@ SHEET = 255
 
 
 @dataclass(frozen=True)
-class Names:
+class LegendNames:
     """Names of the overlay's lines in a legend; lines without a name are left out.
 
     Parameters

@@ -12,7 +12,7 @@ import numpy as np
 from ..optics.camera import Camera
 from ..rendering.layer import Layer
 from .gauge import Gauge
-from .legend import Names
+from .legend import LegendNames
 from .outlines import OPAQUE, blank, box_around, dash, ink_of, outlines, silhouette
 from .styles import Opening
 from .window import DARK
@@ -21,7 +21,7 @@ from .window import DARK
 BEFORE, DOTTED = (0.86, 0.88, 0.90), (2, 5)
 # Smallest motion with an arrow [pixel].
 LEAST_ARROW = 4.0
-UNNAMED = Names()
+UNNAMED = LegendNames()
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ class Words:
 
     doubt: str = ""
     head: Sequence[str] = ()
-    names: Names = UNNAMED
+    names: LegendNames = UNNAMED
     moved: tuple[float, float] | None = None
     error: float | None = None
 

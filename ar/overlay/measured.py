@@ -11,7 +11,7 @@ import numpy as np
 from ..optics.camera import Camera
 from ..rendering.layer import Layer
 from ..rendering.renderer import Picture
-from .cut import ENDS, Plane, captioned, plane_through, profile, section
+from .cut import ENDS, CutPlane, captioned, plane_through, profile, section
 from .distances import RING, RINGS, distance_of_seen, draw_rings, tree_of
 from .gauge import Gauge
 from .hud import FINE, HEAD, Below, bound_words, folded, haloed, lay
@@ -71,7 +71,7 @@ class Measure:
         return np.stack(np.meshgrid(*np.stack([low - beyond, high + beyond], axis=1)), axis=-1).reshape(-1, 3)
 
     @property
-    def plane(self) -> Plane:
+    def plane(self) -> CutPlane:
         """Plane of a cut."""
         middle = self.hidden.vertices.mean(axis=0)
         return plane_through(self.camera, middle, None if self.gauge is None else self.gauge.tip)

@@ -13,7 +13,7 @@ from ..optics.camera import Camera
 from ..rendering.layer import Layer, vertex_normals
 from ..rendering.lens_rasteriser import pixel_at
 from ..rendering.parallel import forward_kernel, launch_in_bands, load
-from ..rendering.rasteriser import NOTHING, Seen, depth_of, face_of
+from ..rendering.rasteriser import NOTHING, RasterisedSurface, depth_of, face_of
 from ..rendering.renderer import Pictures
 from ..rendering.triangle import weights_of
 
@@ -65,7 +65,7 @@ def overlaid(
     box: tuple[slice, slice],
     camera: Camera,
     hidden: Layer,
-    seen: Seen,
+    seen: RasterisedSurface,
     roles: Roles,
     style: str,
     lines: Lines,
@@ -152,7 +152,7 @@ def sheet(lines: np.ndarray | None, device: str) -> wp.array:
     return wp.array(lines.reshape(-1, 4), dtype=wp.vec4ub, device=device, copy=False)
 
 
-def from_edge(seen: Seen) -> wp.array:
+def from_edge(seen: RasterisedSurface) -> wp.array:
     """Compute the chamfer distance (h, w) of each pixel from a silhouette's edge [pixel], up to the soft edge's width.
 
     OpenCV's on the CPU, and the same by kernels on a GPU.

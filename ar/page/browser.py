@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 import viser
 
-from .control_lock import Crowd, Inputs, noted
+from .control_lock import Clients, Inputs, noted
 from .elements import ASIDE_SPOT, BACK, KEYS, LIVE_KEYS, ON, PICTURE, RECORD, SAID, SPACE, aside, coded, sight, unparted
-from .guard import LIMITS, Limits, bracketed, check_address, open_server
-from .parts import Body, Control, Deed, Fold, Note, Playback, Sign, Viewpoint
+from .guard import LIMITS, ConnectionLimits, bracketed, check_address, open_server
+from .parts import Control, Fold, LastChange, Note, Playback, SceneSurface, SceneViewpoint, Sign
 from .recording import Recorder
 from .scene import add_body, dress
 from .style import PAGE, STATUS, style
@@ -37,13 +37,13 @@ class Browser:
     """Browser screen for any number of clients, who share image and controls.
 
     `show`, `move`, `report`, `write` and `put` only note the newest value. They may be called from any thread at any
-    rate. A thread of the page sends it, as often as `Limits` allow.
+    rate. A thread of the page sends it, as often as `ConnectionLimits` allow.
     """
 
     def __init__(
         self,
-        bodies: Sequence[Body],
-        viewpoint: Viewpoint,
+        bodies: Sequence[SceneSurface],
+        viewpoint: SceneViewpoint,
         playback: Playback,
         controls: Sequence[Control | Fold | Note] = (),
         title: str = "sulcus",
@@ -52,7 +52,7 @@ class Browser:
         port: int = 8080,
         size: tuple[int, int] = (640, 480),
         signs: Sequence[Sign] = (),
-        limits: Limits = LIMITS,
+        limits: ConnectionLimits = LIMITS,
         origins: tuple[str, ...] = (),
     ) -> None:
         """Start the server; if `port` is taken, the next free one is used, see `address`.
@@ -91,7 +91,7 @@ class Browser:
         # Function that draws slices and charts, if not yet sent; earliest time to send them [s].
         self.drawn: Callable[[], tuple[np.ndarray, str]] | None = None
         self.due = 0.0
-        self.crowd, self.recorder = Crowd(self.server, self.text.order + 0.5), Recorder(self.server)
+        self.crowd, self.recorder = Clients(self.server, self.text.order + 0.5), Recorder(self.server)
         self.controls = Inputs(self.server, self.crowd)
         self.newest: dict[str, Callable[[], object]] = {}
         self.lock, self.sending = threading.Lock(), threading.Lock()
@@ -104,7 +104,7 @@ class Browser:
 
     def fill(
         self,
-        bodies: Sequence[Body],
+        bodies: Sequence[SceneSurface],
         playback: Playback,
         controls: Sequence[Control | Fold | Note] = (),
         title: str = "sulcus",
@@ -142,7 +142,7 @@ class Browser:
         return self.controls.handles
 
     @property
-    def deed(self) -> Deed | None:
+    def deed(self) -> LastChange | None:
         """Action of the newest message, for the `changed` that it calls."""
         return self.controls.deed
 
@@ -206,7 +206,7 @@ class Browser:
     def show_beside(self, drawn: Callable[[], tuple[np.ndarray, str]]) -> None:
         """Show an image (H, W, 3) uint8 of slices, and charts (HTML) of the last seconds, in tabs next to the 3-D view.
 
-        `drawn` makes them, on the page's own thread, as often as `Limits` allow: intermediate ones are skipped.
+        `drawn` makes them, on the page's own thread, as often as `ConnectionLimits` allow: intermediate ones are skipped.
         """
         with self.lock:
             self.drawn = drawn

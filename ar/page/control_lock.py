@@ -10,7 +10,7 @@ from typing import Any
 
 import viser
 
-from .parts import Choice, Control, Deed, Fold, Key, Note, Slider, Toggle
+from .parts import Control, Dropdown, Fold, Key, LastChange, Note, Slider, Toggle
 from .style import LOOKS_ON, NOTE
 
 IDLE = 60.0
@@ -18,7 +18,7 @@ IDLE = 60.0
 
 
 @dataclass
-class Lead:
+class ControlLock:
     """State of the lock: number of the client with control, time of its last action [s], queue of requests."""
 
     leader: int | None = None
@@ -66,7 +66,7 @@ class Lead:
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class ClientRow:
     """Elements that one client sees: line, buttons to request and hand over control, rules that dim the controls."""
 
     line: viser.GuiMarkdownHandle
@@ -75,14 +75,14 @@ class Row:
     dim: viser.GuiHtmlHandle
 
 
-class Crowd:
+class Clients:
     """Clients of a page, by their numbers from 1 in order of arrival. Only for viser's own thread."""
 
     def __init__(self, server: viser.ViserServer, order: float) -> None:
         """Build the list; `order` is the position on the page of each client's line."""
         self.server, self.order = server, order
-        self.lead = Lead()
-        self.rows: dict[int, Row] = {}
+        self.lead = ControlLock()
+        self.rows: dict[int, ClientRow] = {}
 
     @property
     def here(self) -> set[int]:
@@ -112,7 +112,7 @@ class Crowd:
             _set(row.give, "visible", leads and bool(self.lead.asking))
             _set(row.dim, "content", "" if leads else LOOKS_ON)
 
-    def add_row(self, client: viser.ClientHandle) -> Row:
+    def add_row(self, client: viser.ClientHandle) -> ClientRow:
         """Add the elements that only this client sees to its page."""
         gui, lead = client.gui, self.lead
         ask = gui.add_button("Ask to lead", color="orange", order=self.order + 0.1, visible=False)
@@ -127,7 +127,7 @@ class Crowd:
             if lead.act(client.client_id + 1, clock.monotonic()):
                 lead.give(clock.monotonic())
 
-        return Row(gui.add_markdown("", order=self.order), ask, give, gui.add_html("", order=self.order + 0.3))
+        return ClientRow(gui.add_markdown("", order=self.order), ask, give, gui.add_html("", order=self.order + 0.3))
 
 
 def _set(handle: object, name: str, value: object) -> None:
@@ -149,9 +149,9 @@ class Inputs:
         Folders of words by their labels.
     """
 
-    def __init__(self, server: viser.ViserServer, crowd: Crowd) -> None:
+    def __init__(self, server: viser.ViserServer, crowd: Clients) -> None:
         self.server, self.crowd = server, crowd
-        self.deed: Deed | None = None
+        self.deed: LastChange | None = None
         self.handles: dict[str, viser.GuiInputHandle] = {}
         # Keyed by identity, as viser's controls have no hash.
         self.kept: dict[int, float | str] = {}
@@ -186,7 +186,7 @@ class Inputs:
         @button.on_click
         async def pressed(event: viser.GuiEvent) -> None:
             if event.client is not None and self.crowd.heard(event.client):
-                self.deed = Deed(event.client.client_id + 1, button.label)
+                self.deed = LastChange(event.client.client_id + 1, button.label)
                 act(event.client)
 
     def command(self, key: Key, act: Callable[[viser.ClientHandle], None]) -> None:
@@ -197,7 +197,7 @@ class Inputs:
         @handle.on_trigger
         async def hit(event: viser.CommandEvent) -> None:
             if event.client is not None and self.crowd.heard(event.client):
-                self.deed = Deed(event.client.client_id + 1, key.does)
+                self.deed = LastChange(event.client.client_id + 1, key.does)
                 act(event.client)
 
     def add(self, control: Control | Fold | Note) -> None:
@@ -218,14 +218,14 @@ class Inputs:
                 handle = gui.add_checkbox(words, control.start, hint=hint)
             case Slider():
                 handle = gui.add_slider(words, control.low, control.high, control.step, control.start, hint=hint)
-            case Choice():
+            case Dropdown():
                 handle = gui.add_dropdown(words, control.options, initial_value=control.start, hint=hint)
         self.handles[control.label] = handle
         self.hear(handle, control.changed)
-        if isinstance(control, Choice) and control.key is not None:
+        if isinstance(control, Dropdown) and control.key is not None:
             self.command(control.key, partial(self.next, handle, control))
 
-    def next(self, handle: viser.GuiInputHandle, choice: Choice, _: viser.ClientHandle) -> None:
+    def next(self, handle: viser.GuiInputHandle, choice: Dropdown, _: viser.ClientHandle) -> None:
         """Select the next of several names."""
         options = choice.options
         name = options[(options.index(str(handle.value)) + 1) % len(options)]
@@ -245,7 +245,7 @@ class Inputs:
                 control.value = self.kept[id(control)]
                 return
             self.kept[id(control)] = control.value
-            self.deed = Deed(event.client.client_id + 1, control.label)
+            self.deed = LastChange(event.client.client_id + 1, control.label)
             changed(control.value)
 
 

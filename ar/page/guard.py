@@ -41,7 +41,7 @@ HEADERS = {"Content-Security-Policy": "frame-ancestors 'self'", "Referrer-Policy
 
 
 @dataclass(frozen=True)
-class Limits:
+class ConnectionLimits:
     """Limits of the traffic between a page and its clients.
 
     Parameters
@@ -64,7 +64,7 @@ class Limits:
     asides: float = 2.0
 
 
-LIMITS = Limits()
+LIMITS = ConnectionLimits()
 
 
 class UnguardedError(RuntimeError):
@@ -72,7 +72,7 @@ class UnguardedError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Door:
+class AccessPolicy:
     """Access policy: `host` that the page is bound to, `token` (None: any program of this machine may connect).
 
     `origins` are further addresses of the page, by a proxy or another port, in the form of `origin_of`.
@@ -83,7 +83,7 @@ class Door:
     origins: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, host: str, origins: tuple[str, ...] = ()) -> Door:
+    def of(cls, host: str, origins: tuple[str, ...] = ()) -> AccessPolicy:
         """Build a policy with a fresh token, unless only this machine reaches the host and no proxy leads there.
 
         Raises
@@ -137,10 +137,12 @@ class Door:
                     yield value
 
 
-class Visit(ServerConnection):
+class Connection(ServerConnection):
     """WebSocket connection of a client: its messages are checked before viser gets them; `controls` finds controls."""
 
-    def __init__(self, *args: Any, controls: Callable[[str], object], limits: Limits, **settings: Any) -> None:
+    def __init__(
+        self, *args: Any, controls: Callable[[str], object], limits: ConnectionLimits, **settings: Any
+    ) -> None:
         super().__init__(*args, **settings)
         self.controls, self.limits = controls, limits
         self.credit, self.counted = limits.burst, self.loop.time()
@@ -182,7 +184,7 @@ class Visit(ServerConnection):
             raise MessageError("there are too many", malformed=True)
 
 
-class Brief(logging.Filter):
+class ConnectionLog(logging.Filter):
     """Log filter for client connections: each message once, without traceback; failed handshakes never."""
 
     def __init__(self) -> None:
@@ -215,7 +217,7 @@ class Controls:
 
 
 def open_server(
-    host: str, port: int, title: str, limits: Limits = LIMITS, origins: tuple[str, ...] = ()
+    host: str, port: int, title: str, limits: ConnectionLimits = LIMITS, origins: tuple[str, ...] = ()
 ) -> tuple[viser.ViserServer, str | None]:
     """Serve a page; return viser's server and the token that the page's address must carry, if any.
 
@@ -226,7 +228,7 @@ def open_server(
     """
     if not viser.__version__.startswith(KNOWN):
         raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {KNOWN}*.")
-    door, controls = Door.of(host, origins), Controls()
+    door, controls = AccessPolicy.of(host, origins), Controls()
     with guarding(door, controls, limits) as opened:
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     try:
@@ -245,16 +247,16 @@ PATCHING = threading.Lock()
 
 
 @contextmanager
-def guarding(door: Door, controls: Controls, limits: Limits) -> Iterator[list[bool]]:
+def guarding(door: AccessPolicy, controls: Controls, limits: ConnectionLimits) -> Iterator[list[bool]]:
     """Guard the server that viser opens within this context; the yielded list is non-empty once it is open."""
     opened: list[bool] = []
     serve = websockets.asyncio.server.serve
     log = logging.Logger("page", logging.WARNING)
-    log.addFilter(Brief())
+    log.addFilter(ConnectionLog())
 
     def guarded(*args: Any, process_request: Callable, **settings: Any) -> Any:
         opened.append(True)
-        visit = partial(Visit, controls=controls, limits=limits)
+        visit = partial(Connection, controls=controls, limits=limits)
         settings |= {"max_size": LARGEST, "logger": log, "create_connection": visit}
         return serve(*args, process_request=partial(answer, door, limits, process_request), **settings)
 
@@ -267,7 +269,7 @@ def guarding(door: Door, controls: Controls, limits: Limits) -> Iterator[list[bo
 
 
 def answer(
-    door: Door, limits: Limits, served: Callable, connection: ServerConnection, request: Request
+    door: AccessPolicy, limits: ConnectionLimits, served: Callable, connection: ServerConnection, request: Request
 ) -> Response | None:
     """Respond to a request as viser does, if it is accepted; None opens a WebSocket connection."""
     address, port = connection.local_address[:2]

@@ -30,7 +30,7 @@ class MessageError(ValueError):
         self.malformed = malformed
 
 
-class Camera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
+class PageCamera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
     """Camera of a client, in viser's message format."""
 
     wxyz: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
@@ -55,7 +55,7 @@ class Value(msgspec.Struct, forbid_unknown_fields=True):
     value: bool | int | float | str
 
 
-class Setting(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
+class ControlSetting(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
     """Control that a client set, in viser's message format."""
 
     uuid: str
@@ -68,7 +68,7 @@ class Command(msgspec.Struct, tag_field="type", tag="CommandTriggerMessage", for
     uuid: str
 
 
-DECODER = msgspec.msgpack.Decoder(Camera | Setting | Command)
+DECODER = msgspec.msgpack.Decoder(PageCamera | ControlSetting | Command)
 
 
 def checked(message: str | bytes, control: Callable[[str], object]) -> bytes:
@@ -87,7 +87,7 @@ def checked(message: str | bytes, control: Callable[[str], object]) -> bytes:
         raise MessageError("it is none that a visitor may send") from error
     except (ValueError, RecursionError) as error:
         raise MessageError("it cannot be read", malformed=True) from error
-    if isinstance(said, Setting):
+    if isinstance(said, ControlSetting):
         said.updates.value = ranged(control(said.uuid), said.updates.value)
     if isinstance(said, Command) and not isinstance(control(said.uuid), viser.CommandHandle):
         raise MessageError("it is a command that is not there")

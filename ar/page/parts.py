@@ -10,7 +10,7 @@ import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class SceneSurface:
     """Surface in the 3-D view: vertices (V, 3) [m], triangles (F, 3), colour (3,) sRGB in [0, 1].
 
     The browser computes normals again for each update: some 5,000 vertices for all bodies together stay fluent.
@@ -60,7 +60,7 @@ class Key:
 
 
 @dataclass(frozen=True)
-class Choice:
+class Dropdown:
     """Selection of one of several names; other fields as in `Slider`. A `key` selects the next one."""
 
     label: str
@@ -88,7 +88,7 @@ class Fold:
     """Folder of controls, closed at first."""
 
     label: str
-    controls: tuple[Slider | Choice | Toggle, ...]
+    controls: tuple[Slider | Dropdown | Toggle, ...]
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Note:
     words: str = ""
 
 
-Control = Slider | Choice | Toggle
+Control = Slider | Dropdown | Toggle
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class Playback:
 
 
 @dataclass(frozen=True)
-class Deed:
+class LastChange:
     """Last action of a client: its number, from 1, and the label of the control."""
 
     visitor: int
@@ -123,7 +123,7 @@ class Deed:
 
 
 @dataclass(frozen=True, eq=False)
-class Viewpoint:
+class SceneViewpoint:
     """Initial viewpoint of the 3-D view: eye, target and up direction, (3,) [m]; vertical field of view [rad]."""
 
     eye: np.ndarray

@@ -25,7 +25,7 @@ RECORDS, STOPS, MAKES = "Record", "Stop recording", "Encoding the video ..."
 
 
 @dataclass
-class Recording:
+class PageRecording:
     """Images as encoded by `coded`, each with its arrival time [s]."""
 
     began: float
@@ -89,7 +89,7 @@ class Recorder:
     def __init__(self, server: viser.ViserServer) -> None:
         self.server = server
         self.lock = threading.Lock()
-        self.recording: Recording | None = None
+        self.recording: PageRecording | None = None
         self.client: viser.ClientHandle | None = None
         self.button: viser.GuiButtonHandle | None = None
         self.name = "sulcus"
@@ -111,7 +111,7 @@ class Recorder:
             if self.making:
                 return
             if self.recording is None:
-                self.recording, self.client = Recording(clock.monotonic()), client
+                self.recording, self.client = PageRecording(clock.monotonic()), client
                 self.recording.take(code, clock.monotonic())
                 self.say()
                 return
@@ -144,7 +144,7 @@ class Recorder:
             target=self.send, args=(recording, client, clock.monotonic()), name="film", daemon=True
         ).start()
 
-    def send(self, recording: Recording, client: viser.ClientHandle, ended: float) -> None:
+    def send(self, recording: PageRecording, client: viser.ClientHandle, ended: float) -> None:
         """Send the video of the recording; if that fails, report the reason."""
         try:
             client.send_file_download(f"{self.name}.mp4", recording.film(ended), save_immediately=True)

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import viser
 
-from .parts import Body, Sign, Viewpoint
+from .parts import SceneSurface, SceneViewpoint, Sign
 
 # Width of the docked panel in browsers that do not support the page's rules [CSS pixel].
 PANEL = 676.0
 
 
-def dress(server: viser.ViserServer, viewpoint: Viewpoint, signs: Sequence[Sign]) -> None:
+def dress(server: viser.ViserServer, viewpoint: SceneViewpoint, signs: Sequence[Sign]) -> None:
     """Set up colours, light, labels, the panel's place and the first view of the 3-D scene."""
     gui, scene = server.gui, server.scene
     gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
@@ -33,7 +33,7 @@ def dress(server: viser.ViserServer, viewpoint: Viewpoint, signs: Sequence[Sign]
     start.up, start.fov = tuple(viewpoint.up), viewpoint.fov
 
 
-def add_body(server: viser.ViserServer, body: Body) -> viser.MeshHandle:
+def add_body(server: viser.ViserServer, body: SceneSurface) -> viser.MeshHandle:
     """Add a two-sided surface to the 3-D view."""
     return server.scene.add_mesh_simple(
         f"/{body.name}",

@@ -34,7 +34,7 @@ DIGITS = 4
 
 
 @dataclass(frozen=True)
-class Plane:
+class SliceView:
     """View along an axis of RAS: its right and down directions, as unit vectors (3,)."""
 
     name: str
@@ -58,9 +58,9 @@ class Plane:
 
 
 PLANES = (
-    Plane("axial", (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)),
-    Plane("coronal", (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
-    Plane("sagittal", (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
+    SliceView("axial", (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)),
+    SliceView("coronal", (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    SliceView("sagittal", (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
 )
 """Views in radiological convention: the patient's right on the left."""
 
@@ -99,7 +99,7 @@ def sliced(scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
     return np.concatenate([view(plane, scan, np.asarray(middle, np.float64), cut) for plane in PLANES], axis=1)
 
 
-def view(plane: Plane, scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
+def view(plane: SliceView, scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
     """Draw one view (SIDE, SIDE, 3) uint8."""
     grey = np.full((SIDE, SIDE), NOWHERE, np.uint8) if scan is None else resampled(plane, scan, middle)
     colour = np.repeat(grey[..., None], 3, axis=2)
@@ -132,7 +132,7 @@ def said_of(cut: Cut) -> str:
     return f"{cut.whose}: within {bound_words(cut.error, 1)}"
 
 
-def resampled(plane: Plane, scan: Solid, middle: np.ndarray) -> np.ndarray:
+def resampled(plane: SliceView, scan: Solid, middle: np.ndarray) -> np.ndarray:
     """Resample the scan in a view, (SIDE, SIDE) uint8; `NOWHERE` outside it."""
     count = round(2.0 * REACH / GRAIN)
     matrix = scan.T_index_world
@@ -145,7 +145,7 @@ def resampled(plane: Plane, scan: Solid, middle: np.ndarray) -> np.ndarray:
     return np.where(inside, np.clip(large, 0.0, 255.0), NOWHERE).astype(np.uint8)
 
 
-def within(plane: Plane, middle: np.ndarray, layer: Layer, error: float) -> np.ndarray:
+def within(plane: SliceView, middle: np.ndarray, layer: Layer, error: float) -> np.ndarray:
     """Compute the mask (SIDE, SIDE) bool of pixels within a distance (error [m]) of a surface, in 3-D."""
     count = SIDE // COARSE
     if not len(layer.triangles):
@@ -198,7 +198,7 @@ def chained(segments: np.ndarray) -> list[list[int]]:
     return lines
 
 
-def lines_of(plane: Plane, layer: Layer, middle: np.ndarray) -> list[np.ndarray]:
+def lines_of(plane: SliceView, layer: Layer, middle: np.ndarray) -> list[np.ndarray]:
     """Cut a surface by a view's plane; return lines, each (n, 2) as columns and rows."""
     found = section(layer.vertices, layer.triangles, middle, plane.normal)
     return [plane.pixels(line, middle) for line in found]
@@ -218,7 +218,7 @@ def dense(line: np.ndarray) -> np.ndarray:
     return np.rint(at).astype(np.int32)[:, None]
 
 
-def mark(colour: np.ndarray, plane: Plane, tip: np.ndarray, middle: np.ndarray) -> None:
+def mark(colour: np.ndarray, plane: SliceView, tip: np.ndarray, middle: np.ndarray) -> None:
     """Mark a tip (3,) [m], in place: a dot if it is in the plane, else a ring."""
     ((column, row),) = np.clip(plane.pixels(tip[None], middle), -1e4, 1e4).round().astype(int).tolist()
     beside = abs(float((tip - middle) @ plane.normal)) > BESIDE
@@ -226,7 +226,7 @@ def mark(colour: np.ndarray, plane: Plane, tip: np.ndarray, middle: np.ndarray) 
     cv2.circle(colour, (column, row), 4, WHITE, 1 if beside else -1, cv2.LINE_AA)
 
 
-def label(colour: np.ndarray, plane: Plane, middle: np.ndarray) -> None:
+def label(colour: np.ndarray, plane: SliceView, middle: np.ndarray) -> None:
     """Draw a view's name and position, the orientation labels and a scale bar, in place."""
     right, down = np.asarray(plane.right), np.asarray(plane.down)
     axis = int(np.argmax(np.abs(plane.normal)))

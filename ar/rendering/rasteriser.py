@@ -90,7 +90,7 @@ def rasterise(
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class RasterisedSurface:
     """Surface in one image, on a device.
 
     points (1, V) vec3d: homogeneous, undistorted; triangles (F,) vec3i; nearest (1, H, W): z-buffer of (depth, face);
@@ -111,7 +111,9 @@ class Seen:
         return mask.numpy().reshape(self.nearest.shape[1:]).view(bool)
 
 
-def seen(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR, device: str = "cpu") -> Seen:
+def seen(
+    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR, device: str = "cpu"
+) -> RasterisedSurface:
     """Draw one surface into a z-buffer. Arguments and errors as in `rasterise`."""
     vertices, triangles = checked_mesh(vertices, triangles)
     if not near > 0.0:
@@ -123,7 +125,7 @@ def seen(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: floa
     nearest = empty_buffer(1, camera.height, camera.width, device)
     through = unbent([camera], device)
     draw(points, corners, 0, rows, nearest, device, near, through)
-    return Seen(points, corners, nearest, rows, through)
+    return RasterisedSurface(points, corners, nearest, rows, through)
 
 
 def empty_buffer(count: int, height: int, width: int, device: str) -> wp.array:

@@ -15,7 +15,7 @@ from .lens_rasteriser import Unbent, unbent
 from .parallel import launch_in_bands, load
 from .rasteriser import NEAR, draw, empty_buffer, rows_reached
 from .shade import BRIGHTEST, SOFT, TILE, bound, remember, shade
-from .surfaces import Light, Placed, Shadow, Stack, place
+from .surfaces import Light, PlacedSurface, Shadow, Stack, place
 
 DRAPE = (0.13, 0.30, 0.36)
 SHADOW_PIXELS = 384
@@ -71,7 +71,7 @@ class Backdrop:
 
     camera: Camera
     nearest: wp.array
-    placed: Placed
+    placed: PlacedSurface
     pictures: Pictures
     lit_at: wp.array
 
@@ -193,7 +193,7 @@ class Renderer:
     def _shade(
         self,
         cameras: Sequence[Camera],
-        placed: Placed,
+        placed: PlacedSurface,
         nearest: wp.array,
         casting: wp.array,
         still: int,
@@ -211,7 +211,7 @@ class Renderer:
         outputs = [array.flatten() for array in pictures.arrays]
         launch_in_bands(shade, inputs, outputs, count * height * width, self.device, bands=4)
 
-    def _place(self, cameras: Sequence[Camera], moved: wp.array, placed: Placed, since: int) -> None:
+    def _place(self, cameras: Sequence[Camera], moved: wp.array, placed: PlacedSurface, since: int) -> None:
         """Project the vertices from number `since` on in each image."""
         stack = self.stack
         matrices = wp.array([projection(camera) for camera in cameras], dtype=wp.mat44d, device=self.device)
@@ -227,7 +227,7 @@ class Renderer:
             return slice(0, height)
         return slice(*rows_reached(seen.numpy()[:, since:].reshape(-1, 3), NEAR, height))
 
-    def _shadow(self, placed: Placed, casting: wp.array) -> Shadow:
+    def _shadow(self, placed: PlacedSurface, casting: wp.array) -> Shadow:
         """Draw the shadow map of each image."""
         count, tiles = placed.lit.shape[0], SHADOW_PIXELS // int(TILE)
         shadow = Shadow()
@@ -271,9 +271,9 @@ def empty_pictures(count: int, height: int, width: int, device: str) -> Pictures
     return Pictures(colour, depth, wp.zeros(shape, dtype=wp.uint8, device=device))
 
 
-def copied(placed: Placed) -> Placed:
+def copied(placed: PlacedSurface) -> PlacedSurface:
     """Copy the arrays."""
-    out = Placed()
+    out = PlacedSurface()
     for name in ("seen", "lit", "vertices", "normals"):
         setattr(out, name, wp.clone(getattr(placed, name)))
     return out

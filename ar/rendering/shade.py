@@ -7,7 +7,7 @@ import warp as wp
 from .lens_rasteriser import pixel_at
 from .parallel import forward_kernel
 from .rasteriser import NOTHING, depth_of, face_of
-from .surfaces import Corners, Light, Look, Placed, Point, Shadow, Surfaces
+from .surfaces import FaceCorners, LayerShading, Light, PlacedSurface, Point, Shadow, Surfaces
 from .triangle import weights_at
 
 # Minimum depth of a caster in front of a point that it shades [m].
@@ -58,13 +58,13 @@ def sample(texels: wp.array(dtype=wp.vec4f), begin: wp.int32, size: wp.vec3i, in
 
 
 @wp.func
-def corners_of(picture: wp.int32, winner: wp.int32, surfaces: Surfaces, placed: Placed) -> Corners:
+def corners_of(picture: wp.int32, winner: wp.int32, surfaces: Surfaces, placed: PlacedSurface) -> FaceCorners:
     """Gather the data of a face for its pixels: neighbouring pixels mostly need the same."""
     t = surfaces.triangles[winner]
     qa = placed.seen[picture, t[0]]
     qb = placed.seen[picture, t[1]]
     qc = placed.seen[picture, t[2]]
-    out = Corners()
+    out = FaceCorners()
     out.edge_b = wp.cross(qc, qa - qc)
     out.edge_c = wp.cross(qa, qb - qa)
     out.normal = wp.cross(qb - qa, qc - qa)
@@ -85,7 +85,9 @@ def corners_of(picture: wp.int32, winner: wp.int32, surfaces: Surfaces, placed: 
 
 
 @wp.func
-def point_at(p: wp.vec3d, corners: Corners, look: Look, texels: wp.array(dtype=wp.vec4f), eye: wp.vec3f) -> Point:
+def point_at(
+    p: wp.vec3d, corners: FaceCorners, look: LayerShading, texels: wp.array(dtype=wp.vec4f), eye: wp.vec3f
+) -> Point:
     """Compute the point of a face visible at a pixel p = (u, v, 1)."""
     w = weights_at(p, corners.edge_b, corners.edge_c, corners.normal)
     out = Point()
@@ -165,7 +167,7 @@ def tone(x: wp.float32, curve: wp.array(dtype=wp.uint8)) -> wp.uint8:
 
 
 @wp.func
-def light_on(point: Point, look: Look, light: Light, share: wp.float32) -> wp.vec3f:
+def light_on(point: Point, look: LayerShading, light: Light, share: wp.float32) -> wp.vec3f:
     """Compute scene-linear light from a point that a share of the lamp reaches.
 
     It is base (ambient + wrapped Lambert) + Schlick's Fresnel x a Gaussian lobe, inside a lit circle with a soft edge.
@@ -225,7 +227,7 @@ def remember(
     width: wp.int32,
     nearest: wp.array(dtype=wp.uint64),
     surfaces: Surfaces,
-    placed: Placed,
+    placed: PlacedSurface,
     eyes: wp.array(dtype=wp.vec3f),
     light: Light,
     pixels: wp.array3d(dtype=wp.vec2d),
@@ -256,7 +258,7 @@ def shade(
     size: wp.int32,
     nearest: wp.array(dtype=wp.uint64),
     surfaces: Surfaces,
-    placed: Placed,
+    placed: PlacedSurface,
     eyes: wp.array(dtype=wp.vec3f),
     light: Light,
     shadow: Shadow,
@@ -279,8 +281,8 @@ def shade(
     pixel = start - picture * size - 1
     last = wp.int32(-1)
     bent = pixels.shape[0] > 0
-    corners = Corners()
-    look = Look()
+    corners = FaceCorners()
+    look = LayerShading()
     for index in range(start, wp.min(start + run, end)):
         pixel += 1
         if pixel == size:

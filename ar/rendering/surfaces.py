@@ -32,7 +32,7 @@ class Light:
 
 
 @wp.struct
-class Look:
+class LayerShading:
     """Appearance of a layer: number, highlight, solid texture (first texel, size, transform, dark end, relief [m])."""
 
     id: wp.uint8
@@ -56,14 +56,14 @@ class Surfaces:
 
     triangles: wp.array(dtype=wp.vec3i)
     look_of: wp.array(dtype=wp.uint8)
-    looks: wp.array(dtype=Look)
+    looks: wp.array(dtype=LayerShading)
     colours: wp.array(dtype=wp.vec3f)
     rest: wp.array(dtype=wp.vec3f)
     texels: wp.array(dtype=wp.vec4f)
 
 
 @wp.struct
-class Placed:
+class PlacedSurface:
     """Surface in each image (B, V): homogeneous as seen by the camera, and by the lamp, in the world, normals."""
 
     seen: wp.array2d(dtype=wp.vec3d)
@@ -85,7 +85,7 @@ class Shadow:
 
 
 @wp.struct
-class Corners:
+class FaceCorners:
     """Data of a face for its pixels: edges and normal in the image for the weights, and values to interpolate."""
 
     edge_b: wp.vec3d
@@ -154,7 +154,7 @@ def place(
     around: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.int32),
     # output
-    placed: Placed,
+    placed: PlacedSurface,
 ):
     """Place each vertex from number `since` on, in each image; normals are the faces' weighted by area."""
     start = begin + wp.tid() * run
@@ -209,7 +209,7 @@ class Stack:
         self.surfaces = Surfaces()
         self.surfaces.triangles = here(triangles, dtype=wp.vec3i)
         self.surfaces.look_of = here(numbers.astype(np.uint8), dtype=wp.uint8)
-        self.surfaces.looks = here(looks, dtype=Look)
+        self.surfaces.looks = here(looks, dtype=LayerShading)
         self.surfaces.colours = vectors(
             np.concatenate([np.zeros((0, 3)), *(np.square(layer.colour) for layer in layers)])
         )
@@ -236,21 +236,21 @@ class Stack:
             raise ValueError("a vertex is not finite: every coordinate must be a finite number of metres.")
         return wp.array(vertices, dtype=wp.vec3d, device=self.device)
 
-    def unplaced(self, count: int) -> Placed:
+    def unplaced(self, count: int) -> PlacedSurface:
         """Allocate positions of the surface in `count` images."""
-        placed, shape = Placed(), (count, self.vertices)
+        placed, shape = PlacedSurface(), (count, self.vertices)
         placed.seen, placed.lit = (wp.empty(shape, dtype=wp.vec3d, device=self.device) for _ in range(2))
         placed.vertices, placed.normals = (wp.empty(shape, dtype=wp.vec3f, device=self.device) for _ in range(2))
         return placed
 
 
-def dressed(layers: Sequence[Layer], device: str) -> tuple[wp.array, list[Look]]:
+def dressed(layers: Sequence[Layer], device: str) -> tuple[wp.array, list[LayerShading]]:
     """Build the texels of all solid textures, and the appearance of the layers."""
     solids = list(dict.fromkeys(layer.solid for layer in layers if layer.solid is not None))
     begins = np.cumsum([0, *(solid.values.size for solid in solids)])
     looks = []
     for layer in layers:
-        look = Look()
+        look = LayerShading()
         look.id, look.gloss, look.shininess = layer.id, layer.gloss, layer.shininess
         look.textured = layer.solid is not None
         if layer.solid is not None:

@@ -128,13 +128,9 @@ def stamped(colour: np.ndarray, time: float) -> np.ndarray:
     """
     count = round(time / UNIT) if np.isfinite(time) else -1
     if not 0 <= count < 2**TIME_BITS:
-        raise ValueError(
-            f"the time stamp {time:g} s is out of range: give 0 to {2**TIME_BITS * UNIT:g} s."
-        )
+        raise ValueError(f"the time stamp {time:g} s is out of range: give 0 to {2**TIME_BITS * UNIT:g} s.")
     if colour.shape[0] < CELL or colour.shape[1] < WIDTH:
-        raise ValueError(
-            f"a time needs {WIDTH} x {CELL} pixels: the image has {colour.shape[1]} x {colour.shape[0]}."
-        )
+        raise ValueError(f"a time needs {WIDTH} x {CELL} pixels: the image has {colour.shape[1]} x {colour.shape[0]}.")
     bits = [*BEGIN, *_bits(count, TIME_BITS), *_bits(_check(count), CHECK_BITS)]
     strip = np.kron(np.array(bits, np.uint8), np.ones((CELL, CELL), np.uint8)) * 255
     out = colour.copy()

@@ -10,7 +10,7 @@ from scipy.optimize import OptimizeResult, minimize_scalar
 
 from ..optics.camera import Camera
 from .pose import LEAST, squares_of
-from .targets import Corners, Target
+from .targets import DetectedCorners, Target
 
 # Minimum number of corners in a view; search range and tolerance of the factor on the focal length.
 FEWEST, BOUNDS, EXACT = 12, (0.5, 2.0), 1e-3
@@ -33,7 +33,7 @@ class FocalFit:
         return abs(self.factor - 1.0) > max(TOLERATED, SURE * self.deviation)
 
 
-def focal_fit(camera: Camera, seen: Sequence[tuple[Target, Corners]]) -> FocalFit | None:
+def focal_fit(camera: Camera, seen: Sequence[tuple[Target, DetectedCorners]]) -> FocalFit | None:
     """Estimate the factor on both focal lengths that fits targets' corners best; None: too few corners.
 
     Each target has its best-fitting pose. The deviation is that of least squares, from the curvature of the sum at its

@@ -21,7 +21,7 @@ BLURRED = 0.6
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class BoardView:
     """Corners of the board detected in one image.
 
     Parameters
@@ -53,7 +53,7 @@ class View:
         return found @ shift
 
 
-def find_board(detector: Detector, name: str, grey: np.ndarray) -> View | None:
+def find_board(detector: Detector, name: str, grey: np.ndarray) -> BoardView | None:
     """Detect the detector's board in an image (H, W) uint8.
 
     None if too few of its corners are visible, or all are in one or two rows.
@@ -65,7 +65,7 @@ def find_board(detector: Detector, name: str, grey: np.ndarray) -> View | None:
     lines = np.rint(seen.points[:, :2] / board.faces[0].square)
     if min(len(np.unique(lines[:, axis])) for axis in (0, 1)) < FEWEST_LINES:
         return None
-    view = View(name, seen.points, seen.pixels, _sharpness(grey, seen.pixels))
+    view = BoardView(name, seen.points, seen.pixels, _sharpness(grey, seen.pixels))
     return view if np.isfinite(view.homography).all() and np.linalg.matrix_rank(view.homography) == 3 else None
 
 
@@ -78,7 +78,7 @@ def _sharpness(grey: np.ndarray, pixels: np.ndarray) -> float:
     return float(min(slopes) / max(bright - dark, 1.0))
 
 
-def chosen(views: Sequence[View], face: Face, most: int) -> list[View]:
+def chosen(views: Sequence[BoardView], face: Face, most: int) -> list[BoardView]:
     """Select at most `most` of the sharp views, each as different from those before it as possible.
 
     Views are compared by the position of the board's outline in the image. Gonzalez (1985), "Clustering to minimize the
@@ -98,7 +98,7 @@ def chosen(views: Sequence[View], face: Face, most: int) -> list[View]:
     return [sharp[index] for index in sorted(order)]
 
 
-def directions(views: Sequence[View], width: int, height: int) -> float:
+def directions(views: Sequence[BoardView], width: int, height: int) -> float:
     """Compute the largest angle [rad] between planes of the board in two views, by their vanishing lines.
 
     The focal length, which is not known yet, is taken as the longer side of the image. Hartley and Zisserman (2004),
@@ -113,7 +113,7 @@ def directions(views: Sequence[View], width: int, height: int) -> float:
     return float(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0)).max())
 
 
-def covered(views: Sequence[View], width: int, height: int) -> float:
+def covered(views: Sequence[BoardView], width: int, height: int) -> float:
     """Compute the share of an image that is inside the convex hull of the corners of at least one view."""
     mask = np.zeros((height, width), np.uint8)
     for view in views:
@@ -207,7 +207,7 @@ class Intrinsics:
         return np.sqrt(np.diag(self.covariance))
 
 
-def calibrated(views: Sequence[View], width: int, height: int, name: str = "") -> Intrinsics:
+def calibrated(views: Sequence[BoardView], width: int, height: int, name: str = "") -> Intrinsics:
     """Calibrate the camera of these views, taken in images of `width` x `height`.
 
     Zhang (2000), "A flexible new technique for camera calibration", by OpenCV; a lens of Brown and Conrady with five
@@ -241,7 +241,7 @@ def calibrated(views: Sequence[View], width: int, height: int, name: str = "") -
     return found
 
 
-def _demand_views(views: Sequence[View], left_out: int, width: int, height: int) -> None:
+def _demand_views(views: Sequence[BoardView], left_out: int, width: int, height: int) -> None:
     """Raise ValueError for views that do not determine a camera."""
     if len(views) < FEWEST_VIEWS:
         without = f", and {left_out} more fit badly" if left_out else ""
@@ -258,7 +258,7 @@ def _demand_views(views: Sequence[View], left_out: int, width: int, height: int)
 
 
 def _solved(
-    views: Sequence[View], width: int, height: int
+    views: Sequence[BoardView], width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
     """Solve for K (3, 3), five coefficients, and each view's rotation vector, translation (3,), rms error [pixel]."""
     points = [view.points.astype(np.float32) for view in views]
@@ -277,7 +277,7 @@ def _solved(
 
 
 def covariance_of(
-    calibration: Calibration, views: Sequence[View], poses: Sequence[tuple[np.ndarray, np.ndarray]]
+    calibration: Calibration, views: Sequence[BoardView], poses: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray, float]:
     """Compute the covariance (9, 9) of `PARAMETERS` at the least-squares solution, and the rms distance [pixel].
 

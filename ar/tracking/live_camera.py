@@ -16,7 +16,7 @@ from .pictures import Named, in_colour
 FAILURES, PAUSE = 10, 0.05
 
 
-class Source(Protocol):
+class FrameSource(Protocol):
     """Source of images: `cv2.VideoCapture`, or a replacement."""
 
     def isOpened(self) -> bool:
@@ -32,7 +32,7 @@ class Source(Protocol):
         ...
 
 
-def opened(number: int, width: int, height: int) -> Source:
+def opened(number: int, width: int, height: int) -> FrameSource:
     """Open the camera of this machine with a number, for images of a size, without buffering."""
     camera = cv2.VideoCapture(number)
     camera.set(cv2.CAP_PROP_FRAME_WIDTH, width)
@@ -42,7 +42,7 @@ def opened(number: int, width: int, height: int) -> Source:
 
 
 def camera_pictures(
-    source: Source, name: str, again: Callable[[], Source], now: Callable[[], float] = clock.perf_counter
+    source: FrameSource, name: str, again: Callable[[], FrameSource], now: Callable[[], float] = clock.perf_counter
 ) -> Generator[Named | None]:
     """Yield images of a camera, each with its arrival time [s] by `now`; None if there was none.
 

@@ -31,7 +31,7 @@ PRINTING = (
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedFace:
     """Face at its place on a page.
 
     Parameters
@@ -66,7 +66,7 @@ class Page:
 
     name: str
     pixels: np.ndarray
-    placed: tuple[Placed, ...]
+    placed: tuple[PlacedFace, ...]
 
 
 def printed_pages() -> tuple[Page, ...]:
@@ -142,7 +142,7 @@ def _cube_page(target: Target) -> Page:
     left, top = 57.0, 118.0
     cells = ((along_z, left, top, 1), (along_x, left, top + wide, 0), (along_y, left + wide, top + wide, 0))
     page, ink = _blank(A4)
-    placed = tuple(Placed(face, x + border, y + border, turns) for face, x, y, turns in cells)
+    placed = tuple(PlacedFace(face, x + border, y + border, turns) for face, x, y, turns in cells)
     for each, (face, x, y, _) in zip(placed, cells, strict=True):
         _print(page, each)
         _write(ink, face_name(face), x + 0.8, y + 0.4, TINY)
@@ -175,7 +175,7 @@ def _plate_page(target: Target) -> Page:
     wide, border = _mm(face.size[0] + 2.0 * BORDER), _mm(BORDER)
     left, top = 0.5 * (A4[0] - wide), 110.0
     page, ink = _blank(A4)
-    placed = Placed(face, left + border, top + border)
+    placed = PlacedFace(face, left + border, top + border)
     _print(page, placed)
     corners = [(left, top), (left + wide, top), (left + wide, top + wide), (left, top + wide)]
     for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
@@ -195,7 +195,7 @@ def _board_page(target: Target) -> Page:
     """Draw the board across the page; nothing is cut."""
     (face,) = target.faces
     page, ink = _blank((A4[1], A4[0]))
-    placed = Placed(face, 0.5 * (A4[1] - _mm(face.size[0])) + 20.0, 7.0)
+    placed = PlacedFace(face, 0.5 * (A4[1] - _mm(face.size[0])) + 20.0, 7.0)
     _print(page, placed)
     said = (*_sizes(target), *PRINTING)
     _write(ink, f"sulcus: {target.name}", 15.0, 176.0, LARGE)
@@ -210,7 +210,7 @@ def _finished(
     target: Target,
     page: Image.Image,
     ink: ImageDraw.ImageDraw,
-    placed: tuple[Placed, ...],
+    placed: tuple[PlacedFace, ...],
     said: Sequence[str],
     rulers: tuple[tuple[float, float], tuple[float, float]],
 ) -> Page:
@@ -238,7 +238,7 @@ def _blank(size: tuple[float, float]) -> tuple[Image.Image, ImageDraw.ImageDraw]
     return page, ImageDraw.Draw(page)
 
 
-def _print(page: Image.Image, placed: Placed) -> None:
+def _print(page: Image.Image, placed: PlacedFace) -> None:
     picture = np.rot90(placed.face.picture(_px(_mm(placed.face.square))), -placed.turns)
     page.paste(Image.fromarray(np.ascontiguousarray(picture)), (_px(placed.left), _px(placed.top)))
 

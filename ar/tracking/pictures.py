@@ -174,8 +174,7 @@ def _in_video(path: Path, step: int | None, colour: bool = False, first: int = 0
         width, height = (int(video.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if not video.isOpened() or min(width, height) < 1:
             raise ValueError(
-                f"{path}: is not a readable video, as {_flaw(path)}: give a video, or a folder of PNG or JPEG "
-                "images."
+                f"{path}: is not a readable video, as {_flaw(path)}: give a video, or a folder of PNG or JPEG images."
             )
         _demand_size(path, width, height)
         if turn := int(video.get(cv2.CAP_PROP_ORIENTATION_META)):

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..optics.camera import Camera
 from .rigid import angles_of, cross_matrices
-from .targets import Corners, Detector, Target, seen_from_front, window_round
+from .targets import DetectedCorners, Detector, Target, seen_from_front, window_round
 
 # Minimum number of corners of a pose; lower bound of the residual's deviation, and largest residual [pixel].
 FEWEST, LEAST, MOST = 6, 0.1, 1.0
@@ -70,7 +70,7 @@ class Pose:
 
 
 def pose_of(
-    camera: Camera, target: Target, corners: Corners | None, before: np.ndarray | None = None
+    camera: Camera, target: Target, corners: DetectedCorners | None, before: np.ndarray | None = None
 ) -> tuple[Verdict, Pose | None]:
     """Estimate the pose of a target; none unless it is certain.
 
@@ -107,12 +107,12 @@ def pose_of(
     return Verdict.GOOD, Pose(best, variance * _inverse_normal(camera, best, corners.points), residual, count)
 
 
-def squares_of(camera: Camera, target: Target, corners: Corners) -> float:
+def squares_of(camera: Camera, target: Target, corners: DetectedCorners) -> float:
     """Return the smallest sum of squared distances [pixel^2] of a target's corners over its poses; inf if none."""
     return min((squares for _, squares in _fits(camera, target, corners)), default=np.inf)
 
 
-def _fits(camera: Camera, target: Target, corners: Corners) -> list[tuple[np.ndarray, float]]:
+def _fits(camera: Camera, target: Target, corners: DetectedCorners) -> list[tuple[np.ndarray, float]]:
     """Compute candidate poses (4, 4), and their sums of squared distances of all corners [pixel^2]."""
     out = []
     for number in np.unique(corners.face):
@@ -131,7 +131,7 @@ def _fits(camera: Camera, target: Target, corners: Corners) -> list[tuple[np.nda
     return out
 
 
-def _refined(camera: Camera, corners: Corners, T: np.ndarray) -> tuple[np.ndarray, float]:
+def _refined(camera: Camera, corners: DetectedCorners, T: np.ndarray) -> tuple[np.ndarray, float]:
     """Refine a pose T (4, 4) to all corners; return it and the sum of squares [pixel^2]."""
     turn, shift = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3].reshape(3, 1).copy()
     turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, camera.K, camera.distortion, turn, shift)
@@ -139,7 +139,7 @@ def _refined(camera: Camera, corners: Corners, T: np.ndarray) -> tuple[np.ndarra
     return _rigid(turn, shift), float(np.square(pixels - corners.pixels).sum())
 
 
-def _faces_camera(target: Target, corners: Corners, T: np.ndarray) -> bool:
+def _faces_camera(target: Target, corners: DetectedCorners, T: np.ndarray) -> bool:
     """Return True if every face with corners is seen from its front, and is before the camera."""
     for number in np.unique(corners.face):
         T_camera_face = T @ target.faces[number].T_target_face
@@ -179,7 +179,7 @@ STALE, SEARCHED = 5, 3
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
+class TrackedTargets:
     """Tracking result of one image, by target name.
 
     Parameters
@@ -220,7 +220,7 @@ class Tracker:
         object.__setattr__(self, "camera", replace(self.camera, T_camera_world=np.eye(4)))
         object.__setattr__(self, "_detector", Detector(self.targets))
 
-    def track(self, grey: np.ndarray, before: Tracked | None = None) -> Tracked:
+    def track(self, grey: np.ndarray, before: TrackedTargets | None = None) -> TrackedTargets:
         """Track the targets in an image (H, W) uint8 of the camera's size; `before` is the previous result.
 
         Raises
@@ -239,11 +239,13 @@ class Tracker:
             if pose is not None:
                 poses[target.name] = pose
                 last[target.name] = pose.T_camera_target, number
-        return Tracked(number, verdicts, poses, last)
+        return TrackedTargets(number, verdicts, poses, last)
 
-    def _seen(self, grey: np.ndarray, number: int, last: Mapping[str, tuple[np.ndarray, int]]) -> dict[str, Corners]:
+    def _seen(
+        self, grey: np.ndarray, number: int, last: Mapping[str, tuple[np.ndarray, int]]
+    ) -> dict[str, DetectedCorners]:
         """Detect corners near the last poses, or in the whole image if just lost, and at intervals while lost."""
-        found: dict[str, Corners] = {}
+        found: dict[str, DetectedCorners] = {}
         for target in self.targets:
             if target.name in last:
                 T, outline = last[target.name][0], target.outline

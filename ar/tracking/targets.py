@@ -156,7 +156,7 @@ def all_targets() -> tuple[Target, Target, Target]:
 
 
 @dataclass(frozen=True, eq=False)
-class Corners:
+class DetectedCorners:
     """Detected corners of one target.
 
     Parameters
@@ -201,7 +201,7 @@ class Detector:
         object.__setattr__(self, "_quick", quick)
         object.__setattr__(self, "_boards", boards)
 
-    def seen(self, grey: np.ndarray, names: Sequence[str] = ()) -> dict[str, Corners]:
+    def seen(self, grey: np.ndarray, names: Sequence[str] = ()) -> dict[str, DetectedCorners]:
         """Detect corners in an image (H, W) uint8, by the target's name; targets without visible corners are left out.
 
         Only targets of these `names` are detected; without any, all.
@@ -211,7 +211,7 @@ class Detector:
         found = {target.name: self._between(target, grey, corners, known) for target in wanted}
         return {name: each for name, each in found.items() if len(each.points)}
 
-    def seen_in(self, target: Target, grey: np.ndarray, window: Window) -> Corners | None:
+    def seen_in(self, target: Target, grey: np.ndarray, window: Window) -> DetectedCorners | None:
         """Detect corners of one target in a window of an image (H, W) uint8, if any: faster, with one threshold."""
         part = np.ascontiguousarray(grey[window])
         if min(part.shape) < SMALLEST:
@@ -219,7 +219,7 @@ class Detector:
         found = self._between(target, part, *_markers(self._quick[target.name], [target], part))
         return replace(found, pixels=found.pixels + [window[1].start, window[0].start]) if len(found.points) else None
 
-    def _between(self, target: Target, grey: np.ndarray, markers: np.ndarray, ids: np.ndarray) -> Corners:
+    def _between(self, target: Target, grey: np.ndarray, markers: np.ndarray, ids: np.ndarray) -> DetectedCorners:
         """Interpolate the chessboards' corners of a target between its markers, (n, 1, 4, 2) of numbers (n,)."""
         points, pixels, on = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, int)]
         for number, face in enumerate(target.faces):
@@ -234,7 +234,7 @@ class Detector:
                 points.append(face.corners[rows])
                 pixels.append(np.asarray(found, np.float64).reshape(-1, 2))
                 on.append(np.full(len(rows), number))
-        return Corners(np.concatenate(points), np.concatenate(pixels), np.concatenate(on))
+        return DetectedCorners(np.concatenate(points), np.concatenate(pixels), np.concatenate(on))
 
 
 def window_round(camera: Camera, points: np.ndarray, share: float, least: float) -> Window | None:

@@ -11,7 +11,7 @@ import warp as wp
 
 from ar.page.browser import Browser
 from ar.page.elements import coded
-from ar.page.parts import Body, Playback, Viewpoint
+from ar.page.parts import Playback, SceneSurface, SceneViewpoint
 from ar.rendering.renderer import Renderer
 from scenes.page.demo import pictured
 from scenes.play.player import Player
@@ -114,13 +114,13 @@ def open_page(player: Player) -> Browser:
     """A page with the scene's moving bodies, on this machine alone."""
     positions, site = player.site.anatomy.mesh.nodes, player.site
     bodies = [
-        Body(layer.name, layer.vertices, layer.triangles, colour)
+        SceneSurface(layer.name, layer.vertices, layer.triangles, colour)
         for layer, colour in (
             (player.stage.cortex(positions), CORTEX_COLOUR),
             (player.stage.tumour(positions), TUMOUR_COLOUR),
         )
     ]
-    view = Viewpoint(site.origin - 0.1 * site.axis, site.origin, site.up)
+    view = SceneViewpoint(site.origin - 0.1 * site.axis, site.origin, site.up)
     return Browser(bodies, view, Playback(2, lambda playing: None, lambda number: None))
 
 

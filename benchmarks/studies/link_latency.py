@@ -10,18 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.link.answer import NOT_SEEN, Answer, Seen
+from scenes.link.answer import NOT_SEEN, CameraView, PoseResult
 from scenes.link.frame import HEADER, BadMessageError, framed, read_header, stamp_of, time_of
-from scenes.link.heard import Heard, Names
-from scenes.link.messages import Code, Mesh, polydata, status, transform
-from scenes.link.outgoing import Places
-from scenes.link.session import Session
-from scenes.tracked.follower import Known, State
-from scenes.tracked.tool_motion import Motion
+from scenes.link.heard import ReceivedTransforms, TransformNames
+from scenes.link.messages import Code, SentMesh, polydata, status, transform
+from scenes.link.outgoing import SentPlaces
+from scenes.link.session import LinkSession
+from scenes.tracked.follower import TrackingResult, TumourState
+from scenes.tracked.tool_motion import BrainMotion
 from sim.runtime.processes import process_pool, run_on_each
 
 HOST = "127.0.0.1"
-NAME = Names().tool
+NAME = TransformNames().tool
 CLIENTS = 3
 # Poses before the first that counts.
 WARM_UP = 15
@@ -46,17 +46,19 @@ class Moved:
         """A strip of triangles between points at random."""
         self._points = 0.05 * np.random.default_rng(0).normal(size=(points, 3))
         corners = np.arange(2 * points)[:, None] + np.arange(3)
-        self._mesh = Mesh.of(corners % points)
+        self._mesh = SentMesh.of(corners % points)
 
-    def answer(self, heard: Heard, now: float, moment: float, before: Known | None = None) -> Answer:
+    def answer(
+        self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
+    ) -> PoseResult:
         """The pose's shift, as the motion of a brain that is known."""
         body = heard.beside(heard.names.tool, now)
         if isinstance(body, str):
-            return Answer(0, Known(moment, State.NO_TOOL, body, NOT_SEEN, Motion(self._points)))
-        motion = Motion(self._points + body.T[:3, 3], True)
-        return Answer(body.stamp, Known(moment, State.GOOD, "", NOT_SEEN, motion))
+            return PoseResult(0, TrackingResult(moment, TumourState.NO_TOOL, body, NOT_SEEN, BrainMotion(self._points)))
+        motion = BrainMotion(self._points + body.T[:3, 3], True)
+        return PoseResult(body.stamp, TrackingResult(moment, TumourState.GOOD, "", NOT_SEEN, motion))
 
-    def camera(self, heard: Heard, now: float, stamp: int) -> Seen | str:
+    def camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
         """No camera is listened to."""
         return "no camera"
 
@@ -64,16 +66,16 @@ class Moved:
         """The points where they were."""
         return framed("POLYDATA", "TumourInScan", polydata(1e3 * self._points, self._mesh), stamp)
 
-    def messages(self, answer: Answer, places: Places | None = None) -> tuple[bytes, ...]:
+    def messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """The surface."""
         body = polydata(1e3 * answer.known.motion.positions, self._mesh)
         return (framed("POLYDATA", "TumourNow", body, answer.stamp),)
 
-    def status(self, answer: Answer, refused: str) -> bytes:
+    def status(self, answer: PoseResult, refused: str) -> bytes:
         """What is known."""
         return framed("STATUS", "Sulcus", status(Code.OK, answer.known.words), answer.stamp)
 
-    def placed(self, names: list[str], at: np.ndarray) -> Places:
+    def placed(self, names: list[str], at: np.ndarray) -> SentPlaces:
         """No places are followed."""
         raise BadMessageError("no places are followed")
 
@@ -110,7 +112,7 @@ def _serve(device: str, points: int) -> int:
 
     async def work() -> None:
         moved = Moved(points)
-        session = Session(moved, moved, Heard(Names(), PATIENCE))
+        session = LinkSession(moved, moved, ReceivedTransforms(TransformNames(), PATIENCE))
         port = asyncio.get_running_loop().create_future()
         port.add_done_callback(lambda port: (found.append(port.result()), ready.set()))
         await session.serve(HOST, 0, np.inf, port)

@@ -20,7 +20,7 @@ from sim.geometry.closest_point import closest
 from sim.geometry.surface import areas
 from sim.material import Material
 from sim.runtime.device import find_device
-from surrogate.locating.prior import Prior
+from surrogate.locating.prior import MotionPrior
 
 from .kelvinlets import kelvinlets
 
@@ -167,7 +167,7 @@ def rivals(anatomy: Anatomy) -> dict[str, Rival]:
     }
 
 
-def oracle(prior: Prior, motion: np.ndarray) -> np.ndarray:
+def oracle(prior: MotionPrior, motion: np.ndarray) -> np.ndarray:
     """What no sum of a prior's shapes beats: motion (q, 3) [m] of the tumour's vertices.
 
     The sum is nearest, in least squares at the open cortex and the tumour, to a true motion (V, 3) [m].

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.analysis.loglog_chart import Curve, Panel
+from scenes.analysis.loglog_chart import ChartPanel, Curve
 from scenes.analysis.measurement import timed, watched_card
 from scenes.report.finite_elements import template_mesh
 from sim.accuracy import TRAIN
@@ -138,7 +138,7 @@ def rows(
                 ) from None
 
 
-def panels(found: Sequence[Row]) -> tuple[Panel, ...]:
+def panels(found: Sequence[Row]) -> tuple[ChartPanel, ...]:
     """Seconds and memory over nodes; where another preconditioner is chosen, a mark between the two sizes."""
     batches = sorted({row.asked for row in found})
     by_size = sorted({row.nodes: row.preconditioner for row in found}.items())
@@ -154,8 +154,8 @@ def panels(found: Sequence[Row]) -> tuple[Panel, ...]:
     first = f"left of the first mark: {by_size[0][1]}" if marks else by_size[0][1]
     seconds.append(curve("set-up", "set_up", batches[0]))
     return (
-        Panel("What a load takes", "nodes", f"seconds; {first}", tuple(seconds), marks),
-        Panel("What it needs", "nodes", f"GiB at the peak; {first}", tuple(memory), marks),
+        ChartPanel("What a load takes", "nodes", f"seconds; {first}", tuple(seconds), marks),
+        ChartPanel("What it needs", "nodes", f"GiB at the peak; {first}", tuple(memory), marks),
     )
 
 

@@ -15,7 +15,7 @@ from sim.effects import Effect, ToolContact, pushed_effects
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import BRAIN
-from sim.strategy.plan import Step
+from sim.strategy.plan import SolverStep
 from surrogate.data.tool_loads import draw
 from surrogate.data.tool_poses import draw_poses, tool_of
 
@@ -45,7 +45,7 @@ class Work:
 
     shortcut: str
     name: str
-    step: Step | None
+    step: SolverStep | None
     loads: Sequence[Loads]
     effects: tuple[Effect, ...]
     accuracy: Accuracy = TRAIN
@@ -89,19 +89,19 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
     batches = [many.rows(np.arange(first, first + some)) for first in range(0, len(many), some)]
     for element in ("smoothed", "p1"):
         name = f"{some} palpation loads together, {element}"
-        yield Work("nonlinear elimination near the opening", name, Step.NEAR, batches, pushed, element=element)
+        yield Work("nonlinear elimination near the opening", name, SolverStep.NEAR, batches, pushed, element=element)
     name = "a palpation load from rest, quadratic"
-    yield Work("nonlinear elimination, clamped", name, Step.CLAMPED, single, pushed, element="p2")
-    yield Work("L-BFGS before Newton", "a palpation load from rest", Step.LBFGS, single, pushed)
+    yield Work("nonlinear elimination, clamped", name, SolverStep.CLAMPED, single, pushed, element="p2")
+    yield Work("L-BFGS before Newton", "a palpation load from rest", SolverStep.LBFGS, single, pushed)
     poses = draw_poses("palpation", anatomy, POSES * (runs + 1), SEED)
     together = [poses.rows(np.arange(first, first + POSES)) for first in range(0, len(poses), POSES)]
     tool = (*pushed, ToolContact((tool_of("palpation"),)))
-    yield Work("contact solved apart", f"{POSES} poses of a ball together", Step.CONTACT, together, tool)
+    yield Work("contact solved apart", f"{POSES} poses of a ball together", SolverStep.CONTACT, together, tool)
     for scene, step, shortcut in (
-        ("press", Step.STRAINED, "a stiffness that knows strained tissue"),
-        ("palpate", Step.CONTACT, "contact solved apart"),
+        ("press", SolverStep.STRAINED, "a stiffness that knows strained tissue"),
+        ("palpate", SolverStep.CONTACT, "contact solved apart"),
         ("press", None, "curvature of the last frame"),
-        ("press", Step.FRAME, "frame as one captured graph"),
+        ("press", SolverStep.FRAME, "frame as one captured graph"),
     ):
         played = find_scene(scene)
         effects, first = played.effects_on(anatomy), len(played.times) // 3  # the tool has arrived
@@ -112,11 +112,16 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
         yield Work(shortcut, name, step, frames, effects, LIVE, live=True, follows=True)
 
 
-def tried(fem: Fem, step: Step | None) -> bool:
+def tried(fem: Fem, step: SolverStep | None) -> bool:
     """Whether a solver has a shortcut at all on its device, with its element and effects."""
     plan = fem.plan
     own = {plan.many, plan.single, plan.contact}
-    return step is None or step in own or (plan.quick and step is Step.LBFGS) or (plan.frames and step is Step.FRAME)
+    return (
+        step is None
+        or step in own
+        or (plan.quick and step is SolverStep.LBFGS)
+        or (plan.frames and step is SolverStep.FRAME)
+    )
 
 
 def measure(work: Work, site: Site, device: str) -> Row | None:

@@ -12,7 +12,7 @@ from scenes.play.deformers import Theatre
 from scenes.play.player import Player
 from sim.accuracy import LIVE, TRAIN
 from sim.fem import Fem
-from sim.resected_fem import Operated
+from sim.resected_fem import OperatedFem
 from surrogate.data.tool_loads import draw
 
 WARM_UP = 3
@@ -42,7 +42,7 @@ def rows(
     deformer: str,
     solves: int,
     batch: int,
-    made: Callable[[Fem | Operated], object] = lambda fem: None,
+    made: Callable[[Fem | OperatedFem], object] = lambda fem: None,
 ) -> Iterator[Row]:
     """The figures of a theatre, one by one: finite elements, learners, and the pictures of a player of `deformer`.
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scenes.play.deformers import Theatre
-from scenes.play.observer import Estimate
+from scenes.play.observer import TumourEstimate
 from scenes.script.scene import Scene
 from scenes.script.sight import StereoSight
 from sim.errors import InputError
@@ -79,7 +79,7 @@ def rows(
         seen.append((number, positions, player.stage.corners(None if held is None else held.pose)))
         done += 1
         progress(done, total)
-    found: list[Estimate] = []
+    found: list[TumourEstimate] = []
     for seed in seeds:
         observer = theatre.stage(replace(scene, sight=replace(scene.sight, seed=seed))).observer
         assert observer is not None
@@ -93,7 +93,7 @@ def rows(
     yield row(-1, found)
 
 
-def row(seed: int, estimates: Sequence[Estimate]) -> Row:
+def row(seed: int, estimates: Sequence[TumourEstimate]) -> Row:
     """Sum estimates up."""
     off = 1e3 * np.array([each.off for each in estimates])
     true = 1e3 * np.array([np.linalg.norm(each.true) for each in estimates])

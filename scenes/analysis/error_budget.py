@@ -23,7 +23,7 @@ from ..script.site import Site
 from ..script.uncertainty import LEVEL, SURROGATE
 from ..script.viewpoint import Viewpoint
 from .tracking_errors import CORNER, after_middle, changed, corners_in, seen_by_rows
-from .uncertainty import Motions, off_by
+from .uncertainty import SurfaceMotions, off_by
 
 CALIBRATION, MARKERS, LATENCY, SHUTTER = "calibration", "markers", "latency x motion", "rolling shutter"
 PARAMETERS = "tissue, skull, tool's place"
@@ -116,7 +116,7 @@ class Filmed:
 
 
 @dataclass(frozen=True, eq=False)
-class Errors:
+class OverlayErrors:
     """Errors of an overlay in S samples: across the line of sight and along it [m], and in pixels.
 
     Parameters
@@ -138,7 +138,7 @@ class Errors:
         return np.hypot(self.across, self.along)
 
 
-def errors_of(filmed: Filmed, contributors: Sequence[str], count: int, seed: int = 0) -> Errors:
+def errors_of(filmed: Filmed, contributors: Sequence[str], count: int, seed: int = 0) -> OverlayErrors:
     """Sample the overlay error caused by the contributors, all others being exact.
 
     The same seed gives the same random numbers for any set of contributors.
@@ -149,7 +149,7 @@ def errors_of(filmed: Filmed, contributors: Sequence[str], count: int, seed: int
         A reference that the camera does not see.
     """
     rows = [_compared(*sample) for sample in _samples(filmed, frozenset(contributors), count, seed)]
-    return Errors(*np.array(rows).T)
+    return OverlayErrors(*np.array(rows).T)
 
 
 def _samples(
@@ -247,16 +247,16 @@ def _compared(
 
 
 @dataclass(frozen=True, eq=False)
-class Budget:
+class ErrorBudget:
     """The errors of an overlay: of each contributor alone, and of `TECHNICAL` and `CLINICAL` ones together.
 
     `held` is the share of twins' samples within the band, where there are twins, and its standard deviation. Samples of
     one body are held or not together, and one twin has no deviation.
     """
 
-    alone: dict[str, Errors]
-    technical: Errors
-    clinical: Errors
+    alone: dict[str, OverlayErrors]
+    technical: OverlayErrors
+    clinical: OverlayErrors
     held: tuple[float, float | None] | None = None
 
     @property
@@ -275,11 +275,11 @@ def budgeted(
     seed: int = 0,
     twins: Filmed | None = None,
     progress: Callable[[Sequence[str]], Iterable[str]] = iter,
-) -> Budget:
+) -> ErrorBudget:
     """Compute the budget from `count` samples; `twins`, other bodies, test its band with other random numbers."""
     alone = {name: errors_of(filmed, [name], count, seed) for name in progress(CLINICAL)}
     technical, clinical = (errors_of(filmed, names, count, seed) for names in (TECHNICAL, CLINICAL))
-    budget = Budget(alone, technical, clinical)
+    budget = ErrorBudget(alone, technical, clinical)
     if twins is None:
         return budget
     within = errors_of(twins, CLINICAL, count, seed + 1).worst <= budget.band
@@ -299,7 +299,7 @@ def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | No
     return share, float(np.sqrt(np.square(excess).sum() * clusters / (clusters - 1))) / len(within)
 
 
-def moment_of(still: Motions, answers: Sequence[tuple[np.ndarray, ...]], meshes: np.ndarray) -> int:
+def moment_of(still: SurfaceMotions, answers: Sequence[tuple[np.ndarray, ...]], meshes: np.ndarray) -> int:
     """The moment of a scene at which its bodies differ the most; `meshes` (b,) as of `off_by`."""
     sizes = []
     for number, here in enumerate(still.fields):
@@ -308,7 +308,7 @@ def moment_of(still: Motions, answers: Sequence[tuple[np.ndarray, ...]], meshes:
     return int(np.argmax(sizes))
 
 
-def velocity_at(still: Motions, number: int) -> np.ndarray:
+def velocity_at(still: SurfaceMotions, number: int) -> np.ndarray:
     """Return the velocity (n, 3) [m/s] of the tumour's surface before a time; 0 if tissue was cut meanwhile."""
     before, here = still.fields[max(number - 1, 0)], still.fields[number]
     if number == 0 or before.shape != here.shape:

@@ -16,8 +16,8 @@ from sim.fem import Fem
 from sim.loads import Loads, push, stacked
 from sim.material import BRAIN
 
-from .loglog_chart import Curve, Panel
-from .sensitivity import Body, Study, moved_alike
+from .loglog_chart import ChartPanel, Curve
+from .sensitivity import BodyVariant, SensitivityStudy, moved_alike
 
 Levels = Mapping[str, Sequence[str | float]]
 LEVELS: Levels = {
@@ -54,7 +54,7 @@ def cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> I
         cortex = open_cortex(anatomy)
         places = [cortex.place(*place) for place in PLACES]
         forces = stacked([push(place.point, FORCE * place.inward, FOOTPRINT) for place in places])
-        study = Study(anatomy, forces, _body(DEFAULT), device=device)
+        study = SensitivityStudy(anatomy, forces, _body(DEFAULT), device=device)
         default = study.fem(study.body).deform(forces)
         motions = moved_alike(anatomy, forces, default)
         for combination in product(*(levels[name] for name in DEFAULT)):
@@ -64,9 +64,9 @@ def cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> I
             yield Cell({"opening [mm]": opening, "depth [mm]": depth, **chosen}, *moved)
 
 
-def _body(chosen: Mapping[str, str | float]) -> Body:
+def _body(chosen: Mapping[str, str | float]) -> BodyVariant:
     tissue = replace(BRAIN, poisson=float(chosen["nu"]))
-    return Body(tissue, float(chosen["tumour's stiffness"]), str(chosen["skull"]))
+    return BodyVariant(tissue, float(chosen["tumour's stiffness"]), str(chosen["skull"]))
 
 
 def _motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
@@ -98,7 +98,7 @@ def shares(found: Sequence[Cell], what: str = "force") -> dict[str, float]:
     return dict(sorted({**own, **pairs}.items(), key=lambda item: -item[1]))
 
 
-def panels(found: Sequence[Cell]) -> list[Panel]:
+def panels(found: Sequence[Cell]) -> list[ChartPanel]:
     """The motion over the tumour's depth, a panel for each opening: skulls, and Poisson's ratios of the default one."""
     chosen = [{**DEFAULT, "nu": nu} for nu in _levels(found, "nu")]
     chosen += [{**DEFAULT, "skull": skull} for skull in _levels(found, "skull") if skull != DEFAULT["skull"]]
@@ -114,7 +114,7 @@ def panels(found: Sequence[Cell]) -> list[Panel]:
             curves.append(Curve(f"{body['skull']}, nu {body['nu']:g}", points))
         title = f"Opening of {opening:g} mm: how far {FORCE:g} N move the tumour"
         out.append(
-            Panel(title, "depth of the tumour under the cortex [mm]", "motion [mm]", tuple(curves), y_range=span)
+            ChartPanel(title, "depth of the tumour under the cortex [mm]", "motion [mm]", tuple(curves), y_range=span)
         )
     return out
 

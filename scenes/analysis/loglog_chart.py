@@ -47,7 +47,7 @@ class Dot:
 
 
 @dataclass(frozen=True)
-class Panel:
+class ChartPanel:
     """One pair of axes: title, what they show, curves, dots, and `marks`: labelled vertical lines.
 
     size: width and height [pixel]; y_range: limits of the axis (default: those of the data and a margin).
@@ -63,7 +63,7 @@ class Panel:
     y_range: tuple[float, float] | None = None
 
 
-def drawn(panels: Sequence[Panel]) -> np.ndarray:
+def drawn(panels: Sequence[ChartPanel]) -> np.ndarray:
     """Panels of one height side by side, (height, sum of widths, 3) uint8.
 
     Raises
@@ -76,7 +76,7 @@ def drawn(panels: Sequence[Panel]) -> np.ndarray:
     return np.hstack([_drawn(panel) for panel in panels])
 
 
-def _drawn(panel: Panel) -> np.ndarray:
+def _drawn(panel: ChartPanel) -> np.ndarray:
     pairs = [point for curve in panel.curves for point in curve.points] + [(dot.x, dot.y) for dot in panel.dots]
     points = np.array(pairs, float).reshape(-1, 2)
     if not len(points) or not (points > 0.0).all():

@@ -21,7 +21,7 @@ from surrogate.data.tool_loads import across
 
 
 @dataclass(frozen=True)
-class Body:
+class BodyVariant:
     """Variant of the body: tissue, relative stiffness of the tumour, skull model, element.
 
     `skull` is one of `sim.effects.SKULLS`. Linear tetrahedra lock as nu nears 0.5, which would pass for an influence of
@@ -53,11 +53,11 @@ class Variant:
     what: str
     default: str
     now: str
-    body: Body
+    body: BodyVariant
     aim: Aim = Aim()
 
 
-def variants(anatomy: Anatomy, body: Body, elements: Sequence[str] = ()) -> list[Variant]:
+def variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] = ()) -> list[Variant]:
     """The tool's uncertainty, the tissue's, the skull's, and other `elements`."""
     tissue = body.tissue
     young, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
@@ -135,7 +135,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Row:
+class SensitivityRow:
     """A variant under tools of known force, and under tools of known motion."""
 
     variant: Variant
@@ -144,16 +144,16 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
+class SensitivityStudy:
     """The same `Pushed` loads on variants of a body."""
 
     anatomy: Anatomy
     loads: Loads
-    body: Body
+    body: BodyVariant
     accuracy: Accuracy = STRAINED
     device: str = "auto"
 
-    def fem(self, body: Body) -> Fem:
+    def fem(self, body: BodyVariant) -> Fem:
         """The finite elements of a body, for tools of either kind."""
         tissue = body.tissue
         _, *others = pushed_effects(self.anatomy, tissue, body.skull)
@@ -162,7 +162,7 @@ class Study:
         return Fem(self.anatomy, effects, self.accuracy, self.device, element=body.element)
 
 
-def rows(study: Study, changed: Sequence[Variant]) -> Iterator[Row]:
+def rows(study: SensitivityStudy, changed: Sequence[Variant]) -> Iterator[SensitivityRow]:
     """First the default, whose change is its whole motion; then each variant's change from it.
 
     Known motions are those of the default under its forces: the mean motion of each footprint. Every solve starts at
@@ -182,7 +182,7 @@ def rows(study: Study, changed: Sequence[Variant]) -> Iterator[Row]:
     defaults = ((study.loads, pushed), (known, fem.deform(known, guess(pushed.displacement))))
     rest = np.zeros((len(study.loads), len(nodes), 3))
     whole = [change(default.at(nodes), default.at(nodes), rest) for _, default in defaults]
-    yield Row(Variant("motion itself", "", "", body), *whole)
+    yield SensitivityRow(Variant("motion itself", "", "", body), *whole)
     for variant in changed:
         if variant.body != body:
             body, fem = variant.body, study.fem(variant.body)
@@ -192,7 +192,7 @@ def rows(study: Study, changed: Sequence[Variant]) -> Iterator[Row]:
             start = np.tile(default.displacement, (len(asked) // len(loads), 1, 1))
             of_default = default.at(nodes)
             found.append(change(fem.deform(asked, guess(start), nodes), of_default, of_default.displacement))
-        yield Row(variant, *found)
+        yield SensitivityRow(variant, *found)
 
 
 def change(answer: Deformation, default: Deformation, origin: np.ndarray) -> Change:

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.intrinsics import View, covariance_of
-from ar.tracking.targets import Corners, Target, calibration_board, seen_from_front
+from ar.tracking.intrinsics import BoardView, covariance_of
+from ar.tracking.targets import DetectedCorners, Target, calibration_board, seen_from_front
 
 CORNER = 0.1
 """Standard deviation of a corner per axis [pixel]: by default twice that of sharp images (`benchmarks track`)."""
@@ -38,7 +38,7 @@ def usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarray:
         pixels, _ = camera.project(at)
         inside = np.isfinite(pixels).all(axis=1)
         noisy = pixels + CORNER * random.standard_normal(pixels.shape)
-        views.append(View(str(number), points[inside], noisy[inside], 1.0))
+        views.append(BoardView(str(number), points[inside], noisy[inside], 1.0))
         poses.append((turn, shift))
     return covariance_of(calibration, views, poses)[0]
 
@@ -51,7 +51,7 @@ def changed(calibration: Calibration, step: np.ndarray) -> Calibration:
     return replace(calibration, focal=(fx, fy), principal=(cx, cy), lens=Lens(*coefficients.tolist()))
 
 
-def corners_in(camera: Camera, target: Target, T_world_target: np.ndarray, off: np.ndarray) -> Corners:
+def corners_in(camera: Camera, target: Target, T_world_target: np.ndarray, off: np.ndarray) -> DetectedCorners:
     """Project the corners of a target's visible faces, each with an error from a row of `off` (n, 2) [pixel]."""
     points, faces, T = [], [], camera.T_camera_world @ T_world_target
     for number, face in enumerate(target.faces):
@@ -61,12 +61,12 @@ def corners_in(camera: Camera, target: Target, T_world_target: np.ndarray, off: 
     at = np.concatenate([np.zeros((0, 3)), *points])
     pixels, _ = camera.project(at @ T_world_target[:3, :3].T + T_world_target[:3, 3])
     inside = (np.isfinite(pixels) & (pixels >= 0.0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=1)
-    return Corners(at[inside], (pixels + off[: len(at)])[inside], np.array(faces, int)[inside])
+    return DetectedCorners(at[inside], (pixels + off[: len(at)])[inside], np.array(faces, int)[inside])
 
 
 def seen_by_rows(
-    seen: Corners, camera_at: Callable[[float], Camera], readout: float, T_world_target: np.ndarray
-) -> Corners:
+    seen: DetectedCorners, camera_at: Callable[[float], Camera], readout: float, T_world_target: np.ndarray
+) -> DetectedCorners:
     """Project corners with a rolling shutter that reads the image rows within `readout` [s].
 
     `camera_at` returns the camera at a delay [s] after the middle row is read. The noise of `seen` corners stays.

@@ -33,8 +33,8 @@ from ..script.priors import (
     STIFFNESS,
     TOGETHER,
     TOOL,
-    Draw,
-    Prior,
+    ParameterPrior,
+    PatientSample,
     chosen,
     rigid,
 )  # fmt: skip
@@ -56,19 +56,19 @@ SKULL_EFFECTS = Bonded | Slide | SkullContact
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class SolvedMotions:
     """Motions (n, 3) [m] of the tumour's surface at each moment, and the most tetrahedra inside out at any of them."""
 
     motions: tuple[np.ndarray, ...]
     inverted: int = 0
 
 
-Answer = Solved | None
+Answer = SolvedMotions | None
 """None where some moment has no equilibrium."""
 
 
 @dataclass(frozen=True, eq=False)
-class Motions:
+class SurfaceMotions:
     """Motions of the tumour's surface at each moment, and how it lies.
 
     Parameters
@@ -84,7 +84,7 @@ class Motions:
     normals: tuple[np.ndarray, ...]
 
 
-def changed(scene: Scene, draw: Draw) -> Scene:
+def changed(scene: Scene, draw: PatientSample) -> Scene:
     """The scene with another tissue, tumour, skull and place of the tool.
 
     Raises
@@ -119,19 +119,19 @@ def skull_of(scene: Scene) -> str | None:
     return next((name for name, skull in SKULLS.items() if type(skull) is own), None)
 
 
-def mesh_prior(scene: Scene, skull: str | None) -> Prior:
+def mesh_prior(scene: Scene, skull: str | None) -> ParameterPrior:
     """Return the prior of a scene's mesh error for a skull model."""
     if skull in (None, "bonded"):
         return OF_MESH
     return OF_MESH_SINKING if any(isinstance(effect, Gravity) for effect in scene.effects) else OF_MESH_SLIDING
 
 
-def mesh_errors(scene: Scene, draws: Sequence[Draw]) -> np.ndarray:
+def mesh_errors(scene: Scene, draws: Sequence[PatientSample]) -> np.ndarray:
     """Sample the mesh error (draws,) of each draw, relative to its motion."""
     return mesh_deviations(scene, draws) * np.array([draw.mesh for draw in draws])
 
 
-def mesh_deviations(scene: Scene, draws: Sequence[Draw]) -> np.ndarray:
+def mesh_deviations(scene: Scene, draws: Sequence[PatientSample]) -> np.ndarray:
     """Return the standard deviation (draws,) of each draw's mesh error, relative to its motion."""
     if skull_of(scene) is None:
         return np.full(len(draws), mesh_prior(scene, None).range[1])
@@ -185,7 +185,7 @@ def moments(scene: Scene) -> tuple[float, ...]:
     return tuple(np.linspace(0.0, scene.duration, MOMENTS).tolist())
 
 
-def nominal(theatre: Theatre, scene: Scene) -> Motions:
+def nominal(theatre: Theatre, scene: Scene) -> SurfaceMotions:
     """Solve the scene as it is.
 
     Raises
@@ -202,7 +202,7 @@ def nominal(theatre: Theatre, scene: Scene) -> Motions:
         loads = scene.loads(theatre.site, scene.path(time), time)
         tumour = Stage(scene, theatre.site).at(loads).tumour(theatre.anatomy.mesh.nodes)
         normals.append(vertex_normals(tumour.vertices, tumour.triangles))
-    return Motions(moments(scene), answer.motions, tuple(normals))
+    return SurfaceMotions(moments(scene), answer.motions, tuple(normals))
 
 
 def solved(theatre: Theatre, scene: Scene) -> Answer:
@@ -228,27 +228,29 @@ def solved(theatre: Theatre, scene: Scene) -> Answer:
             return None
         last, before, inverted = answer, time, max(inverted, int(answer.inverted[0]))
         found.append(_surface(stage.at(scene.loads(theatre.site, scene.path(time), time)), last))
-    return Solved(tuple(found), inverted)
+    return SolvedMotions(tuple(found), inverted)
 
 
 def _surface(stage: Stage, answer: Deformation) -> np.ndarray:
     return answer.at(stage.tumour_vertices).displacement[0]
 
 
-def ensemble(theatre: Theatre, scene: Scene, draws: Sequence[Draw]) -> Iterator[Answer]:
+def ensemble(theatre: Theatre, scene: Scene, draws: Sequence[PatientSample]) -> Iterator[Answer]:
     """The motions of every draw."""
     for draw in draws:
         yield solved(theatre, changed(scene, draw))
 
 
-def sound_of(draws: Sequence[Draw], answers: Iterable[Answer]) -> list[tuple[Draw, tuple[np.ndarray, ...]]]:
+def sound_of(
+    draws: Sequence[PatientSample], answers: Iterable[Answer]
+) -> list[tuple[PatientSample, tuple[np.ndarray, ...]]]:
     """The draws that have an equilibrium at each moment, with their motions."""
     return [(draw, answer.motions) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
 
 
 def enough_of(
-    scene: Scene, draws: Sequence[Draw], answers: Iterable[Answer]
-) -> list[tuple[Draw, tuple[np.ndarray, ...]]]:
+    scene: Scene, draws: Sequence[PatientSample], answers: Iterable[Answer]
+) -> list[tuple[PatientSample, tuple[np.ndarray, ...]]]:
     """Return the sound draws, as `sound_of`, of a scene with enough of them.
 
     Raises
@@ -263,7 +265,12 @@ def enough_of(
 
 
 def uncertainty(
-    theatre: Theatre, scene: Scene, still: Motions, draws: Sequence[Draw], answers: Iterable[Answer], seed: int = 0
+    theatre: Theatre,
+    scene: Scene,
+    still: SurfaceMotions,
+    draws: Sequence[PatientSample],
+    answers: Iterable[Answer],
+    seed: int = 0,
 ) -> Uncertainty:
     """Estimate the error of the shown tumour position from the motions of an ensemble.
 
@@ -319,7 +326,7 @@ def distances(
     return worst, middle
 
 
-def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw], scene: Scene) -> dict[str, float]:
+def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[PatientSample], scene: Scene) -> dict[str, float]:
     """Return the error of each contributor alone [m]: root mean square over the draws, at the worst surface point of each.
 
     A linear fit of the draws (draws, n, 3) tells the causes apart; what it leaves is of several together.
@@ -338,7 +345,7 @@ def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw], scene: S
     return found | {SEGMENTATION: OF_SEGMENTATION.range[1]}
 
 
-def causes(draws: Sequence[Draw], scene: Scene) -> dict[str, np.ndarray]:
+def causes(draws: Sequence[PatientSample], scene: Scene) -> dict[str, np.ndarray]:
     """Return, by contributor, the difference of each draw from the scene (draws, columns); zero without difference."""
     poisson = tissue_of(scene).poisson
     table = np.array([[np.log(one.stiffness), one.poisson - poisson, np.log(one.ratio), *one.tip] for one in draws])
@@ -357,7 +364,12 @@ def size(field: np.ndarray) -> float:
 
 
 def coverage(
-    scene: Scene, still: Motions, stated: Uncertainty, draws: Sequence[Draw], answers: Iterable[Answer], seed: int
+    scene: Scene,
+    still: SurfaceMotions,
+    stated: Uncertainty,
+    draws: Sequence[PatientSample],
+    answers: Iterable[Answer],
+    seed: int,
 ) -> Uncertainty:
     """The uncertainty with its coverage on synthetic patients: other draws, with other errors of registration.
 

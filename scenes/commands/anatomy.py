@@ -19,7 +19,7 @@ from sim.bodies.label_volume import masked_subject
 from sim.bodies.mesher import lost_pieces, lost_words, surface_errors
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.placement import side_of
-from sim.bodies.subject import MeshPlan, Part, Subject, make_anatomy
+from sim.bodies.subject import MeshPlan, Subject, SubjectPart, make_anatomy
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh, dihedral_angles
 from sim.runtime.timing import stage
@@ -184,7 +184,7 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost:
     }
 
 
-def _volume(mesh: TetMesh, part: Part) -> float:
+def _volume(mesh: TetMesh, part: SubjectPart) -> float:
     """[m^3] of the tetrahedra of a part."""
     return float(mesh.volumes[mesh.within(part.label)].sum())
 

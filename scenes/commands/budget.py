@@ -25,12 +25,12 @@ from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissu
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
 
-    from ..analysis.error_budget import Budget, Errors, Filmed
+    from ..analysis.error_budget import ErrorBudget, Filmed, OverlayErrors
     from ..play.deformers import Theatre
-    from ..script.priors import Draw
+    from ..script.priors import PatientSample
     from ..script.scene import Scene
 
-    Bodies = list[tuple[Draw, tuple[np.ndarray, ...]]]
+    Bodies = list[tuple[PatientSample, tuple[np.ndarray, ...]]]
 
 FEWEST, FEWEST_SAMPLES = 8, 200
 # Mean errors of overlays as published: a headset in 20 patients (10.3171/2025.5.JNS243160), and 35 studies [mm].
@@ -61,14 +61,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="from `sulcus register` (default: a published 1.56 mm along each axis)",
     )  # fmt: skip
     parser.add_argument(
-        "--corner-px", type=float, default=0.1, help="standard deviation of a marker corner [pixel] (default: %(default)s)"
+        "--corner-px",
+        type=float,
+        default=0.1,
+        help="standard deviation of a marker corner [pixel] (default: %(default)s)",
     )
     parser.add_argument(
         "--latency-ms", type=float, default=0.0,
         help="delay between the tracked and the drawn image [ms] (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--clock-ms", type=float, default=5.0, help="standard deviation of image and pose times [ms] (default: %(default)s)"
+        "--clock-ms",
+        type=float,
+        default=5.0,
+        help="standard deviation of image and pose times [ms] (default: %(default)s)",
     )
     parser.add_argument(
         "--readout-ms", type=float,
@@ -231,7 +237,7 @@ def _promised(theatre: Theatre, scene: Scene, time: float) -> float:
     return player.draw(number, time, scene.path(time)).model_error or 0.0
 
 
-def _flat(args: argparse.Namespace, filmed: Filmed, found: Budget, split: dict[str, float]) -> dict[str, Any]:
+def _flat(args: argparse.Namespace, filmed: Filmed, found: ErrorBudget, split: dict[str, float]) -> dict[str, Any]:
     """All figures [mm, pixel]."""
     from ..analysis.error_budget import PARAMETERS
 
@@ -255,7 +261,7 @@ def _flat(args: argparse.Namespace, filmed: Filmed, found: Budget, split: dict[s
     }  # fmt: skip
 
 
-def _figures(errors: Errors) -> dict[str, dict[str, float]]:
+def _figures(errors: OverlayErrors) -> dict[str, dict[str, float]]:
     """Medians and 95 in 100 of one row."""
     columns = {
         "across_mm": 1e3 * errors.across, "along_mm": 1e3 * np.abs(errors.along), "pixels": errors.pixels,

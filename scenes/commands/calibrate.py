@@ -53,7 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("A.csv", "B.csv"),
         help="estimate the transform from body B to body A from simultaneous poses of both; columns as below",
     )
-    parser.add_argument("--out", metavar="K.yaml", help="calibration to write; its covariance goes to K.json next to it")
+    parser.add_argument(
+        "--out", metavar="K.yaml", help="calibration to write; its covariance goes to K.json next to it"
+    )
     parser.add_argument("--size", metavar="WxH", help="reject images of any other size, such as 1280x960")
     add_json(parser, "print one JSON line, with covariances, in place of words")
     add_force(parser)

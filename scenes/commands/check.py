@@ -17,7 +17,7 @@ from ..options.shared_options import add_json, add_style
 from ..options.theatre_options import add_theatre, deformer_name, playable, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
-    from ..play.checks import Figures
+    from ..play.checks import SceneFigures
     from ..play.deformers import Theatre
     from ..play.player import Frame
     from ..script.scene import Scene
@@ -141,7 +141,7 @@ def _bond(share: float) -> str:
     return f", whose bond bears {share:.0%} of its strength" if math.isfinite(share) else ""
 
 
-def _estimates(figures: Figures) -> str:
+def _estimates(figures: SceneFigures) -> str:
     """Summarise the errors of the estimates in a scene with observations."""
     if not math.isfinite(figures.covered):
         return ""

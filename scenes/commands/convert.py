@@ -27,7 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=FORMATS,
         help="LeRobot v3.0, robomimic (.hdf5), images and tables, XDMF for ParaView, or the card of a data set",
     )
-    parser.add_argument("--out", type=Path, help="new folder, or .hdf5 file; a card is written into the data set itself")
+    parser.add_argument(
+        "--out", type=Path, help="new folder, or .hdf5 file; a card is written into the data set itself"
+    )
     add_force(parser)
     add_json(parser)
 

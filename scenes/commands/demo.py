@@ -36,7 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--port", type=int, default=8080, help="port, or the next free one (default %(default)s)")
     add_address(parser)
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="exit after this many seconds (default: never)")
+    parser.add_argument(
+        "--seconds", type=float, default=float("inf"), help="exit after this many seconds (default: never)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -19,8 +19,8 @@ from ..options.shared_options import add_json, add_seed, json_line
 from .interrupt import INTERRUPTED, terminated_as_interrupted
 
 if TYPE_CHECKING:
-    from ..episodes.engine import Heard, Tally
-    from ..episodes.plan import Plan
+    from ..episodes.engine import ProgressListener, RunStatistics
+    from ..episodes.plan import EpisodePlan
     from ..episodes.workers import Workers
 
 
@@ -29,8 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plan", metavar="PLAN", help="a plan that ships with sulcus, or your own .toml")
     parser.add_argument("--count", required=True, type=_positive, help="number of episodes")
     add_seed(parser, "all draws", _natural)
-    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder of the episodes; an unfinished run is resumed")
-    parser.add_argument("--first", type=_natural, default=0, metavar="K", help="number of the first episode (default: 0)")
+    parser.add_argument(
+        "--out", required=True, type=Path, metavar="DIR", help="folder of the episodes; an unfinished run is resumed"
+    )
+    parser.add_argument(
+        "--first", type=_natural, default=0, metavar="K", help="number of the first episode (default: 0)"
+    )
     who = parser.add_mutually_exclusive_group()
     who.add_argument(
         "--workers", type=_positive, metavar="K",
@@ -97,22 +101,22 @@ def run(args: argparse.Namespace) -> int:
         return INTERRUPTED
 
 
-def _made(args: argparse.Namespace, plan: Plan, out: Path, stop_if_asked: Callable[[], None]) -> int:
+def _made(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_if_asked: Callable[[], None]) -> int:
     with needed_from("data", "sulcus episodes needs"):
         from ..episodes.engine import make_all, still_missing
     from ..episodes.make import body_of, make_body, make_episode
-    from ..episodes.run_folder import Run, begin, finished, read_run, versions_here
-    from ..episodes.tasks import Work
+    from ..episodes.run_folder import RunSettings, begin, finished, read_run, versions_here
+    from ..episodes.tasks import RunWork
 
     before = read_run(out)
     device = before.device if before and args.device == "auto" else args.device
     with _workers(args, device) as workers:
-        run = Run(plan.name, plan.digest, args.seed, workers.device, versions_here())
+        run = RunSettings(plan.name, plan.digest, args.seed, workers.device, versions_here())
         first_client = begin(out, run, plan.text, args.force)
         found = finished(out)
         there, missing = still_missing(out, found, range(args.first, args.first + args.count), first_client, args.again)
         given = out, plan, args.seed
-        work = Work(
+        work = RunWork(
             partial(body_of, plan, args.seed),
             partial(make_body, *given, device=workers.device),
             partial(make_episode, *given, device=workers.device),
@@ -156,13 +160,15 @@ def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Wo
 
 
 @contextmanager
-def _progress(out: Path, there: Tally, total: int, stop_if_asked: Callable[[], None]) -> Iterator[Heard]:
+def _progress(
+    out: Path, there: RunStatistics, total: int, stop_if_asked: Callable[[], None]
+) -> Iterator[ProgressListener]:
     """A bar of episodes, with frames a second and what failed; and what each task took, into the folder."""
     from tqdm import tqdm
 
     from ..episodes.engine import BODY
     from ..episodes.rates import written_rates
-    from ..episodes.tasks import Outcome
+    from ..episodes.tasks import TaskOutcome
 
     done, begun = there, time.perf_counter()
     pause = 0.5 if sys.stderr.isatty() else 30.0
@@ -172,7 +178,7 @@ def _progress(out: Path, there: Tally, total: int, stop_if_asked: Callable[[], N
     }  # fmt: skip
     with written_rates(out) as written, tqdm(**words) as bar:
 
-        def heard(kind: str, outcome: Outcome | None, workers: int) -> None:
+        def heard(kind: str, outcome: TaskOutcome | None, workers: int) -> None:
             nonlocal done
             if outcome is None:
                 stop_if_asked()
@@ -191,7 +197,7 @@ def _progress(out: Path, there: Tally, total: int, stop_if_asked: Callable[[], N
         yield heard
 
 
-def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, where: str, card: bool) -> None:
+def _report(args: argparse.Namespace, out: Path, tally: RunStatistics, seconds: float, where: str, card: bool) -> None:
     from ..episodes.bodies import models_of, said_of_weak, weak_as_json
     from ..episodes.run_folder import failed, failure_of
 
@@ -232,7 +238,7 @@ def _report(args: argparse.Namespace, out: Path, tally: Tally, seconds: float, w
             print(f"Episode {number}: {one.reason}")
 
 
-def _print_estimate(args: argparse.Namespace, plan: Plan, out: Path) -> int:
+def _print_estimate(args: argparse.Namespace, plan: EpisodePlan, out: Path) -> int:
     from ..episodes.estimate import estimated, lines
     from ..episodes.rates import read_rates
     from ..episodes.run_folder import read_run

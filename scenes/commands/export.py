@@ -15,7 +15,12 @@ ENDING = ".model.npz"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("model", type=Path, metavar="MODEL.npz", help="from `sulcus train`")
-    parser.add_argument("--out", required=True, metavar="MODEL.onnx", help="ONNX file to write; its inputs and outputs carry descriptions")
+    parser.add_argument(
+        "--out",
+        required=True,
+        metavar="MODEL.onnx",
+        help="ONNX file to write; its inputs and outputs carry descriptions",
+    )
     parser.add_argument("--learner", help="name of the model (default: the one with the smallest error bound)")
     parser.add_argument(
         "--anatomy", type=Path, help=f"anatomy it was trained on, .vtu (default: MESH.vtu next to MESH{ENDING})"

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..play.deformers import Theatre
     from ..play.player import Player
     from ..script.scene import Scene
-    from ..tracked.filming import Shot, Trouble
+    from ..tracked.filming import Trouble, VideoFrame
 
 # Repeated here, so that `--help` does not import the renderer.
 TROUBLES = ("reference", "tool", "bright", "smear", "gap")
@@ -43,8 +43,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=1, help="record every Nth frame (default: %(default)s)")
     parser.add_argument("--seconds", type=float, help="duration of the recorded part of the scene [s] (default: all)")
     parser.add_argument("--png", action="store_true", help="write lossless DIR/frames/*.png instead of film.mp4")
-    parser.add_argument("--blur", type=float, default=0.5, metavar="PX", help="standard deviation of the lens blur [pixel] (default: %(default)s)")
-    parser.add_argument("--noise", type=float, default=2.0, help="standard deviation of the pixel noise, of 255 (default: %(default)s)")
+    parser.add_argument(
+        "--blur",
+        type=float,
+        default=0.5,
+        metavar="PX",
+        help="standard deviation of the lens blur [pixel] (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--noise", type=float, default=2.0, help="standard deviation of the pixel noise, of 255 (default: %(default)s)"
+    )
     parser.add_argument(
         "--readout", type=float, metavar="MS",
         help="rolling-shutter readout time [ms] (default: the camera's)",
@@ -87,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     from ..tracked.filming import Taking, Trouble, mounted, registered, shots_of
     from ..tracked.registration_file import write_registration
     from ..tracked.tracked_tool import write_tool
-    from ..tracked.truth import Truth, write_table, write_truth
+    from ..tracked.truth import VideoGroundTruth, write_table, write_truth
 
     at_least("--every", args.every, 1)
     for name, value in (
@@ -110,13 +118,13 @@ def run(args: argparse.Namespace) -> int:
     paths = {name: claimed(folder / name, Path(name).suffix, args.force) for name in FILES}
     player = theatre.player(args.deformer or "fem", scene)
     mounts = mounted(player)
-    shots: list[Shot] = []
+    shots: list[VideoFrame] = []
     film = _write_film(args, shots_of(player, mounts, taking, args.every), shots, player)
     write_calibration(paths["camera.yaml"], replace(calibration, name=f"sulcus film: {scene.name}"))
     write_exactly_known(paths["camera.json"], calibration)
     write_registration(paths["registration.json"], registered(player.site, mounts, shift, turn, args.seed))
     write_tool(paths["tool.json"], mounts.tool)
-    truth = Truth(
+    truth = VideoGroundTruth(
         player.site.anatomy.digest,
         np.array([shot.time for shot in shots]),
         np.stack([shot.T_camera_scan for shot in shots]),
@@ -156,7 +164,7 @@ def _scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
     return scene if args.seconds is None else replace(scene, duration=min(args.seconds, scene.duration))
 
 
-def _write_film(args: argparse.Namespace, taken: Iterator[Shot], shots: list[Shot], player: Player) -> Path:
+def _write_film(args: argparse.Namespace, taken: Iterator[VideoFrame], shots: list[VideoFrame], player: Player) -> Path:
     """Write the images, and append the ground truth of each to `shots`; return the path of the video or folder."""
     from tqdm import tqdm
 

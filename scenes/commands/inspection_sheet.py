@@ -48,7 +48,7 @@ LIGHT = np.array([-0.4, 0.5, 0.77])
 
 
 @dataclass(frozen=True)
-class View:
+class InspectionView:
     """Square image of a plane in space.
 
     Parameters
@@ -98,7 +98,7 @@ def sheet(found: Inspection, masks: HeadMasks, subject: Subject, opened: np.ndar
         across = np.abs(right) + np.abs(down)
         reach = 0.5 * float(((high - low) * across).max()) + ROOM
         middle = 0.5 * (low + high) * across + centre * (1.0 - across)
-        view = View(f"{plane.name}, through the tumour", right, down, middle, reach)
+        view = InspectionView(f"{plane.name}, through the tumour", right, down, middle, reach)
         colour, names = _slice(view, masks, subject, opened)
         panels.append(_framed(colour, view))
         drawn |= names
@@ -110,7 +110,7 @@ def sheet(found: Inspection, masks: HeadMasks, subject: Subject, opened: np.ndar
     return np.asarray(picture)
 
 
-def _slice(view: View, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> tuple[np.ndarray, set[str]]:
+def _slice(view: InspectionView, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> tuple[np.ndarray, set[str]]:
     """Labels in colours, over the scan where there is one, and the opened cortex; and the names of what is drawn."""
     points = view.points().reshape(-1, 3)
     inverse = np.linalg.inv(masks.affine)
@@ -175,7 +175,7 @@ def _outside(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarr
     right = np.cross(down, inward)
     across = subject.cortex - subject.site
     reach = float(np.abs(np.stack([across @ right, across @ down])).max(axis=1).mean()) * 0.8
-    view = View("from outside, along the opening", right, down, subject.site, reach)
+    view = InspectionView("from outside, along the opening", right, down, subject.site, reach)
     cell = max(2.0 * reach / SIDE, 1.5 * float(np.linalg.norm(masks.affine[:3, :3], axis=0).max()))
     seen = _seen(view, subject.cortex, inward, cell)
     colour = np.tile(np.array(GROUND, float), (SIDE, SIDE, 1))
@@ -191,7 +191,7 @@ def _outside(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarr
     return _framed(np.rint(colour).astype(np.uint8), view)
 
 
-def _seen(view: View, points: np.ndarray, inward: np.ndarray, cell: float) -> np.ndarray:
+def _seen(view: InspectionView, points: np.ndarray, inward: np.ndarray, cell: float) -> np.ndarray:
     """(SIDE, SIDE): the number of the point (n, 3) that each pixel shows, or -1; points are squares of `cell` [m]."""
     off, scale = points - view.middle, 0.5 * SIDE / view.reach
     half = int(np.ceil(0.5 * cell * scale))
@@ -206,7 +206,7 @@ def _seen(view: View, points: np.ndarray, inward: np.ndarray, cell: float) -> np
     return seen
 
 
-def _framed(colour: np.ndarray, view: View) -> np.ndarray:
+def _framed(colour: np.ndarray, view: InspectionView) -> np.ndarray:
     """The panel with its name, the patient's sides and a scale."""
     picture = Image.fromarray(colour)
     ink = ImageDraw.Draw(picture)

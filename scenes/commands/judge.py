@@ -17,7 +17,9 @@ from ..options.shared_options import add_json
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("model", metavar="MODEL.npz", help="models from `sulcus train`")
-    parser.add_argument("data", metavar="FRESH.h5", help="test loads from `sulcus simulate` on the same mesh, with another --seed")
+    parser.add_argument(
+        "data", metavar="FRESH.h5", help="test loads from `sulcus simulate` on the same mesh, with another --seed"
+    )
     add_json(parser)
 
 

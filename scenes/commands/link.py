@@ -23,8 +23,8 @@ from ..tracked.tracked_scene import mover, tracked_scene
 from .interrupt import until_ended
 
 if TYPE_CHECKING:
-    from ..link.heard import Names
-    from ..link.session import Session
+    from ..link.heard import TransformNames
+    from ..link.session import LinkSession
     from ..play.deformers import Theatre
     from ..tracked.tracked_tool import TrackedTool
 
@@ -38,13 +38,17 @@ FAREWELL = 0.25
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("anatomy", type=Path, metavar="PATIENT.vtu", help="from `sulcus patient` or `sulcus anatomy`")
-    parser.add_argument("--model", type=Path, help="model of a pose-controlled tool (default: PATIENT.model.npz next to the anatomy)")
+    parser.add_argument(
+        "--model", type=Path, help="model of a pose-controlled tool (default: PATIENT.model.npz next to the anatomy)"
+    )
     parser.add_argument(
         "--deformer", metavar="NAME",
         help="deformation model under the tool: a model of tool poses, guarded, fem or rest. rest: as in the "
         "scan. Default: the best model that knows the tool, else rest",
     )  # fmt: skip
-    parser.add_argument("--host", default="127.0.0.1", help="network address of the server (default: %(default)s, this machine only)")
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="network address of the server (default: %(default)s, this machine only)"
+    )
     parser.add_argument("--port", type=int, default=PORT, help="0: any free one (default %(default)s)")
     parser.add_argument(
         "--client",
@@ -55,10 +59,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--clients", type=int, default=16, help="maximum number of clients (default: %(default)s)")
     what = "transforms that are heard, in mm; AToB takes places in A's frame to B's; the scan's space is RAS"
     names = parser.add_argument_group(what)
-    names.add_argument("--tool-name", default="StylusTipToReference", help="name of the incoming tool transform (default: %(default)s)")
-    names.add_argument("--reference-name", default="ReferenceToTracker", help="name of the incoming reference transform, AToTracker (default: %(default)s)")
-    names.add_argument("--camera-name", default="CameraToReference", help="name of the incoming camera transform (default: %(default)s)")
-    names.add_argument("--registration-name", default="ReferenceToRas", help="name of the incoming scan registration, RAS (default: %(default)s)")
+    names.add_argument(
+        "--tool-name", default="StylusTipToReference", help="name of the incoming tool transform (default: %(default)s)"
+    )
+    names.add_argument(
+        "--reference-name",
+        default="ReferenceToTracker",
+        help="name of the incoming reference transform, AToTracker (default: %(default)s)",
+    )
+    names.add_argument(
+        "--camera-name",
+        default="CameraToReference",
+        help="name of the incoming camera transform (default: %(default)s)",
+    )
+    names.add_argument(
+        "--registration-name",
+        default="ReferenceToRas",
+        help="name of the incoming scan registration, RAS (default: %(default)s)",
+    )
     parser.add_argument(
         "--registration",
         metavar="R.json",
@@ -78,7 +96,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--stale", type=float, default=0.3, metavar="S", help="maximum pose age [s] (default: %(default)s)"
     )
     parser.add_argument("--camera", metavar="K.yaml", help="from `sulcus calibrate`: IMAGE is drawn into and sent back")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="exit after this many seconds (default: never)")
+    parser.add_argument(
+        "--seconds", type=float, default=float("inf"), help="exit after this many seconds (default: never)"
+    )
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_skull_argument(parser)
     add_element_argument(parser)
@@ -118,11 +138,11 @@ def run(args: argparse.Namespace) -> int:
     return until_ended(partial(_linked, args, source))
 
 
-def names_of(args: argparse.Namespace) -> Names:
+def names_of(args: argparse.Namespace) -> TransformNames:
     """Names of the transforms that are received."""
-    from ..link.heard import Names
+    from ..link.heard import TransformNames
 
-    return Names(args.tool_name, args.reference_name, args.camera_name, args.registration_name)
+    return TransformNames(args.tool_name, args.reference_name, args.camera_name, args.registration_name)
 
 
 def address_of(text: str) -> tuple[str, int]:
@@ -198,7 +218,7 @@ def _linked(args: argparse.Namespace, source: tuple[str, int] | None, closing: E
     return 0
 
 
-def opened(args: argparse.Namespace) -> Session:
+def opened(args: argparse.Namespace) -> LinkSession:
     """The link that the arguments ask for; in an event loop.
 
     Raises
@@ -210,11 +230,11 @@ def opened(args: argparse.Namespace) -> Session:
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
 
-    from ..link.answer import Answering
+    from ..link.answer import PoseResponder
     from ..link.console import limited, printed
-    from ..link.heard import Heard
+    from ..link.heard import ReceivedTransforms
     from ..link.outgoing import Outgoing
-    from ..link.session import Eye, Session
+    from ..link.session import LinkSession, OverlayCamera
     from ..play.deformers import open_theatre
     from ..tracked.calibration_file import read_calibration
     from ..tracked.picture import Painter
@@ -243,9 +263,9 @@ def opened(args: argparse.Namespace) -> Session:
     if calibration is not None:
         device = find_device(args.device, LIVE.precision).name
         load_kernels(device)
-        eye = Eye(calibration, Painter(stage, tool, device=device), tracking)
+        eye = OverlayCamera(calibration, Painter(stage, tool, device=device), tracking)
     print(f"{args.anatomy.name}; {tool.shape}; motion by {who}", flush=True)
-    answering = Answering(ToolMotion(stage, deformer), tool, tracking, registration)
+    answering = PoseResponder(ToolMotion(stage, deformer), tool, tracking, registration)
     seconds = 0.0 if deformer is None else answering.measure()
     if deformer is not None:
         print(f"one solution takes {seconds:.2g} s on this machine", flush=True)
@@ -255,8 +275,8 @@ def opened(args: argparse.Namespace) -> Session:
             f"{np.ceil(3.0 * seconds):.0f}, or a model of the tool's poses",
             file=sys.stderr,
         )
-    heard = Heard(names_of(args), args.stale)
-    return Session(answering, Outgoing(stage, registration is not None), heard, eye, args.clients, limited(printed))
+    heard = ReceivedTransforms(names_of(args), args.stale)
+    return LinkSession(answering, Outgoing(stage, registration is not None), heard, eye, args.clients, limited(printed))
 
 
 def _tool_of(theatre: Theatre, path: Path) -> TrackedTool:

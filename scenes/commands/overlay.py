@@ -65,24 +65,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "scan. Default: the best model that knows the tool, else rest",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FILM.mp4", help="video with overlay: .mp4, .gif or .webp")
-    parser.add_argument("--table", type=Path, metavar="ROWS.csv", help="CSV with one row per frame: state, position, error")
+    parser.add_argument(
+        "--table", type=Path, metavar="ROWS.csv", help="CSV with one row per frame: state, position, error"
+    )
     parser.add_argument(
         "--covered", type=Path, metavar="MASKS",
         help="video or folder of PNG masks, one per frame in order. Non-black pixels are in front, as "
         "a hand: nothing is drawn over it",
     )  # fmt: skip
     add_style(parser)
-    parser.add_argument("--rate", type=float, default=30.0, help="frame rate of a folder of images [1/s] (default: %(default)s)")
+    parser.add_argument(
+        "--rate", type=float, default=30.0, help="frame rate of a folder of images [1/s] (default: %(default)s)"
+    )
     parser.add_argument(
         "--live", action="store_true", help="process the video in real time: frames that arrive too fast are skipped"
     )
-    parser.add_argument("--truth", metavar="TRUTH.npz", help="ground truth from `sulcus film`: reports the overlay error")
+    parser.add_argument(
+        "--truth", metavar="TRUTH.npz", help="ground truth from `sulcus film`: reports the overlay error"
+    )
     parser.add_argument(
         "--page", action="store_true", help="show the video in the browser; a live camera always has a page"
     )
-    parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one (default: %(default)s)")
+    parser.add_argument(
+        "--port", type=int, default=8080, help="port of the page, or the next free one (default: %(default)s)"
+    )
     add_address(parser)
-    parser.add_argument("--seconds", type=float, default=np.inf, help="close the page after this many seconds (default: never)")
+    parser.add_argument(
+        "--seconds", type=float, default=np.inf, help="close the page after this many seconds (default: never)"
+    )
     add_poses(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_skull_argument(parser)

@@ -21,7 +21,7 @@ from .interrupt import INTERRUPTED
 
 if TYPE_CHECKING:
     from ..report.page import Section
-    from ..report.study import Study
+    from ..report.study import ReportStudy
 
 # Loads of the data that is made where none is given; loads held against the reference; loads beyond the training range.
 QUICK, WHOLE = (256, 8, 24), (3000, 64, 120)
@@ -80,7 +80,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     from ..report.page import Section, write_report
     from ..report.reference import solve_beyond, solve_reference
     from ..report.rows import every, learners, rows, star
-    from ..report.study import Study
+    from ..report.study import ReportStudy
 
     several = device_names(args.device)
     device = args.device if len(several) == 1 else several[0]
@@ -96,7 +96,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     if not paths:
         paths = [args.out / "palpation.h5"]
         _simulated(paths[0], args, count)
-    studies = [Study(path, args.out, device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
+    studies = [ReportStudy(path, args.out, device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
     sections = []
     for study in studies:
         specs = (*(every(study) if args.full else star(study, not args.quick)), *learners())
@@ -118,7 +118,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     return sections
 
 
-def _tabulate(study: Study, bar: tqdm) -> None:
+def _tabulate(study: ReportStudy, bar: tqdm) -> None:
     from ..report.study import tabulate_series
 
     tabulate_series(study, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"))
@@ -138,7 +138,7 @@ def _simulated(path: Path, args: argparse.Namespace, count: int) -> None:
             raise KeyboardInterrupt
 
 
-def _about(study: Study) -> tuple[str, ...]:
+def _about(study: ReportStudy) -> tuple[str, ...]:
     from ..report.reference import reference_of
     from ..report.study import KINDS
 

@@ -23,7 +23,7 @@ from ..options.theatre_options import add_bodies
 if TYPE_CHECKING:
     from surrogate.model.learned import Learned
 
-    from ..analysis.sensitivity import Change, Row, Study
+    from ..analysis.sensitivity import Change, SensitivityRow, SensitivityStudy
 
 HEAD = ("what", "default", "now", "F mean", "F 95", "F %", "F x", "M mean", "M 95", "M %", "M x")
 WIDTHS = (18, 11, 9, 6, 6, 6, 5, 6, 6, 6, 5)
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
     from ..analysis.measurement import machine, write_table
-    from ..analysis.sensitivity import Body, Study, rows, variants
+    from ..analysis.sensitivity import BodyVariant, SensitivityStudy, rows, variants
     from ..play.deformers import open_theatre
 
     if args.out:
@@ -89,8 +89,8 @@ def run(args: argparse.Namespace) -> int:
     pushed = (model for model in theatre.models.values() if model.tool is None)
     model = min(pushed, key=lambda model: model.bound, default=None)
     loads = draw(args.preset, anatomy, args.count, args.seed)
-    body = Body(element=args.element or ("smoothed" if anatomy.mesh.middles is None else "p2"))
-    study = Study(anatomy, loads, body, device=args.device)
+    body = BodyVariant(element=args.element or ("smoothed" if anatomy.mesh.middles is None else "p2"))
+    study = SensitivityStudy(anatomy, loads, body, device=args.device)
     changed = variants(anatomy, body, args.beside)
     where = machine(args.device)
     lines = sys.stderr if args.json else sys.stdout
@@ -155,7 +155,7 @@ def _factorial(args: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def _opening(study: Study, preset: str) -> str:
+def _opening(study: SensitivityStudy, preset: str) -> str:
     tissue, skull = study.body.tissue, study.body.skull if study.anatomy.slide_normal.any() else "none"
     return (
         f"{len(study.loads)} {preset} loads on {len(study.anatomy.mesh.nodes)} vertices. By default: element "
@@ -183,7 +183,7 @@ def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(f'{cell:<{width}}' for cell, width in zip(cells, WIDTHS, strict=True))} |"
 
 
-def _remarks(study: Study, beside: Sequence[str], model: Learned | None, failed: int) -> list[str]:
+def _remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned | None, failed: int) -> list[str]:
     """List remarks that a reader of the table needs, in sentences."""
     said = []
     if failed:
@@ -211,7 +211,7 @@ def _stated(model: Learned) -> dict[str, Any]:
     return {**about, "element": training.get("element", "p1"), "bound_mm": 1e3 * model.bound}
 
 
-def _flat(row: Row) -> dict[str, Any]:
+def _flat(row: SensitivityRow) -> dict[str, Any]:
     variant = row.variant
     sides = {"force": row.force, "motion": row.motion}
     figures = {f"{side} {name}": value for side, change in sides.items() for name, value in asdict(change).items()}

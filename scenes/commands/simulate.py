@@ -22,16 +22,16 @@ from sim.errors import InputError
 from sim.loads import Loads
 from sim.material import Tissue
 from sim.runtime.device import device_names
-from sim.runtime.memory import Budget
+from sim.runtime.memory import MemoryBudget
 from sim.runtime.partial_files import unfinished_path
 from sim.runtime.timing import stage
 from sim.runtime.versions import version_of
 from sim.tools import Ball, BuiltIn, Capsule, Spatula
 from surrogate.data.answer_rows import stating
-from surrogate.data.crew import Asked, solving
+from surrogate.data.crew import LazyFem, solving
 from surrogate.data.dataset import read_outcomes
 from surrogate.data.holding import HISTORY, drawn_times
-from surrogate.data.simulate import Solved, simulate
+from surrogate.data.simulate import SimulatedRows, simulate
 from surrogate.data.tool_loads import BEYOND_TISSUE, PRESETS, draw, refused_share, refused_words
 from surrogate.data.tool_poses import draw_poses, tool_of
 
@@ -87,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_element_argument(parser)
     add_skull_argument(parser, ("bonded", "slide"))
     parser.add_argument("--tolerance", type=float, default=1e-4, help="relative residual (default %(default)s)")
-    widest = f"up to {Budget.widest}, on CUDA {Budget.widest_on_cuda}"
+    widest = f"up to {MemoryBudget.widest}, on CUDA {MemoryBudget.widest_on_cuda}"
     parser.add_argument(
         "--batch",
         type=int,
@@ -119,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as closing:
         stop_if_asked = closing.enter_context(terminated_as_interrupted())
         with stage("set-up"):
-            wanted = Asked(anatomy, effects, accuracy, args.element, batch, len(loads))
+            wanted = LazyFem(anatomy, effects, accuracy, args.element, batch, len(loads))
             solver = closing.enter_context(solving(wanted, devices, partial(print, file=sys.stderr)))
         provenance = {
             "effects": repr(effects),
@@ -185,7 +185,7 @@ def _asked(args: argparse.Namespace) -> BuiltIn | None:
     return None if args.blade is None else Spatula(*(size / 1e3 for size in args.blade))
 
 
-def _report(args: argparse.Namespace, solver: str, asked: int, solved: Solved) -> None:
+def _report(args: argparse.Namespace, solver: str, asked: int, solved: SimulatedRows) -> None:
     with h5py.File(args.out, "r") as file:
         outcomes, units = read_outcomes(file, "answers"), len(read_outcomes(file, "unit"))
     counts = {outcome.name.lower(): outcomes.count(outcome) for outcome in Outcome if outcome in outcomes}

@@ -21,7 +21,10 @@ BODIES, FRAMES = ("tool", "patient", "board", "camera"), ("camera", "patient", "
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "pictures", type=Path, metavar="VIDEO|FOLDER", help="a video, or a folder of PNG or JPEG images in order of name"
+        "pictures",
+        type=Path,
+        metavar="VIDEO|FOLDER",
+        help="a video, or a folder of PNG or JPEG images in order of name",
     )
     parser.add_argument("--camera", required=True, metavar="K.yaml", help="the camera, from `sulcus calibrate`")
     parser.add_argument("--out", required=True, metavar="POSES.csv", help="CSV with one pose per frame")
@@ -34,7 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tip", type=float, nargs=3, metavar=("X", "Y", "Z"),
         help="the tool's tip in the frame of its cube [mm], from `sulcus calibrate --pivot` (default 0 0 -150)",
     )  # fmt: skip
-    parser.add_argument("--rate", type=float, default=30.0, help="frame rate of a folder of images [1/s] (default: %(default)s)")
+    parser.add_argument(
+        "--rate", type=float, default=30.0, help="frame rate of a folder of images [1/s] (default: %(default)s)"
+    )
     add_json(parser)
     add_force(parser)
 

@@ -23,7 +23,7 @@ from .fit import fitted_beside
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
-    from ..script.priors import Draw
+    from ..script.priors import PatientSample
     from ..script.scene import Scene
     from ..script.uncertainty import Uncertainty
 
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     read_uncertainties(out)
     fitted = fitted_beside(args.tissue, args.anatomy or template_path(), theatre.anatomy.digest)
 
-    def draws_of(scene: Scene, count: int, seed: int) -> list[Draw]:
+    def draws_of(scene: Scene, count: int, seed: int) -> list[PatientSample]:
         if fitted is None:
             return drawn(count, seed)
         young = tissue_of(scene).young

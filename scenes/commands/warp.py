@@ -20,7 +20,7 @@ from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissu
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
     from ..script.scene import Scene
-    from ..warp.moment import Moment
+    from ..warp.moment import DeformedAnatomy
 
 ORDERS = ("linear", "cubic")
 # Largest accepted push [N], and distance from the open cortex [mm]: more is a typing error.
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     from ..play.deformers import open_theatre
     from ..script.scene import demand_scene
     from ..script.shipped_files import template_path
-    from ..warp.export import Asked, write_warp
+    from ..warp.export import WarpSettings, write_warp
     from ..warp.images import read_picture
     from ..warp.places import steps_of
 
@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
         spacing = None if args.spacing is None else 1e-3 * args.spacing
         total = steps_of(spacing) + 2 + len(pictures) + bool(sequence)
         with tqdm(total=total, unit="part", desc="fields, files", file=sys.stderr) as bar:
-            asked = Asked(spacing, args.interpolation, source, bar.update)
+            asked = WarpSettings(spacing, args.interpolation, source, bar.update)
             report = write_warp(place, moment, pictures, asked, sequence)
     for warning in report["warnings"]:
         print(f"sulcus warp: {warning}", file=sys.stderr)
@@ -198,7 +198,7 @@ def pushing(theatre: Theatre, asked: tuple[float, float, float, float]) -> Scene
 
 def moments(
     args: argparse.Namespace, theatre: Theatre, scene: Scene | None
-) -> tuple[Moment, list[tuple[float, Moment]]]:
+) -> tuple[DeformedAnatomy, list[tuple[float, DeformedAnatomy]]]:
     """The moment that is asked for, and those of a sequence with their times [s]; None as scene: of a file.
 
     Raises

@@ -26,7 +26,7 @@ from surrogate.data.simulate import OF_ITS_MAKING, simulate
 from surrogate.data.tool_loads import draw as draw_loads
 from surrogate.model.applicability import refusal
 from surrogate.model.learned import Learned
-from surrogate.model.left_out import OffBy
+from surrogate.model.left_out import HeldOutError
 from surrogate.model.store import load, save, stated_errors
 from surrogate.training.expansion import Expansion
 from surrogate.training.train import train
@@ -35,7 +35,7 @@ from ..play.deformers import Theatre, model_path, open_theatre
 from ..script.shipped_files import template_path
 from .draws import drawn, random_of
 from .half_made import DATA, TABLE, forget, gone_on
-from .plan import NO_LEARNER, Bodies, Plan, digest_beside, fields_of, ratio_of
+from .plan import NO_LEARNER, Bodies, EpisodePlan, digest_beside, fields_of, ratio_of
 from .run_folder import BODIES, versions_here
 
 # Maximum number of sampled tumours: one may leave the brain, or its craniotomy have too few nodes.
@@ -47,7 +47,7 @@ ANATOMY, ABOUT = "anatomy.vtu", "body.json"
 
 
 @dataclass(frozen=True)
-class Body:
+class EpisodeBody:
     """A body: where its files are, and what was drawn for it by name."""
 
     folder: Path
@@ -113,7 +113,9 @@ def drawn_body(bodies: Bodies, seed: int, number: int, attempt: int = 0) -> dict
     return found
 
 
-def write_body(folder: Path, plan: Plan, seed: int, number: int, device: str, others: Sequence[Path] = ()) -> bool:
+def write_body(
+    folder: Path, plan: EpisodePlan, seed: int, number: int, device: str, others: Sequence[Path] = ()
+) -> bool:
     """Make a body in a folder of its own: anatomy, scan, trained model, and `body.json`, last.
 
     Loads that were solved there before, or in `others`, are not solved again; returns whether there were any. The files
@@ -131,7 +133,7 @@ def write_body(folder: Path, plan: Plan, seed: int, number: int, device: str, ot
     """
     bodies = plan.contents.bodies
     anatomy, scan, values = _anatomy(plan, seed, number)
-    body = Body(folder, values)
+    body = EpisodeBody(folder, values)
     write_anatomy(body.anatomy, anatomy)
     if scan is not None:
         write_intensity(sidecar(body.anatomy), scan)
@@ -142,7 +144,7 @@ def write_body(folder: Path, plan: Plan, seed: int, number: int, device: str, ot
     return before
 
 
-def read_body(folder: Path) -> Body:
+def read_body(folder: Path) -> EpisodeBody:
     """A body that `write_body` made.
 
     Raises
@@ -152,12 +154,12 @@ def read_body(folder: Path) -> Body:
     """
     path = folder / ABOUT
     try:
-        return Body(folder, json.loads(path.read_text(encoding="utf-8")))
+        return EpisodeBody(folder, json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: is no body of a data set ({error}). Make the episodes anew.") from error
 
 
-def _anatomy(plan: Plan, seed: int, number: int) -> tuple[Anatomy, Intensity | None, dict[str, Any]]:
+def _anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy, Intensity | None, dict[str, Any]]:
     """An anatomy, its scan, and what was drawn."""
     bodies = plan.contents.bodies
     values = drawn_body(bodies, seed, number)
@@ -186,7 +188,7 @@ def _anatomy(plan: Plan, seed: int, number: int) -> tuple[Anatomy, Intensity | N
     raise InputError(f"none of {TRIES} anatomies that were drawn can be meshed; the last: {refused[-1]}")
 
 
-def _shipped(body: Body, anatomy: Anatomy) -> bool:
+def _shipped(body: EpisodeBody, anatomy: Anatomy) -> bool:
     """Return True if the shipped model applies to this body."""
     if body.drawn["bodies.anatomies"] != "template":
         return False
@@ -196,7 +198,7 @@ def _shipped(body: Body, anatomy: Anatomy) -> bool:
 
 
 def _train(
-    body: Body, anatomy: Anatomy, plan: Plan, seed: int, number: int, device: str, others: Sequence[Path]
+    body: EpisodeBody, anatomy: Anatomy, plan: EpisodePlan, seed: int, number: int, device: str, others: Sequence[Path]
 ) -> bool:
     """Simulate loads on a body, and train its model on them; the data are not kept. Whether some were there before."""
     learner = plan.contents.bodies.learner
@@ -229,7 +231,7 @@ MOST_SAID = 10
 """Bodies that are named one by one."""
 
 
-def models_of(folder: Path) -> dict[int, OffBy]:
+def models_of(folder: Path) -> dict[int, HeldOutError]:
     """Read the reported errors of the models of a folder's bodies, by number; bodies without a model are excluded."""
     found = {}
     for path in sorted((folder / BODIES).glob("[0-9]*")):
@@ -238,12 +240,12 @@ def models_of(folder: Path) -> dict[int, OffBy]:
     return found
 
 
-def weak_of(models: Mapping[int, OffBy]) -> dict[int, OffBy]:
+def weak_of(models: Mapping[int, HeldOutError]) -> dict[int, HeldOutError]:
     """Those that are weak, the worst first."""
     return dict(sorted(((number, one) for number, one in models.items() if one.weak), key=lambda each: -each[1].bound))
 
 
-def said_of_weak(models: Mapping[int, OffBy]) -> list[str]:
+def said_of_weak(models: Mapping[int, HeldOutError]) -> list[str]:
     """Describe the weak models and their errors, in sentences; empty if there is none."""
     weak = weak_of(models)
     if not weak:
@@ -256,7 +258,7 @@ def said_of_weak(models: Mapping[int, OffBy]) -> list[str]:
     ]
 
 
-def weak_as_json(models: Mapping[int, OffBy]) -> list[dict[str, float | int | None]]:
+def weak_as_json(models: Mapping[int, HeldOutError]) -> list[dict[str, float | int | None]]:
     """The weak ones as numbers."""
     return [
         {

@@ -11,7 +11,7 @@ import numpy as np
 from sim.errors import InputError
 
 
-class Spread(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Distribution(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Distribution of a number or a word; exactly one of `uniform`, `log`, `normal` and `choice` is given.
 
     Parameters
@@ -31,14 +31,14 @@ class Spread(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: list[float] | None = None
 
 
-Number = float | tuple[float, float] | Spread
-"""In a plan: a number; its least and greatest, with evenly spread values between; or a `Spread`."""
-Word = str | list[str] | Spread
-"""In a plan: a word; words of which each is as probable; or a `Spread`."""
+Number = float | tuple[float, float] | Distribution
+"""In a plan: a number; its least and greatest, with evenly spread values between; or a `Distribution`."""
+Word = str | list[str] | Distribution
+"""In a plan: a word; words of which each is as probable; or a `Distribution`."""
 
 
 @dataclass(frozen=True)
-class Limits:
+class ValueLimits:
     """Least and greatest value that a number of a plan may take, and their unit."""
 
     low: float
@@ -55,13 +55,13 @@ def random_of(seed: int, number: int, name: str) -> np.random.Generator:
     return np.random.default_rng([seed, number, crc32(name.encode())])
 
 
-def spread_of(value: object) -> Spread:
-    """A plan's value as a `Spread`."""
-    if isinstance(value, Spread):
+def spread_of(value: object) -> Distribution:
+    """A plan's value as a `Distribution`."""
+    if isinstance(value, Distribution):
         return value
     if isinstance(value, tuple):
-        return Spread(uniform=value)
-    return Spread(choice=list(value) if isinstance(value, list) else [value])  # type: ignore[list-item]
+        return Distribution(uniform=value)
+    return Distribution(choice=list(value) if isinstance(value, list) else [value])  # type: ignore[list-item]
 
 
 def drawn(value: object, random: np.random.Generator) -> float | str | bool:
@@ -79,7 +79,7 @@ def drawn(value: object, random: np.random.Generator) -> float | str | bool:
     return spread.choice[int(random.choice(len(spread.choice), p=weights))]
 
 
-def check_spread(value: object, name: str, limits: Limits | None, words: tuple[str, ...] = ()) -> None:
+def check_spread(value: object, name: str, limits: ValueLimits | None, words: tuple[str, ...] = ()) -> None:
     """See that all that may be drawn is possible.
 
     Parameters
@@ -118,7 +118,7 @@ def check_spread(value: object, name: str, limits: Limits | None, words: tuple[s
         _check_value(each, name, limits, words)
 
 
-def _check_choice(spread: Spread, name: str) -> None:
+def _check_choice(spread: Distribution, name: str) -> None:
     count, weights = len(spread.choice or ()), spread.weights
     if not count:
         raise InputError(f"{name}: there is nothing to choose from: give one value or more.")
@@ -130,7 +130,7 @@ def _check_choice(spread: Spread, name: str) -> None:
         raise InputError(f"{name}: weights {weights} are none: give numbers that are not below 0, and one above.")
 
 
-def _check_value(value: float | str | bool, name: str, limits: Limits | None, words: tuple[str, ...]) -> None:
+def _check_value(value: float | str | bool, name: str, limits: ValueLimits | None, words: tuple[str, ...]) -> None:
     if limits is None:
         if words and value not in words:
             raise InputError(f"{name}: {value!r} is not known: choose from {', '.join(map(str, words))}.")

@@ -19,8 +19,8 @@ from distributed.scheduler import KilledWorker
 
 from sim.errors import InputError
 
-from .run_folder import Failure, Run, episode_name, failed, failures, mark_failed, unmark
-from .tasks import Made, Outcome, Work, attempted
+from .run_folder import Failure, RunSettings, episode_name, failed, failures, mark_failed, unmark
+from .tasks import Made, RunWork, TaskOutcome, attempted
 from .workers import MOST_DEATHS, Workers, scheduler_ended
 
 RETRIES = 3
@@ -35,16 +35,16 @@ GRACE = 60
 """Warning time before the end of a job [s]."""
 
 
-class Heard(Protocol):
+class ProgressListener(Protocol):
     """Callback for each finished task, with the number of workers; `outcome` is None if no task finished."""
 
-    def __call__(self, kind: str, outcome: Outcome | None, workers: int) -> object:
+    def __call__(self, kind: str, outcome: TaskOutcome | None, workers: int) -> object:
         """Take note."""
         ...
 
 
 @dataclass(frozen=True)
-class Tally:
+class RunStatistics:
     """Statistics of a run: episodes made now, present before, failed permanently, lost for now; frames and bytes made."""
 
     made: int = 0
@@ -54,7 +54,7 @@ class Tally:
     frames: int = 0
     bytes: int = 0
 
-    def plus(self, outcome: Outcome) -> Tally:
+    def plus(self, outcome: TaskOutcome) -> RunStatistics:
         """With one more episode."""
         if outcome.failed:
             return replace(self, lost=self.lost + 1) if outcome.lost else replace(self, failed=self.failed + 1)
@@ -66,7 +66,7 @@ class Tally:
 
 def still_missing(
     folder: Path, found: Set[int], numbers: range, first_client: bool, again: bool = False
-) -> tuple[Tally, list[int]]:
+) -> tuple[RunStatistics, list[int]]:
     """Count episodes that exist or have failed permanently, and list the missing ones in their order of execution.
 
     The first client takes them in ascending order. Later clients use a random order, so that two in one folder seldom make the
@@ -85,12 +85,18 @@ def still_missing(
     missing = [number for number in numbers if number not in there and number not in gone]
     if not first_client:
         random.shuffle(missing)
-    return Tally(skipped=len(there), failed=len(gone)), missing
+    return RunStatistics(skipped=len(there), failed=len(gone)), missing
 
 
 def make_all(
-    work: Work, folder: Path, run: Run, numbers: Sequence[int], workers: Workers, heard: Heard, before: Tally
-) -> Tally:
+    work: RunWork,
+    folder: Path,
+    run: RunSettings,
+    numbers: Sequence[int],
+    workers: Workers,
+    heard: ProgressListener,
+    before: RunStatistics,
+) -> RunStatistics:
     """Make episodes that are missing, each after its body; failures are noted in the folder. What was done in all.
 
     Parameters
@@ -118,7 +124,7 @@ def make_all(
         future.add_done_callback(ended.put)
         return future
 
-    def note(kind: str, outcome: Outcome) -> None:
+    def note(kind: str, outcome: TaskOutcome) -> None:
         nonlocal tally
         if outcome.halt:
             raise InputError(outcome.halt)
@@ -134,7 +140,7 @@ def make_all(
     def missing() -> Iterator[int]:
         for number in numbers:
             if (folder / episode_name(number)).exists():  # another client made it meanwhile
-                note(EPISODE, Outcome(number, skipped=True))
+                note(EPISODE, TaskOutcome(number, skipped=True))
             else:
                 yield number
 
@@ -173,11 +179,11 @@ def _drained(ended: SimpleQueue[Future]) -> list[Future]:
 
 def _outcomes(
     futures: Sequence[Future], workers: Workers, ended: SimpleQueue[Future]
-) -> Iterator[tuple[Future, Outcome]]:
+) -> Iterator[tuple[Future, TaskOutcome]]:
     """Collect the results of finished tasks; those whose worker died with its result will finish again."""
     for future in futures:
         if future.status == "error":
-            yield future, Outcome(0, failed=_reason(future.exception()), lost=True)
+            yield future, TaskOutcome(0, failed=_reason(future.exception()), lost=True)
             continue
         try:  # briefly, as the worker may have to be restarted
             outcome = future.result(timeout=POLL)

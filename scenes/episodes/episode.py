@@ -25,7 +25,7 @@ from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Posture, Pushed, Resected, Retracted, Touching
-from sim.resected_fem import Operated
+from sim.resected_fem import OperatedFem
 from sim.runtime.atomic_files import demand_space, written_stream
 from sim.runtime.versions import version_of
 from surrogate.data.answer_rows import stating
@@ -106,7 +106,7 @@ UNITS = {
 
 
 @dataclass(frozen=True)
-class Recording:
+class EpisodeRecording:
     """Settings of what is written of a scene.
 
     Parameters
@@ -133,10 +133,10 @@ class Recording:
     grain: Callable[[int, np.ndarray], np.ndarray] = lambda number, colour: colour
     sensed: Callable[[Mapping[str, Any]], Mapping[str, np.ndarray]] = lambda columns: {}
     stated: Mapping[str, str | int] = field(default_factory=dict)
-    fem: Fem | Operated | None = None
+    fem: Fem | OperatedFem | None = None
 
 
-WHOLE = Recording()
+WHOLE = EpisodeRecording()
 """All of it, solved in every frame."""
 
 
@@ -147,7 +147,7 @@ def collect(
     deformer: str,
     progress: Callable[[Iterable], Iterable],
     solved: Callable[[int], object] = lambda more: None,
-    recording: Recording = WHOLE,
+    recording: EpisodeRecording = WHOLE,
 ) -> dict[str, object]:
     """Play a scene and write its episode, whole or not at all; return its contents.
 
@@ -184,7 +184,7 @@ def collect(
     return {"out": str(path), "scene": player.scene.name, "deformer": deformer, "frames": total, "fem": outcomes}
 
 
-def encoded(frame: Frame, player: Player, recording: Recording, right: Stage | None) -> dict[str, np.ndarray]:
+def encoded(frame: Frame, player: Player, recording: EpisodeRecording, right: Stage | None) -> dict[str, np.ndarray]:
     """Encode the frame's images, by name; `right` renders the right eye, if there is one."""
     picture = frame.picture
     tumour = player.stage.at(frame.loads).tumour(player.believed(frame))
@@ -283,7 +283,12 @@ def caused(loads: Loads) -> dict[str, np.ndarray]:
 
 
 def write_motion(
-    file: h5py.File, player: Player, rows: list[dict], numbers: np.ndarray, truth: Deformation | None, how: Recording
+    file: h5py.File,
+    player: Player,
+    rows: list[dict],
+    numbers: np.ndarray,
+    truth: Deformation | None,
+    how: EpisodeRecording,
 ) -> dict[str, int]:
     """Write all values except images, one row per frame, and the FEM solutions; return their outcomes.
 
@@ -316,7 +321,7 @@ def write_motion(
     return {name.lower(): outcomes.count(name) for name in sorted(set(outcomes))}
 
 
-def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, recording: Recording) -> None:
+def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, recording: EpisodeRecording) -> None:
     """Units, frames and provenance as attributes."""
     scene, camera, model = player.scene, player.camera, model_of(player.deformer)
     file.create_dataset("K", data=camera.K)

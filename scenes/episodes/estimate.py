@@ -29,7 +29,7 @@ class Amount:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class RunEstimate:
     """Estimated cost of a run.
 
     Parameters
@@ -66,7 +66,7 @@ class Estimate:
         return _added([Amount(part.mean * by, part.error * by) for part, by in parts if np.isfinite(part.mean)])
 
 
-def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
+def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEstimate:
     """Estimate the cost of a number of episodes on a number of bodies from measured ones.
 
     Raises
@@ -88,7 +88,7 @@ def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> Estimate:
             [_sum([getattr(one, what) for one in those[kind]], counts[kind]) for kind in those if those[kind]]
         )
 
-    return Estimate(
+    return RunEstimate(
         episodes=episodes, bodies=bodies, measured=len(own[EPISODE]), measured_bodies=len(own[BODY]),
         seconds=amount("seconds", {**own, EPISODE: by[LATER] if apart else own[EPISODE]}),
         frames=amount("frames", {EPISODE: own[EPISODE]}),
@@ -125,7 +125,7 @@ def _added(amounts: Sequence[Amount]) -> Amount:
     return Amount(sum(one.mean for one in amounts), float(np.hypot.reduce([one.error for one in amounts])))
 
 
-def lines(estimate: Estimate) -> list[str]:
+def lines(estimate: RunEstimate) -> list[str]:
     """A table of it."""
     found = estimate
     rows = [

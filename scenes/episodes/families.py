@@ -17,7 +17,7 @@ from ..script.debulking import Debulking
 from ..script.head_posture import Lie, drained_then_turned, supine
 from ..script.tool import Blade, Instrument, Probe
 from ..script.tool_paths import Path, Touch, draw, idle, lay, palpate, press, slide, smooth
-from .draws import Limits, Number
+from .draws import Number, ValueLimits
 
 PRONY = RELAXING.prony
 """Relaxation of tissue under a spatula."""
@@ -25,87 +25,87 @@ PRONY = RELAXING.prony
 REST = 0.3
 
 
-class Motion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class FamilyMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Weight of a family, relative to the others."""
 
-    weight: Annotated[float, Limits(0, 100_000)] = 1.0
+    weight: Annotated[float, ValueLimits(0, 100_000)] = 1.0
 
 
-class Pushing(Motion, frozen=True):
+class Pushing(FamilyMotion, frozen=True):
     """A ball is pushed with a force; `spread` is how far from the middle, as a share of the way to the bone."""
 
-    force_n: Annotated[Number, Limits(0.01, 2, "N")] = (0.05, 0.35)
-    radius_mm: Annotated[Number, Limits(1, 15, "mm")] = (5.0, 7.5)
-    spread: Annotated[Number, Limits(0, 1)] = (0.0, 1.0)
+    force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.35)
+    radius_mm: Annotated[Number, ValueLimits(1, 15, "mm")] = (5.0, 7.5)
+    spread: Annotated[Number, ValueLimits(0, 1)] = (0.0, 1.0)
 
 
 class Press(Pushing, frozen=True):
     """Press on one place, aslant, hold, and let go."""
 
-    tilt_deg: Annotated[Number, Limits(0, 45, "°")] = (0.0, 25.0)
+    tilt_deg: Annotated[Number, ValueLimits(0, 45, "°")] = (0.0, 25.0)
 
 
-class Slide(Pushing, frozen=True):
+class SlideMotion(Pushing, frozen=True):
     """Press, slide along a straight line, and let go."""
 
-    force_n: Annotated[Number, Limits(0.01, 2, "N")] = (0.05, 0.3)
+    force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.3)
 
 
-class Draw(Pushing, frozen=True):
+class DrawMotion(Pushing, frozen=True):
     """Lay on, and draw the tissue aside."""
 
-    force_n: Annotated[Number, Limits(0.01, 2, "N")] = (0.05, 0.25)
-    tilt_deg: Annotated[Number, Limits(0, 45, "°")] = (20.0, 40.0)
+    force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.25)
+    tilt_deg: Annotated[Number, ValueLimits(0, 45, "°")] = (20.0, 40.0)
 
 
 class Reach(Pushing, frozen=True):
     """Touch several places one after the other, with minimum jerk between them."""
 
-    places: Annotated[Number, Limits(2, 12)] = (2.0, 5.0)
+    places: Annotated[Number, ValueLimits(2, 12)] = (2.0, 5.0)
 
 
 class Walk(Pushing, frozen=True):
     """Wander at random in place and force, always in contact."""
 
-    force_n: Annotated[Number, Limits(0.01, 2, "N")] = (0.05, 0.25)
+    force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.25)
 
 
-class Palpate(Motion, frozen=True):
+class Palpate(FamilyMotion, frozen=True):
     """A ball is moved by its pose, and slides through the tissue; finite elements play."""
 
-    depth_mm: Annotated[Number, Limits(0.5, 10, "mm")] = (1.0, 4.0)
-    radius_mm: Annotated[Number, Limits(3, 15, "mm")] = 7.0
-    spread: Annotated[Number, Limits(0, 1)] = (0.0, 0.8)
+    depth_mm: Annotated[Number, ValueLimits(0.5, 10, "mm")] = (1.0, 4.0)
+    radius_mm: Annotated[Number, ValueLimits(3, 15, "mm")] = 7.0
+    spread: Annotated[Number, ValueLimits(0, 1)] = (0.0, 0.8)
 
 
-class Retract(Motion, frozen=True):
+class Retract(FamilyMotion, frozen=True):
     """A spatula draws the cortex aside while the tissue relaxes; finite elements play."""
 
-    depth_mm: Annotated[Number, Limits(0.5, 12, "mm")] = (3.0, 8.0)
-    tilt_deg: Annotated[Number, Limits(0, 40, "°")] = (10.0, 30.0)
-    spread: Annotated[Number, Limits(0, 1)] = (0.0, 0.3)
+    depth_mm: Annotated[Number, ValueLimits(0.5, 12, "mm")] = (3.0, 8.0)
+    tilt_deg: Annotated[Number, ValueLimits(0, 40, "°")] = (10.0, 30.0)
+    spread: Annotated[Number, ValueLimits(0, 1)] = (0.0, 0.3)
 
 
-class Drain(Motion, frozen=True):
+class Drain(FamilyMotion, frozen=True):
     """Fluid drains to a share of its height, and the head is turned; the skull lets go; finite elements play."""
 
-    fluid: Annotated[Number, Limits(0, 1)] = (0.0, 0.7)
-    turn_deg: Annotated[Number, Limits(-60, 60, "°")] = (-30.0, 30.0)
+    fluid: Annotated[Number, ValueLimits(0, 1)] = (0.0, 0.7)
+    turn_deg: Annotated[Number, ValueLimits(-60, 60, "°")] = (-30.0, 30.0)
 
 
-class Debulk(Motion, frozen=True):
+class Debulk(FamilyMotion, frozen=True):
     """Fluid has partly drained, and the tumour is cut out in shares; finite elements play."""
 
-    fluid: Annotated[Number, Limits(0, 1)] = (0.2, 0.7)
-    steps: Annotated[Number, Limits(2, 8)] = (3.0, 5.0)
+    fluid: Annotated[Number, ValueLimits(0, 1)] = (0.2, 0.7)
+    steps: Annotated[Number, ValueLimits(2, 8)] = (3.0, 5.0)
 
 
-class Motions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class FamilyMotions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The families of a plan; those that are not named are not played."""
 
     press: Press | None = None
-    slide: Slide | None = None
-    draw: Draw | None = None
+    slide: SlideMotion | None = None
+    draw: DrawMotion | None = None
     reach: Reach | None = None
     walk: Walk | None = None
     palpate: Palpate | None = None
@@ -114,14 +114,14 @@ class Motions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     debulk: Debulk | None = None
 
     @property
-    def named(self) -> dict[str, Motion]:
+    def named(self) -> dict[str, FamilyMotion]:
         """Those that the plan has, by name."""
         found = {name: getattr(self, name) for name in self.__struct_fields__}
         return {name: motion for name, motion in found.items() if motion is not None}
 
 
 @dataclass(frozen=True)
-class Act:
+class Scenario:
     """Scenario of an episode.
 
     Parameters
@@ -146,7 +146,7 @@ class Act:
 
 
 @dataclass(frozen=True)
-class Chance:
+class ScenarioInputs:
     """Inputs of a scenario: sampled values, random numbers, duration [s], reach [m].
 
     `reach` is the largest distance of a tool of a radius [m] from the centre of the open cortex.
@@ -169,7 +169,7 @@ class Chance:
         return Probe(radius=1e-3 * self.values["radius_mm"])
 
 
-def pressed(chance: Chance) -> Act:
+def pressed(chance: ScenarioInputs) -> Scenario:
     """The act of `Press`."""
     probe = chance.probe
     at = chance.place(probe.radius)
@@ -180,19 +180,19 @@ def pressed(chance: Chance) -> Act:
     def path(time: float) -> Touch:
         return replace(way(time), tilt=aslant)
 
-    return Act(path, probe)
+    return Scenario(path, probe)
 
 
-def slid(chance: Chance) -> Act:
-    """The act of `Slide`."""
+def slid(chance: ScenarioInputs) -> Scenario:
+    """The act of `SlideMotion`."""
     probe = chance.probe
     start, end = chance.place(probe.radius), chance.place(probe.radius)
     rise = 0.12 * chance.seconds
-    return Act(slide(chance.values["force_n"], start, end, chance.seconds - 2.0 * rise, rise), probe)
+    return Scenario(slide(chance.values["force_n"], start, end, chance.seconds - 2.0 * rise, rise), probe)
 
 
-def drawn_aside(chance: Chance) -> Act:
-    """The act of `Draw`."""
+def drawn_aside(chance: ScenarioInputs) -> Scenario:
+    """The act of `DrawMotion`."""
     probe, rise = chance.probe, 0.25 * chance.seconds
     tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(probe.radius)
     way = draw(chance.values["force_n"], tilt, rise, 0.2 * chance.seconds, at)
@@ -202,10 +202,10 @@ def drawn_aside(chance: Chance) -> Act:
         touch = way(time)
         return replace(touch, tilt=(touch.tilt[0] * float(np.cos(angle)), touch.tilt[0] * float(np.sin(angle))))
 
-    return Act(path, probe)
+    return Scenario(path, probe)
 
 
-def reach(chance: Chance) -> Act:
+def reach(chance: ScenarioInputs) -> Scenario:
     """The act of `Reach`."""
     probe, count = chance.probe, round(chance.values["places"])
     places = np.array([chance.place(probe.radius) for _ in range(count)])
@@ -221,10 +221,10 @@ def reach(chance: Chance) -> Act:
         half = 0.5 * (1.0 - REST)
         return Touch(float(x), float(y), float(forces[number] * (smooth(share / half) - smooth(share / half - 1.0))))
 
-    return Act(path, probe)
+    return Scenario(path, probe)
 
 
-def walk(chance: Chance) -> Act:
+def walk(chance: ScenarioInputs) -> Scenario:
     """The act of `Walk`."""
     probe, seed = chance.probe, int(chance.random.integers(2**31))
     far, force = 0.5 * chance.values["spread"] * chance.reach(probe.radius), chance.values["force_n"]
@@ -234,45 +234,45 @@ def walk(chance: Chance) -> Act:
         begun = smooth(time / (0.15 * chance.seconds))
         return Touch(float(far * way[0]), float(far * way[1]), force * begun * float(np.clip(0.6 + 0.2 * way[2], 0, 1)))
 
-    return Act(path, probe)
+    return Scenario(path, probe)
 
 
-def palpated(chance: Chance) -> Act:
+def palpated(chance: ScenarioInputs) -> Scenario:
     """The act of `Palpate`."""
     probe, rise = chance.probe, 0.2 * chance.seconds
     start, end = chance.place(probe.radius), chance.place(probe.radius)
     way = palpate(1e-3 * chance.values["depth_mm"], start, end, chance.seconds - 2.0 * rise, rise)
-    return Act(way, probe, (ToolContact((probe.shape,)),))
+    return Scenario(way, probe, (ToolContact((probe.shape,)),))
 
 
-def retracted(chance: Chance) -> Act:
+def retracted(chance: ScenarioInputs) -> Scenario:
     """The act of `Retract`."""
     blade = Blade()
     tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(blade.radius)
     way = lay(1e-3 * chance.values["depth_mm"], tilt, 0.4 * chance.seconds, at)
-    return Act(way, blade, (Retraction(blade.shape),), relaxes=True)
+    return Scenario(way, blade, (Retraction(blade.shape),), relaxes=True)
 
 
-def drained(chance: Chance) -> Act:
+def drained(chance: ScenarioInputs) -> Scenario:
     """The act of `Drain`."""
     turn, fluid = float(np.radians(chance.values["turn_deg"])), chance.values["fluid"]
     lie = drained_then_turned(0.5 * chance.seconds, 0.1 * chance.seconds, 0.3 * chance.seconds, turn, fluid)
-    return Act(effects=(Gravity(),), lying=lie, lets_go=True)
+    return Scenario(effects=(Gravity(),), lying=lie, lets_go=True)
 
 
-def debulked(chance: Chance) -> Act:
+def debulked(chance: ScenarioInputs) -> Scenario:
     """The act of `Debulk`."""
     count, fluid = round(chance.values["steps"]), chance.values["fluid"]
     lie = drained_then_turned(0.3 * chance.seconds, 0.0, 1.0, 0.0, fluid)
     times = tuple((chance.seconds * np.linspace(0.4, 0.9, count)).tolist())
-    return Act(effects=(Gravity(),), lying=lie, surgery=Debulking(times), lets_go=True)
+    return Scenario(effects=(Gravity(),), lying=lie, surgery=Debulking(times), lets_go=True)
 
 
-FAMILIES: dict[str, Callable[[Chance], Act]] = {
+FAMILIES: dict[str, Callable[[ScenarioInputs], Scenario]] = {
     "press": pressed, "slide": slid, "draw": drawn_aside, "reach": reach, "walk": walk, "palpate": palpated,
     "retract": retracted, "drain": drained, "debulk": debulked,
 }  # fmt: skip
-"""Scenario of each family of `Motions`."""
+"""Scenario of each family of `FamilyMotions`."""
 
 
 def trembling(path: Path, seed: int, place: float, force: float) -> Path:

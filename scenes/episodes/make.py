@@ -16,18 +16,18 @@ from scipy.special import ndtri
 
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.resected_fem import Operated
+from sim.resected_fem import OperatedFem
 from sim.runtime.atomic_files import written_folder
 from sim.runtime.partial_files import partial_path, partials_of
 
 from ..play.deformers import Theatre
 from ..play.reference import following
 from ..script.scene import Scene
-from .bodies import ABOUT, Body, read_body, write_body
+from .bodies import ABOUT, EpisodeBody, read_body, write_body
 from .draws import random_of
-from .episode import Recording, collect
+from .episode import EpisodeRecording, collect
 from .half_made import begun, emptied
-from .plan import NO_LEARNER, Plan
+from .plan import NO_LEARNER, EpisodePlan
 from .run_folder import BODIES, episode_name
 from .scripted import drawn_body_of, drawn_episode, scene_of
 from .tasks import Made
@@ -88,12 +88,12 @@ def body_path(folder: Path, number: int) -> Path:
     return folder / BODIES / f"{number:04d}"
 
 
-def body_of(plan: Plan, seed: int, number: int) -> int:
+def body_of(plan: EpisodePlan, seed: int, number: int) -> int:
     """Return the number of the body of an episode."""
     return drawn_body_of(plan.contents, seed, number)
 
 
-def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "auto") -> Made:
+def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: str = "auto") -> Made:
     """Make a body, unless it exists; a failure is reported in `Made.failed`.
 
     It is made under another name, so that a folder of its name is whole. A second
@@ -120,7 +120,7 @@ def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "a
     return Made(path, bytes=size, resumed=resumed)
 
 
-def make_episode(folder: Path, plan: Plan, seed: int, number: int, device: str = "auto") -> Made:
+def make_episode(folder: Path, plan: EpisodePlan, seed: int, number: int, device: str = "auto") -> Made:
     """Make an episode, unless it exists; its body must exist. A failure is reported in `Made.failed`.
 
     Loads without equilibrium fail no episode: their frames say so in `outcome_predicted` and `outcome_fem`.
@@ -141,11 +141,11 @@ def make_episode(folder: Path, plan: Plan, seed: int, number: int, device: str =
 class Opened:
     """A body whose files were read, and the finite elements that were made for it, by the effects that they solve."""
 
-    body: Body
+    body: EpisodeBody
     theatre: Theatre
-    made: dict[str, Fem | Operated] = field(default_factory=dict)
+    made: dict[str, Fem | OperatedFem] = field(default_factory=dict)
 
-    def fem(self, scene: Scene) -> Fem | Operated:
+    def fem(self, scene: Scene) -> Fem | OperatedFem:
         """Those of a scene; the last few are kept, for to make them takes as long as some frames."""
         asked = repr(scene.effects_on(self.theatre.anatomy))
         if asked not in self.made:
@@ -162,7 +162,7 @@ def opened_body(place: Path, device: str) -> Opened:
     return Opened(body, body.theatre(device))
 
 
-def _collected(path: Path, plan: Plan, seed: int, number: int, place: Path, device: str) -> Mapping[str, Any]:
+def _collected(path: Path, plan: EpisodePlan, seed: int, number: int, place: Path, device: str) -> Mapping[str, Any]:
     """Play an episode and write its file."""
     contents = plan.contents
     opened, asked = opened_body(place, device), drawn_episode(contents, seed, number)
@@ -175,7 +175,7 @@ def _collected(path: Path, plan: Plan, seed: int, number: int, place: Path, devi
     def grain(picture: int, colour: np.ndarray) -> np.ndarray:
         return noisy(colour, noise["grey_levels"], random_of(seed, number, f"noise.picture/{picture}"))
 
-    recording = Recording(
+    recording = EpisodeRecording(
         None if name == "fem" else contents.solved_every, contents.overlay, False, grain,
         lambda columns: sensed(columns, noise, seed, number),
         {

@@ -22,8 +22,8 @@ from sim.runtime.outside_files import read_as
 from surrogate.training.train import LEARNERS, check_learners
 
 from ..script.camera_paths import PATHS
-from .draws import Limits, Number, Spread, Word, check_spread
-from .families import Motions
+from .draws import Distribution, Number, ValueLimits, Word, check_spread
+from .families import FamilyMotions
 
 KINDS = {
     "object": "a table", "array": "a list", "str": "text in quotation marks", "float": "a number",
@@ -69,35 +69,35 @@ def _named(words: str) -> str:
     return plain.replace("Expected ", "give ").replace(", got ", ", and not ")
 
 
-class Tumour(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class TumourPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The template's tumour and opening, for anatomies that are drawn; as the options of `sulcus anatomy`."""
 
-    radius_mm: Annotated[Number, Limits(3, 35, "mm")] = (9.0, 16.0)
-    cover_mm: Annotated[Number, Limits(1, 60, "mm")] = (3.0, 12.0)
+    radius_mm: Annotated[Number, ValueLimits(3, 35, "mm")] = (9.0, 16.0)
+    cover_mm: Annotated[Number, ValueLimits(1, 60, "mm")] = (3.0, 12.0)
     shape: Annotated[Word, ("sphere", "lobed")] = msgspec.field(default_factory=lambda: ["sphere", "lobed"])
     site: Annotated[Word, tuple(SITES)] = msgspec.field(default_factory=lambda: list(SITES))
-    opening_mm: Annotated[Number, Limits(25, 90, "mm")] = (40.0, 60.0)
-    nodes: Annotated[Number, Limits(2000, 250_000)] = 5300.0
+    opening_mm: Annotated[Number, ValueLimits(25, 90, "mm")] = (40.0, 60.0)
+    nodes: Annotated[Number, ValueLimits(2000, 250_000)] = 5300.0
 
 
-class Tissue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class TissuePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Tissue and skull model of a body."""
 
     law: Annotated[Word, LAWS] = "neo-hookean"
-    young_pa: Annotated[Number, Limits(100, 50_000, "Pa")] = 3000.0
-    poisson: Annotated[Number, Limits(0.3, 0.495)] = 0.49
-    tumour_ratio: Annotated[Number, Limits(0.1, 10)] = 1.0
-    necrosis_ratio: Annotated[Number, Limits(0.01, 10)] = 1.0
-    oedema_ratio: Annotated[Number, Limits(0.01, 10)] = 1.0
-    ventricles_ratio: Annotated[Number, Limits(0.01, 10)] = 1.0
+    young_pa: Annotated[Number, ValueLimits(100, 50_000, "Pa")] = 3000.0
+    poisson: Annotated[Number, ValueLimits(0.3, 0.495)] = 0.49
+    tumour_ratio: Annotated[Number, ValueLimits(0.1, 10)] = 1.0
+    necrosis_ratio: Annotated[Number, ValueLimits(0.01, 10)] = 1.0
+    oedema_ratio: Annotated[Number, ValueLimits(0.01, 10)] = 1.0
+    ventricles_ratio: Annotated[Number, ValueLimits(0.01, 10)] = 1.0
     skull: Annotated[Word, tuple(SKULLS)] = "bonded"
 
 
-class Learner(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class LearnerPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Training of a body's model: learner and number of loads. `name` "none": FEM plays."""
 
     name: Annotated[str, (NO_LEARNER, *LEARNERS)] = "series-gp"
-    loads: Annotated[int, Limits(40, 100_000)] = 200
+    loads: Annotated[int, ValueLimits(40, 100_000)] = 200
 
 
 class Bodies(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -107,67 +107,67 @@ class Bodies(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     that ships; or an own .vtu, next to the plan.
     """
 
-    count: Annotated[int, Limits(1, 100_000)] = 1
+    count: Annotated[int, ValueLimits(1, 100_000)] = 1
     anatomies: Word = "template"
-    tumour: Tumour = Tumour()
-    tissue: Tissue = Tissue()
-    learner: Learner = Learner()
+    tumour: TumourPlan = TumourPlan()
+    tissue: TissuePlan = TissuePlan()
+    learner: LearnerPlan = LearnerPlan()
 
 
-class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AppearancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Camera, light and texture."""
 
-    distance_mm: Annotated[Number, Limits(80, 800, "mm")] = 200.0
-    tilt_deg: Annotated[Number, Limits(-75, 75, "°")] = -46.0
-    fov_deg: Annotated[Number, Limits(4, 60, "°")] = 16.0
+    distance_mm: Annotated[Number, ValueLimits(80, 800, "mm")] = 200.0
+    tilt_deg: Annotated[Number, ValueLimits(-75, 75, "°")] = -46.0
+    fov_deg: Annotated[Number, ValueLimits(4, 60, "°")] = 16.0
     path: Annotated[Word, (FIXED, *PATHS)] = FIXED
-    bent: Annotated[Number, Limits(-0.6, 0.6)] = 0.0
-    stereo: Annotated[Number, Limits(0, 1)] = 0.0
-    lamp: Annotated[Number, Limits(0.2, 3)] = 1.0
-    ambient: Annotated[Number, Limits(0, 1)] = 0.16
-    lamp_turn_deg: Annotated[Number, Limits(-180, 180, "°")] = 0.0
-    vessels: Annotated[Number, Limits(0, 1)] = 0.0
-    tint: Annotated[Number, Limits(0, 0.5)] = 0.0
-    cottonoids: Annotated[Number, Limits(0, 5)] = 0.0
-    glove: Annotated[Number, Limits(0, 1)] = 0.0
+    bent: Annotated[Number, ValueLimits(-0.6, 0.6)] = 0.0
+    stereo: Annotated[Number, ValueLimits(0, 1)] = 0.0
+    lamp: Annotated[Number, ValueLimits(0.2, 3)] = 1.0
+    ambient: Annotated[Number, ValueLimits(0, 1)] = 0.16
+    lamp_turn_deg: Annotated[Number, ValueLimits(-180, 180, "°")] = 0.0
+    vessels: Annotated[Number, ValueLimits(0, 1)] = 0.0
+    tint: Annotated[Number, ValueLimits(0, 0.5)] = 0.0
+    cottonoids: Annotated[Number, ValueLimits(0, 5)] = 0.0
+    glove: Annotated[Number, ValueLimits(0, 1)] = 0.0
 
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Sensor noise; standard deviations of an episode."""
 
-    grey_levels: Annotated[Number, Limits(0, 40, "grey levels")] = 0.0
-    force_n: Annotated[Number, Limits(0, 1, "N")] = 0.0
-    tool_mm: Annotated[Number, Limits(0, 20, "mm")] = 0.0
-    tool_deg: Annotated[Number, Limits(0, 20, "°")] = 0.0
-    camera_mm: Annotated[Number, Limits(0, 20, "mm")] = 0.0
-    camera_deg: Annotated[Number, Limits(0, 20, "°")] = 0.0
+    grey_levels: Annotated[Number, ValueLimits(0, 40, "grey levels")] = 0.0
+    force_n: Annotated[Number, ValueLimits(0, 1, "N")] = 0.0
+    tool_mm: Annotated[Number, ValueLimits(0, 20, "mm")] = 0.0
+    tool_deg: Annotated[Number, ValueLimits(0, 20, "°")] = 0.0
+    camera_mm: Annotated[Number, ValueLimits(0, 20, "mm")] = 0.0
+    camera_deg: Annotated[Number, ValueLimits(0, 20, "°")] = 0.0
 
 
-class Hand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class HandTremor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Tremor of the hand, added to the intended motion: standard deviations."""
 
-    tremor_mm: Annotated[Number, Limits(0, 3, "mm")] = 0.0
-    tremor_n: Annotated[Number, Limits(0, 0.1, "N")] = 0.0
+    tremor_mm: Annotated[Number, ValueLimits(0, 3, "mm")] = 0.0
+    tremor_n: Annotated[Number, ValueLimits(0, 0.1, "N")] = 0.0
 
 
-class Contents(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PlanContents(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The whole of a plan's file."""
 
     title: str
-    motion: Motions
-    seconds: Annotated[Number, Limits(0.1, 600, "s")] = 4.0
-    frames_per_second: Annotated[float, Limits(1, 240, "1/s")] = 30.0
-    size: Annotated[tuple[int, int], Limits(32, 4096, "pixel")] = (640, 480)
-    solved_every: Annotated[int, Limits(1, 100_000, "frames")] = 15
+    motion: FamilyMotions
+    seconds: Annotated[Number, ValueLimits(0.1, 600, "s")] = 4.0
+    frames_per_second: Annotated[float, ValueLimits(1, 240, "1/s")] = 30.0
+    size: Annotated[tuple[int, int], ValueLimits(32, 4096, "pixel")] = (640, 480)
+    solved_every: Annotated[int, ValueLimits(1, 100_000, "frames")] = 15
     overlay: bool = False
     bodies: Bodies = Bodies()
-    look: Look = Look()
-    hand: Hand = Hand()
+    look: AppearancePlan = AppearancePlan()
+    hand: HandTremor = HandTremor()
     noise: Noise = Noise()
 
 
 @dataclass(frozen=True)
-class Plan:
+class EpisodePlan:
     """A plan as it was read.
 
     Parameters
@@ -186,7 +186,7 @@ class Plan:
 
     name: str
     text: str
-    contents: Contents
+    contents: PlanContents
     folder: Path
     own: Mapping[str, str] = field(default_factory=dict)
 
@@ -201,7 +201,7 @@ def shipped() -> list[str]:
     return sorted(path.stem for path in SHIPPED.glob("*.toml"))
 
 
-def load_plan(name: str) -> Plan:
+def load_plan(name: str) -> EpisodePlan:
     """A plan that ships, by name, or one's own, by the path of its .toml.
 
     Raises
@@ -223,7 +223,7 @@ def load_plan(name: str) -> Plan:
     return replace(plan, own={each: digest_beside(plan, each) for each in _own_anatomies(plan.contents)})
 
 
-def digest_beside(plan: Plan, anatomy: str) -> str:
+def digest_beside(plan: EpisodePlan, anatomy: str) -> str:
     """Sixteen hexadecimal digits of an own anatomy's file and of its scan, as they are now.
 
     Raises
@@ -238,7 +238,7 @@ def digest_beside(plan: Plan, anatomy: str) -> str:
     return found.hexdigest()[:16]
 
 
-def plan_from(text: str, name: str, folder: Path = Path()) -> Plan:
+def plan_from(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
     """The plan that a TOML text holds.
 
     Raises
@@ -247,11 +247,11 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> Plan:
         As `load_plan`.
     """
     try:
-        contents = msgspec.toml.decode(text, type=Contents)
+        contents = msgspec.toml.decode(text, type=PlanContents)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         said = said_plainly(str(error))
         raise InputError(f"the plan {name}: {said} docs/datasets_make.md says what a plan holds.") from error
-    plan = Plan(name, text, contents, folder)
+    plan = EpisodePlan(name, text, contents, folder)
     try:
         _check(contents)
     except InputError as error:
@@ -259,33 +259,33 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> Plan:
     return plan
 
 
-def fields_of(table: msgspec.Struct) -> list[tuple[str, object, Limits | None, tuple[str, ...]]]:
+def fields_of(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | None, tuple[str, ...]]]:
     """List every field that may be sampled: name, value, limits of a number, and known words."""
     found = []
     for name, (kind, about) in _kinds_of(type(table)).items():
         if kind in (Number, Word):
-            limits, words = (about, ()) if isinstance(about, Limits) else (None, about or ())
+            limits, words = (about, ()) if isinstance(about, ValueLimits) else (None, about or ())
             found.append((name, getattr(table, name), limits, words))
     return found
 
 
-def fixed_of(table: msgspec.Struct) -> list[tuple[str, float, Limits]]:
+def fixed_of(table: msgspec.Struct) -> list[tuple[str, float, ValueLimits]]:
     """List every fixed number: name, value and limits; one entry for each number of a pair."""
     found = []
     for name, (kind, about) in _kinds_of(type(table)).items():
-        if kind != Number and isinstance(about, Limits):
+        if kind != Number and isinstance(about, ValueLimits):
             value = getattr(table, name)
             found += [(name, each, about) for each in (value if isinstance(value, tuple) else (value,))]
     return found
 
 
-def _kinds_of(table: type[msgspec.Struct]) -> dict[str, tuple[object, Limits | tuple[str, ...] | None]]:
+def _kinds_of(table: type[msgspec.Struct]) -> dict[str, tuple[object, ValueLimits | tuple[str, ...] | None]]:
     """List every field: its types, and its limits or known words."""
     hints = get_type_hints(table, include_extras=True)
     return {name: get_args(kind)[:2] if get_origin(kind) is Annotated else (kind, None) for name, kind in hints.items()}
 
 
-def tables_of(contents: Contents) -> dict[str, msgspec.Struct]:
+def tables_of(contents: PlanContents) -> dict[str, msgspec.Struct]:
     """The tables of a plan by name: those whose fields are drawn for each episode, and those of bodies."""
     bodies, motion = contents.bodies, {f"motion.{name}": each for name, each in contents.motion.named.items()}
     of_bodies = {f"bodies.{name}": getattr(bodies, name) for name in ("tumour", "tissue", "learner")}
@@ -293,7 +293,7 @@ def tables_of(contents: Contents) -> dict[str, msgspec.Struct]:
     return {"": contents, "bodies": bodies, **of_bodies, **seen, **motion}
 
 
-def _check(contents: Contents) -> None:
+def _check(contents: PlanContents) -> None:
     for table, values in tables_of(contents).items():
         for name, value, limits, words in fields_of(values):
             check_spread(value, f"{table}.{name}".lstrip("."), limits, words)
@@ -304,7 +304,7 @@ def _check(contents: Contents) -> None:
         check_learners([contents.bodies.learner.name], False, "bodies.learner.name")
     if not any(each.weight > 0.0 for each in contents.motion.named.values()):
         raise InputError("motion: give one family or more, with a weight above 0.")
-    if contents.bodies.tumour != Tumour() and "drawn" not in _anatomies(contents):
+    if contents.bodies.tumour != TumourPlan() and "drawn" not in _anatomies(contents):
         raise InputError(
             'bodies.tumour: only drawn anatomies have such a tumour. Say anatomies = "drawn", or leave it out.'
         )
@@ -328,13 +328,13 @@ def ratio_of(region: str) -> str:
     return f"{region}_ratio"
 
 
-def _own_anatomies(contents: Contents) -> list[str]:
+def _own_anatomies(contents: PlanContents) -> list[str]:
     """List the named anatomies of bodies, except the built-in ones."""
     return sorted(_anatomies(contents) - {"drawn", "template"})
 
 
-def _anatomies(contents: Contents) -> set[str]:
+def _anatomies(contents: PlanContents) -> set[str]:
     """List the named anatomies of bodies."""
     choices = contents.bodies.anatomies
-    named = choices.choice if isinstance(choices, Spread) else [choices] if isinstance(choices, str) else choices
+    named = choices.choice if isinstance(choices, Distribution) else [choices] if isinstance(choices, str) else choices
     return {str(each) for each in named or ()}

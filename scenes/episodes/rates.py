@@ -14,7 +14,7 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import why
 
 from .run_folder import RATES
-from .tasks import Outcome
+from .tasks import TaskOutcome
 
 COLUMNS = "kind,number,frames,bytes,seconds,first"
 
@@ -35,7 +35,7 @@ class Rate:
 
 
 @contextmanager
-def written_rates(folder: Path) -> Iterator[Callable[[str, Outcome], None]]:
+def written_rates(folder: Path) -> Iterator[Callable[[str, TaskOutcome], None]]:
     """Yield a function that records each completed task, unless it was resumed, in a file of this process.
 
     Raises
@@ -52,7 +52,7 @@ def written_rates(folder: Path) -> Iterator[Callable[[str, Outcome], None]]:
     with file:
         file.write(COLUMNS + "\n")
 
-        def note(kind: str, one: Outcome) -> None:
+        def note(kind: str, one: TaskOutcome) -> None:
             if not (one.failed or one.skipped or one.resumed):
                 file.write(f"{kind},{one.number},{one.frames},{one.bytes},{one.seconds:.4f},{one.first}\n")
 

@@ -29,7 +29,7 @@ PARTS = ("h5py", "numpy", "scipy", "sulcus", "warp-lang")
 
 
 @dataclass(frozen=True)
-class Run:
+class RunSettings:
     """Settings of a run: all that determines the bytes of an episode, except its number.
 
     Parameters
@@ -69,7 +69,7 @@ def episode_name(number: int) -> str:
     return f"episode_{number:06d}.h5"
 
 
-def begin(folder: Path, run: Run, text: str, force: bool = False) -> bool:
+def begin(folder: Path, run: RunSettings, text: str, force: bool = False) -> bool:
     """Initialise the folder of a run, or open it; return True if it is new.
 
     Unfinished files of dead processes are removed; those of an unfinished body stay, to be resumed.
@@ -108,7 +108,7 @@ def begin(folder: Path, run: Run, text: str, force: bool = False) -> bool:
     return True
 
 
-def read_run(folder: Path) -> Run | None:
+def read_run(folder: Path) -> RunSettings | None:
     """Read the settings of the run of a folder, if it has one.
 
     Raises
@@ -121,7 +121,7 @@ def read_run(folder: Path) -> Run | None:
         found = json.loads(path.read_text())
         if found.pop("format") != FORMAT:
             raise ValueError
-        return Run(**found)
+        return RunSettings(**found)
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -189,7 +189,7 @@ def _demand_empty(folder: Path, force: bool) -> None:
         )
 
 
-def _demand_same(folder: Path, found: Run, run: Run, force: bool) -> None:
+def _demand_same(folder: Path, found: RunSettings, run: RunSettings, force: bool) -> None:
     if found.digest != run.digest:
         changed = f"of another text or other anatomies of the plan {run.plan}"
         other = changed if found.plan == run.plan else f"of the plan {found.plan}"

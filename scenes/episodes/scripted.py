@@ -16,11 +16,11 @@ from sim.errors import InputError
 from ..script.camera_paths import PATHS
 from ..script.scene import Scene
 from ..script.site import Site
-from ..script.viewpoint import Cottonoid, Look, Viewpoint
-from .bodies import Body
+from ..script.viewpoint import Appearance, Cottonoid, Viewpoint
+from .bodies import EpisodeBody
 from .draws import drawn, random_of
-from .families import FAMILIES, PRONY, Chance, trembling
-from .plan import FIXED, Contents, Plan, fields_of, tables_of
+from .families import FAMILIES, PRONY, ScenarioInputs, trembling
+from .plan import FIXED, EpisodePlan, PlanContents, fields_of, tables_of
 
 # Deviation of a cortex's red, green and blue from ours is the tint times one of these.
 TINTS = np.array([0.3, 1.0, 1.0])
@@ -29,7 +29,7 @@ SECOND = -0.3
 
 
 @dataclass(frozen=True)
-class Drawn:
+class EpisodeSample:
     """Sampled values of an episode.
 
     Parameters
@@ -52,12 +52,12 @@ class Drawn:
         return {name.removeprefix(head): value for name, value in self.values.items() if name.startswith(head)}
 
 
-def drawn_body_of(contents: Contents, seed: int, number: int) -> int:
+def drawn_body_of(contents: PlanContents, seed: int, number: int) -> int:
     """The number of the body that an episode is played on."""
     return int(random_of(seed, number, "body").integers(contents.bodies.count))
 
 
-def drawn_episode(contents: Contents, seed: int, number: int) -> Drawn:
+def drawn_episode(contents: PlanContents, seed: int, number: int) -> EpisodeSample:
     """Sample the values of an episode from the seed and its number alone, each by its own name."""
     named = contents.motion.named
     weights = np.array([motion.weight for motion in named.values()])
@@ -69,10 +69,10 @@ def drawn_episode(contents: Contents, seed: int, number: int) -> Drawn:
         for name, value, *_ in fields_of(struct):
             full = f"{table}.{name}".lstrip(".")
             values[full] = drawn(value, random_of(seed, number, full))
-    return Drawn(drawn_body_of(contents, seed, number), family, values)
+    return EpisodeSample(drawn_body_of(contents, seed, number), family, values)
 
 
-def scene_of(plan: Plan, body: Body, site: Site, asked: Drawn, seed: int, number: int) -> Scene:
+def scene_of(plan: EpisodePlan, body: EpisodeBody, site: Site, asked: EpisodeSample, seed: int, number: int) -> Scene:
     """Build the scene of an episode on a body.
 
     Raises
@@ -81,7 +81,9 @@ def scene_of(plan: Plan, body: Body, site: Site, asked: Drawn, seed: int, number
         An impossible scene: a tumour of too few tetrahedra for its shares, a lens that folds the image.
     """
     contents, seconds = plan.contents, asked.values["seconds"]
-    chance = Chance(asked.group(f"motion.{asked.family}"), random_of(seed, number, "motion"), seconds, site.reach)
+    chance = ScenarioInputs(
+        asked.group(f"motion.{asked.family}"), random_of(seed, number, "motion"), seconds, site.reach
+    )
     act = FAMILIES[asked.family](chance)
     hand = asked.group("hand")
     path = act.path
@@ -109,7 +111,7 @@ def relaxing(tissue: Elasticity) -> Elasticity:
     return Elasticity(None if tissue.default is None else relaxed(tissue.default), regions)
 
 
-def _viewpoint(contents: Contents, look: Mapping[str, Any], seed: int, number: int) -> Viewpoint:
+def _viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int, number: int) -> Viewpoint:
     """The camera of an episode."""
     random = random_of(seed, number, "look.camera")
     width, height = contents.size
@@ -132,7 +134,7 @@ def _viewpoint(contents: Contents, look: Mapping[str, Any], seed: int, number: i
         raise InputError(f"look.bent {look['bent']:g}: {error}") from error
 
 
-def _look(look: Mapping[str, Any], site: Site, seed: int, number: int) -> Look:
+def _look(look: Mapping[str, Any], site: Site, seed: int, number: int) -> Appearance:
     """Light, colour and covers of an episode."""
     random = random_of(seed, number, "look.covers")
     vessels = int(random.integers(2**31)) if random.random() < look["vessels"] else None
@@ -143,4 +145,4 @@ def _look(look: Mapping[str, Any], site: Site, seed: int, number: int) -> Look:
         far, angle, turn = site.clearance * np.sqrt(random.random()), *random.uniform(0.0, 2.0 * np.pi, 2)
         lain.append(Cottonoid(float(far * np.cos(angle)), float(far * np.sin(angle)), angle=float(turn)))
     turned = float(np.radians(look["lamp_turn_deg"]))
-    return Look(look["lamp"], look["ambient"], turned, tuple(tint.tolist()), vessels, tuple(lain), finger)
+    return Appearance(look["lamp"], look["ambient"], turned, tuple(tint.tolist()), vessels, tuple(lain), finger)

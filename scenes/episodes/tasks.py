@@ -14,7 +14,7 @@ from typing import ClassVar
 from sim.errors import InputError
 from sim.runtime.threads import one_thread
 
-from .run_folder import Run, read_run, unlike, versions_here
+from .run_folder import RunSettings, read_run, unlike, versions_here
 
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 """Errors that every other episode would meet too."""
@@ -49,7 +49,7 @@ class Made:
 
 
 @dataclass(frozen=True)
-class Work:
+class RunWork:
     """Functions that make bodies and episodes: module-level, so that workers can import them, or partial functions of these.
 
     Parameters
@@ -66,7 +66,7 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TaskOutcome:
     """Outcome of one task.
 
     Parameters
@@ -106,7 +106,9 @@ class _Process:
     spoilt = False
 
 
-def attempted(make: Callable[[int], Made], number: int, folder: Path, run: Run, body: Outcome | None = None) -> Outcome:
+def attempted(
+    make: Callable[[int], Made], number: int, folder: Path, run: RunSettings, body: TaskOutcome | None = None
+) -> TaskOutcome:
     """Make the one of a number, by a worker that sees the run's folder and has its versions.
 
     Raises
@@ -119,16 +121,16 @@ def attempted(make: Callable[[int], Made], number: int, folder: Path, run: Run, 
         os._exit(1)
     halt = _unfit(folder, run)
     if halt:
-        return Outcome(number, halt=halt)
+        return TaskOutcome(number, halt=halt)
     if body is not None and (body.failed or body.halt):
-        return Outcome(number, failed=body.failed and f"its body {body.number}: {body.failed}", halt=body.halt)
+        return TaskOutcome(number, failed=body.failed and f"its body {body.number}: {body.failed}", halt=body.halt)
     begun = time.perf_counter()
     try:
         with one_thread():
             made = make(number)
     except Exception as error:
         if _is_full(error):
-            return Outcome(number, halt=str(error))
+            return TaskOutcome(number, halt=str(error))
         _Process.spoilt = run.device == "cuda" and not isinstance(error, InputError | OSError)
         raise
     seconds, kind = time.perf_counter() - begun, getattr(make, "func", make)
@@ -136,12 +138,12 @@ def attempted(make: Callable[[int], Made], number: int, folder: Path, run: Run, 
     first = OF_PROCESS if kind not in _Process.made else LATER if on_body in _Process.made else OF_BODY
     if not (made.failed or made.skipped):
         _Process.made |= {kind, on_body}
-    return Outcome(
+    return TaskOutcome(
         number, made.frames, made.bytes, seconds, made.failed, skipped=made.skipped, resumed=made.resumed, first=first
     )
 
 
-def _unfit(folder: Path, run: Run) -> str:
+def _unfit(folder: Path, run: RunSettings) -> str:
     """Return the reason why this worker cannot take part in the run; empty if it can."""
     here = platform.node()
     other = unlike(versions_here(), run.versions)

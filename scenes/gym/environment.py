@@ -16,13 +16,13 @@ from gymnasium.vector.utils import batch_space
 from sim.arguments import at_least
 from sim.errors import InputError
 
-from .episode import Episode, Step
+from .episode import Episode, EpisodeStep
 from .observation import KINDS, space_of, twists
-from .pictures import Pictures
+from .pictures import ObservationCamera
 from .registration import NAMESPACE, STEPS
-from .setting import Setting, checked, open_setting
+from .setting import TaskSetting, checked, open_setting
 from .tasks import SECONDS, find_task
-from .touched import Asked
+from .touched import TissueRequest
 
 RENDERED = ("rgb_array",)
 METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(1.0 / SECONDS)}
@@ -31,7 +31,7 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(
 
 def opened(
     task: str, observation: str, render_mode: str | None, given: Mapping[str, Any], together: bool | None = None
-) -> Setting:
+) -> TaskSetting:
     """Open the setting of environments; anatomy, physics, device, size and model are `given` as to `open_setting`.
 
     Raises
@@ -84,7 +84,7 @@ class Operation(gymnasium.Env):
         self.observation, self.render_mode = observation, render_mode
         self.observation_space = space_of(observation, size)
         self.action_space = twists()
-        self.episode, self.pictures = Episode(self.setting), Pictures(self.setting)
+        self.episode, self.pictures = Episode(self.setting), ObservationCamera(self.setting)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode: what is seen, and the truth; `options` are none.
@@ -123,7 +123,7 @@ class Operation(gymnasium.Env):
         """
         return None if self.render_mode is None else self.pictures.drawn([self.episode.seen])[0][0]
 
-    def _observed(self, step: Step) -> Any:
+    def _observed(self, step: EpisodeStep) -> Any:
         if self.observation == "states":
             return step.states
         colour, depth = self.pictures.drawn([self.episode.seen])
@@ -178,7 +178,7 @@ class Operations(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.episodes = [Episode(self.setting) for _ in range(num_envs)]
-        self.pictures = Pictures(self.setting)
+        self.pictures = ObservationCamera(self.setting)
         self.randoms = [np.random.default_rng() for _ in range(num_envs)]
 
     def reset(
@@ -234,18 +234,18 @@ class Operations(VectorEnv):
             return None
         return tuple(self.pictures.drawn([episode.seen for episode in self.episodes])[0])
 
-    def _taken(self, asked: list[Asked]) -> list[Step]:
+    def _taken(self, asked: list[TissueRequest]) -> list[EpisodeStep]:
         answers = self.setting.answers.answer(asked)
         return [episode.take(touched) for episode, touched in zip(self.episodes, answers, strict=True)]
 
-    def _observed(self, steps: Sequence[Step]) -> Any:
+    def _observed(self, steps: Sequence[EpisodeStep]) -> Any:
         states = np.stack([step.states for step in steps])
         if self.observation == "states":
             return states
         colour, depth = self.pictures.drawn([episode.seen for episode in self.episodes])
         return {"rgb": colour, "depth": depth, "states": states}
 
-    def _infos(self, steps: Sequence[Step]) -> dict[str, Any]:
+    def _infos(self, steps: Sequence[EpisodeStep]) -> dict[str, Any]:
         """The truth as arrays with a row for each environment, and Gymnasium's masks of who has it: all."""
         infos = {name: np.stack([step.info[name] for step in steps]) for name in steps[0].info}
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}

@@ -13,10 +13,10 @@ from ..script.camera_paths import wandering
 from ..script.tool_paths import smooth
 from .observation import FELT, SEEN, TRACKED, states
 from .pictures import Seen
-from .setting import Setting
+from .setting import TaskSetting
 from .tasks import OVER, SECONDS, Goal
-from .tool_motion import Hand, frame_of, laid, lever_of, moved, trembling
-from .touched import Asked, Touched
+from .tool_motion import RobotTool, frame_of, laid, lever_of, moved, trembling
+from .touched import TissueRequest, Touched
 
 STEP, OVER_LIMIT, DONE, ENDED = 0.01, 0.5, 10.0, -10.0
 """Rewards of a step, of a step over a limit, of success, and of the end at a limit."""
@@ -31,7 +31,7 @@ DRAINS = 60
 
 
 @dataclass(frozen=True)
-class Judged:
+class EpisodeScore:
     """Distance of an episode from its goal.
 
     Parameters
@@ -57,7 +57,7 @@ class Judged:
         return SHARE * self.cut - min(self.away, FAR) / NEAR - min(self.off, 1.0)
 
 
-def earned(before: Judged, now: Judged, success: bool, ended: bool) -> float:
+def earned(before: EpisodeScore, now: EpisodeScore, success: bool, ended: bool) -> float:
     """The reward of a step from one state to the next; `ended`: at a limit, without success."""
     reward = now.potential - before.potential - STEP
     if now.load > 1.0:
@@ -66,7 +66,7 @@ def earned(before: Judged, now: Judged, success: bool, ended: bool) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class EpisodeStep:
     """Result of a step: state (24,), reward, end of the episode, and ground truth."""
 
     states: np.ndarray
@@ -76,16 +76,16 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class ResetSample:
     """Random values of an episode: goal, initial pose, seed and size of the tremor [m]."""
 
     goal: Goal
-    hand: Hand
+    hand: RobotTool
     seed: int
     tremor: float
 
 
-def draw(setting: Setting, random: np.random.Generator) -> Drawn:
+def draw(setting: TaskSetting, random: np.random.Generator) -> ResetSample:
     """Draw an episode."""
     goal, site, tool = setting.goal(random), setting.site, setting.task.tool
     high, far, angle, size = random.random(4)
@@ -94,7 +94,7 @@ def draw(setting: Setting, random: np.random.Generator) -> Drawn:
     x, y = x + aside * np.cos(2.0 * np.pi * angle), y + aside * np.sin(2.0 * np.pi * angle)
     under = site.contact(float(x), float(y), tool.radius).point
     tip = under - (ABOVE[0] + high * (ABOVE[1] - ABOVE[0])) * site.axis
-    return Drawn(goal, laid(site, tool, tip), int(random.integers(2**31)), TREMOR * float(size))
+    return ResetSample(goal, laid(site, tool, tip), int(random.integers(2**31)), TREMOR * float(size))
 
 
 class Episode:
@@ -106,13 +106,13 @@ class Episode:
         Task and body.
     """
 
-    def __init__(self, setting: Setting):
+    def __init__(self, setting: TaskSetting):
         self.setting = setting
         self.frame = frame_of(setting.site)
-        self.drawn: Drawn | None = None
+        self.drawn: ResetSample | None = None
         self.over = True
 
-    def begin(self, random: np.random.Generator) -> Asked:
+    def begin(self, random: np.random.Generator) -> TissueRequest:
         """Draw an episode; what is asked of the tissue as it begins."""
         self.random, self.drawn = random, draw(self.setting, random)
         self.hand, self.touched, self.judged = self.drawn.hand, None, None
@@ -120,7 +120,7 @@ class Episode:
         self.patch = self.setting.near(self.drawn.goal.place)
         return self._asked(self.drawn)
 
-    def ask(self, action: np.ndarray) -> Asked:
+    def ask(self, action: np.ndarray) -> TissueRequest:
         """Move the tool; what is asked of the tissue then.
 
         Raises
@@ -139,12 +139,12 @@ class Episode:
         self.step += 1
         return self._asked(self.drawn)
 
-    def _asked(self, drawn: Drawn) -> Asked:
+    def _asked(self, drawn: ResetSample) -> TissueRequest:
         task = self.setting.task
         offset = drawn.tremor * self.frame @ wandering(drawn.seed, SECONDS * self.step)[:3]
         self.actual = trembling(self.hand, offset)
         fluid = 1.0 - (1.0 - drawn.goal.fluid) * smooth(self.step / DRAINS)
-        return Asked(self.actual.pose(task.tool), self.touched, fluid, self.done)
+        return TissueRequest(self.actual.pose(task.tool), self.touched, fluid, self.done)
 
     @property
     def done(self) -> int:
@@ -164,7 +164,7 @@ class Episode:
             raise InputError("no episode has begun: call reset() before render().")
         return self.touched, self.actual.pose(self.setting.task.tool), self.shown
 
-    def take(self, touched: Touched) -> Step:
+    def take(self, touched: Touched) -> EpisodeStep:
         """Return the result of a step from the tissue's response."""
         assert self.drawn is not None
         task, goal, self.shown = self.setting.task, self.drawn.goal, self.done
@@ -181,7 +181,7 @@ class Episode:
         reward = 0.0 if self.judged is None else earned(self.judged, judged, success, ended)
         self.violations += int(judged.load > 1.0)
         self.touched, self.judged, self.over = touched, judged, success or ended
-        return Step(self._states(touched), reward, success or ended, self._truth(touched, target, success))
+        return EpisodeStep(self._states(touched), reward, success or ended, self._truth(touched, target, success))
 
     def _target(self, touched: Touched) -> np.ndarray:
         """Target position of the tool (3,) [m]: above the goal, or at the next share where it is now."""
@@ -200,18 +200,18 @@ class Episode:
         nodes = self.setting.site.anatomy.mesh.nodes
         return self.drawn.goal.place if self.share is None else nodes[self.share].mean(axis=0)
 
-    def _judge(self, touched: Touched, target: np.ndarray) -> Judged:
+    def _judge(self, touched: Touched, target: np.ndarray) -> EpisodeScore:
         assert self.drawn is not None
         task, goal, axis = self.setting.task, self.drawn.goal, self.setting.site.axis
         size = float(np.linalg.norm(touched.force))
         load = max(size / task.force, touched.pressure / task.pressure)
         if task.cuts:
-            return Judged(float(np.linalg.norm(self.actual.place - target)), 0.0, self.cut, load)
+            return EpisodeScore(float(np.linalg.norm(self.actual.place - target)), 0.0, self.cut, load)
         tip = self.actual.place + lever_of(task.tool) * axis
         along = float((target - tip) @ axis)
         aside = float(np.linalg.norm(target - tip - along * axis))
         away = float(np.hypot(aside, max(along, 0.0) if size == 0.0 else 0.0))
-        return Judged(away, abs(self._reached(touched) - goal.amount) / goal.amount, 0, load)
+        return EpisodeScore(away, abs(self._reached(touched) - goal.amount) / goal.amount, 0, load)
 
     def _reached(self, touched: Touched) -> float:
         """Return the force [N], the shift [m], or the shares cut, which are compared with the goal's amount."""

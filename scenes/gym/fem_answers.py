@@ -15,12 +15,12 @@ from sim.geometry.closest_point import closest
 from sim.geometry.surface import vertex_normals
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Resected, Touching
-from sim.resected_fem import Operated
+from sim.resected_fem import OperatedFem
 
 from ..script.head_posture import Lying
 from ..script.site import Site
 from .model_answers import Hertz
-from .touched import Asked, Touched
+from .touched import TissueRequest, Touched
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class PosedElements:
     ball: Hertz | None
     together: bool = False
 
-    def answer(self, asked: Sequence[Asked]) -> list[Touched]:
+    def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         """Solve as `Answers.answer`; environments at the start of an episode form a separate batch."""
         found: dict[int, Touched] = {}
         begin = [row for row, each in enumerate(asked) if each.last is None]
@@ -53,7 +53,7 @@ class PosedElements:
                 found |= dict(zip(some, self._answered([asked[row] for row in some]), strict=True))
         return [found[row] for row in range(len(asked))]
 
-    def _answered(self, asked: Sequence[Asked]) -> list[Touched]:
+    def _answered(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         loads = Loads((Touching(np.stack([each.pose for each in asked])[:, None]),))
         starts = [each.last.memory for each in asked if each.last is not None and each.last.memory is not None]
         answer = self.fem.deform(loads, _stacked(starts) if starts else None)
@@ -82,7 +82,7 @@ APART = 0.1
 AROUND = 0.03
 
 
-class Healthy(NamedTuple):
+class HealthySurface(NamedTuple):
     """The surface (S, 3) of the healthy tissue that is left near the tumour; outward normals (V, 3) at rest."""
 
     triangles: np.ndarray
@@ -106,16 +106,16 @@ class CutElements:
     """
 
     site: Site
-    fem: Operated
+    fem: OperatedFem
     ball: Hertz
     _solved: dict[tuple[int, int], Deformation] = field(default_factory=dict)
-    _surfaces: dict[int, Healthy] = field(default_factory=dict)
+    _surfaces: dict[int, HealthySurface] = field(default_factory=dict)
 
-    def answer(self, asked: Sequence[Asked]) -> list[Touched]:
+    def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         """Solve as `Answers.answer`; earlier requests have no influence, because levels are solved in one order."""
         return [self._touched(each) for each in asked]
 
-    def _touched(self, asked: Asked) -> Touched:
+    def _touched(self, asked: TissueRequest) -> Touched:
         level = (1.0 - asked.fluid) / APART
         low = int(level)
         share = level - low
@@ -153,13 +153,13 @@ class CutElements:
         distance = float(np.copysign(np.linalg.norm(away), away @ outward))
         return -float(self.ball.force(np.array(radius - distance))) * outward
 
-    def _healthy(self, done: int) -> Healthy:
+    def _healthy(self, done: int) -> HealthySurface:
         """Return the remaining body after a number of steps."""
         if done not in self._surfaces:
             self._surfaces[done] = self._near(done)
         return self._surfaces[done]
 
-    def _near(self, done: int) -> Healthy:
+    def _near(self, done: int) -> HealthySurface:
         body = self.fem.remains(done).anatomy
         left, brain = body.mesh, ~body.in_tumour
         surface = TetMesh(left.nodes, left.tets[brain], left.region[brain]).surface
@@ -168,4 +168,4 @@ class CutElements:
         middle = left.nodes[surface].mean(axis=1)
         around = np.concatenate([way, left.nodes[tumour]])
         near = np.linalg.norm(middle[:, None] - around, axis=2).min(axis=1) < AROUND
-        return Healthy(surface[near], vertex_normals(left.nodes, surface))
+        return HealthySurface(surface[near], vertex_normals(left.nodes, surface))

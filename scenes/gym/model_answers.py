@@ -19,7 +19,7 @@ from surrogate.model.guarded import tool_pressure
 from surrogate.model.learned import Learned
 
 from ..script.site import Site
-from .touched import Asked, Touched
+from .touched import TissueRequest, Touched
 
 # Tolerance of the ball's depth [m], and maximum number of iterations.
 NEAR, TRIES = 1e-5, 12
@@ -98,7 +98,7 @@ class PressedModel:
     def _patch(self) -> Patch:
         return open_patch(self.site.anatomy)
 
-    def answer(self, asked: Sequence[Asked]) -> list[Touched]:
+    def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         """Predict as `Answers.answer`."""
         poses = np.stack([each.pose for each in asked])
         parts = [poses] if self.together else np.split(poses, len(poses))
@@ -173,7 +173,7 @@ class PosedModel:
     model: Learned
     ball: Hertz | None
 
-    def answer(self, asked: Sequence[Asked]) -> list[Touched]:
+    def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         """Predict as `Answers.answer`, one by one. If the model rejects a pose, the tissue stays and is marked unreliable."""
         return [self._answered(each.pose, each.last) for each in asked]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from gymnasium import spaces
 
-from .tasks import Goal, Task
-from .tool_motion import Hand
+from .tasks import Goal, GymTask
+from .tool_motion import RobotTool
 
 KINDS = ("states", "rgbd")
 """Kinds of observations."""
@@ -45,7 +45,7 @@ def space_of(kind: str, size: tuple[int, int]) -> spaces.Space:
 
 
 def states(
-    task: Task, goal: Goal, hand: Hand, sensed: np.ndarray, time: float, done: float, frame: np.ndarray,
+    task: GymTask, goal: Goal, hand: RobotTool, sensed: np.ndarray, time: float, done: float, frame: np.ndarray,
     origin: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Numbers (24,) float32 of a state, in the frame (3, 3) of twists, from the open cortex's middle (3,) [m].

@@ -10,17 +10,17 @@ import numpy as np
 from ar.optics.camera import Camera
 from ar.rendering.renderer import Renderer
 
-from .setting import Setting
+from .setting import TaskSetting
 from .touched import Touched
 
 Seen = tuple[Touched, np.ndarray, int]
 """Rendered state: the tissue's response, T_world_tool (4, 4), and the number of resection steps done."""
 
 
-class Pictures:
+class ObservationCamera:
     """Draws what the camera of a setting sees."""
 
-    def __init__(self, setting: Setting):
+    def __init__(self, setting: TaskSetting):
         self.setting = setting
         self._renderers: dict[int, Renderer] = {}
 

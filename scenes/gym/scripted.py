@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .observation import LENGTH
-from .tasks import DEBULK, RETRACT, Task, find_task
+from .tasks import DEBULK, RETRACT, GymTask, find_task
 
 # A tool goes down when it is so near over its place [m]; a force above this is contact [N]: three of its deviations.
 OVER, TOUCHES = 1.5e-3, 6e-3
@@ -46,6 +46,6 @@ def scripted(task: str, states: np.ndarray) -> np.ndarray:
     return _action(known, off)
 
 
-def _action(task: Task, way: np.ndarray) -> np.ndarray:
+def _action(task: GymTask, way: np.ndarray) -> np.ndarray:
     turn = np.zeros_like(way)
     return np.clip(np.concatenate([way / task.step, turn], axis=-1), -1.0, 1.0).astype(np.float32)

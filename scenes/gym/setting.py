@@ -31,8 +31,8 @@ from ..script.site import Site
 from ..script.tool import Blade, Probe
 from .fem_answers import CutElements, PosedElements
 from .model_answers import Hertz, PosedModel, PressedModel
-from .tasks import Goal, Task
-from .touched import Answers
+from .tasks import Goal, GymTask
+from .touched import TissueModel
 
 PHYSICS = ("auto", "model", "fem")
 TEMPLATE = "template"
@@ -48,7 +48,7 @@ PATCH = 8e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
+class TaskSetting:
     """Task on a body.
 
     Parameters
@@ -59,10 +59,10 @@ class Setting:
         Model of the tissue's response to the tool.
     """
 
-    task: Task
+    task: GymTask
     scene: Scene
     theatre: Theatre
-    answers: Answers
+    answers: TissueModel
 
     @property
     def site(self) -> Site:
@@ -119,14 +119,14 @@ class Setting:
 
 @lru_cache(maxsize=8)
 def open_setting(
-    task: Task,
+    task: GymTask,
     anatomy: str,
     physics: str,
     device: str,
     size: tuple[int, int],
     model: str | None = None,
     together: bool | None = None,
-) -> Setting:
+) -> TaskSetting:
     """A task on a body, read once for all environments of a process.
 
     Parameters
@@ -165,18 +165,20 @@ def open_setting(
         refused = _refusals(task, scene, theatre)
         known = [each for name, each in theatre.models.items() if refused[name] is None]
         if posed := [each for each in known if each.tool is not None]:
-            return Setting(task, scene, theatre, PosedModel(min(posed, key=TIGHTEST), ball))
+            return TaskSetting(task, scene, theatre, PosedModel(min(posed, key=TIGHTEST), ball))
         if ball is not None and known:
-            return Setting(task, scene, theatre, PressedModel(theatre.site, min(known, key=TIGHTEST), ball, at_once))
+            return TaskSetting(
+                task, scene, theatre, PressedModel(theatre.site, min(known, key=TIGHTEST), ball, at_once)
+            )
         _say_none(task, anatomy, physics, model, next(iter(refused.values()), None))
     fem = theatre.fem(scene, LIVE, batch=64 if at_once else 1, live=not at_once)
     if isinstance(fem, Fem):
-        return Setting(task, scene, theatre, PosedElements(fem, ball, at_once))
+        return TaskSetting(task, scene, theatre, PosedElements(fem, ball, at_once))
     assert ball is not None
-    return Setting(task, scene, theatre, CutElements(theatre.site, fem, ball))
+    return TaskSetting(task, scene, theatre, CutElements(theatre.site, fem, ball))
 
 
-def _touched(task: Task, scene: Scene, site: Site) -> Tissue:
+def _touched(task: GymTask, scene: Scene, site: Site) -> Tissue:
     """Return the tissue that a ball presses: the one with the largest volume within its radius of the goals' centre.
 
     Where tissue is cut away, it is the brain's.
@@ -192,7 +194,7 @@ def _touched(task: Task, scene: Scene, site: Site) -> Tissue:
     return tissue
 
 
-def _refusals(task: Task, scene: Scene, theatre: Theatre) -> dict[str, str | None]:
+def _refusals(task: GymTask, scene: Scene, theatre: Theatre) -> dict[str, str | None]:
     """Return, by name, why a trained model is not applicable; None if it is. For a ball, models of pushes apply too."""
     if task.cuts:
         return dict.fromkeys(theatre.models, "tissue is cut away, which no model learned")
@@ -207,7 +209,7 @@ def _refusals(task: Task, scene: Scene, theatre: Theatre) -> dict[str, str | Non
     return found
 
 
-def _say_none(task: Task, anatomy: str, physics: str, model: str | None, why: str | None) -> None:
+def _say_none(task: GymTask, anatomy: str, physics: str, model: str | None, why: str | None) -> None:
     """Report that no trained model is applicable, and why.
 
     Raises
@@ -234,7 +236,7 @@ def _theatre(anatomy: str, model: str | None, device: str) -> Theatre:
     return open_theatre(body, None if model is None else Path(model), device)
 
 
-def _shipped(task: Task) -> str | None:
+def _shipped(task: GymTask) -> str | None:
     return str(spatula_model_path()) if isinstance(task.tool, Blade) else None
 
 

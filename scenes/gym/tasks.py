@@ -44,7 +44,7 @@ class Goal:
 
 
 @dataclass(frozen=True)
-class Task:
+class GymTask:
     """Task of an environment; lengths in metres.
 
     Parameters
@@ -120,16 +120,16 @@ class Aspirator(Probe):
     lean: float = 0.1
 
 
-PALPATE = Task(
+PALPATE = GymTask(
     "palpate", "Press on the cortex over the tumour with the force that is asked for, and hold it.",
     Probe(radius=6e-3), force=0.25, pressure=2.7e3, amount=(0.06, 0.15), unit=0.25, tolerance=0.15, aside=3e-3, held=5,
 )  # fmt: skip
-RETRACT = Task(
+RETRACT = GymTask(
     "retract", "Lay a spatula on the cortex, draw it aside as far as is asked for, and hold it.",
     Blade(), force=0.5, pressure=4e3, amount=(1.5e-3, 3.5e-3), unit=5e-3, tolerance=0.15, aside=6e-3, held=5,
     forward=float(np.radians(30.0)),
 )  # fmt: skip
-DEBULK = Task(
+DEBULK = GymTask(
     "debulk", "Follow the tumour as it sinks, and suck it out share by share, without pressing on healthy tissue.",
     Aspirator(), force=0.02, pressure=2e3, amount=(3.0, 3.0), unit=3.0, tolerance=0.0, aside=4e-3, held=5,
     deepest=0.06, cuts=True,
@@ -138,7 +138,7 @@ TASKS = {task.name: task for task in (PALPATE, RETRACT, DEBULK)}
 """Tasks by name."""
 
 
-def find_task(name: object) -> Task:
+def find_task(name: object) -> GymTask:
     """A task by name.
 
     Raises

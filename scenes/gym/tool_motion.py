@@ -15,7 +15,7 @@ HIGHEST = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Hand:
+class RobotTool:
     """A tool in a robot's hand.
 
     Parameters
@@ -47,13 +47,13 @@ def frame_of(site: Site) -> np.ndarray:
     return np.column_stack([site.right, site.up, -site.axis])
 
 
-def laid(site: Site, tool: Instrument, tip: np.ndarray) -> Hand:
+def laid(site: Site, tool: Instrument, tip: np.ndarray) -> RobotTool:
     """A tool in its first posture, its lowest point at `tip` (3,) [m]."""
     turned = tool.pose(tip, site.axis, site.right)[:3, :3]
-    return Hand(tip - lever_of(tool) * site.axis, turned)
+    return RobotTool(tip - lever_of(tool) * site.axis, turned)
 
 
-def moved(hand: Hand, site: Site, tool: Instrument, twist: np.ndarray, tilt: float, deepest: float) -> Hand:
+def moved(hand: RobotTool, site: Site, tool: Instrument, twist: np.ndarray, tilt: float, deepest: float) -> RobotTool:
     """A tool after a twist (6,) [m, rad], in the frame of `frame_of`, about its own point.
 
     The bone stops it at the opening's edge. It goes no deeper than `deepest` [m] below the open cortex's middle. It
@@ -67,9 +67,9 @@ def moved(hand: Hand, site: Site, tool: Instrument, twist: np.ndarray, tilt: flo
     first = tool.pose(site.origin, site.axis, site.right)[:3, 2]
     if turned[:, 2] @ first < np.cos(tilt):
         turned = hand.turned
-    return Hand(place, np.asarray(turned))
+    return RobotTool(place, np.asarray(turned))
 
 
-def trembling(hand: Hand, offset: np.ndarray) -> Hand:
+def trembling(hand: RobotTool, offset: np.ndarray) -> RobotTool:
     """Return the pose shifted by (3,) [m]."""
     return replace(hand, place=hand.place + offset)

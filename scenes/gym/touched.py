@@ -41,7 +41,7 @@ class Touched:
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class TissueRequest:
     """Load on the tissue of one environment.
 
     Parameters
@@ -62,13 +62,13 @@ class Asked:
     done: int = 0
 
 
-class Answers(Protocol):
+class TissueModel(Protocol):
     """Model of the tissue's response to tools: trained, or FEM.
 
     On a GPU all requests are solved in one batch. On the CPU each is solved alone, so that results are the same byte
     for byte for any number of requests.
     """
 
-    def answer(self, asked: Sequence[Asked]) -> list[Touched]:
+    def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         """Compute the responses to requests, in their order."""
         ...

@@ -10,36 +10,36 @@ import numpy as np
 from scipy.stats import chi2
 
 from ar.overlay.gauge import Gauge
-from ar.tracking.pose import Pose, Tracked
+from ar.tracking.pose import Pose, TrackedTargets
 from ar.tracking.pose_stream import LONGEST, PoseStream
 from ar.tracking.registration import Registration
 
 from ..script.uncertainty import LEVEL
-from ..tracked.follower import LIMIT, UNCHECKED, UNKNOWN, Known, State, tip_covariance, wide_words
+from ..tracked.follower import LIMIT, UNCHECKED, UNKNOWN, TrackingResult, TumourState, tip_covariance, wide_words
 from ..tracked.picture import Painter
 from ..tracked.plausible import misplaced_tool
 from ..tracked.tool_motion import ToolMotion
 from ..tracked.tracked_tool import TrackedTool
 from .frame import stamp_of, time_of
-from .heard import Heard, Sent
+from .heard import ReceivedTransforms, Sent
 
 # # Minimum number of poses to estimate the camera's acceleration between them.
 EVEN = 3
 THEIRS = "are these its poses and registration?"
-NOT_SEEN = Tracked(0, {}, {}, {})
+NOT_SEEN = TrackedTargets(0, {}, {}, {})
 # Depth of the tool whose solution is timed at the start [m].
 PRESSED = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class CameraPlacement:
     """Camera pose T (4, 4) [m] in the reference's frame, and error of a position by the camera's motion [m]."""
 
     T: np.ndarray
     moved: float
 
 
-def placed_at(course: Sequence[Sent], now: float, stamp: int, place: np.ndarray, stale: float) -> Placed | str:
+def placed_at(course: Sequence[Sent], now: float, stamp: int, place: np.ndarray, stale: float) -> CameraPlacement | str:
     """Interpolate a camera's pose at an image's time stamp, from its poses, the newest last; or return a reason.
 
     Between two poses, and just after the newest, it is interpolated as by `PoseStream.at`. The error is the camera's
@@ -57,7 +57,7 @@ def placed_at(course: Sequence[Sent], now: float, stamp: int, place: np.ndarray,
         if between is not None:
             arm = float(np.linalg.norm(place - between.T_camera_target[:3, 3]))
             shift, turn = np.sqrt(np.diag(between.covariance)[[0, 3]])
-            return Placed(between.T_camera_target, float(shift + turn * arm))
+            return CameraPlacement(between.T_camera_target, float(shift + turn * arm))
     apart = abs(time - times[-1])
     if apart > stale:
         return f"no {{name}} within {stale:g} s of the image's time"
@@ -66,11 +66,11 @@ def placed_at(course: Sequence[Sent], now: float, stamp: int, place: np.ndarray,
     step = times[-1] - times[-2]
     here, there = (np.linalg.inv(T) @ np.append(place, 1.0) for T in poses[-1:-3:-1])
     way = float(np.linalg.norm((here - there)[:3]))
-    return Placed(body.T, way * apart / step if step > 0.0 else np.inf)
+    return CameraPlacement(body.T, way * apart / step if step > 0.0 else np.inf)
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class PoseResult:
     """Result for a pose.
 
     Parameters
@@ -84,12 +84,12 @@ class Answer:
     """
 
     stamp: int
-    known: Known
+    known: TrackingResult
     gauge: Gauge | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class CameraView:
     """Pose of the scan in a camera's frame: T_camera_scan (4, 4) [m].
 
     `moved` is the tumour's error [m] from the time between pose and image.
@@ -100,7 +100,7 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class Answering:
+class PoseResponder:
     """Solver for poses: a pure function of the received transforms, except for the start of an FEM solution.
 
     Parameters
@@ -120,7 +120,9 @@ class Answering:
     tracking: float
     registration: Registration | None = None
 
-    def answer(self, heard: Heard, now: float, moment: float, before: Known | None = None) -> Answer:
+    def answer(
+        self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
+    ) -> PoseResult:
         """Compute the result at a time `now` [s], from the result `before`; `moment` is now, in seconds since 1970."""
         registration = self._registration(heard)
         if isinstance(registration, str):
@@ -133,18 +135,18 @@ class Answering:
         pose = np.linalg.inv(registration.T_patient_scan) @ body.T @ self.tool.T_cube_tool
         spread = tip_covariance(registration, self.tool, beside)
         motion = self.motion.under(pose, spread, None if before is None else before.motion)
-        known = Known(
-            time_of(stamp), State.GOOD if motion.moved > 0.0 else State.REST, "", NOT_SEEN, motion, None, pose, spread
+        known = TrackingResult(
+            time_of(stamp), TumourState.GOOD if motion.moved > 0.0 else TumourState.REST, "", NOT_SEEN, motion, None, pose, spread
         )  # fmt: skip
         known = replace(known, seen=known.time, felt=moment, **self._doubts(known, before))
-        if known.state is State.UNKNOWN:
-            return Answer(stamp, known)
+        if known.state is TumourState.UNKNOWN:
+            return PoseResult(stamp, known)
         known = self._with_band(known, registration)
         if known.relied and registration.scanned is None:
-            known = replace(known, state=State.UNSURE, words=UNCHECKED)
+            known = replace(known, state=TumourState.UNSURE, words=UNCHECKED)
         stage = self.motion.stage
         gauge = Painter(stage, self.tool).gauge(known, stage.tumour(motion.positions))
-        return Answer(stamp, known, gauge)
+        return PoseResult(stamp, known, gauge)
 
     def measure(self) -> float:
         """Measure the time of one solution [s]: the tool 2 mm deep at the craniotomy, with kernels loaded before."""
@@ -155,7 +157,7 @@ class Answering:
         self.motion.under(pose, self.tracking**2 * np.eye(3))
         return clock.perf_counter() - begun
 
-    def camera(self, heard: Heard, now: float, stamp: int) -> Seen | str:
+    def camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
         """Return the scan's pose in the camera's frame for an image's time stamp, or why it is unknown at `now` [s]."""
         name = heard.names.camera
         registration, body = self._registration(heard), heard.beside(name, now)
@@ -165,9 +167,9 @@ class Answering:
         placed = placed_at(heard.course(name), now, stamp, middle[:3], heard.stale)
         if isinstance(placed, str):
             return placed.format(name=name)
-        return Seen(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.moved)
+        return CameraView(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.moved)
 
-    def _registration(self, heard: Heard) -> Registration | str:
+    def _registration(self, heard: ReceivedTransforms) -> Registration | str:
         """From the file, or as it was sent; or why there is none."""
         if self.registration is not None:
             return self.registration
@@ -176,19 +178,19 @@ class Answering:
             return f"no {heard.names.registration} yet"
         return Registration(np.linalg.inv(sent.T), np.zeros((6, 6)), np.zeros(3), 0.0, 0)
 
-    def _doubts(self, known: Known, before: Known | None) -> dict[str, object]:
+    def _doubts(self, known: TrackingResult, before: TrackingResult | None) -> dict[str, object]:
         """Return state, text and `near` of an unreliable result; only `near` of a reliable one."""
         near = before is not None and before.near
         assert known.T_scan_tool is not None
         doubt, near = misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, THEIRS)
         doubt = doubt or known.motion.doubt
         if doubt:
-            return {"state": State.UNSURE, "words": doubt, "near": near}
+            return {"state": TumourState.UNSURE, "words": doubt, "near": near}
         if not known.motion.known:
-            return {"state": State.UNKNOWN, "words": UNKNOWN, "near": near}
+            return {"state": TumourState.UNKNOWN, "words": UNKNOWN, "near": near}
         return {"near": near}
 
-    def _with_band(self, known: Known, registration: Registration) -> Known:
+    def _with_band(self, known: TrackingResult, registration: Registration) -> TrackingResult:
         """Add the bound on the tumour's error [m], and its parts by source, to a reliable result."""
         if not known.relied:
             return known
@@ -199,27 +201,27 @@ class Answering:
         band = float(np.hypot(registered, known.motion.error))
         return bounded(known, band, parts)
 
-    def _nothing(self, why: str, moment: float, before: Known | None) -> Answer:
+    def _nothing(self, why: str, moment: float, before: TrackingResult | None) -> PoseResult:
         """Nothing is known now, and why."""
         felt = None if before is None else before.felt
         near = before is not None and before.near
-        state = State.NO_TOOL if felt is None else State.STALE
+        state = TumourState.NO_TOOL if felt is None else TumourState.STALE
         motion = self.motion.rest if before is None else before.motion
-        return Answer(
-            stamp_of(moment), Known(moment, state, why, NOT_SEEN, motion, felt=felt, near=near)
+        return PoseResult(
+            stamp_of(moment), TrackingResult(moment, state, why, NOT_SEEN, motion, felt=felt, near=near)
         )  # fmt: skip
 
 
-def bounded(known: Known, band: float, parts: dict[str, float]) -> Known:
+def bounded(known: TrackingResult, band: float, parts: dict[str, float]) -> TrackingResult:
     """Add a bound [m] on the position, and its parts, to a result; beyond 5 mm it is unreliable."""
     if band <= LIMIT:
         return replace(known, band=band, parts=parts)
-    return replace(known, state=State.UNSURE, words=wide_words(band), band=None, parts={})
+    return replace(known, state=TumourState.UNSURE, words=wide_words(band), band=None, parts={})
 
 
-def late(answer: Answer, age: float, stale: float) -> Answer:
+def late(answer: PoseResult, age: float, stale: float) -> PoseResult:
     """Return the result for a pose of the given age [s]: stale if older than `stale`."""
-    if age <= stale or not (answer.known.relied or answer.known.state is State.UNSURE):
+    if age <= stale or not (answer.known.relied or answer.known.state is TumourState.UNSURE):
         return answer
     words = f"stale, the result is {age:.1f} s old: do not rely on it"
-    return replace(answer, known=replace(answer.known, state=State.STALE, words=words, band=None), gauge=None)
+    return replace(answer, known=replace(answer.known, state=TumourState.STALE, words=words, band=None), gauge=None)

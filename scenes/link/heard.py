@@ -22,7 +22,7 @@ KEPT = 32
 
 
 @dataclass(frozen=True)
-class Names:
+class TransformNames:
     """Device names of the transforms that are listened to, each AToB: it takes places in A's frame to B's.
 
     Where tool or camera end in another frame than the patient's reference, they end in that of the tracker, as
@@ -56,7 +56,7 @@ class Sent:
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
+class ReceivedTransforms:
     """The newest transforms by name.
 
     Parameters
@@ -69,12 +69,12 @@ class Heard:
         The newest, and some before them, the oldest first.
     """
 
-    names: Names
+    names: TransformNames
     stale: float
     sent: Mapping[str, Sent] = field(default_factory=dict)
     earlier: Mapping[str, tuple[Sent, ...]] = field(default_factory=dict)
 
-    def hearing(self, name: str, matrix: np.ndarray, stamp: int, now: float, sender: int) -> Heard:
+    def hearing(self, name: str, matrix: np.ndarray, stamp: int, now: float, sender: int) -> ReceivedTransforms:
         """With a transform (4, 4) [mm] of one client.
 
         Raises

@@ -41,7 +41,7 @@ class Code(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class SentMesh:
     """Triangles (m, 3) of a surface whose points move, as they are sent.
 
     The bytes of the triangles are made once.
@@ -51,18 +51,18 @@ class Mesh:
     cells: bytes
 
     @staticmethod
-    def of(triangles: np.ndarray) -> Mesh:
+    def of(triangles: np.ndarray) -> SentMesh:
         """From vertex numbers (m, 3)."""
         rows = np.full((len(triangles), 4), 3, WHOLES)
         rows[:, 1:] = triangles
-        return Mesh(len(triangles), rows.tobytes())
+        return SentMesh(len(triangles), rows.tobytes())
 
 
-NOTHING = Mesh(0, b"")
+NOTHING = SentMesh(0, b"")
 """A surface that is not known."""
 
 
-def polydata(points: np.ndarray, mesh: Mesh) -> bytes:
+def polydata(points: np.ndarray, mesh: SentMesh) -> bytes:
     """POLYDATA: points (n, 3) [mm] and the triangles between them."""
     head = struct.pack(">10I", len(points), 0, 0, 0, 0, mesh.count, len(mesh.cells), 0, 0, 0)
     return head + np.ascontiguousarray(points, FLOATS).tobytes() + mesh.cells

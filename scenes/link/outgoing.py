@@ -13,10 +13,10 @@ from sim.geometry.closest_point import closest
 from sim.geometry.locate import Located, locate
 
 from ..play.stage import Stage
-from ..tracked.follower import Known, State
-from .answer import Answer
+from ..tracked.follower import TrackingResult, TumourState
+from .answer import PoseResult
 from .frame import BadMessageError, framed
-from .messages import NOTHING, Code, Mesh, points, polydata, status, string, transform
+from .messages import NOTHING, Code, SentMesh, points, polydata, status, string, transform
 
 # A place that is asked for belongs to tumour or open cortex where the scan has it no farther from them [m].
 BESIDE = 2e-3
@@ -31,7 +31,7 @@ ON = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class SentPlaces:
     """Places in or on the tumour, or on open cortex.
 
     Parameters
@@ -64,11 +64,11 @@ class Outgoing:
     registered: bool = True
 
     @cached_property
-    def _surfaces(self) -> tuple[tuple[str, np.ndarray, Mesh], ...]:
+    def _surfaces(self) -> tuple[tuple[str, np.ndarray, SentMesh], ...]:
         """Name, vertices and triangles of the tumour, and of the open cortex."""
         cortex, faces = np.unique(self.stage.anatomy.open_surface, return_inverse=True)
-        tumour = Mesh.of(self.stage.tumour_at_rest.triangles)
-        return ("Tumour", self.stage.tumour_vertices, tumour), ("Cortex", cortex, Mesh.of(faces.reshape(-1, 3)))
+        tumour = SentMesh.of(self.stage.tumour_at_rest.triangles)
+        return ("Tumour", self.stage.tumour_vertices, tumour), ("Cortex", cortex, SentMesh.of(faces.reshape(-1, 3)))
 
     def scan(self, stamp: int) -> bytes:
         """The tumour as the scan has it."""
@@ -76,7 +76,7 @@ class Outgoing:
         at = self.stage.anatomy.mesh.nodes[vertices]
         return framed("POLYDATA", "TumourInScan", polydata(1e3 * at, mesh), stamp)
 
-    def messages(self, answer: Answer, places: Places | None = None) -> tuple[bytes, ...]:
+    def messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """Build all messages of a result, with its stamp: unknown surfaces are sent without points."""
         known, stamp = answer.known, answer.stamp
         none = polydata(np.empty((0, 3)), NOTHING)
@@ -84,7 +84,7 @@ class Outgoing:
         for name, vertices, mesh in self._surfaces:
             here = _follows(known, vertices)
             body = polydata(1e3 * known.motion.positions[vertices], mesh) if here else none
-            for word, shown in (("Now", known.relied), ("Doubtful", known.state is State.UNSURE)):
+            for word, shown in (("Now", known.relied), ("Doubtful", known.state is TumourState.UNSURE)):
                 out.append(framed("POLYDATA", f"{name}{word}", body if shown else none, stamp))
         if known.relied:
             rest, now = (each[self.stage.tumour_vertices] for each in (self._rest, known.motion.positions))
@@ -93,18 +93,18 @@ class Outgoing:
         out.append(framed("STRING", "TumourMotion", string(self._motion_words(known)), stamp))
         if places is not None:
             body = self._points(known, places)
-            for word, shown in (("Now", known.relied), ("Doubtful", known.state is State.UNSURE)):
+            for word, shown in (("Now", known.relied), ("Doubtful", known.state is TumourState.UNSURE)):
                 out.append(framed("POINT", f"Points{word}", body if shown else b"", stamp))
         return tuple(out)
 
-    def status(self, answer: Answer, refused: str) -> bytes:
+    def status(self, answer: PoseResult, refused: str) -> bytes:
         """Build the STATUS of a result, with the number of rejected messages by reason."""
         known = answer.known
         code = Code.OK if known.relied else Code.NOT_READY
         words = known.words or f"the tumour is known, {known.state.value}"
         return framed("STATUS", "Sulcus", status(code, f"{words}{refused}"), answer.stamp)
 
-    def placed(self, names: list[str], at: np.ndarray) -> Places:
+    def placed(self, names: list[str], at: np.ndarray) -> SentPlaces:
         """Attach points of the scan (n, 3) [m]: to the tumour's volume if inside, else to the nearest surface.
 
         Raises
@@ -129,7 +129,7 @@ class Outgoing:
         good = np.flatnonzero(away <= BESIDE)
         if not len(good):
             raise BadMessageError(f"{STRANGE}: {strange}")
-        return Places(tuple(names[row] for row in good), at[good], vertices[good], weights[good], strange)
+        return SentPlaces(tuple(names[row] for row in good), at[good], vertices[good], weights[good], strange)
 
     def _in_tumour(self, held: Located, at: np.ndarray) -> np.ndarray:
         """Return True for each point (n, 3) [m] in tetrahedra of the tumour."""
@@ -141,7 +141,7 @@ class Outgoing:
     def _rest(self) -> np.ndarray:
         return self.stage.anatomy.mesh.nodes
 
-    def _points(self, known: Known, places: Places) -> bytes:
+    def _points(self, known: TrackingResult, places: SentPlaces) -> bytes:
         """Build the POINT message of the positions of those points that the result covers."""
         moved = (known.motion.positions - self._rest)[places.vertices]
         at = 1e3 * (places.rest + np.einsum("nk,nkd->nd", places.weights, moved))
@@ -149,7 +149,7 @@ class Outgoing:
         here = np.flatnonzero((np.isin(places.vertices, nodes) | (places.weights <= 0.0)).all(axis=1))
         return points([places.names[row] for row in here], at[here])
 
-    def _distance_words(self, answer: Answer) -> str:
+    def _distance_words(self, answer: PoseResult) -> str:
         """The distance from tip to tumour with its error and what that is of; or why it is not known."""
         known, gauge = answer.known, answer.gauge
         if gauge is None:
@@ -157,7 +157,7 @@ class Outgoing:
         inside = "inside the tumour, its edge " if gauge.inside else ""
         return f"{inside}{millimetres(gauge.distance, gauge.error)} (95 %; {self._of}){_but(known)}"
 
-    def _motion_words(self, known: Known) -> str:
+    def _motion_words(self, known: TrackingResult) -> str:
         """Describe the tumour's displacement, with its error and sources; or why it is unknown."""
         if known.band is None:
             return f"not known: {known.words}"
@@ -172,7 +172,7 @@ class Outgoing:
         return "of tracking and model; not known of registration, tissue and segmentation"
 
 
-def _but(known: Known) -> str:
+def _but(known: TrackingResult) -> str:
     """Describe why numbers are unreliable; empty if they are reliable."""
     return "" if known.relied else f"; doubtful: {known.words}"
 
@@ -183,7 +183,7 @@ def _listed(names: list[str]) -> str:
     return ", ".join(names[:MOST_NAMED]) + (f" and {others} others" if others > 0 else "")
 
 
-def _follows(known: Known, vertices: np.ndarray) -> bool:
+def _follows(known: TrackingResult, vertices: np.ndarray) -> bool:
     """Return True if the motion of these vertices is known."""
     answer = known.motion.answer
     return answer is not None and bool(np.isin(vertices, answer.nodes).all())

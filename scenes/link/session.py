@@ -15,15 +15,15 @@ import numpy as np
 
 from ar.optics.calibration import Calibration
 
-from ..tracked.follower import Known, State, across
+from ..tracked.follower import TrackingResult, TumourState, across
 from ..tracked.picture import Painter
-from .answer import Answer, Seen, bounded, late
+from .answer import CameraView, PoseResult, bounded, late
 from .clients import Clients
 from .console import address_words
 from .frame import BadMessageError, Header, framed, stamp_of
-from .heard import Heard, check_status
+from .heard import ReceivedTransforms, check_status
 from .messages import IMAGE, POINT, Code, image, read_image, read_points, read_position, read_transform, status
-from .outgoing import MOST_PLACES, STRANGE, Places
+from .outgoing import MOST_PLACES, STRANGE, SentPlaces
 
 # # Intervals [s]: check of missing input, unchanged STATUS, new attempt to connect to a server.
 TICK, BEAT, AGAIN = 0.1, 1.0, 1.0
@@ -39,53 +39,55 @@ Picture = tuple[np.ndarray, int]
 """Colours (H, W, 3) uint8, and a time stamp."""
 
 
-class Answers(Protocol):
+class PoseResponderLike(Protocol):
     """Interface of a solver for poses."""
 
-    def answer(self, heard: Heard, now: float, moment: float, before: Known | None = None) -> Answer:
+    def answer(
+        self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
+    ) -> PoseResult:
         """Compute the result, as `Answering.answer`."""
         ...
 
-    def camera(self, heard: Heard, now: float, stamp: int) -> Seen | str:
+    def camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
         """Return the scan's pose, as `Answering.camera`."""
         ...
 
 
-class Speaks(Protocol):
+class MessageWriter(Protocol):
     """Interface of an encoder of results."""
 
     def scan(self, stamp: int) -> bytes:
         """Build the scan's message, as `Outgoing.scan`."""
         ...
 
-    def messages(self, answer: Answer, places: Places | None = None) -> tuple[bytes, ...]:
+    def messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """Build the messages, as `Outgoing.messages`."""
         ...
 
-    def status(self, answer: Answer, refused: str) -> bytes:
+    def status(self, answer: PoseResult, refused: str) -> bytes:
         """Build the STATUS, as `Outgoing.status`."""
         ...
 
-    def placed(self, names: list[str], at: np.ndarray) -> Places:
+    def placed(self, names: list[str], at: np.ndarray) -> SentPlaces:
         """Attach points, as `Outgoing.placed`."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
-class Eye:
+class OverlayCamera:
     """Overlay of a camera's images; `tracking` is the standard deviation of its position along each axis [m]."""
 
     calibration: Calibration
     painter: Painter
     tracking: float
 
-    def painted(self, colour: np.ndarray, known: Known, seen: Seen | str) -> np.ndarray:
+    def painted(self, colour: np.ndarray, known: TrackingResult, seen: CameraView | str) -> np.ndarray:
         """Draw a result on an image (H, W, 3) uint8.
 
         If the scan's pose in the camera's frame is unknown, only the reason is drawn.
         """
         if isinstance(seen, str):
-            known = replace(known, state=State.NO_REFERENCE, words=f"{seen}: nothing is drawn")
+            known = replace(known, state=TumourState.NO_REFERENCE, words=f"{seen}: nothing is drawn")
             return self.painter.paint(colour, known).colour
         T = seen.T_camera_scan
         if known.band is not None:
@@ -96,7 +98,7 @@ class Eye:
         return self.painter.paint(colour, replace(known, camera=self.calibration.camera(T))).colour
 
 
-class Session:
+class LinkSession:
     """Live link that receives poses, computes results, and publishes them.
 
     All but `_computed` and the drawing belongs to the event loop's thread.
@@ -117,10 +119,10 @@ class Session:
 
     def __init__(
         self,
-        answers: Answers,
-        speaks: Speaks,
-        heard: Heard,
-        eye: Eye | None = None,
+        answers: PoseResponderLike,
+        speaks: MessageWriter,
+        heard: ReceivedTransforms,
+        eye: OverlayCamera | None = None,
         most: int = 16,
         note: Callable[[str], None] = lambda line: None,
     ) -> None:
@@ -128,8 +130,8 @@ class Session:
         self._note = note
         self._answers, self._speaks, self._heard, self._eye = answers, speaks, heard, eye
         self._others: dict[str, None] = {}
-        self._places: Places | None = None
-        self._states: set[State] = set()
+        self._places: SentPlaces | None = None
+        self._states: set[TumourState] = set()
         self._loop = asyncio.get_running_loop()
         self._solved = self._shown = answers.answer(heard, self._loop.time(), clock.time())
         # Arrival of the pose that was solved last, and start of the solution that is being computed [s].
@@ -230,36 +232,38 @@ class Session:
                 self.clients.publish("status", (self._speaks.status(answer, self._refused_words(known)),))
             await asyncio.sleep(TICK)
 
-    def _current(self, now: float) -> Answer:
+    def _current(self, now: float) -> PoseResult:
         """Return the last solution, or the reason why none holds at a time [s]; the solver is not called."""
         if isinstance(self._heard.beside(self._heard.names.tool, now), str):
             return self._answers.answer(self._heard, now, clock.time(), self._shown.known)
         answer, waited = late(self._solved, now - self._arrived, self._heard.stale), now - self._begun
-        if answer is self._solved and answer.known.state in (State.NO_TOOL, State.STALE) and waited > BEAT:
+        if answer is self._solved and answer.known.state in (TumourState.NO_TOOL, TumourState.STALE) and waited > BEAT:
             return replace(answer, known=replace(answer.known, words=f"no solution yet, computing for {waited:.0f} s"))
         return answer
 
-    def _computed(self, heard: Heard, places: Places | None, now: float) -> tuple[Answer, tuple[bytes, ...]]:
+    def _computed(
+        self, heard: ReceivedTransforms, places: SentPlaces | None, now: float
+    ) -> tuple[PoseResult, tuple[bytes, ...]]:
         """Compute a result and its messages, in the solver's thread."""
         answer = self._answers.answer(heard, now, clock.time(), self._shown.known)
         return answer, self._speaks.messages(answer, places)
 
-    def _show(self, answer: Answer, messages: tuple[bytes, ...]) -> None:
+    def _show(self, answer: PoseResult, messages: tuple[bytes, ...]) -> None:
         self._shown = answer
         if answer.known.state not in self._states:
             self._states.add(answer.known.state)
             self._note(f"the tumour is {_found(answer.known)}")
         self.clients.publish("answer", messages)
 
-    def _refused_words(self, known: Known) -> str:
+    def _refused_words(self, known: TrackingResult) -> str:
         """Describe rejected messages, and other received transforms if the wanted one does not arrive."""
         parts = [f"{number} {why}" for why, number in self.clients.refused.most_common(MOST_OTHERS)]
         words = f"; rejected: {', '.join(parts)}" if parts else ""
-        if self._others and known.state in (State.NO_TOOL, State.STALE):
+        if self._others and known.state in (TumourState.NO_TOOL, TumourState.STALE):
             words += f"; other transforms received: {', '.join(self._others)}"
         return words
 
-    async def _drawing(self, eye: Eye, thread: ThreadPoolExecutor) -> None:
+    async def _drawing(self, eye: OverlayCamera, thread: ThreadPoolExecutor) -> None:
         """Draw into the newest image, repeatedly."""
         while True:
             await self._pictured.wait()
@@ -315,8 +319,8 @@ class Session:
             self._posed.set()
 
 
-def _found(known: Known) -> str:
+def _found(known: TrackingResult) -> str:
     """Describe the state of the tumour, for a console."""
     if known.relied:
         return f"known, {known.state.value}"
-    return f"{'doubtful' if known.state is State.UNSURE else 'not known'}: {known.words}"
+    return f"{'doubtful' if known.state is TumourState.UNSURE else 'not known'}: {known.words}"

@@ -26,9 +26,7 @@ def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None
     group.add_argument(
         "--size", type=size, metavar="WxH", help="scale the calibration of --camera to images of this size [pixel]"
     )
-    group.add_argument(
-        "--path", choices=PATHS, default=path, help=f"camera motion (default: {path or 'none'})"
-    )
+    group.add_argument("--path", choices=PATHS, default=path, help=f"camera motion (default: {path or 'none'})")
     group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held (default: %(default)s)")
     group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
     from ar.tracking.pose_stream import Clock, PoseStream
 
-    from ..tracked.elsewhere import Elsewhere
+    from ..tracked.elsewhere import ExternalTracker
 
 AUTO = "auto"
 
@@ -74,7 +74,7 @@ def _clock(words: list[str]) -> tuple[float, float]:
     return offset, error
 
 
-def elsewhere_of(args: argparse.Namespace, calibration: Calibration) -> Elsewhere | None:
+def elsewhere_of(args: argparse.Namespace, calibration: Calibration) -> ExternalTracker | None:
     """The other tracker's poses; None where none are asked for.
 
     Raises
@@ -83,7 +83,7 @@ def elsewhere_of(args: argparse.Namespace, calibration: Calibration) -> Elsewher
         Files that cannot be read; clocks that cannot be compared.
     """
     from ..tracked.calibration_file import read_hand_eye
-    from ..tracked.elsewhere import Elsewhere, Eye
+    from ..tracked.elsewhere import CameraMount, ExternalTracker
     from ..tracked.pose_file import read_stream
 
     if args.poses is None:
@@ -92,13 +92,13 @@ def elsewhere_of(args: argparse.Namespace, calibration: Calibration) -> Elsewher
     eye = None
     if args.hand_eye is not None:
         body = None if args.camera_poses is None else read_stream(args.camera_poses)
-        eye = Eye(*read_hand_eye(args.hand_eye), body)
-    elsewhere = Elsewhere(tool, patient, _clock_of(args, calibration, tool, patient), eye)
+        eye = CameraMount(*read_hand_eye(args.hand_eye), body)
+    elsewhere = ExternalTracker(tool, patient, _clock_of(args, calibration, tool, patient), eye)
     _say_apart(args, elsewhere)
     return elsewhere
 
 
-def _say_apart(args: argparse.Namespace, elsewhere: Elsewhere) -> None:
+def _say_apart(args: argparse.Namespace, elsewhere: ExternalTracker) -> None:
     """Report the times of poses and images, if the video begins outside the poses."""
     from ar.tracking.pictures import film_of
 

@@ -130,12 +130,20 @@ def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
         "--mask, the brain of any healthy head, with --t1 if you like",
     )
     drawn.add_argument(
-        "--brain-ml", type=float, metavar="ML", help="volume to which the brain is scaled [ml] (default: 1470; with --mask, its own)"
+        "--brain-ml",
+        type=float,
+        metavar="ML",
+        help="volume to which the brain is scaled [ml] (default: 1470; with --mask, its own)",
     )
     drawn.add_argument(
-        "--radius", type=float, metavar="MM", help="radius of the tumour [mm]; if lobed, of a ball of equal volume (default: 12)"
+        "--radius",
+        type=float,
+        metavar="MM",
+        help="radius of the tumour [mm]; if lobed, of a ball of equal volume (default: 12)",
     )
-    drawn.add_argument("--cover", type=float, metavar="MM", help="distance from the cortex to the top of the tumour [mm] (default: 10)")
+    drawn.add_argument(
+        "--cover", type=float, metavar="MM", help="distance from the cortex to the top of the tumour [mm] (default: 10)"
+    )
     drawn.add_argument("--tumour-shape", choices=("sphere", "lobed"), help="shape of the tumour (default: sphere)")
     drawn.add_argument("--site", choices=tuple(SITES), help="region of the cortex above the tumour (default: central)")
     drawn.add_argument(

@@ -12,17 +12,17 @@ from sim.deformation import Deformation, Deformer
 from ..play.deformers import GUARDED, Theatre
 from ..play.effect_ablation import without
 from ..play.player import Player
-from ..play.replay import Session
+from ..play.replay import ReplaySession
 from ..play.stage import Stage
 from ..script.camera_paths import PATHS
 from ..script.scene import Scene
-from .referee import Question, Referee, Truth
+from .referee import FemResult, FemWorker, Question
 
 ALL: frozenset[str] = frozenset()
 """Disabled effects when all effects are active."""
 
 
-class Cast:
+class SceneSolvers:
     """Stages, models and FEM solvers of one scene, with all its effects or without some.
 
     `playable` is true if one of them is ready to compute.
@@ -42,10 +42,10 @@ class Cast:
         self.players: dict[tuple[str, frozenset[str]], Player] = {}
         self.filmed: dict[tuple[frozenset[str], str], Stage] = {}
         self.last: dict[str, Deformation] = {}
-        self.sessions: dict[str, Session] = {}
-        self.solvers: dict[frozenset[str], Referee] = {}
+        self.sessions: dict[str, ReplaySession] = {}
+        self.solvers: dict[frozenset[str], FemWorker] = {}
         # The finite elements that are asked for what is shown next, and their question.
-        self.seeking: tuple[Referee, Question] | None = None
+        self.seeking: tuple[FemWorker, Question] | None = None
         self.playable = deformer != "fem"
         if self.playable:
             self.player(deformer)
@@ -59,10 +59,10 @@ class Cast:
             self.stages[off] = replace(self.stages[ALL], scene=scene)
         return self.stages[off]
 
-    def solver(self, off: frozenset[str] = ALL) -> Referee:
+    def solver(self, off: frozenset[str] = ALL) -> FemWorker:
         """The finite elements of the scene without some effects."""
         if off not in self.solvers:
-            self.solvers[off] = Referee(self.theatre, self.stage(off).scene, self.turn)
+            self.solvers[off] = FemWorker(self.theatre, self.stage(off).scene, self.turn)
         return self.solvers[off]
 
     def player(self, name: str, off: frozenset[str] = ALL) -> Player:
@@ -94,23 +94,25 @@ class Cast:
         with self.turn if name == GUARDED else nullcontext():
             return replace(self.theatre, device="cpu").deformer(name, scene)
 
-    def predicted(self, name: str, question: Question) -> Truth:
+    def predicted(self, name: str, question: Question) -> FemResult:
         """Compute a trained model's solution; its FEM fallback starts from the last one.
 
         A model that integrates its tissue in time computes the previous frames first.
         """
         begun, player = clock.perf_counter(), self.player(name)
         if player.follows:
-            session = self.sessions.setdefault(name, Session(player))
+            session = self.sessions.setdefault(name, ReplaySession(player))
             number, answer = session.towards(*question)
             while number != question[0]:
                 number, answer = session.towards(*question)
-            return Truth(number, player.loads(*question), answer, clock.perf_counter() - begun, question)
+            return FemResult(number, player.loads(*question), answer, clock.perf_counter() - begun, question)
         loads = player.loads(*question)
         answer = self.last[name] = player.answer(loads, self.last.get(name))
-        return Truth(question[0], loads, answer, clock.perf_counter() - begun, question)
+        return FemResult(question[0], loads, answer, clock.perf_counter() - begun, question)
 
-    def solved(self, off: frozenset[str], question: Question, seen: Truth | None, patience: float) -> Truth | None:
+    def solved(
+        self, off: frozenset[str], question: Question, seen: FemResult | None, patience: float
+    ) -> FemResult | None:
         """Return the FEM solution of a frame, or of one on the way to it. The solver is started if necessary.
 
         Parameters
@@ -137,7 +139,7 @@ class Cast:
         self.playable = self.playable or solver.player is not None
         return truth
 
-    def _seek(self, solver: Referee, question: Question) -> None:
+    def _seek(self, solver: FemWorker, question: Question) -> None:
         """Ask for what is shown next; what was asked before is not wanted any more."""
         if self.seeking is not None and self.seeking[0] is not solver:
             self.seeking[0].drop()
@@ -150,7 +152,7 @@ class Cast:
             self.seeking[0].drop()
             self.seeking = None
 
-    def dismiss(self) -> list[Referee]:
+    def dismiss(self) -> list[FemWorker]:
         """Stop the finite elements, without waiting for the steps in hand; returns those that have one."""
         for solver in self.solvers.values():
             solver.dismiss()

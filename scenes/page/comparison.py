@@ -18,13 +18,13 @@ from ..play.frame_text import doubt_of
 from ..play.player import Frame, Player
 from ..play.tip_reading import measured
 from ..script.tool_paths import lifted
-from .referee import Truth
+from .referee import FemResult
 
 OWN, TRUTH = "this is the result of the FEM solver", "the truth is the result of the FEM solver"
 
 
 @dataclass(frozen=True)
-class Judged:
+class Comparison:
     """Error of a deformer relative to an FEM solution: mean and maximum, and the motion [m].
 
     doubt is the reason why the FEM solution is unreliable. mean and largest are None if the shown solution is by FEM.
@@ -40,7 +40,7 @@ class Judged:
     distance: float | None = None
 
 
-def judge(truth: Truth, player: Player, own: bool, shown: Deformation | None = None) -> Judged:
+def judge(truth: FemResult, player: Player, own: bool, shown: Deformation | None = None) -> Comparison:
     """Compare a deformer with an FEM solution, for the same loads.
 
     `shown` is the deformer's solution of these loads, if it depends on previous ones.
@@ -57,10 +57,10 @@ def judge(truth: Truth, player: Player, own: bool, shown: Deformation | None = N
     lift = lifted(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
     gauge = measured(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
     distance = None if gauge is None else gauge.distance
-    return Judged(truth.number, truth.seconds, doubt_of(truth.deformation.outcome[0]), motion, *off, distance)
+    return Comparison(truth.number, truth.seconds, doubt_of(truth.deformation.outcome[0]), motion, *off, distance)
 
 
-def verdict_words(judged: Judged | None, stale: bool, waits: str, own: str = OWN) -> str:
+def verdict_words(judged: Comparison | None, stale: bool, waits: str, own: str = OWN) -> str:
     """Format the comparison; that of a previous load is greyed and marked, with the state of the FEM solver.
 
     `own` is the text for a solution by FEM itself.
@@ -79,7 +79,7 @@ def verdict_words(judged: Judged | None, stale: bool, waits: str, own: str = OWN
     return f"<p>{said}; {tail}</p>"
 
 
-def changed(truth: Truth, player: Player, shown: Deformation, off: Sequence[str]) -> str:
+def changed(truth: FemResult, player: Player, shown: Deformation, off: Sequence[str]) -> str:
     """Describe the tumour's distance from its position under all effects, for a solution without some."""
     nodes = player.stage.at(truth.loads).anatomy.tumour_nodes
     apart = truth.deformation.at(nodes).displacement[0] - shown.at(nodes).displacement[0]
@@ -90,7 +90,7 @@ def changed(truth: Truth, player: Player, shown: Deformation, off: Sequence[str]
 
 
 @dataclass
-class Moment:
+class PageState:
     """State of the page: the request, its solution, the frame, and the FEM comparison.
 
     `goal` is the request that the frame is on the way to, `asked` the one that it fulfils, `look` the display style.
@@ -98,16 +98,16 @@ class Moment:
 
     goal: tuple | None = None
     asked: tuple | None = None
-    shown: Truth | None = None
+    shown: FemResult | None = None
     rests: bool = False
     look: tuple[Style, str, str] | None = None
     load: str = ""
     frame: Frame | None = None
     picture: np.ndarray | None = None
-    truth: Truth | None = None
-    own: Truth | None = None
+    truth: FemResult | None = None
+    own: FemResult | None = None
     by: tuple | None = None
-    judged: Judged | None = None
+    judged: Comparison | None = None
     stale: bool | None = None
     plan: tuple[str, ...] | None = None
 
@@ -117,7 +117,7 @@ RECENT = 120
 
 
 @dataclass(frozen=True)
-class Row:
+class ComparisonRow:
     """A deformer's medians over `loads` loads; `best` where no other equals or beats it in both. None: no ranking."""
 
     name: str
@@ -127,7 +127,7 @@ class Row:
     best: bool | None
 
 
-class Tally:
+class AccuracyTimeTable:
     """Milliseconds and mean distance from the finite elements, by deformer and load."""
 
     def __init__(self) -> None:
@@ -143,7 +143,7 @@ class Tally:
         _keep(self._missed.setdefault(name, {}), load, 1e3 * metres)
 
     @property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ComparisonRow]:
         """The deformers of which both are known, fastest first.
 
         Where all of them were shown some of the same loads, those alone count, and the rows are ranked. Otherwise each
@@ -155,7 +155,7 @@ class Tally:
         places = {name: self._place(name, common or loads) for name, loads in known.items()}
         best = unbeaten(places) if common else None
         return [
-            Row(name, *place, len(common or known[name]), None if best is None else name in best)
+            ComparisonRow(name, *place, len(common or known[name]), None if best is None else name in best)
             for name, place in sorted(places.items(), key=lambda item: item[1])
         ]
 

@@ -10,7 +10,7 @@ import numpy as np
 from ar.overlay.hud import bearings
 from ar.overlay.styles import STYLES, Style
 from ar.page.elements import STYLE
-from ar.page.parts import Choice, Fold, Note, Slider, Toggle
+from ar.page.parts import Dropdown, Fold, Note, Slider, Toggle
 from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, Resection, Slide, remember
 
 from ..script.camera_paths import PATHS
@@ -18,7 +18,7 @@ from ..script.scene import SCENES, Scene
 from ..script.site import Site
 from ..script.tool_paths import AIR, Touch
 from .beside import TIP, TUMOUR_MIDDLE
-from .requests import HAND, SCRIPT, Wish
+from .requests import HAND, SCRIPT, Requests
 from .text import effect_words
 
 MOST_FORCE, MOST_DEPTH, MOST_TILT = 0.4, 8.0, 40.0
@@ -42,13 +42,13 @@ def controls(
     scene: Scene,
     site: Site,
     names: tuple[str, ...],
-    wish: Wish,
+    wish: Requests,
     give: Callable[[str], None],
     take: Callable[..., None],
-) -> list[Slider | Choice | Toggle | Fold | Note]:
+) -> list[Slider | Dropdown | Toggle | Fold | Note]:
     """Build all controls of a scene that these deformers support.
 
-    `give` receives who gets the tool, `take` numbers of its touch, as `Wish.hand` does.
+    `give` receives who gets the tool, `take` numbers of its touch, as `Requests.hand` does.
     """
     cameras = "scene default", STAYS, *PATHS
 
@@ -62,8 +62,8 @@ def controls(
     slices = through(wish.through, lambda name: wish.set(through=name))
     scenes = SCENES if scene.name in SCENES else (scene.name, *SCENES)
     return [
-        Choice("scene", scenes, scene.name, lambda name: wish.set(scene=name), hint="what happens to the brain"),
-        Choice(
+        Dropdown("scene", scenes, scene.name, lambda name: wish.set(scene=name), hint="what happens to the brain"),
+        Dropdown(
             "deformer",
             names,
             wish.deformer,
@@ -72,7 +72,7 @@ def controls(
             "fem: finite elements, solved each time; the others: models that were trained on them",
         ),
         overlays(wish.style, lambda style: wish.set(style=style)),
-        Choice("camera", cameras, wish.path or cameras[0], film, hint="how the camera moves"),
+        Dropdown("camera", cameras, wish.path or cameras[0], film, hint="how the camera moves"),
         *([] if scene.tool is None else [*hand(scene, site, wish, give, take), slices]),
         *([Fold("physics effects (on/off)", switches)] if switches else []),
         Note(PLAN),
@@ -80,19 +80,19 @@ def controls(
     ]
 
 
-def overlays(now: Style, choose: Callable[[Style], None]) -> Choice:
+def overlays(now: Style, choose: Callable[[Style], None]) -> Dropdown:
     """Build the choice of overlay styles."""
     styles: dict[str, Style] = {words: style for style, words in STYLES.items()}
-    return Choice(
+    return Dropdown(
         "overlay", tuple(styles), STYLES[now], lambda words: choose(styles[words]), hint="how it is drawn", key=STYLE
     )
 
 
-def through(now: str, choose: Callable[[str], None]) -> Choice:
+def through(now: str, choose: Callable[[str], None]) -> Dropdown:
     """Build the choice of slice positions."""
     places = TUMOUR_MIDDLE, TIP
     hint = "position of the scan slices (tab slices)"
-    return Choice("slices", places, now or places[0], choose, hint=hint)
+    return Dropdown("slices", places, now or places[0], choose, hint=hint)
 
 
 def switched(scene: Scene, site: Site) -> list[str]:
@@ -109,8 +109,8 @@ def clocked(scene: Scene, site: Site) -> bool:
 
 
 def hand(
-    scene: Scene, site: Site, wish: Wish, give: Callable[[str], None], take: Callable[..., None]
-) -> list[Slider | Choice]:
+    scene: Scene, site: Site, wish: Requests, give: Callable[[str], None], take: Callable[..., None]
+) -> list[Slider | Dropdown]:
     """Build the controls of the tool: who holds it, and its position within the opening, in patient directions."""
     assert scene.tool is not None
     room = max(0.5, np.floor(2e3 * (site.clearance - scene.tool.radius)) / 2.0)
@@ -132,7 +132,7 @@ def hand(
         )
         for way, _, side in ways
     )  # fmt: skip
-    return [Choice("tool", (SCRIPT, HAND), SCRIPT, give, hint=HANDS), strength(scene, wish, take), *places, *tilts]
+    return [Dropdown("tool", (SCRIPT, HAND), SCRIPT, give, hint=HANDS), strength(scene, wish, take), *places, *tilts]
 
 
 def slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
@@ -143,7 +143,7 @@ def slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
     return {label: round(float(value), 2) for label, value in (strong | places | tilts).items()}
 
 
-def strength(scene: Scene, wish: Wish, take: Callable[..., None]) -> Slider:
+def strength(scene: Scene, wish: Requests, take: Callable[..., None]) -> Slider:
     """Build the slider of the force, or of the depth of a posed tool."""
     touch = wish.touch
     if scene.posed:

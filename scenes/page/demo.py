@@ -25,11 +25,11 @@ from ..play.waiting_notice import Busy
 from ..script.scene import Scene, find_scene
 from ..script.tool_paths import Touch
 from .beside import lines_of, sample_of, slices_of
-from .cast import Cast
-from .comparison import OWN, TRUTH, Moment, Tally, changed, judge, verdict_words
+from .cast import SceneSolvers
+from .comparison import OWN, TRUTH, AccuracyTimeTable, PageState, changed, judge, verdict_words
 from .controls import PLAN, clocked, controls, slider_values
-from .referee import Referee, Truth
-from .requests import HAND, SCRIPT, Wish, holding
+from .referee import FemResult, FemWorker
+from .requests import HAND, SCRIPT, Requests, holding
 from .text import effect_words, pending_words, plan_words, report, words, work_words
 from .view import (
     FEM_COLOUR,
@@ -81,7 +81,7 @@ class Demo:
             origins=origins,
         )
         self.busy = Busy(lambda line: self.browser.status(escape(line)))
-        self.dismissed: list[Referee] = []
+        self.dismissed: list[FemWorker] = []
         self.asked, self.drawn = self.wish.now(), 0
 
     def run(self, seconds: float = float("inf")) -> int:
@@ -121,12 +121,12 @@ class Demo:
 
     def _run(self, seconds: float) -> None:
         """Play until the time is over or something fails."""
-        now, end = Moment(), clock.perf_counter() + seconds
+        now, end = PageState(), clock.perf_counter() + seconds
         while clock.perf_counter() < end:
             begun = clock.perf_counter()
             if self.wish.scene != self.stage.scene.name:
                 self._change(self.wish.scene)
-                now = Moment()
+                now = PageState()
             self.drawn += self.answer(now)
             self.browser.plays(self.wish.plays)
             self._tell()
@@ -154,17 +154,17 @@ class Demo:
         return self.cast.stage()
 
     @property
-    def referee(self) -> Referee:
+    def referee(self) -> FemWorker:
         """The finite elements under all effects, which judge the models."""
         return self.cast.solver()
 
     def _cast(self, scene: Scene, deformer: str) -> None:
         """Have a deformer play a scene."""
-        self.cast, self.tally = Cast(self.theatre, scene, deformer, self.turn), Tally()
+        self.cast, self.tally = SceneSolvers(self.theatre, scene, deformer, self.turn), AccuracyTimeTable()
         self.history = History(lines_of(scene))
         # The frame that is shown.
         self.reached: int | None = None
-        self.wish = Wish(deformer, scene.path(0.0), scene.name, clocked=clocked(scene, self.theatre.site))
+        self.wish = Requests(deformer, scene.path(0.0), scene.name, clocked=clocked(scene, self.theatre.site))
 
     def _change(self, name: str) -> None:
         """Play another scene; where this body has none of that name, stay, and say why."""
@@ -187,7 +187,7 @@ class Demo:
         self.browser.fill(*parts)
         self.dismissed = [solver for solver in self.dismissed if solver.thread.is_alive()] + old[0].dismiss()
 
-    def answer(self, now: Moment) -> int:
+    def answer(self, now: PageState) -> int:
         """Bring the page nearer to what is wished; returns how many frames were drawn, 0 or 1."""
         self.asked = self.wish.now()
         if self.asked == now.asked:
@@ -205,7 +205,7 @@ class Demo:
         self.cast.rest()
         self.wish.go_on(self.asked[0], len(self.stage.scene.times))
 
-    def _found(self, now: Moment) -> Truth | None:
+    def _found(self, now: PageState) -> FemResult | None:
         """Return the solution of the request, or of a frame on the way to it; None until there is one."""
         number, name, touch, off = self.asked
         question, scene = (number, touch), self.stage.scene
@@ -225,7 +225,7 @@ class Demo:
             self.busy.on(work_words(scene, "fem", *question))
         return self.cast.solved(off, question, now.shown, 1.0 / scene.frames_per_second)
 
-    def _rest(self, now: Moment) -> None:
+    def _rest(self, now: PageState) -> None:
         """Show the body at rest while nothing else can be shown."""
         number, _, touch, _ = self.asked
         stage = replace(self.stage, observer=None)  # there is no truth yet to be seen
@@ -236,7 +236,7 @@ class Demo:
         self._beside(frame, player)
         now.rests = True
 
-    def _draw(self, now: Moment, found: Truth) -> None:
+    def _draw(self, now: PageState, found: FemResult) -> None:
         """Draw a solution, and have it compared with FEM unless it is by FEM."""
         number, name, touch, off = self.asked
         fem = name == "fem" or bool(off)
@@ -268,7 +268,7 @@ class Demo:
             for label, value in slider_values(self.stage.scene, touch).items():
                 self.browser.put(label, value, wanted)
 
-    def _restyle(self, now: Moment) -> None:
+    def _restyle(self, now: PageState) -> None:
         """Draw the same solution in another style."""
         assert now.frame is not None and now.asked is not None
         frame, now.look = now.frame, self.wish.look
@@ -288,7 +288,7 @@ class Demo:
         through, history = self.wish.through, self.history
         self.browser.show_beside(lambda: (slices_of(frame, player, through), history.chart()))
 
-    def _check(self, now: Moment) -> None:
+    def _check(self, now: PageState) -> None:
         """Show what the finite elements say of what is shown, and whether it is of the same load."""
         assert now.frame is not None and now.asked is not None
         _, name, _, off = now.asked

@@ -12,7 +12,7 @@ from sim.loads import Loads
 
 from ..play.deformers import Theatre, plan_of
 from ..play.player import Player
-from ..play.replay import Session
+from ..play.replay import ReplaySession
 from ..script.scene import Scene
 from ..script.tool_paths import Touch
 
@@ -21,7 +21,7 @@ Question = tuple[int, Touch | None]
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class FemResult:
     """Solution of one frame: its number, the deformation, the loads, and seconds; the request.
 
     The frame may be one on the way to the requested one.
@@ -34,7 +34,7 @@ class Truth:
     asked: Question | None = None
 
 
-class Referee:
+class FemWorker:
     """Thread that solves the newest frame by FEM; older requests that it did not reach are dropped.
 
     It is prepared at the first request. Frames on the way to the requested one are solved too. If FEM fails, `failure`
@@ -45,7 +45,7 @@ class Referee:
     def __init__(self, theatre: Theatre, scene: Scene, turn: threading.Lock) -> None:
         """Start the thread; it holds `turn` while it prepares, so that of several one does at a time."""
         self.newest: Question | None = None
-        self.truth: Truth | None = None
+        self.truth: FemResult | None = None
         self.failure: Exception | None = None
         self.refused: Question | None = None
         self.player: Player | None = None
@@ -74,10 +74,10 @@ class Referee:
         with self.wake:
             self.newest = None
 
-    def newer(self, question: Question, seen: Truth | None, seconds: float) -> Truth | None:
+    def newer(self, question: Question, seen: FemResult | None, seconds: float) -> FemResult | None:
         """Wait up to `seconds` for a solution of a question, or on the way to it, other than `seen`; None after it."""
 
-        def found() -> Truth | None:
+        def found() -> FemResult | None:
             truth = self.truth
             return truth if truth is not None and truth.asked == question and truth is not seen else None
 
@@ -113,7 +113,7 @@ class Referee:
             try:
                 number, answer = session.towards(asked, touch)
                 loads, took = session.player.loads(number, touch), clock.perf_counter() - begun
-                self.truth = Truth(number, loads, answer, took, question)
+                self.truth = FemResult(number, loads, answer, took, question)
                 self.failure = self.refused = None
             except InputError as error:
                 number, self.failure, self.refused = asked, error, question
@@ -128,11 +128,11 @@ class Referee:
             self.wake.wait_for(lambda: self.closed.is_set() or self.newest is not None)
             return None if self.closed.is_set() else self.newest
 
-    def _prepared(self, theatre: Theatre, scene: Scene) -> Session | None:
+    def _prepared(self, theatre: Theatre, scene: Scene) -> ReplaySession | None:
         """The finite elements; None where they are not wanted any more when it is their turn."""
         with self.turn:
             if self.closed.is_set() or self.newest is None:
                 return None
-            session = Session(theatre.player("fem", scene))
+            session = ReplaySession(theatre.player("fem", scene))
         self.player, self.plan = session.player, plan_of(session.player.deformer)
         return session

@@ -14,7 +14,7 @@ SCRIPT, HAND = "script", "hand"
 
 
 @dataclass
-class Wish:
+class Requests:
     """Requests of the users, written by the page's threads and read by the loop, under its lock.
 
     `path` is the name of the camera's motion; "": the scene's own. `through` is the position of the slices.

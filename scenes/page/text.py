@@ -13,14 +13,14 @@ from sim.deformation import Deformation, Outcome
 from sim.material import Material, Tissue
 
 from ..play.deformers import GUARDED, Theatre
-from ..play.observer import ELLIPSOID_COLOUR, Estimate
+from ..play.observer import ELLIPSOID_COLOUR, TumourEstimate
 from ..play.player import Frame, is_undeformed
 from ..play.stage import TRUTH_COLOUR, TUMOUR_COLOUR, Stage
 from ..script.scene import Scene
 from ..script.site import Site
 from ..script.tool_paths import Touch
 from ..script.uncertainty import TumourError
-from .comparison import Row
+from .comparison import ComparisonRow
 
 SEEN = (
     "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; "
@@ -210,7 +210,13 @@ def tumour_trust(error: TumourError) -> str:
 
 
 def report(
-    frame: Frame, stage: Stage, name: str, verdict: str, rows: Sequence[Row], frames: int, without: Sequence[str] = ()
+    frame: Frame,
+    stage: Stage,
+    name: str,
+    verdict: str,
+    rows: Sequence[ComparisonRow],
+    frames: int,
+    without: Sequence[str] = (),
 ) -> str:
     """Build the report of a solution: distance first, then reliability, loads, comparison and table."""
     left = stage.at(frame.loads).left
@@ -248,7 +254,7 @@ def moved_words(frame: Frame) -> str:
     return f"{said} ({off})"
 
 
-def estimated(found: Estimate) -> list[str]:
+def estimated(found: TumourEstimate) -> list[str]:
     """Describe an estimate, its error and its input; or the reason of its rejection."""
     truth = f"truly {unbroken(found.truly)}"
     if found.location is None:
@@ -279,7 +285,7 @@ def unbroken(length: float, error: float | None = None) -> str:
     return said.replace(" ", "&nbsp;")
 
 
-def table(rows: Sequence[Row]) -> str:
+def table(rows: Sequence[ComparisonRow]) -> str:
     """Build the table of time and error of the deformers shown; ranked only if all have the same loads."""
     if not rows:
         return ""

@@ -6,13 +6,13 @@ import numpy as np
 
 from ar.overlay.hud import marked
 from ar.page.browser import Browser
-from ar.page.parts import Body, Sign, Viewpoint
+from ar.page.parts import SceneSurface, SceneViewpoint, Sign
 
 from ..play.observer import BALL, BALL_FACES, ELLIPSOID_COLOUR
 from ..play.player import Frame, Player
 from ..play.stage import CORTEX_COLOUR, TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR, Stage
 from ..script.site import Site
-from .referee import Truth
+from .referee import FemResult
 
 FEM_COLOUR = TRUTH_COLOUR
 STALE_COLOUR = (0.45, 0.45, 0.45)
@@ -23,29 +23,29 @@ SMALL = 1e-4
 BESIDE = 12e-3
 
 
-def bodies_of(stage: Stage) -> list[Body]:
+def bodies_of(stage: Stage) -> list[SceneSurface]:
     """Brain, open cortex, tumour, the finite elements' tumour, an estimate's ellipsoid and the tool, at rest."""
     tool, site, tumour = stage.scene.tool, stage.site, stage.tumour(stage.site.anatomy.mesh.nodes)
-    wire = Body("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True)
+    wire = SceneSurface("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True)
     bodies = [*brain_of(stage), wire]
     if stage.observer is not None:
         middle = tumour.vertices.mean(axis=0)
-        bodies.append(Body("ellipsoid", middle + SMALL * BALL, BALL_FACES, ELLIPSOID_COLOUR, wireframe=True))
+        bodies.append(SceneSurface("ellipsoid", middle + SMALL * BALL, BALL_FACES, ELLIPSOID_COLOUR, wireframe=True))
     if tool is not None:
         pose = tool.pose(site.origin - 0.02 * site.axis, site.axis, site.right)
         at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
-        bodies.append(Body("tool", at, tool.mesh.faces, TOOL_COLOUR))
+        bodies.append(SceneSurface("tool", at, tool.mesh.faces, TOOL_COLOUR))
     return bodies
 
 
-def brain_of(stage: Stage) -> list[Body]:
+def brain_of(stage: Stage) -> list[SceneSurface]:
     """Brain, open cortex and tumour, at rest."""
     positions = stage.site.anatomy.mesh.nodes
     brain, cortex, tumour = stage.brain, stage.cortex(positions), stage.tumour(positions)
     return [
-        Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
-        Body("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
-        Body("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
+        SceneSurface("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
+        SceneSurface("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
+        SceneSurface("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
     ]
 
 
@@ -57,10 +57,10 @@ def signs_of(site: Site) -> list[Sign]:
     return [Sign(word, middle + way) for (plus, minus), arm in ways for word, way in ((plus, arm), (minus, -arm))]
 
 
-def viewpoint_of(site: Site) -> Viewpoint:
+def viewpoint_of(site: Site) -> SceneViewpoint:
     """Obliquely onto the open cortex."""
     eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
-    return Viewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))
+    return SceneViewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))
 
 
 def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
@@ -76,7 +76,7 @@ def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
         browser.move("tool", tool.mesh.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
 
 
-def move_wire(browser: Browser, stage: Stage, truth: Truth, player: Player) -> None:
+def move_wire(browser: Browser, stage: Stage, truth: FemResult, player: Player) -> None:
     """Show where the finite elements, under all effects, have the tumour."""
     seen = stage.at(truth.loads).tumour(player.positions(truth.deformation))
     browser.move("finite elements", seen.vertices, seen.triangles)

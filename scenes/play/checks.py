@@ -24,7 +24,7 @@ NOWHERE = 0.0, np.inf, np.inf, np.inf, False
 
 
 @dataclass(frozen=True)
-class Figures:
+class SceneFigures:
     """Worst metrics over the frames of a scene.
 
     Parameters
@@ -108,7 +108,7 @@ class Figures:
 
 def measure(
     player: Player, camera_at: Callable[[float], Camera], frames: Sequence[Frame], truth: Deformation
-) -> Figures:
+) -> SceneFigures:
     """Compare drawn frames with the FEM solutions of the same loads (one row per frame).
 
     `camera_at` gives the reference camera at a time [s].
@@ -124,7 +124,7 @@ def measure(
         for row, frame in enumerate(frames)
     ]
     overlap, error, pixels, drawn, honestly = zip(*misses, strict=True)
-    return Figures(
+    return SceneFigures(
         overlap=min(overlap),
         error_mm=1e3 * max(error),
         motion_mm=1e3 * float(max(moved)),

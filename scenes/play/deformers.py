@@ -19,7 +19,7 @@ from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.fem import Fem, solver_named
 from sim.loads import Loads
-from sim.resected_fem import Operated, finite_elements
+from sim.resected_fem import OperatedFem, finite_elements
 from sim.runtime.device import find_device
 from surrogate.data.answer_rows import first_stated
 from surrogate.locating.locator import Locator
@@ -181,7 +181,7 @@ class Theatre:
             return f"{model.source}; where its error may exceed {limit:g} mm, {solver}"
         return solver if name == "fem" else self.models[name].source
 
-    def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | Operated:
+    def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | OperatedFem:
         """Finite elements for a scene's effects, tissue and element; `live` as `Fem` has it."""
         effects, element = scene.effects_on(self.anatomy), self.element_of(scene)
         return finite_elements(self.anatomy, effects, accuracy, self.device, batch, element, live)

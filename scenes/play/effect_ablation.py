@@ -25,7 +25,7 @@ ALL = "all"
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class AblationRun:
     """A scene's frames by finite elements: displacements (F, V, 3) [m], NaN of what was cut out, and what they took.
 
     milliseconds, median a frame; held, bytes of the device arrays that are kept from frame to frame.
@@ -37,7 +37,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Row:
+class AblationRow:
     """One effect: the scene with all of them, less the scene without it; `ALL` is the scene itself, less nothing.
 
     Its figures: milliseconds a frame; megabytes that are kept on the device; and how far the means over the tumour's
@@ -60,7 +60,7 @@ def without(scene: Scene, effect: Effect) -> Scene:
     return replace(scene, effects=tuple(other for other in scene.effects if other != effect))
 
 
-def rows(theatre: Theatre, scene: Scene, every: int) -> Iterator[Row]:
+def rows(theatre: Theatre, scene: Scene, every: int) -> Iterator[AblationRow]:
     """Yield the row of the scene, then of each effect, with the scene's own tissue; solve each `every`-th frame.
 
     Raises
@@ -74,17 +74,17 @@ def rows(theatre: Theatre, scene: Scene, every: int) -> Iterator[Row]:
     for effect in scene.effects_on(theatre.anatomy):
         name = type(effect).__name__
         if isinstance(effect, Elasticity):
-            yield Row(name, refused="nothing else resists deformation")
+            yield AblationRow(name, refused="nothing else resists deformation")
             continue
         try:
             less = run(theatre, without(scene, effect), every)
         except InputError as error:
-            yield Row(name, refused=str(error))
+            yield AblationRow(name, refused=str(error))
             continue
         yield _row(theatre, name, whole, less)
 
 
-def run(theatre: Theatre, scene: Scene, every: int) -> Run:
+def run(theatre: Theatre, scene: Scene, every: int) -> AblationRun:
     """Solve each `every`-th frame of a scene in order, each starting from the previous one.
 
     Raises
@@ -99,7 +99,7 @@ def run(theatre: Theatre, scene: Scene, every: int) -> Run:
     wp.synchronize()
     known = {id(array) for array in before}
     held = sum(array.capacity for array in device_arrays() if id(array) not in known)
-    return Run(np.stack(found), 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :])), held)
+    return AblationRun(np.stack(found), 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :])), held)
 
 
 def _solved(fem: Deformer, scene: Scene, site: Site, times: list[float]) -> tuple[list[np.ndarray], list[float]]:
@@ -123,14 +123,14 @@ def device_arrays() -> list[wp.array]:
     return [thing for thing in gc.get_objects() if type(thing) is wp.array and thing.deleter is not None]
 
 
-def _row(theatre: Theatre, name: str, whole: Run, less: Run) -> Row:
+def _row(theatre: Theatre, name: str, whole: AblationRun, less: AblationRun) -> AblationRow:
     anatomy = theatre.anatomy
 
     def apart(nodes: np.ndarray) -> float:
         difference = (whole.displacement - less.displacement)[:, nodes]
         return 1e3 * float(np.nanmean(np.linalg.norm(difference, axis=2), axis=1).max())
 
-    return Row(
+    return AblationRow(
         name,
         whole.milliseconds - less.milliseconds,
         1e-6 * (whole.held - less.held),

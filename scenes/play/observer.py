@@ -40,7 +40,7 @@ NOTHING = Observation(np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class TumourEstimate:
     """Estimated tumour position, with the ground truth.
 
     Parameters
@@ -145,7 +145,7 @@ class Estimate:
 class Sees(Protocol):
     """Observer that estimates the tumour position from observations, for a stage."""
 
-    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Estimate:
+    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
         """Estimate the tumour position in frame `number`, for a body at `positions` (V, 3) [m].
 
         `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is observed.
@@ -161,7 +161,7 @@ class Observer:
     locator: Locator
     sight: Sight
 
-    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Estimate:
+    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
         """Estimate the tumour position in frame `number`, for a body at `positions` (V, 3) [m].
 
         `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is observed.
@@ -246,7 +246,7 @@ def touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> np.nda
 
 def estimated(
     anatomy: Anatomy, locator: Locator, see: Callable[[], Observation], positions: np.ndarray, begun: float
-) -> Estimate:
+) -> TumourEstimate:
     """Locate the tumour from an observation, and compare with the truth at `positions` (V, 3) [m]; rejections are kept.
 
     `begun` is the start time of the measurement, by `time.perf_counter`.
@@ -259,4 +259,4 @@ def estimated(
         refusal = str(error)
     seconds, rest = clock.perf_counter() - begun, anatomy.mesh.nodes
     middle, true = middle_of(anatomy, np.stack([rest, positions - rest]))
-    return Estimate(anatomy, observation, location, refusal, middle, true, seconds)
+    return TumourEstimate(anatomy, observation, location, refusal, middle, true, seconds)

@@ -13,7 +13,7 @@ from ar.optics.camera import Camera
 from ar.overlay.composite import Overlaid, composite, draw_points, head_lines
 from ar.overlay.gauge import Gauge
 from ar.overlay.hud import NARROW, folded, lay
-from ar.overlay.legend import Names
+from ar.overlay.legend import LegendNames
 from ar.overlay.marks import Cover, Marks, Trace, Words
 from ar.overlay.styles import Style
 from ar.rendering.layer import Layer
@@ -35,7 +35,7 @@ from ..script.tool_paths import Touch, lifted
 from ..script.uncertainty import NOT_KNOWN, TumourError, Uncertainty
 from .cortex_layers import COTTON, GLOVE
 from .frame_text import acting, doubt_of, error_lines
-from .observer import Estimate
+from .observer import TumourEstimate
 from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, TOOL, Stage
 from .tip_reading import reading
 
@@ -131,7 +131,7 @@ class Frame:
     head: tuple[str, ...]
     remark: str
     seconds: Mapping[str, float]
-    estimate: Estimate | None = None
+    estimate: TumourEstimate | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +280,9 @@ class Player:
         bound = of_load if np.isfinite(of_load) else model.bound
         return bound if np.isfinite(bound) else None
 
-    def _tumour_error(self, touch: Touch, loads: Loads, promised: float, estimate: Estimate | None) -> TumourError:
+    def _tumour_error(
+        self, touch: Touch, loads: Loads, promised: float, estimate: TumourEstimate | None
+    ) -> TumourError:
         """Return the error of the tumour position: known on the script's tool path; an estimate replaces its bound."""
         time = float(loads.times[0])
         scripted = self.uncertainty is not None and touch == self.scene.path(time)
@@ -348,11 +350,11 @@ def is_undeformed(deformation: Deformation) -> bool:
     return bool(np.abs(deformation.displacement).max(initial=0.0) < STILL)
 
 
-def _believed(positions: np.ndarray, estimate: Estimate | None) -> np.ndarray:
+def _believed(positions: np.ndarray, estimate: TumourEstimate | None) -> np.ndarray:
     return positions if estimate is None else estimate.carried(positions)
 
 
-def traces_of(estimate: Estimate, truth: Layer) -> tuple[Trace, ...]:
+def traces_of(estimate: TumourEstimate, truth: Layer) -> tuple[Trace, ...]:
     """Build the traces of an estimate: its ellipsoid, and the true tumour surface with its centroid."""
     ellipsoid, true = estimate.ellipsoid(), Trace(truth, TRUE_STROKES, estimate.middle + estimate.true)
     if ellipsoid is None:
@@ -360,7 +362,7 @@ def traces_of(estimate: Estimate, truth: Layer) -> tuple[Trace, ...]:
     return Trace(ellipsoid, ELLIPSOID_STROKES, estimate.middle + estimate.motion), true
 
 
-def names_of(estimate: Estimate | None) -> Names:
+def names_of(estimate: TumourEstimate | None) -> LegendNames:
     """Return the names of the lines of an image; a rejected estimate has no ellipsoid."""
     if estimate is None:
         return PREDICTED_LINES

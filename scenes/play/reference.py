@@ -9,7 +9,7 @@ from sim.accuracy import TRAIN
 from sim.deformation import Deformation, Deformer, joined
 from sim.fem import Fem
 from sim.loads import Loads, stacked
-from sim.resected_fem import Operated
+from sim.resected_fem import OperatedFem
 from sim.runtime.device import find_device
 
 from ..script.scene import Scene
@@ -19,7 +19,7 @@ from .deformers import Theatre
 TOGETHER = 16
 
 
-def following(theatre: Theatre, scene: Scene) -> Fem | Operated:
+def following(theatre: Theatre, scene: Scene) -> Fem | OperatedFem:
     """Finite elements for the truth of many scenes alike: on a card of frames together, else frame after frame.
 
     A frame that starts from the last one takes a quarter of the time of one that is solved apart.
@@ -34,7 +34,7 @@ def past_matters(fem: Deformer) -> bool:
 
     Not needed if only forces act on an elastic intact body. A deformer that is not FEM needs no history.
     """
-    return isinstance(fem, Operated) or (isinstance(fem, Fem) and not fem.problem.plain)
+    return isinstance(fem, OperatedFem) or (isinstance(fem, Fem) and not fem.problem.plain)
 
 
 def truth_of(
@@ -42,7 +42,7 @@ def truth_of(
     scene: Scene,
     loads: Sequence[Loads],
     progress: Callable[[int], object] = lambda more: None,
-    fem: Fem | Operated | None = None,
+    fem: Fem | OperatedFem | None = None,
 ) -> Deformation:
     """One row per frame's loads, every vertex, at training accuracy; one after the other where the past matters.
 

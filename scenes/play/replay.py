@@ -20,7 +20,7 @@ LEAP = 0.2
 
 
 @dataclass(frozen=True)
-class Course:
+class ReplayOrder:
     """Order in which frames are reached from others.
 
     Parameters
@@ -38,13 +38,13 @@ class Course:
     kept: int = 16
 
 
-IN_ORDER = Course()
+IN_ORDER = ReplayOrder()
 """Each frame depends on the previous one. Stored solutions take 2 MB each with relaxing tissue on the default brain,
 and ten times as much on quadratic elements.
 """
 
 
-class Reel(Generic[T]):
+class FrameCache(Generic[T]):
     """Frames of a run in any order. In order, frame n is what the straight run 0 ... n gives, whatever came before.
 
     Parameters
@@ -57,7 +57,7 @@ class Reel(Generic[T]):
         How a frame is reached.
     """
 
-    def __init__(self, frames: int, step: Callable[[int, T | None], T], course: Course = IN_ORDER) -> None:
+    def __init__(self, frames: int, step: Callable[[int, T | None], T], course: ReplayOrder = IN_ORDER) -> None:
         self._step, self._course = step, course
         self._every = course.leap * -(-frames // (course.leap * course.kept))
         self.kept: dict[int, T] = {}
@@ -85,7 +85,7 @@ class Reel(Generic[T]):
         return max(number, -(-start // leap) * leap - leap)
 
 
-class Session:
+class ReplaySession:
     """FEM solutions for users who scrub through a script or control its tool.
 
     With history-dependent solutions, a frame of the script is that of the straight run. Manual control continues from
@@ -98,9 +98,11 @@ class Session:
     def __init__(self, player: Player) -> None:
         self.player = player
         course, scene = course_of(player), player.scene
-        self._reel: Reel[Deformation] | None = None
+        self._reel: FrameCache[Deformation] | None = None
         if course is not None:
-            self._reel = Reel(len(scene.times), lambda number, last: player.answer(player.loads(number), last), course)
+            self._reel = FrameCache(
+                len(scene.times), lambda number, last: player.answer(player.loads(number), last), course
+            )
         self._last: Deformation | None = None
 
     def towards(self, number: int, touch: Touch | None = None) -> tuple[int, Deformation]:
@@ -116,7 +118,7 @@ class Session:
         return number, self._last
 
 
-def course_of(player: Player) -> Course | None:
+def course_of(player: Player) -> ReplayOrder | None:
     """Return the order in which frames of a script are computed; None if all are independent."""
     scene = player.scene
     if player.remembers:
@@ -124,4 +126,4 @@ def course_of(player: Player) -> Course | None:
     if not any(isinstance(effect, SkullContact) for effect in scene.effects_on(player.site.anatomy)):
         return None
     # # Only displacements of such a state are stored, a third of a megabyte each.
-    return Course(max(1, round(LEAP * scene.frames_per_second)), back=True, kept=64)
+    return ReplayOrder(max(1, round(LEAP * scene.frames_per_second)), back=True, kept=64)

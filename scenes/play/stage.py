@@ -9,13 +9,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ar.optics.camera import Camera
-from ar.overlay.legend import Names
+from ar.overlay.legend import LegendNames
 from ar.overlay.styles import Opening
 from ar.rendering.layer import Layer, Solid, vertex_normals
 from ar.rendering.renderer import Lamp, Picture, Renderer, lamp_beside
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity
-from sim.discretisation.resected_body import Remains, bodies
+from sim.discretisation.resected_body import RemainingBody, bodies
 from sim.effects import SkullContact
 from sim.loads import Loads, Resected
 
@@ -41,8 +41,8 @@ TRUTH_COLOUR = (0.90, 0.35, 0.78)
 DARK, RELIEF = (0.33, 0.16, 0.17), 1.5e-3
 OPENING = Opening((CORTEX,), ((DRAPE, "under the drape"),), "seen through bone")
 """Layer through which the tumour is seen, and text for the occluders."""
-PREDICTED_LINES = Names("predicted tumour", "its error, 95 %", "in the scan")
-ESTIMATED_LINES = Names("estimated tumour", "", "in the scan", ("95 % of its middle", "truth"), "estimate moved")
+PREDICTED_LINES = LegendNames("predicted tumour", "its error, 95 %", "in the scan")
+ESTIMATED_LINES = LegendNames("estimated tumour", "", "in the scan", ("95 % of its middle", "truth"), "estimate moved")
 """Names of the lines in an image of a prediction, and in one of an estimate."""
 # Grey matter's outer rim mixes with fluid in the scan: it is read this far under the surface [m].
 READ_BELOW = 2.0e-3
@@ -81,7 +81,7 @@ class Stage:
     scene: Scene
     site: Site
     intensity: Intensity | None = None
-    left: Remains | None = None
+    left: RemainingBody | None = None
     device: str = "cpu"
     observer: Sees | None = None
 

@@ -12,9 +12,9 @@ from surrogate.locating.locator import Locator
 from surrogate.locating.observation import Observation
 
 from ..script.sight import StereoSight
-from .observer import NOTHING, Estimate, RigidError, estimated, rigid_error, touched
+from .observer import NOTHING, RigidError, TumourEstimate, estimated, rigid_error, touched
 from .stage import Stage
-from .stereo_update import First, Shot, cloud_of, first_of, points_of
+from .stereo_update import First, StereoPair, cloud_of, first_of, points_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class StereoObserver:
     locator: Locator
     sight: StereoSight
 
-    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Estimate:
+    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
         """Estimate the tumour in a frame; arguments as of `Observer.estimate`. Rendering time is not counted."""
         shot, anatomy = self.shot(number, positions, tool), self.stage.site.anatomy
         tips = NOTHING.now if tool is None else touched(anatomy, positions, tool)
@@ -36,7 +36,7 @@ class StereoObserver:
         begun = clock.perf_counter()
         return estimated(anatomy, self.locator, lambda: self.seen(shot, tips), positions, begun)
 
-    def seen(self, shot: Shot, tips: np.ndarray) -> Observation:
+    def seen(self, shot: StereoPair, tips: np.ndarray) -> Observation:
         """Extract the observation from a stereo pair, with contact points of a tool, `tips` (k, 3) [m].
 
         Raises
@@ -49,7 +49,7 @@ class StereoObserver:
             return cloud_of(site, shot, sight.points, self._tracked(0), tips)
         return points_of(site, self.first, shot, self._tracked(1), tips)
 
-    def shot(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Shot:
+    def shot(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> StereoPair:
         """Render both eyes' images of a frame, for positions (V, 3) [m] and a tool's corners (t, 3) [m].
 
         Number -1 is before the first frame.
@@ -62,7 +62,7 @@ class StereoObserver:
             for eye, (stage, camera) in enumerate(zip(self._stages, (left, right), strict=True))
         ]
         seen = None if tool is None or scene.tool is None else (tool, np.asarray(scene.tool.mesh.faces))
-        return Shot((left, right), (pictures[0], pictures[1]), seen)
+        return StereoPair((left, right), (pictures[0], pictures[1]), seen)
 
     @cached_property
     def first(self) -> First:
@@ -76,7 +76,7 @@ class StereoObserver:
         return first_of(self.stage.site, self._first_shot, self.sight.points, self._tracked(0))
 
     @cached_property
-    def _first_shot(self) -> Shot:
+    def _first_shot(self) -> StereoPair:
         return self.shot(-1, self.stage.site.anatomy.mesh.nodes)
 
     @cached_property
@@ -91,12 +91,12 @@ class StereoObserver:
         lit = np.float32(1.0 - eye * self.sight.darker) * picture + noise
         return np.clip(np.rint(lit), 0.0, 255.0).astype(np.uint8)
 
-    def _tracked(self, number: int) -> Tracked:
-        return Tracked(rigid_error(self.sight, 2 + number), self.stage.site.origin)
+    def _tracked(self, number: int) -> TrackedMicroscope:
+        return TrackedMicroscope(rigid_error(self.sight, 2 + number), self.stage.site.origin)
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
+class TrackedMicroscope:
     """Rigid error of a tracked microscope about the centre (3,) [m] of the craniotomy."""
 
     error: RigidError

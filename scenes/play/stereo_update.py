@@ -42,7 +42,7 @@ Rigid = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class StereoPair:
     """Stereo pair of a microscope.
 
     Parameters
@@ -96,13 +96,13 @@ class First:
     still: np.ndarray
 
 
-def first_of(site: Site, shot: Shot, count: int, rigid: Rigid) -> First:
+def first_of(site: Site, shot: StereoPair, count: int, rigid: Rigid) -> First:
     """Match the first pair, of an undeformed brain: `count` points, each at the nearest point of the scan.
 
     Raises
     ------
     InputError
-        As `Shot.seen`; too few points; points off the scan's cortex.
+        As `StereoPair.seen`; too few points; points off the scan's cortex.
     """
     view = shot.seen(site)
     pixels = grid(site, view, count)
@@ -120,13 +120,13 @@ def first_of(site: Site, shot: Shot, count: int, rigid: Rigid) -> First:
     return First(view, pixels[found.which[good]], rest[good], len(pixels), around, rigid(still))
 
 
-def points_of(site: Site, first: First, shot: Shot, rigid: Rigid, tips: np.ndarray) -> Observation:
+def points_of(site: Site, first: First, shot: StereoPair, rigid: Rigid, tips: np.ndarray) -> Observation:
     """Points of the first pair, where a later one shows them; `tips` (k, 3) [m], where a tool touches.
 
     Raises
     ------
     InputError
-        As `Shot.seen`; too few points; surroundings that seem to move; motions larger than are searched for.
+        As `StereoPair.seen`; too few points; surroundings that seem to move; motions larger than are searched for.
     """
     view = shot.seen(site)
     demand_still(first, view, rigid)
@@ -144,7 +144,7 @@ def points_of(site: Site, first: First, shot: Shot, rigid: Rigid, tips: np.ndarr
     return Observation(now[good], rest[good], stated(found.sigma[good]), rigid(tips))
 
 
-def cloud_of(site: Site, shot: Shot, count: int, rigid: Rigid, tips: np.ndarray) -> Observation:
+def cloud_of(site: Site, shot: StereoPair, count: int, rigid: Rigid, tips: np.ndarray) -> Observation:
     """Return `count` cortex points without correspondences, from one pair; arguments and errors as of `points_of`."""
     view = shot.seen(site)
     pixels = grid(site, view, count)

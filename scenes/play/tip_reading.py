@@ -17,7 +17,7 @@ from ..script.tool import Instrument, Probe
 
 
 @dataclass(frozen=True)
-class Reading:
+class TipDistance:
     """Distance from tip to tumour.
 
     Parameters
@@ -37,7 +37,7 @@ class Reading:
 
 def reading(
     deformer: Deformer, loads: Loads, answer: Deformation, tool: Instrument | None, apart: float
-) -> Reading | None:
+) -> TipDistance | None:
     """Read the distance in the first load case of a solution; None unless a single ball pushes or is moved.
 
     A distance by FEM has no bound. A trained model has no bound outside of its training range.
@@ -51,16 +51,16 @@ def reading(
         return None
     model = answering(deformer, answer)
     if model is None:
-        return Reading(apart, None)
+        return TipDistance(apart, None)
     found = model.distance(loads, answer, np.array([apart]))
     promised = float(found.bound[0, 0])
     kept = answer.outcome[0].good and promised < float("inf")
-    return Reading(float(found.value[0]), promised if kept else None)
+    return TipDistance(float(found.value[0]), promised if kept else None)
 
 
 def measured(
     anatomy: Anatomy, loads: Loads, answer: Deformation, tool: Instrument | None, lift: float
-) -> Reading | None:
+) -> TipDistance | None:
     """Measure the distance in a solution of any deformer, without error bound.
 
     Parameters
@@ -79,7 +79,7 @@ def measured(
     if ball is None:
         return None
     found = tip_gauge(anatomy).distances(loads, answer.displacement, answer.nodes, ball.shape, lift)
-    return Reading(float(found[0]), None)
+    return TipDistance(float(found[0]), None)
 
 
 def _ball(loads: Loads, tool: Instrument | None) -> Probe | None:

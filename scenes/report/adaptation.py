@@ -17,7 +17,7 @@ from sim.geometry.tetmesh import TetMesh
 from sim.runtime.partial_files import unfinished_path
 from surrogate.data.simulate import simulate
 
-from .study import Study, note_seconds, noted_seconds
+from .study import ReportStudy, note_seconds, noted_seconds
 
 # Removed share of the tumour's volume.
 SHARE = 0.2
@@ -38,12 +38,12 @@ def debulked(anatomy: Anatomy) -> Anatomy:
     return Anatomy(body, anatomy.held[used], anatomy.slide_normal[used], anatomy.craniotomy[used])
 
 
-def debulked_study(study: Study) -> Study:
+def debulked_study(study: ReportStudy) -> ReportStudy:
     """The same study of the debulked body, once `simulate_debulked` has made its data."""
     return replace(study, data=_path(study))
 
 
-def simulate_debulked(study: Study, progress: Callable[[int], object]) -> None:
+def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> None:
     """Solve the data's own loads on the debulked body; `progress` receives the number of newly solved rows."""
     path = _path(study)
     if path.exists():
@@ -65,10 +65,10 @@ def simulate_debulked(study: Study, progress: Callable[[int], object]) -> None:
         note_seconds(path, clock.perf_counter() - begun)
 
 
-def simulating_seconds(study: Study) -> float | None:
+def simulating_seconds(study: ReportStudy) -> float | None:
     """Read the seconds of `simulate_debulked`; None if it was not run, or not in one run."""
     return noted_seconds(_path(study))
 
 
-def _path(study: Study) -> Path:
+def _path(study: ReportStudy) -> Path:
     return study.folder / "answers" / f"debulked-{study.digest}.h5"

@@ -23,8 +23,8 @@ from sim.material import Material, Tissue
 
 from ..analysis.measurement import timed
 from .adaptation import debulked
-from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, of_times
-from .study import Study
+from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, ReportRow, against_reference, of_times
+from .study import ReportStudy
 
 OWN, HALVED = "own", "halved"
 # The tolerance of data sets.
@@ -32,7 +32,7 @@ STANDARD = 1e-4
 
 
 @dataclass(frozen=True)
-class Elements:
+class FemVariant:
     """Finite elements; what is None is as the data's.
 
     mesh: `OWN`, `HALVED` (every edge), or the nodes wanted of the template. Without a precision it is single, or double
@@ -53,7 +53,7 @@ class Elements:
         return Accuracy(tolerance=self.tolerance, precision=self.precision or precision)
 
 
-def measure_elements(study: Study, spec: Elements) -> tuple[Row, np.ndarray]:
+def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, np.ndarray]:
     """The row, and displacements (n, k, 3) [m] of the tumour's vertices under the played loads.
 
     Raises
@@ -73,7 +73,7 @@ def measure_elements(study: Study, spec: Elements) -> tuple[Row, np.ndarray]:
         fields.append(located.read(answer.displacement)[0])
         good.append(answer.outcome[0].good)
     field = np.array(fields)
-    row = Row(
+    row = ReportRow(
         spec.name,
         "finite elements",
         against=against(study, spec),
@@ -87,19 +87,19 @@ def measure_elements(study: Study, spec: Elements) -> tuple[Row, np.ndarray]:
     return row, field
 
 
-def _adapt(study: Study, spec: Elements, load: Loads) -> float:
+def _adapt(study: ReportStudy, spec: FemVariant, load: Loads) -> float:
     """Return the seconds from the debulked body to its first solution, with compiled kernels."""
     body = debulked(body_of(study, spec.mesh))
     return timed(lambda: _fem(study, spec, body).deform(load))[1]
 
 
-def _fem(study: Study, spec: Elements, body: Anatomy) -> Fem:
+def _fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:
     """Set up for single loads."""
     effects = pushed_effects(body, tissue_of(study.tissue_on(body), spec.law))
     return Fem(body, effects, spec.accuracy, study.device, None, spec.element or study.element, live=True)
 
 
-def against(study: Study, spec: Elements) -> str:
+def against(study: ReportStudy, spec: FemVariant) -> str:
     """Describe the kind of difference from the reference."""
     if tissue_of(study.tissue, spec.law) != study.tissue:
         return DIFFERENCE
@@ -107,7 +107,7 @@ def against(study: Study, spec: Elements) -> str:
     return TOLERANCE_ALONE if same else ERROR
 
 
-def body_of(study: Study, mesh: str) -> Anatomy:
+def body_of(study: ReportStudy, mesh: str) -> Anatomy:
     """The body on a mesh by name; meshes of the template are made once and kept."""
     if mesh == OWN:
         return study.anatomy

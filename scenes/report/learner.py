@@ -8,7 +8,7 @@ import numpy as np
 
 from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
-from surrogate.data.splits import Split, leave_sectors_out
+from surrogate.data.splits import DiscSplit, leave_sectors_out
 from surrogate.evaluation.coverage import TENTHS, coverage
 from surrogate.evaluation.score import SolveCounts, bare_microseconds, single_seconds
 from surrogate.training.train import train
@@ -16,20 +16,20 @@ from surrogate.training.train import train
 from ..analysis.measurement import timed
 from .adaptation import debulked_study, simulating_seconds
 from .reference import beyond_of
-from .row import Figures, Row, against_reference, figures_between, of_times
-from .study import Study, series_seconds
+from .row import ErrorFigures, ReportRow, against_reference, figures_between, of_times
+from .study import ReportStudy, series_seconds
 
 FEWEST_LOADS = 64
 
 
 @dataclass(frozen=True)
-class Learner:
+class LearnerSpec:
     """One of `train.LEARNERS`."""
 
     name: str
 
 
-def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
+def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, np.ndarray]:
     """The row, and displacements (n, k, 3) [m] of the tumour's vertices under the played loads.
 
     Raises
@@ -39,7 +39,7 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
     """
     nodes, truth = study.anatomy.tumour_nodes, study.answers
 
-    def judged(model: Deformer, split: Split) -> tuple[Figures | None, float]:
+    def judged(model: Deformer, split: DiscSplit) -> tuple[ErrorFigures | None, float]:
         """Return the errors relative to the data's own solutions of held-out loads."""
         rows = np.flatnonzero(split.test)
         return _held(model, study.converged.rows(rows), truth[rows], nodes)
@@ -65,7 +65,7 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
     adapt, adapted = _adapted(study, spec)
     held_out = study.converged.rows(np.flatnonzero(discs.test))
     bare = bare_microseconds(model, held_out)
-    row = Row(
+    row = ReportRow(
         spec.name,
         "learnt",
         reference=against_reference(study, field, np.ones(len(field), bool), nodes),
@@ -92,7 +92,7 @@ def counts(most: int) -> list[int]:
     return [FEWEST_LOADS << k for k in range(20) if FEWEST_LOADS << k < most]
 
 
-def coverage_of(study: Study, spec: Learner, outside: Loads, truth: np.ndarray) -> dict[str, float]:
+def coverage_of(study: ReportStudy, spec: LearnerSpec, outside: Loads, truth: np.ndarray) -> dict[str, float]:
     """Return the coverage of the 95 % bounds outside their guarantee; `truth` (B, n, 3) [m] of the loads `outside`."""
     trained = train(study.dataset, [spec.name], expansion=study.expansion)
     model, found = trained.models[spec.name], trained.left_out.get(spec.name)
@@ -102,7 +102,7 @@ def coverage_of(study: Study, spec: Learner, outside: Loads, truth: np.ndarray) 
     return {name: share for name, share in held.items() if share is not None}
 
 
-def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]:
+def _adapted(study: ReportStudy, spec: LearnerSpec) -> tuple[float | None, ErrorFigures | None]:
     """Seconds of simulating and learning the debulked body, and figures there; nothing where it was not simulated."""
     seconds = simulating_seconds(study)
     if seconds is None:
@@ -114,7 +114,7 @@ def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]
     return seconds, _held(model, after.converged.rows(rows), after.answers[rows], after.anatomy.tumour_nodes)[0]
 
 
-def _trained(study: Study, spec: Learner, split: Split) -> tuple[Deformer, SolveCounts]:
+def _trained(study: ReportStudy, spec: LearnerSpec, split: DiscSplit) -> tuple[Deformer, SolveCounts]:
     """Train a model on the training loads of a split; with the solves that it took."""
     trained = train(study.dataset, [spec.name], split=split, expansion=study.expansion)
     solves = trained.scores[0].solves
@@ -122,7 +122,7 @@ def _trained(study: Study, spec: Learner, split: Split) -> tuple[Deformer, Solve
     return trained.models[spec.name], solves
 
 
-def _held(model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> tuple[Figures | None, float]:
+def _held(model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> tuple[ErrorFigures | None, float]:
     """Figures against `truth` (B, k, 3) [m], and the share of the loads that the model calls extrapolated."""
     answer = model.deform(loads, at=nodes)
     flagged = [outcome is Outcome.EXTRAPOLATED for outcome in answer.outcome]

@@ -17,9 +17,9 @@ from sim.runtime.atomic_files import written_whole
 from surrogate.evaluation.choose import unbeaten
 from surrogate.model.left_out import FEWEST_FOR_P999
 
-from ..analysis.loglog_chart import Curve, Dot, Panel, drawn
+from ..analysis.loglog_chart import ChartPanel, Curve, Dot, drawn
 from ..analysis.measurement import write_table
-from .row import ERROR, TOLERANCE_ALONE, Figures, Row
+from .row import ERROR, TOLERANCE_ALONE, ErrorFigures, ReportRow
 
 SIZE = (880, 560)
 DIFFERENT = "another law: model difference"
@@ -27,7 +27,7 @@ TIME = "milliseconds a load, one at a time"
 Place = tuple[float, float]
 
 
-def front(rows: Sequence[Row]) -> frozenset[str]:
+def front(rows: Sequence[ReportRow]) -> frozenset[str]:
     """Names of the rows that no other equals or beats in both milliseconds and mean distance from the reference.
 
     Only errors count: another law is none, and the reference's own elements have none of their mesh.
@@ -35,7 +35,7 @@ def front(rows: Sequence[Row]) -> frozenset[str]:
     return unbeaten(_places((row, row.reference) for row in rows if row.against == ERROR))
 
 
-def against_time(rows: Sequence[Row]) -> np.ndarray | None:
+def against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
     """Error against time, (H, W, 3) uint8; the rows off the front pale. None without rows.
 
     What shows its tolerance alone would stand far below all others, and is left out.
@@ -46,7 +46,7 @@ def against_time(rows: Sequence[Row]) -> np.ndarray | None:
     return _scatter(title, "mean distance from the reference at the tumour [mm]", places, group, front(rows))
 
 
-def learners_against_time(rows: Sequence[Row]) -> np.ndarray | None:
+def learners_against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
     """Plot the learning error against time, (H, W, 3) uint8; None without learners."""
     places = _places((row, row.own_fem.get("discs")) for row in rows)
     title = "What learning lost, against time: distance from its own finite elements, left-out discs"
@@ -56,16 +56,16 @@ def learners_against_time(rows: Sequence[Row]) -> np.ndarray | None:
     )
 
 
-def against_solves(rows: Sequence[Row]) -> np.ndarray | None:
+def against_solves(rows: Sequence[ReportRow]) -> np.ndarray | None:
     """Error against the number of training loads, (H, W, 3) uint8; None without learners."""
     curves = tuple(
         Curve(row.name, tuple((float(count), each.mm.mean) for count, each in row.curve)) for row in rows if row.curve
     )
     y = "mean distance from its own finite elements on left-out discs [mm]"
-    return drawn([Panel("Error against solves", "training loads", y, curves, size=SIZE)]) if curves else None
+    return drawn([ChartPanel("Error against solves", "training loads", y, curves, size=SIZE)]) if curves else None
 
 
-def _places(found: Iterable[tuple[Row, Figures | None]]) -> dict[str, Place]:
+def _places(found: Iterable[tuple[ReportRow, ErrorFigures | None]]) -> dict[str, Place]:
     """Milliseconds a load and mean distance [mm] by name, where both are there and can stand on logarithmic axes."""
     return {
         row.name: (row.median, figures.mm.mean)
@@ -78,7 +78,7 @@ def _scatter(
     title: str, y: str, places: Mapping[str, Place], group: Mapping[str, str], best: frozenset[str]
 ) -> np.ndarray | None:
     dots = tuple(Dot(name, group[name], *place, pale=name not in best) for name, place in places.items())
-    return drawn([Panel(title, TIME, y, dots=dots, size=SIZE)]) if dots else None
+    return drawn([ChartPanel(title, TIME, y, dots=dots, size=SIZE)]) if dots else None
 
 
 PLOTS = {"time": against_time, "learners": learners_against_time, "solves": against_solves}
@@ -131,7 +131,7 @@ class Section:
 
     name: str
     about: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[ReportRow, ...]
 
 
 def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> None:
@@ -179,7 +179,7 @@ def _section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
     )
 
 
-def _plans(rows: Sequence[Row]) -> str:
+def _plans(rows: Sequence[ReportRow]) -> str:
     """Describe how the FEM rows solve a load."""
     plans = []
     for row in rows:
@@ -211,24 +211,24 @@ def _against_reference(section: Section) -> str:
     return _table(heads, lines)
 
 
-def _adapting(row: Row) -> str:
+def _adapting(row: ReportRow) -> str:
     if row.adapt is None:
         return "not measured"
     return _text(row.adapt) if row.adapted is None else f"{_text(row.adapt)} ({_text(row.adapted.mm.mean)})"
 
 
-def _solves(row: Row) -> str:
+def _solves(row: ReportRow) -> str:
     """Format the number of FEM solves that a row used, by kind."""
     kinds = ((row.loads, ""), (row.units, " unit"), (row.series, " series"))
     return " + ".join(f"{count}{kind}" for count, kind in kinds if count)
 
 
-def _count(row: Row) -> str:
+def _count(row: ReportRow) -> str:
     loads = 0 if row.reference is None else row.reference.loads
     return f"{loads}, {row.failed} failed" if row.failed else str(loads)
 
 
-def _against_own_fem(rows: Sequence[Row]) -> str:
+def _against_own_fem(rows: Sequence[ReportRow]) -> str:
     heads = (
         "row", "loads of", "loads", *SPREAD_HEADS, "called extrapolated", "within 95 % bound",
     )  # fmt: skip
@@ -253,7 +253,7 @@ def _share(share: float | None) -> str:
     return "" if share is None else f"{100.0 * share:.0f} %"
 
 
-def _by_force(measured: Sequence[Row], learnt: Sequence[Row]) -> str:
+def _by_force(measured: Sequence[ReportRow], learnt: Sequence[ReportRow]) -> str:
     """Return the errors of learners relative to their own FEM, over more loads."""
     lines = [(row.name, "reference", row.reference) for row in measured]
     lines += [(row.name, "own FEM", row.own_fem["discs"]) for row in learnt if "discs" in row.own_fem]
@@ -267,7 +267,7 @@ def _by_force(measured: Sequence[Row], learnt: Sequence[Row]) -> str:
     return _table(heads, table)
 
 
-def _spread(figures: Figures | None) -> tuple[str, ...]:
+def _spread(figures: ErrorFigures | None) -> tuple[str, ...]:
     if figures is None:
         return ("",) * len(SPREAD_HEADS)
     worst = figures.worst

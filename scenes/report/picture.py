@@ -22,14 +22,14 @@ from ..script.site import Site, site_of
 from ..script.tool import Probe
 from ..script.viewpoint import Viewpoint
 from .reference import reference_of
-from .study import Study
+from .study import ReportStudy
 
 # So narrow that a pixel is a tenth of a millimetre.
 VIEW = Viewpoint(fov=np.radians(9.0), width=400, height=300)
 YELLOW = (255, 215, 50)
 
 
-def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
+def worst_picture(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
     """Render the test load with the largest error, (H, W, 3) uint8.
 
     answer (n, k, 3) [m]: a row's displacements of the tumour's vertices.

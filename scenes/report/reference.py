@@ -19,14 +19,14 @@ from sim.runtime.outside_files import read_as
 from surrogate.model.kept_arrays import REMADE
 from surrogate.model.npz_archive import Archive
 
-from .study import Study
+from .study import ReportStudy
 
 # Loads that are solved together where a batch is worth it: a stop loses no more than these.
 TOGETHER = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class ReferenceSolutions:
     """Solutions of n loads: displacement (n, k, 3) [m]; good (n,) bool, which converged; seconds (n,) that each took."""
 
     displacement: np.ndarray
@@ -34,7 +34,7 @@ class Truth:
     seconds: np.ndarray
 
 
-def solve_reference(study: Study, progress: Callable[[int], object], accuracy: Accuracy = REFERENCE) -> None:
+def solve_reference(study: ReportStudy, progress: Callable[[int], object], accuracy: Accuracy = REFERENCE) -> None:
     """Solve the played loads with quadratic tetrahedra, and keep each at `study.drawn`.
 
     `progress` is given how many more are done. What is kept already is not solved again.
@@ -48,7 +48,7 @@ def solve_reference(study: Study, progress: Callable[[int], object], accuracy: A
     _solve(study, "reference", study.played, made, progress)
 
 
-def solve_beyond(study: Study, progress: Callable[[int], object]) -> None:
+def solve_beyond(study: ReportStudy, progress: Callable[[int], object]) -> None:
     """Solve the loads beyond the training range like the data's own loads, and store each at the tumour."""
 
     def made() -> tuple[Fem, Located]:
@@ -59,18 +59,22 @@ def solve_beyond(study: Study, progress: Callable[[int], object]) -> None:
     _solve(study, "beyond", study.outside, made, progress)
 
 
-def reference_of(study: Study) -> Truth:
+def reference_of(study: ReportStudy) -> ReferenceSolutions:
     """Read the solutions of `solve_reference`."""
     return _read(study, "reference", len(study.played))
 
 
-def beyond_of(study: Study) -> Truth:
+def beyond_of(study: ReportStudy) -> ReferenceSolutions:
     """Read the solutions of `solve_beyond`."""
     return _read(study, "beyond", len(study.outside))
 
 
 def _solve(
-    study: Study, kind: str, loads: Loads, made: Callable[[], tuple[Fem, Located]], progress: Callable[[int], object]
+    study: ReportStudy,
+    kind: str,
+    loads: Loads,
+    made: Callable[[], tuple[Fem, Located]],
+    progress: Callable[[int], object],
 ) -> None:
     missing = np.array([row for row in range(len(loads)) if not _path(study, kind, row).exists()], int)
     progress(len(loads) - len(missing))
@@ -85,7 +89,7 @@ def _solve(
         progress(len(rows))
 
 
-def _read(study: Study, kind: str, count: int) -> Truth:
+def _read(study: ReportStudy, kind: str, count: int) -> ReferenceSolutions:
     kept = []
     for row in range(count):
         path = _path(study, kind, row)
@@ -96,8 +100,8 @@ def _read(study: Study, kind: str, count: int) -> Truth:
             names = "displacement", "good", "seconds"
             arrays = Archive(raw, REMADE).arrays(names)
             kept.append([arrays[name] for name in names])
-    return Truth(*(np.stack(part) for part in zip(*kept, strict=True)))
+    return ReferenceSolutions(*(np.stack(part) for part in zip(*kept, strict=True)))
 
 
-def _path(study: Study, kind: str, row: int) -> Path:
+def _path(study: ReportStudy, kind: str, row: int) -> Path:
     return study.folder / "answers" / f"{kind}-{study.digest}-{row:04d}.npz"

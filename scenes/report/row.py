@@ -13,7 +13,7 @@ from surrogate.data.encode import directions
 from surrogate.evaluation.score import spread
 
 from .reference import reference_of
-from .study import Study
+from .study import ReportStudy
 
 # Kind of difference from the reference: same law, another law, or the reference's own elements.
 ERROR, DIFFERENCE, TOLERANCE_ALONE = "error", "model difference", "its tolerance alone"
@@ -21,7 +21,7 @@ TENTHS, FEWEST_FOR_P99 = 10, 1000
 
 
 @dataclass(frozen=True)
-class Spread:
+class ErrorSpread:
     """Mean, 95 and 99.9 percentile, and maximum of distances over load x vertex; no 99.9 percentile of few loads."""
 
     mean: float
@@ -42,7 +42,7 @@ class Tenth:
 
 
 @dataclass(frozen=True)
-class Figures:
+class ErrorFigures:
     """Distances between solutions: number of loads and values, in mm and in % of each load's motion, by force.
 
     `worst` is of each load's worst vertex, over the loads [mm].
@@ -51,13 +51,13 @@ class Figures:
     loads: int
     values: int
     motion: float
-    mm: Spread
-    worst: Spread
-    percent: Spread
+    mm: ErrorSpread
+    worst: ErrorSpread
+    percent: ErrorSpread
     tenths: tuple[Tenth, ...]
 
 
-def figures_of(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> Figures | None:
+def figures_of(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> ErrorFigures | None:
     """Figures of distances (B, n) [m] from `truth` (B, n, 3) [m] under forces (B,) [N]; None of no load.
 
     A load's motion is the mean displacement of its n vertices in `truth`.
@@ -71,24 +71,26 @@ def figures_of(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> Fi
         Tenth(*(float(v) for v in (force[r].min(), force[r].max(), mm[r].mean(), mm[r].max(), percent[r].mean())))
         for r in parts
     )
-    return Figures(
+    return ErrorFigures(
         len(distance),
         distance.size,
         1e3 * float(motion.mean()),
-        Spread(*spread(mm)),
-        Spread(*spread(mm.max(axis=1))),
-        Spread(*spread(percent)),
+        ErrorSpread(*spread(mm)),
+        ErrorSpread(*spread(mm.max(axis=1))),
+        ErrorSpread(*spread(percent)),
         tuple(tenths),
     )
 
 
-def figures_between(answer: np.ndarray, truth: np.ndarray, loads: Loads) -> Figures | None:
+def figures_between(answer: np.ndarray, truth: np.ndarray, loads: Loads) -> ErrorFigures | None:
     """Figures of `answer` (B, n, 3) [m] against `truth` (B, n, 3) [m] under pushes."""
     (pushed,) = loads.every(Pushed)
     return figures_of(np.linalg.norm(answer - truth, axis=2), truth, directions(pushed)[0])
 
 
-def against_reference(study: Study, answer: np.ndarray, good: np.ndarray, nodes: np.ndarray) -> Figures | None:
+def against_reference(
+    study: ReportStudy, answer: np.ndarray, good: np.ndarray, nodes: np.ndarray
+) -> ErrorFigures | None:
     """Compute the errors of solutions (n, k, 3) [m] at vertices (k,) of the test loads where both are `good` (n,)."""
     truth = reference_of(study)
     rows = np.flatnonzero(good & truth.good)
@@ -104,7 +106,7 @@ def of_times(seconds: Sequence[float]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Row:
+class ReportRow:
     """Measurements of one deformation model; None where nothing was measured.
 
     Parameters
@@ -159,8 +161,8 @@ class Row:
     family: str
     state: str = "measured"
     against: str = ERROR
-    reference: Figures | None = None
-    own_fem: Mapping[str, Figures] = field(default_factory=dict)
+    reference: ErrorFigures | None = None
+    own_fem: Mapping[str, ErrorFigures] = field(default_factory=dict)
     flagged: Mapping[str, float] = field(default_factory=dict)
     covered: Mapping[str, float] = field(default_factory=dict)
     failed: int = 0
@@ -178,7 +180,7 @@ class Row:
     solving: float | None = None
     learning: float | None = None
     adapt: float | None = None
-    adapted: Figures | None = None
-    curve: tuple[tuple[int, Figures], ...] = ()
+    adapted: ErrorFigures | None = None
+    curve: tuple[tuple[int, ErrorFigures], ...] = ()
     plan: tuple[str, ...] = ()
     picture: str | None = None

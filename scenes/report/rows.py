@@ -29,16 +29,16 @@ from sim.runtime.threads import one_thread
 from surrogate.training.train import LEARNERS
 
 from ..analysis.measurement import peak_memory, watched_card
-from .finite_elements import HALVED, OWN, STANDARD, Elements, law_of, measure_elements
-from .learner import Learner, measure_learner
-from .row import Row
-from .study import Study
+from .finite_elements import HALVED, OWN, STANDARD, FemVariant, law_of, measure_elements
+from .learner import LearnerSpec, measure_learner
+from .row import ReportRow
+from .study import ReportStudy
 
-Spec = Elements | Learner
-FAMILY = {Elements: "finite elements", Learner: "learnt"}
+Spec = FemVariant | LearnerSpec
+FAMILY = {FemVariant: "finite elements", LearnerSpec: "learnt"}
 
 
-def ready(device: str, study: Study) -> Study:
+def ready(device: str, study: ReportStudy) -> ReportStudy:
     """Import all that rows need, and start Warp without its notes; on a card also PyTorch, and what draws."""
     find_device("auto", "float32")
     if study.on_card:
@@ -47,17 +47,17 @@ def ready(device: str, study: Study) -> Study:
     return study
 
 
-def measured(study: Study, spec: Spec, picture: Path) -> Row:
-    """Measure the row of a deformation model, and render its worst case; `Row.state` gives the reason for a missing one."""
+def measured(study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
+    """Measure the row of a deformation model, and render its worst case; `ReportRow.state` gives the reason for a missing one."""
     try:
-        if isinstance(spec, Elements):
+        if isinstance(spec, FemVariant):
             with watched_card(study.device) as taken:
                 row, field = measure_elements(study, spec)
             row = replace(row, card=max(taken) / 2**30 or None)
         else:
             row, field = _on_one_core(study, spec)
     except InputError as error:
-        return Row(spec.name, FAMILY[type(spec)], state=str(error))
+        return ReportRow(spec.name, FAMILY[type(spec)], state=str(error))
     row = replace(row, memory=peak_memory())
     # The time for images does not belong to the row.
     from ar.screen import write_png
@@ -69,7 +69,7 @@ def measured(study: Study, spec: Spec, picture: Path) -> Row:
     return replace(row, picture=picture.name)
 
 
-def _on_one_core(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
+def _on_one_core(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, np.ndarray]:
     """Products this small take longer on several, and say less."""
     with one_thread():
         return measure_learner(study, spec)
@@ -78,30 +78,30 @@ def _on_one_core(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
 ELEMENTS = ("p1", "smoothed", "p2")
 MESHES = {"2.5k": "2500", "17k": "17000"}
 TOLERANCES = (1e-2, 1e-3, STANDARD, 1e-5, 1e-6)
-Run = Callable[[Study, Spec, Path], Row]
+Run = Callable[[ReportStudy, Spec, Path], ReportRow]
 # Cores per measured learner, which uses one; the others prepare the next process.
 CORES = 4
 
 
-def star(study: Study, remesh: bool = True) -> tuple[Elements, ...]:
+def star(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
     """The data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`."""
     meshes = {} if not remesh else MESHES if study.of_template else {"halved edges": HALVED}
     return (
-        Elements("FEM"),
-        *(Elements(f"FEM {name}", element=name) for name in ELEMENTS if name != study.element),
-        *(Elements(f"FEM {name}", mesh=mesh) for name, mesh in meshes.items()),
-        *(Elements(f"FEM {_power(size)}", tolerance=size) for size in TOLERANCES if size != STANDARD),
-        Elements("FEM float64", precision="float64"),
-        *(Elements(f"FEM {law} law", law=law) for law in LAWS if law != law_of(study.tissue)),
+        FemVariant("FEM"),
+        *(FemVariant(f"FEM {name}", element=name) for name in ELEMENTS if name != study.element),
+        *(FemVariant(f"FEM {name}", mesh=mesh) for name, mesh in meshes.items()),
+        *(FemVariant(f"FEM {_power(size)}", tolerance=size) for size in TOLERANCES if size != STANDARD),
+        FemVariant("FEM float64", precision="float64"),
+        *(FemVariant(f"FEM {law} law", law=law) for law in LAWS if law != law_of(study.tissue)),
     )
 
 
-def every(study: Study) -> tuple[Elements, ...]:
+def every(study: ReportStudy) -> tuple[FemVariant, ...]:
     """All of the star's laws, elements, meshes, tolerances and precisions with each other."""
     meshes = {OWN: OWN, **(MESHES if study.of_template else {"halved edges": HALVED})}
     precisions: tuple[Precision, ...] = ("float32", "float64")
     return tuple(
-        Elements(f"FEM {law} {element} {name} {_power(size)} {precision}", law, element, mesh, size, precision)
+        FemVariant(f"FEM {law} {element} {name} {_power(size)} {precision}", law, element, mesh, size, precision)
         for law, element, (name, mesh), size, precision in product(
             LAWS, ELEMENTS, meshes.items(), TOLERANCES, precisions
         )
@@ -109,32 +109,32 @@ def every(study: Study) -> tuple[Elements, ...]:
     )
 
 
-def learners() -> tuple[Learner, ...]:
+def learners() -> tuple[LearnerSpec, ...]:
     """One for each learner of `surrogate`."""
-    return tuple(Learner(name) for name in LEARNERS)
+    return tuple(LearnerSpec(name) for name in LEARNERS)
 
 
-def apart(turn: AbstractContextManager[object], study: Study, spec: Spec, picture: Path) -> Row:
+def apart(turn: AbstractContextManager[object], study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
     """Measured in a process of its own, which starts at once and measures in its `turn`."""
     try:
         # Data that the study has already read stay here.
         with process_pool(["cpu"], ready, replace(study)) as children, turn:
             return run_on_each(children, _measure, [(spec, picture)])[0]
     except LostError:
-        return Row(spec.name, FAMILY[type(spec)], state="its process was ended, for want of memory most likely")
+        return ReportRow(spec.name, FAMILY[type(spec)], state="its process was ended, for want of memory most likely")
 
 
-def _measure(study: Study, task: tuple[Spec, Path]) -> Row:
+def _measure(study: ReportStudy, task: tuple[Spec, Path]) -> ReportRow:
     return measured(study, *task)
 
 
 def rows(
-    study: Study,
+    study: ReportStudy,
     specs: Sequence[Spec],
     run: Run | None = None,
     cores: int | None = None,
     on_card: bool | None = None,
-) -> Iterator[Row]:
+) -> Iterator[ReportRow]:
     """A row for each of the `specs`; those whose inputs are the same as before are read.
 
     A row is kept as soon as it is measured, unless it could not be. By default each has a process of its own. Finite
@@ -146,7 +146,7 @@ def rows(
     beside = cores >= 2 * CORES and (study.on_card if on_card is None else on_card)
     stopped, groups = Event(), []
     for kind, alike in groupby(specs, type):
-        together = 1 if kind is Elements else max(1, cores // CORES - beside)
+        together = 1 if kind is FemVariant else max(1, cores // CORES - beside)
         measuring = run or partial(apart, BoundedSemaphore(together))
         ahead = together if cores >= CORES else 0
         groups.append(_ahead(partial(_row, study, measuring), list(alike), ahead))
@@ -163,9 +163,9 @@ def rows(
             stopped.set()
 
 
-def _ahead(work: Callable[[Spec], Row], specs: Sequence[Spec], ahead: int) -> Iterator[Row]:
+def _ahead(work: Callable[[Spec], ReportRow], specs: Sequence[Spec], ahead: int) -> Iterator[ReportRow]:
     """Yield the rows in order, while further ones run ahead. After a stop, no other row begins."""
-    waiting: deque[Future[Row]] = deque()
+    waiting: deque[Future[ReportRow]] = deque()
     with ThreadPoolExecutor(ahead + 1) as threads:
         try:
             for spec in specs:
@@ -179,7 +179,7 @@ def _ahead(work: Callable[[Spec], Row], specs: Sequence[Spec], ahead: int) -> It
                 future.cancel()
 
 
-def _row(study: Study, run: Run, spec: Spec) -> Row:
+def _row(study: ReportStudy, run: Run, spec: Spec) -> ReportRow:
     stem = f"{study.data.stem} {spec.name}".replace(" ", "-")
     path = study.folder / "rows" / f"{stem}.json"
     digest = _digest(study, spec)
@@ -197,7 +197,7 @@ def _power(tolerance: float) -> str:
     return f"{tolerance:.0e}".replace("e-0", "e-")
 
 
-def _digest(study: Study, spec: Spec) -> str:
+def _digest(study: ReportStudy, spec: Spec) -> str:
     stated = f"{study.digest} {study.timed} {study.device} {type(spec).__name__} {sorted(asdict(spec).items())}"
     return digest_of(np.frombuffer(stated.encode(), np.uint8))
 
@@ -206,11 +206,11 @@ FORMER_NAMES = {"teacher": "own_fem", "taught": "loads"}
 """Former names of fields in files of rows."""
 
 
-def _kept(path: Path, digest: str) -> Row | None:
+def _kept(path: Path, digest: str) -> ReportRow | None:
     """The row in a file, if it is there, whole, and of the same inputs."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8-sig"))
         row = {FORMER_NAMES.get(name, name): value for name, value in stored["row"].items()}
-        return msgspec.convert(row, Row) if stored["digest"] == digest else None
+        return msgspec.convert(row, ReportRow) if stored["digest"] == digest else None
     except (OSError, ValueError, LookupError, TypeError):
         return None

@@ -24,14 +24,14 @@ from surrogate.data.answer_rows import BRAIN, stated_tissue
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.encode import directions
-from surrogate.data.splits import Split, leave_discs_out
+from surrogate.data.splits import DiscSplit, leave_discs_out
 from surrogate.training.expansion import EXPANDED, Expansion
 
 from ..script.shipped_files import template_path
 
 
 @dataclass(frozen=True)
-class Study:
+class ReportStudy:
     """One data set, and how much of it is played.
 
     Parameters
@@ -132,7 +132,7 @@ class Study:
         return self.dataset.displacement(self.anatomy.tumour_nodes)[self.dataset.good]
 
     @cached_property
-    def discs(self) -> Split:
+    def discs(self) -> DiscSplit:
         """Discs of cortex left out."""
         return leave_discs_out(self.pushed.point, self.patch)
 
@@ -224,12 +224,12 @@ def _beside(made: Path) -> Path:
     return made.with_suffix(".json")
 
 
-def tabulate_series(study: Study, progress: Callable[[int, int], object]) -> None:
+def tabulate_series(study: ReportStudy, progress: Callable[[int, int], object]) -> None:
     """Make the table, if the data says of what tissue; `progress` hears the places that are done, and their number."""
     if "tissue" in study.dataset.provenance:
         replace(study.expansion, progress=progress).tabulated  # noqa: B018 (asking makes it)
 
 
-def series_seconds(study: Study, learner: str) -> float:
+def series_seconds(study: ReportStudy, learner: str) -> float:
     """Return the seconds spent on the table, if this learner uses it."""
     return study.expansion.tabulated.seconds if learner in EXPANDED else 0.0

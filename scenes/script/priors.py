@@ -24,7 +24,7 @@ TOGETHER = "several together"
 
 
 @dataclass(frozen=True)
-class Prior:
+class ParameterPrior:
     """Prior distribution of an unknown parameter.
 
     Parameters
@@ -59,48 +59,48 @@ class Prior:
                 return high * ndtri(share)
 
 
-STIFFNESS = Prior(
+STIFFNESS = ParameterPrior(
     "brain's stiffness", "log-uniform", (0.5, 2.0), "Young's modulus over the scene's",
     "the laws of `sulcus` have 2.0 to 3.3 kPa; persons and methods scatter more: review of Budday, Ovaert, Holzapfel, "
     "Steinmann, Kuhl 2019, Arch. Comput. Methods Eng., 10.1007/s11831-019-09352-w",
 )  # fmt: skip
-POISSON = Prior(
+POISSON = ParameterPrior(
     "Poisson's ratio", "uniform", (0.45, 0.4945), "of brain and tumour",
     "0.45 where fluid has left: Miga, Paulsen et al. 1999, IEEE Trans. Med. Imaging 18:866-874; 0.4945 at once: "
     "Tonutti, Gras, Yang 2017, Artif. Intell. Med. 80:39-47",
 )  # fmt: skip
-RATIO = Prior(
+RATIO = ParameterPrior(
     "tumour's stiffness", "log-uniform", (0.4, 2.5), "Young's modulus of the tumour over the brain's, over the scene's",
     "22 glioblastomas of 1.32 kPa (healthy tissue: 1.54), five of them stiffer, all of soft and stiff parts: "
     "Streitberger et al. 2014, PLoS ONE 9:e110588",
 )  # fmt: skip
-TIP = Prior(
+TIP = ParameterPrior(
     TOOL, "normal", (1.06e-3, 1.06e-3), "place of the tool's tip, along each axis [m]",
     "mean error of a tracked probe 1.69 mm: Perwoeg et al. 2018, Int. J. Comput. Assist. Radiol. Surg. 13",
 )  # fmt: skip
-SKULL_HOLDS = Prior(
+SKULL_HOLDS = ParameterPrior(
     SKULL, "uniform", (0.0, 1.0), "bonded, sliding or letting go, each as probable",
     "contested: Ji, Roberts, Hartov, Paulsen 2009, Med. Image Anal. 13:659; its bond tears at some kPa, "
     "arXiv 2512.08425",
 )  # fmt: skip
-OF_MESH = Prior(
+OF_MESH = ParameterPrior(
     MESH, "normal", (0.05, 0.05), "share of the tumour's motion, where the skull holds the brain",
     "smoothed elements are 5.2 % off quadratic ones: docs/notes/surrogate_experiments.md",
 )  # fmt: skip
-OF_MESH_SLIDING = Prior(
+OF_MESH_SLIDING = ParameterPrior(
     "mesh of a sliding brain", "normal", (0.12, 0.12), "share of the tumour's motion, where the brain slides",
     "smoothed elements are 8 to 17 % off quadratic ones under tools: docs/notes/uncertainty_experiments.md",
 )  # fmt: skip
-OF_MESH_SINKING = Prior(
+OF_MESH_SINKING = ParameterPrior(
     "mesh of a sinking brain", "normal", (0.25, 0.25), "share of the tumour's motion, where it slides under weight",
     "smoothed elements are 16 to 22 % off quadratic ones, and these go down on finer meshes: "
     "docs/notes/uncertainty_experiments.md",
 )  # fmt: skip
-OF_REGISTRATION = Prior(
+OF_REGISTRATION = ParameterPrior(
     REGISTRATION, "normal", (1.56e-3, 1.56e-3), "shift of the whole scan, along each axis [m]",
     "2.49 mm in the mean by point pairs in 11 patients: Mongen, Willems 2019, Acta Neurochir. 161",
 )  # fmt: skip
-OF_SEGMENTATION = Prior(
+OF_SEGMENTATION = ParameterPrior(
     SEGMENTATION, "normal", (1e-3, 1e-3), "how far the tumour's outline is too wide, all round [m]",
     "raters agree with a Dice score of 74 - 85 %, which is 1.3 - 2.3 mm between two of them on 7 ml: Menze et al. "
     "2015, IEEE Trans. Med. Imaging 34:1993-2024",
@@ -111,7 +111,7 @@ PRIORS = (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, *OF_MESHES, OF_REGISTRATI
 
 
 @dataclass(frozen=True)
-class Draw:
+class PatientSample:
     """Sample of body and tool parameters.
 
     Parameters
@@ -135,7 +135,7 @@ class Draw:
     mesh: float
 
 
-def drawn(count: int, seed: int = 0) -> list[Draw]:
+def drawn(count: int, seed: int = 0) -> list[PatientSample]:
     """Draw `count` samples that cover each prior evenly (a Latin hypercube: McKay, Beckman, Conover 1979)."""
     random = np.random.default_rng(seed)
 
@@ -145,12 +145,12 @@ def drawn(count: int, seed: int = 0) -> list[Draw]:
     columns = [prior.at(shares()).tolist() for prior in (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, TIP, TIP)]
     columns.append(ndtri(shares()).tolist())
     rows = zip(*columns, strict=True)
-    return [Draw(young, nu, ratio, skull, tuple(tip), mesh) for young, nu, ratio, skull, *tip, mesh in rows]
+    return [PatientSample(young, nu, ratio, skull, tuple(tip), mesh) for young, nu, ratio, skull, *tip, mesh in rows]
 
 
 def drawn_from(
     tissue: FittedTissue, young: float, skulls: Sequence[str], count: int, seed: int = 0, ratio: float = 1.0
-) -> list[Draw]:
+) -> list[PatientSample]:
     """Draw `count` samples whose tissue and skull are from a fit; all else as in `drawn`.
 
     `young` [Pa] is the scene's own modulus, `ratio` its tumour's relative stiffness, and `skulls` the skulls that it

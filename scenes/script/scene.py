@@ -38,7 +38,7 @@ from .sight import Sight, StereoSight
 from .site import Site
 from .tool import Instrument, Probe
 from .tool_paths import AIR, Path, Touch, idle
-from .viewpoint import PLAIN, USUAL, Look, Viewpoint
+from .viewpoint import PLAIN, USUAL, Appearance, Viewpoint
 
 # # Maximum number of frames of a scene: one hour at 30 frames/s.
 MOST_FRAMES = 108_000
@@ -114,7 +114,7 @@ class Scene:
     surgery: Debulking | None = None
     sight: Sight | StereoSight | None = None
     viewpoint: Viewpoint = USUAL
-    look: Look = PLAIN
+    look: Appearance = PLAIN
     element: str | None = None
     accuracy: Accuracy = LIVE
     bounds: Bounds = Bounds()

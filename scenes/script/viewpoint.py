@@ -36,7 +36,7 @@ class Cottonoid:
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """Light, colour and what covers the cortex.
 
     Parameters
@@ -64,7 +64,7 @@ class Look:
     finger: float | None = None
 
 
-PLAIN = Look()
+PLAIN = Appearance()
 """Default look of scenes."""
 
 

@@ -9,7 +9,7 @@ from ar.page.history import Line, Sample
 from ar.page.slices import Cut
 
 from ..page.beside import sliced_where
-from .follower import Known
+from .follower import TrackingResult
 from .picture import Painter
 
 DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of tip and motion (95 %); dotted: not to be relied on")
@@ -21,7 +21,7 @@ def lines_of(tooled: bool) -> tuple[Line, ...]:
     return (DISTANCE, WITHIN) if tooled else (WITHIN,)
 
 
-def sample_of(known: Known, gauge: Gauge | None, tooled: bool, now: float) -> Sample:
+def sample_of(known: TrackingResult, gauge: Gauge | None, tooled: bool, now: float) -> Sample:
     """Build the readings of an image that is shown at a time [s], in the order of `lines_of`."""
     within = 1e3 * known.band if known.relied and known.band is not None else None
     if not tooled:
@@ -31,7 +31,7 @@ def sample_of(known: Known, gauge: Gauge | None, tooled: bool, now: float) -> Sa
     return Sample(now, (distance, within), (error, 0.0))
 
 
-def slices_of(known: Known, painter: Painter, through: str) -> np.ndarray:
+def slices_of(known: TrackingResult, painter: Painter, through: str) -> np.ndarray:
     """Three slices (h, 3 h, 3) uint8 of the scan, through one of the places of `scenes.page.beside`.
 
     Their band is the error of the motion, for tracking and registration do not move the tumour in the scan.

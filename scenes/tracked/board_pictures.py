@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ar.tracking.intrinsics import View, find_board
+from ar.tracking.intrinsics import BoardView, find_board
 from ar.tracking.pictures import GIVE, pictures_of
 from ar.tracking.targets import Detector, Target
 from sim.errors import InputError
@@ -13,7 +13,7 @@ from sim.runtime.outside_files import read_as
 
 
 @dataclass(frozen=True)
-class Seen:
+class BoardDetections:
     """Detections of the board.
 
     Parameters
@@ -26,13 +26,13 @@ class Seen:
         Number of images.
     """
 
-    views: tuple[View, ...]
+    views: tuple[BoardView, ...]
     width: int
     height: int
     looked_at: int
 
 
-def seen_views(path: Path, board: Target, size: tuple[int, int] | None = None) -> Seen:
+def seen_views(path: Path, board: Target, size: tuple[int, int] | None = None) -> BoardDetections:
     """Detect the board in each image of a folder or a video; `size` is the required width and height.
 
     Raises
@@ -63,4 +63,4 @@ def seen_views(path: Path, board: Target, size: tuple[int, int] | None = None) -
         raise InputError(
             f"{path}: the board is in none of {count} images: print it by `sulcus markers`, and show most of it."
         )
-    return Seen(tuple(views), *size, count)
+    return BoardDetections(tuple(views), *size, count)

@@ -20,7 +20,7 @@ from ..play.stage import Stage
 from ..script.camera_paths import HandHeld
 from ..script.scene import find_scene
 from ..script.site import Site
-from .filming import USUAL, VIEW, Mounted, Shot, Taking, Trouble, from_where_it_sees_all, mounted, shots_of
+from .filming import USUAL, VIEW, Mounted, Taking, Trouble, VideoFrame, from_where_it_sees_all, mounted, shots_of
 
 SCENE = "palpate"
 """Scene of the video."""
@@ -77,10 +77,10 @@ class DrawnFilm:
     mounts: Mounted
     calibration: Calibration
     deformer: Deformer
-    shots: tuple[Shot, ...]
+    shots: tuple[VideoFrame, ...]
     taking: Taking
 
-    def picture(self, shot: Shot) -> Named:
+    def picture(self, shot: VideoFrame) -> Named:
         """Return an image as a video gives it."""
         return in_colour(f"{shot.time:.1f} s", shot.colour, shot.time)
 

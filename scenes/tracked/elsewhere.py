@@ -12,7 +12,7 @@ import numpy as np
 from ar.optics.calibration import Calibration
 from ar.tracking.drawn import read_stamp
 from ar.tracking.pictures import GIVE, Named, film_of
-from ar.tracking.pose import Pose, Tracked, Tracker, Verdict
+from ar.tracking.pose import Pose, TrackedTargets, Tracker, Verdict
 from ar.tracking.pose_stream import Clock, PoseStream, clock_by_motion
 from ar.tracking.rigid import cross_matrices, turn_vectors
 from ar.tracking.targets import all_targets, patient_reference, tool_cube
@@ -39,7 +39,7 @@ def rows_of(film: Iterable[Named], calibration: Calibration, body: str, frame: s
     targets = {each.name: each for each in all_targets()}
     wanted = [each for each in (body, frame) if each != "camera"]
     tracker = Tracker(calibration.camera(np.eye(4)), tuple(targets[name] for name in wanted))
-    state: Tracked | None = None
+    state: TrackedTargets | None = None
     for picture in film:
         begun = time.perf_counter()
         state = tracker.track(picture.grey, state)
@@ -77,7 +77,7 @@ def _at_its_time(picture: Named) -> Named:
     return picture if stamp is None else replace(picture, time=stamp)
 
 
-def _known(state: Tracked, wanted: list[str]) -> tuple[Verdict, Pose | None, str]:
+def _known(state: TrackedTargets, wanted: list[str]) -> tuple[Verdict, Pose | None, str]:
     """Return the pose of the first target, relative to the second if given; else the verdict of the missing one."""
     for name in wanted:
         if name not in state.poses:
@@ -87,7 +87,7 @@ def _known(state: Tracked, wanted: list[str]) -> tuple[Verdict, Pose | None, str
 
 
 @dataclass(frozen=True, eq=False)
-class Eye:
+class CameraMount:
     """Pose of the camera in the tracker's frame.
 
     Parameters
@@ -106,7 +106,7 @@ class Eye:
 
 
 @dataclass(frozen=True, eq=False)
-class Elsewhere:
+class ExternalTracker:
     """Poses of another tracker.
 
     Parameters
@@ -122,7 +122,7 @@ class Elsewhere:
     tool: PoseStream
     patient: PoseStream
     clock: Clock = field(default_factory=Clock)
-    eye: Eye | None = None
+    eye: CameraMount | None = None
 
     def beside(self, time: float) -> Pose | None:
         """Return the tool relative to the reference, in the image of a time [s]; None if the poses are missing."""
@@ -133,7 +133,7 @@ class Elsewhere:
         return self._at(time, self._in_camera)
 
     @property
-    def swapped(self) -> Elsewhere:
+    def swapped(self) -> ExternalTracker:
         """The same poses with the tool's taken for the reference's."""
         return replace(self, tool=self.patient, patient=self.tool)
 
@@ -221,7 +221,11 @@ def clock_of_film(film: Iterable[Named], calibration: Calibration, tool: PoseStr
     film_rows = rows_of(film, calibration, tool_cube().name, patient_reference().name)
     seen = [(row.time, row.pose) for row in film_rows if row.pose is not None]
     times, places = [time for time, _ in seen], [pose.T_camera_target[:3, 3] for _, pose in seen]
-    both = [(time, pose) for time in tool.times.tolist() if (pose := Elsewhere(tool, patient).beside(time)) is not None]
+    both = [
+        (time, pose)
+        for time in tool.times.tolist()
+        if (pose := ExternalTracker(tool, patient).beside(time)) is not None
+    ]
     others = [pose.T_camera_target[:3, 3] for _, pose in both]
     if not both:
         raise ValueError("tool and reference have poses at no common time: record both at once.")

@@ -102,7 +102,7 @@ class Taking:
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class VideoFrame:
     """Image with its ground truth.
 
     Parameters
@@ -168,7 +168,7 @@ def registered(site: Site, mounts: Mounted, shift: float, turn: float, seed: int
     return Registration(T, np.diag(deviations**2), centre, 0.0, 0, scanned=scanned_of(site.anatomy))
 
 
-def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) -> Iterator[Shot]:
+def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) -> Iterator[VideoFrame]:
     """Render the images of a scene, one in `every` frames; the deformer's solutions are the ground truth.
 
     With a rolling shutter, each row is rendered from its own camera pose; tool and tissue are those of the image's
@@ -206,7 +206,7 @@ def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) ->
         )
         camera = camera_at(time_of_point(camera_at, readout, places[0]))
         moved = tumour - rest[stage.tumour_vertices]
-        yield Shot(time, stamped(_taken(shown, taking, wrong, number), time), camera.T_camera_world, pose, moved)
+        yield VideoFrame(time, stamped(_taken(shown, taking, wrong, number), time), camera.T_camera_world, pose, moved)
 
 
 def _later(player: Player, time: float, after: float) -> Camera:

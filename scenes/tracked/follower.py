@@ -13,15 +13,15 @@ from scipy.stats import chi2
 from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera
 from ar.tracking.intrinsics import calibration_error
-from ar.tracking.pose import Pose, Tracked, Tracker
+from ar.tracking.pose import Pose, TrackedTargets, Tracker
 from ar.tracking.registration import Registration
 from ar.tracking.targets import patient_reference, tool_cube
 
 from ..script.uncertainty import DEVIATIONS, LEVEL
 from .agreement import Agreement
-from .elsewhere import Elsewhere
+from .elsewhere import ExternalTracker
 from .plausible import implausible, misplaced_tool
-from .tool_motion import Motion, ToolMotion
+from .tool_motion import BrainMotion, ToolMotion
 from .tracked_tool import TrackedTool
 
 # # Time for which the overlay keeps its position after the reference is lost: hand-held, its error is then less than
@@ -44,7 +44,7 @@ NO_PACE = "a rolling shutter, and how the camera moves is not known yet: do not 
 TOOL, PATIENT = tool_cube().name, patient_reference().name
 
 
-class State(Enum):
+class TumourState(Enum):
     """State of the tumour in an image."""
 
     GOOD = "where it is now"
@@ -57,7 +57,7 @@ class State(Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class TrackingResult:
     """Tracking result of an image.
 
     Parameters
@@ -91,10 +91,10 @@ class Known:
     """
 
     time: float
-    state: State
+    state: TumourState
     words: str
-    tracked: Tracked
-    motion: Motion
+    tracked: TrackedTargets
+    motion: BrainMotion
     camera: Camera | None = None
     T_scan_tool: np.ndarray | None = None
     tip_covariance: np.ndarray | None = None
@@ -110,7 +110,7 @@ class Known:
     @property
     def relied(self) -> bool:
         """True if the tumour is drawn as reliable."""
-        return self.state in (State.GOOD, State.REST)
+        return self.state in (TumourState.GOOD, TumourState.REST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ class Follower:
     registration: Registration
     tool: TrackedTool | None
     motion: ToolMotion
-    elsewhere: Elsewhere | None = None
+    elsewhere: ExternalTracker | None = None
     intrinsic: np.ndarray | None = None
 
     @cached_property
@@ -146,7 +146,7 @@ class Follower:
         wanted = (patient_reference(),) if self.tool is None else (patient_reference(), tool_cube())
         return Tracker(self.calibration.camera(np.eye(4)), wanted)
 
-    def step(self, grey: np.ndarray, time: float, before: Known | None = None) -> Known:
+    def step(self, grey: np.ndarray, time: float, before: TrackingResult | None = None) -> TrackingResult:
         """Compute the tracking result of an image (H, W) uint8 taken at a time [s], from the result `before`.
 
         Raises
@@ -161,17 +161,17 @@ class Follower:
         known = replace(known, near=known.near or before.near)
         return replace(known, interval=min(before.interval, apart) if apart > 0.0 else before.interval)
 
-    def _agreeing(self, known: Known, before: Known | None) -> Known:
+    def _agreeing(self, known: TrackingResult, before: TrackingResult | None) -> TrackingResult:
         """With what printed targets say of another tracker's poses, which may make the tumour's place not known."""
         if self.elsewhere is None:
             return known
         agreement = Agreement() if before is None else before.agreement
         known = replace(known, agreement=self.elsewhere.agreed(known.time, known.tracked.poses, agreement))
-        if not known.agreement.doubt or not (known.relied or known.state is State.UNSURE):
+        if not known.agreement.doubt or not (known.relied or known.state is TumourState.UNSURE):
             return known
-        return replace(known, state=State.UNSURE, words=known.agreement.doubt, band=None, parts={})
+        return replace(known, state=TumourState.UNSURE, words=known.agreement.doubt, band=None, parts={})
 
-    def _looked(self, grey: np.ndarray, time: float, before: Known | None) -> Known:
+    def _looked(self, grey: np.ndarray, time: float, before: TrackingResult | None) -> TrackingResult:
         """Compute the result of `step`, for any intervals."""
         apart = None if before is None else time - before.time
         longest = GAP if before is None else max(GAP, MISSED * before.interval)
@@ -193,21 +193,21 @@ class Follower:
         doubt, near = self._implausible(camera, known.T_scan_tool, before)
         known = replace(known, near=near)
         if known.relied and pace is None and self.calibration.readout > 0.0:
-            known = replace(known, state=State.UNSURE, words=NO_PACE)
+            known = replace(known, state=TumourState.UNSURE, words=NO_PACE)
         if known.relied and self.registration.scanned is None:
-            known = replace(known, state=State.UNSURE, words=UNCHECKED)
+            known = replace(known, state=TumourState.UNSURE, words=UNCHECKED)
         if doubt:
-            known = replace(known, state=State.UNSURE, words=doubt)
-        if doubt or known.state is State.UNKNOWN:
+            known = replace(known, state=TumourState.UNSURE, words=doubt)
+        if doubt or known.state is TumourState.UNKNOWN:
             known = replace(known, band=None, parts={})
         if stale and apart is not None:
             why = f"no image for {apart:.1f} s" if apart > 0.0 else "the camera repeats an image"
-            return replace(known, state=State.STALE, words=f"stale, {why}: do not rely on it")
-        if known.state in (State.GOOD, State.REST) and band > LIMIT:
-            return replace(known, state=State.UNSURE, words=wide_words(band))
+            return replace(known, state=TumourState.STALE, words=f"stale, {why}: do not rely on it")
+        if known.state in (TumourState.GOOD, TumourState.REST) and band > LIMIT:
+            return replace(known, state=TumourState.UNSURE, words=wide_words(band))
         return known
 
-    def _implausible(self, camera: Camera, tool: np.ndarray | None, before: Known | None) -> tuple[str, bool]:
+    def _implausible(self, camera: Camera, tool: np.ndarray | None, before: TrackingResult | None) -> tuple[str, bool]:
         """Describe why the registration is implausible for this patient; and return the updated `near`."""
         stage, near = self.motion.stage, before is not None and before.near
         theirs = "is this its registration?" if self.elsewhere is None else "are these its poses and registration?"
@@ -215,7 +215,7 @@ class Follower:
         doubt = implausible(self.registration, stage, camera) or misplaced
         return doubt, near
 
-    def _without_reference(self, tracked: Tracked, time: float, before: Known | None) -> Known:
+    def _without_reference(self, tracked: TrackedTargets, time: float, before: TrackingResult | None) -> TrackingResult:
         """The reference is not seen: for a moment the overlay stays where it was."""
         seen = None if before is None else before.seen
         motion = self.motion.rest if before is None else before.motion
@@ -223,12 +223,12 @@ class Follower:
         camera = before.camera if before is not None and held else None
         why = self._late(time) or ("not seen yet" if seen is None else "lost")
         what = "nothing is drawn" if camera is None else "drawn where it was"
-        return Known(
-            time, State.NO_REFERENCE, f"reference {why}: {what}", tracked, motion, camera, seen=seen,
+        return TrackingResult(
+            time, TumourState.NO_REFERENCE, f"reference {why}: {what}", tracked, motion, camera, seen=seen,
             felt=None if before is None else before.felt,
         )  # fmt: skip
 
-    def _pace(self, reference: Pose, time: float, before: Known | None) -> float | None:
+    def _pace(self, reference: Pose, time: float, before: TrackingResult | None) -> float | None:
         """Return the recent maximum speed of the brain across the image [m/s]; None if unknown.
 
         A hand trembles: the speed during one image may be larger than that between two images.
@@ -241,28 +241,30 @@ class Follower:
         speed = float(np.linalg.norm(now - then)) / (time - before.time)
         return max(speed, CALMS ** (time - before.time) * (before.pace or 0.0))
 
-    def _with_tool(self, tracked: Tracked, reference: Pose, time: float, before: Known | None, shutter: float) -> Known:
+    def _with_tool(
+        self, tracked: TrackedTargets, reference: Pose, time: float, before: TrackingResult | None, shutter: float
+    ) -> TrackingResult:
         """Compute the motion under the tool, by its pose relative to the reference; a `shutter` adds an error [m]."""
         felt, last = (None, None) if before is None else (before.felt, before.motion)
         beside = self._beside(tracked, reference, time)
         if self.tool is None or beside is None:
             if self.motion.deformer is None:
-                return Known(time, State.UNKNOWN, UNKNOWN, tracked, self.motion.rest, felt=felt)
+                return TrackingResult(time, TumourState.UNKNOWN, UNKNOWN, tracked, self.motion.rest, felt=felt)
             if felt is None or last is None:
                 words = f"tool {self._late(time) or 'not seen yet'}: the tumour as in the scan"
-                return Known(time, State.NO_TOOL, words, tracked, self.motion.rest)
+                return TrackingResult(time, TumourState.NO_TOOL, words, tracked, self.motion.rest)
             words = f"tool {self._late(time) or 'lost'}: the tumour as {time - felt:.1f} s ago"
-            return Known(time, State.NO_TOOL, words, tracked, last, felt=felt)
+            return TrackingResult(time, TumourState.NO_TOOL, words, tracked, last, felt=felt)
         into = np.linalg.inv(self.registration.T_patient_scan)
         pose = into @ beside.T_camera_target @ self.tool.T_cube_tool
         spread = tip_covariance(self.registration, self.tool, beside) + (LEVER * shutter / DEVIATIONS) ** 2 * np.eye(3)
         motion = self.motion.under(pose, spread, last)
-        moved = State.GOOD if motion.moved > 0.0 else State.REST
-        state = State.UNSURE if motion.doubt else moved if motion.known else State.UNKNOWN
-        words = UNKNOWN if state is State.UNKNOWN else motion.doubt
-        return Known(time, state, words, tracked, motion, None, pose, spread, felt=time)
+        moved = TumourState.GOOD if motion.moved > 0.0 else TumourState.REST
+        state = TumourState.UNSURE if motion.doubt else moved if motion.known else TumourState.UNKNOWN
+        words = UNKNOWN if state is TumourState.UNKNOWN else motion.doubt
+        return TrackingResult(time, state, words, tracked, motion, None, pose, spread, felt=time)
 
-    def _beside(self, tracked: Tracked, reference: Pose, time: float) -> Pose | None:
+    def _beside(self, tracked: TrackedTargets, reference: Pose, time: float) -> Pose | None:
         """Return the tool's cube relative to the reference."""
         if self.elsewhere is not None:
             return self.elsewhere.beside(time)
@@ -279,7 +281,7 @@ class Follower:
         return f"stale, no pose for {age:.1f} s" if np.isfinite(age) else "not seen yet by the other tracker"
 
     def _band(
-        self, reference: Pose, middle: np.ndarray, motion: Motion, shutter: float
+        self, reference: Pose, middle: np.ndarray, motion: BrainMotion, shutter: float
     ) -> tuple[float, dict[str, float]]:
         """Compute the error bound of the tumour's `middle` (3,) [m] across the line of sight, and its parts by source."""
         place, beside = self.registration.point(middle)

@@ -16,7 +16,7 @@ from ar.overlay.gauge import Gauge
 from ar.overlay.styles import Style
 from ar.page.browser import Browser
 from ar.page.history import History
-from ar.page.parts import Body, Playback
+from ar.page.parts import Playback, SceneSurface
 from ar.tracking.pictures import Named
 
 from ..page.controls import overlays, through
@@ -24,7 +24,7 @@ from ..page.view import STALE_COLOUR, brain_of, signs_of, viewpoint_of
 from ..play.stage import TOOL_COLOUR, TUMOUR_COLOUR
 from ..play.waiting_notice import Busy
 from .beside import lines_of, sample_of, slices_of
-from .follower import GAP, SLOWEST, Follower, Known, State
+from .follower import GAP, SLOWEST, Follower, TrackingResult, TumourState
 from .picture import IN_GREY, Painter
 from .run import Shown, Timed, overlaid_one
 from .seekable_film import SeekableFilm
@@ -93,7 +93,7 @@ class OverlayPage:
         if tool is not None:
             # # Empty until the tool is seen.
             away = np.tile(stage.site.origin, (len(tool.bare[0]), 1))
-            bodies.append(Body("tool", away, tool.bare[1], TOOL_COLOUR))
+            bodies.append(SceneSurface("tool", away, tool.bare[1], TOOL_COLOUR))
         self.browser = Browser(
             bodies,
             viewpoint_of(stage.site),
@@ -232,7 +232,7 @@ class OverlayPage:
         self.history.add(sample_of(one.known, self._gauge(one.known), self.tooled, now))
         self._draw(one)
 
-    def _gauge(self, known: Known) -> Gauge | None:
+    def _gauge(self, known: TrackingResult) -> Gauge | None:
         """From tip to tumour, where both are known."""
         if known.state in IN_GREY:
             return None
@@ -278,7 +278,7 @@ class OverlayPage:
             self.browser.report(f'<p class="warn">{escape(why)}</p><p>{escape(hint)}</p>')
         else:
             assert self.taken.picture.colour is not None
-            known = replace(self.newest.known, state=State.STALE, words=said)
+            known = replace(self.newest.known, state=TumourState.STALE, words=said)
             dim = (FADED * self.taken.picture.colour).astype(np.uint8)
             self.place = f"{hint} The last image" if hint else "the last image"
             self._draw(replace(self.newest, known=known, colour=self._painter().paint(dim, known).colour, latency=None))

@@ -20,13 +20,13 @@ from ar.rendering.real_picture import real_picture
 from ..play.player import gauged
 from ..play.stage import CORTEX, PREDICTED_LINES, TOOL, TOOL_COLOUR, Stage
 from ..script.uncertainty import DEVIATIONS
-from .follower import Known, State
+from .follower import TrackingResult, TumourState
 from .tracked_tool import TrackedTool
 
 ABOVE = "the tool does not touch: as in the scan"
 SEEN_THROUGH = Opening((CORTEX,), (), "seen through bone or drape")
 """The opening is visible within the drape's hole; all else may be bone."""
-IN_GREY = (State.NO_TOOL, State.STALE, State.NO_REFERENCE)
+IN_GREY = (TumourState.NO_TOOL, TumourState.STALE, TumourState.NO_REFERENCE)
 """States in which the tumour is drawn in grey, and dotted."""
 
 
@@ -51,7 +51,7 @@ class Painter:
     style: Style = "window"
     device: str = "cpu"
 
-    def paint(self, colour: np.ndarray, known: Known, covered: np.ndarray | None = None) -> Overlaid:
+    def paint(self, colour: np.ndarray, known: TrackingResult, covered: np.ndarray | None = None) -> Overlaid:
         """Draw a tracking result on an image (H, W, 3) uint8.
 
         covered (H, W) bool marks foreground in front of the brain, such as a hand. Nothing is drawn over it, and the
@@ -87,19 +87,19 @@ class Painter:
         share = hidden / max(np.count_nonzero(mask), 1)
         return (f"{share:.0%} of the tumour is behind what lies in front",) if share >= NOTICED else ()
 
-    def _layers(self, known: Known) -> list[Layer]:
+    def _layers(self, known: TrackingResult) -> list[Layer]:
         """Build the open cortex, under which the tumour is seen, the surrounding drape as in videos, and the tool."""
         tool = self.held(known)
         return [*self.stage.layers(known.motion.positions, None), *([] if tool is None else [tool])]
 
-    def held(self, known: Known, cubed: bool = True) -> Layer | None:
+    def held(self, known: TrackingResult, cubed: bool = True) -> Layer | None:
         """The tool where it is seen, with its cube or without."""
         pose = known.T_scan_tool
         if self.tool is None or pose is None:
             return None
         return Layer("tool", TOOL, *self.tool.at(pose, cubed), TOOL_COLOUR)
 
-    def gauge(self, known: Known, tumour: Layer) -> Gauge | None:
+    def gauge(self, known: TrackingResult, tumour: Layer) -> Gauge | None:
         """From the tool's tip to the tumour, with the error of both; None where one is not known."""
         if known.T_scan_tool is None or known.tip_covariance is None or known.band is None:
             return None
@@ -108,7 +108,7 @@ class Painter:
         spread = DEVIATIONS * float(np.sqrt(along @ known.tip_covariance @ along))
         return Gauge(gauge.tip, gauge.nearest, error=float(np.hypot(spread, known.motion.error)))
 
-    def _grey(self, colour: np.ndarray, known: Known, covered: np.ndarray | None) -> Overlaid:
+    def _grey(self, colour: np.ndarray, known: TrackingResult, covered: np.ndarray | None) -> Overlaid:
         """The outline in grey, if it has a place, and why."""
         over = Overlaid(colour.copy(), np.zeros(colour.shape[:2], np.uint8))
         if known.camera is not None and self.style != "none":
@@ -127,12 +127,12 @@ class Painter:
         dash(over.colour[box], outlines(mask), ink_of(BEFORE), DOTTED)
 
 
-def head_lines(known: Known) -> Sequence[str]:
+def head_lines(known: TrackingResult) -> Sequence[str]:
     """Describe the tumour position and its error, for the top of the image."""
     if known.band is None:
         return ()
     largest = max(known.parts, key=lambda name: known.parts[name])
-    lines = [ABOVE] if known.state is State.REST else []
+    lines = [ABOVE] if known.state is TumourState.REST else []
     if known.relied:
         lines.append(f"tumour: within {bound_words(known.band, 1)} across the view (95 %), mainly {largest}")
     motion = "; of motion: not known" if not known.motion.known else ""

@@ -16,9 +16,9 @@ from ar.tracking.pictures import Named
 from ar.tracking.pose_stream import DAY
 from sim.runtime.atomic_files import written_whole
 
-from .follower import Follower, Known, State
+from .follower import Follower, TrackingResult, TumourState
 from .picture import Painter
-from .truth import Off
+from .truth import OverlayError
 
 # Edges of the histogram of latencies [ms].
 EDGES = (0, 20, 40, 60, 80, 100, 150, 200, 300, 500, 1000)
@@ -53,7 +53,7 @@ class Shown:
         True if the time was read from the image's pixels.
     """
 
-    known: Known
+    known: TrackingResult
     colour: np.ndarray
     seconds: float
     middle: np.ndarray
@@ -141,7 +141,7 @@ def overlaid(film: Iterator[Timed], follower: Follower, painter: Painter, live: 
     ValueError
         As `Follower.step`, and of the video.
     """
-    known: Known | None = None
+    known: TrackingResult | None = None
     for taken, begun in paced(film) if live else ((each, None) for each in film):
         shown = overlaid_one(taken, begun, known, follower, painter)
         known = shown.known
@@ -149,7 +149,7 @@ def overlaid(film: Iterator[Timed], follower: Follower, painter: Painter, live: 
 
 
 def overlaid_one(
-    taken: Timed, begun: float | None, before: Known | None, follower: Follower, painter: Painter
+    taken: Timed, begun: float | None, before: TrackingResult | None, follower: Follower, painter: Painter
 ) -> Shown:
     """Compute one image with its overlay, from the result `before`.
 
@@ -171,11 +171,11 @@ def overlaid_one(
     return Shown(drawn, colour, ready - arrived, middle, latency, taken.stamped)
 
 
-def aged(known: Known, age: float) -> Known:
+def aged(known: TrackingResult, age: float) -> TrackingResult:
     """Return the result of an image of the given age [s]: it is stale beyond `OLD`."""
     if age <= OLD or not known.relied:
         return known
-    return replace(known, state=State.STALE, words=f"stale, the image is {age:.1f} s old: do not rely on it")
+    return replace(known, state=TumourState.STALE, words=f"stale, the image is {age:.1f} s old: do not rely on it")
 
 
 def latencies(shown: list[Shown]) -> dict[str, object]:
@@ -193,7 +193,7 @@ def latencies(shown: list[Shown]) -> dict[str, object]:
     }
 
 
-def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[Off | None]) -> None:
+def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[OverlayError | None]) -> None:
     """Write a row for each image, atomically; unknown values are blank.
 
     The position is that of the tumour's centroid in the scan, RAS. `within_mm` is the 95 % bound across the line of
@@ -206,7 +206,7 @@ def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[Off | None])
         table.writerows(_row(each, error) for each, error in zip(shown, errors, strict=True))
 
 
-def _row(shown: Shown, error: Off | None) -> list[str]:
+def _row(shown: Shown, error: OverlayError | None) -> list[str]:
     known = shown.known
     placed = known.camera is not None
     lengths: list[float | None] = [*shown.middle, known.motion.moved if known.motion.known else None]

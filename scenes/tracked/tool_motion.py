@@ -21,7 +21,7 @@ REFUSED = "the tool is farther inside the brain than the model knows: do not rel
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class BrainMotion:
     """State of the brain.
 
     Parameters
@@ -62,11 +62,13 @@ class ToolMotion:
     deformer: Deformer | None = None
 
     @property
-    def rest(self) -> Motion:
+    def rest(self) -> BrainMotion:
         """The brain as in the scan."""
-        return Motion(self.stage.anatomy.mesh.nodes)
+        return BrainMotion(self.stage.anatomy.mesh.nodes)
 
-    def under(self, T_scan_tool: np.ndarray, tip_covariance: np.ndarray, before: Motion | None = None) -> Motion:
+    def under(
+        self, T_scan_tool: np.ndarray, tip_covariance: np.ndarray, before: BrainMotion | None = None
+    ) -> BrainMotion:
         """Compute the brain under a tool at a pose (4, 4) [m], whose tip has an error covariance (3, 3) [m^2].
 
         Its influence on the tumour is found by a second solution, for a tool that is 1.96 standard deviations deeper.
@@ -80,7 +82,7 @@ class ToolMotion:
         try:
             answer, further = self._answers(T_scan_tool, deeper, start)
         except InputError:
-            return Motion(self.rest.positions, doubt=REFUSED)
+            return BrainMotion(self.rest.positions, doubt=REFUSED)
         vertices, rest = self.stage.tumour_vertices, self.rest.positions
         moved, beyond = (each.at(vertices).displacement[0] for each in (answer, further))
         positions, doubt = rest.copy(), doubt_of(answer.outcome[0])
@@ -89,7 +91,7 @@ class ToolMotion:
         bound = 0.0 if model is None else float(answer.bound[0, 0])
         if model is not None and not np.isfinite(bound):
             bound, doubt = (model.bound, doubt) if np.isfinite(model.bound) else (0.0, doubt or UNBOUND)
-        return Motion(
+        return BrainMotion(
             positions,
             True,
             float(np.linalg.norm(moved, axis=1).mean()),

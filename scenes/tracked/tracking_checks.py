@@ -16,8 +16,8 @@ from ar.overlay.styles import Style
 from ..play.picture_checks import SOFT
 from ..play.stage import TUMOUR_COLOUR
 from .drawn_film import DrawnFilm
-from .filming import Shot, registered
-from .follower import Follower, Known
+from .filming import VideoFrame, registered
+from .follower import Follower, TrackingResult
 from .picture import Painter
 from .run import OLD, Timed, overlaid_one
 from .tool_motion import ToolMotion
@@ -77,7 +77,7 @@ class TrackingFigures:
 class Event:
     """Image at its arrival: its age [s], and the required text; empty without a disturbance."""
 
-    shot: Shot
+    shot: VideoFrame
     late: float = 0.0
     words: str = ""
 
@@ -107,7 +107,7 @@ def usual(film: DrawnFilm, style: Style = "window") -> tuple[Follower, Painter]:
 
 def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> TrackingFigures:
     """Track a video, draw the results, and detect in the images what they show."""
-    known: Known | None = None
+    known: TrackingResult | None = None
     confident, unsaid, waits, worst, waiting, count = 0, 0, [0], 0.0, True, 0
     for event in events_of(film):
         count += 1
@@ -135,7 +135,7 @@ def _says(colour: np.ndarray, words: str, wanted: str) -> bool:
     return words.startswith(wanted) and all(stands(colour, line, FINE, ink_of(WARNING)) for line in lines)
 
 
-def _off(film: DrawnFilm, shot: Shot, colour: np.ndarray) -> float:
+def _off(film: DrawnFilm, shot: VideoFrame, colour: np.ndarray) -> float:
     """Compute the distance between the outline in an image and the true one [pixel]."""
     camera, rest = film.calibration.camera(shot.T_camera_scan), film.stage.tumour_at_rest
     mask = silhouette(camera, rest.vertices + shot.displacement, rest.triangles)

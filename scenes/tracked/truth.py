@@ -20,7 +20,7 @@ from sim.runtime.outside_files import path_of, read_as
 from surrogate.model.npz_archive import Archive
 
 from ..play.stage import Stage
-from .follower import Known
+from .follower import TrackingResult
 
 FORMAT = "sulcus film 1"
 WANTED = "Give the truth.npz that `sulcus film` wrote."
@@ -31,7 +31,7 @@ WRONG = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class VideoGroundTruth:
     """Ground truth of the F images of a video.
 
     Parameters
@@ -58,7 +58,7 @@ class Truth:
         return near if abs(self.times[near] - time) < 1e-3 else None
 
 
-def write_truth(path: Path, truth: Truth) -> None:
+def write_truth(path: Path, truth: VideoGroundTruth) -> None:
     """Write a truth as .npz; it appears whole or not at all."""
     with written_whole(path, ".npz") as partial, partial.open("wb") as file:
         np.savez_compressed(
@@ -71,7 +71,7 @@ def write_truth(path: Path, truth: Truth) -> None:
         )
 
 
-def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LARGEST_FILM) -> Truth:
+def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LARGEST_FILM) -> VideoGroundTruth:
     """The truth in a file, of a body with this digest and number of `vertices` on its tumour's surface.
 
     Its arrays inflate to at most `largest` bytes.
@@ -97,10 +97,10 @@ def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LAR
         raise InputError(f"{path}: has arrays of other shapes. {WANTED}")
     if not all(np.isfinite(each).all() for each in (times, cameras, tools, moved)):
         raise InputError(f"{path}: has numbers that are not finite. {WANTED}")
-    return Truth(str(header["anatomy"]), times, cameras, tools, moved)
+    return VideoGroundTruth(str(header["anatomy"]), times, cameras, tools, moved)
 
 
-def write_table(path: Path, truth: Truth, rest: np.ndarray) -> None:
+def write_table(path: Path, truth: VideoGroundTruth, rest: np.ndarray) -> None:
     """Write a truth as a readable table, a row for each image; rest (n, 3) [m]: the tumour's surface in the scan.
 
     Poses are rows of 12 numbers, of the matrix from the scan to the camera, and from the tool to the scan [mm].
@@ -118,7 +118,7 @@ def write_table(path: Path, truth: Truth, rest: np.ndarray) -> None:
 
 
 @dataclass(frozen=True)
-class Off:
+class OverlayError:
     """Error of one overlay.
 
     Parameters
@@ -138,7 +138,7 @@ class Off:
     held: bool
 
 
-def off(known: Known, truth: Truth, calibration: Calibration, stage: Stage) -> Off | None:
+def off(known: TrackingResult, truth: VideoGroundTruth, calibration: Calibration, stage: Stage) -> OverlayError | None:
     """Compute the error of a tracking result; None if no position is drawn, or without ground truth at its time."""
     row = truth.at(known.time)
     if row is None or known.camera is None:
@@ -150,7 +150,7 @@ def off(known: Known, truth: Truth, calibration: Calibration, stage: Stage) -> O
     seen, apart = camera.in_frame(true), known.camera.in_frame(here) - camera.in_frame(true)
     across = _across(apart, seen)
     middle = float(_across(apart.mean(axis=0)[None], seen.mean(axis=0)[None])[0])
-    return Off(
+    return OverlayError(
         _between(*masks),
         iou(*masks),
         middle,
@@ -174,7 +174,7 @@ def _between(true: np.ndarray, drawn: np.ndarray) -> float:
     return float(max(there[edges[1]].mean(), back[edges[0]].mean()))
 
 
-def summary(known: Sequence[Known], errors: Sequence[Off | None]) -> dict[str, object]:
+def summary(known: Sequence[TrackingResult], errors: Sequence[OverlayError | None]) -> dict[str, object]:
     """Compute medians and 95th percentiles over images whose tumour is drawn as known; number of wrong ones."""
     relied = [(each, error) for each, error in zip(known, errors, strict=True) if each.relied and error is not None]
     if not relied:

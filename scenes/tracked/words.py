@@ -10,13 +10,13 @@ from ar.overlay.hud import bound_words
 
 from ..page.text import RESEARCH, keyed, stroked, tip_words, unbroken
 from ..play.stage import TUMOUR_COLOUR
-from .follower import Known, State
+from .follower import TrackingResult, TumourState
 from .run import Shown
 
 PATIENT_ERROR = "<p>Error of the tumour: not known. Tissue and segmentation add to the error of the overlay.</p>"
 DRAWN = {
-    State.GOOD: "The tumour is drawn where it is now.",
-    State.REST: "The tumour is drawn as in the scan, for the tool does not touch.",
+    TumourState.GOOD: "The tumour is drawn where it is now.",
+    TumourState.REST: "The tumour is drawn as in the scan, for the tool does not touch.",
 }
 
 
@@ -69,7 +69,7 @@ def distance_words(gauge: Gauge | None, relied: bool) -> str:
     return tip_words(gauge.distance, gauge.error if relied else None, gauge.inside)
 
 
-def overlay_error(known: Known) -> str:
+def overlay_error(known: TrackingResult) -> str:
     """Describe the error of the outline across the view, by source."""
     if not known.relied or known.band is None:
         return "<p>Error of the overlay: not known.</p>"

@@ -15,13 +15,13 @@ import numpy as np
 from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, faded, faint_of, forward_on, warp_grid
 
-from .images import Picture, Warped, write_field_nifti, write_warped
+from .images import PatientImage, Warped, write_field_nifti, write_warped
 from .landmarks import CENTROID, Landmark, centroid_now
 from .markups import write_markups
 from .meshes import mesh_of, write_glb, write_stl, write_vtp
-from .moment import Moment
+from .moment import DeformedAnatomy
 from .nrrd_files import write_field_nrrd, write_field_sequence, write_segmentation
-from .places import ENOUGH, Folded, Places, fields_of, folds_of, places_of
+from .places import ENOUGH, Folded, SamplePlaces, fields_of, folds_of, places_of
 from .readme import page
 
 LOOKS = {
@@ -39,7 +39,7 @@ SEQUENCE_SPACING, MOST_NUMBERS = 3e-3, 400_000_000
 
 
 @dataclass(frozen=True)
-class Asked:
+class WarpSettings:
     """Settings of fields and images: spacing of the fields [m] (None: as `fields_of`), and interpolation of images.
 
     `source` is the name of the anatomy's file; `step` receives the number of newly finished parts.
@@ -52,7 +52,11 @@ class Asked:
 
 
 def write_warp(
-    place: Path, moment: Moment, pictures: Sequence[Picture], asked: Asked, sequence: Sequence[tuple[float, Moment]]
+    place: Path,
+    moment: DeformedAnatomy,
+    pictures: Sequence[PatientImage],
+    asked: WarpSettings,
+    sequence: Sequence[tuple[float, DeformedAnatomy]],
 ) -> dict[str, Any]:
     """Write a moment into the folder that `written_folder` yields, and moments of a `sequence` with their times [s].
 
@@ -96,7 +100,7 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _write_surfaces(place: Path, moment: Moment) -> None:
+def _write_surfaces(place: Path, moment: DeformedAnatomy) -> None:
     triangles = {
         "brain": moment.left.mesh.surface,
         "cortex": moment.left.open_surface,
@@ -112,7 +116,7 @@ def _write_surfaces(place: Path, moment: Moment) -> None:
     write_glb(place / "deformed.glb", meshes)
 
 
-def _write_points(place: Path, moment: Moment, marks: Sequence[Landmark]) -> None:
+def _write_points(place: Path, moment: DeformedAnatomy, marks: Sequence[Landmark]) -> None:
     points = named_points(moment, marks)
     if points:
         write_markups(place / "landmarks.mrk.json", "Fiducial", points)
@@ -124,7 +128,7 @@ def _write_points(place: Path, moment: Moment, marks: Sequence[Landmark]) -> Non
         write_segmentation(place / "tumour.seg.nrrd", moment.now, tumour, moment.bound)
 
 
-def named_points(moment: Moment, marks: Sequence[Landmark]) -> dict[str, np.ndarray]:
+def named_points(moment: DeformedAnatomy, marks: Sequence[Landmark]) -> dict[str, np.ndarray]:
     """Points (3,) [m] by name: of tissue in the scan and now, the tumour's centroid now, and the tool's tip."""
     points = {}
     for one in marks:
@@ -134,7 +138,7 @@ def named_points(moment: Moment, marks: Sequence[Landmark]) -> dict[str, np.ndar
     return points | {name: point for name, point in others.items() if point is not None}
 
 
-def _write_sequence(path: Path, sequence: Sequence[tuple[float, Moment]]) -> None:
+def _write_sequence(path: Path, sequence: Sequence[tuple[float, DeformedAnatomy]]) -> None:
     anatomy = sequence[0][1].anatomy
     moved = np.stack([faded(moment.displacement) for _, moment in sequence])
     grid = warp_grid(anatomy, moved, SEQUENCE_SPACING)
@@ -154,7 +158,7 @@ def spaces(files: Sequence[str]) -> dict[str, str]:
 
 
 def figures(
-    moment: Moment, fields: WarpFields, places: Places, warped: Sequence[Warped], frames: int
+    moment: DeformedAnatomy, fields: WarpFields, places: SamplePlaces, warped: Sequence[Warped], frames: int
 ) -> dict[str, Any]:
     """Collect the report of a warp: millimetres, shares, counts of voxels, and warnings."""
     error = 1e3 * places.errors(fields)

@@ -126,7 +126,7 @@ def index_of(affine: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class PatientImage:
     """An image of a patient: its file, itself as NIfTI, its values (I, J, K) and their place; what seems wrong."""
 
     path: Path
@@ -146,7 +146,7 @@ class Warped:
     gone: int
 
 
-def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> Picture:
+def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> PatientImage:
     """Read an image, or a label map, that shows the brain of an anatomy.
 
     Raises
@@ -166,7 +166,7 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> 
             "in the space of the labels that the anatomy was made from, or register it to them first."
         )
     warnings = [*volume.notes, *doubts(values, volume.affine, labels, anatomy)]
-    return Picture(path, image, volume, labels, tuple(warnings))
+    return PatientImage(path, image, volume, labels, tuple(warnings))
 
 
 def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
@@ -188,7 +188,7 @@ def warped_name(path: Path) -> str:
     return f"{path.name[: len(path.name) - len(ending)]}_deformed.nii.gz"
 
 
-def write_warped(folder: Path, picture: Picture, fields: WarpFields, order: str) -> Warped:
+def write_warped(folder: Path, picture: PatientImage, fields: WarpFields, order: str) -> Warped:
     """Write an image as the brain is now, with its own header: type, scale, sform and qform stay as they are.
 
     Label maps have the nearest voxel's label. Voxels whose source lies outside the image, or in tissue that was cut

@@ -24,7 +24,7 @@ TO_GLTF = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class NamedSurface:
     """A named surface: vertices (n, 3) [m, RAS], how far each has moved (n, 3) [m], triangles (m, 3), colour RGBA."""
 
     name: str
@@ -36,13 +36,13 @@ class Mesh:
 
 def mesh_of(
     name: str, triangles: np.ndarray, nodes: np.ndarray, moved: np.ndarray, colour: tuple[float, float, float, float]
-) -> Mesh:
+) -> NamedSurface:
     """The surface of some triangles of a body's nodes (V, 3) [m], moved by (V, 3) [m], without other vertices."""
     used, numbers = np.unique(triangles, return_inverse=True)
-    return Mesh(name, nodes[used] + moved[used], moved[used], numbers.reshape(-1, 3), colour)
+    return NamedSurface(name, nodes[used] + moved[used], moved[used], numbers.reshape(-1, 3), colour)
 
 
-def write_vtp(path: Path, mesh: Mesh) -> None:
+def write_vtp(path: Path, mesh: NamedSurface) -> None:
     """Write VTK's XML of polygons in millimetres, LPS, which its field SPACE says; `displacement` [mm] at points."""
     points, moved = (1e3 * values * LPS for values in (mesh.vertices, mesh.moved))
     ends = 3 * np.arange(1, len(mesh.triangles) + 1)
@@ -81,7 +81,7 @@ def _array(name: str, kind: str, components: int, values: np.ndarray) -> str:
     return f"{head}{text}</DataArray>"
 
 
-def write_stl(path: Path, mesh: Mesh) -> None:
+def write_stl(path: Path, mesh: NamedSurface) -> None:
     """Write binary STL in millimetres, LPS, which its header says in Slicer's words."""
     corners = (1e3 * mesh.vertices * LPS)[mesh.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -92,7 +92,7 @@ def write_stl(path: Path, mesh: Mesh) -> None:
     path.write_bytes(header + struct.pack("<I", len(corners)) + facets.tobytes())
 
 
-def write_glb(path: Path, meshes: Sequence[Mesh]) -> None:
+def write_glb(path: Path, meshes: Sequence[NamedSurface]) -> None:
     """Write surfaces as binary glTF 2.0, a named node each: metres, y towards the head, z forwards."""
     data, views, accessors, parts = b"", [], [], []
     for mesh in meshes:
@@ -129,7 +129,7 @@ def write_glb(path: Path, meshes: Sequence[Mesh]) -> None:
     path.write_bytes(struct.pack("<III", MAGIC, 2, 12 + len(chunks)) + chunks)
 
 
-def _material(mesh: Mesh) -> Mapping[str, object]:
+def _material(mesh: NamedSurface) -> Mapping[str, object]:
     look = {"baseColorFactor": list(mesh.colour), "metallicFactor": 0.0, "roughnessFactor": 0.8}
     clear = {"alphaMode": "BLEND", "doubleSided": True} if mesh.colour[3] < 1.0 else {"doubleSided": True}
     return {"name": mesh.name, "pbrMetallicRoughness": look, **clear}

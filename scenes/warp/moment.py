@@ -18,7 +18,7 @@ from sim.fem import Fem
 from sim.geometry.closest_point import closest
 from sim.geometry.surface import encloses
 from sim.loads import Loads, Pushed
-from sim.resected_fem import Operated
+from sim.resected_fem import OperatedFem
 from surrogate.locating.calibration import RADIUS_SQUARED
 
 from ..play.deformers import AtRest, Theatre
@@ -81,7 +81,7 @@ def _rounded(values: np.ndarray) -> list[float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class DeformedAnatomy:
     """Displaced anatomy.
 
     Parameters
@@ -132,7 +132,9 @@ class Played:
     scene: Scene
     load: bool = False
 
-    def moments(self, frames: Sequence[int], progress: Callable[[int], object] = lambda more: None) -> list[Moment]:
+    def moments(
+        self, frames: Sequence[int], progress: Callable[[int], object] = lambda more: None
+    ) -> list[DeformedAnatomy]:
         """The moments of some frames, in rising order."""
         fem = self.theatre.fem(self.scene, TRAIN, 1, live=True)
         needed = range(frames[-1] + 1) if past_matters(fem) else frames
@@ -144,7 +146,7 @@ class Played:
         scene, time = self.scene, float(self.scene.times[number])
         return scene.loads(self.theatre.site, scene.path(time), time)
 
-    def _moment(self, number: int, answer: Deformation, fem: Fem | Operated) -> Moment:
+    def _moment(self, number: int, answer: Deformation, fem: Fem | OperatedFem) -> DeformedAnatomy:
         scene, site, time = self.scene, self.theatre.site, float(self.scene.times[number])
         moved = answer.displacement[0]
         # Nothing is located here, and no locator is asked for.
@@ -158,12 +160,12 @@ class Played:
         cause = load_cause(loads) if self.load else scene_cause(scene, number)
         said = {} if bound is None else {"bound_words": ENSEMBLE}
         left = stage.at(loads).anatomy
-        return Moment(
+        return DeformedAnatomy(
             cause.by(answer.source), site.anatomy, left, moved, answer.outcome[0].good, bound, tip=tip, **said
         )
 
 
-def read_moment(path: Path, anatomy: Anatomy) -> Moment:
+def read_moment(path: Path, anatomy: Anatomy) -> DeformedAnatomy:
     """The moment in a result of `sulcus locate` or `sulcus solve` for an anatomy.
 
     Raises
@@ -184,9 +186,9 @@ def read_moment(path: Path, anatomy: Anatomy) -> Moment:
         raise InputError(f"{path}: is of another mesh than the anatomy. Give the anatomy that it was made with.")
     cause = file_cause(path)
     if "covariance" not in file.point_data:
-        return Moment(cause, anatomy, anatomy, np.asarray(moved, np.float64))
+        return DeformedAnatomy(cause, anatomy, anatomy, np.asarray(moved, np.float64))
     xx, yy, zz, xy, yz, xz = np.asarray(file.point_data["covariance"])[np.unique(anatomy.tumour_surface)].T
     matrices = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
     bound = float(np.sqrt(RADIUS_SQUARED * np.linalg.eigvalsh(matrices)[:, -1].max()))
     said = "what was seen of the cortex, as the covariance in the file says, at the tumour's worst vertex"
-    return Moment(cause, anatomy, anatomy, np.asarray(moved, np.float64), True, bound, said)
+    return DeformedAnatomy(cause, anatomy, anatomy, np.asarray(moved, np.float64), True, bound, said)

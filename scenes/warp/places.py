@@ -15,7 +15,7 @@ from sim.fields.warp_fields import WarpFields, warp_fields, warp_grid
 from sim.geometry.tetmesh import signed_volumes
 
 from .landmarks import Landmark, landmarks_of
-from .moment import Moment
+from .moment import DeformedAnatomy
 
 # Weights of corners at the places between vertices: of a tetrahedron, of a triangle. No field is fitted there.
 WITHIN, ON = 0.55 * np.eye(4) + 0.15 * (1.0 - np.eye(4)), 0.58 * np.eye(3) + 0.21 * (1.0 - np.eye(3))
@@ -30,7 +30,7 @@ STEP, SPARE, TIMES = 0.05e-3, 0.95, 3
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class SamplePlaces:
     """Vertices of a body, then places in its tetrahedra and on its open cortex, then its landmarks.
 
     Parameters
@@ -58,7 +58,7 @@ class Places:
         return np.maximum(np.linalg.norm(forward, axis=1), np.linalg.norm(backward, axis=1))
 
 
-def places_of(moment: Moment) -> Places:
+def places_of(moment: DeformedAnatomy) -> SamplePlaces:
     """Vertices of what is left of a body, four places in each tetrahedron, three on each open triangle, landmarks."""
     body, mesh = moment.left, moment.left.mesh
     used, marks = np.unique(mesh.tets), landmarks_of(body, moment.displacement)
@@ -74,7 +74,7 @@ def places_of(moment: Moment) -> Places:
     cortex[part == 0], cortex[part == 2] = np.isin(used, body.open_surface), True
     rest = at(mesh.nodes, [one.rest for one in marks])
     moved = at(moment.displacement, [one.now - one.rest for one in marks])
-    return Places(rest, moved, tumour, cortex, part == 3, marks)
+    return SamplePlaces(rest, moved, tumour, cortex, part == 3, marks)
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Folded:
     off: float
 
 
-def folds_of(moment: Moment, fields: WarpFields) -> tuple[Folded, ...]:
+def folds_of(moment: DeformedAnatomy, fields: WarpFields) -> tuple[Folded, ...]:
     """Find places where FEM folds, largest first."""
     mesh = moment.left.mesh
     bad = mesh.tets[signed_volumes(mesh.nodes + moment.displacement, mesh.tets) <= 0.0]
@@ -118,7 +118,7 @@ def steps_of(spacing: float | None) -> int:
     return 2 * (1 + (TIMES if spacing is None else 0))
 
 
-def fields_of(moment: Moment, spacing: float | None, step: Callable[[int], object]) -> WarpFields:
+def fields_of(moment: DeformedAnatomy, spacing: float | None, step: Callable[[int], object]) -> WarpFields:
     """Compute the fields of a moment at a spacing [m]; None: 1 mm, or finer until tumour and landmarks are accurate.
 
     `step` receives the number of newly finished steps of `steps_of`.
@@ -141,7 +141,7 @@ def fields_of(moment: Moment, spacing: float | None, step: Callable[[int], objec
     return fields
 
 
-def finer_spacing(moment: Moment, fields: WarpFields) -> float | None:
+def finer_spacing(moment: DeformedAnatomy, fields: WarpFields) -> float | None:
     """A spacing [m] at which both are exact enough, or as near as size allows; None where no finer one helps."""
     now = fields.grid.spacing
     places = places_of(moment)
@@ -154,9 +154,9 @@ def finer_spacing(moment: Moment, fields: WarpFields) -> float | None:
     return STEP * steps if steps < round(now / STEP) else None
 
 
-def _nodes(moment: Moment, spacing: float) -> float:
+def _nodes(moment: DeformedAnatomy, spacing: float) -> float:
     return float(np.prod(warp_grid(moment.anatomy, moment.displacement[None], spacing).shape, dtype=float))
 
 
-def _fields(moment: Moment, spacing: float, step: Callable[[int], object]) -> WarpFields:
+def _fields(moment: DeformedAnatomy, spacing: float, step: Callable[[int], object]) -> WarpFields:
     return warp_fields(moment.anatomy, moment.displacement, spacing, moment.left, lambda: step(1))

@@ -16,7 +16,7 @@ from .label_map import Label, LabelMap, Mask, listed, on_border, read_labels, wi
 from .one_space import in_one_space
 from .placement import side_of
 from .volume import read_volume
-from .voxels import OF_BRAINS, Grid, Voxels
+from .voxels import OF_BRAINS, VoxelGrid, Voxels
 
 # Share of what is labelled that may lie outside of a mask without a word.
 OUTSIDE = 0.01
@@ -98,7 +98,7 @@ class HeadMasks:
     notes: tuple[str, ...] = ()
     cut: int = 0
     parts: dict[str, np.ndarray] = field(default_factory=dict)
-    grids: tuple[Grid, ...] = ()
+    grids: tuple[VoxelGrid, ...] = ()
     voxels: Voxels = OF_BRAINS
 
 
@@ -156,7 +156,7 @@ def head_masks(sources: Sources) -> HeadMasks:
         cut=on_border(others["brain"].marked if sources.mask else whole.mask(brain)),
         parts=marked,
         grids=(
-            Grid(Path(sources.labels), whole.layers.shape[:3], whole.affine),
+            VoxelGrid(Path(sources.labels), whole.layers.shape[:3], whole.affine),
             *(one.grid for name, one in others.items() if name != NECROSIS),
         ),
         voxels=sources.voxels,

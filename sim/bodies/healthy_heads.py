@@ -16,7 +16,7 @@ from .head_masks import HeadMasks
 from .intensity import Intensity, read_intensity
 from .label_map import on_border
 from .label_volume import whole_brain
-from .template import MIDDLE, Healthy, scaled, size_of
+from .template import MIDDLE, HealthyHead, scaled, size_of
 from .volume import read_volume
 
 SEEN_FROM = (1e-3 * MIDDLE[0], 1e-3 * MIDDLE[1], 1e-3 * MIDDLE[2])
@@ -27,7 +27,7 @@ VOXEL = 1e-3
 REMEDY = install_hint("heads")
 
 
-def masked_head(mask: Path, t1: Path | None = None, volume: float | None = None) -> Healthy:
+def masked_head(mask: Path, t1: Path | None = None, volume: float | None = None) -> HealthyHead:
     """The head whose brain is what is not 0 in a volume, scaled about its centroid to a `volume` [m^3] if one is given.
 
     `t1` is a volume of intensities in the same space, and is scaled with it.
@@ -44,11 +44,11 @@ def masked_head(mask: Path, t1: Path | None = None, volume: float | None = None)
     notes = list(read.notes)
     masks = HeadMasks(str(mask), "its voxels", brain, np.zeros_like(brain), read.affine, cut=on_border(brain))
     solid = whole_brain(masks, notes)
-    healthy = Healthy(solid, read.affine, t1 and read_intensity(t1), SEEN_FROM, tuple(notes))
+    healthy = HealthyHead(solid, read.affine, t1 and read_intensity(t1), SEEN_FROM, tuple(notes))
     return healthy if volume is None else _scaled(healthy, volume)
 
 
-def fsaverage_head(volume: float) -> Healthy:
+def fsaverage_head(volume: float) -> HealthyHead:
     """The head of fsaverage, scaled to a `volume` [m^3]: all that its inner skull encloses counts as brain.
 
     The surface of this body is the skull: no fluid lies between them, and no sulci are in it.
@@ -64,7 +64,7 @@ def fsaverage_head(volume: float) -> Healthy:
         mask, affine = enclosed(points, triangles, VOXEL)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return _scaled(Healthy(mask, affine, middle=SEEN_FROM), volume)
+    return _scaled(HealthyHead(mask, affine, middle=SEEN_FROM), volume)
 
 
 def _skull_path() -> Path:
@@ -77,7 +77,7 @@ def _skull_path() -> Path:
     return path
 
 
-def _scaled(healthy: Healthy, volume: float) -> Healthy:
+def _scaled(healthy: HealthyHead, volume: float) -> HealthyHead:
     centre, own = size_of(healthy.mask, healthy.affine)
     factor = (volume / own) ** (1.0 / 3.0)
     grey = healthy.intensity

@@ -36,7 +36,7 @@ SPLIT_24 = np.array([[0, 1, 2, 4], [0, 4, 2, 5], [0, 4, 5, 3]])
 
 
 @dataclass(frozen=True)
-class Stuffing:
+class IsosurfaceStuffingOptions:
     """How far a cut pulls nodes onto its surface, and how exactly it finds where an edge crosses that.
 
     Parameters
@@ -89,7 +89,12 @@ def whole(lattice: Lattice) -> Pieces:
     return Pieces(lattice.nodes, kind, lattice.tets, everywhere, np.zeros(len(kind), bool))
 
 
-def cut(pieces: Pieces, field: Field, pinned: np.ndarray | None = None, settings: Stuffing = Stuffing()) -> Pieces:
+def cut(
+    pieces: Pieces,
+    field: Field,
+    pinned: np.ndarray | None = None,
+    settings: IsosurfaceStuffingOptions = IsosurfaceStuffingOptions(),
+) -> Pieces:
     """Split `pieces` along the zero surface of `field`.
 
     Nodes near the surface are pulled onto it, but for those `pinned` (V,), which count as lying on it where they are.
@@ -138,7 +143,7 @@ def _crossings(field: Field, nodes: np.ndarray, edges: np.ndarray, values: np.nd
     return 0.5 * (low + high)
 
 
-def _snapping_reach(pieces: Pieces, edges: np.ndarray, settings: Stuffing) -> np.ndarray:
+def _snapping_reach(pieces: Pieces, edges: np.ndarray, settings: IsosurfaceStuffingOptions) -> np.ndarray:
     """The share (E, 2) of each edge within which a crossing pulls either end."""
     kinds = pieces.kind[edges]
     share = np.where(kinds[:, 0] == kinds[:, 1], settings.snap_long, settings.snap_short)

@@ -14,7 +14,7 @@ from scipy import ndimage
 from ..errors import InputError
 from ..runtime.file_limits import MOST_VOXELS
 from .volume import read_volume
-from .voxels import OF_BRAINS, Grid, Segment, Voxels
+from .voxels import OF_BRAINS, Segment, VoxelGrid, Voxels
 
 # Difference of a label from a whole number that a slope of the file or a resampling leaves.
 ROUND_OFF = 1e-3
@@ -177,9 +177,9 @@ class Mask:
         return ends @ self.affine[:3, :3].T + self.affine[:3, 3]
 
     @property
-    def grid(self) -> Grid:
+    def grid(self) -> VoxelGrid:
         """Where its voxels lie."""
-        return Grid(self.path, self.marked.shape, self.affine)
+        return VoxelGrid(self.path, self.marked.shape, self.affine)
 
     @property
     def box(self) -> np.ndarray:

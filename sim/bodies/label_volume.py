@@ -20,8 +20,8 @@ from .label_map import Label, Mask, on_border
 from .one_space import demand_scan_of
 from .placement import Piece, site_over
 from .signed_distance import Blur, mask_field
-from .subject import Part, Subject, rim
-from .voxels import Grid
+from .subject import Subject, SubjectPart, rim
+from .voxels import VoxelGrid
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def masked_subject(
             raise InputError(f"{masks.name}: marks no {name}, so it is no region. Choose from {known}{own}.")
     intensity = None if t1 is None else read_intensity(t1, masks.voxels)
     if t1 is not None and intensity is not None:
-        scan = Grid(path_of(t1), intensity.values.shape, intensity.affine)
+        scan = VoxelGrid(path_of(t1), intensity.values.shape, intensity.affine)
         demand_scan_of(Mask(Path(masks.name), masks.brain, masks.affine), scan, masks.grids)
     affine, voxel = masks.affine, abs(float(np.linalg.det(masks.affine[:3, :3])))
     notes = list(masks.notes)
@@ -125,7 +125,7 @@ def _septum(name: str, masks: HeadMasks) -> Septum:
 
 def _parts(
     masks: HeadMasks, solid: np.ndarray, tumour: np.ndarray, regions: Sequence[str], settings: Labelling
-) -> tuple[Part, ...]:
+) -> tuple[SubjectPart, ...]:
     """The parts that become regions; their volumes are those that lie in brain or tumour, as the mesh has it."""
     voxel, parts = abs(float(np.linalg.det(masks.affine[:3, :3]))), []
     taken = np.zeros_like(solid)
@@ -133,7 +133,7 @@ def _parts(
         mask, label = masks.parts[name], PART_LABELS[name]
         own = mask & (tumour if label == NECROSIS_LABEL else solid & ~tumour) & ~taken
         taken |= own
-        parts.append(Part(label, mask_field(mask, masks.affine, settings.blur), float(own.sum() * voxel)))
+        parts.append(SubjectPart(label, mask_field(mask, masks.affine, settings.blur), float(own.sum() * voxel)))
     return tuple(reversed(parts))
 
 

@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..geometry.surface import areas
 from ..geometry.tetmesh import SLIVER_DEGREES, TetMesh, faces_once
 from .bcc_lattice import graded_lattice
-from .isosurface_stuffing import Pieces, Stuffing, cut, whole
+from .isosurface_stuffing import IsosurfaceStuffingOptions, Pieces, cut, whole
 from .manifold_repair import clean, ears
 from .mesh_smoothing import Projection, Smoothing, fitted, improved, smallest_sines, unfolded
 from .placement import Piece
@@ -69,7 +69,7 @@ class Meshing:
     largest_error: float = 0.1
     shown: float = 0.1
     more: tuple[float, ...] = (1.25, 1.6, 2.0, 2.5)
-    stuffing: Stuffing = field(default_factory=Stuffing)
+    stuffing: IsosurfaceStuffingOptions = field(default_factory=IsosurfaceStuffingOptions)
     smoothing: Smoothing = field(default_factory=Smoothing)
 
 

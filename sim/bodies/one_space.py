@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 
 from ..errors import InputError
 from .label_map import Mask
-from .voxels import LPS, Grid
+from .voxels import LPS, VoxelGrid
 
 # Share of what has to lie inside that does: less is amiss, and so much after x and y are negated says why.
 AMISS, EXPLAINED = 0.5, 0.9
@@ -44,7 +44,7 @@ def in_one_space(brain: Mask, tumour: Mask) -> bool:
     return turned > EXPLAINED and not _same(brain.grid, tumour.grid)
 
 
-def demand_scan_of(brain: Mask, scan: Grid, grids: Iterable[Grid]) -> None:
+def demand_scan_of(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -> None:
     """Refuse a scan in LPS that is stated as RAS, as far as it shows; `grids` are of the files that mark the `brain`.
 
     Raises
@@ -63,7 +63,7 @@ def demand_scan_of(brain: Mask, scan: Grid, grids: Iterable[Grid]) -> None:
         )
 
 
-def demand_not_negated(one: Grid, other: Grid) -> None:
+def demand_not_negated(one: VoxelGrid, other: VoxelGrid) -> None:
     """Refuse two grids of which one is the other with x and y negated.
 
     Raises
@@ -72,11 +72,11 @@ def demand_not_negated(one: Grid, other: Grid) -> None:
         Such grids.
     """
     negated = np.array([*LPS, 1.0])[:, None] * other.affine
-    if _same(one, Grid(other.path, other.shape, negated)):
+    if _same(one, VoxelGrid(other.path, other.shape, negated)):
         raise InputError(f"{other.path}: has the grid of {one.path}, but with x and y negated: {ONE_OF_BOTH}")
 
 
-def _same(one: Grid, other: Grid) -> bool:
+def _same(one: VoxelGrid, other: VoxelGrid) -> bool:
     return one.shape == other.shape and np.allclose(one.affine, other.affine, rtol=0.0, atol=1e-6)
 
 
@@ -85,7 +85,7 @@ def _thinned(points: np.ndarray) -> np.ndarray:
     return points[:: max(1, len(points) // SAMPLED)]
 
 
-def _places(grid: Grid, index: np.ndarray) -> np.ndarray:
+def _places(grid: VoxelGrid, index: np.ndarray) -> np.ndarray:
     """Places (n, 3) [m] of voxels (n, 3)."""
     return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 

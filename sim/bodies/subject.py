@@ -66,7 +66,7 @@ class MeshPlan:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class SubjectPart:
     """A part of brain or tumour that has a stiffness of its own: region label, field, and volume [m^3] in the labels.
 
     Necrosis is a part of the tumour, all else of the brain.
@@ -114,7 +114,7 @@ class Subject:
     intensity: Intensity | None = None
     notes: tuple[str, ...] = ()
     pieces: tuple[Piece, ...] = ()
-    parts: tuple[Part, ...] = ()
+    parts: tuple[SubjectPart, ...] = ()
     septa: tuple[Septum, ...] = ()
     outline: np.ndarray | None = None
 

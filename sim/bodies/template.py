@@ -133,7 +133,7 @@ class Tumour:
 
 
 @dataclass(frozen=True, eq=False)
-class Healthy:
+class HealthyHead:
     """A head without a tumour.
 
     Parameters
@@ -191,7 +191,7 @@ def template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
     return drawn_subject(tumour, _scaled_template(head), head)
 
 
-def drawn_subject(tumour: Tumour, healthy: Healthy, head: Head = Head()) -> Subject:
+def drawn_subject(tumour: Tumour, healthy: HealthyHead, head: Head = Head()) -> Subject:
     """A healthy head with a tumour drawn in it. Of `head`, volume and threshold do not count here.
 
     Raises
@@ -234,7 +234,7 @@ def size_of(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, float]:
     return centre, float(mask.sum() * abs(np.linalg.det(affine[:3, :3])))
 
 
-def _scaled_template(head: Head) -> Healthy:
+def _scaled_template(head: Head) -> HealthyHead:
     with needed_from("heads", "an anatomy of the average brain needs"):
         from nilearn.datasets import load_mni152_template  # takes seconds
 
@@ -245,7 +245,7 @@ def _scaled_template(head: Head) -> Healthy:
     affine = np.array(image.affine, np.float64)
     centre, volume = size_of(mask, affine)
     affine = scaled(affine, centre, (head.volume / volume) ** (1.0 / 3.0), 1e-3 * centre)
-    return Healthy(mask, affine, Intensity(grey, affine))
+    return HealthyHead(mask, affine, Intensity(grey, affine))
 
 
 def _site(

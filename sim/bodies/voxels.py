@@ -85,7 +85,7 @@ class Volume:
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class VoxelGrid:
     """Where the voxels of a file lie: how many there are along each axis, and (4, 4) from indices to metres (RAS)."""
 
     path: Path

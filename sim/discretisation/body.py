@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ..anatomy import Anatomy
 from ..runtime.device import Device
-from .footprint import Skin
+from .footprint import ContactSurface
 from .space import Discretisation
 
 
@@ -21,5 +21,5 @@ class Body:
 
     anatomy: Anatomy
     space: Discretisation
-    skin: Skin
+    skin: ContactSurface
     device: Device

@@ -18,7 +18,7 @@ from ..runtime.device import Device, forward_kernel
 
 
 @dataclass(frozen=True)
-class Freedom:
+class MinFreeDofs:
     """How little may be left free before it counts as held.
 
     Parameters
@@ -34,7 +34,7 @@ class Freedom:
 
 
 @dataclass(frozen=True)
-class Kernels:
+class ConstraintKernels:
     """Constraint arithmetic of one scalar type."""
 
     project: wp.Kernel
@@ -44,7 +44,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(device: Device) -> Kernels:
+def kernels_of(device: Device) -> ConstraintKernels:
     """Kernels of a device's scalar type."""
     scalar, vec = device.scalar, device.vector
     chunk = CHUNK
@@ -111,7 +111,7 @@ def kernels_of(device: Device) -> Kernels:
         for k in range(3):
             v[3 * i + k, c] += weight[i, c] * amount[k, c]
 
-    return Kernels(project, close, average, spread)
+    return ConstraintKernels(project, close, average, spread)
 
 
 class Constraint:
@@ -130,7 +130,7 @@ class Constraint:
         What counts as held.
     """
 
-    def __init__(self, held: np.ndarray, normal: np.ndarray, device: Device, freedom: Freedom = Freedom()):
+    def __init__(self, held: np.ndarray, normal: np.ndarray, device: Device, freedom: MinFreeDofs = MinFreeDofs()):
         self.held, self._freedom = held, freedom
         self.normal, drag = _within_free(held, normal, freedom.normal)
         self.device = device

@@ -22,7 +22,7 @@ vec6d = wp.types.vector(length=6, dtype=wp.float64)
 
 
 @dataclass(frozen=True)
-class Division:
+class EdgeSubdivision:
     """Into how many pieces each edge of a triangle is divided under a footprint.
 
     Parameters
@@ -66,7 +66,7 @@ class Footprints:
 
 
 @dataclass(frozen=True, eq=False)
-class Imprint:
+class FootprintArrays:
     """Arrays on the device in which B tools press: (B,) of point and radius [m], and of where each touches first.
 
     `found` (n, B) on the way there, fewer each time; weight (M, B) and sums (B,) as `Footprints`.
@@ -79,7 +79,7 @@ class Imprint:
     sums: wp.array
 
 
-class Skin:
+class ContactSurface:
     """A surface that tools touch, on a device.
 
     Parameters
@@ -102,7 +102,7 @@ class Skin:
         triangles: np.ndarray,
         device: Device,
         name: str = "surface",
-        division: Division = Division(),
+        division: EdgeSubdivision = EdgeSubdivision(),
     ):
         self.device, self._name, self._division = device, name, division
         self.nodes, table = np.unique(triangles, return_inverse=True)
@@ -141,7 +141,7 @@ class Skin:
             last = self._last = key, self._pressed(points, radii)
         return last[1]  # another thread may have pressed elsewhere since
 
-    def imprint(self, tools: wp.array) -> Imprint:
+    def imprint(self, tools: wp.array) -> FootprintArrays:
         """Where tools (B,) are about to press."""
         count, device = len(tools), self.device.name
         found, left = [], len(self._ball)
@@ -150,9 +150,9 @@ class Skin:
             found.append(wp.empty((left, count), dtype=wp.vec4d, device=device))
         sums = wp.empty(count, dtype=wp.vec4d, device=device)
         weight = wp.empty((len(self.nodes), count), dtype=wp.float64, device=device)
-        return Imprint(tools, found[-1].flatten(), tuple(found), weight, sums)
+        return FootprintArrays(tools, found[-1].flatten(), tuple(found), weight, sums)
 
-    def put(self, imprint: Imprint) -> None:
+    def put(self, imprint: FootprintArrays) -> None:
         """Let the tools press, on the device alone; infinitely far away, and no weight, where one does not touch."""
         self._touch(imprint)
         imprint.weight.zero_()
@@ -196,7 +196,7 @@ class Skin:
     def _tools(self, points: np.ndarray, radii: np.ndarray) -> wp.array:
         return self.device.array(np.column_stack([points, radii]), wp.vec4d)
 
-    def _touch(self, imprint: Imprint) -> None:
+    def _touch(self, imprint: FootprintArrays) -> None:
         """Where each tool touches first, and how far that is from its point; inf if beyond its radius."""
         inputs = [self._corners, self._ball, imprint.tools]
         self.device.launch(_search, imprint.found[0].shape, inputs, [imprint.found[0]])
@@ -205,14 +205,14 @@ class Skin:
 
 
 def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray) -> sp.csr_array:
-    """Weights (B, N), each row summing to one; parameters and errors as `Skin` and `Skin.press`, on the host."""
-    return Skin(nodes, triangles, find_device("cpu", "float64")).press(points, radii).rows(len(nodes))
+    """Weights (B, N), each row summing to one; parameters and errors as `ContactSurface` and `ContactSurface.press`, on the host."""
+    return ContactSurface(nodes, triangles, find_device("cpu", "float64")).press(points, radii).rows(len(nodes))
 
 
 def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     """The point (3,) nearest to `point` (3,) on triangles with `corners` (S, 3, 3) [m]."""
     apart = np.arange(3 * len(corners)).reshape(-1, 3)
-    skin = Skin(corners.reshape(-1, 3), apart, find_device("cpu", "float64"))
+    skin = ContactSurface(corners.reshape(-1, 3), apart, find_device("cpu", "float64"))
     return skin.nearest(point[None], np.array([np.inf]))[0][0]
 
 

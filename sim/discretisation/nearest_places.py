@@ -15,7 +15,7 @@ from .footprint import on_triangle
 TURNS = 16
 
 
-class Near(NamedTuple):
+class NearestPlaces(NamedTuple):
     """Corner coordinates (S, 3) of places, how far they are (S,) [m], and the directions to them (S, 3)."""
 
     share: np.ndarray
@@ -24,7 +24,7 @@ class Near(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedBox:
     """A box where it stands, of which a tool is all within a radius: a point of a ball, a line of a rod.
 
     A flat one, of a blade, has tissue below it alone. What came through it is as far inside as it is above.
@@ -36,7 +36,7 @@ class Placed:
     axes: np.ndarray
     half: np.ndarray
 
-    def moved(self, way: np.ndarray) -> Placed:
+    def moved(self, way: np.ndarray) -> PlacedBox:
         """The same, moved by (3,) [m]."""
         return replace(self, middle=self.middle + way)
 
@@ -46,7 +46,7 @@ class Placed:
         signs = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
         return self.middle + (signs * self.half) @ self.axes.T
 
-    def nearest(self, corners: np.ndarray) -> Near:
+    def nearest(self, corners: np.ndarray) -> NearestPlaces:
         """The places nearest to it on triangles with `corners` (S, 3, 3) [m].
 
         A place of one takes turns with the nearest of the other, with momentum (Beck, Teboulle 2009, "A fast iterative
@@ -72,7 +72,7 @@ class Nearest:
 
     def __init__(self, count: int):
         self._corners = np.empty((count, 3, 3))
-        self._found = Near(np.empty((count, 3)), np.empty(count), np.empty((count, 3)))
+        self._found = NearestPlaces(np.empty((count, 3)), np.empty(count), np.empty((count, 3)))
         load(_nearest.module)
         kinds = (wp.vec3d, wp.vec3d, wp.float64, wp.vec3d)
         given = zip((self._corners, *self._found), kinds, strict=True)
@@ -83,8 +83,8 @@ class Nearest:
             _nearest, count, [arrays[0], *stands], arrays[1:], device="cpu", record_cmd=True, record_tape=False
         )
 
-    def to(self, core: Placed, corners: np.ndarray) -> Near:
-        """As `Placed.nearest`; what it gave before is overwritten."""
+    def to(self, core: PlacedBox, corners: np.ndarray) -> NearestPlaces:
+        """As `PlacedBox.nearest`; what it gave before is overwritten."""
         if self._launch is None:  # of no triangles
             return self._found
         self._corners[:] = corners

@@ -14,7 +14,7 @@ from .rigid_modes import check_held, loosened
 
 
 @dataclass(frozen=True, eq=False)
-class Remains:
+class RemainingBody:
     """A body after so many steps.
 
     Parameters
@@ -39,7 +39,7 @@ class Remains:
         return f"{said}; {len(self.loose)} tetrahedra that nothing held any more went too"
 
 
-def bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[Remains, ...]:
+def bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[RemainingBody, ...]:
     """`remains` under effects, `Resection` one of them: what none of them holds, or keeps on the skull, comes loose.
 
     Raises
@@ -55,7 +55,7 @@ def bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[Remains, ...]:
     return remains(whole, cut, bool(kinds & {Bonded, Slide}))
 
 
-def remains(anatomy: Anatomy, effect: Resection, slides: bool = True) -> tuple[Remains, ...]:
+def remains(anatomy: Anatomy, effect: Resection, slides: bool = True) -> tuple[RemainingBody, ...]:
     """What is left after 0, 1, ... all steps; `slides`: slide normals keep tissue on the skull.
 
     Raises
@@ -66,10 +66,10 @@ def remains(anatomy: Anatomy, effect: Resection, slides: bool = True) -> tuple[R
     return tuple(_remains(anatomy, effect, slides))
 
 
-def _remains(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[Remains]:
+def _remains(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[RemainingBody]:
     normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
     check_held(anatomy.mesh, anatomy.held, normal)  # else all of it would count as loose
-    yield Remains(0, anatomy, np.zeros(0, np.int64))
+    yield RemainingBody(0, anatomy, np.zeros(0, np.int64))
     taken: set[int] = set()
     for done, step in enumerate(effect.steps, start=1):
         taken.update(step)
@@ -78,6 +78,6 @@ def _remains(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[Rema
             left = anatomy.without(gone)
             kept = np.setdiff1d(np.arange(len(anatomy.mesh.tets)), gone)
             loose = kept[loosened(left, slides)]
-            yield Remains(done, anatomy.without(np.concatenate([gone, loose])) if len(loose) else left, loose)
+            yield RemainingBody(done, anatomy.without(np.concatenate([gone, loose])) if len(loose) else left, loose)
         except InputError as error:
             raise InputError(f"step {done} of Resection cannot be done: {error}") from error

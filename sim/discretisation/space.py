@@ -17,7 +17,7 @@ from .smoothed import edge_elements, node_elements
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ElementPart:
     """Elements, and which of a tissue's stiffness they carry: "whole", "shape" or "volume"."""
 
     elements: Elements
@@ -76,7 +76,7 @@ class Discretisation:
         middles = self.table[:, 4:].ravel()[first[np.searchsorted(key, asked)]]
         return np.column_stack([corners, middles.reshape(-1, 3)])
 
-    def parts(self, chosen: np.ndarray) -> tuple[Part, ...]:
+    def parts(self, chosen: np.ndarray) -> tuple[ElementPart, ...]:
         """Elements over the `chosen` (T,) bool tetrahedra.
 
         Raises
@@ -85,11 +85,11 @@ class Discretisation:
             Quadratic elements that are folded over.
         """
         if self.element == "p1":
-            return (Part(linear_elements(self.mesh, chosen), "whole"),)
+            return (ElementPart(linear_elements(self.mesh, chosen), "whole"),)
         if self.element == "p2":
-            return (Part(quadratic_elements(self.nodes, self.table, chosen), "whole"),)
+            return (ElementPart(quadratic_elements(self.nodes, self.table, chosen), "whole"),)
         edges, nodes = _smoothed(self.mesh, chosen.tobytes())
-        return Part(edges, "shape"), Part(nodes, "volume")
+        return ElementPart(edges, "shape"), ElementPart(nodes, "volume")
 
     def held(self, held: np.ndarray) -> np.ndarray:
         """Held components (N, 3) from the mesh's own (V, 3).

@@ -30,7 +30,7 @@ EXACT, STEPS = 1e-3, 300
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class NodalField:
     """A field (V, 3) [m] of vertices `nodes` (V, 3) [m], linear in each of the tetrahedra (T, 4)."""
 
     nodes: np.ndarray
@@ -47,7 +47,7 @@ class _Samples(NamedTuple):
     simplex: np.ndarray
 
 
-def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarray, body: Body) -> None:
+def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarray, body: NodalField) -> None:
     """Change a field (3, I, J, K), sampled inside a body and in a collar (I, J, K) round it, to fit it between nodes.
 
     It is done in place, where sampling is off by more than 0.02 mm, and in the collar where it moves. The square of the
@@ -91,7 +91,7 @@ def _read(flat: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> np.ndar
     return np.stack([np.einsum("nc,nc->n", part[numbers], weights) for part in flat], axis=-1)
 
 
-def _samples(grid: Grid, body: Body, which: np.ndarray, density: float) -> Iterator[_Samples]:
+def _samples(grid: Grid, body: NodalField, which: np.ndarray, density: float) -> Iterator[_Samples]:
     """Points in some tetrahedra, so many to a node's distance along the longest edge; by their share of a cell."""
     corners = body.nodes[body.tets[which]]
     volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / (6.0 * grid.spacing**3)
@@ -99,7 +99,7 @@ def _samples(grid: Grid, body: Body, which: np.ndarray, density: float) -> Itera
         yield some._replace(simplex=which[some.simplex])
 
 
-def _on_surface(grid: Grid, body: Body, touched: np.ndarray) -> Iterator[_Samples]:
+def _on_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterator[_Samples]:
     """Points of the surface's triangles of which a vertex is touched (V,)."""
     faces = faces_once(body.tets)
     faces = faces[touched[faces].any(axis=1)]
@@ -108,7 +108,9 @@ def _on_surface(grid: Grid, body: Body, touched: np.ndarray) -> Iterator[_Sample
     return _lattices(grid, body, faces, SURFACE * areas, ON_SURFACE)
 
 
-def _lattices(grid: Grid, body: Body, simplices: np.ndarray, weights: np.ndarray, density: float) -> Iterator[_Samples]:
+def _lattices(
+    grid: Grid, body: NodalField, simplices: np.ndarray, weights: np.ndarray, density: float
+) -> Iterator[_Samples]:
     """Points of simplices (n, c) of vertices, each of a lattice, evenly; they share the weights (n,)."""
     corners = body.nodes[simplices]
     size = simplices.shape[1]

@@ -16,7 +16,7 @@ from .folds import unfold
 from .grid import Grid, grid_around
 from .in_tetrahedra import in_tetrahedra
 from .inversion import inverted
-from .projection import Body, project
+from .projection import NodalField, project
 
 # Beyond the body the field fades to zero within so much [m], and so many times what the body moves by.
 LEAST_REACH, REACHES = 5e-3, 2.0
@@ -106,7 +106,7 @@ def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.
     collar = collar_of(inside)
     numbers = np.flatnonzero(collar)
     field.reshape(3, -1)[:, numbers] = beyond_surface(nodes, tets, displacement, grid.points(numbers)).T
-    project(grid, field, inside, collar, Body(nodes, tets, displacement))
+    project(grid, field, inside, collar, NodalField(nodes, tets, displacement))
     filled = extended(field, inside | collar, reach_of(displacement) / grid.spacing)
     return filled, unfold(filled, inside, collar, grid.spacing)
 
@@ -123,7 +123,7 @@ def backward_on(grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np
     guess = -forward.reshape(3, -1)[:, numbers].T.astype(np.float64)
     flat[:, numbers] = inverted(grid, forward, grid.points(numbers), guess).T
     collar = collar_of(inside)
-    project(grid, field, inside, collar, Body(now, tets, -displacement))
+    project(grid, field, inside, collar, NodalField(now, tets, -displacement))
     return field, unfold(field, inside, collar, grid.spacing)
 
 

@@ -13,7 +13,7 @@ import pyamg
 import scipy.sparse as sp
 
 from ..runtime.device import Device
-from .multigrid import CHEBYSHEV, Chebyshev, Lifted, TwoLevel, regular
+from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevel, regular
 from .pcg import Preconditioner
 
 Direct = Callable[[sp.csc_array, sp.csc_array, np.ndarray], Preconditioner]
@@ -55,7 +55,9 @@ def algebraic(
     coarse = _direct(sp.csc_array(lowest.A), sp.csc_array(lowest.P), lowest.P.blocksize[1], direct)
     solver = TwoLevel(coarse, _blocks(lowest.A), device, smoother=smoother)
     for level in reversed(upper):
-        solver = TwoLevel(Lifted(sp.bsr_array(level.P), solver, device), _blocks(level.A), device, smoother=smoother)
+        solver = TwoLevel(
+            ReducedPreconditioner(sp.bsr_array(level.P), solver, device), _blocks(level.A), device, smoother=smoother
+        )
     solver.name = f"algebraic multigrid, {len(fine) + 1} levels"
     return solver
 

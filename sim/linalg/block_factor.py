@@ -13,7 +13,7 @@ from ..runtime.device import Device
 
 
 @dataclass(frozen=True)
-class Functions:
+class BlockFactorFunctions:
     """Functions of Warp on matrices (b, n, n) and vectors (b, n), of which the first `size` rows count."""
 
     factor: wp.Function
@@ -21,7 +21,7 @@ class Functions:
 
 
 @cache
-def functions_of(device: Device) -> Functions:
+def functions_of(device: Device) -> BlockFactorFunctions:
     """Those for the blocks of a device."""
     down, across = threads_of(device)
     threads = down * across
@@ -75,4 +75,4 @@ def functions_of(device: Device) -> Functions:
                 x[c, k] = y
         wait()
 
-    return Functions(factor, solve)
+    return BlockFactorFunctions(factor, solve)

@@ -101,7 +101,7 @@ class Buffers:
     square: wp.array
 
 
-class Dense:
+class DenseInverse:
     """A rest stiffness K over some motions L, L (L^T K L)^-1 L^T, inverted in double precision.
 
     stiffness K (3N, 3N) [N/m]; motions L (3N, n), independent columns.

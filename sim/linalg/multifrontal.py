@@ -151,7 +151,7 @@ def node_of(basis: sp.csc_array) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
+class FrontPanel:
     """What is kept of a front of k own and m border unknowns: `values` (k, k + m) = R^-T [1, -R^-1 C^T].
 
     S = R R^T (k, k) and C (m, k) are the rows of the matrix at the front's own and border unknowns, less what was
@@ -174,7 +174,7 @@ class Panel:
         x[self.front.first : self.front.stop] = self.values @ x[self.front.rows]
 
 
-def _swept(panels: Sequence[Panel], x: np.ndarray) -> np.ndarray:
+def _swept(panels: Sequence[FrontPanel], x: np.ndarray) -> np.ndarray:
     """x (n, b) after both sweeps through these panels, in place."""
     for panel in panels:
         panel.up(x)
@@ -185,7 +185,7 @@ def _swept(panels: Sequence[Panel], x: np.ndarray) -> np.ndarray:
 
 def panels_of(
     matrix: sp.csc_array, fronts: Sequence[Sequence[Front]], precision: Precision, singular: float
-) -> tuple[np.ndarray, list[Panel]]:
+) -> tuple[np.ndarray, list[FrontPanel]]:
     """The values of all panels, one after the other in one array; and the panels.
 
     Raises
@@ -199,7 +199,7 @@ def panels_of(
     cuts = np.cumsum([0, *(k * n for k, n in shapes)])
     values = np.zeros(cuts[-1], precision)
     panels = [
-        Panel(front, values[first:stop].reshape(shape))
+        FrontPanel(front, values[first:stop].reshape(shape))
         for front, shape, (first, stop) in zip(every, shapes, pairwise(cuts), strict=True)
     ]
     ends = np.cumsum([0, *(len(part) for part in fronts)]).tolist()
@@ -218,7 +218,7 @@ def panels_of(
 class _Fronts:
     """Fronts of a sparse matrix, one after the other; those of different parts may be eliminated at the same time."""
 
-    def __init__(self, matrix: sp.csc_array, panels: Sequence[Panel], singular: float):
+    def __init__(self, matrix: sp.csc_array, panels: Sequence[FrontPanel], singular: float):
         self._matrix, self._panels = matrix, panels
         self._least = singular * matrix.diagonal()
         sizes = [len(panel.values) for panel in panels]

@@ -169,7 +169,7 @@ class TwoLevel:
         return largest
 
 
-class Lifted:
+class ReducedPreconditioner:
     """L M L^T: a preconditioner M of fewer unknowns, for what motions L (m, n), in blocks, can do."""
 
     on_device = False

@@ -17,7 +17,7 @@ from ..discretisation.space import Discretisation
 from ..errors import InputError
 from ..runtime.device import Device
 from .multifrontal import Factor, node_of
-from .multigrid import CHEBYSHEV, Chebyshev, Lifted, TwoLevel, over_free
+from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevel, over_free
 from .pcg import BlockJacobi, Preconditioner
 
 
@@ -124,13 +124,13 @@ def rest_solver(problem: Problem) -> Preconditioner:
 
 def _on_corners(
     stiffness: sp.csc_array, space: Discretisation, constraint: Constraint, device: Device, settings: Preconditioning
-) -> Lifted:
+) -> ReducedPreconditioner:
     """What linear tetrahedra on the same corners can do, as far as it is free."""
     corner, free = np.unique(space.table[:, :4]), constraint.basis()
     every = sp.csc_array(free @ (free.T @ sp.kron(space.corner_interpolation, sp.eye_array(3))))
     own = Constraint(constraint.held[corner], constraint.normal[corner], device)
     coarse = _solver(sp.csc_array(every.T @ stiffness @ every), own, space.nodes[corner], device, settings)
-    return Lifted(sp.bsr_array(sp.csr_array(every), blocksize=(3, 3)), coarse, device)
+    return ReducedPreconditioner(sp.bsr_array(sp.csr_array(every), blocksize=(3, 3)), coarse, device)
 
 
 def _solver(
@@ -168,7 +168,7 @@ def direct(
         It is singular.
     """
     if device.on_cuda and _inverts(len(node), device):
-        from .dense_inverse import Dense
+        from .dense_inverse import DenseInverse
 
-        return Dense(stiffness, motions, device)
+        return DenseInverse(stiffness, motions, device)
     return Factor(stiffness, motions, node, device, precision)

@@ -16,7 +16,7 @@ from .preconditioner import is_exact, rest_solver
 
 
 @dataclass(frozen=True, eq=False)
-class Resting:
+class RestStiffnessSolver:
     """The linear body that a problem is at rest.
 
     Parameters

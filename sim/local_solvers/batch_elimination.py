@@ -21,7 +21,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import KDTree
 
-from ..compile import Part, compile_part, surrounded
+from ..compile import LocalProblem, compile_part, surrounded
 from ..discretisation.constraint import Constraint
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
@@ -30,10 +30,10 @@ from ..linalg.pcg import Preconditioner
 from ..linalg.preconditioner import rest_solver
 from ..linalg.schur import condensed
 from ..minimisers.lbfgs import Descended, Lbfgs
-from ..minimisers.residual import Judge, State
+from ..minimisers.residual import Judge, ResidualState
 from ..runtime.columns import combined, put_rows, rows_taken
 from ..runtime.dense_product import product_with
-from .outer_loop import USUAL, Limits, eliminated
+from .outer_loop import USUAL, CycleLimits, eliminated
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,11 @@ class BatchElimination:
     problem: Problem
     preconditioner: Preconditioner
     rows: wp.array
-    part: Part
+    part: LocalProblem
     lbfgs: Lbfgs
     shared: wp.array
     follow: Callable[[wp.array, wp.array], None]
-    limits: Limits = USUAL
+    limits: CycleLimits = USUAL
     near: NearPart = NEAR
 
     def descend(
@@ -88,7 +88,7 @@ class BatchElimination:
     ) -> Descended:
         """As `Lbfgs.descend`, in at most `most` cycles; nothing is learnt."""
 
-        def cycle(judge: Judge, now: State, force: np.ndarray) -> State:
+        def cycle(judge: Judge, now: ResidualState, force: np.ndarray) -> ResidualState:
             return judge(self._corrected(now.u, now.g, force))
 
         return eliminated(self.problem, start, tolerance, most, self.limits, cycle)

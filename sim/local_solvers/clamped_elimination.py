@@ -22,10 +22,10 @@ from ..linalg.pcg import Preconditioner
 from ..minimisers.compact_lbfgs import no_pairs
 from ..minimisers.lbfgs import Descended
 from ..minimisers.line_search import goes_too_far, kept_of
-from ..minimisers.residual import Judge, State
+from ..minimisers.residual import Judge, ResidualState
 from ..runtime.columns import combined
 from .clamped_part import ClampedPart
-from .outer_loop import Limits, eliminated
+from .outer_loop import CycleLimits, eliminated
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class ClampedSize:
     cuts: int = 6
 
 
-DEAR = Limits(cycles=30, patience=8, rise=1e6, forcing=0.1, enough=0.5)
+DEAR = CycleLimits(cycles=30, patience=8, rise=1e6, forcing=0.1, enough=0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class ClampedElimination:
     preconditioner: Preconditioner
     effects: Iterable[Effect]
     space: Discretisation
-    limits: Limits = DEAR
+    limits: CycleLimits = DEAR
     size: ClampedSize = ClampedSize()
 
     def descend(
@@ -84,7 +84,7 @@ class ClampedElimination:
         )
         z = np.zeros(0)
 
-        def cycle(judge: Judge, now: State, force: np.ndarray) -> State:
+        def cycle(judge: Judge, now: ResidualState, force: np.ndarray) -> ResidualState:
             nonlocal chosen, part, pairs, z
             if part is None:
                 z = self._solved(now.g)
@@ -112,7 +112,7 @@ class ClampedElimination:
 
         return eliminated(self.problem, start, tolerance, most, self.limits, cycle)
 
-    def _lower(self, judge: Judge, now: State, part: ClampedPart, d: np.ndarray, force: float) -> State:
+    def _lower(self, judge: Judge, now: ResidualState, part: ClampedPart, d: np.ndarray, force: float) -> ResidualState:
         """A step along d (3N,) that does not go too far, and the part settled to `force` [N] there.
 
         Its free force is not finite where no step that was tried leads on.

@@ -9,11 +9,11 @@ import numpy as np
 
 from ..minimisers.compact_lbfgs import PairsOfColumns
 from ..minimisers.residual import Judge, relative
-from .strained_part import Model
+from .strained_part import StrainedModel
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class ContactState:
     """u (3N, b) [m]; free gradients (3N, b) [N] of all that is smooth, and of all; 2-norms (b,), and scales (b,)."""
 
     u: Any
@@ -32,12 +32,12 @@ class State:
         """(b,) bool: whether each is a state at all. Forces that overflow have no scale."""
         return np.isfinite(self.free) & np.isfinite(self.scale)
 
-    def rows(self, stay: np.ndarray) -> State:
+    def rows(self, stay: np.ndarray) -> ContactState:
         """Some of the columns (k,)."""
         parts = (self.u[:, stay], self.smooth[:, stay], self.whole[:, stay])
-        return State(*parts, self.free[stay], self.scale[stay])
+        return ContactState(*parts, self.free[stay], self.scale[stay])
 
-    def put(self, columns: np.ndarray, some: Any, other: State) -> None:
+    def put(self, columns: np.ndarray, some: Any, other: ContactState) -> None:
         """Write columns (k,) of another state over these; `some` are the same of an array's."""
         for mine, its in ((self.u, other.u), (self.smooth, other.smooth), (self.whole, other.whole)):
             mine[:, some] = its[:, some]
@@ -66,9 +66,9 @@ class Batch:
     """
 
     judge: Judge
-    now: State
+    now: ContactState
     pairs: PairsOfColumns
-    model: Model | None
+    model: StrainedModel | None
     stale: np.ndarray
     force: Any
     rest: Any

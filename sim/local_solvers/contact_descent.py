@@ -32,12 +32,12 @@ from ..minimisers.line_search import goes_too_far, kept_of
 from ..minimisers.residual import Judge, judge_of
 from ..runtime.device import Device
 from ..runtime.views import columns_of, doubled, from_view, in_order, like, on_host, placed, view
-from .contact_batch import Batch, State
-from .contact_forces import BENT, FORCES, ForceLimits, Softness, scratch_of, settled
+from .contact_batch import Batch, ContactState
+from .contact_forces import BENT, FORCES, ContactCompliance, ForceLimits, scratch_of, settled
 from .contact_limits import CONTACT, ContactLimits
 from .contact_steps import PROMISED, STATUS, ContactSteps, judged
 from .contact_structs import CROWDED, FOUND, Scratch
-from .strained_part import STRAINS, StrainedPart, Strains
+from .strained_part import STRAINS, StrainedPart, StrainLimits
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class ContactDescent:
     preconditioner: Preconditioner
     barrier: Local
     limits: ContactLimits = CONTACT
-    strains: Strains = STRAINS
+    strains: StrainLimits = STRAINS
     replays: bool = False
 
     @cached_property
@@ -270,7 +270,7 @@ class ContactDescent:
         if barrier is None:
             return known, np.ones(len(some), bool)
         exact = self._exactly(batch, tolerance)[some]
-        soft, free = Softness(self.compliance, self._exact, self._room), now.u[rows] - batch.rest[rows]
+        soft, free = ContactCompliance(self.compliance, self._exact, self._room), now.u[rows] - batch.rest[rows]
         if batch.model is not None:
             free = free - self._bent(batch, batch.force)[1]
             soft = replace(soft, own=batch.model.own[on])
@@ -343,7 +343,7 @@ class ContactDescent:
         batch.forget(np.flatnonzero(misled))
         return there, misled
 
-    def _learn(self, batch: Batch, new: State, taken: np.ndarray, some: Any) -> None:
+    def _learn(self, batch: Batch, new: ContactState, taken: np.ndarray, some: Any) -> None:
         """From steps that columns (k,) have taken to a new state; `some` are the same of an array's."""
         now = batch.now
         if batch.model is not None:
@@ -359,7 +359,7 @@ class ContactDescent:
             on = columns_of(self.problem.device, felt, len(taken))
             batch.pairs.learn(taken[felt], moved[:, on], change[:, on], way[:, on])
 
-    def _felt(self, now: State) -> Any:
+    def _felt(self, now: ContactState) -> Any:
         """Forces (3n, b) that balance all that is smooth, where tools touch."""
         barrier, rows = self.barrier.reduced(np.arange(len(now.free))), self._rows
         own = doubled(now.smooth[rows])
@@ -376,7 +376,7 @@ class ContactDescent:
         out[self._rows] += force
         return out
 
-    def _judged(self, judge: Judge, u: Any) -> State:
+    def _judged(self, judge: Judge, u: Any) -> ContactState:
         """The states u (3N, b), as `Problem.residual` measures them."""
         problem, device = self.problem, self.problem.device
         place, pressed = device.zeros(*u.shape), device.zeros(*u.shape)
@@ -385,7 +385,7 @@ class ContactDescent:
         self.barrier.add_gradient(place, pressed)
         problem.constraint.project_nodes(pressed)
         whole = view(found.g)
-        return State(view(place), whole - view(pressed), whole, found.free, found.scale)
+        return ContactState(view(place), whole - view(pressed), whole, found.free, found.scale)
 
     def _answered(self, smooth: Any, force: Any) -> Any:
         """How the body at rest moves (3N, b) [m] under what is out of balance."""

@@ -27,7 +27,7 @@ from ..runtime.device import Device
 from ..runtime.threads import together
 from ..runtime.views import columns_of, from_view, on_host, view
 from .contact_kernel import kernel_of
-from .contact_structs import CROWDED, FOUND, OPEN, UNKNOWN, Ends, Model, Scratch
+from .contact_structs import CROWDED, FOUND, OPEN, UNKNOWN, ComplianceModel, Ends, Scratch
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ BENT = ForceLimits(late=FORCES.iterations)
 
 
 @dataclass(frozen=True, eq=False)
-class Softness:
+class ContactCompliance:
     """C of a model: what a body at rest does, and what b columns have learnt since, at the n nodes of the compliance.
 
     `learnt` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision; none where nothing was learnt yet. `own`
@@ -84,9 +84,9 @@ class Softness:
             every[: len(force) // 3] = on_host((force != 0.0).any(1)).reshape(-1, 3).any(axis=1)
             self.rest.know(every)
 
-    def model(self, columns: np.ndarray, rounded: float) -> Model:
+    def model(self, columns: np.ndarray, rounded: float) -> ComplianceModel:
         """Of some columns (k,)."""
-        out, n, count = Model(), len(self.rest.rows), len(columns)
+        out, n, count = ComplianceModel(), len(self.rest.rows), len(columns)
         out.rest, out.known = from_view(self.device, self.rest.columns), self.device.array(self.rest.known, wp.int32)
         none = wp.zeros((count, 0, 0), dtype=wp.float32, device=self.device.name)
         kinds = ("learnt", self.device.zeros(count, 0, n)), ("middle", self.device.zeros(count, 0, 0)), ("own", none)
@@ -100,7 +100,7 @@ class Softness:
 
 def settled(
     barrier: Reduction,
-    soft: Softness,
+    soft: ContactCompliance,
     here: Any,
     there: Any,
     known: Any,
@@ -138,7 +138,7 @@ def settled(
 
 def _solved(
     barrier: Reduction,
-    soft: Softness,
+    soft: ContactCompliance,
     columns: np.ndarray,
     own: tuple[Any, Any, Any],
     asked: tuple[np.ndarray, np.ndarray],

@@ -9,7 +9,7 @@ from ..linalg.block_factor import functions_of
 from ..minimisers.lbfgs_kernels import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
 from ..runtime.blocks import before, threads_of, total, wait
 from ..runtime.device import Device, forward_kernel
-from .contact_structs import CROWDED, FOUND, NONE, OPEN, UNKNOWN, Ends, Model, Scratch
+from .contact_structs import CROWDED, FOUND, NONE, OPEN, UNKNOWN, ComplianceModel, Ends, Scratch
 
 # So many sums at once keep a thread from waiting for memory; where there are many threads, few.
 WIDE, NARROW = 8, 2
@@ -108,7 +108,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         wait()
 
     @wp.func
-    def changed(model: Model, c: int, i: int, j: int) -> wp.float64:
+    def changed(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
         """What strained tissue changes of the compliance."""
         own = wp.float64(0.0)
         if model.own.shape[1] > 0:
@@ -116,12 +116,12 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return own
 
     @wp.func
-    def between(model: Model, c: int, i: int, j: int) -> wp.float64:
+    def between(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
         """The compliance between touched nodes, symmetric: half precision may have rounded its columns at rest."""
         return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i]) + changed(model, c, i, j)
 
     @wp.func
-    def pull(model: Model, s: Scratch, c: int, me: int) -> int:
+    def pull(model: ComplianceModel, s: Scratch, c: int, me: int) -> int:
         """On how many nodes the change acts, which, and what weights it gives to what was learnt."""
         m = listed(s.change, s.acts, s.acting, s.counts, ACTING, c, me)
         pairs = model.learnt.shape[1]
@@ -141,7 +141,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return m
 
     @wp.func
-    def give(model: Model, out: wp.array2d(dtype=wp.float64), s: Scratch, c: int, me: int):
+    def give(model: ComplianceModel, out: wp.array2d(dtype=wp.float64), s: Scratch, c: int, me: int):
         """How far all nodes go against the change."""
         m, size = pull(model, s, c, me), out.shape[0]
         for first in range(me, size, wide * threads):
@@ -166,7 +166,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         wait()
 
     @wp.func
-    def give_touched(model: Model, size: int, s: Scratch, c: int, me: int):
+    def give_touched(model: ComplianceModel, size: int, s: Scratch, c: int, me: int):
         """How far the touched nodes, `size` numbers, go under the change: to `at`."""
         m = pull(model, s, c, me)
         for i in range(me, size, threads):
@@ -181,7 +181,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         wait()
 
     @wp.func
-    def soften(model: Model, m: int, s: Scratch, c: int, me: int) -> wp.float64:
+    def soften(model: ComplianceModel, m: int, s: Scratch, c: int, me: int) -> wp.float64:
         """The compliance between m touched nodes; its mean."""
         pairs = model.learnt.shape[1]
         for j in range(me, 3 * m, threads):
@@ -266,7 +266,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return True
 
     @wp.func
-    def are_known(model: Model, m: int, s: Scratch, c: int) -> bool:
+    def are_known(model: ComplianceModel, m: int, s: Scratch, c: int) -> bool:
         """Whether the compliance at all touched nodes is."""
         missing = wp.int32(0)
         for i in range(m):
@@ -283,7 +283,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         first: int,
         stage: Stage,
         near: Near,
-        model: Model,
+        model: ComplianceModel,
         ends: Ends,
         s: Scratch,
         # outputs

@@ -22,13 +22,13 @@ from ..runtime.columns import add_dots, combined, put_rows, rows_taken
 from ..runtime.columns import kernels_of as columns_kernels_of
 from ..runtime.device import Device, forward_kernel
 from ..runtime.views import from_view, view
-from .contact_batch import State
+from .contact_batch import ContactState
 from .contact_forces import BENT, FORCES, ends_of, scratch_of
 from .contact_kernel import kernel_of
+from .contact_structs import ComplianceModel as Softness
 from .contact_structs import Ends
-from .contact_structs import Model as Softness
 from .press_kernel import press_of
-from .strained_part import Model
+from .strained_part import StrainedModel
 
 # A product is divided among so many threads a row.
 PARTS = 16
@@ -39,7 +39,7 @@ STATUS, TRIED, PROMISED, AHEAD, LOUD, WHOLE_SUM, FREE_SUM, SAID = range(8)
 
 
 @dataclass(frozen=True)
-class Kernels:
+class ContactStepKernels:
     """What stands between products, in one scalar type."""
 
     look: wp.Kernel
@@ -50,7 +50,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(device: Device) -> Kernels:
+def kernels_of(device: Device) -> ContactStepKernels:
     """Kernels of a device's scalar type, for one column."""
     scalar = device.scalar
 
@@ -123,7 +123,7 @@ def kernels_of(device: Device) -> Kernels:
         out[WHOLE_SUM] = sums[WHOLE, 0]
         out[FREE_SUM] = sums[FREE, 0]
 
-    return Kernels(look, change, shorten, push, report)
+    return ContactStepKernels(look, change, shorten, push, report)
 
 
 def judged(said: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -190,7 +190,7 @@ class ContactSteps:
         self._live = np.ones(1, bool)
         self._graphs: dict[str, wp.Graph] = {}
 
-    def load(self, model: Model) -> None:
+    def load(self, model: StrainedModel) -> None:
         """Know strained tissue as a model of one column does."""
         for array in (self._nodes, self._matrix, self._model.own):
             array.zero_()
@@ -229,13 +229,13 @@ class ContactSteps:
         wp.copy(self._constant, constant)
         return True
 
-    def hold(self, now: State, force: Any, rest: Any) -> tuple[State, Any, Any, Any]:
+    def hold(self, now: ContactState, force: Any, rest: Any) -> tuple[ContactState, Any, Any, Any]:
         """Begin at a state under forces, where the body at rest moves so: views on what stands still, and on `x`."""
         here = [view(array) for array in (self._u, self._smooth, self._whole, self._force, self._rest, self._x)]
         for mine, its in zip(here, (now.u, now.smooth, now.whole, force, rest), strict=False):
             mine[:] = its
         u, smooth, whole, *others = here
-        return State(u, smooth, whole, now.free.copy(), now.scale.copy()), *others
+        return ContactState(u, smooth, whole, now.free.copy(), now.scale.copy()), *others
 
     def _run(self, name: str, work: Callable[[], None]) -> np.ndarray:
         device = self._device

@@ -7,7 +7,7 @@ OPEN, FOUND, NONE, CROWDED, UNKNOWN = (wp.constant(number) for number in range(5
 
 
 @wp.struct
-class Model:
+class ComplianceModel:
     """How nodes give way: the compliance at rest, transposed (3n, 3n), and what b columns have learnt since.
 
     `known` (n,): whether a node's column is; `learnt` (b, p, 3n), `middle` (b, p, p). `own` (b, 3n, 3n) is what

@@ -15,12 +15,12 @@ import warp as wp
 from ..discretisation.problem import Problem
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
-from ..minimisers.residual import Judge, State, judge_of
+from ..minimisers.residual import Judge, ResidualState, judge_of
 from ..runtime.columns import scattered
 
 
 @dataclass(frozen=True)
-class Limits:
+class CycleLimits:
     """When cycles end, and how exactly each solves its local problem.
 
     Parameters
@@ -42,14 +42,14 @@ class Limits:
     enough: float = 0.3
 
 
-USUAL = Limits()
-Cycle = Callable[[Judge, State, np.ndarray], State]
+USUAL = CycleLimits()
+Cycle = Callable[[Judge, ResidualState, np.ndarray], ResidualState]
 """The next states (b columns), of these; the local problem may keep free forces (b,) [N]. A column that finds no way
 on has a free force that is not finite."""
 
 
 def eliminated(
-    problem: Problem, start: wp.array, tolerance: np.ndarray, most: int, limits: Limits, cycle: Cycle
+    problem: Problem, start: wp.array, tolerance: np.ndarray, most: int, limits: CycleLimits, cycle: Cycle
 ) -> Descended:
     """Go on from start (3N, b) [m], as `Lbfgs.descend`, in at most `most` cycles; nothing is learnt.
 

@@ -26,9 +26,9 @@ from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs import Descended, Lbfgs
 from ..runtime.threads import one_thread
 from .batch_elimination import open_vertices
-from .strained_part import StrainedPart, Strains
+from .strained_part import StrainedPart, StrainLimits
 
-SINGLE = Strains(nodes=320, cut=np.inf)
+SINGLE = StrainLimits(nodes=320, cut=np.inf)
 """A single model takes its room from nobody, and need not be right everywhere: L-BFGS learns the rest."""
 
 
@@ -49,7 +49,7 @@ class Renewal:
 
 
 @dataclass(frozen=True, eq=False)
-class Stiffening:
+class StiffnessUpdate:
     """What tissue is stiffer than at rest.
 
     rows (n,) of the 3N; added (n, n) D [N/m]; factor (n, n) and pivots (n,) of 1 + D C, as LAPACK has them. All but the
@@ -81,7 +81,7 @@ class StiffenedPreconditioner:
 
     def __init__(self, rest: Factor, problem: Problem):
         self._rest, self._problem = rest, problem
-        self.stiffening: Stiffening | None = None
+        self.stiffening: StiffnessUpdate | None = None
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """Both serve every state."""
@@ -139,7 +139,7 @@ class StrainedDescent:
         serves = learnt is not None and steps <= self._renewal.served
         return replace(found, steps=np.array([steps]), learnt=stiffening.learnt if stiffening and serves else {})
 
-    def _stiffening(self, u: wp.array) -> Stiffening | None:
+    def _stiffening(self, u: wp.array) -> StiffnessUpdate | None:
         """At u (3N, 1) [m]; None where nothing is strained."""
         found = self._part.stiffening(u, np.arange(1))
         if found is None or not found[0].shape[1]:
@@ -153,9 +153,9 @@ class StrainedDescent:
             system[np.diag_indices(len(place))] += 1.0
             if not np.isfinite(system).all():
                 return None
-            return Stiffening(compliance.rows[place], added, *lu_factor(system, True, check_finite=False))
+            return StiffnessUpdate(compliance.rows[place], added, *lu_factor(system, True, check_finite=False))
 
-    def known(self, learnt: Mapping[str, np.ndarray] | None) -> Stiffening | None:
+    def known(self, learnt: Mapping[str, np.ndarray] | None) -> StiffnessUpdate | None:
         """What an earlier descent of this problem left warm; None if that does not fit."""
         if learnt is None or any(name not in learnt for name in LEARNT.values()):
             return None
@@ -170,11 +170,11 @@ class StrainedDescent:
             return None
         if any(array.dtype != np.float32 or not all_finite(array) for array in (added, factor)):
             return None
-        return Stiffening(rows[0], added[0], factor[0], pivots[0])
+        return StiffnessUpdate(rows[0], added[0], factor[0], pivots[0])
 
 
 def strained_part(
-    problem: Problem, preconditioner: Preconditioner, space: Discretisation, strains: Strains = SINGLE
+    problem: Problem, preconditioner: Preconditioner, space: Discretisation, strains: StrainLimits = SINGLE
 ) -> StrainedPart:
     """On a body with a small opening: models have the nodes that are nearest to it."""
     distance, _ = KDTree(space.nodes[open_vertices(space, problem.constraint)]).query(space.nodes)

@@ -27,7 +27,7 @@ PARTS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Bent:
+class UpdatedModel:
     """A model on the device, to which nobody writes: nodes (1, n) of all, matrix (1, 3n, 3n) float32 M [N/m].
 
     Zeros fill what is not needed.
@@ -42,7 +42,7 @@ class Bent:
         return {NODES: self.nodes.numpy(), MATRIX: self.matrix.numpy()}
 
 
-def bent_at(part: StrainedPart, device: Device, u: wp.array) -> Bent | None:
+def bent_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedModel | None:
     """The model at u (3N, 1) [m], which the problem has begun, of a part that is prepared; None where there is none.
 
     A card is not waited for.
@@ -65,10 +65,10 @@ def bent_at(part: StrainedPart, device: Device, u: wp.array) -> Bent | None:
         matrix = -solved(system, added)
         bent[:] = lib.where(lib.isfinite(matrix).all(), 0.5 * (matrix + matrix.mT), 0.0 * added)
         nodes[:] = like(nodes, placed(device, part.compliance.nodes))[places]
-        return Bent(of, own)
+        return UpdatedModel(of, own)
 
 
-def bent_from(warm: Mapping[str, np.ndarray], device: Device, count: int, size: int) -> Bent | None:
+def bent_from(warm: Mapping[str, np.ndarray], device: Device, count: int, size: int) -> UpdatedModel | None:
     """What an answer on so many nodes left warm; None if there is nothing, or it does not fit models of 3n = `size`."""
     if NODES not in warm or MATRIX not in warm:
         return None
@@ -77,10 +77,10 @@ def bent_from(warm: Mapping[str, np.ndarray], device: Device, count: int, size: 
         return None
     if matrix.dtype != np.float32 or not all_finite(matrix) or (nodes < 0).any() or (nodes >= count).any():
         return None
-    return Bent(device.array(nodes, wp.int32), device.array(matrix, wp.float32))
+    return UpdatedModel(device.array(nodes, wp.int32), device.array(matrix, wp.float32))
 
 
-class BentPreconditioner:
+class UpdatedPreconditioner:
     """A Preconditioner of single columns: the rest's, and what the model in its arrays adds.
 
     Parameters
@@ -100,7 +100,7 @@ class BentPreconditioner:
         self._matrix = wp.zeros((1, size, size), dtype=wp.float32, device=name)
         self._pull, self._more = (problem.device.zeros(problem.rows, 1) for _ in range(2))
 
-    def load(self, bent: Bent | None) -> None:
+    def load(self, bent: UpdatedModel | None) -> None:
         """Take another model, or none."""
         if bent is None:
             self._matrix.zero_()

@@ -23,7 +23,7 @@ from .press_kernel import press_of
 
 
 @dataclass(frozen=True)
-class Strains:
+class StrainLimits:
     """Which tissue counts as strained.
 
     Parameters
@@ -53,13 +53,13 @@ class Strains:
     bytes: int = 2**31
 
 
-STRAINS = Strains()
-ON_CARD = Strains(least=0.1, nodes=480, cut=0.5, near=1600)
+STRAINS = StrainLimits()
+ON_CARD = StrainLimits(least=0.1, nodes=480, cut=0.5, near=1600)
 """A card inverts a larger model in less time than the steps take that it spares."""
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class StrainedModel:
     """What b columns have beside the rest: arrays of `views.library`.
 
     nodes (b, k) are places in the compliance, matrix (b, 3k, 3k) is M [N/m], of zeros where a column has fewer nodes.
@@ -80,15 +80,15 @@ class Model:
         """Which columns (b,) have."""
         return on_host((self.matrix != 0.0).any(-1).any(-1))
 
-    def rows(self, columns: np.ndarray) -> Model:
+    def rows(self, columns: np.ndarray) -> StrainedModel:
         """Of some columns (k,)."""
-        return Model(self.nodes[columns], self.matrix[columns], self.own[columns])
+        return StrainedModel(self.nodes[columns], self.matrix[columns], self.own[columns])
 
     def forget(self, columns: np.ndarray) -> None:
         """Of some columns (k,) only the rest is left."""
         self.matrix[columns], self.own[columns] = 0.0, 0.0
 
-    def with_columns(self, columns: np.ndarray, other: Model) -> Model:
+    def with_columns(self, columns: np.ndarray, other: StrainedModel) -> StrainedModel:
         """With another model's as some columns (k,)."""
         most = max(self.nodes.shape[1], other.nodes.shape[1])
         mine, its = self._widened(most), other._widened(most)
@@ -96,11 +96,11 @@ class Model:
             one[columns] = two
         return mine
 
-    def _widened(self, most: int) -> Model:
+    def _widened(self, most: int) -> StrainedModel:
         """With places for so many nodes."""
         missing = most - self.nodes.shape[1]
         nodes, matrix = padded(self.nodes, (missing,)), padded(self.matrix, (3 * missing, 3 * missing))
-        return Model(nodes, matrix, self.own)
+        return StrainedModel(nodes, matrix, self.own)
 
     def pressed(self, device: Device, motion: wp.array) -> wp.array:
         """E M E' motion (3n, b) [N], of motions (3n, b) [m] of the nodes of the compliance."""
@@ -139,7 +139,7 @@ class StrainedPart:
         Which tissue counts as strained.
     """
 
-    def __init__(self, problem: Problem, compliance: Compliance, touchable: int, strains: Strains = STRAINS):
+    def __init__(self, problem: Problem, compliance: Compliance, touchable: int, strains: StrainLimits = STRAINS):
         device, nodes = problem.device, compliance.nodes
         self._problem, self.compliance, self._touchable, self._strains = problem, compliance, touchable, strains
         self.size = 3 * min(strains.nodes, len(nodes))
@@ -150,7 +150,7 @@ class StrainedPart:
         found = [(term, term.elements_on(near)) for term in problem.terms if isinstance(term, Strained)]
         self._elements = [(term, device.array(some, wp.int32)) for term, some in found]
 
-    def model(self, u: wp.array, columns: np.ndarray) -> Model | None:
+    def model(self, u: wp.array, columns: np.ndarray) -> StrainedModel | None:
         """Of some columns (k,) of those at u (3N, b) [m], which the problem has begun; None where there is none."""
         found = self.stiffening(u, columns)
         return None if found is None else self._bent(*found)
@@ -190,7 +190,7 @@ class StrainedPart:
         between = self.compliance.columns[rows[:, :, None], rows[:, None, :]]
         return 0.5 * (between + between.mT)
 
-    def _bent(self, nodes: Any, stiffer: Any) -> Model:
+    def _bent(self, nodes: Any, stiffer: Any) -> StrainedModel:
         """Of D (b, 3k, 3k) [N/m] on some nodes (b, k) of the compliance."""
         self.prepare()
         device, count, size = self._problem.device, len(nodes), stiffer.shape[1]
@@ -217,4 +217,4 @@ class StrainedPart:
             place = rows[:, :most].clip(max=own.shape[1] - 1)
             columns = like(nodes, placed(device, np.arange(count)))[some][:, None, None]
             own[columns, place[:, :, None], place[:, None, :]] = like(own, reach.mT @ (matrix[some] @ reach))
-        return Model(nodes, matrix, own)
+        return StrainedModel(nodes, matrix, own)

@@ -21,7 +21,7 @@ from .lbfgs_kernels import PAIRS
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
+class CurvaturePairs:
     """s and w = H0 y (m, 3N), oldest first; products s_i . y_j and y_i . w_j (m, m)."""
 
     s: np.ndarray
@@ -44,7 +44,7 @@ class Pairs:
         some, others = np.split(weights.astype(self.s.dtype), 2)
         return some @ self.s + others @ self.w
 
-    def and_one(self, s: np.ndarray, y: np.ndarray, w: np.ndarray) -> Pairs:
+    def and_one(self, s: np.ndarray, y: np.ndarray, w: np.ndarray) -> CurvaturePairs:
         """With a newer pair (3N,), and the oldest forgotten where there are too many."""
         some = slice(max(0, len(self.s) - PAIRS + 1), None)
         steps, ways = (np.vstack([old[some], new.astype(old.dtype)]) for old, new in ((self.s, s), (self.w, w)))
@@ -53,12 +53,12 @@ class Pairs:
         # y . H0 y' = y' . H0 y: what the new change is worth along old ones, and old changes along the new step.
         sy[:, -1], yw[:, -1] = steps @ y.astype(steps.dtype), ways @ y.astype(steps.dtype)
         yw[-1] = yw[:, -1]
-        return Pairs(steps, ways, sy, yw)
+        return CurvaturePairs(steps, ways, sy, yw)
 
 
-def no_pairs(rows: int, kind: str) -> Pairs:
+def no_pairs(rows: int, kind: str) -> CurvaturePairs:
     """Nothing learnt yet of a column of `rows`, kept as numbers of a `kind`."""
-    return Pairs(*np.zeros((2, 0, rows), kind), *np.zeros((2, 0, 0)))
+    return CurvaturePairs(*np.zeros((2, 0, rows), kind), *np.zeros((2, 0, 0)))
 
 
 def middle_of(sy: np.ndarray, yw: np.ndarray) -> np.ndarray:
@@ -87,7 +87,7 @@ class PairsOfColumns:
         self._sw = view(device.zeros(columns * 2 * PAIRS, rows)).reshape(columns, 2 * PAIRS, rows)
         self._sy, self._yw = np.zeros((2, columns, PAIRS, PAIRS))
         self.count = np.zeros(columns, int)
-        self._asked: tuple[np.ndarray, Learnt] | None = None
+        self._asked: tuple[np.ndarray, LbfgsHistory] | None = None
 
     def keep(self, columns: np.ndarray) -> None:
         """Keep these columns (k,): the others have left the batch."""
@@ -105,7 +105,7 @@ class PairsOfColumns:
         """How many pairs the column with the most of them has."""
         return min(int(self.count.max(initial=0)), PAIRS)
 
-    def of(self, columns: np.ndarray) -> Learnt:
+    def of(self, columns: np.ndarray) -> LbfgsHistory:
         """What some columns (k,) have learnt; asked again, nothing is worked out again."""
         if self._asked is not None and np.array_equal(self._asked[0], columns):
             return self._asked[1]
@@ -116,7 +116,7 @@ class PairsOfColumns:
         found = middle_of(self._sy[place], self._yw[place])
         middle[np.arange(len(columns))[:, None, None], both[:, :, None], both[:, None, :]] = found
         own = self._sw[columns_of(self._device, columns, len(self.count))]
-        learnt = Learnt(own, placed(self._device, middle.astype(self._device.precision)))
+        learnt = LbfgsHistory(own, placed(self._device, middle.astype(self._device.precision)))
         self._asked = columns, learnt
         return learnt
 
@@ -136,7 +136,7 @@ class PairsOfColumns:
 
 
 @dataclass(frozen=True, eq=False)
-class Learnt:
+class LbfgsHistory:
     """[S, W]' (k, 2m, 3N) and M (k, 2m, 2m) of k columns."""
 
     sw: Any

@@ -35,7 +35,7 @@ PRODUCTS = 3
 
 
 @dataclass(frozen=True)
-class Kernels:
+class LbfgsKernels:
     """Arithmetic of one scalar type and number of pairs."""
 
     absorb: wp.Kernel
@@ -52,7 +52,7 @@ def few_of(device: Device) -> int:
 
 
 @cache
-def kernels_of(device: Device, pairs: int) -> Kernels:
+def kernels_of(device: Device, pairs: int) -> LbfgsKernels:
     """Kernels of a device's scalar type for columns that keep so many pairs."""
     scalar = device.scalar
     several, few_scalars = (wp.types.vector(length=length, dtype=scalar) for length in (SOME, few_of(device)))
@@ -340,4 +340,4 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
         t[c] = wp.min(t[c], wp.float64(bound[c]))
         bound[c] = scalar(1.0)
 
-    return Kernels(absorb, multiply, judge, aim, move, clamp)
+    return LbfgsKernels(absorb, multiply, judge, aim, move, clamp)

@@ -61,7 +61,7 @@ def ground_of(problem: Problem, width: int) -> dict[str, wp.array]:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class LbfgsState:
     """Arrays of `width` columns by name, and by kind of number all those that move with them, where both stand."""
 
     columns: Mapping[str, wp.array]
@@ -69,7 +69,7 @@ class State:
     ground: Mapping[str, wp.array]  # arrays that stand on it do not keep it
 
 
-def standing(problem: Problem, width: int, ground: Mapping[str, wp.array]) -> State:
+def standing(problem: Problem, width: int, ground: Mapping[str, wp.array]) -> LbfgsState:
     """The state of so many columns on a ground that `ground_of` made for at least this width."""
     columns: dict[str, wp.array] = {}
     together: dict[str, wp.array] = {}
@@ -79,7 +79,7 @@ def standing(problem: Problem, width: int, ground: Mapping[str, wp.array]) -> St
             columns[name] = _placed(ground[kind], first, (*shape, width))
             first += width * prod(shape)
         together[kind] = _placed(ground[kind], 0, (_rows(moved), width))
-    return State(columns, together, ground)
+    return LbfgsState(columns, together, ground)
 
 
 class Workspace:

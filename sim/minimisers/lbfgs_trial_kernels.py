@@ -19,7 +19,7 @@ EACH, EACH_ON_CPU = 2, 1024
 
 
 @dataclass(frozen=True)
-class Spread:
+class ThreadSpread:
     """How threads share rows, or nodes: a group takes neighbouring ones in turn, `each` of its threads so many."""
 
     lanes: int
@@ -30,11 +30,11 @@ class Spread:
         return -(-count // (self.lanes * self.each)) * self.lanes
 
 
-def spread_of(device: Device, columns: int) -> Spread:
+def spread_of(device: Device, columns: int) -> ThreadSpread:
     """How the threads of a device share the rows of so many columns."""
     if columns > 1:
-        return Spread(1, SOME)
-    return Spread(lanes_of(device), EACH if device.on_cuda else EACH_ON_CPU)
+        return ThreadSpread(1, SOME)
+    return ThreadSpread(lanes_of(device), EACH if device.on_cuda else EACH_ON_CPU)
 
 
 @wp.func
@@ -50,7 +50,7 @@ def alone(value: wp.float64) -> wp.float64:
 
 
 @dataclass(frozen=True)
-class Kernels:
+class LbfgsTrialKernels:
     """Arithmetic of one scalar type and spread, launched over (threads of rows or nodes, columns)."""
 
     step: wp.Kernel
@@ -58,7 +58,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(device: Device, spread: Spread) -> Kernels:
+def kernels_of(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
     """Kernels of a device's scalar type."""
     scalar, vec = device.scalar, device.vector
     lanes, each = spread.lanes, spread.each
@@ -114,7 +114,7 @@ def kernels_of(device: Device, spread: Spread) -> Kernels:
             wp.atomic_add(sums, free_row, c, free)
             wp.atomic_add(sums, slope_row, c, slope)
 
-    return Kernels(step, finish)
+    return LbfgsTrialKernels(step, finish)
 
 
 @cache

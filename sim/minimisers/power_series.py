@@ -86,7 +86,7 @@ def terms_of(sizes: int, orders: int) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
+class SeriesReading:
     """What is asked of a body: r shares of its motion, each by what a force at any unknown adds to it at rest.
 
     Parameters

@@ -81,7 +81,7 @@ def constants_of(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class ResidualState:
     """Where b columns are: u (3N, b) [m], free gradients g (3N, b) [N], their 2-norms `free` (b,), and `scale` (b,).
 
     The scale [N] is what free gradients are measured against.
@@ -102,10 +102,10 @@ class State:
         """(b,) bool: whether each is a state at all. Forces that overflow have no scale."""
         return np.isfinite(self.free) & np.isfinite(self.scale)
 
-    def rows(self, device: Device, stay: np.ndarray) -> State:
+    def rows(self, device: Device, stay: np.ndarray) -> ResidualState:
         """Some of the columns (k,)."""
         u, g = (gathered(device, array, stay) for array in (self.u, self.g))
-        return State(u, g, self.free[stay], self.scale[stay])
+        return ResidualState(u, g, self.free[stay], self.scale[stay])
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,14 +119,14 @@ class Judge:
     constant: wp.array
     square: np.ndarray
 
-    def __call__(self, u: wp.array) -> State:
+    def __call__(self, u: wp.array) -> ResidualState:
         """The states u (3N, b) [m]."""
         found = balance(self.problem, u, self.constant)
         sums = found.sums.numpy()
         with np.errstate(invalid="ignore", over="ignore"):
             largest = np.maximum(self.square, found.own.numpy().max(axis=0, initial=0.0))
             largest = np.maximum(largest, sums[WHOLE] - sums[FREE])
-            return State(u, found.g, np.sqrt(sums[FREE]), np.sqrt(largest))
+            return ResidualState(u, found.g, np.sqrt(sums[FREE]), np.sqrt(largest))
 
     def rows(self, stay: np.ndarray) -> Judge:
         """Of some of the columns (k,), which are all that the problem keeps from now on."""

@@ -19,7 +19,7 @@ CHUNK = 64
 
 
 @dataclass(frozen=True)
-class Kernels:
+class ColumnKernels:
     """Column arithmetic of one scalar type, and what moves rows."""
 
     dot: wp.Kernel
@@ -33,7 +33,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(device: Device) -> Kernels:
+def kernels_of(device: Device) -> ColumnKernels:
     """Kernels of a device's scalar type."""
     scalar = device.scalar
     chunk, lanes = CHUNK, lanes_of(device)
@@ -137,7 +137,7 @@ def kernels_of(device: Device) -> Kernels:
         i, c = wp.tid()
         out[rows[i], c] += x[i, c]
 
-    return Kernels(dot, dot_alone, combine, add_multiple, unstack, take, put, add)
+    return ColumnKernels(dot, dot_alone, combine, add_multiple, unstack, take, put, add)
 
 
 @cache
@@ -189,7 +189,7 @@ def is_kept(width: int) -> bool:
     return width in WIDTHS or width % WIDTHS[-1] == 0
 
 
-class Rooms:
+class Workspaces:
     """Arrays of so many columns; of a width that rooms of L-BFGS may have always the same, as graphs want them."""
 
     def __init__(self, make: Callable[[int], wp.array], device: Device):

@@ -21,7 +21,7 @@ COARSER = "take a coarser mesh, or a larger machine."
 
 
 @dataclass(frozen=True)
-class Budget:
+class MemoryBudget:
     """What of a machine's memory a solver may use.
 
     Parameters
@@ -43,14 +43,14 @@ class Budget:
     group: Path = Path("/sys/fs/cgroup")
 
 
-def free_bytes(device: Device, budget: Budget = Budget()) -> int:
+def free_bytes(device: Device, budget: MemoryBudget = MemoryBudget()) -> int:
     """Memory that is free: the card's, or what the host and its control group still give."""
     if device.on_cuda:
         return int(wp.get_device(device.name).free_memory)
     return host_bytes(budget)
 
 
-def host_bytes(budget: Budget = Budget()) -> int:
+def host_bytes(budget: MemoryBudget = MemoryBudget()) -> int:
     """Memory that the host and its control group still give; without bound where neither says."""
     found = [2**62]
     for line in _lines(Path("/proc/meminfo")):
@@ -64,14 +64,16 @@ def host_bytes(budget: Budget = Budget()) -> int:
     return min(found)
 
 
-def fitting_batch(rows: int, device: Device, free: int, budget: Budget = Budget()) -> int:
+def fitting_batch(rows: int, device: Device, free: int, budget: MemoryBudget = MemoryBudget()) -> int:
     """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it and `free` bytes hold."""
     widest = budget.widest_on_cuda if device.on_cuda else budget.widest
     fitting = int(budget.batches * free / max(column_bytes(rows, device), 1))
     return int(np.clip(widest_within(device, fitting), 1, widest))
 
 
-def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0, budget: Budget = Budget()) -> None:
+def check_fits(
+    rows: int, batch: int, count: int, device: Device, held: int = 0, budget: MemoryBudget = MemoryBudget()
+) -> None:
     """Refuse `count` load cases of `rows` = 3N unknowns, `batch` together, that would not fit.
 
     `held` bytes are the solver's own already.

@@ -9,17 +9,17 @@ import numpy as np
 
 from ..deformation import Outcome
 from ..discretisation.term import Cases
-from .strategy import Answer, Strategy
-from .time_steps import Still
+from .strategy import SolverResult, Strategy
+from .time_steps import NoMotionStep
 
 
-def solve_off_bone(strategy: Strategy | Still, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
+def solve_off_bone(strategy: Strategy | NoMotionStep, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
     """Solve as `Strategy.solve` the cases whose tools overlap no bone; the others stay at the last of their guesses.
 
     Against bone no tissue gives way: a solution would be that of the barrier's stiffness, and take long.
     """
     problem, device, count = strategy.problem, strategy.problem.device, len(cases.loads)
-    if isinstance(strategy, Still) or not problem.barriers:
+    if isinstance(strategy, NoMotionStep) or not problem.barriers:
         return strategy.solve(cases, guesses)
     problem.begin(cases)
     on_bone = problem.overlaps(device.zeros(problem.rows, count))[1]
@@ -27,7 +27,7 @@ def solve_off_bone(strategy: Strategy | Still, cases: Cases, guesses: Sequence[n
         return strategy.solve(cases, guesses)
     u = device.array(guesses[-1]) if guesses else device.zeros(problem.rows, count)
     none, outcome = np.zeros(count, int), np.full(count, Outcome.ON_BONE, object)
-    answer = Answer(u, outcome, none, np.full(count, np.inf), np.zeros(count), strategy.inversion.count(u), 0)
+    answer = SolverResult(u, outcome, none, np.full(count, np.inf), np.zeros(count), strategy.inversion.count(u), 0)
     anew, clear = np.zeros(count, bool), np.flatnonzero(~on_bone)
     if len(clear):
         found = strategy.solve(cases.rows(clear), [guess[:, clear] for guess in guesses])

@@ -11,14 +11,14 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from ..discretisation.footprint import Skin
+from ..discretisation.footprint import ContactSurface
 from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
-from ..local_solvers.strained_frame import Bent, BentPreconditioner, bent_at
+from ..local_solvers.strained_frame import UpdatedModel, UpdatedPreconditioner, bent_at
 from ..local_solvers.strained_part import StrainedPart
 from ..minimisers.lbfgs_kernels import LIVE, PAIRS
-from ..minimisers.lbfgs_state import State, Workspace, ground_of, standing
+from ..minimisers.lbfgs_state import LbfgsState, Workspace, ground_of, standing
 from ..runtime.columns import lanes_of, summed
 from ..runtime.device import Device, forward_kernel
 
@@ -34,7 +34,7 @@ HEAD = 8
 
 
 @dataclass(frozen=True)
-class Kernels:
+class FrameKernels:
     """What stands around the iterations of a frame, in one scalar type."""
 
     pull: wp.Kernel
@@ -45,7 +45,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(device: Device) -> Kernels:
+def kernels_of(device: Device) -> FrameKernels:
     """Kernels of a device's scalar type, for one column."""
     scalar, most, m, head, lanes = device.scalar, FRAME_EVALUATIONS, PAIRS, HEAD, lanes_of(device)
 
@@ -155,10 +155,10 @@ def kernels_of(device: Device) -> Kernels:
             for k in range(4):
                 out[SUMS + k] = sums[0][k]
 
-    return Kernels(pull, move_on, renew, look, report)
+    return FrameKernels(pull, move_on, renew, look, report)
 
 
-class Frame:
+class CapturedFrame:
     """Answers one push from the state that stands here, which then is that of the answer.
 
     Parameters
@@ -180,17 +180,17 @@ class Frame:
         problem: Problem,
         preconditioner: Preconditioner,
         inversion: Inversion,
-        skin: Skin,
+        skin: ContactSurface,
         tolerance: float,
         part: StrainedPart | None = None,
     ):
         self._device, self._inversion, self._skin, self.part = problem.device, inversion, skin, part
-        self.bent: Bent | None = None
+        self.bent: UpdatedModel | None = None
         """What the next frame knows of strained tissue."""
-        self._knowing: BentPreconditioner | None = None
+        self._knowing: UpdatedPreconditioner | None = None
         if part is not None:
             part.prepare()
-            self._knowing = BentPreconditioner(preconditioner, problem, part.size)
+            self._knowing = UpdatedPreconditioner(preconditioner, problem, part.size)
         self._workspace = Workspace(problem, self._knowing or preconditioner, 1, ground_of(problem, 1))
         self._workspace.columns["tolerance"].fill_(tolerance)
         self._workspace.prepare()
@@ -204,7 +204,7 @@ class Frame:
         self._graph: wp.Graph | None = None
 
     @property
-    def state(self) -> State:
+    def state(self) -> LbfgsState:
         """Of the last answer."""
         return self._workspace.state
 
@@ -214,12 +214,12 @@ class Frame:
         return self._workspace.columns["u"]
 
     @property
-    def before(self) -> State:
+    def before(self) -> LbfgsState:
         """What the last answer started from."""
         return self._before
 
     def take(
-        self, u: np.ndarray, past: np.ndarray | None, learnt: Mapping[str, np.ndarray], bent: Bent | None = None
+        self, u: np.ndarray, past: np.ndarray | None, learnt: Mapping[str, np.ndarray], bent: UpdatedModel | None = None
     ) -> None:
         """Another state: displacements u (3N, 1) [m], those before them, and what was learnt, if anything."""
         columns = self._workspace.columns
@@ -238,7 +238,7 @@ class Frame:
             self._know(bent_at(self.part, self._device, self._workspace.columns["u"]))
             self._workspace.columns["known"].zero_()  # pairs belong to the model that they were learnt with
 
-    def _know(self, bent: Bent | None) -> None:
+    def _know(self, bent: UpdatedModel | None) -> None:
         if self._knowing is not None:
             self.bent = bent
             self._knowing.load(bent)

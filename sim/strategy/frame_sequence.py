@@ -16,18 +16,18 @@ import numpy as np
 
 from ..deformation import Cost, Deformation, Outcome
 from ..diagnostics.deformed_tissue import Diagnostics
-from ..discretisation.footprint import Skin
+from ..discretisation.footprint import ContactSurface
 from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..discretisation.term import Cases
 from ..loads import Loads
 from ..local_solvers.strained_descent import strained_part
-from ..local_solvers.strained_frame import Bent, bent_from
+from ..local_solvers.strained_frame import UpdatedModel, bent_from
 from ..minimisers.lbfgs import LEARNT, learnt_from, rows_first
 from ..minimisers.lbfgs_kernels import DONE
-from ..minimisers.lbfgs_state import State
-from .captured_frame import HEAD, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, Frame
+from ..minimisers.lbfgs_state import LbfgsState
+from .captured_frame import HEAD, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, CapturedFrame
 from .extrapolation import BEFORE, PUSHES, knows, pushes_of, shares, way_of
 from .strategy import Strategy
 
@@ -42,10 +42,10 @@ class Kept(Mapping[str, Any]):
     the next frame is about to be made.
     """
 
-    def __init__(self, own: Mapping[str, np.ndarray], state: State, lock: RLock, bent: Bent | None = None):
+    def __init__(self, own: Mapping[str, np.ndarray], state: LbfgsState, lock: RLock, bent: UpdatedModel | None = None):
         self._own = dict(own)
         self._lock = lock
-        self.state: State | None = state
+        self.state: LbfgsState | None = state
         self.bent = bent
 
     def settle(self) -> None:
@@ -91,7 +91,7 @@ class FrameSequence:
         self,
         problem: Problem,
         inversion: Inversion,
-        frame: Frame,
+        frame: CapturedFrame,
         diagnostics: Diagnostics,
         lock: RLock,
         source: str,
@@ -170,7 +170,7 @@ class FrameSequence:
         self._frame.take(last, past, learnt_from(cases, len(last)), self._bent(start.warm))
         return True
 
-    def _bent(self, warm: Mapping[str, Any]) -> Bent | None:
+    def _bent(self, warm: Mapping[str, Any]) -> UpdatedModel | None:
         if isinstance(warm, Kept):
             return warm.bent
         part = self._frame.part
@@ -187,12 +187,12 @@ class FrameSequence:
 
 
 def frame_sequence(
-    strategy: Strategy, space: Discretisation, skin: Skin, diagnostics: Diagnostics, lock: RLock, source: str
+    strategy: Strategy, space: Discretisation, skin: ContactSurface, diagnostics: Diagnostics, lock: RLock, source: str
 ) -> FrameSequence:
     """By the solvers of a plan that follows frames, on the tissue under a skin."""
     problem, preconditioner, inversion = strategy.problem, strategy.preconditioner, strategy.inversion
     part = strained_part(problem, preconditioner, space) if strategy.plan.strained else None
-    frame = Frame(problem, preconditioner, inversion, skin, strategy.accuracy.tolerance, part)
+    frame = CapturedFrame(problem, preconditioner, inversion, skin, strategy.accuracy.tolerance, part)
     return FrameSequence(problem, inversion, frame, diagnostics, lock, source)
 
 

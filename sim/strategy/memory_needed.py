@@ -13,14 +13,14 @@ from ..errors import InputError
 from ..linalg.preconditioner import Preconditioning
 from ..runtime.columns import widest_within, width_of
 from ..runtime.device import Device, find_device
-from ..runtime.memory import COARSER, Budget, column_bytes, fitting_batch, free_bytes, gigabytes
+from ..runtime.memory import COARSER, MemoryBudget, column_bytes, fitting_batch, free_bytes, gigabytes
 
 PER_NODE = {"p1": 2_200, "smoothed": 5_800, "p2": 2_900}
 """Bytes of single precision that each node of an element takes: tables of the elements, and levels of multigrid. The
 arrays were counted on the CPU, on 49,239 nodes (p1, smoothed) and 123,508 (p2), 2026-11-24."""
 FIXED = 2**30
 """Bytes that the libraries' own buffers, kernels and the last level take, about."""
-BUDGET = Budget()
+BUDGET = MemoryBudget()
 """What of a card's memory is taken, unless another budget is given."""
 
 
@@ -61,7 +61,7 @@ class Needed:
         taken, free = gigabytes(self.peak), gigabytes(self.free)
         return f"{self.nodes:,} nodes ({self.element}), {loads}: about {taken} of {self.device.name}, {free} free"
 
-    def demand(self, budget: Budget = BUDGET) -> Needed:
+    def demand(self, budget: MemoryBudget = BUDGET) -> Needed:
         """Itself, if it fits.
 
         Raises
@@ -111,7 +111,7 @@ def needed(
     batch: int | None,
     loads: int,
     free: int,
-    budget: Budget = BUDGET,
+    budget: MemoryBudget = BUDGET,
 ) -> Needed:
     """The same of elements whose preconditioner inverts so many unknowns, on a card with `free` bytes."""
     rows, width = 3 * space.count, wp.types.type_size_in_bytes(device.scalar)

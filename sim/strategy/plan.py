@@ -33,7 +33,7 @@ EVALUATIONS, EVALUATIONS_ON_CUDA = 60, 800
 FEWEST = 10
 
 
-class Step(Enum):
+class SolverStep(Enum):
     """What may be tried for a load; the value says what it is."""
 
     NEAR = "nonlinear elimination: the tissue near the opening, which all loads share, is solved by itself"
@@ -46,7 +46,7 @@ class Step(Enum):
 
 
 @dataclass(frozen=True)
-class Plan:
+class SolverPlan:
     """How loads on one body are solved.
 
     Parameters
@@ -69,9 +69,9 @@ class Plan:
     """
 
     preconditioner: str
-    many: Step | None
-    single: Step | None
-    contact: Step | None
+    many: SolverStep | None
+    single: SolverStep | None
+    contact: SolverStep | None
     quick: bool
     frames: bool
     strained: bool
@@ -80,36 +80,36 @@ class Plan:
     load_steps: int
     batch: int
 
-    def local(self, count: int) -> Step | None:
+    def local(self, count: int) -> SolverStep | None:
         """What is tried first of so many loads together."""
         return self.many if count >= WORTH else self.single if count == 1 else None
 
-    def steps(self, count: int, imposed: bool = False) -> tuple[Step, ...]:
+    def steps(self, count: int, imposed: bool = False) -> tuple[SolverStep, ...]:
         """What is tried for so many loads together, in this order; `imposed` if they prescribe motion."""
         if imposed or not self.quick:
-            return (Step.NEWTON,)
+            return (SolverStep.NEWTON,)
         first = self.local(count)
-        return (*([] if first is None else [first]), Step.LBFGS, Step.NEWTON)
+        return (*([] if first is None else [first]), SolverStep.LBFGS, SolverStep.NEWTON)
 
     def explain(self) -> tuple[str, ...]:
         """The same in sentences."""
         lines = [f"The stiffness at rest is prepared once ({self.preconditioner}); every solver starts from it."]
         if self.frames:
             knows = ". It knows which tissue the last load strained" if self.strained else ""
-            lines.append(f"A load that follows another is {Step.FRAME.value}{knows}.")
+            lines.append(f"A load that follows another is {SolverStep.FRAME.value}{knows}.")
         if self.contact:
             lines.append(f"Tools are moved by pose. Every load begins with {self.contact.value}.")
-            lines.append(f"{Step.NEWTON.value} takes what that leaves, load by load.")
+            lines.append(f"{SolverStep.NEWTON.value} takes what that leaves, load by load.")
         elif not self.quick:
-            lines.append(f"Every load is solved by {Step.NEWTON.value}, in at most {self.outer} iterations.")
+            lines.append(f"Every load is solved by {SolverStep.NEWTON.value}, in at most {self.outer} iterations.")
         else:
             if self.many:
                 lines.append(f"Batches of {WORTH} loads and more begin with {self.many.value}.")
             if self.single:
                 lines.append(f"A single load begins with {self.single.value}.")
-            lines.append(f"{Step.LBFGS.value} takes what is left, in at most {self.evaluations} evaluations.")
-            lines.append(f"{Step.NEWTON.value} takes what that leaves, in at most {self.outer} iterations.")
-            lines.append(f"Loads that prescribe motion go to {Step.NEWTON.value} at once.")
+            lines.append(f"{SolverStep.LBFGS.value} takes what is left, in at most {self.evaluations} evaluations.")
+            lines.append(f"{SolverStep.NEWTON.value} takes what that leaves, in at most {self.outer} iterations.")
+            lines.append(f"Loads that prescribe motion go to {SolverStep.NEWTON.value} at once.")
         if self.load_steps:
             lines.append(
                 "A load that ends without equilibrium is tried again from rest, and then in load steps: at most "
@@ -127,8 +127,8 @@ def plan_for(
     accuracy: Accuracy,
     batch: int,
     live: bool = False,
-    avoid: Collection[Step] = (),
-) -> Plan:
+    avoid: Collection[SolverStep] = (),
+) -> SolverPlan:
     """Choose the solvers of a problem: the one place where this is decided.
 
     `batch` loads are solved together where nothing solves them one by one; `live` ones come one at a time. What is to
@@ -137,36 +137,36 @@ def plan_for(
     cuda, exact = problem.device.on_cuda, is_exact(preconditioner)
     elastic = problem.plain  # what is solved by itself is elastic, and nothing else
     small = elastic and has_small_opening(space, problem.constraint)
-    strained = small and exact and space.element == "smoothed" and Step.STRAINED not in avoid
+    strained = small and exact and space.element == "smoothed" and SolverStep.STRAINED not in avoid
     single = None
     if elastic and not cuda:
         if space.element == "p2" and isinstance(preconditioner, TwoLevel):
-            single = Step.CLAMPED
+            single = SolverStep.CLAMPED
         elif live and strained:
-            single = Step.STRAINED
+            single = SolverStep.STRAINED
     contact = None
     if problem.barriers:
         # The model of contact knows one barrier, and needs a preconditioner that is alike at every state.
         alike = not isinstance(preconditioner, BlockJacobi)
         one = len(problem.barriers) == 1 and isinstance(problem.barriers[0], Local)
-        contact = Step.CONTACT if one and alike else Step.NEWTON
+        contact = SolverStep.CONTACT if one and alike else SolverStep.NEWTON
     following = cuda and exact and elastic and can_follow(space, accuracy) and wp.is_conditional_graph_supported()
     quick = not problem.steep and not problem.barriers and accuracy.outer >= FEWEST
-    single, contact = None if single in avoid else single, Step.NEWTON if contact in avoid else contact
+    single, contact = None if single in avoid else single, SolverStep.NEWTON if contact in avoid else contact
     most = EVALUATIONS_ON_CUDA if cuda else EVALUATIONS
     most = most if accuracy.evaluations is None else min(most, accuracy.evaluations)
-    return Plan(
+    return SolverPlan(
         preconditioner=name_of(preconditioner),
-        many=Step.NEAR if small and exact and Step.NEAR not in avoid else None,
+        many=SolverStep.NEAR if small and exact and SolverStep.NEAR not in avoid else None,
         single=single,
         contact=contact,
-        quick=quick and most > 0 and Step.LBFGS not in avoid,
-        frames=following and most >= FRAME_EVALUATIONS and Step.FRAME not in avoid,
+        quick=quick and most > 0 and SolverStep.LBFGS not in avoid,
+        frames=following and most >= FRAME_EVALUATIONS and SolverStep.FRAME not in avoid,
         strained=strained,
         evaluations=most,
         outer=accuracy.outer,
         load_steps=accuracy.steps,
-        batch=1 if single is Step.CLAMPED else batch,  # each load has a part of its own
+        batch=1 if single is SolverStep.CLAMPED else batch,  # each load has a part of its own
     )
 
 
@@ -176,13 +176,13 @@ def can_follow(space: Discretisation, accuracy: Accuracy) -> bool:
 
 
 def local_solvers(
-    plan: Plan, problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
+    plan: SolverPlan, problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
 ) -> tuple[Callable[[], BatchElimination | None], Alone | None]:
     """What a plan solves by itself: for many loads, made when it is asked for first, and for a single one."""
     near = cache(partial(batch_elimination, problem, preconditioner, effects, space) if plan.many else lambda: None)
-    if plan.single is Step.CLAMPED:
+    if plan.single is SolverStep.CLAMPED:
         return near, ClampedElimination(problem, preconditioner, effects, space)
-    if plan.single is Step.STRAINED:
+    if plan.single is SolverStep.STRAINED:
         assert isinstance(preconditioner, Factor)
         return near, StrainedDescent(problem, preconditioner, strained_part(problem, preconditioner, space))
     return near, None

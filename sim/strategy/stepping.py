@@ -9,7 +9,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Stepping:
+class LoadStepping:
     """How load steps grow, shrink and end.
 
     Parameters
@@ -30,11 +30,11 @@ class Stepping:
     patience: int = 4
 
 
-STEPPING = Stepping()
+STEPPING = LoadStepping()
 
 
 @dataclass(frozen=True)
-class Gaps:
+class GapContinuation:
     """How the gap of tools is opened for a long way, and closed again.
 
     Parameters
@@ -57,7 +57,7 @@ class Gaps:
     nearly: float = 0.1
 
 
-GAPS = Gaps()
+GAPS = GapContinuation()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class Shares:
         """Cases at the share 0, whose `first` step is so long."""
         return cls(np.zeros(len(gaps)), np.full(len(gaps), first), gaps)
 
-    def limit(self, longest: np.ndarray, stepping: Stepping) -> tuple[np.ndarray, np.ndarray]:
+    def limit(self, longest: np.ndarray, stepping: LoadStepping) -> tuple[np.ndarray, np.ndarray]:
         """Limit steps to the `longest` (b,) at once; which (b,) bool are shorter than that, and which cases go on."""
         shorter = self.step < longest
         np.minimum(self.step, longest, out=self.step)

@@ -28,14 +28,14 @@ from ..minimisers.residual import shortfall
 from ..runtime.columns import gathered, scattered
 from ..runtime.device import Device
 from ..runtime.views import in_order, on_host, view
-from .plan import Alone, Plan, Step
-from .stepping import GAPS, STEPPING, Gaps, Shares, Stepping
+from .plan import Alone, SolverPlan, SolverStep
+from .stepping import GAPS, STEPPING, GapContinuation, LoadStepping, Shares
 
 NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class SolverResult:
     """u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, shares of the load reached, inverted tets.
 
     The linear iterations of the batch; what of the curvature the next frame may know. Where tools move, shares (B,) of
@@ -58,7 +58,7 @@ class Answer:
         """(B,) bool."""
         return np.array([outcome.good for outcome in self.outcome], bool)
 
-    def put(self, index: np.ndarray, other: Answer, device: Device) -> None:
+    def put(self, index: np.ndarray, other: SolverResult, device: Device) -> None:
         """Write the answer of other cases over some of these (k,); outer steps add up."""
         scattered(device, other.u, index, self.u)
         self.iterations[index] += other.iterations
@@ -92,11 +92,11 @@ class Strategy:
     preconditioner: Preconditioner
     inversion: Inversion
     accuracy: Accuracy
-    plan: Plan
+    plan: SolverPlan
     near: Callable[[], BatchElimination | None] = lambda: None
     alone: Alone | None = None
-    stepping: Stepping = STEPPING
-    gaps: Gaps = GAPS
+    stepping: LoadStepping = STEPPING
+    gaps: GapContinuation = GAPS
 
     @cached_property
     def lbfgs(self) -> Lbfgs:
@@ -106,7 +106,7 @@ class Strategy:
     @cached_property
     def contact(self) -> ContactDescent | None:
         """What solves the nodes that tools touch apart from the tissue; None where the plan does not."""
-        if self.plan.contact is not Step.CONTACT:
+        if self.plan.contact is not SolverStep.CONTACT:
             return None
         (barrier,) = self.problem.barriers
         assert isinstance(barrier, Local)
@@ -116,7 +116,7 @@ class Strategy:
     def local(self, count: int) -> BatchElimination | Alone | None:
         """What solves a part by itself for so many loads, if anything does."""
         step = self.plan.local(count)
-        return None if step is None else self.near() if step is Step.NEAR else self.alone
+        return None if step is None else self.near() if step is SolverStep.NEAR else self.alone
 
     @cached_property
     def _touched(self) -> Preconditioner:
@@ -130,7 +130,7 @@ class Strategy:
         """Bytes that L-BFGS keeps for the next batch to stand in."""
         return self.lbfgs.held
 
-    def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
+    def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
         """The equilibria of B cases, each from the first of its guesses (3N, B) [m] that will do; from rest without.
 
         A start that lies inside out is left alone, and so is a state that does to which a start led. A body turned over
@@ -196,13 +196,13 @@ class Strategy:
                 guess, inverted = np.where(fewer < inverted, other, guess), np.minimum(fewer, inverted)
         return guess, self.inversion.doubtful(inverted)
 
-    def _lost(self, answer: Answer) -> np.ndarray:
+    def _lost(self, answer: SolverResult) -> np.ndarray:
         """Which cases (B,) another solver may save: at round-off none is nearer to equilibrium."""
         return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
     def _whole(
         self, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] | None = NOTHING
-    ) -> Answer:
+    ) -> SolverResult:
         """The whole load at once, of a batch that has begun: eliminations, L-BFGS, Newton, each from where one ended.
 
         From rest without a start; `learnt` on the way to it, if anything was. Motions that are imposed are left
@@ -216,12 +216,12 @@ class Strategy:
             return self._moved(cases, start)
         if problem.paced:  # the next frame would gain nothing
             learnt = None
-        if Step.LBFGS not in self.plan.steps(count, imposed):
+        if SolverStep.LBFGS not in self.plan.steps(count, imposed):
             return self._thorough(start, self.accuracy.outer)
         near = self.local(count)
         descents = [(self.lbfgs, learnt)] if near is None else [(near, cases.warm), (self.lbfgs, None)]
         index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
-        answer = Answer(
+        answer = SolverResult(
             wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
         )
         gained: Mapping[str, np.ndarray] = {}
@@ -242,7 +242,7 @@ class Strategy:
             answer.put(index, self._thorough(start, self.accuracy.outer), device)
         return replace(answer, learnt=gained)
 
-    def _touching(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
+    def _touching(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
         """Of cases whose tools have gone so many times their gap: what touches and what gives apart, then Newton.
 
         On the CPU Newton has them one by one: the preconditioner of a single one knows what it touches.
@@ -269,7 +269,7 @@ class Strategy:
             answer.put(some, self._closed(cases.rows(some), gathered(device, start, some), outer, gaps), device)
         return answer
 
-    def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
+    def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
         """Newton, of cases whose tools have gone so many times their gap: it is opened first, and closed step by step.
 
         In a narrow gap tissue would be thrown out of a tool, and caught again, node by node; a wide one leads it.
@@ -287,7 +287,7 @@ class Strategy:
         linear += found.linear_iterations
         return replace(found, iterations=iterations + found.iterations, linear_iterations=linear)
 
-    def _thorough(self, start: wp.array, outer: int, tolerance: float | None = None) -> Answer:
+    def _thorough(self, start: wp.array, outer: int, tolerance: float | None = None) -> SolverResult:
         """Newton, in at most so many outer steps, of a batch that has begun."""
         newton = NewtonCG(self._touched, self.accuracy.inner)
         accuracy = replace(self.accuracy, outer=outer, tolerance=tolerance or self.accuracy.tolerance)
@@ -296,11 +296,11 @@ class Strategy:
 
     def _answer(
         self, u: wp.array, outcome: np.ndarray, steps: np.ndarray, residual: np.ndarray, linear_iterations: int
-    ) -> Answer:
+    ) -> SolverResult:
         reached = np.array([ended.good for ended in outcome], float)
-        return Answer(u, outcome, steps, residual, reached, self.inversion.count(u), linear_iterations)
+        return SolverResult(u, outcome, steps, residual, reached, self.inversion.count(u), linear_iterations)
 
-    def _in_steps(self, cases: Cases, failed: Answer, index: np.ndarray) -> Answer:
+    def _in_steps(self, cases: Cases, failed: SolverResult, index: np.ndarray) -> SolverResult:
         """From rest, the load raised in steps that grow and shrink; the equilibrium under the largest share found.
 
         Of cases that are the rows `index` (k,) of what failed; where no larger share is found that stands.
@@ -320,7 +320,7 @@ class Strategy:
         found.residual[none], found.reached[none] = failed.residual[index[none]], failed.reached[index[none]]
         return replace(found, outcome=outcome, inverted=self.inversion.count(found.u))
 
-    def _moved(self, cases: Cases, start: wp.array) -> Answer:
+    def _moved(self, cases: Cases, start: wp.array) -> SolverResult:
         """From start (3N, b), where the tools were, as far as they may go at once again and again.
 
         A body at rest on which nothing acts where they end is there, whatever they met on their way.
@@ -334,7 +334,7 @@ class Strategy:
         if len(acting) == count:
             return self._by_steps(cases, start, moved, 1.0, most)
         none, every = np.zeros(count, int), np.full(count, Outcome.CONVERGED, object)
-        answer = Answer(device.zeros(*start.shape), every, none, np.zeros(count), np.ones(count), none.copy(), 0)
+        answer = SolverResult(device.zeros(*start.shape), every, none, np.zeros(count), np.ones(count), none.copy(), 0)
         if len(acting):
             part = gathered(device, start, acting)
             answer.put(acting, self._by_steps(cases.rows(acting), part, moved, 1.0, most), device)
@@ -347,7 +347,7 @@ class Strategy:
         aimed: Callable[[Cases, np.ndarray], Cases],
         first: float,
         most: int,
-    ) -> Answer:
+    ) -> SolverResult:
         """From start (3N, b), cases at growing shares: the equilibrium at the largest share found.
 
         `aimed` makes cases at shares (b,); the `first` step is so long, and none longer than tools may go at once.
@@ -359,7 +359,7 @@ class Strategy:
         shares = Shares.at_rest(first, gaps)
         u, left, done = wp.clone(start), most, 1
         none, outcome = np.zeros(count, int), np.full(count, Outcome.BUDGET, object)
-        answer = Answer(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
+        answer = SolverResult(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
         outer = self.accuracy.outer
         wanted, outer = (outer, outer) if problem.barriers else (self.stepping.aimed, min(self.stepping.most, outer))
         while left >= 0:
@@ -383,7 +383,7 @@ class Strategy:
             answer = replace(answer, linear_iterations=answer.linear_iterations + found.linear_iterations)
         return self._arrived(cases, aimed, answer)
 
-    def _arrived(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], answer: Answer) -> Answer:
+    def _arrived(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], answer: SolverResult) -> SolverResult:
         """Judge cases that went as far as they could, in place: those that tools pierce, and those that fell short."""
         problem, u, outcome, reached = self.problem, answer.u, answer.outcome, answer.reached
         short = np.flatnonzero(reached < 1.0)

@@ -11,22 +11,22 @@ from ..deformation import Outcome
 from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
-from .strategy import Answer
+from .strategy import SolverResult
 
 
 @dataclass(frozen=True, eq=False)
-class Still:
+class NoMotionStep:
     """Stands in for a `Strategy`: what has mass does not move at once, whatever pulls at it, nor do tools."""
 
     problem: Problem
     inversion: Inversion
 
-    def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
+    def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
         """Where the bodies were (3N, B) [m], the last of the guesses; at rest without."""
         device, count = self.problem.device, len(cases.loads)
         u = device.array(guesses[-1]) if guesses else device.zeros(self.problem.rows, count)
         outcome, none = np.full(count, Outcome.CONVERGED, object), np.zeros(count, int)
-        return Answer(
+        return SolverResult(
             u, outcome, none, np.zeros(count), np.ones(count), self.inversion.count(u), 0, gone=np.zeros(count)
         )
 

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from ..discretisation.footprint import Skin
+from ..discretisation.footprint import ContactSurface
 from ..discretisation.term import Cases
 from ..loads import Loads, Nodal, Pushed, check_field
 from ..runtime.columns import CHUNK, gathered
@@ -15,7 +15,7 @@ from ..runtime.device import Device, forward_kernel
 
 
 @dataclass(frozen=True)
-class Kernels:
+class DeadForceKernels:
     """Arithmetic on the loaded nodes in one scalar type."""
 
     spread: wp.Kernel
@@ -24,7 +24,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(device: Device) -> Kernels:
+def kernels_of(device: Device) -> DeadForceKernels:
     """Kernels of a device's scalar type."""
     scalar = device.scalar
     chunk = CHUNK
@@ -70,7 +70,7 @@ def kernels_of(device: Device) -> Kernels:
                 total += wp.float64(force[3 * i + k, c]) * wp.float64(u[3 * nodes[i] + k, c])
         wp.atomic_sub(out, c, total)
 
-    return Kernels(spread, subtract, subtract_work)
+    return DeadForceKernels(spread, subtract, subtract_work)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class Forces:
     force: wp.array
 
 
-def pushed_forces(skin: Skin, device: Device, loads: Loads) -> Forces | None:
+def pushed_forces(skin: ContactSurface, device: Device, loads: Loads) -> Forces | None:
     """Nodal forces of pushing tools on a body's surface; None without any.
 
     Raises

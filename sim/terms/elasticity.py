@@ -12,12 +12,12 @@ import warp as wp
 
 from ..discretisation.element import Elements, hooke_stiffness
 from ..discretisation.term import Cases
-from ..runtime.columns import Rooms
+from ..runtime.columns import Workspaces
 from ..runtime.device import Device
 from ..runtime.threads import cores, together
 from .element_kernels import kernels_of, spreading_of
 from .laws.law import Law
-from .state_source import Source
+from .state_source import StateSource
 
 # The step of a difference in the displacement gradient.
 BEND = 1e-3
@@ -34,7 +34,7 @@ class _Part:
     coefficients: wp.array
 
 
-class Elasticity:
+class ElasticTerm:
     """A Term: hyperelastic energy of some elements.
 
     Parameters
@@ -66,7 +66,7 @@ class Elasticity:
         coefficients: np.ndarray,
         lame: np.ndarray,
         device: Device,
-        sources: Sequence[Source] = (),
+        sources: Sequence[StateSource] = (),
     ):
         self.name = name
         self.passive = not sources
@@ -90,8 +90,8 @@ class Elasticity:
         constants = device.array(coefficients, wp.types.vector(length=own, dtype=device.scalar))
         self._constants = device.array(coefficients) if sources else constants
         points = elements.weight.shape
-        self._numbers = Rooms(lambda columns: device.zeros(*points, count, columns), device)
-        self._strains = Rooms(lambda columns: wp.empty((*points, columns), device.matrix, device.name), device)
+        self._numbers = Workspaces(lambda columns: device.zeros(*points, count, columns), device)
+        self._strains = Workspaces(lambda columns: wp.empty((*points, columns), device.matrix, device.name), device)
         every = len(elements.table)
         ends = np.linspace(0, every, (1 if device.on_cuda else cores(every)) + 1).astype(int).tolist()
         self._parts = [
@@ -179,12 +179,12 @@ class Elasticity:
         return sp.csc_array(sp.coo_array((entries, place), shape=(3 * elements.nodes,) * 2))
 
     @cached_property
-    def _apart(self) -> "Elasticity":
+    def _apart(self) -> "ElasticTerm":
         """The same elements, each with nodes of its own."""
         elements, law, coefficients = self._rest[0], *self._tissue
         table = np.arange(elements.table.size, dtype=np.int32).reshape(elements.table.shape)
         apart = replace(elements, table=table, nodes=table.size)
-        return Elasticity(self.name, law, apart, coefficients, np.column_stack(self._rest[1:]), self._device)
+        return ElasticTerm(self.name, law, apart, coefficients, np.column_stack(self._rest[1:]), self._device)
 
     def second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
         """As `Strained.second_order`: from the law's stress by central differences, of fourth order in the step."""
@@ -199,7 +199,7 @@ class Elasticity:
         u[3:12] = size.reshape(-1, 3, 3).transpose(2, 1, 0).reshape(9, -1)
         tensors = []
         for each in tissues:
-            term = Elasticity(self.name, law, one, each[None], np.zeros((1, 2)), self._device)
+            term = ElasticTerm(self.name, law, one, each[None], np.zeros((1, 2)), self._device)
             out = self._device.zeros(*u.shape)
             term.add_gradient(self._device.array(u), out)
             stress = out.numpy()[3:12].reshape(3, 3, -1).transpose(2, 1, 0).reshape(-1, 9)

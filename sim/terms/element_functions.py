@@ -11,7 +11,7 @@ from .laws.law import Law
 
 
 @dataclass(frozen=True)
-class Functions:
+class ElementFunctions:
     """The displacement gradient; coefficients there and at rest, and the type of their array."""
 
     gradient: wp.Function
@@ -21,7 +21,7 @@ class Functions:
 
 
 @cache
-def functions_of(law: Law, device: Device, size: int, count: int) -> Functions:
+def functions_of(law: Law, device: Device, size: int, count: int) -> ElementFunctions:
     """Functions for elements of `size` nodes and laws of `count` coefficients, as `kernels_of` takes them."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
@@ -67,5 +67,5 @@ def functions_of(law: Law, device: Device, size: int, count: int) -> Functions:
 
     own = wp.array(dtype=constants)
     if law.at_rest is None:
-        return Functions(gradient_of, of_element, same, own)
-    return Functions(gradient_of, of_point, law.at_rest, wp.array4d(dtype=scalar))
+        return ElementFunctions(gradient_of, of_element, same, own)
+    return ElementFunctions(gradient_of, of_point, law.at_rest, wp.array4d(dtype=scalar))

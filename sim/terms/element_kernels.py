@@ -15,7 +15,7 @@ VOLUME_KEPT = 0.1
 
 
 @dataclass(frozen=True)
-class Kernels:
+class ElementKernels:
     """The compiled loops over elements of one law."""
 
     add_energy: wp.Kernel
@@ -45,7 +45,7 @@ def spreading_of(device: Device) -> wp.Kernel:
 
 
 @cache
-def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
+def kernels_of(law: Law, device: Device, size: int, count: int) -> ElementKernels:
     """Kernels for elements of `size` nodes and laws of `count` coefficients.
 
     Each launches over (element, column). Elements of `size` 0 have as many nodes as `sizes` says, each its own number.
@@ -248,4 +248,4 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
             out[e, q, c] = gradient_of(u, sizes, table, gradient, e, q, c)
 
     bounded = bound_step if law.needs_positive_volume else None
-    return Kernels(add_energy, add_gradient, add_curvature, add_diagonal, bounded, measure)
+    return ElementKernels(add_energy, add_gradient, add_curvature, add_diagonal, bounded, measure)

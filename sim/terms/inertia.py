@@ -10,7 +10,7 @@ import warp as wp
 from ..discretisation.element import quadratic_elements
 from ..discretisation.space import Discretisation
 from ..discretisation.term import Cases
-from ..runtime.columns import CHUNK, Rooms
+from ..runtime.columns import CHUNK, Workspaces
 from ..runtime.device import Device, forward_kernel
 
 # Shares of a quadratic tetrahedron's mass: its consistent mass matrix' diagonal, scaled to the whole. Row sums would be
@@ -19,7 +19,7 @@ CORNER, MIDDLE = 1.0 / 36.0, 4.0 / 27.0
 
 
 @dataclass(frozen=True)
-class Kernels:
+class InertiaKernels:
     """Arithmetic of lumped masses in one scalar type."""
 
     add_energy: wp.Kernel
@@ -28,7 +28,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(device: Device) -> Kernels:
+def kernels_of(device: Device) -> InertiaKernels:
     """Kernels of a device's scalar type."""
     scalar, mat = device.scalar, device.matrix
     chunk = CHUNK
@@ -77,7 +77,7 @@ def kernels_of(device: Device) -> Kernels:
         i, c = wp.tid()
         out[i, c] += mass[i] * weight[c] * wp.identity(n=3, dtype=scalar)
 
-    return Kernels(add_energy, add_force, add_blocks)
+    return InertiaKernels(add_energy, add_force, add_blocks)
 
 
 def lumped_mass(density: float, space: Discretisation) -> np.ndarray:
@@ -95,7 +95,7 @@ def lumped_mass(density: float, space: Discretisation) -> np.ndarray:
     return density * np.bincount(space.table.ravel(), np.outer(volume, share).ravel(), space.count)
 
 
-class Inertia:
+class InertiaTerm:
     """A Term: E = w/2 |u - a|^2_M, M the lumped mass, w = (1/dt + damping) / dt, a = u_n + dt v_n / (1 + damping dt).
 
     Its gradient is M ((v - v_n) / dt + damping v) with v = (u - u_n) / dt: backward Euler (Martin, Thomaszewski,
@@ -122,8 +122,8 @@ class Inertia:
         self._device, self._kernels = device, kernels_of(device)
         self._damping, self._masses, self.marks = damping, mass, marks
         self._mass = device.array(mass)
-        self._weight = Rooms(lambda columns: device.zeros(columns), device)
-        self._aim = Rooms(lambda columns: device.zeros(3 * len(mass), columns), device)
+        self._weight = Workspaces(lambda columns: device.zeros(columns), device)
+        self._aim = Workspaces(lambda columns: device.zeros(3 * len(mass), columns), device)
         self._cases: Cases | None = None
 
     def begin(self, cases: Cases) -> None:

@@ -11,7 +11,7 @@ from ..discretisation.term import Cases
 from .laws.law import Law
 
 
-class Source(Protocol):
+class StateSource(Protocol):
     """Numbers that vary from point to point and from case to case, and the law that takes them.
 
     Numbers are Warp's (T, q, n, b) in the device's scalar type: element, point, number, column.

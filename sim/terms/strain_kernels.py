@@ -11,7 +11,7 @@ from .laws.law import Law
 
 
 @dataclass(frozen=True)
-class Kernels:
+class StrainKernels:
     """The compiled loops over some elements of one law."""
 
     strain: wp.Kernel
@@ -19,7 +19,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
+def kernels_of(law: Law, device: Device, size: int, count: int) -> StrainKernels:
     """Kernels as those of `element_kernels.kernels_of`; each launches over (place in `some`, in `columns`)."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
@@ -96,4 +96,4 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
                             for m in range(3):
                                 wp.atomic_add(out, c, row + m, column, wp.float64(f[m]))
 
-    return Kernels(strain, stiffen)
+    return StrainKernels(strain, stiffen)

@@ -72,7 +72,7 @@ def swollen(law: Law, device: Device, count: int) -> Law:
 
 
 @dataclass(frozen=True)
-class Kernels:
+class SwellingKernels:
     """How much wider every point is; each launches over (element, point, column)."""
 
     fill: wp.Kernel
@@ -80,7 +80,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(device: Device) -> Kernels:
+def kernels_of(device: Device) -> SwellingKernels:
     """Kernels of a device's scalar type."""
     scalar, mat = device.scalar, device.matrix
 
@@ -108,7 +108,7 @@ def kernels_of(device: Device) -> Kernels:
         r = swells[e] * wider[c]
         strain[e, q, c] = (strain[e, q, c] - r * wp.identity(n=3, dtype=scalar)) / (scalar(1.0) + r)
 
-    return Kernels(fill, shrink)
+    return SwellingKernels(fill, shrink)
 
 
 class Swelling:

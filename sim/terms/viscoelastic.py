@@ -91,7 +91,7 @@ def relaxing(law: Law, device: Device, count: int) -> Law:
 
 
 @dataclass(frozen=True)
-class Kernels:
+class ViscoelasticKernels:
     """A step of the Prony series at every point."""
 
     fade: wp.Kernel
@@ -99,7 +99,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(law: Law, device: Device, count: int) -> Kernels:
+def kernels_of(law: Law, device: Device, count: int) -> ViscoelasticKernels:
     """Kernels for a law of `count` coefficients; each launches over (element, point, column)."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
@@ -153,7 +153,7 @@ def kernels_of(law: Law, device: Device, count: int) -> Kernels:
                 half, row = wp.exp(-step[c] / (scalar(2.0) * tau[e, i])), six * (i + 1) + k
                 out[c, p, row] = half * (half * past[c, p, row] + share[e, i] * (now - past[c, p, k]))
 
-    return Kernels(fade, advance)
+    return ViscoelasticKernels(fade, advance)
 
 
 class Prony:

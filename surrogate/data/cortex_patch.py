@@ -16,7 +16,7 @@ from sim.geometry.surface import areas, vertex_normals
 from ..array_functions import squared_distances, taken
 
 if TYPE_CHECKING:
-    from sim.discretisation.footprint import Skin
+    from sim.discretisation.footprint import ContactSurface
 
 
 def barycentric_lattice(rows: int) -> np.ndarray:
@@ -56,13 +56,13 @@ class Patch:
         return -vertex_normals(self.points, self.triangles)
 
     @cached_property
-    def skin(self) -> Skin:
+    def skin(self) -> ContactSurface:
         """Contact surface of the patch."""
         # Warp is imported only for pressing tools, not for reading a model.
-        from sim.discretisation.footprint import Skin
+        from sim.discretisation.footprint import ContactSurface
         from sim.runtime.device import find_device
 
-        return Skin(self.points, self.triangles, find_device("cpu", "float64"), "open cortex")
+        return ContactSurface(self.points, self.triangles, find_device("cpu", "float64"), "open cortex")
 
     @cached_property
     def rim(self) -> np.ndarray:

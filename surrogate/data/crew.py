@@ -20,11 +20,11 @@ from sim.runtime.processes import process_pool, run_on_each
 from sim.strategy.memory_needed import Needed, foreseen
 
 from .holding import held, series_of
-from .tasks import Crew
+from .tasks import SolverPool
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class LazyFem:
     """FEM that is built on first use: a `Deformer`.
 
     Parameters
@@ -68,14 +68,14 @@ class Asked:
 class Solver:
     """Deformer of the loads, its element, its description, and the number of loads that are solved together."""
 
-    deformer: Deformer | Crew
+    deformer: Deformer | SolverPool
     element: str
     description: str
     batch: int
 
 
 @contextmanager
-def solving(asked: Asked, devices: Sequence[str], said: Callable[[str], object]) -> Iterator[Solver]:
+def solving(asked: LazyFem, devices: Sequence[str], said: Callable[[str], object]) -> Iterator[Solver]:
     """Open FEM solvers on each of the devices; with one device it is in this process.
 
     Without a `batch` it is as large as fits. With several GPUs each then gets the same number of batches. `said` first
@@ -101,20 +101,20 @@ def solving(asked: Asked, devices: Sequence[str], said: Callable[[str], object])
         batch = min(batches)
         if asked.batch is None and devices[0].startswith("cuda"):
             batch = even_batch(batch // most, asked.loads, len(devices))
-        yield Solver(Crew(asked.anatomy, children), elements[0], words[0], batch)
+        yield Solver(SolverPool(asked.anatomy, children), elements[0], words[0], batch)
 
 
-def placed(device: str, asked: Asked) -> Asked:
+def placed(device: str, asked: LazyFem) -> LazyFem:
     """Return the FEM of a device."""
     return replace(asked, device=device)
 
 
-def memory_of(asked: Asked, task: None) -> Needed | None:
+def memory_of(asked: LazyFem, task: None) -> Needed | None:
     """Return the GPU memory that the FEM needs."""
     return asked.needed
 
 
-def described(asked: Asked, task: None) -> tuple[str, str, int]:
+def described(asked: LazyFem, task: None) -> tuple[str, str, int]:
     """Return the FEM's element, description and batch size, after a check that it fits in memory."""
     if asked.needed is None:  # on the CPU: before a file is created that keeps its batch
         fem = asked.fem

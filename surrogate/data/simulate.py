@@ -41,7 +41,7 @@ from .dataset import (
     write_loads,
     write_provenance,
 )
-from .tasks import Crew, Task, answered, posed_tools
+from .tasks import LoadBatch, SolverPool, answered, posed_tools
 
 # Names of the file's groups in reports of their seconds.
 STAGES = {"unit": "unit responses", "answers": "loads"}
@@ -55,7 +55,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Solved:
+class SimulatedRows:
     """Rows of unit responses and of loads that one call solved, and the seconds of each, with writing."""
 
     units: int = 0
@@ -70,7 +70,7 @@ class Solved:
 
 
 @dataclass(frozen=True, eq=False)
-class Work:
+class SimulationWork:
     """Requested unit responses and loads, in batches.
 
     Parameters
@@ -109,20 +109,20 @@ class Work:
         name, first = batch
         return np.arange(first, min(first + self.batch, self.counts[name]))
 
-    def task(self, batch: Batch) -> Task:
+    def task(self, batch: Batch) -> LoadBatch:
         """Build the task that solves a batch."""
         rows = self.rows(batch)
-        return Task(batch, rows, None if batch[0] == "unit" else self.loads.rows(rows))
+        return LoadBatch(batch, rows, None if batch[0] == "unit" else self.loads.rows(rows))
 
 
 def simulate(
     path: str | Path,
-    deformer: Deformer | Crew,
+    deformer: Deformer | SolverPool,
     loads: Loads,
     provenance: Mapping[str, str],
     batch: int = 64,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Solved:
+) -> SimulatedRows:
     """Solve every load, and the unit forces on the open cortex unless the loads are poses, into an HDF5 file.
 
     Batches are written to `PATH.partial` (`journal`), where a kill at any moment loses at most one. The same call
@@ -133,7 +133,7 @@ def simulate(
     Parameters
     ----------
     deformer
-        Deformer of `loads` and `Nodal` loads at every vertex; a `Crew` has one on each of several devices.
+        Deformer of `loads` and `Nodal` loads at every vertex; a `SolverPool` has one on each of several devices.
     provenance
         Texts that must agree for a run to resume.
     progress
@@ -160,14 +160,14 @@ def simulate(
     stated |= {"reactions": "kept"} if posed else {}
     partial = unfinished_path(path)
     finished: set[Batch] = set()
-    work = Work(deformer.anatomy, loads, nodes, batch)
+    work = SimulationWork(deformer.anatomy, loads, nodes, batch)
     if path.exists():
         before = _earlier(path, stated, loads)
         if len(before) > len(loads):
-            work = Work(deformer.anatomy, before, nodes, batch)
+            work = SimulationWork(deformer.anatomy, before, nodes, batch)
         finished = _whole_batches(path, work)
         if not partial.exists() and not set(work.batches) - finished and _same_body(path, work):
-            return Solved()
+            return SimulatedRows()
     size = sum(work.row(group).itemsize * rows for group, rows in work.counts.items())
     held = partial.stat().st_size if partial.exists() else 0
     demand_space(path, max(size - held, 0) + size, size)
@@ -180,11 +180,15 @@ def simulate(
         with stage(STAGES["answers"]):
             _write(path, work, {**stated, **_rates(path, solved, seconds)}, journal)
     partial.unlink(missing_ok=True)
-    return Solved(solved["unit"], solved["answers"], *(seconds[name] for name in STAGES.values()))
+    return SimulatedRows(solved["unit"], solved["answers"], *(seconds[name] for name in STAGES.values()))
 
 
 def _fill(
-    journal: Journal, work: Work, deformer: Deformer | Crew, finished: set[Batch], progress: Callable[[int, int], None]
+    journal: Journal,
+    work: SimulationWork,
+    deformer: Deformer | SolverPool,
+    finished: set[Batch],
+    progress: Callable[[int, int], None],
 ) -> dict[str, int]:
     """Solve the batches that are in neither file. A second thread writes a batch while the next is solved."""
     known = [batch for batch in work.batches if batch in finished or batch in journal]
@@ -226,7 +230,7 @@ def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) 
     return rates
 
 
-def _write(path: Path, work: Work, stated: Mapping[str, str], journal: Journal) -> None:
+def _write(path: Path, work: SimulationWork, stated: Mapping[str, str], journal: Journal) -> None:
     """Write the data set: batches of the journal, and those of the finished file that it replaces."""
     with written_stream(path, path.suffix) as stream, h5py.File(stream, "w", libver=READERS) as file:
         facts = {
@@ -278,7 +282,7 @@ def _ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tup
             yield batch, ready
 
 
-def _kept(path: Path, work: Work, batch: Batch) -> np.ndarray:
+def _kept(path: Path, work: SimulationWork, batch: Batch) -> np.ndarray:
     """Read a batch's rows from a finished file, checked again for damage."""
     with h5py.File(path, "r") as before:
         rows, good = _batch(before, work, batch)
@@ -294,7 +298,7 @@ def _tool(loads: Loads, stated: Mapping[str, str]) -> str:
     return f"the rigid tool {stated.get('shape', 'not stated')}, sizes in m, moved by pose: see loads/Touching"
 
 
-def _batch(file: h5py.File, work: Work, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+def _batch(file: h5py.File, work: SimulationWork, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
     """Read a batch's rows from a finished file, and the mask of undamaged rows."""
     rows = work.rows(batch)
     return read_rows(file, batch[0], len(work.anatomy.mesh.nodes), int(rows[0]), int(rows[-1]) + 1)
@@ -314,7 +318,7 @@ def _earlier(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
     return before
 
 
-def _same_body(path: Path, work: Work) -> bool:
+def _same_body(path: Path, work: SimulationWork) -> bool:
     """Return True if the body in a finished file is undamaged."""
     with h5py.File(path, "r") as file:
         try:
@@ -323,7 +327,7 @@ def _same_body(path: Path, work: Work) -> bool:
             return False
 
 
-def _whole_batches(path: Path, work: Work) -> set[Batch]:
+def _whole_batches(path: Path, work: SimulationWork) -> set[Batch]:
     """Return the batches that a finished file holds undamaged.
 
     A last short batch is excluded, unless it is the last again: it would have been solved in another batch.

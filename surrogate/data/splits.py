@@ -22,7 +22,7 @@ SECTORS, UPRIGHT = 8, 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class Split:
+class DiscSplit:
     """Held-out discs of the cortex.
 
     Parameters
@@ -64,7 +64,7 @@ class Split:
         )
 
 
-def leave_discs_out(points: np.ndarray, patch: Patch) -> Split:
+def leave_discs_out(points: np.ndarray, patch: Patch) -> DiscSplit:
     """Hold out discs of 6 mm radius round distant load points (B, 3) [m]: at least 6, and 15 % of the patch.
 
     No disc beyond the sixth is taken if it would leave fewer than half of the loads to train on. At a small craniotomy,
@@ -86,7 +86,7 @@ def leave_discs_out(points: np.ndarray, patch: Patch) -> Split:
     return next((split for split in splits if split.test.mean() <= 0.5), fewest)
 
 
-def _discs(points: np.ndarray, candidates: np.ndarray, patch: Patch, radius: float) -> Split:
+def _discs(points: np.ndarray, candidates: np.ndarray, patch: Patch, radius: float) -> DiscSplit:
     split = _split(points, candidates[:FEWEST], patch, radius)
     for count in range(FEWEST + 1, len(candidates)):
         if split.share >= SHARE:
@@ -98,16 +98,16 @@ def _discs(points: np.ndarray, candidates: np.ndarray, patch: Patch, radius: flo
     return split
 
 
-def _split(points: np.ndarray, centres: np.ndarray, patch: Patch, radius: float) -> Split:
+def _split(points: np.ndarray, centres: np.ndarray, patch: Patch, radius: float) -> DiscSplit:
     which, distance = nearest(points, centres)
-    return Split(centres, radius, np.where(distance <= radius, which, -1), patch.covered(centres, radius))
+    return DiscSplit(centres, radius, np.where(distance <= radius, which, -1), patch.covered(centres, radius))
 
 
 @dataclass(frozen=True, eq=False)
-class Sectors(Split):
+class Sectors(DiscSplit):
     """Held-out sectors of tangential direction.
 
-    As `Split`, but `centres` are unit directions (k, 3), and `radius` is half the width of a sector [rad]. `disc` is
+    As `DiscSplit`, but `centres` are unit directions (k, 3), and `radius` is half the width of a sector [rad]. `disc` is
     the number of the sector that a load's force is in, and `share` a part of the circle.
     """
 

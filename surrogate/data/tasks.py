@@ -22,7 +22,7 @@ UNIT_FORCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class LoadBatch:
     """Batch, the numbers of its rows (B,), and their loads; None for unit responses."""
 
     batch: Batch
@@ -31,23 +31,23 @@ class Task:
 
 
 @dataclass(frozen=True, eq=False)
-class Crew:
+class SolverPool:
     """Processes that each have a deformer of the same body."""
 
     anatomy: Anatomy
     children: Sequence[Child]
 
 
-def answered(deformer: Deformer | Crew, tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
+def answered(deformer: Deformer | SolverPool, tasks: Iterable[LoadBatch]) -> Iterator[tuple[LoadBatch, bytes]]:
     """Yield each task with its rows from `solved`: one after the other in this process, by a crew in any order."""
-    if isinstance(deformer, Crew):
+    if isinstance(deformer, SolverPool):
         yield from map_unordered(deformer.children, solved, tasks)
     else:
         for task in tasks:
             yield task, solved(deformer, task)
 
 
-def solved(deformer: Deformer, task: Task) -> bytes:
+def solved(deformer: Deformer, task: LoadBatch) -> bytes:
     """Solve a batch (`answer_rows.row_type`). Every batch starts undeformed, independent of earlier ones."""
     anatomy = deformer.anatomy
     unit = task.loads is None

@@ -25,7 +25,7 @@ LATTICE = 200
 
 
 @dataclass(frozen=True)
-class Tool:
+class ToolLoads:
     """Range of a surgical tool's loads.
 
     Parameters
@@ -62,15 +62,15 @@ class Tool:
 TOOLS = {
     tool.name: tool
     for tool in (
-        Tool("palpation", (5e-3, 7.5e-3), (0.05, 0.4), depth=10e-3),
-        Tool("bipolar", (0.5e-3, 1e-3), (0.01, 0.05)),
-        Tool("dissector", (1.5e-3, 2e-3), (0.02, 0.25)),
+        ToolLoads("palpation", (5e-3, 7.5e-3), (0.05, 0.4), depth=10e-3),
+        ToolLoads("bipolar", (0.5e-3, 1e-3), (0.01, 0.05)),
+        ToolLoads("dissector", (1.5e-3, 2e-3), (0.02, 0.25)),
         # 5-30 mmHg under plates of 10-20 x 20-40 mm.
-        Tool("spatula", (8e-3, 16e-3), (0.13, 3.2), pressure=(700.0, 4000.0)),
+        ToolLoads("spatula", (8e-3, 16e-3), (0.13, 3.2), pressure=(700.0, 4000.0)),
     )
 }
 # Stress test of the solver, not surgery: 1 N on 3 mm would be a flat punch 40 mm deep.
-BRUTAL = Tool("brutal", (3e-3, 10e-3), (0.02, 1.05), pressure=(0.0, np.inf), depth=np.inf, even=True)
+BRUTAL = ToolLoads("brutal", (3e-3, 10e-3), (0.02, 1.05), pressure=(0.0, np.inf), depth=np.inf, even=True)
 PRESETS = (*TOOLS, "mixed", "seed", BRUTAL.name)
 BEYOND_TISSUE = ("seed", BRUTAL.name)
 """Presets whose loads strain tissue beyond measurements on brain: their equilibria are stored all the same."""
@@ -101,14 +101,14 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     return Loads((Pushed(rows[:, :3], rows[:, 3:6], rows[:, 6]),))
 
 
-def drawn_of(tool: Tool, patch: Patch, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def drawn_of(tool: ToolLoads, patch: Patch, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample positions of a tool, and its unit directions, (count, 3) each: as `draw`, for any force."""
     free = replace(tool, pressure=(0.0, np.inf), depth=np.inf)
     rows = _in_blocks([free], patch, count, seed)
     return rows[:, :3], rows[:, 3:6] / np.linalg.norm(rows[:, 3:6], axis=1, keepdims=True)
 
 
-def _in_blocks(tools: list[Tool], patch: Patch, count: int, seed: int) -> np.ndarray:
+def _in_blocks(tools: list[ToolLoads], patch: Patch, count: int, seed: int) -> np.ndarray:
     """Sample point [m], force [N] and footprint [m] of each load: (count, 7)."""
     key = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
     blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
@@ -141,7 +141,7 @@ def refused_words(preset: str) -> str:
     )
 
 
-def _drawn(tools: list[Tool], patch: Patch, key: int, block: range) -> np.ndarray:
+def _drawn(tools: list[ToolLoads], patch: Patch, key: int, block: range) -> np.ndarray:
     """Sample point [m], force [N] and footprint [m] of each load of a block: (n, 7)."""
     kind = (len(tools) * _uniform(key, 0, block)[:, -1]).astype(int)
     out = np.zeros((len(block), 7))
@@ -162,7 +162,7 @@ def _uniform(key: int, attempt: int, block: range) -> np.ndarray:
     return np.random.Generator(source).random((len(block), NUMBERS))
 
 
-def _drawn_of(tool: Tool, patch: Patch, key: int, block: range, rows: np.ndarray) -> np.ndarray:
+def _drawn_of(tool: ToolLoads, patch: Patch, key: int, block: range, rows: np.ndarray) -> np.ndarray:
     """Sample as `_drawn`, for one tool and some rows (k,) of the block: loads that do not fit are sampled again."""
     out, waiting = np.zeros((len(block), 7)), rows
     for attempt in range(ATTEMPTS):

@@ -21,14 +21,14 @@ class Offer:
 
 
 @dataclass(frozen=True)
-class Choice:
+class ModelChoice:
     """Selected deformer, and a sentence with the reason."""
 
     offer: Offer
     reason: str
 
 
-def choose(offers: Sequence[Offer], within_mm: float | None = None, within_ms: float | None = None) -> Choice:
+def choose(offers: Sequence[Offer], within_mm: float | None = None, within_ms: float | None = None) -> ModelChoice:
     """Select the fastest deformer within an error limit; without one, the most accurate within a time limit.
 
     If both limits are given, both are satisfied.
@@ -54,7 +54,7 @@ def choose(offers: Sequence[Offer], within_mm: float | None = None, within_ms: f
         near += [f"the fastest is {min(exact or offers, key=_time)}"] if within_ms is not None else []
         raise InputError(f"no deformer here is within {asked}: {'; '.join(near)}. Allow more.")
     taken, word = (min(both, key=_error), "most accurate") if within_mm is None else (min(both, key=_time), "fastest")
-    return Choice(taken, f"{taken} is the {word} of {len(both)} deformers within {asked}, of {len(offers)} here")
+    return ModelChoice(taken, f"{taken} is the {word} of {len(both)} deformers within {asked}, of {len(offers)} here")
 
 
 def _error(offer: Offer) -> tuple[float, float]:

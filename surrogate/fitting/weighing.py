@@ -16,7 +16,7 @@ from ..array_functions import squared_distances
 from ..locating.causes import DRAINAGE
 from ..locating.evidence import Evidence, alike
 from ..locating.locator import Locator
-from ..locating.prior import Prior
+from ..locating.prior import MotionPrior
 from .frame import Frame
 from .responses import LINEAR, Responses
 
@@ -30,7 +30,7 @@ SIZES = (0.3, 1.0, 3.0)
 COARSENED, COARSENED_TOOLS = 2.0, 8.0
 
 
-def of_drained(drained: Responses, prior: Prior, evidence: Evidence) -> np.ndarray:
+def of_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:
     """Compute the log-likelihood (skulls, poissons, ratios) of a frame with drained fluid."""
     lower, seen = errors(evidence)
     rows = {name: seen_of(drained, name, evidence) for name in LINEAR}

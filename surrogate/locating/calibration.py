@@ -17,7 +17,7 @@ from .ensemble import Ensemble, surface_size
 from .evidence import SIGMA, Evidence, of_motions
 from .observation import Observation
 from .posterior import Posterior
-from .prior import Prior, middle_of, prior_of
+from .prior import MotionPrior, middle_of, prior_of
 from .rounds import settled
 
 LEVEL = 0.95
@@ -163,7 +163,7 @@ def seen_patch(anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator
     return of_motions(place, at, moved, np.full(count, SIGMA))
 
 
-def _square(prior: Prior, found: Posterior, middle: np.ndarray) -> float:
+def _square(prior: MotionPrior, found: Posterior, middle: np.ndarray) -> float:
     """Squared Mahalanobis distance of an estimate's error (3,) [m] by its own covariance."""
     off = found.weight @ prior.middle - middle
     return float(off @ np.linalg.solve(found.covariance(prior.middle[:, None])[0], off))

@@ -14,7 +14,7 @@ import numpy as np
 
 from .causes import KINDS
 from .posterior import Posterior
-from .prior import Prior
+from .prior import MotionPrior
 
 # Number of posterior samples; probability outside a share's interval at each end; max. width of a determined interval.
 DRAWS, BEYOND, KNOWN = 400, 0.05, 0.5
@@ -78,7 +78,7 @@ def _partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
                 yield [[first, *some], *groups]
 
 
-def drawn_shares(prior: Prior, posterior: Posterior) -> np.ndarray:
+def drawn_shares(prior: MotionPrior, posterior: Posterior) -> np.ndarray:
     """Sample shares (n, kinds) of causes in the mean square motion of the open cortex from the posterior."""
     ends = np.round(DRAWS * np.cumsum([answer.share for answer in posterior.answers])).astype(int)
     normal = np.random.default_rng(0).standard_normal((DRAWS, len(prior.kind)))

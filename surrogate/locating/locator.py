@@ -18,7 +18,7 @@ from .cause_shares import CauseShare, cause_shares, drawn_shares
 from .causes import KINDS
 from .observation import Observation, looked_at
 from .posterior import Posterior, within_errors
-from .prior import Prior
+from .prior import MotionPrior
 from .regions import Region
 from .rounds import settled
 
@@ -84,7 +84,7 @@ class Location:
         Time taken, without set-up and tables that all observations share.
     """
 
-    prior: Prior
+    prior: MotionPrior
     posterior: Posterior
     p95: float
     outliers: np.ndarray
@@ -232,7 +232,7 @@ class Locator:
         Regions whose stiffness was known.
     """
 
-    prior: Prior
+    prior: MotionPrior
     tried: np.ndarray
     regions: tuple[Region, ...] = ()
 

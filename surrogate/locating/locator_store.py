@@ -23,7 +23,7 @@ from .calibration import TRIALS, trials
 from .causes import KINDS, USUAL, Causes, pressed
 from .ensemble import solved
 from .locator import Locator
-from .prior import NOWHERE, PRESSED, Prior, prior_of
+from .prior import NOWHERE, PRESSED, MotionPrior, prior_of
 from .regions import Region, check_regions
 
 FORMAT = "sulcus locator 6"
@@ -76,7 +76,7 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
         arrays = archive.sealed(header, [*_names(header), "tried"])
         _check(path, anatomy, arrays)
         tried = arrays.pop("tried")
-        return Locator(Prior(anatomy, **arrays), tried, regions)
+        return Locator(MotionPrior(anatomy, **arrays), tried, regions)
 
 
 def _names(header: dict[str, Any]) -> tuple[str, ...]:

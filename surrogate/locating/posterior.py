@@ -20,8 +20,8 @@ from sim.errors import InputError
 
 from .causes import OEDEMA, TOOL
 from .evidence import SHIFT, SLIPPED, Evidence, triangular_inverse
-from .prior import RIGIDS, SETS, WITH_PLACE, Hypothesis, Prior
-from .whitened import Equations, Whitened, whitened, with_places
+from .prior import RIGIDS, SETS, WITH_PLACE, Hypothesis, MotionPrior
+from .whitened import Equations, WhitenedSystem, whitened, with_places
 
 # Significance level of a motion, for each of three tests.
 MOVED = 0.005
@@ -60,7 +60,7 @@ def within_errors(posterior: Posterior) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class HypothesisResult:
     """Posterior of k unknowns under one hypothesis.
 
     Parameters
@@ -106,13 +106,13 @@ class Posterior:
     slipped
         Log-odds of a slipped registration against one that did not slip: of the best hypothesis of each.
     moving
-        `moving` of a `SeenPrior`.
+        `moving` of a `ObservedPrior`.
     factor
         Calibration factor on the mixture's covariances.
     """
 
     evidence: Evidence
-    answers: list[Answer]
+    answers: list[HypothesisResult]
     unknown: np.ndarray
     surprise: float
     outliers: np.ndarray
@@ -147,7 +147,7 @@ class Posterior:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenPrior:
+class ObservedPrior:
     """Prior at the observed points, whitened by their errors.
 
     Parameters
@@ -159,16 +159,16 @@ class SeenPrior:
     rows
         Whitened effect of unit weights, and of a rigid error of one standard deviation, on the observation.
     odds
-        As `Prior.odds`.
+        As `MotionPrior.odds`.
     slip
         As `Evidence.slip`.
     named
         True if points have correspondences. A cloud excludes oedema: its errors look like it.
     """
 
-    prior: Prior
+    prior: MotionPrior
     scale: float
-    rows: Whitened
+    rows: WhitenedSystem
     odds: np.ndarray
     slip: float = SLIPPED / SHIFT
     named: bool = True
@@ -194,7 +194,7 @@ class SeenPrior:
         """Mask of the hypotheses (h,) with a slipped registration."""
         return np.isinf([hypothesis.rigid for hypothesis in self.prior.hypotheses])
 
-    def answers(self, free: bool = False) -> list[Answer]:
+    def answers(self, free: bool = False) -> list[HypothesisResult]:
         """Compute the posteriors of the most probable hypotheses, the best first; their shares sum to 1.
 
         Hypotheses of a slipped registration are included if it is `free`.
@@ -253,7 +253,7 @@ class SeenPrior:
         """Row numbers (6,) of the rigid error."""
         return np.arange(-7, -1) + len(self.rows.products)
 
-    def answer(self, hypothesis: Hypothesis, place: np.ndarray, share: float) -> Answer:
+    def answer(self, hypothesis: Hypothesis, place: np.ndarray, share: float) -> HypothesisResult:
         """Compute the posterior of a hypothesis with the additional rows (q,) of one place."""
         own = np.concatenate([hypothesis.rows, self._rigid, place])
         size = np.full(len(own), self.scale)
@@ -263,18 +263,18 @@ class SeenPrior:
         inner.flat[:: len(own) + 1] += 1.0
         lower = np.linalg.cholesky(inner)
         mean = size * potrs(lower.T, size * self.rows.products[-1, own])[0]
-        return Answer(share, own, mean, size, lower)
+        return HypothesisResult(share, own, mean, size, lower)
 
 
-def seen_prior(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> SeenPrior:
+def seen_prior(prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> ObservedPrior:
     """Whiten a prior at the points of some evidence; tips of tools (k, 3) [m] touch the cortex."""
     seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
     # A motion and a rigid error may cancel, so that the observation is small; and noise hides smaller motions.
     scale = 1e3 * max(float(np.hypot(seen, np.sqrt(3.0) * evidence.shift)), float(np.median(evidence.sigma)))
-    return SeenPrior(prior, scale, whitened(prior, evidence, seen), prior.odds(tips), evidence.slip, evidence.named)
+    return ObservedPrior(prior, scale, whitened(prior, evidence, seen), prior.odds(tips), evidence.slip, evidence.named)
 
 
-def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS, free: bool = False) -> Posterior:
+def conditioned(prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS, free: bool = False) -> Posterior:
     """Condition a prior on evidence, without points that no other supports. Tips (k, 3) [m] touch the cortex.
 
     The rigid error is of the reported size, or `free`: then it may be that of a slipped registration.
@@ -306,7 +306,7 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS, fr
     return Posterior(some, answers, unknown, float(odd.sum() / len(some)), outliers, seen.slipped, seen.moving)
 
 
-def _oddness(rows: Whitened, answer: Answer, point: np.ndarray) -> np.ndarray:
+def _oddness(rows: WhitenedSystem, answer: HypothesisResult, point: np.ndarray) -> np.ndarray:
     """Compute square Mahalanobis distances (n,) of points from their leave-one-out predictions by one hypothesis."""
     data = len(rows.products) - 1
     precise = rows.precise(np.append(answer.rows, data))

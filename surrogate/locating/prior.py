@@ -69,7 +69,7 @@ class Hypothesis:
 
 
 @dataclass(frozen=True, eq=False)
-class Together:
+class PriorTables:
     """Shapes that may act in each of s skulls, as tables with one kind per column.
 
     Parameters
@@ -91,7 +91,7 @@ class Together:
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class MotionPrior:
     """Prior of motions of one anatomy: its shapes.
 
     Parameters
@@ -129,7 +129,7 @@ class Prior:
         """
         return self.shape[:, self._columns(nodes)]
 
-    def restricted(self, nodes: np.ndarray) -> Prior:
+    def restricted(self, nodes: np.ndarray) -> MotionPrior:
         """Return this prior restricted to some vertices (k,); it raises InputError as `at` does.
 
         Results are unchanged where available. An observation that touches other vertices is rejected.
@@ -207,7 +207,7 @@ class Prior:
         return tuple(made)
 
     @cached_property
-    def together(self) -> Together:
+    def together(self) -> PriorTables:
         """Tables of the shapes that may act in each skull."""
         found, places = zip(*map(self._in_skull, range(len(SKULLS))), strict=True)
         rows, size, kinds = [], [], []
@@ -216,10 +216,12 @@ class Prior:
             rows.append([np.pad(own[kind], (0, most - len(own[kind]))) for own in found])
             size.append([np.where(np.arange(most) < len(own[kind]), SIZE[kind], 0.0) for own in found])
             kinds += most * [kind]
-        return Together(np.concatenate(rows, axis=1), np.concatenate(size, axis=1), np.array(kinds), np.array(places))
+        return PriorTables(
+            np.concatenate(rows, axis=1), np.concatenate(size, axis=1), np.array(kinds), np.array(places)
+        )
 
 
-def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = None) -> Prior:
+def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = None) -> MotionPrior:
     """Build the prior of an ensemble, or of some of its members (N,) bool, and of forces on the open cortex."""
     anatomy, parts = ensemble.anatomy, []
     chosen = np.ones(len(ensemble.kind), bool) if members is None else members
@@ -245,7 +247,7 @@ def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = 
     shapes, *labels = zip(*parts, strict=True)
     counts = [len(shape) for shape in shapes]
     labels = [np.repeat(label, counts) for label in labels]
-    return Prior(anatomy, np.concatenate(shapes), *labels, presses.points[centres])
+    return MotionPrior(anatomy, np.concatenate(shapes), *labels, presses.points[centres])
 
 
 def unit(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:

@@ -10,13 +10,13 @@ import numpy as np
 
 from .observation import Observation, placed, placed_anew
 from .posterior import Posterior, conditioned
-from .prior import Prior
+from .prior import MotionPrior
 
 # Maximum number of iterations; they end once the tumour's centroid moves by less than this [m].
 ROUNDS, STEADY = 6, 0.2e-3
 
 
-def settled(prior: Prior, observation: Observation, free: bool = False) -> tuple[Posterior, np.ndarray]:
+def settled(prior: MotionPrior, observation: Observation, free: bool = False) -> tuple[Posterior, np.ndarray]:
     """Compute the posterior of an observation, and the numbers (k,) of its points near the cortex.
 
     The rigid error may be `free`, as in `conditioned`.

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from .evidence import Evidence, Whitening
-from .prior import Prior
+from .prior import MotionPrior
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ def _logarithm(gain: np.ndarray, block: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Whitened:
+class WhitenedSystem:
     """Whitened rows (m,) of unknowns (weights of r shapes, rigid error) and of the data.
 
     A shape's rows are `weights` times its motions at the vertices: many points depend on few vertices, so that products
@@ -142,10 +142,10 @@ class Whitened:
         return found
 
 
-def whitened(prior: Prior, evidence: Evidence, seen: float) -> Whitened:
+def whitened(prior: MotionPrior, evidence: Evidence, seen: float) -> WhitenedSystem:
     """Build whitened rows of a prior's shapes and of evidence, with their model error for motions of `seen` [m]."""
     whitening = evidence.whitening(seen)
     vertices, weights = evidence.weights
     shape = prior.at_vertices(vertices).reshape(weights.shape[1], -1).astype(float)
     rest = np.column_stack([evidence.rigid * evidence.rigid_scale, evidence.value])
-    return Whitened(whitening, whitening.root @ weights, shape, whitening.white(rest))
+    return WhitenedSystem(whitening, whitening.root @ weights, shape, whitening.white(rest))

@@ -14,9 +14,9 @@ from sim.loads import Loads
 
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS
-from ..regressors.rigid_contact import Contact
-from .learned import Learned, Part
-from .left_out import LIMIT, OffBy, handed_over
+from ..regressors.rigid_contact import RigidContact
+from .learned import Learned, ModelPart
+from .left_out import LIMIT, HeldOutError, handed_over
 from .tool_contact import HELD
 
 
@@ -86,9 +86,9 @@ class Guarded:
         return handed_over(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
 
 
-def off_by(model: Learned) -> OffBy:
+def off_by(model: Learned) -> HeldOutError:
     """Return a model's reported errors on held-out cortex."""
-    return OffBy(model.bound, model.left_out)
+    return HeldOutError(model.bound, model.left_out)
 
 
 def judged(model: Learned) -> str:
@@ -153,7 +153,7 @@ def tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> np.ndarr
             f"the model {len(model.nodes)}: give the complete result for these loads."
         )
     patch, mesh, contact = open_patch(model.anatomy), model.anatomy.mesh, part.regressor
-    assert isinstance(contact, Contact)
+    assert isinstance(contact, RigidContact)
     held = answer.warm.get(HELD)
     if held is None:
         held = contact.held(ENCODERS[part.encoder](patch, model.within(model.asked(loads))[1]))
@@ -173,7 +173,7 @@ def knows_pressure(model: Learned) -> bool:
     return _contact_of(model) is not None
 
 
-def _contact_of(model: Learned) -> Part | None:
+def _contact_of(model: Learned) -> ModelPart | None:
     if model.force is None:
         return None
-    return next((part for part in model.parts if isinstance(part.regressor, Contact)), None)
+    return next((part for part in model.parts if isinstance(part.regressor, RigidContact)), None)

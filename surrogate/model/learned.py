@@ -27,7 +27,7 @@ from ..data.encode import ENCODERS, Basis, Encoder, directions
 from ..data.holding import stated_series
 from ..data.indentation import indented, posed, with_relaxed
 from ..regressors.protocol import Fitted
-from ..regressors.rigid_contact import Contact
+from ..regressors.rigid_contact import RigidContact
 from .conformal import LEVELS, Bound, features_of
 from .left_out import LeftOut
 from .relaxation import MEMORY, Relaxed, followed
@@ -43,7 +43,7 @@ STORED = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ModelPart:
     """Encoder, regressor and basis: one summand of the response, on the basis's vertices.
 
     Parameters
@@ -97,7 +97,7 @@ class Learned:
     """
 
     anatomy: Anatomy
-    parts: tuple[Part, ...]
+    parts: tuple[ModelPart, ...]
     envelope: Envelope
     bound: float = float("nan")
     bounds: Bound | None = None
@@ -134,13 +134,13 @@ class Learned:
         return open_patch(self.anatomy)
 
     @cached_property
-    def _modes_at(self) -> Callable[[bytes], tuple[tuple[list[Part], np.ndarray], ...]]:
+    def _modes_at(self) -> Callable[[bytes], tuple[tuple[list[ModelPart], np.ndarray], ...]]:
         """Function from vertices to parts by basis, with its modes (r, 3 n) there, zero outside the basis."""
-        groups: dict[int, list[Part]] = {}
+        groups: dict[int, list[ModelPart]] = {}
         for part in self.parts:
             groups.setdefault(id(part.basis.modes), []).append(part)
 
-        def modes_at(nodes: bytes) -> tuple[tuple[list[Part], np.ndarray], ...]:
+        def modes_at(nodes: bytes) -> tuple[tuple[list[ModelPart], np.ndarray], ...]:
             asked, found = np.frombuffer(nodes, np.int64), []
             for parts in groups.values():
                 basis = parts[0].basis
@@ -284,7 +284,7 @@ class Learned:
         magnitude, asked = self.within(pushed)
         found = np.zeros(pushed.force.shape) + self.force.added(self._patch, asked)
         for part in self.parts:
-            if isinstance(part.regressor, Contact):
+            if isinstance(part.regressor, RigidContact):
                 found += part.regressor.exerted(encoders[part.encoder](self._patch, asked))
         return magnitude[:, None] * found
 

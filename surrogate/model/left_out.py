@@ -54,7 +54,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class OffBy:
+class HeldOutError:
     """Reported errors of a model on held-out cortex: `bound` and `left_out` as in `Learned`."""
 
     bound: float

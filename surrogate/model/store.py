@@ -23,13 +23,13 @@ from sim.tools import stated_tool
 from ..data.answer_rows import first_stated
 from ..data.encode import Basis
 from ..regressors.baselines import Ann, Pcr, Svr
-from ..regressors.force_series import Pairs, Remainder, Series
+from ..regressors.force_series import ForcePairs, Remainder, Series
 from ..regressors.gp import Gp
 from ..regressors.protocol import Fitted, Linear, Regressor
-from ..regressors.rigid_contact import Contact
+from ..regressors.rigid_contact import RigidContact
 from .conformal import GROWTH, Bound
-from .learned import Learned, Part
-from .left_out import LeftOut, OffBy
+from .learned import Learned, ModelPart
+from .left_out import HeldOutError, LeftOut
 from .npz_archive import Archive, seal_of, write_archive
 from .own_learners import find_own, name_of
 from .tip_distance import TipModel
@@ -43,10 +43,10 @@ REGRESSORS: dict[str, type[Regressor]] = {"linear": Linear, "pcr": Pcr, "ann": A
 # Regressors that depend on the tool features and their meaning.
 FITTED: dict[str, type[Fitted]] = {
     **REGRESSORS,
-    "pairs": Pairs,
+    "pairs": ForcePairs,
     "series": Series,
     "remainder": Remainder,
-    "contact": Contact,
+    "contact": RigidContact,
 }
 
 
@@ -112,7 +112,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
         return models
 
 
-def stated_errors(path: str | Path) -> dict[str, OffBy]:
+def stated_errors(path: str | Path) -> dict[str, HeldOutError]:
     """Read the reported errors of a file's models, by name; their arrays are not read.
 
     Raises
@@ -121,7 +121,7 @@ def stated_errors(path: str | Path) -> dict[str, OffBy]:
         A file that is missing, or not a model file of this project.
     """
     with _described_in(path) as header:
-        return {name: OffBy(about["bound"], _left_out(about)) for name, about in header["models"].items()}
+        return {name: HeldOutError(about["bound"], _left_out(about)) for name, about in header["models"].items()}
 
 
 def learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
@@ -280,7 +280,7 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
     parts = []
     for part in description["parts"]:
         basis = Basis(arrays[part["nodes"]], arrays[part["modes"]])
-        parts.append(Part(part["encoder"], _rebuilt_regressor(part, arrays), basis))
+        parts.append(ModelPart(part["encoder"], _rebuilt_regressor(part, arrays), basis))
     envelope = dict(description["envelope"])
     envelope["points"] = arrays[envelope["points"]]
     for name in ("force", "footprint"):

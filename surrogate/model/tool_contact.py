@@ -14,7 +14,7 @@ from sim.tools import Ball, BuiltIn
 from ..data.cortex_patch import Patch
 from ..data.encode import ENCODERS, Encoder
 from ..regressors.protocol import Fitted
-from ..regressors.rigid_contact import Contact
+from ..regressors.rigid_contact import RigidContact
 from .conformal import Bound
 
 
@@ -53,7 +53,7 @@ def wrench(force: np.ndarray, pose: np.ndarray, tool: BuiltIn) -> np.ndarray:
 
 
 HELD = "where a blade touches"
-"""Key of the contact in the warm data of a result: rows of `Contact.held`."""
+"""Key of the contact in the warm data of a result: rows of `RigidContact.held`."""
 
 
 def going_on(regressors: Sequence[Fitted], start: Deformation | None) -> Mapping[str, Encoder]:
@@ -77,6 +77,6 @@ def held_of(
     return {} if contact is None else {HELD: contact.held(encoders["core"](patch, asked))}
 
 
-def _contact(regressors: Sequence[Fitted]) -> Contact | None:
+def _contact(regressors: Sequence[Fitted]) -> RigidContact | None:
     """Return the contact regressor of a rod or a blade; a ball's search is short."""
-    return next((each for each in regressors if isinstance(each, Contact) and len(each.core)), None)
+    return next((each for each in regressors if isinstance(each, RigidContact) and len(each.core)), None)

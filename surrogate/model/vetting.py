@@ -15,9 +15,9 @@ from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS, Basis
 from ..data.indentation import Indented, with_relaxed
 from ..data.tool_loads import axes_about
-from ..regressors.rigid_contact import Contact
+from ..regressors.rigid_contact import RigidContact
 from .conformal import LEVELS, Bound
-from .learned import Learned, Part
+from .learned import Learned, ModelPart
 from .left_out import LeftOut
 from .training_range import Envelope
 
@@ -66,7 +66,7 @@ def demand_finite(state: Mapping[str, np.ndarray]) -> None:
         )
 
 
-def _check_part(part: Part, model: Learned) -> None:
+def _check_part(part: ModelPart, model: Learned) -> None:
     _demand(part.encoder in ENCODERS, f"no encoder is called {part.encoder!r}")
     _check_basis(part.basis, model.anatomy)
     features = _probe(part.encoder, model)
@@ -114,7 +114,7 @@ def _check_force(model: Learned) -> None:
         return
     _demand(model.tool is not None, "it knows the force of a tool that it has not")
     _demand(model.force.encoder in ENCODERS, f"no encoder is called {model.force.encoder!r}")
-    grips = [part.regressor.grip for part in model.parts if isinstance(part.regressor, Contact)]
+    grips = [part.regressor.grip for part in model.parts if isinstance(part.regressor, RigidContact)]
     _demand(bool(grips) or model.force.learned is not None, "it knows nothing of its tool's force")
     terms = 4 if model.series else 2
     _demand(all(grip.shape == (terms,) for grip in grips), "what it knows of its tool's force is none")

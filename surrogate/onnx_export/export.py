@@ -22,7 +22,7 @@ from ..model.conformal import LEVELS
 from ..model.learned import Learned
 from ..model.training_range import measured
 from ..regressors.baselines import Ann, Pcr, Svr
-from ..regressors.force_series import Pairs, Remainder, Series
+from ..regressors.force_series import ForcePairs, Remainder, Series
 from ..regressors.gp import Gp
 from ..regressors.protocol import Linear
 from .graph import Port, Sheet
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 # Regressors whose formulas use only operations that a wire supports.
-TRACEABLE = (Linear, Pcr, Ann, Svr, Gp, Remainder, Series, Pairs)
+TRACEABLE = (Linear, Pcr, Ann, Svr, Gp, Remainder, Series, ForcePairs)
 # Version of the names, shapes and meanings of inputs, outputs and metadata.
 FORMAT = "sulcus onnx 1"
 TEXT = (

@@ -192,7 +192,7 @@ def with_pressing(X: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
+class ForcePairs:
     """Regressor of the second-order contribution to the response, from `rooted_shares`.
 
     Parameters

@@ -25,7 +25,7 @@ class Fitted(Protocol):
         ...
 
 
-class Teachable(Protocol):
+class RegressorFactory(Protocol):
     """Factory of a fitted map: a regressor itself, or a selection among several."""
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:

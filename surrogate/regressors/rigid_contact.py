@@ -27,7 +27,7 @@ from sim.runtime.threads import one_thread
 from sim.tools import Ball
 
 if TYPE_CHECKING:
-    from sim.discretisation.nearest_places import Placed
+    from sim.discretisation.nearest_places import PlacedBox
 
 # FEM keeps tissue within a gap of the ball [m]: on average half of it.
 THICKER = 0.5 * ToolContact((Ball(1.0),)).gap
@@ -59,7 +59,7 @@ LYING, STANDING = 8, 17
 
 
 @dataclass(eq=False)
-class Contact:
+class RigidContact:
     """Regressor of the response to one metre of indentation.
 
     Its input is `tool_features` of a ball, or `core_features` of a rod or a blade, optionally followed by `held` of the
@@ -189,18 +189,18 @@ class Contact:
         """Centres (S, 3) and radii (S,) [m] of the triangles' bounding balls."""
         return bounding_balls(self.points[self.triangles])
 
-    def _way(self, x: np.ndarray) -> tuple[list[Placed], float, np.ndarray | None]:
+    def _way(self, x: np.ndarray) -> tuple[list[PlacedBox], float, np.ndarray | None]:
         """Compute the tool's path for a row of features, its radius [m], and a row of `_found`, or None.
 
         The path starts at the previous pose, if that is nearer than the first contact; then the row is the result
         there. Else it starts at the first step of the approach.
         """
         # Warp is imported only for pressing tools, not for reading a model.
-        from sim.discretisation.nearest_places import Placed
+        from sim.discretisation.nearest_places import PlacedBox
 
         point, direction, depth, radius = x[:3], x[3:6], x[6], x[7]
         if not len(self.core):
-            return [Placed(point + (depth - radius) * direction, np.eye(3), np.zeros(3))], radius + THICKER, None
+            return [PlacedBox(point + (depth - radius) * direction, np.eye(3), np.zeros(3))], radius + THICKER, None
         there, stride = self._standing(x), STRIDE * self.core[3]
         steps, last = int(np.ceil(depth / stride)), x[self._width :]
         if len(last) and last[6] > 0.0:
@@ -213,13 +213,13 @@ class Contact:
         ways = [(k / steps - 1.0) * depth * direction for k in range(1, steps + 1)]
         return [there.moved(way) for way in ways], self.core[3] + THICKER, None
 
-    def _standing(self, x: np.ndarray) -> Placed:
-        from sim.discretisation.nearest_places import Placed
+    def _standing(self, x: np.ndarray) -> PlacedBox:
+        from sim.discretisation.nearest_places import PlacedBox
 
         axes = np.column_stack([x[11:14], np.cross(x[14:17], x[11:14]), x[14:17]])
-        return Placed(x[8:11], axes, self.core[:3])
+        return PlacedBox(x[8:11], axes, self.core[:3])
 
-    def _pressed(self, stations: list[Placed], radius: float, begun: np.ndarray | None) -> np.ndarray:
+    def _pressed(self, stations: list[PlacedBox], radius: float, begun: np.ndarray | None) -> np.ndarray:
         """Solve the contact of a tool of a radius [m] at the last of the stations of its path: a row of `_found`.
 
         begun is the result at the first of them; None: no contact before.
@@ -269,7 +269,7 @@ class Contact:
         return np.concatenate([whole, places.ravel()])
 
     def _touchable(
-        self, stations: list[Placed], radius: float
+        self, stations: list[PlacedBox], radius: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Select facets (S,) within reach of a tool; return their nodes (n,), positions (S, 3), compliance rows."""
         around, wide = self._rounds

@@ -14,7 +14,7 @@ from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
 from ..data.holding import stated_series
 from ..data.indentation import indented, with_relaxed
-from ..data.splits import Split
+from ..data.splits import DiscSplit
 from ..evaluation.coverage import Coverage, covered
 from ..evaluation.score import errors, force_errors
 from ..model.conformal import CLASS, Bound, features_of, fitted_bound, fitted_growth
@@ -63,19 +63,19 @@ def corrected_if_better(
 
 
 @dataclass(frozen=True)
-class Way:
+class BoundFit:
     """Settings of a bound: calibration loads in a class of force, and whether its scale is quadratic in the load."""
 
     each: int
     curved: bool
 
 
-TUMOUR = Way(CLASS, True)
+TUMOUR = BoundFit(CLASS, True)
 # The tip sometimes snaps through with the cortex, so that the tail of its errors grows with the force: classes are as
 # small as a 99 % bound allows, and the scale's logarithm is linear.
-TIP = Way(100, False)
+TIP = BoundFit(100, False)
 # Bound of the force of a tool moved by pose.
-FORCE = Way(CLASS, True)
+FORCE = BoundFit(CLASS, True)
 WAYS = {"tumour": TUMOUR, "tip": TIP, "force": FORCE}
 
 
@@ -121,7 +121,7 @@ def missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarray) -> M
     return Missed(pushed, known, envelope.outside(pushed, known), features_of(pushed, envelope.within(known)), error)
 
 
-def bound_by(near: Missed, way: Way, growth: float, seen: Missed | None = None) -> Bound:
+def bound_by(near: Missed, way: BoundFit, growth: float, seen: Missed | None = None) -> Bound:
     """Calibrate a bound on loads `near` the training loads, with a `growth` [1/m] by distance from these.
 
     One in `SCALE` of these loads fits its scale, and the others its quantiles: they have the distribution of the
@@ -136,12 +136,12 @@ def bound_by(near: Missed, way: Way, growth: float, seen: Missed | None = None) 
     )
 
 
-def growth_by(near: Missed, far: Missed, way: Way) -> float:
+def growth_by(near: Missed, far: Missed, way: BoundFit) -> float:
     """Compute the growth [1/m] with which a bound has equal coverage `far` from training loads and near them."""
     return fitted_growth(*_over_plain(near, far, way))
 
 
-def bounds_on_discs(model: Learned, near: Missed, far: Missed, split: Split, way: Way) -> np.ndarray:
+def bounds_on_discs(model: Learned, near: Missed, far: Missed, split: DiscSplit, way: BoundFit) -> np.ndarray:
     """Compute bounds (2, B) [m] of loads on held-out discs, each with the growth estimated from the other discs."""
     known, (ratio, away) = _over_plain(near, far, way)
     disc, bound = split.disc[split.test], np.empty((2, len(far.error)))
@@ -158,7 +158,7 @@ def covered_by(bound: np.ndarray, far: Missed) -> Coverage:
     return covered(far.force, far.error, bound, int(far.extrapolated.sum()))
 
 
-def _over_plain(near: Missed, far: Missed, way: Way) -> list[tuple[np.ndarray, np.ndarray]]:
+def _over_plain(near: Missed, far: Missed, way: BoundFit) -> list[tuple[np.ndarray, np.ndarray]]:
     """Compute errors over a bound without growth, and distances [m] from training loads: calibration loads, `far`."""
     plain = bound_by(near, way, 0.0)
     return [
@@ -173,7 +173,7 @@ def _fits(near: Missed) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Errors:
+class ModelErrors:
     """Errors of a model on B loads: maximum vertex error of the tumour, of the tip-tumour distance, of the force.
 
     The force is that of a tool moved by pose; None if not available.
@@ -190,7 +190,7 @@ class Errors:
 
 
 @dataclass(frozen=True, eq=False)
-class Answers:
+class TrainingSolutions:
     """FEM results for the B converged loads of a data set.
 
     Parameters
@@ -227,21 +227,21 @@ class Answers:
 
     def errors_of(
         self, model: Learned, rows: np.ndarray, tumour: np.ndarray | None = None, tip: np.ndarray | None = None
-    ) -> Errors:
+    ) -> ModelErrors:
         """Compute a model's errors on rows (B,) bool; those at the tumour or of the tip (k,) [m] may be given."""
         asked = rows_of(self.pushed, rows)
 
         def of(error: np.ndarray) -> Missed:
             return missed(model, self.patch, asked, error)
 
-        return Errors(
+        return ModelErrors(
             of(self.vertex_errors(model, rows).max(axis=1) if tumour is None else tumour),
             of(distance_errors(model, self.distances.rows(rows)) if tip is None else tip),
             None if self.force is None else of(force_errors(model.exerted(asked), self.force[rows])),
         )
 
 
-def answers_of(data: Dataset, shared: Expansion) -> Answers:
+def answers_of(data: Dataset, shared: Expansion) -> TrainingSolutions:
     """Read the FEM results for the converged loads of a data set.
 
     Raises
@@ -265,7 +265,7 @@ def answers_of(data: Dataset, shared: Expansion) -> Answers:
     distances = KnownDistances(loads, tip_gauge(data.anatomy).distances(loads, both, at, data.tool))
     reaction = None if data.tool is None else data.reaction()
     force = None if reaction is None else reaction[data.good, 0, :3]
-    return Answers(loads, pushed, shared.patch, nodes, tumour, cortex, distances, force)
+    return TrainingSolutions(loads, pushed, shared.patch, nodes, tumour, cortex, distances, force)
 
 
 def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:

@@ -11,7 +11,7 @@ from sim.loads import Pushed
 
 from ..data.cortex_patch import Patch
 from ..data.encode import ENCODERS, directions
-from ..model.learned import Part
+from ..model.learned import ModelPart
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Examples:
     force: np.ndarray | None = None
 
 
-def left_by(parts: Sequence[Part], patch: Patch, loads: Pushed, moved: np.ndarray) -> np.ndarray:
+def left_by(parts: Sequence[ModelPart], patch: Patch, loads: Pushed, moved: np.ndarray) -> np.ndarray:
     """Compute residual responses (B, n, 3) [m/N]: motions `moved` (B, n, 3) [m] per newton minus the parts."""
     response = moved / directions(loads)[0][:, None, None]
     for part in parts:

@@ -31,11 +31,11 @@ from ..data.encode import Basis, directions, nodal_shares, reduce
 from ..data.tool_loads import spread
 from ..model.applicability import trained_skull
 from ..model.kept_arrays import REMADE
-from ..model.learned import Part, only_pushed
+from ..model.learned import ModelPart, only_pushed
 from ..model.npz_archive import Archive
-from ..regressors.force_series import FACTORS, SPANS, Pairs, Series, filled
+from ..regressors.force_series import FACTORS, SPANS, ForcePairs, Series, filled
 from ..regressors.protocol import Linear
-from ..regressors.rigid_contact import Contact
+from ..regressors.rigid_contact import RigidContact
 from .examples import Examples, left_by
 from .fem_tables import condensed, in_one_disc, radii_between, side_by_side, tabulated, with_middles
 
@@ -113,7 +113,7 @@ class Expansion:
         return with_middles(self.patch)[1]
 
     @cached_property
-    def tables(self) -> tuple[Part, ...]:
+    def tables(self) -> tuple[ModelPart, ...]:
         """Compliance of the tumour, and of the cortex if there is more: exact at every node of the open cortex.
 
         With as many modes as the unit responses need.
@@ -121,7 +121,7 @@ class Expansion:
         return tuple(self._compliance(nodes) for nodes in self._known)
 
     @cached_property
-    def pairs(self) -> Part:
+    def pairs(self) -> ModelPart:
         """Second order of the tumour: exact for forces at any nodes of the open cortex.
 
         Raises
@@ -131,10 +131,10 @@ class Expansion:
         """
         known = self.tabulated
         table = Rounded.of(known.second, PAIR_STEP * np.abs(known.second).max())
-        return Part("rooted", Pairs(known.pairs, table), known.pair_basis)
+        return ModelPart("rooted", ForcePairs(known.pairs, table), known.pair_basis)
 
     @cached_property
-    def exact(self) -> list[tuple[Part, ...]]:
+    def exact(self) -> list[tuple[ModelPart, ...]]:
         """Parts without training or interpolation: two orders of the tumour, and the first of the cortex.
 
         With too many pairs of nodes, the tumour's second order is in the table.
@@ -198,7 +198,7 @@ class Expansion:
         return shares.reshape(len(point) // 3, 3, -1)
 
     @cached_property
-    def contact(self) -> tuple[Contact, list[Basis], float]:
+    def contact(self) -> tuple[RigidContact, list[Basis], float]:
         """Contact of the tool on linear tissue, the bases of tumour and cortex of its results, and its time [s].
 
         Raises
@@ -210,10 +210,10 @@ class Expansion:
         contact, bases = condensed(self.fem(), self._known, self.data.tool)
         return contact, bases, time.perf_counter() - begun
 
-    def _compliance(self, nodes: np.ndarray) -> Part:
+    def _compliance(self, nodes: np.ndarray) -> ModelPart:
         response = self.data.unit_response(nodes)
         basis = reduce(nodes, response, TABLE_TOLERANCE, len(response))
-        return Part("nodal", Linear().fit(np.eye(len(response)), half_precision(basis.encode(response))), basis)
+        return ModelPart("nodal", Linear().fit(np.eye(len(response)), half_precision(basis.encode(response))), basis)
 
     @cached_property
     def tabulated(self) -> Tabulated:
@@ -349,12 +349,12 @@ class Tabulated:
         return np.split(self.table, np.cumsum([len(basis.modes) for basis in self.bases])[:-1], axis=-1)
 
 
-def _linear_form(part: Part, shares: np.ndarray) -> np.ndarray:
+def _linear_form(part: ModelPart, shares: np.ndarray) -> np.ndarray:
     """Compute coefficients (n, 3, r) of unit forces with shares (n, 3, 3 m)."""
     return part.regressor.predict(shares.reshape(-1, shares.shape[2])).reshape(*shares.shape[:2], -1)
 
 
-def _square_form(part: Part, shares: np.ndarray) -> np.ndarray:
+def _square_form(part: ModelPart, shares: np.ndarray) -> np.ndarray:
     """Compute coefficients (n, 6, r) of the products of direction components in `FACTORS`, for shares (n, 3, 3 m)."""
     own = [part.regressor.predict(shares[:, axis]) for axis in range(3)]
     both = [

@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 from sim.fem import Fem
 from sim.geometry.surface import edge_lengths
 from sim.loads import Loads, Pushed
-from sim.minimisers.power_series import Reading
+from sim.minimisers.power_series import SeriesReading
 from sim.runtime.journal import Journal
 from sim.tools import Ball, BuiltIn, core_of
 
@@ -18,7 +18,7 @@ from ..array_functions import squared_distances
 from ..data.cortex_patch import Patch
 from ..data.encode import Basis, reduce
 from ..regressors.force_series import FACTORS, ORDERS, STENCIL, TERMS
-from ..regressors.rigid_contact import Contact
+from ..regressors.rigid_contact import RigidContact
 
 # Nodes whose unit responses are computed together: limits memory.
 STRIP = 64
@@ -26,7 +26,7 @@ STRIP = 64
 TOLERANCE = 1e-4
 
 
-def condensed(fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None) -> tuple[Contact, list[Basis]]:
+def condensed(fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None) -> tuple[RigidContact, list[Basis]]:
     """Condense the contact of a tool with an undeformed body; return it with a basis for each of `parts`, vertex sets.
 
     Without a `tool` it is a ball of the radius in the features. The contact returns coefficients of the bases, one
@@ -39,7 +39,7 @@ def condensed(fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None) ->
     bases = [reduce(some, each, TOLERANCE, len(each)) for some, each in zip(parts, answers, strict=True)]
     coefficients = np.hstack([basis.encode(each) for basis, each in zip(bases, answers, strict=True)])
     rows = 3 * len(nodes)
-    contact = Contact(
+    contact = RigidContact(
         fem.anatomy.mesh.nodes[nodes],
         triangles,
         compliance.reshape(rows, rows),
@@ -88,7 +88,7 @@ def tabulated(
     fem: Fem,
     places: np.ndarray,
     radii: np.ndarray,
-    reading: Reading,
+    reading: SeriesReading,
     progress: Callable[[int, int], object] = lambda done, total: None,
     journal: Journal | None = None,
 ) -> np.ndarray:

@@ -13,17 +13,17 @@ from sim.loads import Pushed
 
 from ..data.cortex_patch import Patch, nearest
 from ..data.encode import ENCODERS, Basis, directions, reduce
-from ..data.splits import Split
+from ..data.splits import DiscSplit
 from ..data.tool_loads import spread
 from ..evaluation.score import SolveCounts
-from ..model.learned import Part
+from ..model.learned import ModelPart
 from ..model.own_learners import find_own, name_of
 from ..model.tool_contact import ForceModel
 from ..regressors.baselines import Ann, Pcr, Svr
 from ..regressors.force_series import TERMS, Remainder
 from ..regressors.gp import Gp
-from ..regressors.protocol import Fitted, Teachable
-from ..regressors.rigid_contact import Contact
+from ..regressors.protocol import Fitted, RegressorFactory
+from ..regressors.rigid_contact import RigidContact
 from .examples import Examples, left_by
 from .expansion import ADDED, COARSE, EXPANDED, TOUCHED, Expansion
 from .fem_tables import side_by_side
@@ -49,14 +49,14 @@ class SharedInputs:
 
     basis_from: Examples
     expansion: Expansion
-    split: Split | None = None
+    split: DiscSplit | None = None
 
     @cached_property
-    def series(self) -> tuple[Part, ...]:
+    def series(self) -> tuple[ModelPart, ...]:
         """Contribution of the FEM series beyond compliance, at the tumour and at the cortex, if there is more."""
         bases = self.expansion.bases(self.basis_from, ADDED, COARSE)
         found = self.expansion.on(bases, self._left_out(self.expansion.places))
-        return tuple(Part("tool", part, basis) for part, basis in zip(found, bases, strict=True))
+        return tuple(ModelPart("tool", part, basis) for part, basis in zip(found, bases, strict=True))
 
     def solve_counts(self, name: str, examples: Examples) -> SolveCounts:
         """Count the FEM solves that a model of `LEARNERS` or `OF_POSES`, or a user-defined one, depends on."""
@@ -102,7 +102,7 @@ class Tuned:
         Regressors to select from; the first is used with few rows.
     """
 
-    settings: tuple[Callable[[], Teachable], ...]
+    settings: tuple[Callable[[], RegressorFactory], ...]
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:
         """Fit the best of the regressors to rows X (n, f) of `tool_features`, Y (n, r)."""
@@ -133,7 +133,7 @@ ANN = tuple(partial(Ann, hidden, decay) for hidden in (64, 128) for decay in (1e
 SVR = tuple(partial(Svr, c, tube) for c in (1.0 / 1.349, 10.0, 100.0) for tube in (1.0 / 13.49, 1e-2, 3e-3, 1e-3))
 # Encoder and regressor of each model type but the compliance matrix; principal components are those of the nodal
 # forces.
-LEARNT: dict[str, tuple[str, Callable[[], Teachable]]] = {
+LEARNT: dict[str, tuple[str, Callable[[], RegressorFactory]]] = {
     "pcr": ("nodal", Pcr),
     "ann": ("tool", partial(Tuned, ANN)),
     "svr": ("tool", partial(Tuned, SVR)),
@@ -144,7 +144,7 @@ LEARNT: dict[str, tuple[str, Callable[[], Teachable]]] = {
 POSED = ("gp", "ann", "svr")
 
 
-def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part, ...]:
+def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[ModelPart, ...]:
     """Fit the summands of one model type to examples: for the tumour, and for the remaining open cortex."""
     known = inputs.expansion
     trained = partial(_trained, known.patch, examples.loads)
@@ -172,7 +172,7 @@ def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part,
     return (*before, learnt, *cortex)
 
 
-def force_of(name: str, parts: Sequence[Part], patch: Patch, examples: Examples) -> ForceModel | None:
+def force_of(name: str, parts: Sequence[ModelPart], patch: Patch, examples: Examples) -> ForceModel | None:
     """Fit one pose model's tool force, given its trained motion `parts`; None if the examples have no force."""
     if examples.force is None:
         return None
@@ -182,7 +182,7 @@ def force_of(name: str, parts: Sequence[Part], patch: Patch, examples: Examples)
     X = ENCODERS[encoder](patch, examples.loads)
     left = examples.force / directions(examples.loads)[0][:, None]
     for part in parts:
-        if isinstance(part.regressor, Contact):
+        if isinstance(part.regressor, RigidContact):
             left = left - part.regressor.exerted(ENCODERS[part.encoder](patch, examples.loads))
     learned = make().fit(X, left)
     if name_of(type(learned)) is not None:
@@ -190,7 +190,7 @@ def force_of(name: str, parts: Sequence[Part], patch: Patch, examples: Examples)
     return ForceModel(encoder, learned)
 
 
-def _learnt(name: str) -> tuple[str, Callable[[], Teachable]]:
+def _learnt(name: str) -> tuple[str, Callable[[], RegressorFactory]]:
     """Return encoder and regressor of a model type, user-defined ones included."""
     if name in LEARNT:
         return LEARNT[name]
@@ -199,7 +199,7 @@ def _learnt(name: str) -> tuple[str, Callable[[], Teachable]]:
     return own.encoder, own.regressor
 
 
-def _touched(known: Expansion, examples: Examples) -> tuple[Part, list[tuple[np.ndarray, np.ndarray]]]:
+def _touched(known: Expansion, examples: Examples) -> tuple[ModelPart, list[tuple[np.ndarray, np.ndarray]]]:
     """Fit the contact on stiffening tissue to examples; return its part, and its residuals: vertices, (B, n, 3) [m]."""
     contact, bases, _ = known.contact
     encoder = "core" if len(contact.core) else "tool"
@@ -208,7 +208,7 @@ def _touched(known: Expansion, examples: Examples) -> tuple[Part, list[tuple[np.
     coefficients = np.hstack([basis.encode(each / size) for basis, each in zip(bases, truth, strict=True)])
     alike = np.repeat(np.arange(len(bases)), [len(basis.modes) for basis in bases])
     force = None if examples.force is None else examples.force / size[:, 0]
-    part = Part(encoder, contact.fitted(features, coefficients, alike, force), side_by_side(bases))
+    part = ModelPart(encoder, contact.fitted(features, coefficients, alike, force), side_by_side(bases))
     answered = np.split(size * part.response(features), [len(known.tumour)], axis=1)
     return part, [(basis.nodes, one - other) for basis, one, other in zip(bases, truth, answered, strict=False)]
 
@@ -216,11 +216,11 @@ def _touched(known: Expansion, examples: Examples) -> tuple[Part, list[tuple[np.
 def _trained(
     patch: Patch,
     loads: Pushed,
-    kind: tuple[str, Callable[[], Teachable]],
-    before: Sequence[Part],
+    kind: tuple[str, Callable[[], RegressorFactory]],
+    before: Sequence[ModelPart],
     on: Basis | np.ndarray,
     truth: np.ndarray,
-) -> Part:
+) -> ModelPart:
     """Fit a part to the residual of `truth` (B, n, 3) [m] after parts `before`: `on` a basis, or on vertices (n,)."""
     response = left_by(before, patch, loads, truth)
     basis = on if isinstance(on, Basis) else reduce(on, response, *COARSE)
@@ -229,7 +229,7 @@ def _trained(
     regressor = make().fit(X, Y)
     if name_of(type(regressor)) is not None:
         _check_own(regressor, X, Y)
-    return Part(encoder, regressor, basis)
+    return ModelPart(encoder, regressor, basis)
 
 
 def _check_own(regressor: Fitted, X: np.ndarray, Y: np.ndarray) -> None:

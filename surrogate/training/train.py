@@ -12,11 +12,11 @@ from sim.runtime.timing import stage
 
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
-from ..data.splits import APART, MOST_APART, Split, leave_discs_out
+from ..data.splits import APART, MOST_APART, DiscSplit, leave_discs_out
 from ..evaluation.coverage import TENTHS, Coverage
 from ..evaluation.score import ForceScore, Score, force_score, score
 from ..model.conformal import LEVELS, USUAL_GROWTH, conformal
-from ..model.learned import Learned, Part
+from ..model.learned import Learned, ModelPart
 from ..model.left_out import left_out_of
 from ..model.own_learners import OWN, find_own
 from ..model.tip_distance import TipModel
@@ -24,8 +24,8 @@ from ..model.tool_contact import ForceModel
 from ..model.training_range import Envelope, envelope_of
 from .bounds import (
     WAYS,
-    Answers,
-    Errors,
+    ModelErrors,
+    TrainingSolutions,
     answers_of,
     bound_by,
     bounds_on_discs,
@@ -59,7 +59,7 @@ class Trained:
 
     models: dict[str, Learned]
     scores: tuple[Score, ...]
-    split: Split
+    split: DiscSplit
     motion: float
     calibrated: int
     training_loads: int
@@ -102,7 +102,7 @@ def train(
     data: Dataset,
     learners: Sequence[str] | None = None,
     progress: Callable[[str], object] = lambda learner: None,
-    split: Split | None = None,
+    split: DiscSplit | None = None,
     most: int | None = None,
     expansion: Expansion | None = None,
 ) -> Trained:
@@ -171,7 +171,7 @@ class Fit:
     inputs: SharedInputs
     envelope: Envelope
 
-    def parts(self, name: str, patch: Patch) -> tuple[tuple[Part, ...], ForceModel | None]:
+    def parts(self, name: str, patch: Patch) -> tuple[tuple[ModelPart, ...], ForceModel | None]:
         """Fit a model type: the parts of its model, and its model of a tool's force."""
         with stage(f"learn {name}"):
             parts = parts_of(name, self.inputs, self.examples)
@@ -189,12 +189,14 @@ class Result:
     force: ForceScore | None
 
 
-def _fit_of(answers: Answers, rows: np.ndarray, shared: Expansion, left: Split | None) -> Fit:
+def _fit_of(answers: TrainingSolutions, rows: np.ndarray, shared: Expansion, left: DiscSplit | None) -> Fit:
     examples = answers.examples(rows)
     return Fit(rows, examples, SharedInputs(examples, shared, left), envelope_of(answers.patch, examples.loads))
 
 
-def _learn(name: str, data: Dataset, answers: Answers, split: Split, apart: np.ndarray, fits: Sequence[Fit]) -> Result:
+def _learn(
+    name: str, data: Dataset, answers: TrainingSolutions, split: DiscSplit, apart: np.ndarray, fits: Sequence[Fit]
+) -> Result:
     """Fit one model type outside the discs and score it inside, then fit it to all loads not used for calibration."""
     outside, patch = fits[0], answers.patch
     parts, force = outside.parts(name, patch)
@@ -232,7 +234,7 @@ def _learn(name: str, data: Dataset, answers: Answers, split: Split, apart: np.n
     return Result(model, scored, of_tumour, of_tip, forces)
 
 
-def _fitted_on_all(name: str, model: Learned, answers: Answers, fit: Fit) -> Learned:
+def _fitted_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: Fit) -> Learned:
     """Fit the model to further loads, with a correction of its distances if it had one."""
     parts, force = fit.parts(name, answers.patch)
     fitted = replace(model, parts=parts, envelope=fit.envelope, force=force)
@@ -242,7 +244,7 @@ def _fitted_on_all(name: str, model: Learned, answers: Answers, fit: Fit) -> Lea
         return with_correction(fitted, answers.patch, answers.distances.rows(fit.rows))
 
 
-def _calibrated(model: Learned, near: Errors, growth: Mapping[str, float], far: Errors) -> Learned:
+def _calibrated(model: Learned, near: ModelErrors, growth: Mapping[str, float], far: ModelErrors) -> Learned:
     """Add bounds, calibrated on errors `near` training loads, to a model; they grow by `growth` [1/m] towards `far`."""
     seen = far.known()
     bounds = {way: bound_by(here, WAYS[way], growth[way], seen[way]) for way, here in near.known().items()}
@@ -255,7 +257,7 @@ def _calibrated(model: Learned, near: Errors, growth: Mapping[str, float], far: 
     )
 
 
-def _motion(answers: Answers, rows: np.ndarray) -> np.ndarray:
+def _motion(answers: TrainingSolutions, rows: np.ndarray) -> np.ndarray:
     """Compute the tumour's mean displacement [m] under selected rows (B,) bool."""
     return np.linalg.norm(answers.tumour[rows], axis=2).mean(axis=1)
 
@@ -265,7 +267,7 @@ def _first(rows: np.ndarray, most: int | None) -> np.ndarray:
     return rows if most is None else rows & (np.cumsum(rows) <= most)
 
 
-def _without(split: Split, apart: np.ndarray) -> Split:
+def _without(split: DiscSplit, apart: np.ndarray) -> DiscSplit:
     """Extend a split of the rows that are not `apart` (B,) to all rows."""
     disc = np.full(len(apart), -2)
     disc[~apart] = split.disc

@@ -15,10 +15,10 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 
 from ..bodies import models_of, said_of_weak
-from ..reading.contents import Contents, opened, read_contents
+from ..reading.contents import EpisodeContents, opened, read_contents
 from ..reading.validation import solved_figures
 from ..reading.windows import episode_paths, numbers_in
-from ..run_folder import Run, episode_name, failed, read_run
+from ..run_folder import RunSettings, episode_name, failed, read_run
 from .columns import LICENCE as LICENCE_NAME
 from .columns import SHEET, task_of
 from .croissant import COLUMNS, croissant
@@ -50,7 +50,7 @@ The program that made the data, sulcus, has its own licence: Apache 2.0.
 
 def write_card(
     folder: Path,
-    contents: Sequence[Contents] | None = None,
+    contents: Sequence[EpisodeContents] | None = None,
     progress: Callable[[Iterable], Iterable] = iter,
     force: bool = False,
 ) -> dict[str, Any]:
@@ -137,7 +137,7 @@ def listed_files(folder: Path) -> dict[str, int]:
         return {}
 
 
-def run_of(folder: Path) -> Run | None:
+def run_of(folder: Path) -> RunSettings | None:
     """The run whose folder it is; None of a folder that is no run's, or whose note of it cannot be read."""
     try:
         return read_run(folder)
@@ -151,7 +151,7 @@ def is_card(path: Path) -> bool:
     return MARK in head or head.startswith(",".join(COLUMNS)) or ("mlcommons.org/croissant" in head and NAME in head)
 
 
-def row_of(contents: Contents, folder: Path) -> dict[str, object]:
+def row_of(contents: EpisodeContents, folder: Path) -> dict[str, object]:
     """An episode as a row of the table."""
     with opened(contents.path) as file:
         times = numbers_in(file, contents, "time")

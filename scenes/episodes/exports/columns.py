@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.errors import InputError
 
-from ..reading.contents import LONGEST_TEXT, Contents
+from ..reading.contents import LONGEST_TEXT, EpisodeContents
 from ..reading.schema import PICTURES
 from ..reading.windows import numbers_in
 
@@ -31,12 +31,12 @@ TASKS = {
 HELD_OUT = 10
 
 
-def task_of(contents: Contents) -> str:
+def task_of(contents: EpisodeContents) -> str:
     """The sentence for an episode's family; of one that has none, its scene's name."""
     return TASKS.get(contents.family, f"Play the scene {contents.family}.")
 
 
-def held_out(episodes: Sequence[Contents]) -> list[bool]:
+def held_out(episodes: Sequence[EpisodeContents]) -> list[bool]:
     """Return which episodes are held out for validation: every tenth body, or every tenth episode if there are fewer
     than ten bodies.
 
@@ -67,7 +67,7 @@ SHEET, LICENCE = "DATASHEET.md", "LICENSE.md"
 """Their names."""
 
 
-def shared_pictures(episodes: Sequence[Contents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:
+def shared_pictures(episodes: Sequence[EpisodeContents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:
     """List the requested images that every episode has.
 
     Raises
@@ -82,7 +82,7 @@ def shared_pictures(episodes: Sequence[Contents], wanted: Sequence[str] = tuple(
     return tuple(name for name in wanted if all(name in one.shapes for one in episodes))
 
 
-def shared_numbers(episodes: Sequence[Contents]) -> tuple[str, ...]:
+def shared_numbers(episodes: Sequence[EpisodeContents]) -> tuple[str, ...]:
     """Those `NUMBERS` that every episode has in the same shape: two bodies' tumours have not."""
     first = episodes[0].shapes
     return tuple(
@@ -93,7 +93,7 @@ def shared_numbers(episodes: Sequence[Contents]) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def rate_of(contents: Contents, time: np.ndarray) -> float:
+def rate_of(contents: EpisodeContents, time: np.ndarray) -> float:
     """Frames a second.
 
     Raises
@@ -107,7 +107,7 @@ def rate_of(contents: Contents, time: np.ndarray) -> float:
     return round(1.0 / float(steps.mean()), 6)
 
 
-def numbers_of(file: h5py.File, contents: Contents, names: Sequence[str]) -> dict[str, np.ndarray]:
+def numbers_of(file: h5py.File, contents: EpisodeContents, names: Sequence[str]) -> dict[str, np.ndarray]:
     """`state` (T, 7), `action` (T, 6) and the named arrays, as float32; `time` as it is stored.
 
     Raises
@@ -123,7 +123,7 @@ def numbers_of(file: h5py.File, contents: Contents, names: Sequence[str]) -> dic
     return {**found, "time": numbers_in(file, contents, "time")}
 
 
-def framed(file: h5py.File, contents: Contents, name: str) -> np.ndarray:
+def framed(file: h5py.File, contents: EpisodeContents, name: str) -> np.ndarray:
     """Rows (T, ...) of a named array; of `K` (T, 3, 3) that of each frame, which changes where the camera zooms."""
     if name != "K":
         return numbers_in(file, contents, name)
@@ -144,12 +144,12 @@ def named_axes(name: str) -> list[str] | None:
     )
 
 
-def stored_size(episodes: Sequence[Contents]) -> int:
+def stored_size(episodes: Sequence[EpisodeContents]) -> int:
     """Bytes of all their files."""
     return sum(one.path.stat().st_size for one in episodes)
 
 
-def file_names(episodes: Sequence[Contents]) -> Mapping[Contents, str]:
+def file_names(episodes: Sequence[EpisodeContents]) -> Mapping[EpisodeContents, str]:
     """A name for each, its file's; where two have the same, with a number."""
     taken: set[str] = set()
     found = {}
@@ -179,7 +179,7 @@ def twists(poses: np.ndarray) -> np.ndarray:
     return np.concatenate([found, np.zeros((1, 6))]).astype(np.float32)
 
 
-def texts_along(episodes: Sequence[Contents]) -> Mapping[str, str]:
+def texts_along(episodes: Sequence[EpisodeContents]) -> Mapping[str, str]:
     """The texts by the names that they go by; those of several folders are numbered. None where there are none."""
     homes = dict.fromkeys(home_of(one.path.resolve().parent) for one in episodes)
     found = {}
@@ -191,7 +191,7 @@ def texts_along(episodes: Sequence[Contents]) -> Mapping[str, str]:
     return found
 
 
-def write_along(episodes: Sequence[Contents], folder: Path) -> None:
+def write_along(episodes: Sequence[EpisodeContents], folder: Path) -> None:
     """Write the texts into a folder."""
     for name, text in texts_along(episodes).items():
         (folder / name).write_text(text, encoding="utf-8")

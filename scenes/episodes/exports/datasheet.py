@@ -9,15 +9,15 @@ from typing import Any
 
 from ...script.shipped_files import template_path
 from ..reading.bodies import is_template
-from ..reading.contents import Contents
+from ..reading.contents import EpisodeContents
 from ..reading.schema import ARRAYS, PICTURES
-from ..run_folder import RUN, Run
+from ..run_folder import RUN, RunSettings
 
 # Longest of each list.
 MOST_DRAWN = 100
 
 
-def parameters_of(contents: Contents) -> dict[str, Any]:
+def parameters_of(contents: EpisodeContents) -> dict[str, Any]:
     """Return the sampled parameters of an episode by dotted names; empty if not recorded as JSON.
 
     Tumours are sampled for synthetic anatomies only; those of others have no effect and are excluded.
@@ -30,7 +30,7 @@ def parameters_of(contents: Contents) -> dict[str, Any]:
     return {key: value for key, value in found.items() if placed or not key.startswith("bodies.tumour.")}
 
 
-def drawn_tables(episodes: Sequence[Contents]) -> Iterator[str]:
+def drawn_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
     """Lines of two tables: ranges of numbers and how often each text came; what is the same wherever it is."""
     values: dict[str, list[Any]] = {}
     for one in episodes:
@@ -85,7 +85,7 @@ TEMPLATE, DRAWN, UNSTATED = "template", "drawn", ""
 """Origin of an anatomy: the shipped one, the same brain with another tumour, or unknown; else the name of an own one."""
 
 
-def origin_of(contents: Contents) -> str:
+def origin_of(contents: EpisodeContents) -> str:
     """Return the origin of an episode's anatomy: `TEMPLATE`, `DRAWN`, the name of an own one, or `UNSTATED`."""
     stated = parameters_of(contents).get("bodies.anatomies")
     if stated is not None:
@@ -100,12 +100,12 @@ def notice_of_template() -> str:
     return "\n".join(["", head, "", *(f"> {line}" for line in lines), ""])
 
 
-def of_template(episodes: Sequence[Contents]) -> bool:
+def of_template(episodes: Sequence[EpisodeContents]) -> bool:
     """Return True if any episode uses the template's brain."""
     return any(origin_of(one) in (TEMPLATE, DRAWN) for one in episodes)
 
 
-def origins(episodes: Sequence[Contents]) -> Iterator[str]:
+def origins(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
     """Lines of the data sheet."""
     for origin, count in Counter(origin_of(one) for one in episodes).most_common():
         if origin in (TEMPLATE, DRAWN):
@@ -129,10 +129,10 @@ MOST_LISTED = 12
 
 def datasheet(
     name: str,
-    episodes: Sequence[Contents],
+    episodes: Sequence[EpisodeContents],
     rows: Sequence[Mapping[str, Any]],
     notes: Sequence[str] = (),
-    run: Run | None = None,
+    run: RunSettings | None = None,
 ) -> str:
     """The sheet as Markdown, of what the files say: `rows` are those of the table of episodes.
 
@@ -166,7 +166,7 @@ def motivation() -> str:
     )
 
 
-def composition(episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> str:
+def composition(episodes: Sequence[EpisodeContents], rows: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> str:
     """Describe the composition: counts, sizes, arrays."""
     lines = ["## Composition\n", "| family | episodes | frames | solved | seconds | GB |", "|---|---|---|---|---|---|"]
     for family in [*sorted({row["family"] for row in rows}), None]:
@@ -195,7 +195,7 @@ def composition(episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]],
     return "\n".join(lines)
 
 
-def bodies_said(episodes: Sequence[Contents]) -> str:
+def bodies_said(episodes: Sequence[EpisodeContents]) -> str:
     """Describe the numbers of anatomies and image sizes."""
     bodies = len({one.said.get("anatomy") for one in episodes})
     sizes = sorted({one.size for one in episodes})
@@ -203,7 +203,7 @@ def bodies_said(episodes: Sequence[Contents]) -> str:
     return "\n".join([f"Anatomies: {bodies}. Pictures: {said_sizes} pixels.\n", *origins(episodes)])
 
 
-def collection(episodes: Sequence[Contents], run: Run | None) -> str:
+def collection(episodes: Sequence[EpisodeContents], run: RunSettings | None) -> str:
     """Describe the collection process, and the random variation."""
     lines = ["## Collection\n", "A scripted tool moved on a simulated brain, and a camera drew what it would see.\n"]
     tools = [str(tool).partition("(")[0] for tool in said(episodes, "tool")]  # sizes are among what was drawn
@@ -230,12 +230,12 @@ def listed(title: str, texts: Sequence[Any]) -> Iterator[str]:
         yield f"- {title}: {len(often) - MOST_LISTED} others (in {others})"
 
 
-def said(episodes: Sequence[Contents], key: str) -> list[Any]:
+def said(episodes: Sequence[EpisodeContents], key: str) -> list[Any]:
     """An attribute of all episodes that have it."""
     return [one.said[key] for one in episodes if key in one.said]
 
 
-def plans(episodes: Sequence[Contents]) -> Iterator[str]:
+def plans(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
     """The plans, as they stand in the files."""
     for text in dict.fromkeys(map(str, said(episodes, "plan"))):
         yield f"## Plan\n\n```toml\n{text.strip()}\n```\n"

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_folder
 
-from ..reading.contents import Contents, opened
+from ..reading.contents import EpisodeContents, opened
 from ..reading.schema import COLOUR, DEPTH, PICTURES, suffix_of
 from ..reading.windows import code_of, picture_of
 from .columns import (
@@ -37,7 +37,7 @@ from .columns import (
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
+class RowStatistics:
     """Statistics of `count` rows: each a float64 array of one row's shape. NaN values are excluded."""
 
     least: np.ndarray
@@ -48,7 +48,7 @@ class Spread:
     count: int
 
     @classmethod
-    def of(cls, rows: np.ndarray) -> Spread:
+    def of(cls, rows: np.ndarray) -> RowStatistics:
         """Compute the statistics of rows (T, ...)."""
         rows = np.asarray(rows, np.float64)
         known = ~np.isnan(rows)
@@ -62,9 +62,9 @@ class Spread:
             len(rows),
         )
 
-    def __add__(self, other: Spread) -> Spread:
+    def __add__(self, other: RowStatistics) -> RowStatistics:
         """Return the statistics of both sets."""
-        return Spread(
+        return RowStatistics(
             np.minimum(self.least, other.least),
             np.maximum(self.greatest, other.greatest),
             self.total + other.total,
@@ -98,7 +98,7 @@ COUNTED = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
 def write_lerobot(
-    episodes: Sequence[Contents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
+    episodes: Sequence[EpisodeContents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
     """Write a data set; the folder appears whole. Returns what it holds. `progress` passes the episodes on.
 
@@ -126,7 +126,7 @@ def write_lerobot(
                     columns = counted(contents.frames, number, first, tasks.index(task_of(contents)), *rates)
                     columns |= {key_of(name): rows_ for name, rows_ in numbers.items()}
                     place = tables.write(file, contents, columns, pictures)
-                    spreads = {name: Spread.of(array) for name, array in columns.items()}
+                    spreads = {name: RowStatistics.of(array) for name, array in columns.items()}
                     spreads |= {f"observation.images.{name}": looks(file, contents, name) for name in pictures}
                 rows.append(
                     {
@@ -187,7 +187,7 @@ class Tables:
     path: Path = field(default_factory=Path)
 
     def write(
-        self, file: h5py.File, contents: Contents, columns: Mapping[str, np.ndarray], pictures: Sequence[str]
+        self, file: h5py.File, contents: EpisodeContents, columns: Mapping[str, np.ndarray], pictures: Sequence[str]
     ) -> tuple[int, int]:
         """Write an episode; returns the numbers of the folder and the file that it is in."""
         if self.writer is not None and self.path.stat().st_size > 1e6 * FILE_MEGABYTES:
@@ -213,7 +213,7 @@ class Tables:
             self.writer = None
 
 
-def coded(file: h5py.File, contents: Contents, name: str, frames: range) -> Iterator[dict[str, Any]]:
+def coded(file: h5py.File, contents: EpisodeContents, name: str, frames: range) -> Iterator[dict[str, Any]]:
     """Yield images as LeRobot stores them."""
     suffix = suffix_of(name)
     return ({"bytes": code_of(file, contents, name, frame), "path": f"{name}_{frame:06d}.{suffix}"} for frame in frames)
@@ -232,17 +232,17 @@ def column_of(array: np.ndarray) -> pa.Array:
     return inner
 
 
-def looks(file: h5py.File, contents: Contents, name: str) -> Spread:
+def looks(file: h5py.File, contents: EpisodeContents, name: str) -> RowStatistics:
     """Compute statistics of a few images: colour and labels relative to 255, depth in its own steps."""
     found = []
     for frame in np.unique(np.linspace(0, contents.frames - 1, LOOKED_AT).round().astype(int)).tolist():
         picture = picture_of(file, contents, name, frame)[::SPARSE, ::SPARSE]
         scale = contents.depth_scale if PICTURES[name] == DEPTH else 255.0
         found.append(picture.reshape(-1, picture.shape[2] if picture.ndim == 3 else 1) / scale)
-    return Spread.of(np.concatenate(found))
+    return RowStatistics.of(np.concatenate(found))
 
 
-def shaped(name: str, spread: Spread) -> dict[str, list]:
+def shaped(name: str, spread: RowStatistics) -> dict[str, list]:
     """Convert statistics to LeRobot's form: of an image (channels, 1, 1)."""
     said = spread.said()
     if not name.startswith("observation.images."):
@@ -278,7 +278,7 @@ def features_of(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
     }
 
 
-def picture_features(contents: Contents, pictures: Sequence[str]) -> dict[str, Any]:
+def picture_features(contents: EpisodeContents, pictures: Sequence[str]) -> dict[str, Any]:
     """Describe images for `info.json`; for depth its step, and its range [m]."""
     width, height = contents.size
     found = {}

@@ -13,7 +13,7 @@ import numpy as np
 
 from sim.runtime.atomic_files import written_folder
 
-from ..reading.contents import Contents, opened
+from ..reading.contents import EpisodeContents, opened
 from ..reading.schema import ARRAYS, PICTURES, SOLVED, suffix_of
 from ..reading.windows import code_of, numbers_in, rows_of
 from .columns import file_names, stored_size, write_along
@@ -23,7 +23,7 @@ WIDE = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "co
 
 
 def write_folder(
-    episodes: Sequence[Contents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
+    episodes: Sequence[EpisodeContents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
     """Write a folder for each episode; the whole appears at once. Returns what it holds.
 
@@ -45,7 +45,7 @@ def write_folder(
     return {"out": str(folder), "episodes": len(episodes), "frames": sum(one.frames for one in episodes)}
 
 
-def write_pictures(place: Path, file: h5py.File, contents: Contents) -> None:
+def write_pictures(place: Path, file: h5py.File, contents: EpisodeContents) -> None:
     """Write the encoded images, one file each: `colour/000000.jpg`."""
     for name in PICTURES:
         if name in contents.shapes:
@@ -55,7 +55,7 @@ def write_pictures(place: Path, file: h5py.File, contents: Contents) -> None:
                 (place / name / f"{frame:06d}.{suffix}").write_bytes(code_of(file, contents, name, frame))
 
 
-def write_tables(place: Path, file: h5py.File, contents: Contents) -> None:
+def write_tables(place: Path, file: h5py.File, contents: EpisodeContents) -> None:
     """Write `frames.csv`, a row for each frame, and a table for each array that is wide. NaN is an empty field."""
     columns: dict[str, Sequence[object] | np.ndarray] = {"frame": range(contents.frames)}
     for name in contents.shapes:
@@ -88,7 +88,7 @@ def write_table(path: Path, columns: dict[str, Any]) -> None:
         )
 
 
-def write_description(path: Path, file: h5py.File, contents: Contents) -> None:
+def write_description(path: Path, file: h5py.File, contents: EpisodeContents) -> None:
     """Write the attributes, what each array is, and the arrays that an episode has once."""
     arrays = {}
     for name in contents.shapes:

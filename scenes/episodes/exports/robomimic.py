@@ -13,7 +13,7 @@ import numpy as np
 from sim.runtime.atomic_files import Stream, demand_space, written_stream
 from sim.runtime.versions import version_of
 
-from ..reading.contents import Contents, opened
+from ..reading.contents import EpisodeContents, opened
 from ..reading.schema import COLOUR, PICTURES
 from ..reading.windows import numbers_in
 from .columns import (
@@ -37,7 +37,7 @@ GYM = 2
 
 
 def write_robomimic(
-    episodes: Sequence[Contents], path: Path, progress: Callable[[Iterable], Iterable] = iter
+    episodes: Sequence[EpisodeContents], path: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
     """Write the file, whole or not at all; return its contents. `progress` wraps the episodes.
 
@@ -70,7 +70,7 @@ def write_robomimic(
     return {"out": str(path), "episodes": len(episodes), "frames": total, "held_out": int(out_of.sum())}
 
 
-def write_demo(demo: h5py.Group, obs: h5py.Group, contents: Contents, numbers: dict[str, np.ndarray]) -> None:
+def write_demo(demo: h5py.Group, obs: h5py.Group, contents: EpisodeContents, numbers: dict[str, np.ndarray]) -> None:
     """Write all but the images of one episode: a state is the tool's, then the tumour's where all have as many."""
     actions, state = numbers.pop("action"), numbers.pop("state")
     tumour = [numbers[name].reshape(contents.frames, -1) for name in ("tumour_predicted",) if name in numbers]
@@ -86,7 +86,7 @@ def write_demo(demo: h5py.Group, obs: h5py.Group, contents: Contents, numbers: d
 
 
 def write_pictures(
-    obs: h5py.Group, file: h5py.File, contents: Contents, pictures: Sequence[str], stream: Stream
+    obs: h5py.Group, file: h5py.File, contents: EpisodeContents, pictures: Sequence[str], stream: Stream
 ) -> None:
     """Write decoded images, (T, H, W, channels): uint8, and depth as float32 [m]."""
     width, height = contents.size
@@ -105,7 +105,7 @@ def write_pictures(
                 raise stream.failure
 
 
-def environment(episodes: Sequence[Contents], rates: Sequence[float]) -> dict[str, Any]:
+def environment(episodes: Sequence[EpisodeContents], rates: Sequence[float]) -> dict[str, Any]:
     """Return the environment metadata of robomimic: no environment replays the actions, so the scenes are named."""
     families = sorted({one.family for one in episodes})
     return {

@@ -14,7 +14,7 @@ import numpy as np
 from sim.runtime.atomic_files import written_folder, written_stream
 
 from ..reading.bodies import anatomy_of, surface_rows
-from ..reading.contents import Contents, array_in, opened
+from ..reading.contents import EpisodeContents, array_in, opened
 from ..reading.windows import numbers_in
 from .columns import SPACE, file_names, stored_size, write_along
 
@@ -23,7 +23,7 @@ SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
 
 
 def write_xdmf(
-    episodes: Sequence[Contents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
+    episodes: Sequence[EpisodeContents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
     """Write two files an episode, `.xdmf` to open and `.h5` with its numbers; the folder appears whole.
 
@@ -66,7 +66,9 @@ def hdf5(path: Path) -> Iterator[h5py.File]:
         yield file
 
 
-def write_arrays(out: h5py.Group, file: h5py.File, contents: Contents, name: str, triangles: np.ndarray | None) -> None:
+def write_arrays(
+    out: h5py.Group, file: h5py.File, contents: EpisodeContents, name: str, triangles: np.ndarray | None
+) -> None:
     """Write positions, displacement and difference of each frame, single precision."""
     at = numbers_in(file, contents, f"{name}_predicted")
     arrays = {"positions": at, "displacement": at - numbers_in(file, contents, f"{name}_rest")}

@@ -12,10 +12,10 @@ from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 
 from ...script.shipped_files import template_path
-from .contents import Contents
+from .contents import EpisodeContents
 
 
-def anatomy_of(contents: Contents) -> Anatomy | None:
+def anatomy_of(contents: EpisodeContents) -> Anatomy | None:
     """Find the anatomy with an episode's digest; None if it is neither the template nor in a nearby folder.
 
     It is searched in `bodies/*/anatomy.vtu` of the episode's folder, and of the folder above.

@@ -88,7 +88,7 @@ FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLE
 
 
 @dataclass(frozen=True, eq=False)
-class Contents:
+class EpisodeContents:
     """Contents of one episode, as its file describes them.
 
     Parameters
@@ -129,7 +129,7 @@ class Contents:
         return float(self.said.get("depth_scale_m", np.nan))
 
 
-def read_contents(path: str | Path) -> Contents:
+def read_contents(path: str | Path) -> EpisodeContents:
     """Find out what an episode holds.
 
     Raises
@@ -143,7 +143,7 @@ def read_contents(path: str | Path) -> Contents:
         return contents_of(file, path)
 
 
-def contents_of(file: h5py.File, path: Path) -> Contents:
+def contents_of(file: h5py.File, path: Path) -> EpisodeContents:
     """Read the contents of an open file.
 
     Raises
@@ -162,7 +162,7 @@ def contents_of(file: h5py.File, path: Path) -> Contents:
     if not all(0 < int(said[name]) <= LARGEST_SIDE for name in ("width", "height")):
         raise InputError(f"its pictures have {said['width']} x {said['height']} pixels. {REMEDY}")
     shapes = _checked(arrays)
-    return Contents(path, said, shapes, _solved(arrays, shapes))
+    return EpisodeContents(path, said, shapes, _solved(arrays, shapes))
 
 
 def attributes_of(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from sim.runtime.outside_files import read_as
 
 from ..checksums import SUM, broken
 from .bodies import anatomy_of, surface_rows
-from .contents import REMEDY, Contents, array_in, attributes_of, contents_of, said_by_validate
+from .contents import REMEDY, EpisodeContents, array_in, attributes_of, contents_of, said_by_validate
 from .schema import ARRAYS, LABELS, PICTURES
 from .windows import numbers_in, picture_of
 
@@ -33,7 +33,7 @@ ROTATED = 1e-6
 POSES = ("T_camera_world", "T_camera_world_right", "T_camera_world_tracked", "T_world_tool", "T_world_tool_tracked")
 
 
-def mask_findings(file: h5py.File, contents: Contents, anatomy: Anatomy | None) -> tuple[list[str], list[str]]:
+def mask_findings(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy | None) -> tuple[list[str], list[str]]:
     """List the faults of `tumour_mask`, and what could not be checked, as sentences."""
     shapes = contents.shapes
     missing = [
@@ -70,7 +70,7 @@ def mask_findings(file: h5py.File, contents: Contents, anatomy: Anatomy | None) 
     return [], left
 
 
-def camera_of(file: h5py.File, contents: Contents, frame: int) -> Camera:
+def camera_of(file: h5py.File, contents: EpisodeContents, frame: int) -> Camera:
     """The camera of a frame; ValueError where its numbers are none of a camera."""
     moves = "K_of_frame" in contents.shapes
     K = (
@@ -141,7 +141,7 @@ def validate_episode(path: Path) -> Report:
         return Report(path, [*problems, said_by_validate(error, path)], skipped)
 
 
-def unit_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
+def unit_findings(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
     """Yield findings on missing or unexpected units, and on unknown arrays."""
     for name in contents.shapes:
         if name in PICTURES:
@@ -151,7 +151,7 @@ def unit_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
             yield f"'{name}' has the unit {said!r} in place of {unit!r}."
 
 
-def number_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
+def number_findings(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
     """Numbers that are not finite and must be; infinite ones anywhere; times that do not grow."""
     for name in contents.shapes:
         if name in PICTURES or ARRAYS[name].kind != "f":
@@ -170,7 +170,7 @@ def number_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
         yield f"'time' does not grow from row {row - 1} to row {row}."
 
 
-def pose_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
+def pose_findings(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
     """Poses that are no rotation and translation; a camera matrix that is none."""
     for name in POSES:
         if name not in contents.shapes:
@@ -191,7 +191,7 @@ def pose_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
                 yield f"'{name}' is no matrix of a camera."
 
 
-def picture_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
+def picture_findings(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
     """Yield findings on images that cannot be decoded, have another size than declared, or have undeclared labels."""
     labels = {int(word.split()[0]) for word in str(contents.said.get("segmentation", "")).split(",") if word.strip()}
     for name, kind in PICTURES.items():
@@ -209,7 +209,7 @@ def picture_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
                 break
 
 
-def solved_figures(file: h5py.File, contents: Contents) -> tuple[int, int, tuple[float, float] | None]:
+def solved_figures(file: h5py.File, contents: EpisodeContents) -> tuple[int, int, tuple[float, float] | None]:
     """Return the numbers of solved and of unconverged frames, and the errors of the prediction [mm].
 
     The errors are None if FEM played the scene.

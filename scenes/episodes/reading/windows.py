@@ -16,13 +16,13 @@ from ar.screen import decoded_colour, decoded_depth, decoded_labels
 from sim.errors import InputError
 from sim.runtime.outside_files import path_of, read_as
 
-from .contents import REMEDY, Contents, OpenFiles, array_in, read_contents
+from .contents import REMEDY, EpisodeContents, OpenFiles, array_in, read_contents
 from .schema import ARRAYS, COLOUR, DEPTH, PICTURES, SOLVED
 
 Rows = np.ndarray | list[str]
 
 
-def rows_of(file: h5py.File, contents: Contents, name: str, frames: range | None = None) -> Rows:
+def rows_of(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> Rows:
     """Read the rows of some frames, or of all: (frames, ...) numbers or decoded images, or a list of texts.
 
     An array without frames is read whole.
@@ -45,12 +45,12 @@ def rows_of(file: h5py.File, contents: Contents, name: str, frames: range | None
         return _read(array, frames) if ARRAYS[name].framed else array[:]
 
 
-def numbers_in(file: h5py.File, contents: Contents, name: str, frames: range | None = None) -> np.ndarray:
+def numbers_in(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> np.ndarray:
     """Read rows as `rows_of`, from an array without texts."""
     return np.asarray(rows_of(file, contents, name, frames))
 
 
-def picture_of(file: h5py.File, contents: Contents, name: str, frame: int) -> np.ndarray:
+def picture_of(file: h5py.File, contents: EpisodeContents, name: str, frame: int) -> np.ndarray:
     """Read and decode one image.
 
     Raises
@@ -72,7 +72,7 @@ def picture_of(file: h5py.File, contents: Contents, name: str, frame: int) -> np
         ) from error
 
 
-def code_of(file: h5py.File, contents: Contents, name: str, frame: int) -> bytes:
+def code_of(file: h5py.File, contents: EpisodeContents, name: str, frame: int) -> bytes:
     """Read the stored bytes of one image; InputError if the file is damaged."""
     with read_as(contents.path, "an episode", REMEDY):
         return np.asarray(array_in(file, f"pictures/{name}")[frame], np.uint8).tobytes()
@@ -85,7 +85,7 @@ def _read(array: h5py.Dataset, frames: range) -> Rows:
     return [text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text) for text in found]
 
 
-def _solved(array: h5py.Dataset, contents: Contents, frames: range) -> Rows:
+def _solved(array: h5py.Dataset, contents: EpisodeContents, frames: range) -> Rows:
     """Rows of an array that has one for each frame that was solved."""
     if len(contents.fem_frames) == contents.frames:
         return _read(array, frames)
@@ -154,7 +154,7 @@ class Episodes(Sequence[dict[str, Any]]):
         Which holds the open files.
     """
 
-    contents: tuple[Contents, ...]
+    contents: tuple[EpisodeContents, ...]
     keys: tuple[str, ...]
     window: int = 1
     step: int = 1

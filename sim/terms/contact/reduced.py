@@ -11,13 +11,13 @@ import warp as wp
 from ...discretisation.term import BlockFunctions, Term
 from ...runtime.device import Device
 from ...runtime.views import view
-from .tool_blocks import Near, Stage, functions_of
+from .tool_blocks import ContactStage, NearPairs, functions_of
 
 
-class Dense(Term, Protocol):
+class DenseTerm(Term, Protocol):
     """A Term that few nodes feel, so that its curvature is a small dense matrix."""
 
-    def stage(self, columns: np.ndarray) -> tuple[Stage, Near]:
+    def stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
         """Its surface, and its tools as they stand in some columns (k,); room for what is near."""
         ...
 
@@ -39,7 +39,7 @@ class Reduced:
         Where it lives.
     """
 
-    def __init__(self, term: Dense, count: int, nodes: int, device: Device):
+    def __init__(self, term: DenseTerm, count: int, nodes: int, device: Device):
         self._term, self._count, self._nodes, self._device = term, count, nodes, device
         # To make an array takes as long as a launch.
         self._arrays = lru_cache(2)(self._made)
@@ -49,7 +49,7 @@ class Reduced:
         """As `Reduction.functions`."""
         return functions_of(self._device, self._nodes)
 
-    def stage(self, columns: np.ndarray) -> tuple[Stage, Near]:
+    def stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
         """As `Reduction.stage`."""
         return self._term.stage(columns)
 

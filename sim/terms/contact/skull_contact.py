@@ -45,7 +45,7 @@ class SkullBarrier:
 
 
 @dataclass(frozen=True)
-class Kernels:
+class SkullKernels:
     """Loops over (skull node, column)."""
 
     add_energy: wp.Kernel
@@ -144,7 +144,7 @@ def fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.f
 
 
 @cache
-def kernels_of(device: Device) -> Kernels:
+def kernels_of(device: Device) -> SkullKernels:
     """Kernels of a device's scalar type; distances are in double precision."""
     scalar, mat = device.scalar, device.matrix
 
@@ -231,7 +231,7 @@ def kernels_of(device: Device) -> Kernels:
             bends = share(p)[0] * wp.dot(along, wall.bend[s] * along)
             wp.atomic_min(out, c, scalar(fraction(d, wp.dot(slope(wall, s, x, p), along), bends)))
 
-    return Kernels(add_energy, add_gradient, add_curvature, add_diagonal, bound_step)
+    return SkullKernels(add_energy, add_gradient, add_curvature, add_diagonal, bound_step)
 
 
 class Skull:

@@ -12,7 +12,7 @@ from .tool_functions import functions_of as at_triangles
 
 
 @wp.struct
-class Stage:
+class ContactStage:
     """Surface and tools, how they repel, and into how many rows of parts a triangle is cut at most."""
 
     surface: Surface
@@ -22,7 +22,7 @@ class Stage:
 
 
 @wp.struct
-class Near:
+class NearPairs:
     """Pairs of a triangle and a tool that may be near: room for all (b, S T); how many (b,), and a number (b,)."""
 
     pairs: wp.array2d(dtype=wp.int32)
@@ -42,7 +42,9 @@ def functions_of(device: Device, size: int) -> BlockFunctions:
     add_matrix_in_row, share_in_row = one.add_matrix_in_row, one.share_in_row
 
     @wp.func
-    def look(x: wp.array2d(dtype=wp.float64), reach: wp.float64, stage: Stage, near: Near, c: int, me: int) -> int:
+    def look(
+        x: wp.array2d(dtype=wp.float64), reach: wp.float64, stage: ContactStage, near: NearPairs, c: int, me: int
+    ) -> int:
         """Find what may be within a reach; how many rows of parts these pairs have at most."""
         if me == 0:
             near.count[c] = 0
@@ -59,8 +61,8 @@ def functions_of(device: Device, size: int) -> BlockFunctions:
     @wp.func
     def add_force(
         x: wp.array2d(dtype=wp.float64),
-        stage: Stage,
-        near: Near,
+        stage: ContactStage,
+        near: NearPairs,
         c: int,
         me: int,
         # outputs
@@ -83,8 +85,8 @@ def functions_of(device: Device, size: int) -> BlockFunctions:
     @wp.func
     def add_matrix(
         x: wp.array2d(dtype=wp.float64),
-        stage: Stage,
-        near: Near,
+        stage: ContactStage,
+        near: NearPairs,
         definite: int,
         place: wp.array2d(dtype=wp.int32),
         c: int,
@@ -106,8 +108,8 @@ def functions_of(device: Device, size: int) -> BlockFunctions:
     def longest(
         x: wp.array2d(dtype=wp.float64),
         way: wp.array2d(dtype=wp.float64),
-        stage: Stage,
-        near: Near,
+        stage: ContactStage,
+        near: NearPairs,
         c: int,
         me: int,
     ) -> wp.float64:
@@ -132,4 +134,4 @@ def functions_of(device: Device, size: int) -> BlockFunctions:
         wait()
         return near.least[c]
 
-    return BlockFunctions(Stage, Near, add_force, add_matrix, longest)
+    return BlockFunctions(ContactStage, NearPairs, add_force, add_matrix, longest)

@@ -19,16 +19,16 @@ from ...runtime.device import Device
 from ...tools import Tool, cores_of
 from .enclosure import any_enclosed
 from .reduced import Reduced
-from .tool_blocks import Near, Stage
+from .tool_blocks import ContactStage, NearPairs
 from .tool_functions import Scale, Surface, Tools
 from .tool_kernels import kernels_of
-from .tool_path import TOUCH, Touch, Way, approach
+from .tool_path import TOUCH, ContactSampling, ToolPath, approach
 
 # Of a triangle cut into smaller ones, the farthest point is so many of their edges from the nearest centre.
 FARTHEST = 2.0 / 3.0
 
 
-class Contact:
+class ToolContactTerm:
     """A Term: the barrier between a body's surface and rigid tools, integrated over the surface at rest.
 
     Parameters
@@ -61,7 +61,7 @@ class Contact:
         self,
         name: str,
         tools: tuple[Tool, ...],
-        way: Callable[[Cases], Way | None],
+        way: Callable[[Cases], ToolPath | None],
         nodes: np.ndarray,
         triangles: np.ndarray,
         whole: np.ndarray,
@@ -69,7 +69,7 @@ class Contact:
         gap: float,
         shear: float,
         device: Device,
-        touch: Touch = TOUCH,
+        touch: ContactSampling = TOUCH,
     ):
         self.name = name
         cores = [core for tool in tools for core in cores_of(tool)]
@@ -95,7 +95,7 @@ class Contact:
         self._single: list[Tools] = []
 
     def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
-        """As `Way.stride`: through the air a tool goes as far as it can touch nothing."""
+        """As `ToolPath.stride`: through the air a tool goes as far as it can touch nothing."""
         way = self._way(cases)
         if way is None:
             return np.ones(len(cases.loads))
@@ -192,11 +192,11 @@ class Contact:
         return np.concatenate([own, np.sort(others)])
 
     @cached_property
-    def _alone(self) -> "tuple[Contact, Reduced]":
+    def _alone(self) -> "tuple[ToolContactTerm, Reduced]":
         """The same on the touchable nodes alone, and as a function of where these go."""
         nodes, own = self._nodes[self.touchable], np.searchsorted(self.touchable, self._triangles)
         corners, exact = own[:, :3], replace(self._device, precision="float64")
-        term = Contact(
+        term = ToolContactTerm(
             self.name, self._shapes, self._way, nodes=nodes, triangles=own, whole=corners, bone=own[:0],
             gap=self._asked, shear=self._shear, device=exact, touch=self._touch,
         )  # fmt: skip
@@ -258,11 +258,11 @@ class Contact:
         out.origin = self._device.array(of_cores[:, :, :3, 3], wp.vec3d)
         return out
 
-    def stage(self, columns: np.ndarray) -> tuple[Stage, Near]:
+    def stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
         """As `Dense.stage`."""
         if self._pose is None:
             raise ValueError("no tool is there")
-        out, near, name = Stage(), Near(), self._device.name
+        out, near, name = ContactStage(), NearPairs(), self._device.name
         every = len(columns) == len(self._pose)
         out.tools = self._tools if every else self._standing(self._pose[columns])
         out.surface, out.scale = self._surface, self._scale
@@ -284,8 +284,8 @@ def contact_of(
     space: Discretisation,
     shear: float,
     device: Device,
-    touch: Touch = TOUCH,
-) -> Contact:
+    touch: ContactSampling = TOUCH,
+) -> ToolContactTerm:
     """The term of an effect on tissue with a shear modulus [Pa]."""
     contact = isinstance(effect, ToolContact)
     name, tools = ("tool contact", effect.tools) if contact else ("retraction", (effect.blade,))
@@ -304,7 +304,7 @@ def contact_of(
         begin = [came_from(number, one.tobytes()) for case in pose for number, one in enumerate(case)]
         return np.reshape(begin, pose.shape)
 
-    def way(cases: Cases) -> Way | None:
+    def way(cases: Cases) -> ToolPath | None:
         last = cases.past(name, (len(tools), 4, 4)) if name in cases.memory else None
         if contact:
             cause = cases.loads.of(Touching)
@@ -314,19 +314,19 @@ def contact_of(
                 raise InputError(
                     f"Touching has poses of {cause.pose.shape[1]} tools, but ToolContact has {len(tools)}."
                 )
-            return Way(_begun(last, cases.anew, clear, cause.pose), cause.pose)
+            return ToolPath(_begun(last, cases.anew, clear, cause.pose), cause.pose)
         cause = cases.loads.of(Retracted)
         if cause is None:
             return None
         laid = cause.pose[:, None]
         held = laid.copy()
         held[:, 0, :3, 3] += cause.displacement
-        return Way(_begun(last, cases.anew, lambda pose: pose, laid), held)
+        return ToolPath(_begun(last, cases.anew, lambda pose: pose, laid), held)
 
     whole = space.surface[:, :3]
     solid = np.logical_or(anatomy.held.all(axis=1), anatomy.slide_normal.any(axis=1))
     bone = space.surface[solid[whole].all(axis=1)]
-    return Contact(
+    return ToolContactTerm(
         name, tools, way, nodes=space.nodes, triangles=triangles, whole=whole, bone=bone,
         gap=effect.gap, shear=shear, device=device, touch=touch,
     )  # fmt: skip

@@ -48,7 +48,7 @@ class Scale:
 
 
 @wp.struct
-class Touch:
+class ToolDistance:
     """Distance to a tool [m], its gradient, and its second derivative [1/m]."""
 
     distance: wp.float64
@@ -57,7 +57,7 @@ class Touch:
 
 
 @wp.func
-def touch_of(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> Touch:
+def touch_of(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDistance:
     """As a core sees a point: d = |v| - r, v from its nearest point to p; n = v / |v|; dn = (M - n (x) n) / |v|.
 
     M keeps the components in which p lies beyond the core.
@@ -68,7 +68,7 @@ def touch_of(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> Touch:
         v[i] = p[i] - wp.clamp(p[i], -half[i], half[i])
         beyond[i] = wp.where(v[i] != zero or half[i] == zero, one, zero)
     length = wp.length(v)
-    out = Touch()
+    out = ToolDistance()
     out.distance = length - radius
     out.normal = wp.vec3d(zero, zero, -one)  # on the core itself: away from the shaft
     if length > zero:
@@ -87,7 +87,7 @@ def clear(room: wp.float64, pace: wp.float64, most: int) -> int:
 
 
 @wp.func
-def curvature_at(touch: Touch, gap: wp.float64, definite: int) -> wp.mat33d:
+def curvature_at(touch: ToolDistance, gap: wp.float64, definite: int) -> wp.mat33d:
     """b'' n (x) n + b' dn; the first alone, which is never negative, where `definite`."""
     out = barrier_curvature(touch.distance, gap) * wp.outer(touch.normal, touch.normal)
     if definite == 0:
@@ -96,7 +96,7 @@ def curvature_at(touch: Touch, gap: wp.float64, definite: int) -> wp.mat33d:
 
 
 @dataclass(frozen=True)
-class Functions:
+class ToolFunctions:
     """Functions of Warp for triangles of one number of nodes, of which `forces` (size, 3) are a type.
 
     A triangle is looked at in the centres of pieces^2 equal parts, which lie in as many rows as there are pieces. What
@@ -122,7 +122,7 @@ class Functions:
 
 
 @cache
-def functions_of(device: Device, size: int) -> Functions:
+def functions_of(device: Device, size: int) -> ToolFunctions:
     """Functions for surface triangles of `size` nodes, 3 or 6.
 
     Positions and distances are in double precision whatever the device's scalar: gaps are small beside bodies.
@@ -307,7 +307,7 @@ def functions_of(device: Device, size: int) -> Functions:
             j += clear(room - farthest / kept, pace, most)
         return out
 
-    return Functions(
+    return ToolFunctions(
         forces=forces,
         motion_of=motion_of,
         nodes_of=nodes_of,

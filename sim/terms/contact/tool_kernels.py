@@ -11,7 +11,7 @@ from .tool_functions import BULGE, ROOM_KEPT, Scale, Surface, Tools, clear, curv
 
 
 @dataclass(frozen=True)
-class Kernels:
+class ToolKernels:
     """Loops over (triangle, column) for triangles of one number of nodes."""
 
     add_energy: wp.Kernel
@@ -26,7 +26,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(device: Device, size: int) -> Kernels:
+def kernels_of(device: Device, size: int) -> ToolKernels:
     """Kernels for surface triangles of `size` nodes, 3 or 6. Each launches over (triangle, column)."""
     scalar, mat = device.scalar, device.matrix
     here, kept = functions_of(device, size), wp.constant(wp.float64(ROOM_KEPT))
@@ -244,7 +244,7 @@ def kernels_of(device: Device, size: int) -> Kernels:
                     for j in range(2 * (n - i) - 1):
                         wp.atomic_min(out, k, c, touch_of(shape_of(i, j, n) * own, half, radius).distance)
 
-    return Kernels(
+    return ToolKernels(
         add_energy=add_energy,
         add_gradient=add_gradient,
         add_curvature=add_curvature,

@@ -12,7 +12,7 @@ from ...tools import Core, Tool, cores_of, distances_to, extent_of
 
 
 @dataclass(frozen=True)
-class Touch:
+class ContactSampling:
     """How finely a surface is looked at under tools, and how these come there.
 
     Parameters
@@ -38,12 +38,12 @@ class Touch:
     kept: int = 4096
 
 
-TOUCH = Touch()
+TOUCH = ContactSampling()
 """Contact with tools as it is unless another is given."""
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class ToolPath:
     """B load cases' tools on their way: T_world_tool (B, tools, 4, 4) at its beginning and at its end."""
 
     begin: np.ndarray
@@ -71,7 +71,7 @@ class Way:
         extent = np.array([extent_of(tool) for tool in tools])
         return np.linalg.norm(after[..., 3] - before[..., 3], axis=2) + angle * extent
 
-    def stride(self, tools: tuple[Tool, ...], clear: np.ndarray, touch: Touch = TOUCH) -> np.ndarray:
+    def stride(self, tools: tuple[Tool, ...], clear: np.ndarray, touch: ContactSampling = TOUCH) -> np.ndarray:
         """The longest shares (B,), at most 1, of the way that tools may go at once that are `clear` (B, tools) [m]."""
         most = clear + touch.stride * np.array([min(core.radius for core in cores_of(tool)) for tool in tools])
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
@@ -83,7 +83,7 @@ def approach(
     points: np.ndarray,
     normals: np.ndarray,
     reach: np.ndarray,
-    march: int = Touch.march,
+    march: int = ContactSampling.march,
 ) -> np.ndarray:
     """Pose (4, 4) just clear of a surface from which a tool comes straight to `pose` (4, 4).
 

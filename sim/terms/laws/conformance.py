@@ -13,7 +13,7 @@ from ...runtime.device import Device, Precision, find_device, forward_kernel
 
 
 @dataclass(frozen=True)
-class Strains:
+class TestStrains:
     """The strains at which a law is checked.
 
     Parameters
@@ -110,7 +110,9 @@ class Finding:
         return f"{self.name}: off by {self.error:.1e}, at most {self.limit:.0e} allowed"
 
 
-def check_tissue(tissue: Tissue, small_strain: bool = False, strains: Strains = Strains()) -> tuple[Finding, ...]:
+def check_tissue(
+    tissue: Tissue, small_strain: bool = False, strains: TestStrains = TestStrains()
+) -> tuple[Finding, ...]:
     """Hold a tissue's law to what the solver asks of it, at random strains on the CPU; a few seconds to compile.
 
     `small_strain`: the law is for small rotations only, as Hooke's, and need not turn with the tissue.
@@ -128,7 +130,7 @@ def check_tissue(tissue: Tissue, small_strain: bool = False, strains: Strains = 
     return found
 
 
-def _findings(tissue: Tissue, small_strain: bool, strains: Strains) -> Iterator[Finding]:
+def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Iterator[Finding]:
     count, step = strains.count, strains.short_step
     mu, lam = tissue.lame
     if not (mu > 0.0 and 3.0 * lam + 2.0 * mu > 0.0 and np.isfinite([mu, lam]).all()):

@@ -33,7 +33,7 @@ def inverse_transpose(H: Any):
 
 
 @dataclass(frozen=True)
-class Split:
+class LawSplit:
     """Of a law with coefficients k, at a displacement gradient H and along a change D of it.
 
     energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa], E the strain that a stress A [Pa] works on. stress and
@@ -47,13 +47,13 @@ class Split:
     needs_positive_volume: bool
 
 
-def split_of(law: Law, device: Device) -> Split:
+def split_of(law: Law, device: Device) -> LawSplit:
     """As the law itself has it, or by the isochoric part of F."""
     return isochoric_split(law, device) if law.of_shape is None else own_split(law, law.of_shape, device)
 
 
 @cache
-def isochoric_split(law: Law, device: Device) -> Split:
+def isochoric_split(law: Law, device: Device) -> LawSplit:
     """Shape is psi(F) - psi(J^(1/3) I), and E = (Fb^T Fb - I) / 2 with Fb = J^(-1/3) F."""
     scalar, mat = device.scalar, device.matrix
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
@@ -102,11 +102,11 @@ def isochoric_split(law: Law, device: Device) -> Split:
         G, wide = identity + cofactor_excess(Hb), scalar(1.0) + dilated(H)[0, 0]
         return wide * (wp.transpose(G) * (P - wp.ddot(P, identity + Hb) / scalar(3.0) * G))
 
-    return Split(energy, stress, stress_change, overstress, True)
+    return LawSplit(energy, stress, stress_change, overstress, True)
 
 
 @cache
-def own_split(law: Law, of_shape: wp.Function, device: Device) -> Split:
+def own_split(law: Law, of_shape: wp.Function, device: Device) -> LawSplit:
     """Shape is the law itself with its coefficients `of_shape`, and E = (F^T F - I) / 2.
 
     The potential is infinite nowhere that the law is not; the overstress is where J is exactly 0. Tissue that has
@@ -135,4 +135,4 @@ def own_split(law: Law, of_shape: wp.Function, device: Device) -> Split:
         """S = F^-1 P_shape."""
         return wp.transpose(inverse_transpose(H)) * own_stress(H, of_shape(k))
 
-    return Split(energy, stress, stress_change, overstress, False)
+    return LawSplit(energy, stress, stress_change, overstress, False)
