@@ -39,7 +39,7 @@ def write_png(path: Path, colour: np.ndarray) -> None:
         part.unlink(missing_ok=True)
 
 
-def shrunk(colour: np.ndarray, width: int, height: int) -> np.ndarray:
+def shrink_image(colour: np.ndarray, width: int, height: int) -> np.ndarray:
     """Downsample an image (H, W, 3) uint8 to (height, width, 3): means of the pixels covered."""
     return cv2.resize(colour, (width, height), interpolation=cv2.INTER_AREA)
 
@@ -124,7 +124,7 @@ AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION
 """Flag to ignore EXIF orientation: the camera matrix is for unrotated images."""
 
 
-def stated_size(code: bytes) -> tuple[int, int]:
+def read_image_size(code: bytes) -> tuple[int, int]:
     """Read width and height [pixel] from the header of a JPEG or a PNG, without decoding.
 
     Raises
@@ -154,7 +154,7 @@ def stated_size(code: bytes) -> tuple[int, int]:
         raise ValueError("its header is damaged") from error
 
 
-def decoded_colour(code: bytes, width: int, height: int) -> np.ndarray:
+def decode_colour(code: bytes, width: int, height: int) -> np.ndarray:
     """Decode an image (height, width, 3) uint8 sRGB.
 
     Raises
@@ -165,31 +165,31 @@ def decoded_colour(code: bytes, width: int, height: int) -> np.ndarray:
     return _decoded(code, (height, width, 3), cv2.IMREAD_COLOR_RGB | AS_STORED, np.uint8)
 
 
-def decoded_depth(code: bytes, width: int, height: int, scale: float) -> np.ndarray:
+def decode_depth(code: bytes, width: int, height: int, scale: float) -> np.ndarray:
     """Decode depth (height, width) float32 [m] from a PNG of 16 bits with unit `scale` [m]; 0 where nothing is seen.
 
     Raises
     ------
     ValueError
-        As `decoded_colour`.
+        As `decode_colour`.
     """
     steps = _decoded(code, (height, width), cv2.IMREAD_UNCHANGED | AS_STORED, np.uint16)
     return steps * np.float32(scale)
 
 
-def decoded_labels(code: bytes, width: int, height: int) -> np.ndarray:
+def decode_labels(code: bytes, width: int, height: int) -> np.ndarray:
     """Decode labels (height, width) uint8 from a PNG of 8 bits.
 
     Raises
     ------
     ValueError
-        As `decoded_colour`.
+        As `decode_colour`.
     """
     return _decoded(code, (height, width), cv2.IMREAD_UNCHANGED | AS_STORED, np.uint8)
 
 
 def _decoded(code: bytes, shape: tuple[int, ...], flag: int, kind: type) -> np.ndarray:
-    width, height = stated_size(code)
+    width, height = read_image_size(code)
     if (height, width) != shape[:2]:
         raise ValueError(f"it has {width} x {height} pixels in place of {shape[1]} x {shape[0]}")
     try:

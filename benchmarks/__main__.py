@@ -7,7 +7,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from scenes.cli import carried_out, limit_threads, with_points
+from scenes.cli import join_points, limit_threads, run_command
 
 BENCHMARKS = {
     "stages": "cost of each stage of a frame on this machine",
@@ -36,9 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one measurement. Returns what `sulcus` commands return."""
     if argv is None:
         limit_threads()
-    arguments = with_points(sys.argv[1:] if argv is None else argv)
+    arguments = join_points(sys.argv[1:] if argv is None else argv)
     args = make_parser(*arguments[:1]).parse_args(arguments)
-    return carried_out(args, "benchmarks")
+    return run_command(args, "benchmarks")
 
 
 def make_parser(*asked: str) -> argparse.ArgumentParser:

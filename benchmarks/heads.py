@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from sim import Bonded, Elasticity, Fem, Held, Slide, ToolForce, open_cortex, push
-from sim.bodies.healthy_heads import fsaverage_head, masked_head
+from sim.bodies.healthy_heads import build_masked_head, read_fsaverage_head
 from sim.bodies.subject import MeshPlan, Subject, make_anatomy
-from sim.bodies.template import SITES, Head, HealthyHead, Tumour, drawn_subject, template_subject
+from sim.bodies.template import SITES, Head, HealthyHead, Tumour, build_synthetic_subject, template_subject
 from sim.errors import InputError
 
 FORCE, FOOTPRINT = 0.3, 7e-3  # [N], [m]
@@ -30,17 +30,17 @@ FORCE, FOOTPRINT = 0.3, 7e-3  # [N], [m]
 def heads(mask: Path | None) -> dict[str, Callable[[Tumour], Subject]]:
     """What draws a tumour, by the name of the head."""
     volume = Head().volume
-    found = {"template": template_subject, "fsaverage": partial(_drawn, fsaverage_head(volume))}
+    found = {"template": template_subject, "fsaverage": partial(_drawn, read_fsaverage_head(volume))}
     if mask is not None:
         found |= {
-            "mask": partial(_drawn, masked_head(mask, volume=volume)),
-            "mask, own size": partial(_drawn, masked_head(mask)),
+            "mask": partial(_drawn, build_masked_head(mask, volume=volume)),
+            "mask, own size": partial(_drawn, build_masked_head(mask)),
         }
     return found
 
 
 def _drawn(healthy: HealthyHead, tumour: Tumour) -> Subject:
-    return drawn_subject(tumour, healthy)
+    return build_synthetic_subject(tumour, healthy)
 
 
 def motions(subject: Subject, nodes: int) -> list[float]:

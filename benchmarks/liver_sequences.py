@@ -28,14 +28,14 @@ from scipy.sparse import load_npz
 from scipy.sparse.linalg import splu
 
 from sim.errors import InputError
-from sim.geometry.closest_point import closest
+from sim.geometry.closest_point import find_closest_points
 from sim.geometry.locate import locate
-from sim.geometry.surface import unit
+from sim.geometry.surface import normalise_vectors
 from sim.geometry.tetmesh import TetMesh
-from sim.runtime.threads import one_thread
-from surrogate.array_functions import squared_distances
+from sim.runtime.threads import limit_to_one_thread
+from surrogate.array_functions import compute_squared_distances
 from surrogate.locating.calibration import RADIUS_SQUARED
-from surrogate.locating.evidence import alike
+from surrogate.locating.evidence import compute_correlation
 
 PUBLISHED = {"linear": "force 6.5 - 9.4 %, 0.8 - 1.2 s an update", "neohookean": "no figure that we know"}
 # Lengths [m] over which forces are alike, sizes of one vertex's force [N], and errors of points [m], to choose from.
@@ -103,7 +103,7 @@ class Belief:
     def covariance(self, liver: Liver) -> np.ndarray:
         """Of the patch's forces (3 f, 3 f) [N^2]."""
         at = liver.mesh.nodes[liver.patch]
-        return np.kron(self.size**2 * alike(squared_distances(at, at), self.length), np.eye(3))
+        return np.kron(self.size**2 * compute_correlation(compute_squared_distances(at, at), self.length), np.eye(3))
 
 
 def seen(liver: Liver, cloud: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -113,15 +113,15 @@ def seen(liver: Liver, cloud: np.ndarray, force: np.ndarray) -> tuple[np.ndarray
     """
     nodes = liver.mesh.nodes
     corners = (nodes + liver.motion @ force)[liver.surface]
-    _, triangle, weights = closest(cloud, corners)
+    _, triangle, weights = find_closest_points(cloud, corners)
     a, b, c = np.moveaxis(corners[triangle], 1, 0)
-    normal, vertices = unit(np.cross(b - a, c - a)), liver.surface[triangle]
+    normal, vertices = normalise_vectors(np.cross(b - a, c - a)), liver.surface[triangle]
     rows = np.einsum("nc,ni,ncif->nf", weights, normal, liver.motion[vertices], optimize=True)
     at_rest = np.einsum("nc,nci->ni", weights, nodes[vertices])
     return rows, np.einsum("ni,ni->n", cloud - at_rest, normal)
 
 
-def conditioned(
+def condition_prior(
     belief: Belief, prior: np.ndarray, rows: np.ndarray, value: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Mean (3 f,) [N] and covariance of forces, and the logarithm of the evidence (Rasmussen, Williams 2006, 2.30)."""
@@ -138,7 +138,7 @@ def chosen(liver: Liver, cloud: np.ndarray) -> Belief:
     """The belief of greatest evidence on a cloud."""
     rows, value = seen(liver, cloud, np.zeros(3 * len(liver.patch)))
     beliefs = [Belief(*each) for each in product(LENGTHS, SIZES, ERRORS)]
-    return max(beliefs, key=lambda belief: conditioned(belief, belief.covariance(liver), rows, value)[2])
+    return max(beliefs, key=lambda belief: condition_prior(belief, belief.covariance(liver), rows, value)[2])
 
 
 def estimates(liver: Liver, clouds: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray, float]]:
@@ -148,7 +148,7 @@ def estimates(liver: Liver, clouds: list[np.ndarray]) -> list[tuple[np.ndarray, 
     for cloud in clouds:
         begun = time.perf_counter()
         for _ in range(ROUNDS):
-            force, covariance, _ = conditioned(belief, prior, *seen(liver, cloud, force))
+            force, covariance, _ = condition_prior(belief, prior, *seen(liver, cloud, force))
         found.append((force, covariance, time.perf_counter() - begun))
     return found
 
@@ -164,7 +164,7 @@ def measured(folder: Path, mesh: str, name: str) -> str:
     places = np.load(sequence / "positions-default.npy").reshape(len(true), -1, 3)
     rest = meshio.read(folder / "mesh-default" / "liver.msh").points
     at, off, position, held, seconds = locate(liver.mesh, rest), [], [], [], []
-    with one_thread():  # products are small
+    with limit_to_one_thread():  # products are small
         found = estimates(liver, clouds)
     for (force, covariance, took), truth, place in zip(found, true, places, strict=True):
         miss = force.reshape(-1, 3).sum(axis=0) - truth

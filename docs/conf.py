@@ -3,14 +3,14 @@
 import sys
 from pathlib import Path
 
-from sim.runtime.versions import version_of
+from sim.runtime.versions import get_version
 
 sys.path.insert(0, str(Path(__file__).parent / "extensions"))
 
 project = "sulcus"
 author = "the sulcus authors"
 copyright = "the sulcus authors, Apache-2.0"
-version = release = version_of("sulcus")
+version = release = get_version("sulcus")
 
 extensions = [
     "generated_pages",

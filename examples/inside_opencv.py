@@ -24,7 +24,7 @@ camera = Camera(K, look_at(eye, target, cortex.up).T_camera_world, width=640, he
 picture = np.full((480, 640, 3), 90, np.uint8)  # as cv2.VideoCapture reads it: BGR
 
 
-def silhouette(vertices: np.ndarray) -> np.ndarray:
+def compute_silhouette(vertices: np.ndarray) -> np.ndarray:
     """Mask (480, 640) of the tumour's surface with vertices (V, 3) [m]."""
     pixels, _ = camera.project(vertices)
     mask = np.zeros(picture.shape[:2], np.uint8)
@@ -38,11 +38,11 @@ answer = model.deform(push(place.point, 0.3 * place.inward, footprint=7e-3), at=
 scan, now = anatomy.mesh.nodes, anatomy.mesh.nodes.copy()
 now[answer.nodes] += answer.displacement[0]
 for vertices, colour in ((scan, GREY), (now, GREEN)):
-    outline, _ = cv2.findContours(silhouette(vertices), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline, _ = cv2.findContours(compute_silhouette(vertices), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(picture, outline, -1, colour, 1, cv2.LINE_AA)
 cv2.imwrite("tumour.png", picture)
 
-middles = [np.argwhere(silhouette(vertices))[:, ::-1].mean(axis=0) for vertices in (scan, now)]
+middles = [np.argwhere(compute_silhouette(vertices))[:, ::-1].mean(axis=0) for vertices in (scan, now)]
 moved = float(np.linalg.norm(middles[1] - middles[0]))
 print(f"the outline moves {moved:.1f} pixels; {answer.outcome[0].value}")
 assert 4.0 < moved < 6.0

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from surrogate import learner
-from surrogate.regressors.protocol import standardisation
+from surrogate.regressors.protocol import compute_standardisation
 
 NEIGHBOURS = 8
 
@@ -22,7 +22,7 @@ class Nearest:
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Keep rows X (n, f), Y (n, r)."""
-        self.mean_, self.deviation_ = standardisation(X)
+        self.mean_, self.deviation_ = compute_standardisation(X)
         self.X_, self.Y_ = (X - self.mean_) / self.deviation_, Y
         return self
 

@@ -23,7 +23,7 @@ LOOKS = {
 """Colour and opacity of each surface that is sent. What may not be relied on is orange."""
 
 
-def node_of(kind, name):
+def find_moved_nodes(kind, name):
     """The node of a class and a name; it is made if there is none."""
     found = slicer.util.getFirstNodeByClassByName(kind, name)
     return found or slicer.mrmlScene.AddNewNodeByClass(kind, name)
@@ -34,13 +34,13 @@ def connect():
     if not hasattr(slicer, "vtkMRMLIGTLConnectorNode"):
         raise RuntimeError("Slicer has no OpenIGTLink: install SlicerOpenIGTLink by the Extensions Manager.")
     for name, (colour, opacity) in LOOKS.items():
-        model = node_of("vtkMRMLModelNode", name)
+        model = find_moved_nodes("vtkMRMLModelNode", name)
         model.CreateDefaultDisplayNodes()
         display = model.GetDisplayNode()
         display.SetColor(*colour)
         display.SetOpacity(opacity)
         display.SetVisibility2D(True)
-    connector = node_of("vtkMRMLIGTLConnectorNode", "sulcus")
+    connector = find_moved_nodes("vtkMRMLIGTLConnectorNode", "sulcus")
     connector.Stop()
     connector.SetTypeClient(HOST, PORT)
     connector.Start()

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from sim import Body, Cases, InputError
-from sim.runtime.columns import gathered
+from sim.runtime.columns import gather_columns
 from sim.runtime.device import Device
 
 
@@ -59,7 +59,7 @@ class Kernels:
 
 
 @cache
-def kernels_of(device: Device) -> Kernels:
+def build_kernels(device: Device) -> Kernels:
     """Kernels of a device's scalar type: float32 in scenes, float64 where it was asked for."""
     scalar, vec, mat = device.scalar, device.vector, device.matrix
 
@@ -148,7 +148,7 @@ class VeinsTerm:
     constant, passive, steep = False, True, False
 
     def __init__(self, veins: Veins, device: Device):
-        self._device, self._kernels = device, kernels_of(device)
+        self._device, self._kernels = device, build_kernels(device)
         self._nodes = device.array(np.array(veins.vertices, np.int32), wp.int32)
         self._numbers = [self._nodes, device.scalar(veins.stiffness), device.scalar(veins.slack)]
         self._at: wp.array | None = None
@@ -159,7 +159,7 @@ class VeinsTerm:
     def keep(self, columns: np.ndarray) -> None:
         """What was linearised of the others is dropped."""
         if self._at is not None:
-            self._at = gathered(self._device, self._at, columns)
+            self._at = gather_columns(self._device, self._at, columns)
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """E of each column."""

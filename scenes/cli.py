@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from sim.errors import InputError
 from sim.runtime.kernel_cache import ensure_writable_cache
 from sim.runtime.user_script import run_script
-from sim.runtime.versions import version_of
+from sim.runtime.versions import get_version
 
-from .commands.guidance import guidance
+from .commands.guidance import format_guidance
 from .commands.interrupt import INTERRUPTED
 
 # A command's module is imported only when it is called: `sulcus solve` does not wait for torch.
@@ -89,16 +89,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command. Returns 0 (done), 1 (ran, but did not reach what was asked) or 2 (bad input)."""
     if argv is None:
         limit_threads()
-    arguments = with_points(sys.argv[1:] if argv is None else argv)
+    arguments = join_points(sys.argv[1:] if argv is None else argv)
     asked = arguments[0] if arguments else None
     if asked == "bench":
         print("sulcus bench: is now `python -m benchmarks NAME`, from a checkout of the repository.", file=sys.stderr)
         return 2
     parser, _ = make_parsers(asked)
-    return carried_out(parser.parse_args(arguments), "scenes")
+    return run_command(parser.parse_args(arguments), "scenes")
 
 
-def carried_out(args: argparse.Namespace, package: str) -> int:
+def run_command(args: argparse.Namespace, package: str) -> int:
     """Run a command, of `package`, and say what is wrong with its input. Returns as `main`."""
     warnings.formatwarning = lambda message, *rest: f"{args.program}: {message}\n"
     try:
@@ -128,7 +128,7 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
         description=__doc__,
         epilog=_list_commands(),
     )
-    parser.add_argument("--version", action="version", version=f"sulcus {version_of('sulcus')}")
+    parser.add_argument("--version", action="version", version=f"sulcus {get_version('sulcus')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in COMMANDS.items():
         command = commands.add_parser(
@@ -138,7 +138,7 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
         )
         command.set_defaults(program=f"sulcus {name}")
         if name in asked:
-            command.epilog = guidance(name)
+            command.epilog = format_guidance(name)
             importlib.import_module(f"scenes.commands.{name}").add_arguments(command)
             if name in MAKING + READING:
                 add_plugin(command)
@@ -166,7 +166,7 @@ def add_plugin(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def with_points(arguments: Sequence[str]) -> list[str]:
+def join_points(arguments: Sequence[str]) -> list[str]:
     """The arguments, with a point joined to the option before it: `--opening-at=-3,4,5`."""
     joined: list[str] = []
     for argument in arguments:

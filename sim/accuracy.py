@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Literal
 
-from .arguments import at_least
+from .arguments import check_at_least
 from .errors import InputError
 
 Precision = Literal["float32", "float64"]
@@ -68,9 +68,9 @@ class Accuracy:
                 "ask for that, or for float64."
             )
         for name, least in (("outer", 1), ("inner", 1), ("steps", 0)):
-            at_least(name, getattr(self, name), least)
+            check_at_least(name, getattr(self, name), least)
         if self.evaluations is not None:
-            at_least("evaluations", self.evaluations, 0)
+            check_at_least("evaluations", self.evaluations, 0)
 
 
 DRAFT = Accuracy(tolerance=1e-2, outer=3, precision="float32", steps=0)

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from .errors import InputError
-from .geometry.tetmesh import TetMesh, digest_of
+from .geometry.tetmesh import TetMesh, compute_digest
 
 BRAIN_LABEL, TUMOUR_LABEL, NECROSIS_LABEL = 1, 2, 5
 """Region labels that the project's own anatomies use."""
@@ -21,22 +21,22 @@ REGION_NAMES = {"brain": BRAIN_LABEL, "tumour": TUMOUR_LABEL, **PART_LABELS}
 """Region labels by name."""
 
 
-def region_name(label: int) -> str:
+def name_region(label: int) -> str:
     """A region's name; "region 7" where it has none."""
     return next((name for name, number in REGION_NAMES.items() if number == label), f"region {label}")
 
 
-def region_words(label: int) -> str:
+def describe_region(label: int) -> str:
     """A region by its label, and by its name if it has one."""
-    return f"region {label} ({region_name(label)})" if label in REGION_NAMES.values() else region_name(label)
+    return f"region {label} ({name_region(label)})" if label in REGION_NAMES.values() else name_region(label)
 
 
-def missing_region(mesh: TetMesh, label: int) -> str:
+def describe_missing_region(mesh: TetMesh, label: int) -> str:
     """That a mesh has no such region, and which it has, in words; empty where it has it."""
     if mesh.within(label).any():
         return ""
-    has = ", ".join(map(region_words, np.unique(mesh.region).tolist()))
-    return f"the mesh has no {region_words(label)}. It has {has}."
+    has = ", ".join(map(describe_region, np.unique(mesh.region).tolist()))
+    return f"the mesh has no {describe_region(label)}. It has {has}."
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +130,7 @@ class Anatomy:
     @cached_property
     def tumour_surface(self) -> np.ndarray:
         """Triangles (S, 3), outwards, of the tumour's surface; none between it and its necrosis."""
-        return self.mesh.boundary_of(*TUMOUR_LABELS)
+        return self.mesh.find_boundary(*TUMOUR_LABELS)
 
     @cached_property
     def open_surface(self) -> np.ndarray:
@@ -147,4 +147,4 @@ class Anatomy:
     @cached_property
     def digest(self) -> str:
         """Hash of the mesh and its boundary conditions."""
-        return digest_of(*self.mesh.arrays, self.held, self.slide_normal, self.craniotomy)
+        return compute_digest(*self.mesh.arrays, self.held, self.slide_normal, self.craniotomy)

@@ -12,7 +12,7 @@ from .errors import InputError
 LARGEST = 1e30
 
 
-def all_finite(array: np.ndarray) -> bool:
+def is_all_finite(array: np.ndarray) -> bool:
     """Whether no number is infinite or NaN: in a third of the time that `.all()` takes of a few numbers."""
     return np.count_nonzero(np.isfinite(array)) == array.size
 
@@ -31,7 +31,7 @@ def as_array(name: str, values: object) -> np.ndarray:
         raise InputError(f"{name} makes no array: give numbers, and as many in every row.") from error
 
 
-def numbers(name: str, values: object, largest: float = LARGEST) -> np.ndarray:
+def check_numbers_array(name: str, values: object, largest: float = LARGEST) -> np.ndarray:
     """Real, finite numbers as float64, of whatever shape they are given in; `name` says what they are.
 
     Raises
@@ -48,7 +48,7 @@ def numbers(name: str, values: object, largest: float = LARGEST) -> np.ndarray:
             array = array.astype(np.float64)
     # One pass: NaN compares with nothing.
     if np.count_nonzero(np.abs(array) <= largest) != array.size:
-        if not all_finite(array):
+        if not is_all_finite(array):
             raise InputError(f"{name} has a value that is not finite: every number must be finite.")
         raise InputError(
             f"{name} has a value of {np.abs(array).max():g}, beyond {largest:g}: give numbers in SI units (m, N, s)."
@@ -56,7 +56,7 @@ def numbers(name: str, values: object, largest: float = LARGEST) -> np.ndarray:
     return array
 
 
-def whole_numbers(name: str, values: object) -> np.ndarray:
+def check_whole_numbers(name: str, values: object) -> np.ndarray:
     """Numbers (n,) of vertices, as integers.
 
     Raises
@@ -74,22 +74,22 @@ def whole_numbers(name: str, values: object) -> np.ndarray:
     return array if array.size else array.astype(np.intp)
 
 
-def vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
+def check_vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
     """Numbers (n,) of vertices of a mesh that has `count`.
 
     Raises
     ------
     InputError
-        As `whole_numbers`; a vertex that the mesh does not have.
+        As `check_whole_numbers`; a vertex that the mesh does not have.
     """
-    vertices = whole_numbers(name, values)
+    vertices = check_whole_numbers(name, values)
     beyond = vertices[(vertices < 0) | (vertices >= count)]
     if len(beyond):
         raise InputError(f"the mesh has no vertex {beyond[0]}: ask for some of 0 to {count - 1}.")
     return vertices
 
 
-def at_least(name: str, value: object, least: int) -> int:
+def check_at_least(name: str, value: object, least: int) -> int:
     """A whole number, at least `least`.
 
     Raises

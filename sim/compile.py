@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from .anatomy import Anatomy, region_words
+from .anatomy import Anatomy, describe_region
 from .discretisation.body import Body
 from .discretisation.constraint import Constraint
 from .discretisation.element import Elements
@@ -56,7 +56,7 @@ from .loads import (
     check_field,
     check_loads,
 )
-from .material import Tissue, coefficients_of, functions_of, portion
+from .material import Tissue, build_functions, collect_coefficients, get_portion
 from .runtime.device import Device
 
 CAUSES = {
@@ -109,30 +109,34 @@ def compile_problem(
             case Slide():
                 normal = anatomy.slide_normal
             case ToolForce():
-                from .terms.dead_force import DeadForce, pushed_forces
+                from .terms.dead_force import DeadForce, build_pushed_forces
 
-                terms.append(DeadForce("tool force", partial(pushed_forces, skin, device), device))
+                terms.append(DeadForce("tool force", partial(build_pushed_forces, skin, device), device))
             case NodalForce():
-                from .terms.dead_force import DeadForce, nodal_forces
+                from .terms.dead_force import DeadForce, build_nodal_forces
 
-                terms.append(DeadForce("nodal force", partial(nodal_forces, len(anatomy.mesh.nodes), device), device))
+                terms.append(
+                    DeadForce("nodal force", partial(build_nodal_forces, len(anatomy.mesh.nodes), device), device)
+                )
             case Gravity():
                 from .terms.gravity import change_of_weight
 
                 terms.append(change_of_weight(effect, space, device))
             case Inertia():
                 from .terms.inertia import InertiaTerm as InertiaTerm
-                from .terms.inertia import lumped_mass
+                from .terms.inertia import compute_lumped_mass
 
-                terms.append(InertiaTerm(lumped_mass(effect.density, space), effect.damping, space.marks, device))
+                terms.append(
+                    InertiaTerm(compute_lumped_mass(effect.density, space), effect.damping, space.marks, device)
+                )
             case ToolContact() | Retraction():
-                from .terms.contact.tool_contact import contact_of
+                from .terms.contact.tool_contact import build_tool_contact
 
-                barriers.append(contact_of(effect, anatomy, space, _shear(effects), device))
+                barriers.append(build_tool_contact(effect, anatomy, space, _shear(effects), device))
             case SkullContact():
-                from .terms.contact.skull_contact import skull_of
+                from .terms.contact.skull_contact import build_skull
 
-                barriers.append(skull_of(effect, anatomy, space, _shear(effects), device))
+                barriers.append(build_skull(effect, anatomy, space, _shear(effects), device))
             case Pulsation() | ToolDisplacement():
                 pass  # elasticity swells; a constraint: `_impose` reads the loads
             case Resection():
@@ -212,7 +216,7 @@ def _impose(space: Discretisation, skin: ContactSurface, loads: Loads) -> Impose
     value = None
     if prescribed is not None:
         check_field("Prescribed.displacement", prescribed.displacement, len(space.mesh.nodes))
-        value = space.interpolated(prescribed.displacement).reshape(len(loads), 3 * space.count).T
+        value = space.interpolate_field(prescribed.displacement).reshape(len(loads), 3 * space.count).T
     if displaced is None:
         return Imposed(value)
     weight = skin.press(displaced.point, displaced.footprint).rows(space.count)
@@ -236,14 +240,14 @@ def compile_part(
     return Problem(tuple(_elasticity(effect, space, whole.device, chosen, nodes)), constraint, whole.device)
 
 
-def surrounded(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> LocalProblem:
+def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> LocalProblem:
     """A part and a stiffness (m, m) [N/m] around it, which its rows (m,) of 3n touch."""
     from .terms.schur_stiffness import Exterior
 
     return _loaded(replace(part, terms=(*part.terms, Exterior(rows, stiffness, part.rows, part.device))))
 
 
-def rimmed(
+def compile_clamped_part(
     effects: Iterable[Effect], space: Discretisation, whole: Problem, chosen: np.ndarray, nodes: np.ndarray
 ) -> tuple[LocalProblem, Callable[[], sp.csc_array]]:
     """As `compile_part`, whose nodes that other tetrahedra touch are held.
@@ -287,7 +291,7 @@ def _elasticity(
         raise InputError(f"Pulsation is asked of region {min(absent)}, but the mesh has the regions {labels}.")
     unknown = sorted(set(effect.regions) - set(effect.on(labels).regions))
     if unknown:
-        raise InputError(f"a law is given for {region_words(unknown[0])}, but the mesh has the regions {labels}.")
+        raise InputError(f"a law is given for {describe_region(unknown[0])}, but the mesh has the regions {labels}.")
     materials: dict[int, Tissue] = {}
     for label in labels:
         material = effect.of(label)
@@ -328,9 +332,9 @@ def _obeying(
     """
     from .terms.elasticity import ElasticTerm as ElasticityTerm
 
-    law = functions_of(tissues)
-    lame = np.array([portion(tissue, carries) for tissue in tissues])[which]
-    coefficients = coefficients_of(tissues, carries)[which]
+    law = build_functions(tissues)
+    lame = np.array([get_portion(tissue, carries) for tissue in tissues])[which]
+    coefficients = collect_coefficients(tissues, carries)[which]
     name = f"elasticity {law.name}" if carries == "whole" else f"elasticity {law.name} of {carries}"
     sources = []
     if tissues[0].prony and carries != "volume":  # what resists a change of volume does not relax

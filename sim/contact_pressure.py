@@ -8,7 +8,7 @@ from .deformation import Deformation
 from .discretisation.term import Cases
 from .errors import InputError
 from .fem import Fem
-from .geometry.surface import vertex_areas
+from .geometry.surface import compute_vertex_areas
 from .loads import Loads
 
 
@@ -42,6 +42,6 @@ def pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
         for term in fem.problem.barriers:
             term.add_gradient(u, gradient)
     force = np.linalg.norm(gradient.numpy().T.reshape(answer.displacement.shape), axis=2)
-    area = np.array([vertex_areas(fem.space.nodes + moved, surface) for moved in answer.displacement])
+    area = np.array([compute_vertex_areas(fem.space.nodes + moved, surface) for moved in answer.displacement])
     area = area.reshape(force.shape)
     return np.divide(force, area, out=np.zeros_like(area), where=area > 0.0)

@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from .anatomy import Anatomy
-from .arguments import all_finite, as_array, numbers, whole_numbers
+from .arguments import as_array, check_numbers_array, check_whole_numbers, is_all_finite
 from .errors import InputError
 from .loads import Loads
 
@@ -137,7 +137,7 @@ class Deformation:
             given = getattr(self, name)
             if given.shape != shape:
                 object.__setattr__(self, name, np.broadcast_to(given, shape))
-        if not all_finite(self.displacement):
+        if not is_all_finite(self.displacement):
             raise AssertionError("a deformer let a displacement pass that is not finite: a defect of the deformer")
 
     def __len__(self) -> int:
@@ -167,7 +167,7 @@ class Deformation:
         InputError
             A vertex that is not among `self.nodes`; what are no whole numbers.
         """
-        nodes = whole_numbers("the vertices", nodes)
+        nodes = check_whole_numbers("the vertices", nodes)
         if np.array_equal(nodes, self.nodes):
             return self
         missing = ~np.isin(nodes, self.nodes)
@@ -181,7 +181,7 @@ class Deformation:
         return replace(self, displacement=self.displacement[:, position], nodes=nodes)
 
 
-def joined(parts: Sequence[Deformation]) -> Deformation:
+def join_deformations(parts: Sequence[Deformation]) -> Deformation:
     """Answers of the same vertices, one part after the other; seconds add up, and of memories stays what all have."""
 
     def stacked(name: str) -> np.ndarray:
@@ -229,7 +229,7 @@ def check_start(start: Deformation, count: int, vertices: int) -> None:
     for name, values, finite in [*needed, *((name, values, False) for name, values in start.warm.items())]:
         array = as_array(f"the start's {name!r}", values)
         good = array.dtype.kind in "fiu" and array.shape[:1] == (count,)
-        if not good or (finite and not all_finite(array)):
+        if not good or (finite and not is_all_finite(array)):
             raise InputError(
                 f"the start's {name!r} are no {count} rows of finite numbers: start from an answer to {count} loads as "
                 "it came, or from rest."
@@ -244,7 +244,7 @@ def guess(displacement: np.ndarray) -> Deformation:
     InputError
         Displacements of another shape, or not finite.
     """
-    displacement = numbers("a guessed displacement", displacement)
+    displacement = check_numbers_array("a guessed displacement", displacement)
     if displacement.ndim != 3 or displacement.shape[2] != 3:
         raise InputError(f"a guessed displacement has shape {displacement.shape}: give (B, V, 3) [m].")
     count, vertices, _ = displacement.shape

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
-from .anatomy import NECROSIS_LABEL, TUMOUR_LABEL, Anatomy, region_words
+from .anatomy import NECROSIS_LABEL, TUMOUR_LABEL, Anatomy, describe_region
 from .errors import InputError
 from .material import BRAIN, Tissue, check_described
 from .skulls import Bonded, SkullContact, Slide, check_gap
@@ -57,7 +57,7 @@ class Elasticity:
     def __str__(self) -> str:
         """The tissues as they are named beside every answer."""
         named = [] if self.default is None else [str(self.default)]
-        return "; ".join([*named, *(f"{region_words(label)}: {tissue}" for label, tissue in self.regions.items())])
+        return "; ".join([*named, *(f"{describe_region(label)}: {tissue}" for label, tissue in self.regions.items())])
 
 
 def _around(label: int) -> int:

@@ -14,9 +14,9 @@ import scipy.sparse as sp
 
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
-from .arguments import at_least, vertex_numbers
+from .arguments import check_at_least, check_vertex_numbers
 from .compile import check_causes, compile_problem
-from .deformation import Cost, Deformation, check_start, joined
+from .deformation import Cost, Deformation, check_start, join_deformations
 from .diagnostics.deformed_tissue import Diagnostics
 from .discretisation.footprint import ContactSurface
 from .discretisation.inverted_elements import Inversion
@@ -29,19 +29,19 @@ from .linalg.preconditioner import choose_preconditioner
 from .linalg.rest_solver import RestStiffnessSolver
 from .loads import Displaced, Loads, Nodal, Pushed
 from .minimisers.lbfgs import CARRIED
-from .minimisers.power_series import SeriesReading, factors, taylor, terms_of
-from .minimisers.residual import shortfall
-from .runtime.columns import unstacked
+from .minimisers.power_series import SeriesReading, count_terms, expand_taylor, list_factors
+from .minimisers.residual import measure_residual
+from .runtime.columns import unstack_columns
 from .runtime.device import find_device
-from .runtime.exclusive import alone
-from .runtime.memory import check_fits, fitting_batch, free_bytes
-from .runtime.threads import one_thread
+from .runtime.exclusive import lock_method
+from .runtime.memory import check_fits, choose_batch_size, measure_free_bytes
+from .runtime.threads import limit_to_one_thread
 from .strategy.bone import solve_off_bone
-from .strategy.extrapolation import moved_on, pushes_of, way_of
-from .strategy.frame_sequence import FrameSequence, frame_sequence
-from .strategy.plan import SolverPlan, SolverStep, local_solvers, plan_for
+from .strategy.extrapolation import as_pushes, compute_directions, extrapolate_start
+from .strategy.frame_sequence import FrameSequence, build_frame_sequence
+from .strategy.plan import SolverPlan, SolverStep, build_local_solvers, plan_for
 from .strategy.strategy import SolverResult, Strategy
-from .strategy.time_steps import KEPT, NoMotionStep, alike
+from .strategy.time_steps import KEPT, NoMotionStep, group_alike
 
 # The memory's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
 MIDDLES = "mid-edge nodes"
@@ -109,9 +109,9 @@ class Fem:
         shared = stiff_as and stiff_as.strategy.preconditioner
         preconditioner = shared or choose_preconditioner(problem, self.space, self._unsmoothed)
         if batch is None:
-            batch = fitting_batch(problem.rows, problem.device, free_bytes(problem.device))
-        plan = plan_for(problem, preconditioner, self.space, accuracy, at_least("batch", batch, 1), live, avoid)
-        parts = local_solvers(plan, problem, preconditioner, self.effects, self.space)
+            batch = choose_batch_size(problem.rows, problem.device, measure_free_bytes(problem.device))
+        plan = plan_for(problem, preconditioner, self.space, accuracy, check_at_least("batch", batch, 1), live, avoid)
+        parts = build_local_solvers(plan, problem, preconditioner, self.effects, self.space)
         if problem.device.on_cuda:
             parts[0]()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
         self._diagnostics = Diagnostics(anatomy, self.space, self.effects, problem.device, accuracy.limit_strain)
@@ -134,7 +134,7 @@ class Fem:
     @cached_property
     def description(self) -> str:
         """Element and tissue in words: every answer carries them."""
-        return solver_named(self.space.element, self.effects)
+        return describe_solver(self.space.element, self.effects)
 
     @property
     def problem(self) -> Problem:
@@ -146,7 +146,7 @@ class Fem:
         """The body that is deformed."""
         return self._anatomy
 
-    @alone
+    @lock_method
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """Static equilibrium under every load case.
 
@@ -171,7 +171,7 @@ class Fem:
         if start is not None and last is not None:
             before = last.T.reshape(len(loads), self.space.count, 3)
             cases = Cases(loads, start.time, start.memory, before, warm=start.warm)
-        some = alike(cases.steps, self.batch) if self.problem.paced else None
+        some = group_alike(cases.steps, self.batch) if self.problem.paced else None
         batches = some or [(math.inf, rows) for rows in self._batches(len(loads))]
         parts = []
         for step, rows in batches:
@@ -199,10 +199,12 @@ class Fem:
         """Who answers frame after frame on CUDA. The CPU waits for nothing that this would spare it."""
         if not self.plan.frames:
             return None
-        return frame_sequence(self.strategy, self.space, self._skin, self._diagnostics, self.lock, self.description)
+        return build_frame_sequence(
+            self.strategy, self.space, self._skin, self._diagnostics, self.lock, self.description
+        )
 
     def _vertices(self, at: np.ndarray) -> np.ndarray:
-        return vertex_numbers("at", at, len(self._anatomy.mesh.nodes))
+        return check_vertex_numbers("at", at, len(self._anatomy.mesh.nodes))
 
     def _check_static(self, loads: Loads) -> None:
         check_causes(self.effects, loads)
@@ -214,7 +216,7 @@ class Fem:
         linear = discretise(self._anatomy.mesh, "p1")
         return compile_problem(self.effects, self._anatomy, self._skin.device, linear).rest_curvature(step)
 
-    @alone
+    @lock_method
     def residual(self, loads: Loads, answer: Deformation) -> np.ndarray:
         """The relative residual (B,), in this solver's precision, of somebody's answers at every vertex.
 
@@ -225,9 +227,9 @@ class Fem:
         """
         self._check_static(loads)
         self.problem.begin(Cases(loads, answer.time, answer.memory))
-        return shortfall(self.problem, self.problem.device.array(self.guess(loads, answer)))
+        return measure_residual(self.problem, self.problem.device.array(self.guess(loads, answer)))
 
-    @alone
+    @lock_method
     def reading(self, nodes: np.ndarray, modes: np.ndarray) -> SeriesReading:
         """What `series` is asked for: the shares that modes (r, n, 3) have in the motion of vertices `nodes` (n,).
 
@@ -248,7 +250,7 @@ class Fem:
             answers[some] = self._resting.answer(on_device).numpy().T
         return SeriesReading(answers, device)
 
-    @alone
+    @lock_method
     def series(self, loads: Loads, orders: int, reading: SeriesReading, sizes: int = 1) -> np.ndarray:
         """Power series (G, terms, r) of what is read of the answers, in the sizes of the loads, as far as it converges.
 
@@ -272,18 +274,18 @@ class Fem:
                 raise InputError(f"a series is had of `Pushed` and `Nodal` loads, not of `{type(cause).__name__}`.")
         if len(loads) % sizes:
             raise InputError(f"{len(loads)} loads are no groups of {sizes}: give a multiple of that.")
-        widest = len(factors(sizes, orders))
+        widest = len(list_factors(sizes, orders))
         groups = min(len(loads) // sizes, max(1, self.batch // widest))
         columns = groups * widest
         check_fits(self.problem.rows, columns, columns, self.problem.device, self.strategy.held)
         edge = float(np.cbrt(self._anatomy.mesh.volumes.mean() * 6.0))
-        found = np.empty((len(loads) // sizes, terms_of(sizes, orders), reading.count))
+        found = np.empty((len(loads) // sizes, count_terms(sizes, orders), reading.count))
         # Threads of BLAS wait for one another, ages where something else runs on their cores.
-        with one_thread():
+        with limit_to_one_thread():
             for first in range(0, len(found), max(groups, 1)):
                 some = loads.rows(slice(first * sizes, (first + groups) * sizes))
                 self.problem.begin(Cases(some, np.zeros(len(some))))
-                forces = taylor(self.problem, self._resting.answer, len(some), sizes, edge, orders)
+                forces = expand_taylor(self.problem, self._resting.answer, len(some), sizes, edge, orders)
                 read = [reading.of(force).reshape(len(some) // sizes, -1, reading.count) for force in forces]
                 found[first : first + groups] = np.concatenate(read, axis=1)
         return found
@@ -292,7 +294,7 @@ class Fem:
         """Somebody's answers as columns (3N, B) [m] over the nodes of the element."""
         vertices = len(self._anatomy.mesh.nodes)
         check_start(start, len(loads), vertices)
-        full = self.space.interpolated(start.at(np.arange(vertices)).displacement)
+        full = self.space.interpolate_field(start.at(np.arange(vertices)).displacement)
         if len(self.space.edges) and MIDDLES in start.memory:
             full[:, vertices:] += Cases(loads, start.time, start.memory).past(MIDDLES, (len(self.space.edges), 3))
         return full.reshape(len(loads), self.problem.rows).T
@@ -301,10 +303,10 @@ class Fem:
         self, strategy: Strategy | NoMotionStep, cases: Cases, last: np.ndarray | None, at: np.ndarray | None
     ) -> Deformation:
         clock = time.perf_counter()
-        guesses = () if last is None else (moved_on(cases.loads, last, cases.warm), last)
+        guesses = () if last is None else (extrapolate_start(cases.loads, last, cases.warm), last)
         found = solve_off_bone(strategy, cases, guesses)
         seconds = {"equilibrium": time.perf_counter() - clock}
-        way = way_of(pushes_of(cases.loads), last, cases.warm) if len(cases.loads) <= CARRIED else {}
+        way = compute_directions(as_pushes(cases.loads), last, cases.warm) if len(cases.loads) <= CARRIED else {}
         return self._answered(cases, found, way, at, seconds)
 
     def _answered(
@@ -321,16 +323,16 @@ class Fem:
         memory = dict(self.problem.end(found.u))
         displaced = cases.loads.of(Displaced) is not None
         held = self.problem.gradient(found.u) if displaced or self._diagnostics.needs_forces else None
-        on_footprint = self.problem.constraint.force_on_footprint(held) if displaced else None
+        on_footprint = self.problem.constraint.compute_footprint_force(held) if displaced else None
         touching = [term.reaction(found.u) for term in self.problem.barriers]
         reaction = np.concatenate([self._reaction(cases.loads, on_footprint), *touching], axis=1)
         nodes = np.arange(len(self._anatomy.mesh.nodes)) if at is None else at
         if at is None and len(self.space.edges):
-            whole = unstacked(self.problem.device, found.u, np.arange(self.space.count))
+            whole = unstack_columns(self.problem.device, found.u, np.arange(self.space.count))
             displacement = np.ascontiguousarray(whole[:, : len(nodes)])
-            memory[MIDDLES] = whole[:, len(nodes) :] - self.space.interpolated(displacement)[:, len(nodes) :]
+            memory[MIDDLES] = whole[:, len(nodes) :] - self.space.interpolate_field(displacement)[:, len(nodes) :]
         else:
-            displacement = unstacked(self.problem.device, found.u, nodes)
+            displacement = unstack_columns(self.problem.device, found.u, nodes)
         fields = self._diagnostics.fields(found.u, held)
         return Deformation(
             displacement=displacement,
@@ -364,10 +366,10 @@ class Fem:
 
 def _joined(parts: list[Deformation]) -> Deformation:
     """Batches, one after the other, as one deformation. What is warm in one is not for all of them."""
-    return parts[0] if len(parts) == 1 else joined([replace(part, warm={}) for part in parts])
+    return parts[0] if len(parts) == 1 else join_deformations([replace(part, warm={}) for part in parts])
 
 
-def solver_named(element: str, effects: Iterable[Effect]) -> str:
+def describe_solver(element: str, effects: Iterable[Effect]) -> str:
     """Finite elements in words: their element and tissue, as every answer, picture and file names them."""
     tissue = next((str(effect) for effect in effects if isinstance(effect, Elasticity)), "no elasticity")
     return f"finite elements ({element}; {tissue})"

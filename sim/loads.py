@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
-from .arguments import as_array, numbers
+from .arguments import as_array, check_numbers_array
 from .errors import InputError
 
 
@@ -158,7 +158,7 @@ class Loads:
             )
         object.__setattr__(self, "causes", tuple(_checked(cause) for cause in self.causes))
         rows = {len(array) for cause in self.causes for array in vars(cause).values()}
-        time = np.zeros(max(rows)) if self.time is None else numbers("Loads.time", self.time)
+        time = np.zeros(max(rows)) if self.time is None else check_numbers_array("Loads.time", self.time)
         if time.ndim != 1:
             raise InputError(f"Loads.time has shape {time.shape}: give (B,) [s].")
         if rows - {len(time)}:
@@ -191,7 +191,7 @@ class Loads:
         """All causes of one kind."""
         return tuple(cause for cause in self.causes if isinstance(cause, kind))
 
-    def but(self, kind: type[Cause]) -> Loads:
+    def without_kind(self, kind: type[Cause]) -> Loads:
         """The same loads without the cause of one kind."""
         return Loads(tuple(cause for cause in self.causes if not isinstance(cause, kind)), self.times)
 
@@ -201,7 +201,7 @@ class Loads:
 
     def rows(self, index: slice | np.ndarray) -> Loads:
         """Some of the load cases, as loads."""
-        return Loads(tuple(rows_of(cause, index) for cause in self.causes), self.times[index])
+        return Loads(tuple(select_rows(cause, index) for cause in self.causes), self.times[index])
 
     def scaled(self, fraction: float | np.ndarray) -> Loads:
         """The same causes with every magnitude that they have times `fraction` (scalar or (B,))."""
@@ -217,7 +217,7 @@ class Loads:
         return Loads(tuple(grown(cause) for cause in self.causes), self.times)
 
 
-def rows_of(cause: C, index: slice | np.ndarray) -> C:
+def select_rows(cause: C, index: slice | np.ndarray) -> C:
     """A cause of some of the load cases, by number, a slice, or (B,) bool."""
     return replace(cause, **{item.name: getattr(cause, item.name)[index] for item in fields(cause)})
 
@@ -322,7 +322,7 @@ def _checked(cause: Cause) -> Cause:
         raise InputError(
             f"{name} is no cause: choose from {allowed}; or make your own as sim.OwnCause says, with a magnitude."
         )
-    arrays = {key: numbers(f"{name}.{key}", value) for key, value in vars(cause).items()}
+    arrays = {key: check_numbers_array(f"{name}.{key}", value) for key, value in vars(cause).items()}
     whole_field = isinstance(cause, Nodal | Prescribed)
     for key, array in arrays.items():
         if key == "pose":

@@ -219,7 +219,7 @@ def check_described(tissue: object) -> None:
         )
 
 
-def functions_of(tissues: Iterable[Tissue]) -> Law:
+def build_functions(tissues: Iterable[Tissue]) -> Law:
     """The Warp functions that tissues of one name share.
 
     Raises
@@ -254,16 +254,16 @@ def check_prony(prony: Pairs, law: str) -> None:
         raise InputError(f"the Prony series' g sum to {total:g}: below 1, so that some stiffness is left in the end.")
 
 
-def tissue_to_json(tissue: Tissue) -> str:
-    """One line that `tissue_from_json` reads."""
+def to_tissue_json(tissue: Tissue) -> str:
+    """One line that `read_tissue_json` reads."""
     constants = asdict(tissue)  # pyright: ignore[reportArgumentType]
     if not tissue.prony:
         constants.pop("prony", None)  # as it was written before there were any
     return json.dumps({"law": tissue.law, **constants})
 
 
-def tissue_from_json(text: str) -> Tissue:
-    """The tissue that `tissue_to_json` wrote.
+def read_tissue_json(text: str) -> Tissue:
+    """The tissue that `to_tissue_json` wrote.
 
     Raises
     ------
@@ -287,7 +287,7 @@ def tissue_from_json(text: str) -> Tissue:
 SOFT = 1.5
 
 
-def portion(tissue: Tissue, carries: str) -> tuple[float, float]:
+def get_portion(tissue: Tissue, carries: str) -> tuple[float, float]:
     """Lamé's (mu, lambda) [Pa] of the "whole" tissue, of its resistance to a change of "shape", or of "volume".
 
     The last two sum to the first; in every law lambda weighs the square of one measure of volume.
@@ -297,8 +297,8 @@ def portion(tissue: Tissue, carries: str) -> tuple[float, float]:
     return {"whole": (mu, lam), "shape": (mu, soft), "volume": (0.0, lam - soft)}[carries]
 
 
-def coefficients_of(tissues: Sequence[Tissue], carries: str = "whole") -> np.ndarray:
-    """Coefficients (n, k) of a `portion` of n tissues of one law.
+def collect_coefficients(tissues: Sequence[Tissue], carries: str = "whole") -> np.ndarray:
+    """Coefficients (n, k) of a `get_portion` of n tissues of one law.
 
     Shorter Ogden sums are filled up with terms (0, 1), which add 0.
 
@@ -307,7 +307,7 @@ def coefficients_of(tissues: Sequence[Tissue], carries: str = "whole") -> np.nda
     InputError
         Tissues of another law that have different numbers of them.
     """
-    rows = [tuple(tissue.coefficients_at(*portion(tissue, carries))) for tissue in tissues]
+    rows = [tuple(tissue.coefficients_at(*get_portion(tissue, carries))) for tissue in tissues]
     lengths = sorted({len(row) for row in rows})
     if len(lengths) > 1 and tissues[0].law != Ogden.law:
         raise InputError(

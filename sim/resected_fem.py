@@ -11,14 +11,14 @@ import numpy as np
 
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
-from .deformation import Deformation, check_start, joined
-from .discretisation.resected_body import RemainingBody, bodies
+from .deformation import Deformation, check_start, join_deformations
+from .discretisation.resected_body import RemainingBody, list_remaining_bodies
 from .discretisation.term import Remembering
 from .effects import Effect, Elasticity, Held, Pulsation, Resection
 from .errors import InputError
 from .fem import MIDDLES, Fem
 from .loads import Loads, Resected, check_loads
-from .runtime.exclusive import alone
+from .runtime.exclusive import lock_method
 
 # The memory's key for how many steps (B,) were done.
 DONE = "resection"
@@ -64,7 +64,7 @@ class OperatedFem:
         """What is left after so many steps."""
         return self._bodies[done]
 
-    @alone
+    @lock_method
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """As `Fem.deform`; `start` may be an answer after other steps, and what is left goes on from it.
 
@@ -84,7 +84,7 @@ class OperatedFem:
         for stage, stays in sorted(set(zip(done.tolist(), same.tolist(), strict=True))) or [(most, False)]:
             rows = np.flatnonzero((done == stage) & (same == stays))
             begun = None if start is None else self._begun(start.rows(rows), stage, stays)
-            answer = self._solver(stage).deform(loads.but(Resected).rows(rows), begun, at)
+            answer = self._solver(stage).deform(loads.without_kind(Resected).rows(rows), begun, at)
             order.append(rows)
             stages.append(stage)
             parts.append(self._ended(answer, stage))
@@ -125,7 +125,9 @@ class OperatedFem:
             {name: np.zeros((len(part), *shape)) for name, shape in shapes.items()} | memory
             for part, memory in zip(parts, memories, strict=True)
         ]
-        return joined([replace(part, memory=memory, warm={}) for part, memory in zip(parts, whole, strict=True)])
+        return join_deformations(
+            [replace(part, memory=memory, warm={}) for part, memory in zip(parts, whole, strict=True)]
+        )
 
     def _lasting(self, memory: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
         """What means the same in another body: memories of elements and nodes, poses of tools, steps done."""
@@ -188,7 +190,7 @@ def finite_elements(
     def make(body: Anatomy) -> Fem:
         return Fem(body, (*_of(others, anatomy, body), Held()), accuracy, device, batch, element, live)
 
-    return OperatedFem(bodies(anatomy, effects), make, ahead=live)
+    return OperatedFem(list_remaining_bodies(anatomy, effects), make, ahead=live)
 
 
 def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:

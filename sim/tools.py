@@ -122,7 +122,7 @@ class OwnTool(Protocol):
 Tool = BuiltIn | OwnTool
 
 
-def tool_from_text(text: str) -> BuiltIn:
+def parse_tool(text: str) -> BuiltIn:
     """The tool whose `repr` is this text, of a file from outside: nothing of it is carried out.
 
     Raises
@@ -138,20 +138,20 @@ def tool_from_text(text: str) -> BuiltIn:
     raise InputError(f"{text[:60]!r} is no tool: give one of {', '.join(kinds)} with its sizes in metres.")
 
 
-def stated_tool(text: str | None, ball: object) -> BuiltIn | None:
+def read_tool_statement(text: str | None, ball: object) -> BuiltIn | None:
     """The tool that a file states by its `repr`, or one of an earlier version by a `ball`'s radius [m]; None: neither.
 
     Raises
     ------
     InputError
-        As `tool_from_text`.
+        As `parse_tool`.
     """
     if text is None and ball is None:
         return None
-    return tool_from_text(f"Ball(radius={ball})" if text is None else text)
+    return parse_tool(f"Ball(radius={ball})" if text is None else text)
 
 
-def named(tool: Tool) -> str:
+def name_tool(tool: Tool) -> str:
     """What a person calls a tool, with its sizes in millimetres; one of your own by its `repr`."""
     match tool:
         case Ball(radius):
@@ -175,7 +175,7 @@ def check_tool(effect: str, tool: object) -> None:
     if not isinstance(tool, Tool):
         allowed = ", ".join(kind.__name__ for kind in BuiltIn.__args__)
         raise InputError(f"{effect} has {tool!r} for a tool: choose from {allowed}, or give one that has cores.")
-    cores = cores_of(tool)
+    cores = list_cores(tool)
     for core in cores:
         if not (np.isfinite([*core.centre, *core.half, core.radius]).all() and core.radius > 0.0):
             raise InputError(f"{tool!r} has a core that is not finite or has no radius: give a positive one in metres.")
@@ -183,12 +183,12 @@ def check_tool(effect: str, tool: object) -> None:
         raise InputError(f"{tool!r} has no cores: give at least one, of which tissue touches the surface.")
 
 
-def cores_of(tool: Tool) -> tuple[Core, ...]:
+def list_cores(tool: Tool) -> tuple[Core, ...]:
     """What a tool is made of: all that lies within any of these."""
-    return (core_of(tool),) if isinstance(tool, BuiltIn) else tuple(tool.cores)
+    return (get_core(tool),) if isinstance(tool, BuiltIn) else tuple(tool.cores)
 
 
-def core_of(tool: BuiltIn) -> Core:
+def get_core(tool: BuiltIn) -> Core:
     """What a tool of one core is made of."""
     match tool:
         case Ball(radius):
@@ -199,25 +199,25 @@ def core_of(tool: BuiltIn) -> Core:
             return Core(np.array([0.0, 0.0, edge]), np.array([0.5 * width - edge, 0.5 * length - edge, 0.0]), edge)
 
 
-def extent_of(tool: Tool) -> float:
+def compute_extent(tool: Tool) -> float:
     """How far the tool's farthest point is from its origin [m], at most."""
-    return max(core.extent for core in cores_of(tool))
+    return max(core.extent for core in list_cores(tool))
 
 
-def foremost(tool: BuiltIn, pose: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def find_foremost_points(tool: BuiltIn, pose: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """The points (B, 3) [m] of a tool at T_world_tool `pose` (B, 4, 4) that are farthest in a unit `direction` (3,).
 
     Of an edge or a face that stands square to it the middle.
     """
-    core, local = core_of(tool), np.einsum("bji,j->bi", pose[:, :3, :3], direction)
+    core, local = get_core(tool), np.einsum("bji,j->bi", pose[:, :3, :3], direction)
     corner = core.centre + np.where(np.abs(local) < SQUARE, 0.0, np.sign(local)) * core.half
     return pose[:, :3, 3] + np.einsum("bij,bj->bi", pose[:, :3, :3], corner) + core.radius * direction
 
 
-def distances_to(tool: Tool, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+def compute_distances(tool: Tool, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Signed distances (n,) [m] of points (n, 3) [m] from a tool at T_world_tool `pose` (4, 4); negative inside."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
-    return np.min([_distances(core, local - core.centre) for core in cores_of(tool)], axis=0)
+    return np.min([_distances(core, local - core.centre) for core in list_cores(tool)], axis=0)
 
 
 def _distances(core: Core, local: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 
 @singledispatch
-def squared_distances(points: np.ndarray, sites: np.ndarray) -> np.ndarray:
+def compute_squared_distances(points: np.ndarray, sites: np.ndarray) -> np.ndarray:
     """Compute squared distances (B, n) of points (B, f) from sites (n, f)."""
     from scipy.spatial.distance import cdist  # import takes a tenth of a second; help texts do not need it
 
@@ -46,7 +46,7 @@ class Rounded:
         return np.multiply(self.whole, self.step, order="C", dtype=np.float32)
 
 
-def half_precision(table: np.ndarray) -> np.ndarray:
+def round_to_half(table: np.ndarray) -> np.ndarray:
     """Round numbers of any size to the 11 significant bits of half precision, as float32: a file takes half the bytes.
 
     They change by 1 in 2,000 at most.
@@ -56,24 +56,24 @@ def half_precision(table: np.ndarray) -> np.ndarray:
 
 
 @singledispatch
-def taken(index: np.ndarray, table: np.ndarray | Rounded) -> np.ndarray:
+def take_rows_of(index: np.ndarray, table: np.ndarray | Rounded) -> np.ndarray:
     """Return rows of a table (n, ...) at whole numbers of any shape: `table[index]`."""
     return (table.values if isinstance(table, Rounded) else table)[index]
 
 
 @singledispatch
-def product_of(rows: np.ndarray, table: Rounded, index: np.ndarray) -> np.ndarray:
+def multiply_rows(rows: np.ndarray, table: Rounded, index: np.ndarray) -> np.ndarray:
     """Multiply rows (B, k) by the rows of a table (n, r) at an index (k,)."""
     return rows @ table.values[index]
 
 
 @singledispatch
-def columns_in_use(rows: np.ndarray) -> np.ndarray:
+def find_columns_in_use(rows: np.ndarray) -> np.ndarray:
     """Return the columns of rows (B, n) that are not all zero, ascending."""
     return np.flatnonzero(rows.any(axis=0))
 
 
-def in_chunks(predicted: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, most: int = 64) -> np.ndarray:
+def predict_in_chunks(predicted: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, most: int = 64) -> np.ndarray:
     """Predict rows (B, f) in chunks of at most `most`: limits memory."""
     if len(rows) <= most:
         return predicted(rows)

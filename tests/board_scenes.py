@@ -8,9 +8,9 @@ import numpy as np
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
 from ar.tracking.intrinsics import BoardView
-from ar.tracking.targets import calibration_board
+from ar.tracking.targets import build_calibration_board
 
-FACE = calibration_board().faces[0]
+FACE = build_calibration_board().faces[0]
 K = np.array([[560.0, 0.0, 322.5], [0.0, 556.0, 236.0], [0.0, 0.0, 1.0]])
 LENS = Lens(-0.12, 0.06, 8e-4, -6e-4, -0.01)
 WIDTH, HEIGHT = 640, 480

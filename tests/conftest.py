@@ -12,8 +12,8 @@ import pytest
 
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Outcome
-from sim.discretisation.footprint import footprint_weights
-from sim.geometry.tetmesh import TetMesh, oriented
+from sim.discretisation.footprint import compute_footprint_weights
+from sim.geometry.tetmesh import TetMesh, orient_tetrahedra
 from sim.loads import Nodal, Pushed
 from surrogate.regressors.baselines import Ann
 
@@ -36,16 +36,16 @@ def pytest_collection_modifyitems(items):
 
 def pytest_collection_finish():
     """What was imported and collected stays."""
-    settle()
+    copy_to_host()
 
 
 @pytest.fixture(scope="module")
 def ours_alone():
     """What other tests left is not looked through: for tests that ask again and again what lives."""
-    settle()
+    copy_to_host()
 
 
-def settle():
+def copy_to_host():
     """No search for garbage walks again through what lives now."""
     gc.collect()
     gc.freeze()
@@ -63,7 +63,7 @@ def make_box(cells=(12, 12, 7), spacing=6e-3, tumour=10e-3, depth=22e-3, opening
         for k in (0, 1)
     ]
     paths = [(0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7)]
-    tets, _ = oriented(nodes, np.concatenate([np.stack([corner[c] for c in path], axis=1) for path in paths]))
+    tets, _ = orient_tetrahedra(nodes, np.concatenate([np.stack([corner[c] for c in path], axis=1) for path in paths]))
     inside = np.linalg.norm(nodes[tets].mean(axis=1) + [0.0, 0.0, depth], axis=1) < tumour
     mesh = TetMesh(nodes, tets, np.where(inside, 2, 1))
     surface = np.zeros(len(nodes), bool)
@@ -95,7 +95,7 @@ class Pretender:
         pushed, nodal = loads.of(Pushed), loads.of(Nodal)
         force = np.zeros((len(loads), len(mesh.nodes), 3)) if nodal is None else nodal.force
         if pushed is not None:
-            weights = footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()
+            weights = compute_footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()
             force = force + weights[:, :, None] * pushed.force[:, None]
         size = np.linalg.norm(force.sum(axis=1), axis=1)
         linear = np.einsum("vmij,bmj->bvi", self._kelvin, force[:, self._loaded], optimize=True)
@@ -191,9 +191,9 @@ def short_fits():
 
 @pytest.fixture(scope="module")
 def truth(stage):
-    from films import truth_of
+    from films import solve_reference_frames
 
-    return truth_of(stage)
+    return solve_reference_frames(stage)
 
 
 @pytest.fixture(scope="module")
@@ -252,9 +252,9 @@ def study(tmp_path_factory, study_box):
 def study_rows(study):
     from studies import SPECS
 
-    from scenes.report.rows import measured, rows
+    from scenes.report.rows import measure_row, measure_rows
 
-    return tuple(rows(study, SPECS, measured))
+    return tuple(measure_rows(study, SPECS, measure_row))
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 
-from scenes.gym.scripted import scripted
+from scenes.gym.scripted import compute_scripted_actions
 
 SIZE = (48, 36)
 DOWN = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0], np.float32)
@@ -23,7 +23,7 @@ def played(environment, seed, steps, task="palpate"):
     rows = [(seen, 0.0, truth)]
     for _ in range(steps):
         states = seen["states"] if isinstance(seen, dict) else seen
-        seen, reward, terminated, truncated, truth = environment.step(scripted(task, states))
+        seen, reward, terminated, truncated, truth = environment.step(compute_scripted_actions(task, states))
         rows.append((seen, reward, truth))
         if terminated or truncated:
             break

@@ -8,14 +8,14 @@ from contextlib import asynccontextmanager
 import numpy as np
 
 from scenes.link.answer import PoseResponder
-from scenes.link.frame import HEADER, framed, read_header, stamp_of
+from scenes.link.frame import HEADER, pack_message, read_header, to_stamp
 from scenes.link.heard import ReceivedTransforms, TransformNames
 from scenes.link.outgoing import Outgoing
 from scenes.link.session import LinkSession
 
 HOST = "127.0.0.1"
 NAMES = TransformNames()
-NOW = stamp_of(time.time())
+NOW = to_stamp(time.time())
 
 
 def played(scene):
@@ -42,7 +42,7 @@ class Peer:
         return (await self.next("STATUS", name))[1][30:-1].decode()
 
     def send(self, kind, name, body, stamp=0):
-        self.writer.write(framed(kind, name, body, stamp))
+        self.writer.write(pack_message(kind, name, body, stamp))
 
 
 @asynccontextmanager

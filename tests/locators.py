@@ -7,12 +7,12 @@ from conftest import make_box
 
 from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
-from sim.runtime.threads import one_thread
-from surrogate.locating.calibration import trials
-from surrogate.locating.causes import Presses, pressed
+from sim.runtime.threads import limit_to_one_thread
+from surrogate.locating.calibration import run_trials
+from surrogate.locating.causes import Presses, solve_presses
 from surrogate.locating.ensemble import Ensemble
 from surrogate.locating.locator import Locator
-from surrogate.locating.prior import prior_of
+from surrogate.locating.prior import build_prior
 
 
 def in_a_skull() -> Anatomy:
@@ -47,7 +47,7 @@ def locator_of(body: Anatomy, solved: bool = False) -> Locator:
     dents = np.array([[dent(body, random) for _ in range(3)] for _ in points], np.float32)[None]
     presses = Presses(points, {"bonded": dents, "slide": dents})
     if solved:
-        found = pressed(body, ("bonded",), "cpu")
+        found = solve_presses(body, ("bonded",), "cpu")
         presses = replace(found, motion=dict.fromkeys(presses.motion, found.motion["bonded"]))
-    with one_thread():
-        return Locator(prior_of(ensemble, presses), trials(ensemble, presses, count=240))
+    with limit_to_one_thread():
+        return Locator(build_prior(ensemble, presses), run_trials(ensemble, presses, count=240))

@@ -17,7 +17,7 @@ from sim.discretisation.space import Discretisation, discretise
 from sim.discretisation.term import Cases
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide
 from sim.linalg.pcg import Preconditioner
-from sim.linalg.preconditioner import rest_solver
+from sim.linalg.preconditioner import build_rest_solver
 from sim.loads import Loads, Nodal
 from sim.minimisers.lbfgs import Lbfgs
 from sim.minimisers.lbfgs_kernels import DONE
@@ -67,7 +67,7 @@ def descent_of(
     law: str,
 ) -> Descent:
     """What `make` makes of a problem that is `begun`."""
-    found = make(problem, rest_solver(problem), (Elasticity(tissue(law)), *EFFECTS), space)
+    found = make(problem, build_rest_solver(problem), (Elasticity(tissue(law)), *EFFECTS), space)
     assert found is not None
     return found
 
@@ -76,6 +76,6 @@ def equilibria(problem: Problem, total: np.ndarray = TOTAL) -> np.ndarray:
     """By L-BFGS on the whole."""
     problem.begin(Cases(loads_of(total), np.zeros(len(total))))
     start = problem.device.zeros(problem.rows, len(total))
-    found = Lbfgs(problem, rest_solver(problem)).descend(start, np.full(len(total), FINE), 2000)
+    found = Lbfgs(problem, build_rest_solver(problem)).descend(start, np.full(len(total), FINE), 2000)
     assert (found.status == DONE).all()
     return found.u.numpy().copy()

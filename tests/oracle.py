@@ -136,7 +136,7 @@ def monomials(x: np.ndarray) -> np.ndarray:
     return np.column_stack([np.ones(len(x)), x, x**2, x * x[:, [1, 2, 0]]])
 
 
-def quadratic_shapes(x: np.ndarray) -> np.ndarray:
+def compute_quadratic_shapes(x: np.ndarray) -> np.ndarray:
     """The ten shape functions (q, 10) at points (q, 3) of the unit tetrahedron: one at its node, zero at the others."""
     corner = np.vstack([np.zeros(3), np.eye(3)])
     edges = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
@@ -148,7 +148,11 @@ def _quadratic(mesh: TetMesh) -> Samples:
     corner = np.vstack([np.zeros(3), np.eye(3)])
     points = np.vstack([corner, [corner[list(face)].mean(axis=0) for face in combinations(range(4), 3)]])
     local = np.stack(
-        [quadratic_shapes(points + axis / 2.0) - quadratic_shapes(points - axis / 2.0) for axis in np.eye(3)], axis=2
+        [
+            compute_quadratic_shapes(points + axis / 2.0) - compute_quadratic_shapes(points - axis / 2.0)
+            for axis in np.eye(3)
+        ],
+        axis=2,
     )
     assert mesh.middles is not None
     table = np.hstack([mesh.tets, mesh.middles])

@@ -5,7 +5,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from surrogate.data.answer_rows import checksums
+from surrogate.data.answer_rows import compute_row_checksums
 from surrogate.data.dataset import read_rows
 
 
@@ -18,5 +18,5 @@ def poisoned(source: Path, target: Path, rows: np.ndarray, group: str = "answers
         for row in rows:
             stored[row] = wild
         whole, _ = read_rows(file, group, stored.shape[1], 0, len(stored))
-        file[f"{group}/checksum"][:] = checksums(whole)
+        file[f"{group}/checksum"][:] = compute_row_checksums(whole)
     return target, wild

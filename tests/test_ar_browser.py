@@ -10,11 +10,11 @@ import pytest
 from visitor import Visitor, free_port, wait_for
 
 from ar.page.browser import Browser
-from ar.page.elements import PICTURE, SAID, SLICES, STYLE, coded, unparted
+from ar.page.elements import PICTURE, SAID, SLICES, STYLE, keep_together, to_data_url
 from ar.page.guard import LIMITS, ConnectionLimits
 from ar.page.parts import Dropdown, Fold, Note, Playback, SceneSurface, SceneViewpoint, Sign, Slider, Toggle
 from ar.page.recording import RECORDS, STOPS
-from ar.page.style import NOTE, PAGE, STATUS, style
+from ar.page.style import NOTE, PAGE, STATUS, build_style
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 
@@ -102,8 +102,8 @@ def test_picture_and_words_travel_as_one(page):
     assert numbers == sorted(set(numbers))
     for each in sights()[:-1]:
         number = int(re.findall(r"said of frame&nbsp;(\d+)", each)[0])
-        assert coded(pictures[number]) in each
-    assert coded(pictures[39]) in sights()[-1]
+        assert to_data_url(pictures[number]) in each
+    assert to_data_url(pictures[39]) in sights()[-1]
     assert not any("said" in str(each) for each in visitor.updates if "sulcus-next" not in str(each))
 
 
@@ -244,7 +244,7 @@ def test_slices_and_the_last_seconds_arrive_together_and_not_too_often(page):
         time.sleep(0.02)
     assert wait_for(lambda: "seconds of 39" in page.beside.content)
     assert drawn[-1] == 39 and len(drawn) <= 2 + LIMITS.asides * (time.monotonic() - begun)
-    assert coded(np.full((20, 60, 3), 39, np.uint8)) in page.beside.content and SLICES in page.beside.content
+    assert to_data_url(np.full((20, 60, 3), 39, np.uint8)) in page.beside.content and SLICES in page.beside.content
     visitor.wire.close()
 
 
@@ -330,7 +330,7 @@ def test_on_a_phone_distance_and_playback_come_before_what_explains_the_picture(
     assert page.folder is not None
     assert page.text.order < page.folder.order < page.words.order
     # The distance, and eight lines more: whom to trust, what acts, and the verdict even on an earlier load.
-    phone, low = style(4 / 3).split("@media (max-width: 36em)")[1:]
+    phone, low = build_style(4 / 3).split("@media (max-width: 36em)")[1:]
     (size,) = map(float, re.findall(rf"#{SAID} {{ font-size: ([0-9.]+)rem }}", phone))
     (high,) = map(float, re.findall(rf"#{SAID} {{ max-height: ([0-9.]+)rem; overflow-y: auto;", low))
     assert high >= 1.25 * 1.4 + 8 * 1.4 * size
@@ -339,12 +339,15 @@ def test_on_a_phone_distance_and_playback_come_before_what_explains_the_picture(
 
 
 def test_no_new_line_parts_a_number_from_its_unit():
-    assert unparted('<p style="top: 3 px">in 4.72 mm (95 %)') == '<p style="top: 3 px">in&nbsp;4.72&nbsp;mm (95&nbsp;%)'
+    assert (
+        keep_together('<p style="top: 3 px">in 4.72 mm (95 %)')
+        == '<p style="top: 3 px">in&nbsp;4.72&nbsp;mm (95&nbsp;%)'
+    )
 
 
 def test_a_wide_window_has_its_controls_in_two_columns(page):
     """All of them in sight in 1280 x 720, and the words over them as wide as both."""
-    wide = style(4 / 3).split("@media (min-width: 75em) and (min-aspect-ratio: 13/10) {")[1].split("@media")[0]
+    wide = build_style(4 / 3).split("@media (min-width: 75em) and (min-aspect-ratio: 13/10) {")[1].split("@media")[0]
     holder = f"div:has(> div > #{SAID})"
     assert 75 * 16 <= 1280 and f"{holder} {{ display: grid; grid-template-columns: 1fr 1fr;" in wide
     assert wide.index(f"{holder} > * {{ grid-column: 1 / -1 }}") < wide.index(f"{holder} > div:has(> button)")
@@ -359,7 +362,7 @@ def test_the_line_over_the_picture_comes_and_goes(page):
 
 def test_the_line_over_the_picture_leaves_the_words_at_its_head_in_sight():
     """They stand at the left."""
-    (rule,) = re.findall(rf"#{STATUS} {{ position: fixed; (.*?) }}", style(4 / 3))
+    (rule,) = re.findall(rf"#{STATUS} {{ position: fixed; (.*?) }}", build_style(4 / 3))
     assert "right: calc(100vw - var(--w)" in rule and "left:" not in rule
 
 
@@ -391,7 +394,7 @@ def test_a_body_changes_its_colour(page):
 
 
 def test_the_rules_know_the_picture_s_shape_and_the_page_s_elements(page):
-    sheet = style(4 / 3)
+    sheet = build_style(4 / 3)
     assert "--aspect: 1.3333" in sheet and sheet.startswith("<style>") and sheet.count("{") == sheet.count("}")
     assert f".{NOTE}" in sheet
     for name in (PAGE, PICTURE, SAID, STATUS):

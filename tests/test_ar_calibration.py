@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from ar.optics.calibration import LONGEST_TEXT, Calibration, opencv_text, parsed, ros_text
+from ar.optics.calibration import LONGEST_TEXT, Calibration, parse_calibration, to_opencv_text, to_ros_text
 from ar.optics.lens import Lens
 
 SOME = Calibration((820.5, 818.25), (321.0, 236.5), 640, 480, Lens(-0.31, 0.12, 1e-3, -2e-3, -0.02), "left/1")
@@ -60,13 +60,13 @@ LENS = "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0.1, -0.2, 0.0,
 
 
 @pytest.mark.parametrize("calibration", [SOME, RATIONAL])
-@pytest.mark.parametrize("form", [opencv_text, ros_text])
+@pytest.mark.parametrize("form", [to_opencv_text, to_ros_text])
 def test_what_is_written_is_read_again(calibration, form):
-    assert parsed(form(calibration)) == calibration
+    assert parse_calibration(form(calibration)) == calibration
 
 
 def test_opencv_reads_what_we_write():
-    storage = cv2.FileStorage(opencv_text(SOME), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    storage = cv2.FileStorage(to_opencv_text(SOME), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     assert np.array_equal(storage.getNode("camera_matrix").mat(), SOME.K)
     assert storage.getNode("distortion_coefficients").mat().ravel().tolist() == [-0.31, 0.12, 1e-3, -2e-3, -0.02]
     assert storage.getNode("image_width").real() == 640 and storage.getNode("camera_name").string() == "left/1"
@@ -74,7 +74,7 @@ def test_opencv_reads_what_we_write():
 
 @pytest.mark.parametrize("calibration", [SOME, RATIONAL])
 def test_any_yaml_reader_reads_what_we_write_for_ros(calibration):
-    found = yaml.safe_load(ros_text(calibration))
+    found = yaml.safe_load(to_ros_text(calibration))
     assert found["camera_name"] == calibration.name and found["image_height"] == 480
     assert (
         found["distortion_model"]
@@ -88,11 +88,11 @@ def test_any_yaml_reader_reads_what_we_write_for_ros(calibration):
 
 def test_pictures_of_another_size_are_scaled_only_if_asked_and_of_the_same_shape():
     with pytest.raises(ValueError, match=r"640 x 480, not 320 x 240: calibrate with that size, or ask"):
-        SOME.sized(320, 240)
+        SOME.resize_calibration(320, 240)
     with pytest.raises(ValueError, match=r"not 640 x 360, which have another shape"):
-        SOME.sized(640, 360, scale=True)
-    assert SOME.sized(640, 480) is SOME
-    half, points = SOME.sized(320, 240, scale=True), np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.0]])
+        SOME.resize_calibration(640, 360, scale=True)
+    assert SOME.resize_calibration(640, 480) is SOME
+    half, points = SOME.resize_calibration(320, 240, scale=True), np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.0]])
     pixels = [one.camera(np.eye(4)).project(points)[0] + 0.5 for one in (half, SOME)]
     assert np.allclose(2.0 * pixels[0], pixels[1]) and half.lens == SOME.lens and half.name == SOME.name
 
@@ -101,21 +101,21 @@ def test_the_camera_of_a_calibration_is_opencvs():
     camera, points = SOME.camera(np.eye(4)), np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.0]])
     wanted = cv2.projectPoints(points, np.zeros(3), np.zeros(3), SOME.K, SOME.lens.coefficients[:5])[0]
     assert np.allclose(camera.project(points)[0], wanted.reshape(-1, 2), atol=1e-9)
-    assert repr(SOME) == repr(parsed(ros_text(SOME)))
+    assert repr(SOME) == repr(parse_calibration(to_ros_text(SOME)))
 
 
 def test_what_others_write_is_read():
-    ros, opencv = parsed(ROS), parsed(OPENCV)
+    ros, opencv = parse_calibration(ROS), parse_calibration(OPENCV)
     assert ros == Calibration(
         (520, 521.5), (320.5, 240), 640, 480, Lens(-0.25, 0.05, 1e-3, -2e-4), "narrow_stereo/left"
     )
     assert opencv == Calibration((900, 900), (639.5, 359.5), 1280, 720, Lens(-0.2, 0.1, 1e-3, 2e-3))
     block = "data:\n" + "".join(f"      - {value}\n" for value in [900, 0, 639.5, 0, 900, 359.5, 0, 0, 1])
-    assert parsed(re.sub(r"data: \[ 9.*\]\n", block, OPENCV)) == opencv
-    assert parsed("\ufeff---\n" + ROS.replace("\n", "\r\n")) == ros
-    assert parsed(ROS.replace("narrow_stereo/left", "17")).name == "17"
+    assert parse_calibration(re.sub(r"data: \[ 9.*\]\n", block, OPENCV)) == opencv
+    assert parse_calibration("\ufeff---\n" + ROS.replace("\n", "\r\n")) == ros
+    assert parse_calibration(ROS.replace("narrow_stereo/left", "17")).name == "17"
     twelve = OPENCV.replace("rows: 4", "rows: 12").replace("2.0e-03 ]", "2.0e-03, 0, 0.1, 0.01, 0, 0, 0, 0, 0 ]")
-    assert parsed(twelve).lens == Lens(-0.2, 0.1, 1e-3, 2e-3, 0.0, 0.1, 0.01)
+    assert parse_calibration(twelve).lens == Lens(-0.2, 0.1, 1e-3, 2e-3, 0.0, 0.1, 0.01)
 
 
 def changed(old, new, text=ROS):
@@ -173,14 +173,14 @@ def changed(old, new, text=ROS):
 )
 def test_what_is_wrong_is_refused_by_name_with_a_remedy(text, reason):
     with pytest.raises(ValueError, match=reason) as refused:
-        parsed(text)
+        parse_calibration(text)
     assert re.search(r"[.:;] .+", str(refused.value)) and len(str(refused.value)) < 400
 
 
 def test_damage_never_raises_anything_else():
     """Cut off anywhere, or with other characters in it: a sentence of ours, or a calibration."""
     random, signs = np.random.default_rng(0), list("\n\t :-[]{}\"'#&*!|>%@0.9eé\\")
-    for text in (ROS, OPENCV, opencv_text(RATIONAL)):
+    for text in (ROS, OPENCV, to_opencv_text(RATIONAL)):
         damaged = [text[:cut] for cut in range(0, len(text), 7)]
         for _ in range(300):
             letters = list(text)
@@ -189,7 +189,7 @@ def test_damage_never_raises_anything_else():
             damaged.append("".join(letters))
         for each in damaged:
             try:
-                assert np.isfinite(parsed(each).K).all()
+                assert np.isfinite(parse_calibration(each).K).all()
             except ValueError as error:
                 assert str(error)
 
@@ -199,11 +199,11 @@ def test_damage_never_raises_anything_else():
 def test_calibration_of_ros_with_plain_names_and_lists_is_read(name, inset):
     lists = MATRIX.format("".join(f"{inset}- {number}\n" for number in NUMBERS))
     for start in ("", "\ufeff", "%YAML:1.0\n---\n", "stamp: 12:30:01\nnote: 3rd\n"):
-        found = parsed(start + PLAIN.format(name, lists, LENS))
+        found = parse_calibration(start + PLAIN.format(name, lists, LENS))
         assert found.name == name.strip('"') and found.focal == (500.0, 500.0) and found.lens.k1 == 0.1
 
 
 def test_calibration_of_zeros_is_not_calibrated():
     lists = MATRIX.format("  - 0.0\n" * 9)
     with pytest.raises(ValueError, match="a camera that is not calibrated: calibrate it first"):
-        parsed(PLAIN.format("cam", lists, LENS))
+        parse_calibration(PLAIN.format("cam", lists, LENS))

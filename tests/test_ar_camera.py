@@ -9,18 +9,27 @@ from test_ar_lens import SOME, scene, seen_by
 from test_ar_renderer import LAMP
 from theatres import template_theatre
 
-from ar.optics.calibration import opencv_text, parsed, ros_text
-from ar.optics.camera import BASELINE, Camera, look_at, project_cv2, row_bands, row_time, stereo_pair, time_of_point
+from ar.optics.calibration import parse_calibration, to_opencv_text, to_ros_text
+from ar.optics.camera import (
+    BASELINE,
+    Camera,
+    compute_row_time,
+    find_row_time,
+    look_at,
+    project_cv2,
+    split_row_bands,
+    stereo_pair,
+)
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Lamp, Renderer, render
 from scenes.play.player import Player
 from scenes.script.camera_paths import HandHeld
 from scenes.script.scene import find_scene
-from scenes.tracked.filming import USUAL, VIEW, Taking, mounted, registered, shots_of
+from scenes.tracked.filming import USUAL, VIEW, Taking, mount_targets, register_with_error, render_shots
 from scenes.tracked.follower import Follower, TumourState
 from scenes.tracked.tool_motion import ToolMotion
 from sim.anatomy import Anatomy
-from surrogate.model.learned import predicted
+from surrogate.model.learned import build_prediction
 
 EYE, TARGET, UP = np.array([0.1, -0.3, 0.2]), np.array([0.02, 0.01, 0.05]), np.array([0.0, 0.0, 1.0])
 CAMERA = look_at(np.array([0.0, 0.0, -0.4]), np.zeros(3), np.array([0.0, -1.0, 0.0]), np.radians(16.0), 400, 300)
@@ -40,7 +49,7 @@ def points_in_front(count: int = 200) -> np.ndarray:
 def test_projection_is_opencvs():
     camera = some_camera()
     skewed = Camera(camera.K + [[0, 3.0, 7.5], [0, 12.0, -4.0], [0, 0, 0]], camera.T_camera_world, 320, 200)
-    for one in (camera, camera.perturbed(3.0, (1.0, 2.0, -1.0))):
+    for one in (camera, camera.perturb(3.0, (1.0, 2.0, -1.0))):
         pixels, _ = one.project(points_in_front())
         assert np.abs(pixels - project_cv2(one, points_in_front())).max() < 1e-9
     # OpenCV has no skew, so a skewed camera must be noticed by the comparison.
@@ -71,9 +80,9 @@ def test_points_behind_have_no_pixel():
 
 def test_half_a_degree_moves_the_picture_by_half_a_degree():
     camera = some_camera()
-    moved, _ = camera.perturbed(0.5).project(TARGET)
+    moved, _ = camera.perturb(0.5).project(TARGET)
     assert moved - [159.5, 99.5] == pytest.approx([camera.K[0, 0] * np.tan(np.radians(0.5)), 0.0], abs=1e-9)
-    assert camera.perturbed(0.5).centre == pytest.approx(EYE)
+    assert camera.perturb(0.5).centre == pytest.approx(EYE)
 
 
 @pytest.mark.parametrize("aspect", [2.5, 1.6, 1.0, 0.45])
@@ -95,7 +104,7 @@ def test_twice_the_pixels_see_the_same_view():
 
 def test_the_camera_of_a_part_of_the_picture_sees_that_part():
     camera = some_camera()
-    part = camera.cropped(slice(20, 150), slice(30, 290))
+    part = camera.crop_to(slice(20, 150), slice(30, 290))
     assert (part.width, part.height) == (260, 130)
     assert np.allclose(part.project(points_in_front())[0] + [30, 20], camera.project(points_in_front())[0])
 
@@ -131,7 +140,7 @@ def near_points() -> np.ndarray:
 def test_a_camera_is_moved_along_its_own_axes():
     camera, shift = some_camera(), np.array([0.01, -0.02, 0.03])
     moved = camera.moved(shift)
-    assert np.allclose(moved.in_frame(points_in_front()), camera.in_frame(points_in_front()) - shift)
+    assert np.allclose(moved.to_camera_frame(points_in_front()), camera.to_camera_frame(points_in_front()) - shift)
     assert moved.centre == pytest.approx(EYE + shift @ camera.T_camera_world[:3, :3])
 
 
@@ -153,10 +162,10 @@ def test_focus_changes_the_size_as_a_thin_lens_does():
     for d in (0.2, 0.3, 1e9):
         b = 1.0 / (1.0 / 50e-3 - 1.0 / d)
         start = 1.0 / (1.0 / 50e-3 - 1.0 / 0.25)
-        assert camera.refocused(50e-3, 0.25, d).K[0, 0] == pytest.approx(camera.K[0, 0] * b / start)
+        assert camera.refocus(50e-3, 0.25, d).K[0, 0] == pytest.approx(camera.K[0, 0] * b / start)
     for wrong in ((50e-3, 0.25, 0.04), (0.0, 0.25, 0.3), (50e-3, np.nan, 0.3), (50e-3, 0.05, 0.3)):
         with pytest.raises(ValueError, match="focus farther"):
-            camera.refocused(*wrong)
+            camera.refocus(*wrong)
 
 
 def test_parallel_eyes_see_the_same_rows_and_depth_by_disparity():
@@ -174,7 +183,9 @@ def test_converging_eyes_meet_at_the_working_distance():
     left, right = stereo_pair(camera, 30e-3, distance)
     for one in (left, right):
         assert one.project(TARGET)[0] == pytest.approx([159.5, 99.5], abs=1e-9)
-    assert left.in_frame(right.centre)[0] > 0.0 and np.linalg.norm(left.centre - right.centre) == pytest.approx(30e-3)
+    assert left.to_camera_frame(right.centre)[0] > 0.0 and np.linalg.norm(left.centre - right.centre) == pytest.approx(
+        30e-3
+    )
     assert left.T_camera_world[2, :3] @ right.T_camera_world[2, :3] == pytest.approx(
         np.cos(2.0 * np.arctan(15e-3 / distance))
     )
@@ -208,7 +219,9 @@ class Still:
     def deform(self, loads, start=None, at=None):
         every = np.arange(len(self.anatomy.mesh.nodes))
         none = np.full((2, len(loads)), np.nan)
-        return predicted(np.zeros((len(loads), len(every), 3)), every, loads, [False] * len(loads), 0.0, none, "")
+        return build_prediction(
+            np.zeros((len(loads), len(every), 3)), every, loads, [False] * len(loads), 0.0, none, ""
+        )
 
 
 def camera_at(after):
@@ -227,7 +240,7 @@ def discs(radius=3e-3, corners=48):
 def test_each_row_is_drawn_where_the_camera_is_when_it_is_taken():
     layers = discs()
     renderer = Renderer(layers, Lamp(np.array([0.0, 0.0, -0.4]), np.zeros(3), 0.2))
-    bands = row_bands(camera_at, READOUT, GRID)
+    bands = split_row_bands(camera_at, READOUT, GRID)
     vertices = [layer.vertices for layer in layers]
     drawn = np.concatenate([renderer.picture(camera, vertices).segmentation for _, camera in bands])
     assert drawn.shape == (300, 400) and len(bands) > 5
@@ -242,51 +255,51 @@ def test_each_row_is_drawn_where_the_camera_is_when_it_is_taken():
             row = pixel[1]
         apart.append(np.linalg.norm(middle - pixel))
         assert np.linalg.norm(camera_at(0.0).project(place[None])[0][0] - pixel) < 20.0
-        assert time_of_point(camera_at, READOUT, place) == pytest.approx(row_time(row, 300, READOUT), abs=1e-6)
+        assert find_row_time(camera_at, READOUT, place) == pytest.approx(compute_row_time(row, 300, READOUT), abs=1e-6)
     assert max(apart) < 0.3
     moved = [np.linalg.norm(camera_at(0.0).project(place[None])[0][0] - still[n]) for n, place in enumerate(GRID)]
     assert max(moved) > 1.0  # the test would see a shutter that does not roll
 
 
 def test_a_camera_that_stays_has_one_band_and_rows_beyond_the_picture_are_its_borders():
-    ((rows, camera),) = row_bands(lambda after: CAMERA, READOUT, GRID)
+    ((rows, camera),) = split_row_bands(lambda after: CAMERA, READOUT, GRID)
     assert rows == slice(0, 300) and (camera.width, camera.height) == (400, 300)
-    np.testing.assert_allclose(row_time(np.array([-5, 0, 299, 400]), 300, 0.03), [-0.015, -0.015, 0.015, 0.015])
-    assert time_of_point(camera_at, READOUT, np.array([0.0, 0.0, -1.0])) == 0.0  # behind it
+    np.testing.assert_allclose(compute_row_time(np.array([-5, 0, 299, 400]), 300, 0.03), [-0.015, -0.015, 0.015, 0.015])
+    assert find_row_time(camera_at, READOUT, np.array([0.0, 0.0, -1.0])) == 0.0  # behind it
 
 
 def test_files_have_the_readout_and_others_stay_as_they_were():
-    for text in (opencv_text, ros_text):
-        assert parsed(text(replace(USUAL, readout=0.0125))).readout == 0.0125
-        assert "readout" not in text(USUAL) and parsed(text(USUAL)).readout == 0.0
+    for text in (to_opencv_text, to_ros_text):
+        assert parse_calibration(text(replace(USUAL, readout=0.0125))).readout == 0.0125
+        assert "readout" not in text(USUAL) and parse_calibration(text(USUAL)).readout == 0.0
         with pytest.raises(ValueError, match="readout_time must be a number"):
-            parsed(text(USUAL) + 'readout_time: "fast"\n')
+            parse_calibration(text(USUAL) + 'readout_time: "fast"\n')
         with pytest.raises(ValueError, match="read in 0 to 1 s"):
-            parsed(text(USUAL) + "readout_time: -1\n")
-    assert replace(USUAL, readout=0.02).sized(640, 480, scale=True).readout == 0.02
+            parse_calibration(text(USUAL) + "readout_time: -1\n")
+    assert replace(USUAL, readout=0.02).resize_calibration(640, 480, scale=True).readout == 0.02
 
 
 @pytest.fixture(scope="module")
 def player():
     theatre = template_theatre()
-    small = replace(USUAL.sized(800, 600, scale=True), readout=READOUT)
+    small = replace(USUAL.resize_calibration(800, 600, scale=True), readout=READOUT)
     view = replace(VIEW.calibrated(small), path=HandHeld(0))
     return Player(theatre.stage(replace(find_scene("palpate"), viewpoint=view, duration=0.1)), Still(theatre.anatomy))
 
 
 def test_a_film_rolls_and_what_is_drawn_into_it_says_how_far_off_that_makes_it(player):
-    mounts = mounted(player)
-    shots = list(shots_of(player, mounts, Taking(noise=0.0)))
+    mounts = mount_targets(player)
+    shots = list(render_shots(player, mounts, Taking(noise=0.0)))
     calibration = player.scene.viewpoint.calibration
     assert calibration is not None
     still = replace(player.scene.viewpoint, calibration=replace(calibration, readout=0.0))
     other = replace(player, stage=replace(player.stage, scene=replace(player.scene, viewpoint=still)))
-    plain = next(iter(shots_of(other, mounts, Taking(noise=0.0))))
+    plain = next(iter(render_shots(other, mounts, Taking(noise=0.0))))
     rows = np.abs(plain.colour.astype(int) - shots[0].colour).mean(axis=(1, 2))
     assert rows[290:310].mean() < 0.4 * max(rows[:100].mean(), rows[500:].mean())  # the middle row has its time
     follower = Follower(
         calibration,
-        registered(player.site, mounts, 0.0, 0.0, 0),
+        register_with_error(player.site, mounts, 0.0, 0.0, 0),
         mounts.tool,
         ToolMotion(player.stage, player.deformer),
     )

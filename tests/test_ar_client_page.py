@@ -7,8 +7,8 @@ from contextlib import closing
 import pytest
 from test_ar_guard import Page
 
-from ar.page.client_page import SCRIPT, WITHOUT, own_document
-from ar.page.style import style
+from ar.page.client_page import SCRIPT, WITHOUT, build_document
+from ar.page.style import build_style
 
 
 @pytest.mark.parametrize("encoding", ["gzip", "identity"])
@@ -26,5 +26,5 @@ def test_page_has_own_title_icon_and_script(encoding):
 
 
 def test_unknown_document_is_left_as_it_is():
-    assert own_document(b"<p>none</p>", False) == b"<p>none</p>"
-    assert f":root.{WITHOUT} canvas" in style(1.3)
+    assert build_document(b"<p>none</p>", False) == b"<p>none</p>"
+    assert f":root.{WITHOUT} canvas" in build_style(1.3)

@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 from test_ar_styles import CAMERA, CORTEX, GREEN, seen, tumour
 
-from ar.overlay.cut import EMPTY, CutPlane, plane_through, profile, section
+from ar.overlay.cut import EMPTY, CutPlane, build_plane, compute_profile, draw_section
 from ar.overlay.hud import WHITE
-from ar.overlay.outlines import ink_of, key_of, of_ink
+from ar.overlay.outlines import compute_ink, find_ink, to_key
 from ar.overlay.window import SHUT, Roles
 
 
 def test_a_cut_holds_camera_tip_and_middle():
     middle, tip = np.array([0.0, 0.0, -0.02]), np.array([0.01, 0.004, 0.0])
-    plane = plane_through(CAMERA, middle, tip)
+    plane = build_plane(CAMERA, middle, tip)
     normal = np.cross(plane.across, plane.along)
     assert np.abs([(tip - middle) @ normal, (CAMERA.centre - middle) @ normal]).max() < 1e-12
     assert plane.across @ CAMERA.T_camera_world[0, :3] > 0.0
-    level = plane_through(CAMERA, middle, CAMERA.centre + 0.9 * (middle - CAMERA.centre))
-    np.testing.assert_allclose(level.across, plane_through(CAMERA, middle, None).across)
+    level = build_plane(CAMERA, middle, CAMERA.centre + 0.9 * (middle - CAMERA.centre))
+    np.testing.assert_allclose(level.across, build_plane(CAMERA, middle, None).across)
     assert abs(level.across @ CAMERA.T_camera_world[1, :3]) < 1e-12
     places = np.array([[0.002, -0.01], [0.0, 0.0]])
     np.testing.assert_allclose(plane.coordinates(plane.points(places)), places, atol=1e-15)
@@ -25,27 +25,29 @@ def test_a_cut_holds_camera_tip_and_middle():
 
 def test_a_cut_shows_the_surface_the_section_and_nothing_in_the_air():
     picture, at = seen(0.0), tumour()
-    plane: CutPlane = plane_through(CAMERA, at.vertices.mean(axis=0), None)
+    plane: CutPlane = build_plane(CAMERA, at.vertices.mean(axis=0), None)
     roles = Roles((), (CORTEX,)).of(picture.segmentation)
-    places, what = profile(CAMERA, plane, picture.depth, roles, 0.04)
+    places, what = compute_profile(CAMERA, plane, picture.depth, roles, 0.04)
     assert np.abs(plane.points(places)[:, 2]).max() < 2e-4  # the sheet lies at z = 0
     right = plane.points(places)[:, 0] > 5e-4
     assert (what[right] == SHUT).all() and not what[plane.points(places)[:, 0] < -5e-4].any()
-    ink = key_of(ink_of(GREEN))
-    inset = section(CAMERA, at, plane, (places, what), (240, 180), ink)
+    ink = to_key(compute_ink(GREEN))
+    inset = draw_section(CAMERA, at, plane, (places, what), (240, 180), ink)
     bar = np.flatnonzero((inset[-6] == np.asarray(WHITE, np.uint8)).all(axis=1))
     scale = (np.ptp(bar) - 1) / 0.01  # the bar is 10 mm
-    assert of_ink(inset, ink).sum() == pytest.approx(np.pi * (0.012 * scale) ** 2, rel=0.1)
-    assert of_ink(inset, EMPTY)[:8].mean() > 0.8 and not of_ink(inset, EMPTY)[-60:-20].any()
+    assert find_ink(inset, ink).sum() == pytest.approx(np.pi * (0.012 * scale) ** 2, rel=0.1)
+    assert find_ink(inset, EMPTY)[:8].mean() > 0.8 and not find_ink(inset, EMPTY)[-60:-20].any()
 
 
 @pytest.mark.parametrize("error", [2e-3, 6e-3])
 def test_cut_draws_its_broken_line_at_the_error(error):
-    at, ink = tumour(), key_of(ink_of(GREEN))
-    plane = plane_through(CAMERA, at.vertices.mean(axis=0), None)
+    at, ink = tumour(), to_key(compute_ink(GREEN))
+    plane = build_plane(CAMERA, at.vertices.mean(axis=0), None)
     places = plane.coordinates(np.array([[-0.03, 0.0, 0.0], [0.03, 0.0, 0.0]])), np.zeros(2, int)
-    with_line, without = (section(CAMERA, at, plane, places, (240, 180), ink, error=each) for each in (error, None))
-    inside = np.argwhere(of_ink(without, ink))
+    with_line, without = (
+        draw_section(CAMERA, at, plane, places, (240, 180), ink, error=each) for each in (error, None)
+    )
+    inside = np.argwhere(find_ink(without, ink))
     scale = np.ptp(inside[:, 1]) / 0.024
     away = np.linalg.norm(np.argwhere((with_line != without).any(axis=2)) - inside.mean(axis=0), axis=1) / scale
     assert len(away) > 40 and np.median(away) == pytest.approx(0.012 + error, abs=0.4e-3)

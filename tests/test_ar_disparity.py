@@ -10,8 +10,8 @@ from test_ar_lens import SOME
 from ar.optics.camera import Camera, look_at, stereo_pair
 from ar.rendering.layer import Layer, Solid
 from ar.rendering.renderer import Lamp, Picture, Renderer
-from ar.stereo.disparity import Cloud, cloud, followed, supported, viewed
-from ar.stereo.rectified import Rectified, rectified
+from ar.stereo.disparity import Cloud, compute_stereo_view, find_supported, follow_pixels, triangulate_cloud
+from ar.stereo.rectified import Rectified, rectify
 
 TARGET, REACH, FINE = np.array([0.04, 0.03, 0.02]), 15e-3, 6000.0
 LAMP = Lamp(TARGET + [0.05, 0.05, 0.3], TARGET, radius=0.06)
@@ -55,7 +55,7 @@ def taken(picture: Picture, seed: int, darker: float = 1.0) -> np.ndarray:
 
 
 def window_of(pair: tuple[Camera, Camera]) -> Rectified:
-    return rectified(*pair, tuple(TARGET.tolist()), REACH, FINE)
+    return rectify(*pair, tuple(TARGET.tolist()), REACH, FINE)
 
 
 def grid(size: int) -> np.ndarray:
@@ -88,7 +88,7 @@ def pictures(pair):
 
 @pytest.fixture(scope="module")
 def view(geometry, pictures):
-    return viewed(geometry, *(taken(picture, seed) for seed, picture in enumerate(pictures)))
+    return compute_stereo_view(geometry, *(taken(picture, seed) for seed, picture in enumerate(pictures)))
 
 
 def test_windows_show_what_cameras_with_lenses_see(pair, geometry):
@@ -110,8 +110,8 @@ def test_windows_show_what_cameras_with_lenses_see(pair, geometry):
 @pytest.mark.parametrize("darker", [1.0, 0.85])
 def test_depths_are_as_far_off_as_is_said(pair, geometry, pictures, darker):
     pixels = grid(geometry.size)
-    view = viewed(geometry, taken(pictures[0], 0), taken(pictures[1], 1, darker))
-    found = cloud(view, pixels)
+    view = compute_stereo_view(geometry, taken(pictures[0], 0), taken(pictures[1], 1, darker))
+    found = triangulate_cloud(view, pixels)
     error = off(found, pixels, geometry, pair[0], pictures[0])
     assert len(found.which) > 0.9 * len(pixels)
     assert np.sqrt((error**2).mean()) < 0.35e-3 and abs(error.mean()) < 0.1e-3
@@ -123,7 +123,9 @@ def test_noisier_pictures_are_stated_to_be_farther_off(geometry, pictures):
     sigma = []
     for noise in (0.0, 10.0):
         noisy = [picture.colour + noise * random.standard_normal(picture.colour.shape) for picture in pictures]
-        found = cloud(viewed(geometry, *(np.clip(each, 0.0, 255.0).astype(np.uint8) for each in noisy)), pixels)
+        found = triangulate_cloud(
+            compute_stereo_view(geometry, *(np.clip(each, 0.0, 255.0).astype(np.uint8) for each in noisy)), pixels
+        )
         sigma.append(np.median(found.sigma))
     assert sigma[1] > 1.25 * sigma[0]
 
@@ -133,10 +135,10 @@ def test_glare_is_left_out(pair, geometry, pictures):
     for picture in lit:
         for column, row in random.integers((100, 60), (220, 180), (20, 2)).tolist():
             picture[row - 1 : row + 2, column - 1 : column + 2] = 255
-    pixels, view = grid(geometry.size), viewed(geometry, *lit)
+    pixels, view = grid(geometry.size), compute_stereo_view(geometry, *lit)
     white = [window.min(axis=2) > 250 for window in geometry.windows(*lit)]
     assert white[0].any() and view.hidden[white[0]].all() and view.hidden_right[white[1]].all()
-    found = cloud(view, pixels)
+    found = triangulate_cloud(view, pixels)
     assert 0.3 * len(pixels) < len(found.which) < 0.9 * len(pixels)
     error = off(found, pixels, geometry, pair[0], pictures[0])
     assert np.sqrt((error**2).mean()) < 0.6e-3 and np.median(np.abs(error)) < 0.25e-3
@@ -147,10 +149,10 @@ def test_what_a_tool_hides_in_either_eye_is_no_point(geometry, pictures, view):
     left, right = none.copy(), none.copy()
     left[:, :140], right[:, 180:] = True, True
     colours = [taken(picture, seed) for seed, picture in enumerate(pictures)]
-    found = cloud(viewed(geometry, *colours, (left, right)), pixels)
+    found = triangulate_cloud(compute_stereo_view(geometry, *colours, (left, right)), pixels)
     disparity = geometry.place(found.points)[1]
     at = [pixels[found.which], pixels[found.which] - np.stack([disparity, np.zeros_like(disparity)], axis=1)]
-    assert len(found.which) > 20 and len(found.which) < 0.6 * len(cloud(view, pixels).which)
+    assert len(found.which) > 20 and len(found.which) < 0.6 * len(triangulate_cloud(view, pixels).which)
     for mask, place in zip(geometry.windows(left.astype(np.uint8), right.astype(np.uint8)), at, strict=True):
         column, row = place.round().astype(int).T
         assert mask.any() and not mask[row, column].any()
@@ -158,33 +160,35 @@ def test_what_a_tool_hides_in_either_eye_is_no_point(geometry, pictures, view):
 
 def test_light_alone_tells_no_depth(pair, geometry):
     plain = Renderer([bulge(texture=0.0)], LAMP, "cpu")
-    view = viewed(geometry, *(taken(picture, seed) for seed, picture in enumerate(shot(pair, renderer=plain))))
-    assert not len(cloud(view, grid(geometry.size)).which)
+    view = compute_stereo_view(
+        geometry, *(taken(picture, seed) for seed, picture in enumerate(shot(pair, renderer=plain)))
+    )
+    assert not len(triangulate_cloud(view, grid(geometry.size)).which)
 
 
 def test_other_cameras_and_blind_eyes_are_refused(pair, geometry, pictures):
     left, right = (taken(picture, seed) for seed, picture in enumerate(pictures))
     with pytest.raises(ValueError, match="the right eye sees nothing"):
-        viewed(geometry, left, np.zeros_like(right))
+        compute_stereo_view(geometry, left, np.zeros_like(right))
     with pytest.raises(ValueError, match="which is which"):
         window_of(pair[::-1])
     with pytest.raises(ValueError, match="ahead of the eyes"):
-        rectified(*pair, tuple(2.0 * pair[0].centre - TARGET), REACH, FINE)
-    turned = pair[0], pair[1].perturbed(0.06, (1.0, 0.0, 0.0))
+        rectify(*pair, tuple(2.0 * pair[0].centre - TARGET), REACH, FINE)
+    turned = pair[0], pair[1].perturb(0.06, (1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="pixels apart: calibrate the pair again"):
-        cloud(viewed(window_of(turned), left, right), grid(geometry.size))
+        triangulate_cloud(compute_stereo_view(window_of(turned), left, right), grid(geometry.size))
 
 
 def test_points_are_followed_over_many_pixels(pair, geometry, view):
     """By 5 mm, 30 pixels, in each direction in turn: where they come to is found in three dimensions."""
     pixels = grid(geometry.size)
-    known = cloud(view, pixels)
+    known = triangulate_cloud(view, pixels)
     for seed, motion in enumerate(np.array([[5e-3, 0.0, 0.0], [-2e-3, 4e-3, -2e-3]]), start=5):
-        later = viewed(geometry, *(taken(picture, seed) for picture in shot(pair, motion)))
-        which, there = followed(view, later, pixels[known.which])
-        found = cloud(later, there)
+        later = compute_stereo_view(geometry, *(taken(picture, seed) for picture in shot(pair, motion)))
+        which, there = follow_pixels(view, later, pixels[known.which])
+        found = triangulate_cloud(later, there)
         moved = found.points - known.points[which[found.which]]
-        good = supported(found.points, moved)
+        good = find_supported(found.points, moved)
         assert good.sum() > 0.5 * len(known.which) and good.mean() > 0.9
         error = np.linalg.norm(moved - motion, axis=1)[good]
         assert np.median(error) < 0.25e-3 and np.quantile(error, 0.95) < 0.8e-3
@@ -193,7 +197,7 @@ def test_points_are_followed_over_many_pixels(pair, geometry, view):
 def test_nothing_is_followed_into_another_picture(geometry, view):
     random = np.random.default_rng(0)
     other = replace(view, left=random.integers(0, 255, view.left.shape, dtype=np.uint8))
-    which, there = followed(view, other, grid(geometry.size))
+    which, there = follow_pixels(view, other, grid(geometry.size))
     assert len(which) == len(there) < 3
 
 
@@ -211,7 +215,7 @@ def test_point_that_leads_back_elsewhere_is_dropped(geometry, view, monkeypatch)
         )
 
     monkeypatch.setattr("cv2.calcOpticalFlowPyrLK", matched)
-    which, _ = followed(view, replace(view, hidden=np.zeros_like(view.hidden)), pixels)
+    which, _ = follow_pixels(view, replace(view, hidden=np.zeros_like(view.hidden)), pixels)
     assert len(ends) == 2 and len(which) == len(ends[0]) // 2
 
 
@@ -219,5 +223,5 @@ def test_a_motion_unlike_its_neighbours_has_no_support():
     random = np.random.default_rng(0)
     places, motions = random.uniform(0.0, 0.02, (60, 3)), 1e-4 * random.standard_normal((60, 3)) + 3e-3
     motions[[4, 30]] += [2e-3, 0.0, 0.0]
-    assert np.flatnonzero(~supported(places, motions)).tolist() == [4, 30]
-    assert supported(places[:8], motions[:8]).all()  # too few to judge
+    assert np.flatnonzero(~find_supported(places, motions)).tolist() == [4, 30]
+    assert find_supported(places[:8], motions[:8]).all()  # too few to judge

@@ -5,7 +5,7 @@ import numpy as np
 from test_ar_styles import CAMERA, seen, tumour
 
 from ar.overlay.composite import composite
-from ar.overlay.distances import RING, RINGS, distance_of_seen, draw_rings, lines_of, tree_of
+from ar.overlay.distances import RING, RINGS, build_tree, compute_seen_distance, draw_rings, list_lines
 from ar.overlay.hud import FINE, FONT
 from ar.overlay.window import DARK
 
@@ -13,7 +13,9 @@ from ar.overlay.window import DARK
 def test_rings_lie_where_the_distance_is_what_they_say():
     picture, at = seen(), tumour((0.0, 0.0, -0.014))
     whole, free = np.s_[0:480, 0:640], np.ones((480, 640), bool)
-    far = distance_of_seen(tree_of(at.vertices, at.triangles), CAMERA, whole, picture.drawn.depth[0], free, 18e-3)
+    far = compute_seen_distance(
+        build_tree(at.vertices, at.triangles), CAMERA, whole, picture.drawn.depth[0], free, 18e-3
+    )
     sheet = np.zeros((480, 640, 4), np.uint8)
     assert draw_rings(sheet, far, free) == ["5", "10", "15"]
     rows, columns = np.nonzero(sheet[..., 3] == 255)
@@ -48,5 +50,5 @@ def test_rings_may_be_covered_and_their_numbers_may_not():
     distance = np.repeat(np.linspace(0.0, 8e-3, 120, dtype=np.float32)[None], 80, axis=0)
     assert draw_rings(drawn, distance, np.ones((80, 120), bool), [5e-3]) == ["5"]
     number = cv2.erode((drawn[..., 3] > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    there = lines_of(drawn[..., 3] > 0)
+    there = list_lines(drawn[..., 3] > 0)
     assert number.any() and not there[number].any() and there[8:20].any() and there[60:72].any()

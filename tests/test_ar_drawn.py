@@ -3,16 +3,16 @@
 import numpy as np
 from test_ar_pose import CAMERA, PLATE, flat
 
-from ar.tracking.drawn import drawn
-from ar.tracking.targets import calibration_board
+from ar.tracking.drawn import render_targets
+from ar.tracking.targets import build_calibration_board
 
 
 def test_what_is_behind_is_hidden_and_what_looks_away_is_not_drawn():
     front, behind = flat((0.0, 0.0, 0.0), (-0.03, -0.03, 0.3)), flat((0.0, 0.0, 0.0), (-0.03, -0.03, 0.5))
     blank = np.full((600, 800), 120, np.uint8)
-    both = drawn(blank, CAMERA, [(PLATE, front), (calibration_board(), behind)])
-    other = drawn(blank, CAMERA, [(calibration_board(), behind), (PLATE, front)])
+    both = render_targets(blank, CAMERA, [(PLATE, front), (build_calibration_board(), behind)])
+    other = render_targets(blank, CAMERA, [(build_calibration_board(), behind), (PLATE, front)])
     np.testing.assert_array_equal(both, other)
-    assert not np.array_equal(both, drawn(blank, CAMERA, [(PLATE, front)]))
+    assert not np.array_equal(both, render_targets(blank, CAMERA, [(PLATE, front)]))
     away = flat((180.0, 0.0, 0.0), (-0.03, 0.03, 0.3))
-    np.testing.assert_array_equal(drawn(blank, CAMERA, [(PLATE, away)]), blank)
+    np.testing.assert_array_equal(render_targets(blank, CAMERA, [(PLATE, away)]), blank)

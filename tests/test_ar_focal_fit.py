@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from films import FILM
 
-from ar.tracking.focal_fit import focal_fit
-from ar.tracking.targets import DetectedCorners, tool_cube
+from ar.tracking.focal_fit import fit_focal_length
+from ar.tracking.targets import DetectedCorners, build_tool_cube
 from scenes.tracked.calibration_file import read_calibration
 
-CUBE = tool_cube()
+CUBE = build_tool_cube()
 
 
 def corners_of(camera, noise, seed, faces=(0, 1)):
@@ -33,8 +33,8 @@ def test_a_focal_length_is_found_by_the_relief_of_a_target():
     for factor in (1.0, 1.1):
         K = camera.K.copy()
         K[[0, 1], [0, 1]] *= factor
-        fit = focal_fit(replace(camera, K=K), seen)
+        fit = fit_focal_length(replace(camera, K=K), seen)
         assert fit is not None and fit.differs == (factor > 1.0)
         assert abs(fit.factor * factor - 1.0) < 4.0 * fit.deviation < 0.04
     few = replace(seen[0][1], **{name: getattr(seen[0][1], name)[:8] for name in ("points", "pixels", "face")})
-    assert focal_fit(camera, [(CUBE, few)]) is None and focal_fit(camera, []) is None
+    assert fit_focal_length(camera, [(CUBE, few)]) is None and fit_focal_length(camera, []) is None

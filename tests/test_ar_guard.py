@@ -18,7 +18,7 @@ from websockets.sync.client import connect
 
 from ar.page import guard
 from ar.page.browser import Browser
-from ar.page.messages import MessageError, checked
+from ar.page.messages import MessageError, check_message
 from ar.page.parts import Dropdown, Playback, SceneViewpoint, Slider, Toggle
 
 PROTOCOL = [f"viser-v{viser.__version__}"]
@@ -191,7 +191,7 @@ class TestDoor:
             patch.setattr(viser, "__version__", "2.0.0")
             with pytest.raises(guard.UnguardedError, match=r"viser 2\.0\.0 cannot be guarded: install viser"):
                 Page()
-        monkeypatch.setattr(guard, "guarding", lambda *words: nullcontext([]))
+        monkeypatch.setattr(guard, "guard_server", lambda *words: nullcontext([]))
         with pytest.raises(guard.UnguardedError, match="cannot be guarded"):
             Page()
         assert wait_for(lambda: set(threading.enumerate()) <= before)
@@ -286,7 +286,7 @@ class TestMessages:
     def test_a_control_that_is_not_there_is_refused(self):
         said = msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "none such", "updates": {"value": 1.0}})
         with pytest.raises(MessageError, match="a control that is not there"):
-            checked(said, lambda identifier: None)
+            check_message(said, lambda identifier: None)
 
     def test_messages_of_other_kinds_are_not_heard(self, page, visitor, capfd):
         kinds = ("FileTransferStartUpload", "GuiFormDirtyMessage", "GuiCloseModalMessage", "Message", "no such", 3)

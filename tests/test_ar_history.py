@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from ar.page.history import SPAN, History, Line, Sample, ceiling
+from ar.page.history import SPAN, History, Line, Sample, round_up_scale
 
 
 class TestHistory:
@@ -41,4 +41,4 @@ class TestHistory:
         assert ">not known<" in history.chart()
 
     def test_scales_end_at_round_numbers(self):
-        assert [ceiling(value) for value in (0.0, 0.3, 1.0, 1.2, 9.0, 13.9)] == [1.0, 0.5, 1.0, 2.0, 10.0, 20.0]
+        assert [round_up_scale(value) for value in (0.0, 0.3, 1.0, 1.2, 9.0, 13.9)] == [1.0, 0.5, 1.0, 2.0, 10.0, 20.0]

@@ -5,8 +5,21 @@ import numpy as np
 import pytest
 
 from ar.optics.camera import look_at
-from ar.overlay.hud import BREAK, FINE, FONT, NEAR, Below, bearings, folded, lay, marked, millimetres, panel, towards
-from ar.overlay.outlines import found_at
+from ar.overlay.hud import (
+    BREAK,
+    FINE,
+    FONT,
+    NEAR,
+    Below,
+    draw_orientation_labels,
+    draw_text_panel,
+    format_millimetres,
+    lay,
+    name_bearings,
+    name_direction,
+    wrap_line,
+)
+from ar.overlay.outlines import find_text
 from ar.overlay.places import PAD
 
 
@@ -24,24 +37,24 @@ from ar.overlay.places import PAD
     ],
 )
 def test_a_direction_has_the_letters_of_its_greatest_parts(direction, letters):
-    assert towards(np.array(direction)) == letters
+    assert name_direction(np.array(direction)) == letters
 
 
 def test_what_lies_at_the_edges_follows_from_the_camera():
     """From the patient's right side, crown upwards: the face is on the right."""
     aside = look_at(np.array([0.3, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    assert bearings(aside.T_camera_world[:3, :3]) == {"left": "P", "right": "A", "top": "S", "bottom": "I"}
+    assert name_bearings(aside.T_camera_world[:3, :3]) == {"left": "P", "right": "A", "top": "S", "bottom": "I"}
     # From above, face upwards in the picture: the patient's right is on the right; from below it is on the left.
     above = look_at(np.array([0.0, 0.0, 0.3]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
     below = look_at(np.array([0.0, 0.0, -0.3]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
-    assert bearings(above.T_camera_world[:3, :3]) == {"left": "L", "right": "R", "top": "A", "bottom": "P"}
-    assert bearings(below.T_camera_world[:3, :3]) == {"left": "R", "right": "L", "top": "A", "bottom": "P"}
+    assert name_bearings(above.T_camera_world[:3, :3]) == {"left": "L", "right": "R", "top": "A", "bottom": "P"}
+    assert name_bearings(below.T_camera_world[:3, :3]) == {"left": "R", "right": "L", "top": "A", "bottom": "P"}
 
 
 def test_letters_stand_at_the_edges():
     plain = np.full((240, 320, 3), 90, np.uint8)
     turn = np.eye(3)
-    letters = marked(plain, turn, np.zeros(plain.shape[:2], np.uint8))
+    letters = draw_orientation_labels(plain, turn, np.zeros(plain.shape[:2], np.uint8))
     changed = (letters != plain).any(axis=2)
     for edge in (changed[100:140, :30], changed[100:140, -30:], changed[:30, 60:100], changed[-30:, 220:260]):
         assert edge.any()
@@ -51,8 +64,8 @@ def test_letters_stand_at_the_edges():
 def test_a_panel_leaves_out_lines_that_the_picture_is_too_low_for():
     plain = np.full((100, 320, 3), 90, np.uint8)
     lines = ["first", "second", "third", "fourth", "fifth"]
-    few = panel(plain, lines, below=30)
-    kept = next(count for count in range(1, 6) if np.array_equal(few, panel(plain, lines[:count], below=30)))
+    few = draw_text_panel(plain, lines, below=30)
+    kept = next(count for count in range(1, 6) if np.array_equal(few, draw_text_panel(plain, lines[:count], below=30)))
     assert 1 < kept < 4 and (few[:30] == 90).all() and (few[-PAD:] == 90).all()
 
 
@@ -68,22 +81,22 @@ def test_a_panel_leaves_out_lines_that_the_picture_is_too_low_for():
     ],
 )
 def test_a_length_is_read_in_millimetres_with_what_it_may_be_off_by(length, error, text):
-    assert millimetres(length, error) == text
+    assert format_millimetres(length, error) == text
 
 
 def test_letters_at_an_edge_give_way_along_it():
     """A line that leaves the picture where the upper letter stands moves that letter aside, and no other."""
     plain = np.full((240, 320, 3), 90, np.uint8)
     taken = np.zeros(plain.shape[:2], np.uint8)
-    free = marked(plain, np.eye(3), taken)
+    free = draw_orientation_labels(plain, np.eye(3), taken)
     taken[:120, 70:90] = 1
-    letters = marked(plain, np.eye(3), taken)
+    letters = draw_orientation_labels(plain, np.eye(3), taken)
     changed = (letters != plain).any(axis=2)
     assert not changed[:120, 70:90].any() and changed[:30].any()
     assert np.array_equal(letters[40:], free[40:]) and taken.sum() == 2400
     # Where its edge has no room a letter is left out: at another it would be wrong.
     taken[:40] = 1
-    letters = marked(plain, np.eye(3), taken)
+    letters = draw_orientation_labels(plain, np.eye(3), taken)
     assert np.array_equal(letters[:40], plain[:40]) and np.array_equal(letters[60:], free[60:])
 
 
@@ -106,7 +119,7 @@ def test_words_take_their_place_and_without_room_only_the_needed_are_written():
 @pytest.mark.parametrize("room", [1.0, 60.0, 130.0, 150.0, 1000.0])
 def test_a_folded_line_keeps_its_words_and_its_room(room):
     text = "the bone's edge stops the tool 17.5 mm short"
-    lines = folded(text, room)
+    lines = wrap_line(text, room)
     wide = [cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines]
     assert " ".join(lines) == text
     assert all(width <= room or not BREAK.search(line) for width, line in zip(wide, lines, strict=True))
@@ -115,7 +128,7 @@ def test_a_folded_line_keeps_its_words_and_its_room(room):
 
 def test_a_panel_folds_lines_that_are_wider_than_the_picture():
     colour = np.full((150, 200, 3), 90, np.uint8)
-    shown = panel(colour, ["a line that is much wider than so narrow a picture", "short"])
+    shown = draw_text_panel(colour, ["a line that is much wider than so narrow a picture", "short"])
     changed = (shown != colour).any(axis=2)
     assert not changed[:, 193:].any() and changed[:, 150:190].any()
 
@@ -133,7 +146,7 @@ def test_a_panel_folds_lines_that_are_wider_than_the_picture():
 )
 def test_a_number_stays_beside_its_name_and_its_unit(text, held):
     for room in (1.0, 60.0, 100.0):
-        lines = folded(text, room)
+        lines = wrap_line(text, room)
         assert " ".join(lines) == text and all(any(each in line for line in lines) for each in held)
 
 
@@ -142,9 +155,9 @@ def test_a_panel_leaves_out_its_last_lines_rather_than_hide_what_must_be_seen():
     hidden[40:120, 200:] = 0
     lines = ["the first line", "the second", "the third", "the fourth", "the fifth", "the sixth"]
     for sights in ([np.ones_like(hidden), hidden], [hidden, np.zeros_like(hidden)]):
-        changed = (panel(colour, lines, sights=sights) != colour).any(axis=2)
+        changed = (draw_text_panel(colour, lines, sights=sights) != colour).any(axis=2)
         assert changed.sum() > 1000 and not changed[hidden > 0].any()
-    assert (panel(colour, lines[:2], sights=[hidden]) != colour).any(axis=2).sum() < changed.sum()
+    assert (draw_text_panel(colour, lines[:2], sights=[hidden]) != colour).any(axis=2).sum() < changed.sum()
 
 
 def test_words_cover_thin_lines_rather_than_stand_far_from_their_wish():
@@ -154,5 +167,5 @@ def test_words_cover_thin_lines_rather_than_stand_far_from_their_wish():
         colour, taken = np.zeros((300, 400, 3), np.uint8), np.zeros((300, 400), np.uint8)
         taken[:200, ::20] = 1
         lay(colour, taken, ["8.7 +- 8.0 mm"], (150, 60), below=Below(thin=None if thin is None else taken > 0))
-        _, rows[name], _, _ = found_at(colour, "8.7 +- 8.0 mm", FINE)
+        _, rows[name], _, _ = find_text(colour, "8.7 +- 8.0 mm", FINE)
     assert rows["near"] < 60 + NEAR < 200 < rows["far"]

@@ -9,10 +9,17 @@ from board_scenes import CAMERA, FACE, HEIGHT, WIDTH, K, picture, poses, views
 from test_scenes_error_parts import turned
 
 from ar.optics.camera import Camera
-from ar.tracking.intrinsics import calibrated, calibration_error, chosen, covered, directions, find_board
-from ar.tracking.targets import Detector, calibration_board, patient_reference
+from ar.tracking.intrinsics import (
+    calibrate_intrinsics,
+    choose_views,
+    compute_calibration_error,
+    find_board,
+    measure_covered_share,
+    measure_tilt_range,
+)
+from ar.tracking.targets import Detector, build_calibration_board, build_patient_reference
 
-BOARD = Detector([calibration_board()])
+BOARD = Detector([build_calibration_board()])
 TRUTH = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *CAMERA.lens.coefficients[:5]])
 
 
@@ -20,7 +27,7 @@ def test_a_camera_is_found_from_pictures():
     places = poses(12)
     found = [find_board(BOARD, str(number), picture(T)) for number, T in enumerate(places)]
     assert all(found) and min(len(view.pixels) for view in found) > 20
-    camera = calibrated(found, WIDTH, HEIGHT, "mine")
+    camera = calibrate_intrinsics(found, WIDTH, HEIGHT, "mine")
     assert camera.rms < 0.12 and not camera.left_out and camera.used == tuple(map(str, range(12)))
     np.testing.assert_allclose(camera.values[:4], TRUTH[:4], rtol=3e-3)
     assert (np.abs(camera.values - TRUTH) < 5.0 * camera.deviations).all()
@@ -36,7 +43,7 @@ def test_a_camera_is_found_from_pictures():
 def repeated():
     """Twenty calibrations of one camera, by the same views with other noise of 0.2 pixel."""
     places = poses(14)
-    return [calibrated(views(places, 0.2, seed), WIDTH, HEIGHT) for seed in range(20)]
+    return [calibrate_intrinsics(views(places, 0.2, seed), WIDTH, HEIGHT) for seed in range(20)]
 
 
 def test_the_covariance_is_that_of_repeated_calibrations(repeated):
@@ -63,29 +70,29 @@ def test_deviations_are_those_of_opencv(repeated):
 def test_a_view_that_does_not_fit_is_left_out_and_said():
     some = views(poses(14), 0.1)
     bent = replace(some[5], pixels=some[5].pixels + 3.0 * np.sin(some[5].pixels[:, ::-1] / 20.0))
-    camera = calibrated([*some[:5], bent, *some[6:]], WIDTH, HEIGHT)
+    camera = calibrate_intrinsics([*some[:5], bent, *some[6:]], WIDTH, HEIGHT)
     assert camera.left_out == ("view 5",) and len(camera.used) == 13
-    alone = calibrated([*some[:5], *some[6:]], WIDTH, HEIGHT)
+    alone = calibrate_intrinsics([*some[:5], *some[6:]], WIDTH, HEIGHT)
     np.testing.assert_allclose(camera.values, alone.values, rtol=1e-6)
 
 
 def test_what_determines_no_camera_is_refused():
     with pytest.raises(ValueError, match=r"7 sharp views show the board, but 8 are needed: take 20 pictures"):
-        calibrated(views(poses(7), 0.1), WIDTH, HEIGHT)
+        calibrate_intrinsics(views(poses(7), 0.1), WIDTH, HEIGHT)
     with pytest.raises(ValueError, match=r"one direction in all 14 views, to \d+ degrees\. Tilt the board"):
-        calibrated(views(poses(14, tilt=1.0), 0.1), WIDTH, HEIGHT)
+        calibrate_intrinsics(views(poses(14, tilt=1.0), 0.1), WIDTH, HEIGHT)
     few = views(poses(14, tilt=10.0), 4.0)  # hardly tilted, and found badly
     with pytest.raises(ValueError, match=r"leave the focal length unknown to \d+ %\. Tilt"):
-        calibrated(few, WIDTH, HEIGHT)
+        calibrate_intrinsics(few, WIDTH, HEIGHT)
     some = views(poses(8), 0.1)
     bent = replace(some[5], pixels=some[5].pixels + 3.0 * np.sin(some[5].pixels[:, ::-1] / 20.0))
     with pytest.raises(ValueError, match=r"7 sharp views show the board, and 1 more fit badly, but 8"):
-        calibrated([*some[:5], bent, *some[6:]], WIDTH, HEIGHT)
+        calibrate_intrinsics([*some[:5], bent, *some[6:]], WIDTH, HEIGHT)
 
 
 def test_calibration_error_is_what_the_pose_leaves_of_it():
     """A focal length that is 0.2 % off: the pose is fitted again, and a place beside the target is seen elsewhere."""
-    T, corners, place = turned("x", 25.0), patient_reference().faces[0].corners, np.array([0.1, 0.05, 0.03])
+    T, corners, place = turned("x", 25.0), build_patient_reference().faces[0].corners, np.array([0.1, 0.05, 0.03])
     T[:3, 3], own = (0.0, 0.02, 0.4), np.zeros((9, 9))
     own[:2, :2] = 4.0
     right, wrong = (np.array([[focal, 0.0, 400.0], [0.0, focal, 300.0], [0.0, 0.0, 1.0]]) for focal in (1e3, 1002.0))
@@ -94,7 +101,7 @@ def test_calibration_error_is_what_the_pose_leaves_of_it():
     again = cv2.solvePnP(corners, pixels, wrong, None, turn.copy(), shift.copy(), True)[1:]
     seen = [cv2.projectPoints(place, *pose, K, None)[0] for pose, K in (((turn, shift), right), (again, wrong))]
     expected = np.linalg.norm(seen[1] - seen[0]) / 1e3 * (T[:3, :3] @ place + T[:3, 3])[2]
-    found = calibration_error(Camera(right, np.eye(4), 800, 600), T, corners, place, own)
+    found = compute_calibration_error(Camera(right, np.eye(4), 800, 600), T, corners, place, own)
     assert np.sqrt(np.trace(found)) == pytest.approx(expected, rel=0.1)
 
 
@@ -103,7 +110,7 @@ def test_directions_are_angles_between_planes():
     one, other = views(poses(2, tilt=20.0), 0.0)
     (R, _), (S, _) = ((T[:3, :3], T) for T in poses(2, tilt=20.0))
     true = np.arccos(R[:, 2] @ S[:, 2])
-    assert abs(K[0, 0] - focal) / focal < 0.15 and directions([one, other], WIDTH, HEIGHT) == pytest.approx(
+    assert abs(K[0, 0] - focal) / focal < 0.15 and measure_tilt_range([one, other], WIDTH, HEIGHT) == pytest.approx(
         true, rel=0.2
     )
 
@@ -113,10 +120,10 @@ def test_sharp_views_that_differ_are_chosen():
     some = [replace(view, name=str(number)) for number, view in enumerate(views(places, 0.0))]
     again = [replace(view, name=f"{view.name} again") for view in some for _ in range(4)]
     blurred = replace(some[0], name="blurred", sharpness=0.3)
-    assert len(chosen([*again, *some, blurred], FACE, 100)) == 60
-    few = chosen([*again, blurred], FACE, 12)
+    assert len(choose_views([*again, *some, blurred], FACE, 100)) == 60
+    few = choose_views([*again, blurred], FACE, 12)
     assert len({view.name for view in few}) == 12  # none twice
-    assert chosen([], FACE, 12) == []
+    assert choose_views([], FACE, 12) == []
 
 
 def test_blur_is_seen_in_whichever_direction():
@@ -146,5 +153,5 @@ def test_covered_is_what_lies_between_corners():
     (one,) = views(poses(1, tilt=0.0), 0.0)
     box = replace(one, pixels=np.array([[0.0, 0.0], [319.0, 0.0], [319.0, 239.0], [0.0, 239.0], [100.0, 50.0]]))
     other = replace(box, pixels=box.pixels + [320.0, 0.0])
-    assert covered([box, box], WIDTH, HEIGHT) == pytest.approx(0.25)
-    assert covered([box, other], WIDTH, HEIGHT) == pytest.approx(0.5)
+    assert measure_covered_share([box, box], WIDTH, HEIGHT) == pytest.approx(0.25)
+    assert measure_covered_share([box, other], WIDTH, HEIGHT) == pytest.approx(0.5)

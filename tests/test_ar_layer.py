@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_ar_outlines import CORTEX, EYE, ball, camera, sheet
 
-from ar.rendering.layer import Layer, Solid, vertex_normals
+from ar.rendering.layer import Layer, Solid, compute_vertex_normals
 from ar.rendering.renderer import Lamp, render
 
 
@@ -40,7 +40,7 @@ def test_a_solid_texture_sticks_to_the_material():
 
 def test_vertex_normals_point_out_of_a_sphere():
     vertices, triangles = ball((0.0, 0.0, 0.0), 1.0, 40)
-    normals = vertex_normals(vertices, triangles)
+    normals = compute_vertex_normals(vertices, triangles)
     seam = np.abs(vertices[:, 1]) < 1e-9
     assert np.abs(np.abs((normals * vertices).sum(axis=1))[~seam] - 1.0).max() < 5e-3
-    assert np.array_equal(vertex_normals(np.zeros((2, 3)), np.zeros((0, 3), int)), np.zeros((2, 3)))
+    assert np.array_equal(compute_vertex_normals(np.zeros((2, 3)), np.zeros((0, 3), int)), np.zeros((2, 3)))

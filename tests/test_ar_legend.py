@@ -7,7 +7,7 @@ from ar.overlay.composite import composite
 from ar.overlay.hud import HEAD
 from ar.overlay.legend import SHEET, LegendNames
 from ar.overlay.marks import Cover, Marks, Words
-from ar.overlay.outlines import ink_of, of_ink
+from ar.overlay.outlines import compute_ink, find_ink
 
 
 def test_the_legend_names_lines_without_their_ink_and_leaves_the_cortex_in_sight():
@@ -21,7 +21,7 @@ def test_the_legend_names_lines_without_their_ink_and_leaves_the_cortex_in_sight
     )
     changed = (plain != named).any(axis=2)
     assert changed.sum() > 500 and (picture.segmentation[changed] == DRAPE).all()
-    assert not of_ink(named, ink_of(GREEN))[changed].any()
+    assert not find_ink(named, compute_ink(GREEN))[changed].any()
     crowded = composite(
         seen(), CAMERA, at, cover=Cover(opening=OPENING), marks=Marks(0.003, before=at), words=Words(names=names)
     ).colour

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from test_ar_rasteriser import sphere
+from test_ar_rasteriser import build_sphere
 from test_ar_renderer import BALL, FLOOR, LAMP, ball, floor, scene
 
 from ar.optics.camera import Camera, look_at, project_cv2
@@ -13,7 +13,7 @@ from ar.optics.lens import Lens
 from ar.overlay.composite import composite
 from ar.overlay.gauge import Gauge
 from ar.overlay.marks import Marks
-from ar.overlay.outlines import of_ink, outline_gap, silhouette
+from ar.overlay.outlines import compute_silhouette, find_ink, measure_outline_gap
 from ar.rendering.layer import Layer
 from ar.rendering.raycast import raycast
 from ar.rendering.renderer import Renderer, render
@@ -89,7 +89,7 @@ def test_a_lens_that_cannot_be_is_refused():
 @each_lens
 def test_a_camera_projects_as_opencv_and_back(lens):
     camera = seen_by(lens)
-    for one in (camera, camera.perturbed(3.0, (1.0, 2.0, -1.0))):
+    for one in (camera, camera.perturb(3.0, (1.0, 2.0, -1.0))):
         pixels, depth = one.project(points_in_view())
         there = np.isfinite(pixels).all(axis=1)
         assert there.sum() > 100
@@ -102,7 +102,7 @@ def test_scaled_cropped_and_padded_cameras_see_the_same():
     camera, points = seen_by(), points_in_view()
     pixels, _ = camera.project(points)
     assert np.allclose(camera.scaled(2.0).project(points)[0] + 0.5, 2.0 * (pixels + 0.5))
-    assert np.allclose(camera.cropped(slice(20, 150), slice(30, 290)).project(points)[0] + [30, 20], pixels)
+    assert np.allclose(camera.crop_to(slice(20, 150), slice(30, 290)).project(points)[0] + [30, 20], pixels)
     wide = camera.padded(2.0)
     assert np.allclose(wide.project(points)[0] - pixels, [(wide.width - 320) // 2, 0.0])
 
@@ -114,7 +114,7 @@ def test_straight_pixels_are_bent_back_to_their_own(lens):
     points = replace(camera, lens=None).unproject(camera.straight, np.ones((240, 320)))
     back, seen = camera.project(points)[0], np.isfinite(camera.straight).all(axis=2)
     assert seen.mean() > 0.5 and np.abs(back - np.stack([columns, rows], axis=-1))[seen].max() < 1e-6
-    part = camera.cropped(slice(20, 150), slice(30, 290))
+    part = camera.crop_to(slice(20, 150), slice(30, 290))
     again = Camera(part.K, part.T_camera_world, part.width, part.height, lens)
     assert np.allclose(part.straight, again.straight, atol=1e-6, equal_nan=True)
 
@@ -126,8 +126,8 @@ def test_small_balls_are_drawn_where_opencv_has_them():
         for y in 0.8 * spread:
             (at,) = project_cv2(camera, np.array([[x, y, 0.0]]))
             if (at > 8).all() and (at < [631, 471]).all():
-                vertices, triangles = sphere(12, 16, 1e-3)
-                mask = silhouette(camera.scaled(3.0), vertices + [x, y, 0.0], triangles)
+                vertices, triangles = build_sphere(12, 16, 1e-3)
+                mask = compute_silhouette(camera.scaled(3.0), vertices + [x, y, 0.0], triangles)
                 found = (np.argwhere(mask)[:, ::-1].mean(axis=0) + 0.5) / 3.0 - 0.5
                 assert np.abs(found - at).max() < 0.05, (x, y)
 
@@ -177,15 +177,15 @@ def test_the_overlay_is_in_register_through_a_lens(lens):
     mask = raycast(camera, hidden.vertices, hidden.triangles).mask
     ink = tuple(np.rint(255.0 * np.array([0.3, 0.95, 0.55])))
     clear = np.zeros(mask.shape, bool)
-    assert of_ink(shown, ink).sum() > 200 and outline_gap(shown, ink, mask, clear) < 1.5
+    assert find_ink(shown, ink).sum() > 200 and measure_outline_gap(shown, ink, mask, clear) < 1.5
     off = raycast(replace(camera, lens=None), hidden.vertices, hidden.triangles).mask
-    assert outline_gap(shown, ink, off, clear) > 2.0
+    assert measure_outline_gap(shown, ink, off, clear) > 2.0
 
 
 def test_what_lies_beyond_the_lens_is_not_drawn():
     """OpenCV's polynomial has it in the picture."""
     camera = replace(look_at(np.zeros(3), np.array([0.0, 0, 1]), np.array([0.0, 1, 0])), lens=LENSES["folding"])
-    vertices, triangles = sphere(20, 30, 0.05)
+    vertices, triangles = build_sphere(20, 30, 0.05)
     aside = Layer("ball", BALL, vertices + [1.2, 0.0, 1.0], triangles)
     assert np.abs(project_cv2(camera, aside.vertices) - camera.K[:2, 2]).max() < 0.5 * camera.K[0, 0]
     picture = render(camera, [aside], LAMP)

@@ -2,9 +2,9 @@
 
 import numpy as np
 from test_ar_lens import each_lens, seen_by
-from test_ar_rasteriser import sphere
+from test_ar_rasteriser import build_sphere
 
-from ar.overlay.outlines import box_around, silhouette
+from ar.overlay.outlines import compute_silhouette, find_pixel_box
 from ar.rendering.rasteriser import rasterise
 from ar.rendering.raycast import raycast
 
@@ -12,7 +12,7 @@ from ar.rendering.raycast import raycast
 @each_lens
 def test_the_rasteriser_sees_what_rays_see(lens):
     """Of triangles as large as the picture, which reach behind the camera and beyond the lens, and of small ones."""
-    camera, (vertices, triangles) = seen_by(lens), sphere(20, 30, 0.02)
+    camera, (vertices, triangles) = seen_by(lens), build_sphere(20, 30, 0.02)
     vertices = np.concatenate([vertices + [0.01, 0.0, 0.03], [[-9.0, -9, -0.3], [9, -8, -0.3], [0, 9, 0.3]]])
     triangles = np.concatenate([triangles, [[600, 601, 602]] + np.array(len(vertices) - 603)])
     drawn, cast = rasterise(camera, vertices, triangles), raycast(camera, vertices, triangles)
@@ -28,8 +28,8 @@ def test_a_box_holds_what_a_lens_bends_out_of_the_corners(lens):
     """A triangle as large as the picture: its edges are no lines."""
     camera = seen_by(lens)
     points = np.array([[-0.08, -0.05, 0.0], [0.08, -0.05, 0.0], [0.0, 0.08, 0.0]])
-    mask = silhouette(camera, points, np.array([[0, 1, 2]]))
-    rows, columns = box_around(camera, points)
+    mask = compute_silhouette(camera, points, np.array([[0, 1, 2]]))
+    rows, columns = find_pixel_box(camera, points)
     outside = mask.copy()
     outside[rows, columns] = False
     assert mask.sum() > 5000 and not outside.any()

@@ -6,7 +6,7 @@ from itertools import islice
 import pytest
 from films import Plugged
 
-from ar.tracking.live_camera import camera_pictures, newest
+from ar.tracking.live_camera import read_camera_images, read_newest
 
 
 def test_a_camera_that_is_unplugged_is_opened_until_it_is_back():
@@ -17,7 +17,7 @@ def test_a_camera_that_is_unplugged_is_opened_until_it_is_back():
         late.append(cameras.pop(0))
         return late[-1]
 
-    found = camera_pictures(first, "camera 0", again, lambda: next(moments))
+    found = read_camera_images(first, "camera 0", again, lambda: next(moments))
     seen = [next(found) for _ in range(2)]
     assert [each.time for each in seen] == [0, 1] and seen[0].colour.shape == (720, 960, 3)
     seen = list(islice(found, 21))
@@ -33,7 +33,7 @@ def test_the_newest_picture_is_had_and_a_silence_is_said():
         yield "d"
         raise ValueError("unplugged")
 
-    found = newest(slow(), 0.05)
+    found = read_newest(slow(), 0.05)
     time.sleep(0.02)
     assert next(found) == "c"  # a and b are lost
     assert next(found) is None

@@ -10,7 +10,7 @@ from ar.optics.camera import Camera, look_at
 from ar.overlay.composite import SEEN, composite, draw_points
 from ar.overlay.hud import FINE
 from ar.overlay.marks import Marks, Trace, Words
-from ar.overlay.outlines import ink_of, of_ink, outline_gap, silhouette, stands
+from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_text, measure_outline_gap
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Lamp, Picture, render
 
@@ -36,21 +36,21 @@ def test_traces_are_drawn_under_the_outline_and_the_motion_may_be_given():
     picture = ground(here)
     blue = replace(tumour((0.004, 0.0, -0.02)), colour=np.array((0.2, 0.4, 1.0)))
     trace = Trace(blue, (12, 4), np.array([0.004, 0.0, -0.02]))
-    ink = ink_of(blue.colour)
+    ink = compute_ink(blue.colour)
     plain = composite(picture, here, at, style="contour", marks=Marks(before=at)).colour
     shown = composite(
         picture, here, at, style="contour", marks=Marks(before=at, traces=[trace]), words=Words(moved=(2e-3, 1.24e-3))
     ).colour
-    assert not of_ink(plain, ink).any() and of_ink(shown, ink).sum() > 100
-    own = of_ink(plain, ink_of(at.colour))
-    assert own.sum() > 100 and of_ink(shown, ink_of(at.colour))[own].all()
-    mask = silhouette(here, blue.vertices, blue.triangles)
-    assert outline_gap(shown, ink, mask, own, 32) < 2.5 < outline_gap(plain, ink, mask, own, 32)
-    wrong = silhouette(here, at.vertices + [0.0, 0.003, 0.0], at.triangles)
-    assert outline_gap(shown, ink, wrong, own, 32) > 5.0
+    assert not find_ink(plain, ink).any() and find_ink(shown, ink).sum() > 100
+    own = find_ink(plain, compute_ink(at.colour))
+    assert own.sum() > 100 and find_ink(shown, compute_ink(at.colour))[own].all()
+    mask = compute_silhouette(here, blue.vertices, blue.triangles)
+    assert measure_outline_gap(shown, ink, mask, own, 32) < 2.5 < measure_outline_gap(plain, ink, mask, own, 32)
+    wrong = compute_silhouette(here, at.vertices + [0.0, 0.003, 0.0], at.triangles)
+    assert measure_outline_gap(shown, ink, wrong, own, 32) > 5.0
     column, row = here.project(trace.dot[None])[0][0].round().astype(int)
     assert shown[row, column] == pytest.approx([153, 178, 255], abs=1)  # paler than the ink
-    assert stands(shown, "moved 2.0 +- 1.3 mm", FINE) and stands(plain, "moved 0.0 mm", FINE)
+    assert has_text(shown, "moved 2.0 +- 1.3 mm", FINE) and has_text(plain, "moved 0.0 mm", FINE)
 
 
 def test_fewer_pixels_than_are_asked_for_are_no_outline():
@@ -58,8 +58,8 @@ def test_fewer_pixels_than_are_asked_for_are_no_outline():
     mask[20:40, 20:40] = True
     covered = np.ones((60, 60), bool)
     covered[:, 15:18] = False
-    assert outline_gap(picture, (9, 9, 9), mask, covered, 32) == 0.0
-    assert outline_gap(picture, (9, 9, 9), mask, np.zeros_like(mask), 32) == np.inf
+    assert measure_outline_gap(picture, (9, 9, 9), mask, covered, 32) == 0.0
+    assert measure_outline_gap(picture, (9, 9, 9), mask, np.zeros_like(mask), 32) == np.inf
 
 
 def test_points_are_drawn_where_they_are_in_sight_and_on_no_line():

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from ar.optics.camera import look_at
-from ar.overlay.composite import DOUBTFUL, WARNING, composite, doubt_lines
+from ar.overlay.composite import DOUBTFUL, WARNING, composite, format_warning
 from ar.overlay.gauge import GAUGE, Gauge
-from ar.overlay.hud import FINE, HEAD, ROW, panel, write
+from ar.overlay.hud import FINE, HEAD, ROW, draw_text_panel, write
 from ar.overlay.marks import BEFORE, Cover, Marks, Words
-from ar.overlay.outlines import ink_of, iou, outline_gap, silhouette, stands
+from ar.overlay.outlines import compute_ink, compute_iou, compute_silhouette, has_text, measure_outline_gap
 from ar.rendering.layer import Layer, Solid
 from ar.rendering.renderer import Lamp, lamp_beside, render
 
@@ -103,20 +103,20 @@ def test_a_surface_without_casters_is_evenly_lit():
 
 def test_iou_falls_when_the_tumour_is_moved():
     here = camera()
-    truth = silhouette(here, tumour().vertices, tumour().triangles)
+    truth = compute_silhouette(here, tumour().vertices, tumour().triangles)
     overlaps = []
     for shift in (0.0, 0.001, 0.003, 0.05):
         moved = tumour((shift, 0.0, -0.02))
-        overlaps.append(iou(truth, silhouette(here, moved.vertices, moved.triangles)))
+        overlaps.append(compute_iou(truth, compute_silhouette(here, moved.vertices, moved.triangles)))
     assert overlaps[0] == 1.0
     assert 1.0 > overlaps[1] > overlaps[2] > overlaps[3] == 0.0
     # Two discs of radius r, d apart: the overlap to first order is 1 - 4 d / (pi r).
     assert overlaps[1] == pytest.approx(1.0 - 4.0 * 0.001 / (np.pi * 0.012), abs=0.03)
-    assert iou(truth, silhouette(here.perturbed(0.5), tumour().vertices, tumour().triangles)) < 0.9
+    assert compute_iou(truth, compute_silhouette(here.perturb(0.5), tumour().vertices, tumour().triangles)) < 0.9
 
 
 def test_nothing_seen_is_no_agreement():
-    assert iou(np.zeros((4, 4), bool), np.zeros((4, 4), bool)) == 0.0
+    assert compute_iou(np.zeros((4, 4), bool), np.zeros((4, 4), bool)) == 0.0
 
 
 def contour_mask(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -132,7 +132,7 @@ def test_the_overlay_stands_where_the_tumour_is(style):
     rows, columns = np.nonzero(changed)
     middle, _ = here.project(np.array([0.0, 0.0, -0.02]))
     assert [np.mean(columns), np.mean(rows)] == pytest.approx(middle, abs=2.0)
-    outline = silhouette(here, tumour().vertices, tumour().triangles)
+    outline = compute_silhouette(here, tumour().vertices, tumour().triangles)
     assert changed[outline].mean() > (0.2 if style == "contour" else 0.95)
     fresh = render(here, [cortex()], LAMP)
     for same in ("colour", "depth", "segmentation"):
@@ -190,8 +190,8 @@ def test_lines_at_the_head_stand_there_whatever_the_style():
             marks=Marks(before=tumour((0.01, 0.0, -0.02))),
             words=Words(head=["one", "two"]),
         )
-        assert stands(said.colour[HEAD : HEAD + 2 * ROW], "one", FINE)
-        assert stands(said.colour[HEAD + ROW - 4 : HEAD + 3 * ROW], "two", FINE)
+        assert has_text(said.colour[HEAD : HEAD + 2 * ROW], "one", FINE)
+        assert has_text(said.colour[HEAD + ROW - 4 : HEAD + 3 * ROW], "two", FINE)
         assert said.taken[HEAD + ROW, 8:20].all()
 
 
@@ -215,15 +215,15 @@ def test_the_picture_says_how_far_the_tumour_moved():
     far = np.linspace(0.002, 0.004, len(now.vertices))[:, None] * [1.0, 0.0, 0.0]
     margin = np.linspace(0.0005, 0.0015, len(now.vertices))
     before = replace(now, vertices=now.vertices - far)
-    assert stands(composite(picture, here, now, marks=Marks(margin, before=before)).colour, "moved 3.0 mm", FINE)
-    assert stands(composite(picture, here, now, marks=Marks(before=before)).colour, "moved 3.0 mm", FINE)
+    assert has_text(composite(picture, here, now, marks=Marks(margin, before=before)).colour, "moved 3.0 mm", FINE)
+    assert has_text(composite(picture, here, now, marks=Marks(before=before)).colour, "moved 3.0 mm", FINE)
 
 
 def test_the_arrow_points_to_where_the_tumour_is_now():
     here, before, now = camera(400, 300), tumour((-0.012, 0.0, -0.02), 0.006), tumour((0.012, 0.0, -0.02), 0.006)
     picture = render(here, [cortex()], LAMP)
     shown = composite(picture, here, now, style="contour", marks=Marks(before=before)).colour
-    grey = np.argwhere((np.abs(shown.astype(int) - ink_of(BEFORE)) <= 2).all(axis=2))[:, ::-1]
+    grey = np.argwhere((np.abs(shown.astype(int) - compute_ink(BEFORE)) <= 2).all(axis=2))[:, ::-1]
     near = [
         np.count_nonzero(np.linalg.norm(grey - here.project(np.array([x, 0.0, -0.02]))[0], axis=1) < 8)
         for x in (-0.012, 0.012)
@@ -238,9 +238,9 @@ def test_motion_and_doubt_stand_on_lines_of_their_own():
     before, now = tumour((0.0, 0.0, -0.02)), tumour((0.003, 0.0, -0.02))
     doubt = "outside what the model learned: do not rely on it"
     shown = composite(picture, here, now, marks=Marks(np.nan, before=before), words=Words(doubt)).colour
-    assert stands(shown, "moved 3.0 mm", FINE)
-    assert all(stands(shown, line, FINE, ink_of(WARNING)) for line in doubt_lines(doubt, 400))
-    assert stands(composite(picture, here, now, marks=Marks(np.nan, before=before)).colour, "moved 3.0 mm", FINE)
+    assert has_text(shown, "moved 3.0 mm", FINE)
+    assert all(has_text(shown, line, FINE, compute_ink(WARNING)) for line in format_warning(doubt, 400))
+    assert has_text(composite(picture, here, now, marks=Marks(np.nan, before=before)).colour, "moved 3.0 mm", FINE)
 
 
 def test_of_what_may_not_be_relied_on_nothing_is_promised():
@@ -249,15 +249,18 @@ def test_of_what_may_not_be_relied_on_nothing_is_promised():
     picture = render(here, [cortex()], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
     sure = composite(picture, here, tumour(), marks=Marks(0.004, gauge=gauge)).colour
-    assert stands(sure, "8.0 +- 1.2 mm", GAUGE) and not stands(sure, "do not rely on it", FINE, ink_of(WARNING))
+    assert has_text(sure, "8.0 +- 1.2 mm", GAUGE) and not has_text(
+        sure, "do not rely on it", FINE, compute_ink(WARNING)
+    )
     unsure, plain = (
         composite(picture, here, tumour(), marks=Marks(margin, gauge=gauge), words=Words("do not rely on it")).colour
         for margin in (0.004, 0.0)
     )
-    assert stands(unsure, "8.0 mm", GAUGE) and stands(unsure, "do not rely on it", FINE, ink_of(WARNING))
+    assert has_text(unsure, "8.0 mm", GAUGE) and has_text(unsure, "do not rely on it", FINE, compute_ink(WARNING))
     assert np.array_equal(unsure, plain)
     amber, green = (
-        (np.abs(unsure.astype(int) - ink) <= 2).all(axis=2).sum() for ink in map(ink_of, (DOUBTFUL, (0.2, 0.9, 0.3)))
+        (np.abs(unsure.astype(int) - ink) <= 2).all(axis=2).sum()
+        for ink in map(compute_ink, (DOUBTFUL, (0.2, 0.9, 0.3)))
     )
     assert amber > 20 and green == 0
 
@@ -279,7 +282,7 @@ def test_without_overlay_a_doubt_is_all_that_is_drawn():
         ).colour
         for doubt in ("", "do not rely on it")
     )
-    assert np.array_equal(bare, picture.colour) and stands(unsure, "do not rely on it", FINE, ink_of(WARNING))
+    assert np.array_equal(bare, picture.colour) and has_text(unsure, "do not rely on it", FINE, compute_ink(WARNING))
     rows, columns = np.nonzero((unsure != picture.colour).any(axis=2))
     assert rows.min() > 270 and columns.max() < 120
 
@@ -296,7 +299,7 @@ def test_what_lines_and_words_cover_is_reported():
     taken = drawn.taken > 0
     halo = cv2.dilate(taken.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     assert (halo | ~changed).all() and changed[taken].mean() > 0.5
-    ring = silhouette(here, tumour().vertices, tumour().triangles).astype(np.uint8)
+    ring = compute_silhouette(here, tumour().vertices, tumour().triangles).astype(np.uint8)
     assert taken[(ring - cv2.erode(ring, np.ones((3, 3), np.uint8))) > 0].all()
 
 
@@ -309,10 +312,10 @@ def test_words_stay_inside_the_picture():
 
 def test_the_panel_is_a_copy_in_its_corner():
     colour = np.full((150, 200, 3), 90, np.uint8)
-    shown = panel(colour, ["render 12 ms", "error 0.1 mm"], "bottom right")
+    shown = draw_text_panel(colour, ["render 12 ms", "error 0.1 mm"], "bottom right")
     rows, columns = np.nonzero((shown != colour).any(axis=-1))
     assert (colour == 90).all() and rows.min() > 75 and columns.min() > 75
-    assert np.array_equal(panel(colour, []), colour)
+    assert np.array_equal(draw_text_panel(colour, []), colour)
 
 
 @pytest.mark.parametrize(
@@ -325,7 +328,7 @@ def test_the_panel_is_a_copy_in_its_corner():
         (lambda: Solid(np.zeros((1, 5, 5)), np.eye(4)), "voxels"),
         (lambda: composite(render(camera(), [cortex()], LAMP), camera(), tumour(), style="glow"), "window"),
         (lambda: composite(render(camera(), [cortex()], LAMP), camera(100, 75), tumour()), "camera"),
-        (lambda: panel(np.zeros((9, 9, 3), np.uint8), ["a"], "middle"), "corner"),
+        (lambda: draw_text_panel(np.zeros((9, 9, 3), np.uint8), ["a"], "middle"), "corner"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(attempt, reason):
@@ -336,7 +339,7 @@ def test_what_cannot_be_drawn_is_refused(attempt, reason):
 def test_an_outline_is_off_by_what_is_astray_and_by_what_is_missing():
     """One that stands 12 pixels off beside the true one, and one of which the right half is not drawn."""
     here, ink = camera(400, 300), (20.0, 240.0, 60.0)
-    true = silhouette(here, tumour().vertices, tumour().triangles)
+    true = compute_silhouette(here, tumour().vertices, tumour().triangles)
     nothing = np.zeros(true.shape, bool)
 
     def gap(*masks, left=400):
@@ -344,7 +347,7 @@ def test_an_outline_is_off_by_what_is_astray_and_by_what_is_missing():
         for mask in masks:
             colour[mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3))).astype(bool)] = ink
         colour[:, left:] = 0
-        return outline_gap(colour, ink, true, nothing)
+        return measure_outline_gap(colour, ink, true, nothing)
 
     middle = int(np.nonzero(true)[1].mean())
     assert gap(true) <= 1.0
@@ -356,5 +359,5 @@ def test_an_outline_is_off_by_what_is_astray_and_by_what_is_missing():
 def test_a_line_of_text_is_found_whole():
     colour = np.full((80, 200, 3), 90, np.uint8)
     write(colour, "11.5 mm", (60, 40))
-    found = {text for text in ("11.5 mm", "1.5 mm", "11.6 mm", "5 mm") if stands(colour, text, 0.5)}
-    assert found == {"11.5 mm"} and not stands(colour, "11.5 mm", 0.45)
+    found = {text for text in ("11.5 mm", "1.5 mm", "11.6 mm", "5 mm") if has_text(colour, text, 0.5)}
+    assert found == {"11.5 mm"} and not has_text(colour, "11.5 mm", 0.45)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ar.tracking.pages import Page, face_name, listed_targets, pdf_bytes, png_bytes, printed_pages
-from ar.tracking.targets import BORDER, calibration_board, patient_reference, tool_cube
+from ar.tracking.pages import Page, build_printed_pages, describe_targets, to_face_name, to_pdf, to_png
+from ar.tracking.targets import BORDER, build_calibration_board, build_patient_reference, build_tool_cube
 
 
 @pytest.fixture(scope="module")
 def pages():
-    return printed_pages()
+    return build_printed_pages()
 
 
 def drawn_in_pdf(content):
@@ -36,13 +36,13 @@ def drawn_in_pdf(content):
 
 
 def test_pdf_and_png_hold_the_same_pages_at_their_size(pages):
-    content = pdf_bytes(pages)
+    content = to_pdf(pages)
     found = list(drawn_in_pdf(content))
     assert [page.name for page in pages] == ["tool", "patient", "board"] and len(found) == 3
     for page, (pixels, size) in zip(pages, found, strict=True):
         np.testing.assert_array_equal(pixels, page.pixels)
         np.testing.assert_allclose(sorted(size), [210.0, 297.0], atol=1e-6)
-        with Image.open(io.BytesIO(png_bytes(page))) as picture:
+        with Image.open(io.BytesIO(to_png(page))) as picture:
             np.testing.assert_array_equal(np.asarray(picture.convert("L")), page.pixels)
             mm = np.array(picture.size) / np.array(picture.info["dpi"]) * 25.4
         np.testing.assert_allclose(mm, size, atol=1e-6)
@@ -57,7 +57,7 @@ def edges(line):
 def test_squares_and_markers_measure_on_paper_what_they_should(pages, number):
     """From the PNG's own dots per inch; along the first row and column of squares, and through a marker."""
     page = pages[number]
-    with Image.open(io.BytesIO(png_bytes(page))) as picture:
+    with Image.open(io.BytesIO(to_png(page))) as picture:
         pixels, per_mm = np.asarray(picture.convert("L")), picture.info["dpi"][0] / 25.4
     for each in page.placed:
         face = each.face
@@ -123,7 +123,7 @@ def test_sides_that_touch_on_paper_touch_on_the_cube(pages):
     assert len(shared) == 5  # two folds, whose ends meet in one place of the paper three times
     for one, other in shared:
         np.testing.assert_allclose(one, other, atol=1e-9)
-    names = {face_name(each.face): each for each in pages[0].placed}
+    names = {to_face_name(each.face): each for each in pages[0].placed}
     assert (names["+z"].left, names["+z"].top + 48.0) == (names["+x"].left, names["+x"].top)
     assert (names["+y"].left - 48.0, names["+y"].top) == (names["+x"].left, names["+x"].top)
 
@@ -131,7 +131,7 @@ def test_sides_that_touch_on_paper_touch_on_the_cube(pages):
 def test_cut_lines_go_round_the_borders(pages):
     """Most of each outer side of the net and of the plate is drawn, and nothing of the white between."""
     for page, names in ((pages[0], "+z"), (pages[1], "-z")):
-        (each,) = [each for each in page.placed if face_name(each.face) == names]
+        (each,) = [each for each in page.placed if to_face_name(each.face) == names]
         left, top = (round(20.0 * (at - 1e3 * BORDER)) for at in (each.left, each.top))
         wide = round(2e4 * (each.face.size[0] + 2.0 * BORDER))
         side = page.pixels[top : top + wide, left - 2 : left + 3] == 0
@@ -140,9 +140,9 @@ def test_cut_lines_go_round_the_borders(pages):
 
 
 def test_the_list_holds_what_was_printed():
-    listed = listed_targets()
+    listed = describe_targets()
     assert listed["dictionary"] == "DICT_4X4_250" and listed["nominal_tip_mm"] == {"tool": [0.0, 0.0, -150.0]}
-    targets = (tool_cube(), patient_reference(), calibration_board())
+    targets = (build_tool_cube(), build_patient_reference(), build_calibration_board())
     assert [each["name"] for each in listed["targets"]] == [target.name for target in targets]
     assert [face["name"] for face in listed["targets"][0]["faces"]] == ["+x", "+y", "+z"]
     every = []

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ar.tracking.pictures import film_of, pictures_of
+from ar.tracking.pictures import read_images, read_video
 
 
 @pytest.mark.parametrize(
@@ -26,15 +26,15 @@ def test_folder_pictures_come_in_natural_order(tmp_path, names):
     for grey, name in enumerate(names):
         cv2.imwrite(str(tmp_path / name), np.full((8, 8), 20 * grey, np.uint8))
     with pytest.warns(UserWarning, match="order of the numbers in its names, not alphabetically"):
-        found = [(each.name, round(each.time, 6)) for each in film_of(tmp_path, 10.0)]
+        found = [(each.name, round(each.time, 6)) for each in read_video(tmp_path, 10.0)]
     assert found == [(name, round(0.1 * number, 6)) for number, name in enumerate(names)]
-    assert [each.name for each in pictures_of(tmp_path)] == names
+    assert [each.name for each in read_images(tmp_path)] == names
 
 
 def test_folder_in_alphabetical_order_has_no_notice(tmp_path):
     for name in ("a09.png", "a10.png", "b1.png"):
         cv2.imwrite(str(tmp_path / name), np.zeros((8, 8), np.uint8))
-    assert [each.name for each in film_of(tmp_path, 10.0)] == ["a09.png", "a10.png", "b1.png"]
+    assert [each.name for each in read_video(tmp_path, 10.0)] == ["a09.png", "a10.png", "b1.png"]
 
 
 def test_pixels_are_as_stored_whatever_metadata_says(tmp_path):
@@ -51,11 +51,11 @@ def test_pixels_are_as_stored_whatever_metadata_says(tmp_path):
     assert struct.unpack_from(">9i", code, matrix)[:5] == (one, 0, 0, 0, one)
     struct.pack_into(">9i", code, matrix, 0, one, 0, -one, 0, 0, 64 * one, 0, 1 << 30)
     turned.write_bytes(code)
-    plain = [each.grey for each in film_of(film, 10.0)]
+    plain = [each.grey for each in read_video(film, 10.0)]
     with pytest.warns(UserWarning, match=r"turned.mp4: its metadata turns it by \d+ degrees"):
-        found = [each.grey for each in film_of(turned, 10.0)]
+        found = [each.grey for each in read_video(turned, 10.0)]
     np.testing.assert_array_equal(found, plain)
     exif = Image.Exif()
     exif[0x0112] = 6  # orientation
     Image.fromarray(still).save(tmp_path / "a.jpg", exif=exif)
-    assert next(iter(pictures_of(tmp_path))).grey.shape == (64, 96)
+    assert next(iter(read_images(tmp_path))).grey.shape == (64, 96)

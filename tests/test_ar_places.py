@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ar.overlay.places import ASIDE, CLEAR, PAD, STEP, free_place
+from ar.overlay.places import ASIDE, CLEAR, PAD, STEP, find_free_place
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -24,14 +24,14 @@ def test_the_free_place_is_the_nearest(seed):
 
     grid = [(c, r) for r in range(PAD, 120 - PAD - 12 + 1, STEP) for c in range(PAD, 160 - PAD - 30 + 1, STEP)]
     places = [place for place in grid if free(*place)]
-    found = free_place(taken, size, wish)
+    found = find_free_place(taken, size, wish)
     assert places and found is not None and free(*found)
     assert far(*found) == (0 if free(*there) else min(far(*place) for place in places))
 
 
 def test_without_room_there_is_no_place():
     taken = np.zeros((100, 200), np.uint8)
-    assert free_place(taken, (184, 84), (0, 0)) == (PAD, PAD)
-    assert free_place(taken, (185, 84), (0, 0)) is None and free_place(taken, (20, 85), (0, 0)) is None
+    assert find_free_place(taken, (184, 84), (0, 0)) == (PAD, PAD)
+    assert find_free_place(taken, (185, 84), (0, 0)) is None and find_free_place(taken, (20, 85), (0, 0)) is None
     taken[::10] = 1
-    assert free_place(taken, (20, 12), (50, 50)) is None
+    assert find_free_place(taken, (20, 12), (50, 50)) is None

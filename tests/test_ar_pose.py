@@ -9,11 +9,19 @@ from scipy.spatial.transform import Rotation
 
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.drawn import drawn
-from ar.tracking.pose import Tracker, Verdict, pose_of
-from ar.tracking.targets import TIP, DetectedCorners, Detector, Target, calibration_board, patient_reference, tool_cube
+from ar.tracking.drawn import render_targets
+from ar.tracking.pose import Tracker, Verdict, find_pose
+from ar.tracking.targets import (
+    TIP,
+    DetectedCorners,
+    Detector,
+    Target,
+    build_calibration_board,
+    build_patient_reference,
+    build_tool_cube,
+)
 
-CUBE, PLATE = tool_cube(), patient_reference()
+CUBE, PLATE = build_tool_cube(), build_patient_reference()
 K = np.array([[1000.0, 0.0, 410.0], [0.0, 1000.0, 295.0], [0.0, 0.0, 1.0]])
 CAMERA = Camera(K, np.eye(4), 800, 600, Lens(-0.15, 0.03, 1e-3, -5e-4))
 TIP_AT = np.array([0.0, 0.0, -TIP])
@@ -42,7 +50,7 @@ def flat(degrees: tuple[float, float, float], at: tuple[float, float, float]) ->
 
 def taken(*targets: tuple[Target, np.ndarray], camera: Camera = CAMERA, seed: int = 0) -> np.ndarray:
     """A picture with a little blur and noise."""
-    sharp = drawn(np.full((camera.height, camera.width), 120, np.uint8), camera, targets)
+    sharp = render_targets(np.full((camera.height, camera.width), 120, np.uint8), camera, targets)
     blurred = cv2.GaussianBlur(sharp.astype(np.float64), (0, 0), 0.5)
     return np.clip(blurred + np.random.default_rng(seed).normal(0.0, 2.0, blurred.shape), 0, 255).astype(np.uint8)
 
@@ -59,7 +67,9 @@ def angle(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.degrees(Rotation.from_matrix(one[:3, :3] @ other[:3, :3].T).magnitude()))
 
 
-def seen_from_front(T: np.ndarray, noise: float, rng: np.random.Generator, target: Target = PLATE) -> DetectedCorners:
+def is_seen_from_front(
+    T: np.ndarray, noise: float, rng: np.random.Generator, target: Target = PLATE
+) -> DetectedCorners:
     """All corners of a target's faces that look at the camera, with white noise [pixel]."""
     rows = [
         (face.corners, np.full(len(face.corners), number))
@@ -88,7 +98,7 @@ def test_corners_are_found_where_the_lens_puts_them(scene):
         off = corners.pixels - pixels_of(corners.points, poses[name])
         assert np.sqrt(np.square(off).mean()) < 0.3 and np.abs(off.mean(axis=0)).max() < 0.1
     assert set(Detector((CUBE, PLATE)).seen(picture, ("tool",))) == {"tool"}
-    assert not Detector((calibration_board(),)).seen(picture)
+    assert not Detector((build_calibration_board(),)).seen(picture)
     assert not Detector((CUBE,)).seen(np.full((600, 800), 120, np.uint8))
 
 
@@ -108,7 +118,7 @@ def test_a_covariance_is_what_noise_does():
     rng, T = np.random.default_rng(1), looking((10.0, 5.0, -20.0), (0.0, 0.02, 0.3))
     found = []
     for _ in range(150):
-        verdict, pose = pose_of(CAMERA, CUBE, seen_from_front(T, 0.25, rng, CUBE))
+        verdict, pose = find_pose(CAMERA, CUBE, is_seen_from_front(T, 0.25, rng, CUBE))
         assert verdict is Verdict.GOOD and pose is not None
         turn = Rotation.from_matrix(pose.T_camera_target[:3, :3] @ T[:3, :3].T).as_rotvec()
         error = np.append(pose.T_camera_target[:3, 3] - T[:3, 3], turn)
@@ -124,8 +134,8 @@ def test_a_pose_beside_another_target_has_the_errors_of_both():
     true = (np.linalg.inv(plate) @ T @ [0.0, 0.0, -TIP, 1.0])[:3]
     found = []
     for _ in range(150):
-        tool = pose_of(CAMERA, CUBE, seen_from_front(T, 0.2, rng, CUBE))[1]
-        patient = pose_of(CAMERA, PLATE, seen_from_front(plate, 0.2, rng))[1]
+        tool = find_pose(CAMERA, CUBE, is_seen_from_front(T, 0.2, rng, CUBE))[1]
+        patient = find_pose(CAMERA, PLATE, is_seen_from_front(plate, 0.2, rng))[1]
         assert tool is not None and patient is not None
         place, covariance = tool.seen_from(patient).point(TIP_AT)
         found.append((place - true) @ np.linalg.solve(covariance, place - true))
@@ -137,7 +147,7 @@ def test_a_mirrored_pose_is_never_called_good():
     rng, verdicts = np.random.default_rng(2), []
     for _ in range(300):
         T = flat(tuple(rng.uniform(-25.0, 25.0, 3)), (0.05 * rng.normal(), 0.05 * rng.normal(), rng.uniform(0.4, 1.5)))
-        verdict, pose = pose_of(CAMERA, PLATE, seen_from_front(T, 0.2, rng))
+        verdict, pose = find_pose(CAMERA, PLATE, is_seen_from_front(T, 0.2, rng))
         verdicts.append(verdict)
         if pose is not None:
             assert (
@@ -149,25 +159,25 @@ def test_a_mirrored_pose_is_never_called_good():
 
 def test_the_last_pose_tells_two_apart_and_a_far_one_does_not():
     rng, T = np.random.default_rng(3), flat((12.0, -10.0, 0.0), (0.0, 0.0, 1.0))
-    corners = seen_from_front(T, 0.1, rng)
-    assert pose_of(CAMERA, PLATE, corners)[0] is Verdict.AMBIGUOUS
+    corners = is_seen_from_front(T, 0.1, rng)
+    assert find_pose(CAMERA, PLATE, corners)[0] is Verdict.AMBIGUOUS
     near = T.copy()
     near[:3, :3] = Rotation.from_euler("x", 2.0, degrees=True).as_matrix() @ T[:3, :3]
     for _ in range(10):  # in some the mirrored pose fits better
-        verdict, pose = pose_of(CAMERA, PLATE, seen_from_front(T, 0.2, rng), near)
+        verdict, pose = find_pose(CAMERA, PLATE, is_seen_from_front(T, 0.2, rng), near)
         assert verdict is Verdict.GOOD and pose is not None and angle(pose.T_camera_target, T) < 5.0
     far = flat((0.0, 0.0, 90.0), (0.0, 0.0, 1.0))
-    assert pose_of(CAMERA, PLATE, corners, far) == (Verdict.AMBIGUOUS, None)
+    assert find_pose(CAMERA, PLATE, corners, far) == (Verdict.AMBIGUOUS, None)
 
 
 def test_what_fits_nothing_is_lost():
-    corners = seen_from_front(flat((20.0, 15.0, 5.0), (-0.05, 0.0, 0.3)), 0.1, np.random.default_rng(4))
+    corners = is_seen_from_front(flat((20.0, 15.0, 5.0), (-0.05, 0.0, 0.3)), 0.1, np.random.default_rng(4))
     few = DetectedCorners(corners.points[:5], corners.pixels[:5], corners.face[:5])
-    assert pose_of(CAMERA, PLATE, few) == pose_of(CAMERA, PLATE, None) == (Verdict.LOST, None)
+    assert find_pose(CAMERA, PLATE, few) == find_pose(CAMERA, PLATE, None) == (Verdict.LOST, None)
     strewn = replace(corners, pixels=corners.pixels[::-1] + np.random.default_rng(5).normal(0.0, 20.0, (16, 2)))
-    assert pose_of(CAMERA, PLATE, strewn) == (Verdict.POOR, None)
+    assert find_pose(CAMERA, PLATE, strewn) == (Verdict.POOR, None)
     mirrored = replace(corners, pixels=corners.pixels * [-1.0, 1.0] + [800.0, 0.0])
-    assert pose_of(CAMERA, PLATE, mirrored)[1] is None
+    assert find_pose(CAMERA, PLATE, mirrored)[1] is None
 
 
 def test_a_target_is_followed_lost_and_found(scene):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ar.optics.camera import Camera, look_at
-from ar.rendering.rasteriser import rasterise, rows_reached
+from ar.rendering.rasteriser import find_rows_reached, rasterise
 from ar.rendering.raycast import raycast
 
 NO_TRIANGLES = np.zeros((0, 3), int)
@@ -14,7 +14,7 @@ def camera(width: int = 160, height: int = 120) -> Camera:
     return look_at(np.array([0.0, 0.0, -0.3]), np.zeros(3), np.array([0.0, -1.0, 0.0]), np.radians(30.0), width, height)
 
 
-def sphere(rings: int = 40, segments: int = 60, radius: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
+def build_sphere(rings: int = 40, segments: int = 60, radius: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
     """A closed sphere, its poles shared vertices."""
     polar = np.linspace(0.0, np.pi, rings + 1)[1:-1, None]
     turn = np.linspace(0.0, 2.0 * np.pi, segments, endpoint=False)[None]
@@ -52,14 +52,14 @@ def test_a_triangle_that_reaches_the_camera_may_cover_every_row(depth):
     """Where a corner is nearer than the near plane, its own row says nothing: it may lie on the other side."""
     here = camera(height=41)
     corners = np.array([[-0.1, 0.02, 0.3], [0.1, 0.02, 0.3], [0.0, 0.02, depth]])
-    assert rows_reached(corners @ here.K.T, 1e-3, here.height) == (0, here.height)
+    assert find_rows_reached(corners @ here.K.T, 1e-3, here.height) == (0, here.height)
     behind = corners @ here.T_camera_world[:3, :3] + here.centre
     drawn = rasterise(here, behind, np.array([[0, 1, 2]]))
     assert drawn.mask[-1].any() and not drawn.mask[: here.height // 2].any()
 
 
 def test_a_closed_surface_has_no_cracks_and_the_same_depth_as_rays():
-    smooth, triangles = sphere()
+    smooth, triangles = build_sphere()
     here = camera(640, 480)
     # A crack would show the far wall, behind the sphere's middle.
     assert rasterise(here, smooth, triangles).depth.max() < 0.29
@@ -158,7 +158,7 @@ def test_what_is_no_mesh_is_refused(vertices, triangles, reason):
 
 def test_a_near_plane_behind_the_eye_is_refused():
     with pytest.raises(ValueError, match="near"):
-        rasterise(camera(), *sphere(), near=0.0)
+        rasterise(camera(), *build_sphere(), near=0.0)
 
 
 @pytest.mark.gpu
@@ -167,7 +167,7 @@ def test_the_graphics_card_draws_the_same():
 
     if not wp.is_cuda_available():
         pytest.skip("no CUDA device")
-    vertices, triangles = sphere()
+    vertices, triangles = build_sphere()
     here, there = rasterise(camera(), vertices, triangles), rasterise(camera(), vertices, triangles, device="cuda:0")
     assert np.mean(here.face != there.face) < 1e-3
     same = here.face == there.face

@@ -4,21 +4,21 @@ import cv2
 import numpy as np
 import pytest
 
-from ar.page.elements import coded
-from ar.page.recording import LONGEST, RATE, PageRecording, played
+from ar.page.elements import to_data_url
+from ar.page.recording import LONGEST, RATE, PageRecording, replay_images
 
 
 class TestRecording:
     def test_a_film_shows_each_picture_as_long_as_the_page_did(self):
-        codes = [coded(np.full((48, 64, 3), grey, np.uint8)) for grey in (0, 100, 200)]
-        shown = list(played([(5.0, codes[0]), (6.0, codes[1]), (6.2, codes[2])], 7.0, 10.0))
+        codes = [to_data_url(np.full((48, 64, 3), grey, np.uint8)) for grey in (0, 100, 200)]
+        shown = list(replay_images([(5.0, codes[0]), (6.0, codes[1]), (6.2, codes[2])], 7.0, 10.0))
         assert [round(float(picture.mean()), -2) for picture in shown] == [0.0] * 10 + [100.0] * 2 + [200.0] * 8
 
     def test_it_is_an_mp4_that_can_be_read_and_of_bounded_length(self, tmp_path):
         recording = PageRecording(0.0)
         for number in range(20):
-            recording.take(coded(np.full((48, 64, 3), 10 * number, np.uint8)), 0.1 * number)
-        recording.take(coded(np.zeros((48, 64, 3), np.uint8)), LONGEST + 1.0)
+            recording.take(to_data_url(np.full((48, 64, 3), 10 * number, np.uint8)), 0.1 * number)
+        recording.take(to_data_url(np.zeros((48, 64, 3), np.uint8)), LONGEST + 1.0)
         assert len(recording.taken) == 20 and recording.full(LONGEST)
         (tmp_path / "film.mp4").write_bytes(recording.film(2.0))
         film = cv2.VideoCapture(str(tmp_path / "film.mp4"))

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from ar.tracking.registration import pair_residuals, refined, registered
+from ar.tracking.registration import compute_pair_residuals, refined, register_points
 
 SCAN = 1e-3 * np.array(
     [[70.0, 20, 30], [-65, 30, 25], [0, 95, 20], [30, 60, 80], [-40, 10, 90], [5, -80, 60], [50, -50, 70]]
@@ -35,7 +35,7 @@ def held(found):
 
 
 def test_a_registration_is_exact_without_noise():
-    found = registered(SCAN, moved(SCAN))
+    found = register_points(SCAN, moved(SCAN))
     np.testing.assert_allclose(found.T_patient_scan, TRUE, atol=1e-12)
     assert found.rms < 1e-12 and found.pairs == 7
 
@@ -43,7 +43,7 @@ def test_a_registration_is_exact_without_noise():
 @pytest.mark.parametrize("count", [3, 4, 7])
 def test_its_ellipsoid_holds_the_tumour_as_often_as_it_says(count):
     rng = np.random.default_rng(count)
-    some = [registered(SCAN[:count], moved(SCAN[:count]) + 7e-4 * rng.normal(size=(count, 3))) for _ in range(400)]
+    some = [register_points(SCAN[:count], moved(SCAN[:count]) + 7e-4 * rng.normal(size=(count, 3))) for _ in range(400)]
     assert 0.925 < np.mean([held(each) for each in some]) < 0.98
 
 
@@ -54,7 +54,7 @@ def test_a_traced_surface_makes_it_surer_and_it_still_holds():
     for _ in range(60):
         patient = moved(SCAN[:4]) + 1e-3 * rng.normal(size=(4, 3))
         seen = surface + 3e-4 * rng.normal(size=surface.shape)
-        alone.append(registered(SCAN[:4], patient))
+        alone.append(register_points(SCAN[:4], patient))
         both.append(refined(SCAN[:4], patient, seen, on_ellipsoid))
     off = [[np.linalg.norm(each.point(TUMOUR)[0] - moved(TUMOUR)) for each in some] for some in (alone, both)]
     assert np.median(off[1]) < 0.8 * np.median(off[0])
@@ -64,25 +64,25 @@ def test_a_traced_surface_makes_it_surer_and_it_still_holds():
 def test_what_determines_no_registration_is_refused():
     patient, line = moved(SCAN), SCAN[:1] + np.linspace(0.0, 1.0, 5)[:, None] * [0.1, 0.02, 0.0]
     with pytest.raises(ValueError, match="2 pairs are too few"):
-        registered(SCAN[:2], patient[:2])
+        register_points(SCAN[:2], patient[:2])
     with pytest.raises(ValueError, match="points of the scan lie on a line"):
-        registered(line, moved(line))
+        register_points(line, moved(line))
     with pytest.raises(ValueError, match=r"lie within 0\.\d+ mm of each other: give millimetres"):
-        registered(1e-3 * SCAN, patient)
+        register_points(1e-3 * SCAN, patient)
     with pytest.raises(ValueError, match=r"1\.5 times as far apart as the scan's: give both in millimetres"):
-        registered(SCAN, 1.5 * patient)
+        register_points(SCAN, 1.5 * patient)
     with pytest.raises(ValueError, match="mirror image only"):
-        registered(SCAN * [1.0, 1.0, -1.0], patient)
+        register_points(SCAN * [1.0, 1.0, -1.0], patient)
     wrong = patient.copy()
     wrong[4] += [0.0, 0.03, 0.0]
     with pytest.raises(ValueError, match=r"pair 5 \(below the header\) fits worse"):
-        registered(SCAN, wrong)
+        register_points(SCAN, wrong)
     crossed = patient + 3e-4 * np.random.default_rng(1).normal(size=patient.shape)
     crossed[[1, 4]] = crossed[[4, 1]]
     with pytest.raises(ValueError, match=r"pairs 2 and 5 \(below the header\) are swapped: .* fit to 0\.\d mm"):
-        registered(SCAN, crossed)
+        register_points(SCAN, crossed)
     with pytest.raises(ValueError, match=r"stay .* apart"):
-        registered(SCAN, patient[::-1])
+        register_points(SCAN, patient[::-1])
     with pytest.raises(ValueError, match="3 points of the surface are too few"):
         refined(SCAN, patient, patient[:3], on_ellipsoid)
     with pytest.raises(ValueError, match=r"stay .* from the surface"):
@@ -93,21 +93,24 @@ def test_what_determines_no_registration_is_refused():
 
 def test_each_pair_s_residual_is_that_of_a_registration_without_it():
     patient = moved(SCAN) + 5e-4 * np.random.default_rng(3).normal(size=SCAN.shape)
-    fits = pair_residuals(SCAN, patient)
+    fits = compute_pair_residuals(SCAN, patient)
     for row in range(len(SCAN)):
-        others = registered(np.delete(SCAN, row, axis=0), np.delete(patient, row, axis=0))
+        others = register_points(np.delete(SCAN, row, axis=0), np.delete(patient, row, axis=0))
         left = np.linalg.norm(others.point(SCAN[row])[0] - patient[row])
         assert fits.left_out[row] == pytest.approx(left, rel=0.02) and fits.off[row] < left
-    assert np.isnan(pair_residuals(SCAN[:3], patient[:3]).chance) and not pair_residuals(SCAN[:3], patient[:3]).suspect
+    assert (
+        np.isnan(compute_pair_residuals(SCAN[:3], patient[:3]).chance)
+        and not compute_pair_residuals(SCAN[:3], patient[:3]).suspect
+    )
 
 
 def test_a_wrong_pair_is_suspect_as_often_as_the_docs_say_and_sound_ones_seldom():
     rng, sound, wrong = np.random.default_rng(0), [], []
     for number in range(300):
         patient = moved(SCAN[:6]) + 5e-4 * rng.normal(size=(6, 3))
-        sound.append(pair_residuals(SCAN[:6], patient).suspect)
+        sound.append(compute_pair_residuals(SCAN[:6], patient).suspect)
         off = rng.normal(size=3)
         patient[number % 6] += 4e-3 * off / np.linalg.norm(off)
-        fits = pair_residuals(SCAN[:6], patient)
+        fits = compute_pair_residuals(SCAN[:6], patient)
         wrong.append(fits.suspect and fits.worst == number % 6)
     assert 0.02 < np.mean(sound) < 0.08 and 0.8 < np.mean(wrong) < 0.97

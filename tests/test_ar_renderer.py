@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 import warp as wp
-from test_ar_rasteriser import sphere
+from test_ar_rasteriser import build_sphere
 
 from ar.optics.camera import Camera, look_at
 from ar.overlay.composite import composite
 from ar.overlay.marks import Cover
-from ar.rendering.layer import Layer, Solid, vertex_normals
-from ar.rendering.rasteriser import NOTHING, empty_buffer, keep_nearest, seen
+from ar.rendering.layer import Layer, Solid, compute_vertex_normals
+from ar.rendering.rasteriser import NOTHING, allocate_z_buffer, keep_nearest, rasterise_surface
 from ar.rendering.raycast import raycast
-from ar.rendering.renderer import Lamp, Picture, Pictures, Renderer, as_light, render, tone_curve
+from ar.rendering.renderer import Lamp, Picture, Pictures, Renderer, as_light, build_tone_curve, render
 from ar.rendering.shade import BRIGHTEST
 
 FLOOR, BALL, EGG = 1, 2, 3
@@ -35,7 +35,7 @@ def floor(**look) -> Layer:
 
 
 def ball(centre=(0.0, 0.0, 0.03), **look) -> Layer:
-    vertices, triangles = sphere(20, 30, 0.02)
+    vertices, triangles = build_sphere(20, 30, 0.02)
     return Layer("ball", BALL, vertices + centre, triangles, (0.3, 0.7, 0.9), **look)
 
 
@@ -72,7 +72,7 @@ def test_colours_follow_from_the_formulas_at_the_points_that_rays_see():
     """Without texture and shadow, in NumPy: base (ambient + wrapped Lambert) + Fresnel x lobe, under the lamp's rim."""
     here, layer, light = camera(0.0, 320, 240), ball(gloss=0.4, shininess=30.0), as_light(LAMP)
     picture, cast = render(here, [layer], LAMP), raycast(here, layer.vertices, layer.triangles)
-    normals, on = vertex_normals(layer.vertices, layer.triangles), cast.mask
+    normals, on = compute_vertex_normals(layer.vertices, layer.triangles), cast.mask
 
     def unit(v):
         return v / np.linalg.norm(v, axis=-1, keepdims=True)
@@ -94,7 +94,7 @@ def test_colours_follow_from_the_formulas_at_the_points_that_rays_see():
         light.ambient * (0.35 + 0.65 * dot(n, view).clip(0.0)) + arriving * (dot(n, ray) + 0.2).clip(0.0) * 0.83333
     )
     out = out + 0.4 * arriving * fresnel * lobe
-    wanted = tone_curve()[(np.clip(out / float(BRIGHTEST), 0.0, 1.0) * 4095.0).astype(int)]
+    wanted = build_tone_curve()[(np.clip(out / float(BRIGHTEST), 0.0, 1.0) * 4095.0).astype(int)]
     inside = cv2.erode(on.astype(np.uint8), np.ones((3, 3), np.uint8))[on] > 0
     assert inside.sum() > 1000 and agree(picture.colour[on][inside], wanted[inside]) > 0.999
 
@@ -144,9 +144,9 @@ def test_pictures_together_are_those_alone():
 def test_rows_shared_by_threads_give_the_same_depths():
     """As on a card, where several threads draw each triangle."""
     here, layer = camera(), scene()[0]
-    whole = seen(here, layer.vertices, layer.triangles)
+    whole = rasterise_surface(here, layer.vertices, layer.triangles)
     for parts, begin, end in ((3, 0, 120), (8, 0, 120), (7, 31, 90)):
-        shared = empty_buffer(1, 120, 160, "cpu")
+        shared = allocate_z_buffer(1, 120, 160, "cpu")
         size = 1, -(-len(layer.triangles) // 64), parts
         inputs = [whole.points, whole.triangles, 0, wp.float64(1e-3), begin, end, parts, 64]
         wp.launch(keep_nearest, size, inputs, [shared], device="cpu")

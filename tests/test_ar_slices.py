@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from ar.page.slices import PLANES, REACH, SIDE, Cut, resampled, section, sliced, view, within
+from ar.page.slices import PLANES, REACH, SIDE, Cut, cut_surface, draw_slices, find_pixels_within, resample_view, view
 from ar.rendering.layer import Layer, Solid
-from scenes.script.tool import sphere
+from scenes.script.tool import build_sphere
 
 PITCH = 2.0 * REACH / SIDE
 
 
 def ball(radius: float, middle=(0.0, 0.0, 0.0), colour=(0.3, 0.95, 0.55)) -> Layer:
-    points, triangles = sphere()
+    points, triangles = build_sphere()
     return Layer("ball", 4, np.asarray(middle) + radius * points, triangles, colour)
 
 
@@ -19,7 +19,7 @@ class TestSection:
     def test_a_ball_is_cut_in_a_circle(self):
         """Closed, on the plane, and of the radius that Pythagoras says."""
         layer, normal = ball(12e-3), np.array([0.6, 0.0, 0.8])
-        (line,) = section(layer.vertices, layer.triangles, 5e-3 * normal, normal)
+        (line,) = cut_surface(layer.vertices, layer.triangles, 5e-3 * normal, normal)
         assert np.array_equal(line[0], line[-1]) and len(line) > 30
         assert np.abs(line @ normal - 5e-3).max() < 1e-12
         away = np.linalg.norm(line - 5e-3 * normal, axis=1)
@@ -29,12 +29,12 @@ class TestSection:
         two = [ball(5e-3), ball(5e-3, (20e-3, 0.0, 0.0))]
         vertices = np.concatenate([layer.vertices for layer in two])
         triangles = np.concatenate([two[0].triangles, two[1].triangles + len(two[0].vertices)])
-        assert len(section(vertices, triangles, np.zeros(3), np.array([0.0, 0.0, 1.0]))) == 2
-        assert section(vertices, triangles, np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])) == []
+        assert len(cut_surface(vertices, triangles, np.zeros(3), np.array([0.0, 0.0, 1.0]))) == 2
+        assert cut_surface(vertices, triangles, np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])) == []
 
     def test_an_open_surface_is_cut_in_an_open_line(self):
         corners = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, -1.0]])
-        (line,) = section(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        (line,) = cut_surface(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
         assert sorted(line[[0, -1], 0]) == [0.0, 1.0] and len(line) == 3
 
 
@@ -45,14 +45,14 @@ class TestViews:
         for axis in range(3):
             index = np.indices((51, 51, 51))[axis] / 50.0
             scan = Solid(index.astype(np.float32), np.linalg.inv(np.array(np.diag([2e-3, 2e-3, 2e-3, 1.0]) - OFF)))
-            found = resampled(plane, scan, np.zeros(3)).astype(float)
+            found = resample_view(plane, scan, np.zeros(3)).astype(float)
             across, down = (found[:, 200] - found[:, 80]).mean(), (found[200] - found[80]).mean()
             wanted = 190.0 * 120.0 * PITCH / 0.1
             assert across == pytest.approx(wanted * plane.right[axis], abs=1.5)
             assert down == pytest.approx(wanted * plane.down[axis], abs=1.5)
 
     def test_the_band_is_as_wide_as_the_error(self):
-        inside = within(PLANES[0], np.zeros(3), ball(15e-3), 5e-3)
+        inside = find_pixels_within(PLANES[0], np.zeros(3), ball(15e-3), 5e-3)
         row = np.flatnonzero(inside[SIDE // 2])
         widths = [len(part) * PITCH for part in np.split(row, np.flatnonzero(np.diff(row) > 1) + 1)]
         assert widths == pytest.approx([10e-3, 10e-3], abs=1e-3)
@@ -70,7 +70,7 @@ class TestViews:
             Cut(ball(12e-3), ball(12e-3), 1e-3, tip=np.zeros(3), others=[ball(3e-3)]),
             Cut(none, ball(1e-2), 1e-3),
         ):
-            assert sliced(None, np.zeros(3), cut).shape == (SIDE, 3 * SIDE, 3)
+            assert draw_slices(None, np.zeros(3), cut).shape == (SIDE, 3 * SIDE, 3)
 
 
 OFF = np.array([[0, 0, 0, 5e-2], [0, 0, 0, 5e-2], [0, 0, 0, 5e-2], [0, 0, 0, 0.0]])

@@ -8,14 +8,14 @@ import pytest
 import trimesh
 
 from ar.optics.camera import look_at
-from ar.overlay.composite import composite, head_lines
-from ar.overlay.distances import RING, signed_distance, tree_of
+from ar.overlay.composite import composite, format_head_lines
+from ar.overlay.distances import RING, build_tree, compute_signed_distance
 from ar.overlay.gauge import GAUGE, Gauge
-from ar.overlay.hud import FINE, FONT, ROW, WHITE, folded, panel
+from ar.overlay.hud import FINE, FONT, ROW, WHITE, draw_text_panel, wrap_line
 from ar.overlay.legend import SHEET
 from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.measured import Measure
-from ar.overlay.outlines import found_at, ink_of, of_ink, outline_gap, silhouette, stands
+from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, find_text, has_text, measure_outline_gap
 from ar.overlay.styles import STYLES, Opening
 from ar.overlay.window import DARK, Roles
 from ar.rendering.layer import Layer
@@ -53,18 +53,18 @@ def seen(edge=0.09, *more):
 def test_every_style_has_the_outline_in_register_and_a_band(style):
     picture, at = seen(), tumour()
     shown = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING)).colour
-    mask = silhouette(CAMERA, at.vertices, at.triangles)
+    mask = compute_silhouette(CAMERA, at.vertices, at.triangles)
     words = (shown == np.asarray(WHITE, np.uint8)).all(axis=2)
-    others = words | of_ink(shown, RING)
-    assert outline_gap(shown, ink_of(GREEN), mask, others) < 1.5
-    assert outline_gap(shown, ink_of(GREEN), np.roll(mask, 5, axis=1), others) > 3.0
+    others = words | find_ink(shown, RING)
+    assert measure_outline_gap(shown, compute_ink(GREEN), mask, others) < 1.5
+    assert measure_outline_gap(shown, compute_ink(GREEN), np.roll(mask, 5, axis=1), others) > 3.0
     wide = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING), marks=Marks(0.004)).colour
     outside = cv2.dilate(mask.astype(np.uint8), np.ones((15, 15))) == 0
     assert 100 < (outside & (wide != shown).any(axis=2)).sum() < 2000
     doubtful = composite(
         picture, CAMERA, at, style=style, cover=Cover(opening=OPENING), words=Words("do not rely on it")
     ).colour
-    assert not of_ink(doubtful, ink_of(GREEN)).any()
+    assert not find_ink(doubtful, compute_ink(GREEN)).any()
 
 
 @pytest.mark.parametrize("style", DRAWN)
@@ -86,18 +86,18 @@ def test_tools_and_masks_stay_in_front_of_every_style(style):
 def test_under_the_drape_the_outline_is_broken_and_nothing_shines_through(style):
     picture, at = seen(0.0), tumour()
     shown = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING)).colour
-    mask, shut = silhouette(CAMERA, at.vertices, at.triangles), picture.segmentation == DRAPE
+    mask, shut = compute_silhouette(CAMERA, at.vertices, at.triangles), picture.segmentation == DRAPE
     outline = np.zeros(mask.shape, np.uint8)
     cv2.drawContours(outline, cv2.findContours(mask.astype(np.uint8), 0, 1)[0], -1, (1,))
-    inked = of_ink(shown, ink_of(GREEN)) & (outline > 0)
+    inked = find_ink(shown, compute_ink(GREEN)) & (outline > 0)
     far = cv2.dilate(shut.astype(np.uint8), np.ones((9, 9))) == 0
     assert 0.4 < inked[(outline > 0) & shut].mean() < 0.85 and inked[(outline > 0) & far].mean() > 0.95
     within = cv2.erode((mask & shut).astype(np.uint8), np.ones((13, 13))) > 0
     unchanged = (shown == picture.colour).all(axis=2)
     assert unchanged[within].mean() > 0.6  # all but words
-    assert all(stands(shown, line, FINE) for line in ("partly under", "the drape"))
+    assert all(has_text(shown, line, FINE) for line in ("partly under", "the drape"))
     open_to_all = composite(picture, CAMERA, at, style=style).colour
-    assert (of_ink(open_to_all, ink_of(GREEN)) & (outline > 0))[(outline > 0) & shut].mean() > 0.95
+    assert (find_ink(open_to_all, compute_ink(GREEN)) & (outline > 0))[(outline > 0) & shut].mean() > 0.95
 
 
 def test_what_is_said_of_the_ground():
@@ -136,7 +136,7 @@ def test_distances_are_signed_and_end():
     turned = replace(surface, triangles=surface.triangles[:, ::-1])
     points = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.0, 0.005, 0.0], [0.5, 0.0, 0.0]])
     for each in (surface, turned):
-        found = signed_distance(tree_of(each.vertices, each.triangles), points, 0.1)
+        found = compute_signed_distance(build_tree(each.vertices, each.triangles), points, 0.1)
         assert found[:3] == pytest.approx([-0.01, 0.01, -0.005], abs=2e-4) and np.isnan(found[3])
 
 
@@ -144,10 +144,10 @@ def test_a_panel_moves_out_of_sight_of_what_it_would_hide():
     colour, hidden = np.full((360, 640, 3), 90, np.uint8), np.zeros((360, 640), np.uint8)
     hidden[:, :400] = 1
     lines = ["a line that is as wide as more than half of the picture, or wider", "another"]
-    shown = panel(colour, lines, below=40, sights=[np.ones_like(hidden), hidden])
+    shown = draw_text_panel(colour, lines, below=40, sights=[np.ones_like(hidden), hidden])
     changed = (shown != colour).any(axis=2)
     assert changed.any() and not changed[:, :400].any()
-    assert np.array_equal(panel(colour, lines, sights=[np.ones_like(hidden)]), panel(colour, lines))
+    assert np.array_equal(draw_text_panel(colour, lines, sights=[np.ones_like(hidden)]), draw_text_panel(colour, lines))
 
 
 def test_a_mask_of_another_size_is_refused():
@@ -177,13 +177,13 @@ def test_a_cut_has_letters_at_both_ends_also_where_a_tool_hides_one():
 def test_words_at_the_head_are_broken_beside_a_tool():
     tool = np.zeros((480, 640), bool)
     texts = ["model: finite elements themselves", "tumour: within 5.7 mm of where it is (95 %), above all registration"]
-    assert head_lines(texts, tool) == texts
+    assert format_head_lines(texts, tool) == texts
     tool[:200, 330:390] = True
-    lines = head_lines(texts, tool)
+    lines = format_head_lines(texts, tool)
     assert len(lines) > 2 and " ".join(lines) == " ".join(texts)
     assert max(cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines) < 330
     tool[:, 40:] = True
-    assert head_lines(texts, tool) == texts  # there is no room beside it
+    assert format_head_lines(texts, tool) == texts  # there is no room beside it
 
 
 def test_a_ring_s_number_keeps_off_the_line_from_the_tip():
@@ -215,8 +215,8 @@ def test_a_ring_s_caption_stands_apart_from_the_number_beside_the_tip():
         cover=Cover(opening=OPENING),
         marks=Marks(gauge=Gauge(tip, at.vertices[0])),
     ).colour
-    number = found_at(shown, str(Gauge(tip, at.vertices[0])), GAUGE)
-    caption = found_at(shown, folded(said, 0.3 * 640)[0], FINE)
+    number = find_text(shown, str(Gauge(tip, at.vertices[0])), GAUGE)
+    caption = find_text(shown, wrap_line(said, 0.3 * 640)[0], FINE)
     assert number is not None and caption is not None
     left, top, right, foot = number
     assert caption[1] > foot + ROW or caption[3] < top - ROW or caption[0] > right + ROW or caption[2] < left - ROW

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_ar_pose import CUBE, PLATE
 
-from ar.tracking.targets import BORDER, calibration_board
+from ar.tracking.targets import BORDER, build_calibration_board
 
 
 def test_faces_look_outwards_and_no_two_markers_are_alike():
@@ -14,5 +14,7 @@ def test_faces_look_outwards_and_no_two_markers_are_alike():
         np.testing.assert_allclose(face.corners @ into, -(2.5 * face.square + BORDER))
         assert face.corners.shape == (16, 3) and np.linalg.det(face.T_target_face) == pytest.approx(1.0)
         np.testing.assert_allclose(np.ptp(face.outline, axis=0).max(), 40e-3)
-    ids = [number for target in (CUBE, PLATE, calibration_board()) for face in target.faces for number in face.ids]
+    ids = [
+        number for target in (CUBE, PLATE, build_calibration_board()) for face in target.faces for number in face.ids
+    ]
     assert len(ids) == len(set(ids)) == 79 and max(ids) < 250

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ar.tracking.tracker_calibration import hand_eye, pivoted
+from ar.tracking.tracker_calibration import calibrate_pivot, solve_hand_eye
 
 TIP = np.array([0.002, -0.003, -0.15])
 
@@ -37,7 +37,7 @@ def bodies(X, count=30, seed=0):
 @pytest.mark.parametrize("shift", [(0.05, -0.02, 0.12), (0.0, 0.0, 0.0)])
 def test_hand_eye_is_exact_without_noise(turn, shift):
     X = rigid(turn, shift)
-    found = hand_eye(*bodies(X))
+    found = solve_hand_eye(*bodies(X))
     np.testing.assert_allclose(found.X, X, atol=1e-12)
     assert found.turn < 1e-6 and found.shift < 1e-12 and found.motions > 300
 
@@ -48,7 +48,7 @@ def test_hand_eye_with_a_trackers_noise_is_as_good_as_published():
     turns, shifts = [], []
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        found = hand_eye(*(noisy(poses, 0.3, 5e-4, rng) for poses in bodies(X, seed=seed)))
+        found = solve_hand_eye(*(noisy(poses, 0.3, 5e-4, rng) for poses in bodies(X, seed=seed)))
         turns.append(np.degrees(Rotation.from_matrix(X[:3, :3].T @ found.X[:3, :3]).magnitude()))
         shifts.append(1e3 * np.linalg.norm(found.X[:3, 3] - X[:3, 3]))
         assert 0.3 < np.degrees(found.turn) < 1.0 and 5e-4 < found.shift < 4e-3
@@ -60,16 +60,16 @@ def test_motions_that_determine_nothing_are_refused():
     X = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12])
     first, second = bodies(X)
     with pytest.raises(ValueError, match=r"30 and 29 poses: give both"):
-        hand_eye(first, second[1:])
+        solve_hand_eye(first, second[1:])
     with pytest.raises(ValueError, match=r"3 poses are too few"):
-        hand_eye(first[:3], second[:3])
+        solve_hand_eye(first[:3], second[:3])
     still = np.array([rigid(0.01 * np.array([k, -k, 0]), [0.01 * k, 0.0, 0.0]) for k in range(8)])
     with pytest.raises(ValueError, match=r"0 motions turn the bodies by more than 8 degrees"):
-        hand_eye(still, still @ X)
+        solve_hand_eye(still, still @ X)
     rng = np.random.default_rng(1)
     about = np.array([rigid([0.0, 0.0, angle], rng.normal(size=3)) for angle in np.linspace(0.0, 2.0, 12)])
     with pytest.raises(ValueError, match=r"axes of all \d+ motions are parallel, to 0\.0 degrees"):
-        hand_eye(about, about @ X)
+        solve_hand_eye(about, about @ X)
 
 
 @pytest.mark.parametrize(("tilt", "is_parallel"), [(1.9, True), (2.2, False)])
@@ -81,15 +81,15 @@ def test_hand_eye_axes_within_8_degrees_are_rejected(tilt, is_parallel):
     first = np.array([rigid(turn, 0.1 * rng.normal(size=3)) for turn in turns])
     second = np.linalg.inv(X) @ first @ X
     if not is_parallel:
-        np.testing.assert_allclose(hand_eye(first, second).X, X, atol=1e-9)
+        np.testing.assert_allclose(solve_hand_eye(first, second).X, X, atol=1e-9)
         return
     with pytest.raises(ValueError, match=r"are parallel, to [67]\.\d degrees"):
-        hand_eye(first, second)
+        solve_hand_eye(first, second)
 
 
 def test_many_poses_are_thinned():
     X = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12])
-    found = hand_eye(*bodies(X, count=1000))
+    found = solve_hand_eye(*bodies(X, count=1000))
     assert found.motions == 2000
     np.testing.assert_allclose(found.X, X, atol=1e-12)
 
@@ -107,14 +107,14 @@ def pivoting(count, tilt=30.0, around=1.0):
 
 
 def test_a_tip_is_found_and_its_deviation_is_that_of_repeated_pivoting():
-    exact = pivoted(pivoting(20))
+    exact = calibrate_pivot(pivoting(20))
     np.testing.assert_allclose(exact.tip, TIP, atol=1e-12)
     np.testing.assert_allclose(exact.centre, [0.1, 0.2, 0.3], atol=1e-12)
     assert exact.rms < 1e-12 and np.degrees(exact.tilt) == pytest.approx(
         23.7, abs=1.0
     )  # of its x: 30 sqrt((1 + 0.25) / 2)
     rng = np.random.default_rng(0)
-    found = [pivoted(noisy(pivoting(40), 0.0, 5e-4, rng)) for _ in range(40)]
+    found = [calibrate_pivot(noisy(pivoting(40), 0.0, 5e-4, rng)) for _ in range(40)]
     stated = np.sqrt(np.mean([np.diag(each.covariance) for each in found], axis=0))
     seen = np.std([[*each.tip, *each.centre] for each in found], axis=0)
     assert (seen / stated < 1.5).all() and (stated / seen < 1.5).all()
@@ -123,9 +123,9 @@ def test_a_tip_is_found_and_its_deviation_is_that_of_repeated_pivoting():
 
 def test_too_little_pivoting_is_refused():
     with pytest.raises(ValueError, match=r"9 poses are too few"):
-        pivoted(pivoting(9))
+        calibrate_pivot(pivoting(9))
     with pytest.raises(ValueError, match=r"turns by 3\.\d degrees only .*tilt the tool by 30 degrees"):
-        pivoted(pivoting(20, tilt=5.0))
+        calibrate_pivot(pivoting(20, tilt=5.0))
     swung = np.array([rigid([0.0, angle, 0.0], np.zeros(3)) for angle in np.linspace(-1.0, 1.0, 20)])
     with pytest.raises(ValueError, match=r"turns by 0\.0 degrees only"):  # far, but about one axis
-        pivoted(swung)
+        calibrate_pivot(swung)

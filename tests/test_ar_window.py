@@ -7,10 +7,10 @@ import numpy as np
 import warp as wp
 from test_ar_renderer import EGG, LAMP, agree, ball, camera, floor
 
-from ar.overlay.outlines import box_around
-from ar.overlay.window import FADE, SURROUND, Lines, Roles, chamfer, overlaid
-from ar.rendering.layer import vertex_normals
-from ar.rendering.rasteriser import seen
+from ar.overlay.outlines import find_pixel_box
+from ar.overlay.window import FADE, SURROUND, Lines, Roles, compute_chamfer_distance, draw_overlay
+from ar.rendering.layer import compute_vertex_normals
+from ar.rendering.rasteriser import rasterise_surface
 from ar.rendering.raycast import raycast
 from ar.rendering.renderer import render
 
@@ -22,7 +22,7 @@ def test_the_rim_is_as_wide_by_kernels_as_by_opencv():
         cv2.circle(mask, (int(column), int(row)), int(radius), (1,), -1)
     beside = 1 - mask
     known = cv2.distanceTransform(beside, cv2.DIST_L2, cv2.DIST_MASK_3)
-    found = chamfer(wp.array(beside, dtype=wp.uint8, device="cpu"), "cpu").numpy()
+    found = compute_chamfer_distance(wp.array(beside, dtype=wp.uint8, device="cpu"), "cpu").numpy()
     near = known < float(SURROUND)
     assert 0 < near.sum() < near.size and np.abs(found - known)[near].max() < 2e-3
     assert found[~near].min() > float(SURROUND) - 1e-3
@@ -34,17 +34,17 @@ def test_the_window_is_what_its_formula_says():
     hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG, colour=(0.2, 0.9, 0.3))
     picture = render(here, [floor()], LAMP)
     cast = raycast(here, hidden.vertices, hidden.triangles)
-    box = box_around(here, hidden.vertices)
+    box = find_pixel_box(here, hidden.vertices)
     assert box is not None
-    part = here.cropped(*box)
-    found = seen(part, hidden.vertices, hidden.triangles)
-    shown, taken = overlaid(
+    part = here.crop_to(*box)
+    found = rasterise_surface(part, hidden.vertices, hidden.triangles)
+    shown, taken = draw_overlay(
         picture.drawn, box, part, hidden, found, Roles(), "window", Lines((0.0, 0.0, 0.0), solid=False)
     )
     away = cv2.distanceTransform((~cast.mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3) / float(SURROUND)
     window = np.clip(1.25 - 1.25 * away, 0.0, 1.0)[..., None]
     wanted = picture.colour * (1.0 - 0.62 * window**2 * (3.0 - 2.0 * window))
-    normals = cast.interpolate(hidden.triangles, vertex_normals(hidden.vertices, hidden.triangles))
+    normals = cast.interpolate(hidden.triangles, compute_vertex_normals(hidden.vertices, hidden.triangles))
     facing = normals @ here.T_camera_world[2, :3]
     under = np.where(picture.depth > 0.0, (cast.depth - picture.depth).clip(0.0), 0.0)
     shine = 1.1 * (0.25 + 0.75 * np.abs(facing)) * np.exp(-under / float(FADE)) * cast.mask
@@ -58,20 +58,20 @@ def test_the_outline_runs_along_the_edge():
     here, ink = camera(), (40.0, 220.0, 90.0)
     hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG)
     picture = render(here, [floor()], LAMP)
-    box = box_around(here, hidden.vertices)
+    box = find_pixel_box(here, hidden.vertices)
     assert box is not None
-    part = here.cropped(*box)
-    found = seen(part, hidden.vertices, hidden.triangles)
+    part = here.crop_to(*box)
+    found = rasterise_surface(part, hidden.vertices, hidden.triangles)
     mask = found.mask.astype(np.uint8)
     edge = (mask - cv2.erode(mask, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)))).astype(bool)
     near = cv2.dilate(edge.astype(np.uint8), np.ones((9, 9))).astype(bool)
-    shown, taken = overlaid(picture.drawn, box, part, hidden, found, Roles(), "contour", Lines(ink))
+    shown, taken = draw_overlay(picture.drawn, box, part, hidden, found, Roles(), "contour", Lines(ink))
     inked = np.abs(shown[box].astype(int) - np.array(ink)).max(axis=-1) <= 2
     assert inked[edge].mean() > 0.99 and not taken[~near].any()
     np.testing.assert_array_equal(shown[box][taken == 0], picture.colour[box][taken == 0])
     rim = (taken > 0) & ~inked
     assert (rim & ~found.mask).sum() > 30 and (rim & found.mask).sum() > 30
     assert (shown[box][rim].max(axis=-1) <= picture.colour[box][rim].max(axis=-1) + 2).mean() > 0.6
-    same, free = overlaid(picture.drawn, box, part, hidden, found, Roles((floor().id,)), "contour", Lines(ink))
+    same, free = draw_overlay(picture.drawn, box, part, hidden, found, Roles((floor().id,)), "contour", Lines(ink))
     np.testing.assert_array_equal(same, picture.colour)
     assert not free.any()

@@ -11,7 +11,7 @@ from conftest import make_box
 
 from benchmarks.__main__ import main
 from benchmarks.commands.solver import NAMES
-from benchmarks.peers.comparison import HOUSE, OWN, PEERS, TOLERANCE, Engine, case_of, compare, judge_of
+from benchmarks.peers.comparison import HOUSE, OWN, PEERS, TOLERANCE, Engine, build_judge, case_of, compare
 from benchmarks.peers.engine_sulcus import fem_of
 from sim.bodies.meshfile import write_anatomy
 
@@ -48,7 +48,7 @@ def case(box):
 
 @pytest.fixture(scope="module")
 def judge(case):
-    return judge_of(case)
+    return build_judge(case)
 
 
 def compared(case, judge, *engines):

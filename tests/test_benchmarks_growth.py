@@ -9,7 +9,7 @@ import pytest
 from ar.screen import read_png
 from benchmarks.__main__ import main
 from benchmarks.studies import scaling
-from benchmarks.studies.scaling import LOADS, Row, Trial, measured, panels, rows, template_mesh
+from benchmarks.studies.scaling import LOADS, Row, Trial, build_template_mesh, measured, panels, rows
 from sim.errors import InputError
 
 ROW = Row(
@@ -34,7 +34,7 @@ ROW = Row(
 def folder(tmp_path_factory):
     """Where the smallest template's mesh is kept."""
     folder = tmp_path_factory.mktemp("growth")
-    template_mesh(folder, 2000)
+    build_template_mesh(folder, 2000)
     return folder
 
 

@@ -37,7 +37,7 @@ from sim.loads import Loads, Nodal, Posture, Pushed
 from sim.material import Material
 from surrogate.locating import locator_store
 from surrogate.locating.locator import Locator
-from surrogate.locating.prior import NOWHERE, MotionPrior, middle_of
+from surrogate.locating.prior import NOWHERE, MotionPrior, compute_middle
 
 
 @pytest.fixture(scope="module")
@@ -72,12 +72,12 @@ def some_motion(locator, number):
     return 3.0 * np.tensordot([0.8, 0.6], pair, 1)
 
 
-def scattered(count, seed=0):
+def scatter_columns(count, seed=0):
     return np.random.default_rng(seed).uniform(0.0, 0.08, (count, 3))
 
 
 def test_the_best_rigid_motion_is_one(tumour):
-    rest = scattered(30)
+    rest = scatter_columns(30)
     turn = Rotation.from_rotvec([0.02, -0.05, 0.03])
 
     def motion(at):
@@ -87,7 +87,7 @@ def test_the_best_rigid_motion_is_one(tumour):
 
 
 def test_thin_plates_go_on_linearly_and_smooth_noise_away(tumour):
-    rest = scattered(40)
+    rest = scatter_columns(40)
 
     def motion(at):
         return at @ (0.05 * np.arange(9.0).reshape(3, 3) - 0.2) + [1e-3, 0.0, -2e-3]
@@ -114,7 +114,7 @@ def test_kelvinlets_meet_kelvins_solution_far_away_and_are_symmetric():
 
 def test_forces_at_the_points_are_found_again(tumour):
     """All but what the ridge takes; forces that differ along each axis, so that no axis is mistaken for another."""
-    rest = scattered(12)
+    rest = scatter_columns(12)
     force = np.random.default_rng(2).standard_normal((12, 3)) * [1e-5, 2e-5, 3e-5]
     seen, there = (np.einsum("nivj,ni->vj", kelvinlets(at, rest), force) for at in (rest, tumour))
     found = kelvin_forces(tumour)(rest, seen)
@@ -179,7 +179,7 @@ def test_squares_are_by_the_stated_covariance_of_the_centroid(locator, body):
     motion = some_motion(locator, 0)
     seen = observed(body, motion, PointsSeen(60, 60, 1), (0, 0))
     found, answer = ours(locator, motion, seen), locator.locate(seen)
-    off = answer.centroid - middle_of(body, motion[None])[0]
+    off = answer.centroid - compute_middle(body, motion[None])[0]
     assert found.square == pytest.approx(off @ np.linalg.inv(answer.centroid_covariance) @ off)
     wild = replace(seen, now=seen.rest + 0.01 * np.random.default_rng(0).standard_normal(seen.rest.shape))
     refused = ours(locator, motion, wild)

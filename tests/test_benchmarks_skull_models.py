@@ -21,7 +21,7 @@ from sim.material import Material
 from sim.tearing import Tearing
 from surrogate.data.dataset import read_dataset
 from surrogate.data.tool_loads import draw
-from surrogate.model.applicability import trained_skull
+from surrogate.model.applicability import read_trained_skull
 from surrogate.training.expansion import Expansion
 
 
@@ -96,5 +96,5 @@ def test_what_is_learnt_of_a_skull_is_of_that_skull(tmp_path):
         words = ["--count", "2", "--skull", skull, "--element", "p1", "--tolerance", "1e-3", "--device", "cpu"]
         assert main(["simulate", str(tmp_path / "brain.vtu"), "--out", str(out), *words]) == 0
         data = read_dataset(out)
-        assert trained_skull(data.provenance) == skull
+        assert read_trained_skull(data.provenance) == skull
         assert effect in Expansion(data, "cpu").fem().effects

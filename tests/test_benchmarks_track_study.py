@@ -13,8 +13,8 @@ from benchmarks.studies.track_study import (
     TURNED,
     Shot,
     between,
-    pivoted,
-    row_of,
+    build_row,
+    calibrate_pivot,
     spread,
     trial_camera,
 )
@@ -28,10 +28,12 @@ def shot(tip, off=None, deviation=1e-3, markers=30.0):
 
 def test_a_row_counts_what_was_found_where_it_could_be_and_what_was_wrong():
     shots = [shot([0, 0, 0], [1e-3, 0, 0]), shot([0, 0, 0], [0, 2e-3, 0]), shot([0, 0, 0]), shot([0, 0, 0], markers=10)]
-    row = row_of("trial", shots, lambda certain: np.array([np.linalg.norm(each.found - each.tip) for each in certain]))
+    row = build_row(
+        "trial", shots, lambda certain: np.array([np.linalg.norm(each.found - each.tip) for each in certain])
+    )
     assert (row.pictures, row.median, row.most) == (4, pytest.approx(1.5), pytest.approx(2.0))
     assert row.certain == pytest.approx(100.0 * 2 / 3) and row.wrong == 0 and row.held == 100.0
-    bad = row_of("trial", [*shots, shot([0, 0, 0], [0, 0, 6e-3])], lambda certain: np.zeros(len(certain)))
+    bad = build_row("trial", [*shots, shot([0, 0, 0], [0, 0, 6e-3])], lambda certain: np.zeros(len(certain)))
     assert bad.wrong == 1 and bad.held == pytest.approx(100.0 * 2 / 3) and bad.milliseconds == pytest.approx(10.0)
 
 
@@ -49,7 +51,7 @@ def test_poses_are_those_of_the_protocols():
     np.testing.assert_allclose(middle, [0.0, 0.0, AWAY], atol=0.01)
     pixels = camera.project(np.array([T[:3, 3] for T in evenly]))[0]
     assert (pixels > 0.0).all() and (pixels < [camera.width, camera.height]).all()
-    once, often = (np.array(list(pivoted(20, 0, point))) for point in (np.zeros(3), None))
+    once, often = (np.array(list(calibrate_pivot(20, 0, point))) for point in (np.zeros(3), None))
     tips = once[:, :3, :3] @ [0.0, 0.0, -TIP] + once[:, :3, 3]
     np.testing.assert_allclose(tips, tips[:1].repeat(20, axis=0), atol=1e-12)
     assert np.ptp(often[:, :3, :3] @ [0.0, 0.0, -TIP] + often[:, :3, 3], axis=0).min() > 0.03

@@ -12,7 +12,7 @@ import pytest
 
 from sim.runtime import versions
 from sim.runtime.optional_packages import install_hint
-from sim.runtime.versions import DISTRIBUTION, version_of
+from sim.runtime.versions import DISTRIBUTION, get_version
 
 HOUSE = Path(__file__).parents[1]
 PROJECT = tomllib.loads((HOUSE / "pyproject.toml").read_text())["project"]
@@ -64,11 +64,11 @@ def test_version_of_checkout_that_is_not_installed_is_the_projects(monkeypatch):
     def gone(name):
         raise versions.PackageNotFoundError(name)
 
-    assert version_of("sulcus") == PROJECT["version"]
+    assert get_version("sulcus") == PROJECT["version"]
     monkeypatch.setattr(versions, "version", gone)
-    assert version_of.__wrapped__("sulcus") == PROJECT["version"]
+    assert get_version.__wrapped__("sulcus") == PROJECT["version"]
     with pytest.raises(versions.PackageNotFoundError):
-        version_of.__wrapped__("numpy")
+        get_version.__wrapped__("numpy")
 
 
 FOREIGN = {

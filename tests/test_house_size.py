@@ -44,7 +44,7 @@ def test_classes_take_at_most_eight_positional_values():
                 assert len(node.args) <= 8, f"{name_of(path)}:{node.lineno}: {node.func.id}"
 
 
-FACTORIES = ("kernel_of", "kernels_of", "functions_of")
+FACTORIES = ("build_kernel", "build_kernels", "build_functions")
 
 
 def test_functions_are_short_and_take_few_arguments():

@@ -8,12 +8,12 @@ import trimesh
 from theatres import PUSHING, on_template, small, template_theatre
 
 from ar.optics.camera import project_cv2
-from scenes.play.stage import CORTEX, DRAPE, TOOL, Stage, clipped
+from scenes.play.stage import CORTEX, DRAPE, TOOL, Stage, clip_surface
 from scenes.script.head_posture import Lying
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.site import site_of
 from scenes.script.tool import Probe
-from scenes.script.tool_paths import AIR, Touch, lifted
+from scenes.script.tool_paths import AIR, Touch, compute_lift
 from scenes.script.viewpoint import UNDER, Viewpoint
 from sim.compile import check_causes
 from sim.errors import InputError
@@ -43,7 +43,7 @@ def test_built_in_scenes_say_what_they_are_and_begin_as_the_scan(name, template)
     assert times[0] == 0.0 and times[-1] == pytest.approx(scene.duration) and np.allclose(np.diff(times), 1 / 30)
     assert scene.path(0.0).force == 0.0 and scene.lying(0.0) == Lying()
     loads = scene.loads(template.site, scene.path(0.0), 0.0)
-    check_causes(scene.effects_on(template.anatomy), loads)
+    check_causes(scene.get_effects_on(template.anatomy), loads)
 
 
 @pytest.mark.parametrize("name", PUSHING)
@@ -86,7 +86,7 @@ class TestSite:
     def test_the_tool_stays_inside_the_opening(self, site):
         for x, y in ((0.1, 0.0), (-0.03, 0.03), (0.0, -0.02)):
             point = site.contact(x, y, 0.007).point[None]
-            assert open_patch(site.anatomy).rim_distance(point)[0] > 0.007 * 0.999
+            assert open_patch(site.anatomy).compute_edge_distance(point)[0] > 0.007 * 0.999
             assert site.across(point)[0] > 0.95 * site.reach(0.007)
         assert np.allclose(site.contact(0.1, 0.1, 1.0).point, site.origin, atol=1e-9)
 
@@ -187,8 +187,8 @@ def test_clipping_keeps_the_positive_part():
         a, b, c = (points[triangles[:, k]] for k in range(3))
         return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
 
-    above, over, rim = clipped(points, triangles, value)
-    below, under, _ = clipped(points, triangles, -value)
+    above, over, rim = clip_surface(points, triangles, value)
+    below, under, _ = clip_surface(points, triangles, -value)
     assert area(above, over) + area(below, under) == pytest.approx(area(points, triangles))
     assert min(area(above, over), area(below, under)) > 0.1 * area(points, triangles)
     assert (above[over] @ [1.0, -0.7, 0.0] - 0.1).min() > -1e-12
@@ -201,4 +201,4 @@ def test_an_unknown_scene_is_named_with_the_known_ones():
 
 
 def test_no_force_is_seen_to_act_through_the_air():
-    assert lifted(0.0) == AIR and lifted(0.005) == lifted(0.3) == 0.0
+    assert compute_lift(0.0) == AIR and compute_lift(0.005) == compute_lift(0.3) == 0.0

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from studies import nothing
 
-from scenes.report.adaptation import debulked, debulked_study, simulate_debulked, simulating_seconds
+from scenes.report.adaptation import build_debulked_study, debulk_tumour, read_simulation_seconds, simulate_debulked
 from scenes.report.learner import LearnerSpec
-from scenes.report.rows import measured
+from scenes.report.rows import measure_row
 from surrogate.training.train import train
 
 
 class TestAdapting:
     def test_a_debulked_body_lacks_a_fifth_of_its_tumour_and_nothing_else(self, study_box):
-        after = debulked(study_box)
+        after = debulk_tumour(study_box)
         volume = [body.mesh.volumes[body.mesh.region == 2].sum() for body in (after, study_box)]
         element = study_box.mesh.volumes[study_box.mesh.region == 2].max()
         assert 0.8 * volume[1] <= volume[0] <= 0.8 * volume[1] + element
@@ -35,20 +35,20 @@ class TestAdapting:
         simulate_debulked(study, reported.append)
         rows_in_all = len(study.dataset.loads) + len(study.dataset.unit_good)
         assert sum(reported) == 2 * rows_in_all
-        row = measured(study, LearnerSpec("linear"), study.folder / "adapted.png")
-        after = debulked_study(study)
+        row = measure_row(study, LearnerSpec("linear"), study.folder / "adapted.png")
+        after = build_debulked_study(study)
         model = train(after.dataset, ["linear"], split=after.discs).models["linear"]
         test = np.flatnonzero(after.discs.test)
         guess = model.deform(after.converged.rows(test), at=after.anatomy.tumour_nodes).displacement
         wanted = 1e3 * np.linalg.norm(guess - after.answers[test], axis=2).mean()
         assert row.adapted.mm.mean == pytest.approx(wanted, rel=1e-6)
-        assert row.adapt > simulating_seconds(study) > 0.0
+        assert row.adapt > read_simulation_seconds(study) > 0.0
         assert study_rows[0].adapt > 0.0 and study_rows[0].adapted is None
         assert any("L-BFGS" in line for line in study_rows[0].plan) and not row.plan
         assert study_rows[2].adapt is None  # no data of the debulked body yet
 
     def test_a_run_that_was_stopped_has_no_time(self, study, monkeypatch):
-        path = debulked_study(study).data
+        path = build_debulked_study(study).data
         path.unlink(missing_ok=True)
         path.with_suffix(".json").unlink(missing_ok=True)
 
@@ -59,4 +59,4 @@ class TestAdapting:
         with pytest.raises(KeyboardInterrupt):
             simulate_debulked(study, stopped)
         simulate_debulked(study, nothing)
-        assert path.exists() and simulating_seconds(study) is None
+        assert path.exists() and read_simulation_seconds(study) is None

@@ -9,7 +9,7 @@ import pytest
 
 from scenes.episodes.make import make_body, make_episode
 from scenes.episodes.plan import load_plan
-from scenes.episodes.reading.again import solved_again, validated
+from scenes.episodes.reading.again import solve_again, validate_files
 from scenes.episodes.reading.validation import Report, validate_episode
 from sim.bodies.meshfile import write_anatomy
 
@@ -42,11 +42,11 @@ def episode(request, small_box, tmp_path_factory):
 
 def test_a_frame_is_solved_again_after_its_past(episode):
     """Of the frames 0, 2 and 5 the last is not as it was: the others are right, and it alone is named."""
-    report = solved_again(Report(episode), 3, "cpu")
+    report = solve_again(Report(episode), 3, "cpu")
     assert report.problems == [] and report.again == 3 and report.again_mm < 0.1
     with h5py.File(episode, "a") as file:
         file["tumour_fem"][2, 0, 2] += 4e-4
-    (said,) = solved_again(Report(episode), 3, "cpu").problems
+    (said,) = solve_again(Report(episode), 3, "cpu").problems
     assert said.startswith("frame 2, solved again, is 0.")
 
 
@@ -57,7 +57,7 @@ def slow(path):
 
 
 def test_who_wants_no_more_waits_for_what_has_begun_alone(tmp_path):
-    reports = validated([tmp_path / f"{number}.h5" for number in range(200)], 1, slow)
+    reports = validate_files([tmp_path / f"{number}.h5" for number in range(200)], 1, slow)
     assert next(reports).problems == []
     began = time.perf_counter()
     reports.close()
@@ -75,5 +75,5 @@ def end(path):
 def test_a_file_that_ends_its_reader_ends_no_other(whole, tmp_path):
     broken = tmp_path / "broken.h5"
     broken.write_bytes(whole.read_bytes())
-    reports = {report.path: report for report in validated([broken, whole], 1, end)}
+    reports = {report.path: report for report in validate_files([broken, whole], 1, end)}
     assert "ends the process that reads it" in reports[broken].problems[0] and not reports[whole].problems

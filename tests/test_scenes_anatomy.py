@@ -7,7 +7,7 @@ import pytest
 from balls import ball
 
 from scenes.cli import main
-from sim.bodies.intensity import read_intensity, sidecar
+from sim.bodies.intensity import read_intensity, to_intensity_path
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 
 
@@ -36,7 +36,9 @@ def test_the_template_with_its_intensities_round_trip(tmp_path, capsys):
     # Three millimetres under the opened cortex there is grey matter to be seen.
     nodes = anatomy.mesh.nodes[anatomy.craniotomy]
     inward = anatomy.mesh.nodes.mean(axis=0) - nodes
-    grey = read_intensity(sidecar(out)).at(nodes + 3e-3 * inward / np.linalg.norm(inward, axis=1, keepdims=True))
+    grey = read_intensity(to_intensity_path(out)).at(
+        nodes + 3e-3 * inward / np.linalg.norm(inward, axis=1, keepdims=True)
+    )
     assert 0.3 < grey.mean() < 0.95 and grey.std() > 0.02
     code, text, _ = run(capsys, "--nodes", 2000, "--preset", "superficial", "--out", tmp_path / "second.vtu")
     assert code == 0 and "2.0" not in text.split()[0] and "mm mean" in text and "ml" in text
@@ -48,12 +50,12 @@ def test_a_users_volume_with_and_without_intensities(brain, capsys):
     words = ("--labels", brain / "labels.nii.gz", "--brain", "1", "--tumour", "2", "--nodes", 2000, "--out", out)
     code, text, noted = run(capsys, *words, "--t1", brain / "t1.nii.gz")
     assert code == 0 and "intensities to" in text and "ask for more nodes" not in noted
-    grey = read_intensity(sidecar(out))
+    grey = read_intensity(to_intensity_path(out))
     left, right = grey.at(np.array([[0.010, 0.0, 0.03], [0.030, 0.0, 0.03]]))
     assert right > left + 0.05
     code, text, _ = run(capsys, *words, "--force")
     assert code == 0 and "intensities" not in text
-    assert not sidecar(out).exists()  # those of the earlier mesh do not belong to this one
+    assert not to_intensity_path(out).exists()  # those of the earlier mesh do not belong to this one
 
 
 @pytest.mark.parametrize(

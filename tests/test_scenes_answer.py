@@ -7,8 +7,8 @@ import pytest
 from links import NAMES, NOW, corners_of, in_mm, linked, peers, played
 
 from ar.overlay.gauge import Gauge
-from scenes.link.answer import NOT_SEEN, PoseResult, late
-from scenes.link.messages import points, transform
+from scenes.link.answer import NOT_SEEN, PoseResult, add_lateness
+from scenes.link.messages import encode_points, transform
 from scenes.tracked.follower import TrackingResult, TumourState
 from scenes.tracked.tool_motion import BrainMotion
 
@@ -85,7 +85,7 @@ def test_a_registration_of_nobody_knows_whom_is_used_and_doubtful(follower, regi
             if sent:
                 assert "no ReferenceToRas yet" in await tracker.said("Sulcus")
                 tracker.send("TRANSFORM", NAMES.registration, transform(into), NOW)
-            tracker.send("POINT", "P", points(["a"], 1e3 * follower.motion.stage.tumour_at_rest.vertices[:1]))
+            tracker.send("POINT", "P", encode_points(["a"], 1e3 * follower.motion.stage.tumour_at_rest.vertices[:1]))
             tracker.send("TRANSFORM", NAMES.tool, transform(beside[10]), NOW)
             while not len(found := corners_of((await tracker.next("POLYDATA", "TumourDoubtful"))[1])):
                 pass
@@ -123,8 +123,8 @@ def test_a_tool_that_was_near_and_is_then_too_far_for_any_tracker_is_doubtful(fo
 @pytest.mark.parametrize("state", [TumourState.GOOD, TumourState.UNSURE])
 def test_an_answer_with_a_bound_is_stale_when_it_is_old(stage, state):
     known = TrackingResult(0.0, state, "words", NOT_SEEN, BrainMotion(stage.anatomy.mesh.nodes), band=1e-3)
-    assert late(PoseResult(NOW, known), 0.2, 0.3).known is known
-    old = late(PoseResult(NOW, known, Gauge(np.zeros(3), np.ones(3))), 0.4, 0.3)
+    assert add_lateness(PoseResult(NOW, known), 0.2, 0.3).known is known
+    old = add_lateness(PoseResult(NOW, known, Gauge(np.zeros(3), np.ones(3))), 0.4, 0.3)
     assert (
         old.known.state is TumourState.STALE and old.known.band is old.gauge is None and "0.4 s old" in old.known.words
     )

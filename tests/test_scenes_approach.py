@@ -14,7 +14,7 @@ from test_sim_head_masks import grid, head, nifti
 from theatres import short
 
 from scenes.cli import main
-from scenes.options.placement_options import add_opening_arguments, opening_words, trajectory_given
+from scenes.options.placement_options import add_opening_arguments, get_trajectory_option, to_opening_options
 from scenes.play.deformers import Theatre
 from scenes.script.approach import Approach, approach_of
 from scenes.script.scene import PALPATION, find_scene
@@ -127,7 +127,7 @@ def test_what_misses_the_opening_is_refused(site, tmp_path):
 
 def test_commands_play_scenes_along_it(site, tmp_path, capsys):
     """The push of `press`; near the rim the bone stops the tool and that is said; a scene without a tool stays."""
-    from scenes.options.theatre_options import add_theatre, scene_asked
+    from scenes.options.theatre_options import add_theatre, build_requested_scene
 
     def asked(name: str, line: np.ndarray):
         parser = argparse.ArgumentParser()
@@ -135,7 +135,7 @@ def test_commands_play_scenes_along_it(site, tmp_path, capsys):
         words = parser.parse_args(
             ["--trajectory", str(marked(tmp_path, line))], argparse.Namespace(program="sulcus demo")
         )
-        return scene_asked(words, name, Theatre(site.anatomy, None, {}, "cpu"))
+        return build_requested_scene(words, name, Theatre(site.anatomy, None, {}, "cpu"))
 
     entry, way, line = planned(site, 6e-3, 4e-3, (0.3, 0.1))
     scene = asked("press", line)
@@ -165,10 +165,10 @@ def test_a_patient_says_how_its_scenes_follow_it(site, tmp_path):
     for points, kind, found in ((line, "Line", True), (line[:1], "Fiducial", False)):
         path = marked(tmp_path, points, kind)
         for option in ("--opening-at", "--opening-over"):
-            assert trajectory_given(parser.parse_args([option, str(path)])) == (path if found else None)
-    assert trajectory_given(parser.parse_args([])) is None
+            assert get_trajectory_option(parser.parse_args([option, str(path)])) == (path if found else None)
+    assert get_trajectory_option(parser.parse_args([])) is None
     words = ["--opening-at=1.0,2.0,3.0", "--fine-opening"]
-    assert opening_words(parser.parse_args(words)) == words and not opening_words(parser.parse_args([]))
+    assert to_opening_options(parser.parse_args(words)) == words and not to_opening_options(parser.parse_args([]))
 
 
 def test_no_trajectory_is_the_middle():

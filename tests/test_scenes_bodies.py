@@ -11,13 +11,13 @@ from tiny_episodes import write_episode
 
 from scenes import write_card
 from scenes.cli import main
-from scenes.episodes.bodies import models_of, read_body, said_of_weak, tissue_of, weak_as_json, write_body
-from scenes.episodes.make import body_path, make_body
+from scenes.episodes.bodies import describe_weak, get_tissue, list_model_errors, read_body, to_weak_json, write_body
+from scenes.episodes.make import make_body, to_body_path
 from scenes.episodes.plan import load_plan
 from sim.anatomy import PART_LABELS, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
 from surrogate.model.left_out import LIMIT, HeldOutError, LeftOut
-from surrogate.model.store import load, stated_errors
+from surrogate.model.store import load, read_reported_errors
 
 PLAN = """title = "A box"
 [motion.press]
@@ -74,7 +74,7 @@ def test_a_body_is_made_of_what_is_drawn_for_its_regions(plan, tmp_path):
 def test_a_body_that_was_made_before_has_no_such_regions(plan, tmp_path):
     write_body(tmp_path / "made", plan, 1, 0, "cpu")
     older = {name: value for name, value in read_body(tmp_path / "made").drawn.items() if "oedema" not in name}
-    assert PART_LABELS["oedema"] not in tissue_of(older).regions
+    assert PART_LABELS["oedema"] not in get_tissue(older).regions
 
 
 @pytest.fixture(scope="module")
@@ -104,26 +104,26 @@ def test_a_model_is_weak_by_what_it_states():
 
 def test_the_worst_are_named_first_and_not_all_of_many():
     many = {number: HeldOutError(1e-5 * number, None) for number in range(35)}
-    first, *named = said_of_weak(many)
+    first, *named = describe_weak(many)
     assert first.startswith("14 of 35 bodies with a model have a weak one")
     assert named[0] == f"- body 34: {many[34]}" and len(named) == 11 and named[-1] == "- and 4 more"
-    assert said_of_weak({0: HeldOutError(0.0, None)}) == [] == weak_as_json({0: HeldOutError(0.0, None)})
+    assert describe_weak({0: HeldOutError(0.0, None)}) == [] == to_weak_json({0: HeldOutError(0.0, None)})
 
 
 def test_files_say_what_their_models_state(made):
     folder, anatomy = made
-    path = body_path(folder, 0) / "anatomy.model.npz"
+    path = to_body_path(folder, 0) / "anatomy.model.npz"
     (model,) = load(path, anatomy).values()
-    (body_path(folder, 1)).mkdir()  # of a body that plays by another's model there is none
-    assert stated_errors(path) == {"linear": HeldOutError(model.bound, model.left_out)} and model.bound > LIMIT
-    assert models_of(folder) == {0: HeldOutError(model.bound, None)}
-    body_path(folder, 1).rmdir()
+    (to_body_path(folder, 1)).mkdir()  # of a body that plays by another's model there is none
+    assert read_reported_errors(path) == {"linear": HeldOutError(model.bound, model.left_out)} and model.bound > LIMIT
+    assert list_model_errors(folder) == {0: HeldOutError(model.bound, None)}
+    to_body_path(folder, 1).rmdir()
 
 
 def test_the_run_the_card_and_validate_name_them(made, capsys):
     folder, _ = made
     write_episode(folder / "episode_000000.h5", made[1])
-    bound = f"- body 0: {models_of(folder)[0]}"
+    bound = f"- body 0: {list_model_errors(folder)[0]}"
     write_card(folder)
     assert bound in (folder / "DATASHEET.md").read_text()
     assert main(["validate", str(folder), "--workers", "1"]) == 0
@@ -132,7 +132,7 @@ def test_the_run_the_card_and_validate_name_them(made, capsys):
     )
     assert main(["validate", str(folder), "--workers", "1", "--json"]) == 0
     (weak,) = json.loads(capsys.readouterr().out)["weak_bodies"][str(folder)]
-    assert weak["body"] == 0 and weak["bound_mm"] == pytest.approx(1e3 * models_of(folder)[0].bound)
+    assert weak["body"] == 0 and weak["bound_mm"] == pytest.approx(1e3 * list_model_errors(folder)[0].bound)
     words = ["episodes", str(folder.parent / "own.toml"), "--count", "1", "--seed", "1", "--out", str(folder)]
     words += ["--workers", "1", "--device", "cpu", "--force"]
     assert main(words) == 0 and bound in capsys.readouterr().out

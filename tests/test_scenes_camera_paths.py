@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenes.script.camera_paths import PATHS, Focus, HandHeld, Microscope, Orbit, wandering
+from scenes.script.camera_paths import PATHS, Focus, HandHeld, Microscope, Orbit, sample_wandering
 from scenes.script.viewpoint import USUAL
 from sim.errors import InputError
 
@@ -45,7 +45,7 @@ def test_the_same_hand_moves_in_the_same_way_and_another_does_not(site):
 
 
 def test_a_hand_moves_as_far_as_it_says_and_breathes(site):
-    ways = np.array([wandering(seed, time) for seed in range(6) for time in np.arange(0.0, 60.0, 0.05)])
+    ways = np.array([sample_wandering(seed, time) for seed in range(6) for time in np.arange(0.0, 60.0, 0.05)])
     assert ways.std(axis=0) == pytest.approx(np.ones(6), rel=0.15) and np.abs(ways.mean(axis=0)).max() < 0.1
     calm = replace(USUAL, path=HandHeld(0, shift=0.0, turn=0.0, breath=2e-3))
     start, top, back, low = (calm.camera(site, time).centre for time in (0.0, 1.0, 2.0, 3.0))
@@ -70,7 +70,7 @@ def test_a_microscope_moves_along_its_axis_zooms_and_focuses(site):
     start, zoomed, far = (view.camera(site, time) for time in (0.0, 1.5, 2.8))
     target = USUAL.target(site)
     assert np.array_equal(start.K, USUAL.camera(site).K) and zoomed.K[0, 0] == pytest.approx(1.6 * start.K[0, 0])
-    assert far.in_frame(target)[2] == pytest.approx(1.25 * 0.2)
+    assert far.to_camera_frame(target)[2] == pytest.approx(1.25 * 0.2)
     # Image distances f d / (d - f) at 250 and at 200 mm.
     assert far.K[0, 0] / start.K[0, 0] == pytest.approx((250 / 220) / (200 / 170))
-    assert far.in_frame(target)[:2] == pytest.approx(start.in_frame(target)[:2], abs=1e-12)
+    assert far.to_camera_frame(target)[:2] == pytest.approx(start.to_camera_frame(target)[:2], abs=1e-12)

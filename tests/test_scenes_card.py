@@ -10,7 +10,7 @@ from tiny_episodes import write_episode
 from scenes import write_card
 from scenes.cli import main
 from scenes.episodes.exports.card import keep_card
-from scenes.episodes.run_folder import finished
+from scenes.episodes.run_folder import list_finished
 
 
 def test_a_card_says_what_there_is(folder, tmp_path, capsys):
@@ -56,7 +56,7 @@ def test_a_card_says_what_there_is(folder, tmp_path, capsys):
 
 def test_a_card_is_kept_as_episodes_come(box, tmp_path, monkeypatch):
     def kept(changed):
-        return keep_card(tmp_path, finished(tmp_path), changed)
+        return keep_card(tmp_path, list_finished(tmp_path), changed)
 
     assert kept(True) is None and not list(tmp_path.iterdir())  # no episode is whole
     write_episode(tmp_path / "episode_000000.h5", box)

@@ -9,13 +9,13 @@ import warp as wp
 from theatres import PUSHING, SIGHTED, player, put, small, theatre_of
 
 from ar.overlay.composite import composite
-from ar.overlay.hud import millimetres
+from ar.overlay.hud import format_millimetres
 from ar.overlay.marks import Cover, Marks
 from ar.rendering.renderer import Picture
 from scenes.cli import main
 from scenes.play.checks import SceneFigures, measure
-from scenes.play.player import annotate, gauged
-from scenes.play.reference import truth_of
+from scenes.play.player import annotate, measure_gauge
+from scenes.play.reference import solve_reference_frames
 from scenes.play.stage import OPENING, TOOL
 from scenes.script.scene import SCENES, Bounds, find_scene
 from scenes.script.tool_paths import press
@@ -60,7 +60,7 @@ def frames(play):
 
 @pytest.fixture(scope="module")
 def truth(theatre, play, frames):
-    return truth_of(theatre, play.scene, [frame.loads for frame in frames])
+    return solve_reference_frames(theatre, play.scene, [frame.loads for frame in frames])
 
 
 def broken(play, frames, truth, camera=None):
@@ -107,7 +107,7 @@ def drawn(play, frame, positions, camera=None, tip=None, opening=OPENING):
     """A frame whose picture was drawn from other positions, by another camera, or with another tip."""
     stage, at = play.stage, frame.tip if tip is None else tip
     tumour, rest = (stage.tumour(each) for each in (positions, play.site.anatomy.mesh.nodes))
-    gauge = gauged(at, tumour)
+    gauge = measure_gauge(at, tumour)
     if tip is None:
         gauge = replace(gauge, read=frame.distance)
     shown = composite(
@@ -121,7 +121,7 @@ def drawn(play, frame, positions, camera=None, tip=None, opening=OPENING):
     return replace(frame, shown=shown.colour)
 
 
-def off_by(camera, columns, rows):
+def compute_error(camera, columns, rows):
     """A camera with its principal point elsewhere [pixel]."""
     shift = np.zeros((3, 3))
     shift[:2, 2] = columns, rows
@@ -159,7 +159,7 @@ class TestThePictureItself:
 
     @pytest.mark.parametrize("off", [(3.0, 0.0), (0.0, 8.0), (60.0, 40.0)])
     def test_shifted_it_fails(self, play, frames, truth, off):
-        camera = off_by(play.camera, *off)
+        camera = compute_error(play.camera, *off)
         wrong = drawn(play, frames[2], play.positions(frames[2].deformation), camera)
         sentences, figures = self.pixels(play, frames, truth, wrong)
         assert about(sentences, "outline") and figures.drawn > 2.0
@@ -176,7 +176,7 @@ class TestThePictureItself:
 
     def test_with_a_number_ten_times_too_large_it_fails(self, play, frames, truth, monkeypatch):
         monkeypatch.setattr(
-            "ar.overlay.gauge.millimetres", lambda length, error=None: millimetres(10.0 * length, error)
+            "ar.overlay.gauge.millimetres", lambda length, error=None: format_millimetres(10.0 * length, error)
         )
         wrong = drawn(play, frames[2], play.positions(frames[2].deformation))
         assert about(self.pixels(play, frames, truth, wrong)[0], "does not say")
@@ -188,7 +188,7 @@ class TestThePictureItself:
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
 def test_a_camera_turned_by_half_a_degree_fails(play, frames, truth, axis):
-    off = [replace(frame, camera=frame.camera.perturbed(0.5, axis)) for frame in frames]
+    off = [replace(frame, camera=frame.camera.perturb(0.5, axis)) for frame in frames]
     sentences, figures = broken(play, off, truth)
     assert about(sentences, "pixels off") and figures.pixels > 0.2
     if axis[2] == 0.0:  # about the line of sight a round tumour keeps its outline

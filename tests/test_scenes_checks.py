@@ -10,17 +10,17 @@ from ar.overlay.composite import DOUBTFUL, composite
 from ar.overlay.gauge import GAUGE, Gauge
 from ar.overlay.legend import SHEET
 from ar.overlay.marks import BEFORE, Cover, Marks
-from ar.overlay.outlines import found_at, ink_of
+from ar.overlay.outlines import compute_ink, find_text
 from ar.overlay.styles import STYLES
 from scenes.cli import main
 from scenes.play.checks import measure
 from scenes.play.deformers import open_theatre
 from scenes.play.observer import ELLIPSOID_COLOUR
-from scenes.play.player import annotate, gauged
-from scenes.play.scene_costs import labelled
+from scenes.play.player import annotate, measure_gauge
+from scenes.play.scene_costs import add_cost_label
 from scenes.play.stage import CORTEX_COLOUR, DRAPE, DRAPE_COLOUR, OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.scene import Bounds, find_scene
-from sim.geometry.surface import encloses
+from sim.geometry.surface import is_enclosing
 
 LINES = {"tumour": TUMOUR_COLOUR, "doubt": DOUBTFUL, "scan": BEFORE, "truth": TRUTH_COLOUR, "middle": ELLIPSOID_COLOUR}
 GROUNDS = {"cortex": CORTEX_COLOUR, "drape": DRAPE_COLOUR}
@@ -68,7 +68,7 @@ def player(size, style="window"):
 
 
 @cache
-def frame_of(size=(640, 360), style="window"):
+def build_tool_frame(size=(640, 360), style="window"):
     play = player(size, style)
     return play.draw(40, float(play.scene.times[40]), play.touch(40))
 
@@ -81,7 +81,7 @@ def broken(frame, play):
 
 @pytest.mark.parametrize("style", [style for style in STYLES if style != "none"])
 def test_every_style_passes_the_checks(style):
-    frame, play = frame_of(style=style), player((640, 360), style)
+    frame, play = build_tool_frame(style=style), player((640, 360), style)
     assert measure(play, play.camera_at, [frame], frame.deformation).broken(Bounds()) == []
     tool = frame.picture.segmentation == TOOL
     words = (np.abs(frame.shown.astype(int) - frame.picture.colour).max(axis=2) > 2) & tool
@@ -93,7 +93,7 @@ def again(frame, play, opening, gauge=None, style="window"):
     stage = play.stage
     tumour, rest = (stage.tumour(at) for at in (play.positions(frame.deformation), play.site.anatomy.mesh.nodes))
     if gauge is None:
-        gauge = replace(gauged(frame.tip, tumour), read=frame.distance, error=frame.tumour_error.bound)
+        gauge = replace(measure_gauge(frame.tip, tumour), read=frame.distance, error=frame.tumour_error.bound)
     band = frame.tumour_error.bound or 0.0
     over = composite(
         frame.picture,
@@ -108,7 +108,7 @@ def again(frame, play, opening, gauge=None, style="window"):
 
 
 def test_what_the_drape_covers_must_be_drawn_so():
-    frame, play = frame_of(), player((640, 360))
+    frame, play = build_tool_frame(), player((640, 360))
     seen = "as if it were visible"
     assert broken(again(frame, play, OPENING), play) == []
     for opening in (None, replace(OPENING, ids=(*OPENING.ids, DRAPE))):  # all solid and shaded
@@ -122,9 +122,9 @@ def test_what_the_drape_covers_must_be_drawn_so():
 
 
 def test_the_number_must_be_whole_and_near_the_tip():
-    frame, play = frame_of(), player((640, 360))
+    frame, play = build_tool_frame(), player((640, 360))
     text = str(Gauge(frame.tip, frame.tip, frame.distance, frame.tumour_error.bound))
-    left, top, right, foot = found_at(frame.shown, text, GAUGE)
+    left, top, right, foot = find_text(frame.shown, text, GAUGE)
     box, wide = np.s_[top - 3 : foot + 3, left - 3 : right + 3], right - left
     for to in (np.s_[-60 - (foot - top) - 6 : -60, 4 : wide + 10], None):
         shown = frame.shown.copy()
@@ -137,15 +137,15 @@ def test_the_number_must_be_whole_and_near_the_tip():
 
 
 def test_a_panel_leaves_the_tool_in_sight_in_a_low_picture():
-    frame = frame_of()
-    changed = (labelled(frame, "series-gp") != frame.shown).any(axis=2)
+    frame = build_tool_frame()
+    changed = (add_cost_label(frame, "series-gp") != frame.shown).any(axis=2)
     assert changed.sum() > 5000 and not changed[frame.picture.segmentation == TOOL].any()
 
 
 def test_a_panel_hides_neither_a_scale_nor_a_legend():
     for size in ((640, 360), (640, 480)):
-        frame = frame_of(size, "depth")
-        changed = (labelled(frame, "series-gp") != frame.shown).any(axis=2)
+        frame = build_tool_frame(size, "depth")
+        changed = (add_cost_label(frame, "series-gp") != frame.shown).any(axis=2)
         assert (frame.taken == SHEET).any() and changed.any() and not changed[frame.taken == SHEET].any()
 
 
@@ -153,21 +153,21 @@ def test_a_tip_in_the_tumour_is_found_to_be():
     play = player((640, 360))
     rest = play.stage.tumour_at_rest
     middle, corners = rest.vertices.mean(axis=0), rest.vertices[rest.triangles]
-    assert gauged(middle, rest).inside and not gauged(middle + [0.03, 0.0, 0.0], rest).inside
-    assert encloses(corners[:, ::-1], middle) and not encloses(corners, middle + [0.0, 0.0, 0.5])
-    assert str(gauged(middle, rest)).startswith("inside, ")
+    assert measure_gauge(middle, rest).inside and not measure_gauge(middle + [0.03, 0.0, 0.0], rest).inside
+    assert is_enclosing(corners[:, ::-1], middle) and not is_enclosing(corners, middle + [0.0, 0.0, 0.5])
+    assert str(measure_gauge(middle, rest)).startswith("inside, ")
 
 
 def test_the_same_frame_is_the_same_picture():
     play = player((640, 360), "rings")
-    frame = frame_of(style="rings")
+    frame = build_tool_frame(style="rings")
     anew = play.draw(40, float(play.scene.times[40]), play.touch(40))
     assert np.array_equal(anew.shown, frame.shown)
-    assert np.abs(frame.shown.astype(int) - frame_of().shown).max() > 50
+    assert np.abs(frame.shown.astype(int) - build_tool_frame().shown).max() > 50
 
 
 def test_what_is_not_composed_is_the_picture_and_says_the_same():
-    frame, play = frame_of(), player((640, 360))
+    frame, play = build_tool_frame(), player((640, 360))
     bare = replace(play, composed=False).draw(frame.number, frame.time, frame.touch)
     np.testing.assert_array_equal(bare.shown, bare.picture.colour)
     np.testing.assert_array_equal(bare.picture.colour, frame.picture.colour)
@@ -186,4 +186,4 @@ def test_the_commands_name_all_styles(capsys):
     with pytest.raises(SystemExit):
         main(["check", "press", "--style", "none"])
     assert "invalid choice" in capsys.readouterr().err
-    assert ink_of(TUMOUR_COLOUR) == (51.0, 240.0, 107.0)
+    assert compute_ink(TUMOUR_COLOUR) == (51.0, 240.0, 107.0)

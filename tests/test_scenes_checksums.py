@@ -2,7 +2,7 @@
 
 import h5py
 
-from scenes.episodes.checksums import seal
+from scenes.episodes.checksums import write_checksums
 from scenes.episodes.reading.validation import validate_episode
 
 
@@ -10,7 +10,7 @@ def test_content_that_is_not_what_was_written_is_named(whole, tmp_path):
     path = tmp_path / whole.name
     path.write_bytes(whole.read_bytes())
     with h5py.File(path, "a") as file:
-        seal(file)
+        write_checksums(file)
     assert validate_episode(path).problems == [] and "checksums: it states none" not in validate_episode(path).skipped
     with h5py.File(path, "a") as file:
         file["force"][2, 1] += 1e-9
@@ -21,7 +21,7 @@ def test_arrays_that_are_gone_or_came_later_are_named(whole, tmp_path):
     path = tmp_path / whole.name
     path.write_bytes(whole.read_bytes())
     with h5py.File(path, "a") as file:
-        seal(file)
+        write_checksums(file)
         del file["force"], file["pictures/depth"]
         file["tip"][2, 1] += 1e-9
         file["late"] = [1.0]
@@ -34,6 +34,6 @@ def test_arrays_that_are_gone_or_came_later_are_named(whole, tmp_path):
     ]
     path.write_bytes(whole.read_bytes())
     with h5py.File(path, "a") as file:
-        seal(file)
+        write_checksums(file)
         file["force"].attrs["note"] = "mine"
     assert validate_episode(path).problems == ["attributes are not as they were written."]

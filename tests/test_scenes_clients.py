@@ -9,8 +9,8 @@ from links import HOST, NOW, Peer, peers, played
 
 from scenes.link import clients as limits
 from scenes.link.clients import Clients
-from scenes.link.frame import HEADER, BadMessageError, framed
-from scenes.link.messages import string
+from scenes.link.frame import HEADER, BadMessageError, pack_message
+from scenes.link.messages import encode_string
 
 
 @asynccontextmanager
@@ -32,14 +32,14 @@ async def until(what):
 def test_every_client_hears_the_newest_and_a_new_one_what_it_missed():
     async def scene():
         async with served() as (clients, port):
-            clients.publish("a", [framed("STRING", "A", string("one"), NOW)])
+            clients.publish("a", [pack_message("STRING", "A", encode_string("one"), NOW)])
             async with peers(port, 3) as three:
                 for each in three:
                     header, body = await each.next()
                     assert (header.name, body[4:], header.stamp) == ("A", b"one", NOW)
                 three[0].writer.transport.abort()
                 await until(lambda: len(clients) == 2)
-                clients.publish("a", [framed("STRING", "A", string("two"), NOW + 1)])
+                clients.publish("a", [pack_message("STRING", "A", encode_string("two"), NOW + 1)])
                 assert [(await each.next())[1][4:] for each in three[1:]] == [b"two", b"two"]
 
     played(scene())
@@ -57,7 +57,7 @@ def test_a_client_that_does_not_read_gets_the_newest_later_and_keeps_nobody_wait
                 await until(lambda: len(clients) == 2)
                 await asyncio.sleep(1.2 * limits.GREETING)
                 for number in range(count):
-                    clients.publish("a", [framed("STRING", f"{number}", large, NOW)])
+                    clients.publish("a", [pack_message("STRING", f"{number}", large, NOW)])
                     assert (await quick.next())[0].name == f"{number}"
             slow.setblocking(False)
             late = Peer(*await asyncio.open_connection(sock=slow))
@@ -74,10 +74,10 @@ def test_a_client_that_does_not_read_gets_the_newest_later_and_keeps_nobody_wait
     ("sent", "why", "goes_on"),
     [
         (b"\x16\x03\x01" + bytes(80), "no OpenIGTLink message", False),
-        (framed("TRANSFORM", "A", bytes(48), 0)[:-1] + b"\1", "TRANSFORM A is rejected: wrong checksum", True),
-        (framed("TRANSFORM", "bad", bytes(48), 0), "TRANSFORM bad is rejected: what", True),
-        (framed("NDARRAY", "A", bytes(90), 0), "NDARRAY A is passed over: type not used", True),
-        (framed("TRANSFORM", "A", bytes(1 << 17), 0), "too long", True),
+        (pack_message("TRANSFORM", "A", bytes(48), 0)[:-1] + b"\1", "TRANSFORM A is rejected: wrong checksum", True),
+        (pack_message("TRANSFORM", "bad", bytes(48), 0), "TRANSFORM bad is rejected: what", True),
+        (pack_message("NDARRAY", "A", bytes(90), 0), "NDARRAY A is passed over: type not used", True),
+        (pack_message("TRANSFORM", "A", bytes(1 << 17), 0), "too long", True),
         (HEADER.pack(1, b"POINT", b"A", 0, 1 << 60, 0), "announces 1152921504606846976 bytes", False),
     ],
 )
@@ -102,7 +102,7 @@ def test_what_is_no_good_message_is_said_to_its_sender_alone(sent, why, goes_on)
             await until(lambda: len(heard) == 1 + goes_on)
             assert sorted(heard) == sorted(["fine", *["next"] * goes_on])
             await asyncio.sleep(1.2 * limits.GREETING)
-            clients.publish("a", [framed("STRING", "A", b"", 0)])
+            clients.publish("a", [pack_message("STRING", "A", b"", 0)])
             assert (await good.next())[0].kind == "STRING"  # and no STATUS before it
 
     played(scene())
@@ -122,7 +122,7 @@ def test_a_storm_of_clients_is_bounded_and_passes():
                 refused = [each for each in many if await busy(each)]
                 assert len(refused) >= 5
             await until(lambda: len(clients) == 1)
-            clients.publish("a", [framed("STRING", "A", b"", 0)])
+            clients.publish("a", [pack_message("STRING", "A", b"", 0)])
             assert (await first.next())[0].name == "A"
 
     async def busy(peer):
@@ -137,10 +137,12 @@ def test_a_storm_of_clients_is_bounded_and_passes():
 def test_a_client_that_asks_is_sent_that_and_nothing_else():
     async def scene():
         async with served() as (clients, port), peers(port, 1) as (one,):
-            surfaces = [framed("POLYDATA", name, bytes(40), stamp) for name, stamp in (("O", 1), ("P", 2), ("Q", 2))]
-            clients.publish("a", [framed("STRING", "A", string("s"), 0), *surfaces])
+            surfaces = [
+                pack_message("POLYDATA", name, bytes(40), stamp) for name, stamp in (("O", 1), ("P", 2), ("Q", 2))
+            ]
+            clients.publish("a", [pack_message("STRING", "A", encode_string("s"), 0), *surfaces])
             for _ in range(2):
-                clients.publish("b", [framed("STRING", "B", string("s"), 0)])
+                clients.publish("b", [pack_message("STRING", "B", encode_string("s"), 0)])
                 one.send("GET_POLYDATA", "", b"")
                 assert (await one.next())[0].name == "P"
             one.send("GET_IMAGE", "", b"")

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenes import read_episodes
-from scenes.episodes.exports.columns import held_out, rate_of, states, twists
+from scenes.episodes.exports.columns import build_states, build_twists, mark_held_out, measure_rate
 from scenes.episodes.reading.contents import read_contents
 from sim.errors import InputError
 
@@ -25,14 +25,14 @@ def poses_after(first, steps):
 
 def test_twists_lead_from_pose_to_pose(folder):
     tool = read_episodes(folder, ["T_world_tool"], window=9).at(1, 0)["T_world_tool"]
-    steps = twists(tool)
+    steps = build_twists(tool)
     assert np.allclose(poses_after(tool[0], steps), tool, atol=1e-6) and not steps[-1].any() and steps[:-1].any()
-    state = states(tool)
+    state = build_states(tool)
     assert np.allclose(state[:, :3], tool[:, :3, 3]) and np.allclose(np.linalg.norm(state[:, 3:], axis=1), 1.0)
     turning = np.tile(np.eye(4), (9, 1, 1))
     for number, angle in enumerate(np.linspace(0.0, 4 * np.pi, 9)):
         turning[number, :2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    around = states(turning)[:, 3:]
+    around = build_states(turning)[:, 3:]
     assert (np.einsum("ij,ij->i", around[1:], around[:-1]) > -1e-6).all()
 
 
@@ -41,13 +41,13 @@ def test_rate_of_frames_is_that_of_even_steps_to_100_us(off, tmp_path):
     contents, time = SimpleNamespace(path=tmp_path / "e.h5"), 0.04 * np.arange(26)
     time[10] += off
     if off < 1e-4:
-        assert rate_of(contents, time) == 25.0
+        assert measure_rate(contents, time) == 25.0
         return
     with pytest.raises(InputError, match="not evenly spaced"):
-        rate_of(contents, time)
+        measure_rate(contents, time)
 
 
 def test_every_tenth_body_is_held_out(folder):
     contents = read_contents(folder / "episode_000000.h5")
-    assert held_out([contents]) == [False] and held_out([contents] * 3) == [False, False, True]
-    assert [number for number, out in enumerate(held_out([contents] * 25)) if out] == [9, 19]
+    assert mark_held_out([contents]) == [False] and mark_held_out([contents] * 3) == [False, False, True]
+    assert [number for number, out in enumerate(mark_held_out([contents] * 25)) if out] == [9, 19]

@@ -5,10 +5,17 @@ from dataclasses import replace
 
 from theatres import short
 
-from scenes.page.comparison import RECENT, AccuracyTimeTable, Comparison, ComparisonRow, judge, verdict_words
+from scenes.page.comparison import (
+    RECENT,
+    AccuracyTimeTable,
+    Comparison,
+    ComparisonRow,
+    compare_with_fem,
+    format_comparison,
+)
 from scenes.page.referee import FemResult
-from scenes.page.text import table
-from scenes.play.frame_text import doubt_of
+from scenes.page.text import format_cost_table
+from scenes.play.frame_text import describe_outcome
 from scenes.play.player import Player
 from scenes.play.stage import Stage
 from sim.accuracy import LIVE
@@ -23,7 +30,7 @@ def shown(tally: AccuracyTimeTable, name: str, loads: Iterable[str], millisecond
 
 def test_deformers_are_ranked_over_the_loads_that_all_of_them_had():
     tally = AccuracyTimeTable()
-    assert tally.rows == [] and table(tally.rows) == ""
+    assert tally.rows == [] and format_cost_table(tally.rows) == ""
     shown(tally, "quick", "abc", 1.0, 0.2)
     shown(tally, "quick", "z", 90.0, 90.0)  # a load that nobody else had does not count against it
     shown(tally, "slow", "abc", 4.0, 0.03)
@@ -32,7 +39,7 @@ def test_deformers_are_ranked_over_the_loads_that_all_of_them_had():
     rows = [(row.name, round(row.milliseconds, 9), round(row.millimetres, 9), row.loads) for row in tally.rows]
     assert rows == [("quick", 1.0, 0.2, 2), ("slow", 4.0, 0.03, 2), ("lost", 5.0, 0.2, 2)]
     assert [row.best for row in tally.rows] == [True, True, False]
-    words = table(tally.rows)
+    words = format_cost_table(tally.rows)
     assert "over the same 2 loads" in words and words.count("best") == 2
 
 
@@ -43,7 +50,7 @@ def test_without_a_common_load_nobody_is_ranked():
     assert [row.best for row in tally.rows] == [None]
     shown(tally, "pressing", "c", 1.0, 0.2)
     assert [row.best for row in tally.rows] == [None, None]
-    words = table(tally.rows)
+    words = format_cost_table(tally.rows)
     assert "not comparable" in words and "best" not in words
 
 
@@ -58,29 +65,32 @@ def test_a_load_shown_again_counts_once_and_old_loads_are_forgotten():
 
 def test_an_error_too_small_to_print_is_not_reported_as_none():
     rows = [ComparisonRow("a", 1.0, 4e-4, 3, None), ComparisonRow("b", 1.0, 1.234e-3, 3, None)]
-    assert "error under 0.001 mm" in table(rows) and "error 0.001 mm</td><td>3 loads" in table(rows)
-    assert "0.000" not in table(rows)
+    assert "error under 0.001 mm" in format_cost_table(rows) and "error 0.001 mm</td><td>3 loads" in format_cost_table(
+        rows
+    )
+    assert "0.000" not in format_cost_table(rows)
 
 
 class TestVerdict:
     JUDGED = Comparison(28, 0.35, "", 1e-3, 1e-4, 2e-4)
 
     def test_of_the_present_load_it_stands_plainly(self):
-        said = verdict_words(self.JUDGED, False, "waits")
+        said = format_comparison(self.JUDGED, False, "waits")
         assert "mean 0.100, largest 0.200 mm" in said and "stale" not in said and "waits" not in said
 
     def test_of_another_load_it_is_greyed_and_says_so(self):
-        said = verdict_words(self.JUDGED, True, "waits")
+        said = format_comparison(self.JUDGED, True, "waits")
         assert said.startswith('<p class="stale">previous load') and "frame 28" in said and "waits" in said
 
     def test_an_answer_short_of_its_tolerance_is_not_relied_on(self):
         said = [
-            verdict_words(replace(self.JUDGED, doubt=doubt), False, "waits") for doubt in ("", doubt_of(Outcome.BUDGET))
+            format_comparison(replace(self.JUDGED, doubt=doubt), False, "waits")
+            for doubt in ("", describe_outcome(Outcome.BUDGET))
         ]
         assert ["do not rely on it" in each for each in said] == [False, True]
 
     def test_before_any_it_says_what_is_waited_for(self):
-        assert verdict_words(None, True, "waits") == '<p class="stale">waits</p>'
+        assert format_comparison(None, True, "waits") == '<p class="stale">waits</p>'
 
 
 def test_a_verdict_is_the_error_in_millimetres(theatre):
@@ -95,10 +105,10 @@ def test_a_verdict_is_the_error_in_millimetres(theatre):
             found = whole.deformer.deform(loads, at=at)
             return replace(found, displacement=found.displacement + [0.0, 0.2e-3, 0.0])
 
-    found = judge(FemResult(3, loads, answer, 0.5), replace(whole, deformer=Off()), own=False)
-    said = verdict_words(found, stale=False, waits="")
+    found = compare_with_fem(FemResult(3, loads, answer, 0.5), replace(whole, deformer=Off()), own=False)
+    said = format_comparison(found, stale=False, waits="")
     assert "error against FEM: mean 0.200, largest 0.200 mm; tip to tumour " in said
     tip = whole.drawn(3, whole.touch(3), loads, answer, 0.0).distance
     assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
     assert " by FEM, without the error of the tumour (" in said
-    assert verdict_words(found, stale=True, waits="").startswith('<p class="stale">previous load: ')
+    assert format_comparison(found, stale=True, waits="").startswith('<p class="stale">previous load: ')

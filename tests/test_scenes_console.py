@@ -10,17 +10,17 @@ from itertools import count
 
 import numpy as np
 import pytest
-from films import FILM, follower_of, truth_of
+from films import FILM, follower_of, solve_reference_frames
 from links import HOST, NAMES, corners_of, in_mm, linked, peers, played
 from theatres import template_theatre
 
-from scenes.link.console import limited, printed
-from scenes.link.frame import stamp_of
+from scenes.link.console import limit_rate, print_safely
+from scenes.link.frame import to_stamp
 from scenes.link.messages import transform
 from scenes.script.scene import find_scene
 from scenes.tracked.registration_file import read_registration
 
-BEGUN = stamp_of(time.time())
+BEGUN = to_stamp(time.time())
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_changes_are_noted_once_and_a_status_is_not_repeated_ten_times_a_second(
 def test_link_slow_solver_reports_each_second_and_empties(follower):
     """No answer to a pose older than `stale` is shown, and no STATUS is late, while one solution takes 2 s."""
     registration = read_registration(FILM / "registration.json")
-    poses = registration.T_patient_scan @ truth_of(follower.motion.stage).T_scan_tool
+    poses = registration.T_patient_scan @ solve_reference_frames(follower.motion.stage).T_scan_tool
     beside = in_mm(poses[10] @ np.linalg.inv(follower.tool.T_cube_tool))
     slow, stale, sent = threading.Event(), 0.3, {}
 
@@ -123,11 +123,11 @@ def test_link_slow_solver_reports_each_second_and_empties(follower):
 
 def test_a_console_gets_no_storm_and_nothing_that_a_terminal_obeys(capsys):
     now, lines = [0.0], []
-    note = limited(lines.append, lambda: now[0])
+    note = limit_rate(lines.append, lambda: now[0])
     for number in range(100):
         note(f"{number}")
     now[0] = 6.0
     note("last")
     assert lines == [*map(str, range(10)), "last (90 lines left out)"]
-    printed("a\x1b[2Jb")
+    print_safely("a\x1b[2Jb")
     assert capsys.readouterr().err == "sulcus link: a?[2Jb\n"

@@ -4,7 +4,7 @@ from theatres import short, sinking, small
 
 from ar.page.parts import Dropdown, Fold, Slider
 from scenes.page.beside import TIP
-from scenes.page.controls import clocked, controls
+from scenes.page.controls import build_controls, is_animated
 from scenes.page.requests import Requests
 from scenes.script.scene import find_scene
 from scenes.script.tool_paths import Touch
@@ -14,7 +14,7 @@ class TestControls:
     def test_the_sliders_end_where_the_bone_stops_the_tool(self, theatre):
         scene, site = short(), theatre.site
         assert scene.tool is not None
-        found = controls(scene, site, ("svr", "fem"), Requests("svr", Touch()), print, print)
+        found = build_controls(scene, site, ("svr", "fem"), Requests("svr", Touch()), print, print)
         places = [control for control in found if isinstance(control, Slider) and control.label.startswith("place")]
         room = site.clearance - scene.tool.radius
         assert len(places) == 2 and all(0.5 <= control.high <= max(0.5, 1e3 * room) for control in places)
@@ -23,20 +23,20 @@ class TestControls:
 
     def test_no_code_name_is_shown(self, theatre):
         for name in ("press", "palpate", "retract", "brain_shift", "pulsation"):
-            found = controls(small(name), theatre.site, ("fem",), Requests("fem", Touch()), print, print)
+            found = build_controls(small(name), theatre.site, ("fem",), Requests("fem", Touch()), print, print)
             switches = [inner for control in found if isinstance(control, Fold) for inner in control.controls]
             assert switches and all(inner.words and inner.words != inner.label for inner in switches)
 
     def test_the_overlay_comes_before_the_tool_s_sliders(self, theatre):
         labels = [
             control.label
-            for control in controls(short(), theatre.site, ("fem",), Requests("fem", Touch()), print, print)
+            for control in build_controls(short(), theatre.site, ("fem",), Requests("fem", Touch()), print, print)
         ]
         assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-4] == "slices"
 
     def test_every_overlay_style_is_offered(self, theatre):
         wish = Requests("fem", Touch())
-        found = controls(short(), theatre.site, ("fem",), wish, print, print)
+        found = build_controls(short(), theatre.site, ("fem",), wish, print, print)
         overlay = next(control for control in found if isinstance(control, Dropdown) and control.label == "overlay")
         seen = []
         for option in overlay.options:
@@ -46,7 +46,9 @@ class TestControls:
 
     def test_each_way_of_the_camera_and_each_place_of_the_slices_is_offered(self, theatre):
         wish = Requests("fem", Touch())
-        found = {control.label: control for control in controls(short(), theatre.site, ("fem",), wish, print, print)}
+        found = {
+            control.label: control for control in build_controls(short(), theatre.site, ("fem",), wish, print, print)
+        }
         camera, slices = found["camera"], found["slices"]
         assert isinstance(camera, Dropdown) and isinstance(slices, Dropdown)
         seen = []
@@ -56,10 +58,14 @@ class TestControls:
         assert seen == ["", "stays", "hand-held", "microscope", "orbit"]
         slices.changed(TIP)
         assert wish.look == ("window", "orbit", TIP)
-        assert "slices" not in {each.label for each in controls(sinking(), theatre.site, ("fem",), wish, print, print)}
+        assert "slices" not in {
+            each.label for each in build_controls(sinking(), theatre.site, ("fem",), wish, print, print)
+        }
 
     def test_which_scenes_go_on_by_themselves(self, theatre):
-        found = {name: clocked(find_scene(name), theatre.site) for name in ("press", "palpate", "retract", "pulsation")}
+        found = {
+            name: is_animated(find_scene(name), theatre.site) for name in ("press", "palpate", "retract", "pulsation")
+        }
         assert found == {"press": False, "palpate": False, "retract": True, "pulsation": True}
 
 

@@ -11,8 +11,8 @@ from tiny_episodes import Wanted, write_episode
 
 from scenes.cli import main
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_folder
-from sim.runtime.partial_files import partial_path
+from sim.runtime.atomic_files import write_folder_atomically
+from sim.runtime.partial_files import to_partial_path
 
 
 @pytest.mark.parametrize("name", ["lerobot", "folder", "xdmf"])
@@ -33,7 +33,7 @@ def test_what_does_not_go_together_is_a_sentence_and_leaves_nothing(folder, box,
         del file["T_world_tool"]
     for given, words in (([folder, wide], "convert them apart"), ([bare], "has no tool")):
         for name in ("lerobot", "robomimic"):
-            out = tmp_path / ("x.hdf5" if name == "robomimic" else "x")
+            out = tmp_path / ("x.open_hdf5" if name == "robomimic" else "x")
             assert main(["convert", *map(str, given), "--to", name, "--out", str(out)]) == 2
             assert words in capsys.readouterr().err.splitlines()[-1]
     for given in (["--to", "lerobot"], ["--to", "card", "--out", "x"]):
@@ -42,7 +42,7 @@ def test_what_does_not_go_together_is_a_sentence_and_leaves_nothing(folder, box,
 
 
 def test_what_is_interrupted_leaves_nothing(tmp_path):
-    with pytest.raises(KeyboardInterrupt), written_folder(tmp_path / "out", 10) as partial:
+    with pytest.raises(KeyboardInterrupt), write_folder_atomically(tmp_path / "out", 10) as partial:
         (partial / "a").write_text("a")
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())
@@ -56,25 +56,25 @@ def test_what_a_killed_run_left_is_removed_and_what_runs_is_not(tmp_path):
     done = subprocess.run([sys.executable, "-c", code, str(out)], cwd=Path(__file__).parents[1], check=False)
     (left,) = tmp_path.iterdir()
     assert done.returncode == -9 and (left / "a").exists()
-    with written_folder(out, 10) as partial:
+    with write_folder_atomically(out, 10) as partial:
         assert not left.exists()
-        with written_folder(tmp_path / "other", 10):
+        with write_folder_atomically(tmp_path / "other", 10):
             assert partial.exists()
     assert {path.name for path in tmp_path.iterdir()} == {"out", "other"}
 
 
 def test_a_folder_that_another_run_is_writing_is_rejected(tmp_path):
     folder = tmp_path / "out"
-    other = partial_path(folder).with_name(partial_path(folder).name.replace(str(os.getpid()), str(os.getppid())))
+    other = to_partial_path(folder).with_name(to_partial_path(folder).name.replace(str(os.getpid()), str(os.getppid())))
     other.mkdir()
-    with pytest.raises(InputError, match="another run is writing it"), written_folder(folder):
+    with pytest.raises(InputError, match="another run is writing it"), write_folder_atomically(folder):
         pytest.fail("entered")
     assert list(tmp_path.iterdir()) == [other]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
 def test_a_full_disk_is_said_and_nothing_stays(tmp_path):
-    with pytest.raises(InputError, match="No space left"), written_folder(tmp_path / "out", 10) as partial:
+    with pytest.raises(InputError, match="No space left"), write_folder_atomically(tmp_path / "out", 10) as partial:
         (partial / "a").write_text("a")
         with open("/dev/full", "w") as full:
             full.write("x" * 10_000)

@@ -7,13 +7,13 @@ from tiny_episodes import write_episode
 
 from scenes import write_card
 from scenes.cli import main
-from scenes.episodes.exports.datasheet import listed
+from scenes.episodes.exports.datasheet import format_counts
 
 
 def test_a_sheet_names_what_is_there_most_often():
-    lines = list(listed("tool", ["a", "b", "b", *map(str, range(20))]))
+    lines = list(format_counts("tool", ["a", "b", "b", *map(str, range(20))]))
     assert lines[:2] == ["- tool: b (in 2)", "- tool: a (in 1)"] and lines[-1] == "- tool: 10 others (in 10)"
-    assert list(listed("tool", ["a"])) == ["- tool: a (in 1)"]
+    assert list(format_counts("tool", ["a"])) == ["- tool: a (in 1)"]
 
 
 def test_a_card_says_whose_brain_it_is_and_what_played(box, tmp_path):

@@ -14,7 +14,7 @@ from sim.errors import InputError
 @pytest.mark.parametrize(("asked", "wide"), [(1e-4, 6e-3), (9e-3, 9e-3)])
 def test_the_corridor_is_free_from_the_cortex_to_the_tumour(box, asked, wide):
     """As wide as it is asked for, and never narrower than an edge of the mesh, which is 6 mm here."""
-    corridor = np.array(Debulking(SURGERY.times, corridor=asked).resection(box).steps[0])
+    corridor = np.array(Debulking(SURGERY.times, corridor=asked).build_resection(box).steps[0])
     middle = box.mesh.nodes[box.mesh.tets].mean(axis=1)
     brain, across = box.mesh.region != TUMOUR_LABEL, np.linalg.norm(middle[:, :2], axis=1)
     above = middle[:, 2] > middle[~brain, 2].mean() + 1e-3
@@ -25,4 +25,4 @@ def test_the_corridor_is_free_from_the_cortex_to_the_tumour(box, asked, wide):
 
 def test_a_tumour_of_fewer_elements_is_a_sentence(box):
     with pytest.raises(InputError, match="mesh finer"):
-        Debulking(times=tuple(np.arange(5000.0))).resection(box)
+        Debulking(times=tuple(np.arange(5000.0))).build_resection(box)

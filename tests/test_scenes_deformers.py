@@ -7,11 +7,11 @@ import pytest
 from theatres import PUSHING, player, put, short
 
 from scenes.cli import main
-from scenes.play.deformers import model_path, open_theatre
+from scenes.play.deformers import open_theatre, to_model_path
 from scenes.script.scene import find_scene
 from scenes.script.shipped_files import template_path
 from scenes.script.tool_paths import Touch
-from sim.bodies.intensity import sidecar
+from sim.bodies.intensity import to_intensity_path
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
 
@@ -31,8 +31,8 @@ def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
     touch = Touch(force=0.2)
     pictures = [player(each, short(), "linear").draw(0, 0.0, touch).shown for each in (theatre, again)]
     assert np.array_equal(pictures[0], pictures[1])
-    sidecar(tmp_path / "box.vtu").unlink()
-    model_path(tmp_path / "box.vtu").unlink()
+    to_intensity_path(tmp_path / "box.vtu").unlink()
+    to_model_path(tmp_path / "box.vtu").unlink()
     bare = open_theatre(tmp_path / "box.vtu", device="cpu")
     assert bare.intensity is None and bare.names(short()) == ("fem",) and bare.best(short()) == "fem"
     with pytest.raises(InputError, match=r"'linear'.*fem; `sulcus train`"):
@@ -52,7 +52,7 @@ def test_files_that_do_not_belong_together_are_refused(theatre, template, tmp_pa
 
 
 def test_what_ships_fits_together_and_passes_its_own_checks(capsys):
-    assert model_path(template_path()).stat().st_size <= 40_000_000 and sidecar(template_path()).is_file()
+    assert to_model_path(template_path()).stat().st_size <= 40_000_000 and to_intensity_path(template_path()).is_file()
     theatre = open_theatre(device="cpu")
     assert {"linear", "ann", "svr"} <= set(theatre.models) and theatre.intensity is not None
     assert all(model.bound < 1e-3 for model in theatre.models.values()) and theatre.best(find_scene("press")) != "fem"

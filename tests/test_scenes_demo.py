@@ -8,7 +8,7 @@ import pytest
 from visitor import Visitor, report, run_until, wait_for
 
 from ar.overlay.hud import FINE
-from ar.overlay.outlines import stands
+from ar.overlay.outlines import has_text
 from ar.page.browser import Browser
 from scenes.page.comparison import PageState
 from scenes.page.controls import PLAN
@@ -81,7 +81,7 @@ def test_the_words_beside_a_picture_are_of_its_frame(demo, monkeypatch):
     assert len({number for number, _, _ in shown}) > 3
     pictures = {}
     for number, colour, words in shown:
-        assert f"frame {number} of" in words and stands(colour, f"frame {number}", FINE)
+        assert f"frame {number} of" in words and has_text(colour, f"frame {number}", FINE)
         assert pictures.setdefault(number, colour) is colour
 
 

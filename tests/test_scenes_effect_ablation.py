@@ -13,7 +13,7 @@ import warp as wp
 from theatres import short, sinking, theatre_of
 
 from scenes.cli import main
-from scenes.play.effect_ablation import ALL, device_arrays, rows, run, without
+from scenes.play.effect_ablation import ALL, list_device_arrays, measure_effects, remove_effect, run
 from scenes.script.scene import find_scene
 from sim.bodies.meshfile import write_anatomy
 from sim.effects import Gravity, Held
@@ -44,14 +44,14 @@ def printed(small_box, tmp_path_factory):
 
 def test_a_scene_is_left_without_one_effect():
     scene = sinking()
-    assert Gravity() not in without(scene, Gravity()).effects and len(without(scene, Held()).effects) == 3
+    assert Gravity() not in remove_effect(scene, Gravity()).effects and len(remove_effect(scene, Held()).effects) == 3
     cut = find_scene("resection")
-    assert without(cut, object()).surgery is None and without(cut, Held()).surgery is not None  # type: ignore
+    assert remove_effect(cut, object()).surgery is None and remove_effect(cut, Held()).surgery is not None  # type: ignore
 
 
 def test_each_effect_has_its_row(small_theatre):
     both = replace(short(), effects=(*short().effects, Gravity()), lying=sinking().lying)
-    found = {row.effect: row for row in rows(small_theatre, both, 1)}
+    found = {row.effect: row for row in measure_effects(small_theatre, both, 1)}
     assert list(found) == [ALL, "Elasticity", "Held", "Bonded", "ToolForce", "Gravity"]
     assert "nothing else resists" in found["Elasticity"].refused and found["Elasticity"].milliseconds is None
     assert "can move rigidly" in found["Held"].refused
@@ -72,12 +72,12 @@ def test_bytes_are_the_same_in_every_run(small_theatre):
 
 def counted(theatre, scene, every):
     """Bytes that a scene keeps, counted again: numbers of each array, and the size of a number."""
-    before = device_arrays()  # held: the number of an array that goes may be that of a new one
+    before = list_device_arrays()  # held: the number of an array that goes may be that of a new one
     fem, last = replace(theatre, models={}).fem(scene, scene.accuracy, live=True), None
     for time in scene.times[::every].tolist():
         last = fem.deform(scene.loads(theatre.site, scene.path(time), time), start=last)
     known = {id(array) for array in before}
-    new = [array for array in device_arrays() if id(array) not in known]
+    new = [array for array in list_device_arrays() if id(array) not in known]
     return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in new)
 
 
@@ -87,7 +87,7 @@ def test_the_memory_that_is_printed_is_that_of_arrays(small_theatre, printed):
     table = [[cell.strip() for cell in line.split("|")] for line in error.splitlines() if line.startswith("| ")]
     scene = find_scene("brain_shift")
     whole = counted(small_theatre, scene, 60)
-    expected = {ALL: whole, "Gravity": whole - counted(small_theatre, without(scene, Gravity()), 60)}
+    expected = {ALL: whole, "Gravity": whole - counted(small_theatre, remove_effect(scene, Gravity()), 60)}
     cells = {cells[1]: cells[3] for cells in table}
     reported = {row["effect"]: row["held_mb"] for row in json.loads(out)["effects"]}
     for name, size in expected.items():
@@ -99,7 +99,7 @@ def test_the_memory_that_is_printed_is_that_of_arrays(small_theatre, printed):
 def test_the_change_is_that_between_the_answers(small_theatre):
     """By another way: an effect that does all that is done."""
     scene = sinking()
-    found = {row.effect: row for row in rows(small_theatre, scene, 2)}
+    found = {row.effect: row for row in measure_effects(small_theatre, scene, 2)}
     alone = run(replace(small_theatre, models={}), scene, 2)
     whole = alone.displacement[:, small_theatre.anatomy.tumour_nodes]
     largest = 1e3 * np.linalg.norm(whole, axis=2).mean(axis=1).max()
@@ -114,17 +114,17 @@ def test_a_frame_that_is_not_answered_is_a_sentence(theatre):
 
 
 def test_bytes_are_those_of_arrays_that_live():
-    before = device_arrays()
+    before = list_device_arrays()
     array = wp.zeros(1_000_000, dtype=wp.float32, device="cpu")
     view = array[:500_000]
-    new = [found for found in device_arrays() if all(found is not known for known in before)]
+    new = [found for found in list_device_arrays() if all(found is not known for known in before)]
     assert new == [array] and array.capacity == 4_000_000 and len(view) == 500_000
 
 
 def test_the_command_tells_rows(theatre, anatomy, printed, capsys):
     out, error = printed
     reported = json.loads(out)
-    asked = [type(effect).__name__ for effect in find_scene("brain_shift").effects_on(theatre.anatomy)]
+    asked = [type(effect).__name__ for effect in find_scene("brain_shift").get_effects_on(theatre.anatomy)]
     assert out.count("\n") == 1 and reported["scene"] == "brain_shift"
     assert [row["effect"] for row in reported["effects"]] == [ALL, *asked]
     found = next(row for row in reported["effects"] if row["effect"] == "Gravity")

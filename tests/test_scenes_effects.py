@@ -15,10 +15,10 @@ from scenes.episodes.episode import UNITS, collect
 from scenes.page.demo import Demo
 from scenes.play.checks import measure
 from scenes.play.deformers import Theatre
-from scenes.play.effect_ablation import without
-from scenes.play.frame_text import acting
-from scenes.play.reference import truth_of
-from scenes.play.scene_costs import labelled
+from scenes.play.effect_ablation import remove_effect
+from scenes.play.frame_text import format_acting
+from scenes.play.reference import solve_reference_frames
+from scenes.play.scene_costs import add_cost_label
 from scenes.play.stage import CORTEX, TOOL, Stage
 from scenes.script.scene import Bounds, find_scene
 from scenes.script.site import HOLE
@@ -59,14 +59,14 @@ class TestCauses:
     def test_they_are_reported_in_words(self, theatre):
         both = replace(short(), effects=(*EFFECTS, Gravity(), ToolForce()))
         height = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.04]])  # from -32 to 0 mm against gravity
-        words = acting(both.loads(theatre.site, Touch(force=0.2), 0.0), STILL, theatre.site.anatomy.mesh.nodes)
+        words = format_acting(both.loads(theatre.site, Touch(force=0.2), 0.0), STILL, theatre.site.anatomy.mesh.nodes)
         assert "force 0.20 N" in words and "gravity pulls to the back, fluid up to" in words
-        idle = acting(both.loads(theatre.site, Touch(force=0.0), 0.0), STILL, theatre.site.anatomy.mesh.nodes)
+        idle = format_acting(both.loads(theatre.site, Touch(force=0.0), 0.0), STILL, theatre.site.anatomy.mesh.nodes)
         assert "the tool does not push" in idle and "force" not in idle
-        assert acting(Loads((), np.zeros(1)), STILL, height) == ""
+        assert format_acting(Loads((), np.zeros(1)), STILL, height) == ""
         lying = posture(np.array([-3.0, 0.0, 4.0]), -0.012)
         way = "gravity pulls to the crown (0.80) and the left (0.60), fluid up to "
-        assert acting(lying, STILL, height) == way + "62 % of the brain's height"
+        assert format_acting(lying, STILL, height) == way + "62 % of the brain's height"
 
 
 class TestWithoutATool:
@@ -77,7 +77,7 @@ class TestWithoutATool:
             assert (frame.shown != frame.picture.colour).any()
         lines = []
         monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, text, **given: lines.extend(text) or colour)
-        labelled(frames[-1], "fem")
+        add_cost_label(frames[-1], "fem")
         assert any(
             re.search(r"to the left \(0.87\) and the back \(0.50\), fluid up to \d+ % of the brain's height", line)
             for line in lines
@@ -87,7 +87,7 @@ class TestWithoutATool:
     def test_it_can_be_checked(self, theatre, frames):
         play = player(theatre, sinking(), "fem")
         figures = measure(
-            play, play.camera_at, frames, truth_of(theatre, play.scene, [frame.loads for frame in frames])
+            play, play.camera_at, frames, solve_reference_frames(theatre, play.scene, [frame.loads for frame in frames])
         )
         assert not figures.broken(Bounds()) and figures.motion_mm > 0.01
 
@@ -129,7 +129,7 @@ class TestSwitches:
         assert wait_for(lambda: demo.run(0.3) and "without gravity and fluid the tumour is" in page.shown[2])
         said = float(page.shown[2].split("the tumour is ")[1].split(" mm")[0])
         scene, nodes = demo.stage.scene, theatre.anatomy.tumour_nodes
-        plain, less = replace(theatre, models={}), without(scene, Gravity())
+        plain, less = replace(theatre, models={}), remove_effect(scene, Gravity())
         one, other = (
             plain.fem(each, TRAIN).deform(each.loads(theatre.site, each.path(5 / 30), 5 / 30)).at(nodes).displacement[0]
             for each in (scene, less)

@@ -12,11 +12,11 @@ from scipy.stats import chi2
 from theatres import template_theatre
 
 from ar.optics.lens import Lens
-from ar.tracking.pictures import film_of
+from ar.tracking.pictures import read_video
 from ar.tracking.pose import Pose, Verdict
-from ar.tracking.pose_stream import AHEAD, DAY, LONGEST, Clock, clock_by_motion, stream_of
-from ar.tracking.rigid import moved_about
-from ar.tracking.targets import patient_reference
+from ar.tracking.pose_stream import AHEAD, DAY, LONGEST, Clock, build_pose_stream, estimate_clock_by_motion
+from ar.tracking.rigid import move_about
+from ar.tracking.targets import build_patient_reference
 from scenes.cli import main
 from scenes.script.scene import find_scene
 from scenes.tracked.agreement import Agreement
@@ -28,11 +28,11 @@ from scenes.tracked.calibration_file import (
 )
 from scenes.tracked.elsewhere import CameraMount, ExternalTracker
 from scenes.tracked.follower import Follower, TumourState
-from scenes.tracked.picture import head_lines
-from scenes.tracked.plausible import buried
+from scenes.tracked.picture import format_head_lines
+from scenes.tracked.plausible import describe_penetration
 from scenes.tracked.pose_file import TrackedRow, read_stream, write_poses
 from scenes.tracked.registration_file import read_registration
-from scenes.tracked.run import timed
+from scenes.tracked.run import read_timed
 from scenes.tracked.tool_motion import ToolMotion
 from scenes.tracked.tracked_tool import read_tool
 from scenes.tracked.truth import read_truth
@@ -40,7 +40,7 @@ from scenes.tracked.words import overlay_error
 from sim.errors import InputError
 
 FILM = Path(__file__).parent / "data" / "film"
-TRACKER = moved_about(np.eye(4), np.zeros(3), np.array([0.3, -0.2, 1.1, 0.5, -0.7, 1.2]))
+TRACKER = move_about(np.eye(4), np.zeros(3), np.array([0.3, -0.2, 1.1, 0.5, -0.7, 1.2]))
 """T_tracker_scan."""
 NOISE = np.diag(np.repeat([1e-4**2, 3e-4**2], 3))
 NONE = np.zeros((6, 6))
@@ -50,15 +50,15 @@ def swung(time):
     """A tool in a quick hand: 20 mm and 11 degrees to and fro, 1.2 times a second."""
     phase = 2.0 * np.pi * 1.2 * time
     step = [0.02 * np.sin(phase), 0.01 * np.sin(0.7 * phase), 0.0, 0.0, 0.2 * np.sin(phase + 1.0), 0.1 * np.cos(phase)]
-    return moved_about(TRACKER, np.zeros(3), np.array(step))
+    return move_about(TRACKER, np.zeros(3), np.array(step))
 
 
 def sampled(pose_at, times, rng=None, offset=0.0):
     """A stream of what happens at times, with noise; its stamps are those times and an offset."""
     poses = [pose_at(time) for time in times]
     if rng is not None:
-        poses = [moved_about(T, np.zeros(3), rng.multivariate_normal(np.zeros(6), NOISE)) for T in poses]
-    return stream_of(
+        poses = [move_about(T, np.zeros(3), rng.multivariate_normal(np.zeros(6), NOISE)) for T in poses]
+    return build_pose_stream(
         np.asarray(times) + offset, np.stack(poses), np.tile(NONE if rng is None else NOISE, (len(times), 1, 1))
     )
 
@@ -102,13 +102,13 @@ def test_gaps_have_no_pose_and_the_last_one_goes_on_for_a_moment_only():
         2.5 - times[9]
     )  # of the older one
     with pytest.raises(ValueError, match="pose 3 is not later"):
-        stream_of(np.array([0.0, 2.0, 1.0]), np.tile(np.eye(4), (3, 1, 1)), np.tile(NONE, (3, 1, 1)))
+        build_pose_stream(np.array([0.0, 2.0, 1.0]), np.tile(np.eye(4), (3, 1, 1)), np.tile(NONE, (3, 1, 1)))
 
 
 def test_a_clock_of_24_hours_goes_on_at_midnight():
     times = np.arange(0.0, 2.0, 0.025)
     stamps = (times + DAY - 1.0) % DAY
-    stream = stream_of(stamps, np.stack([swung(time) for time in times]), np.tile(NONE, (len(times), 1, 1)))
+    stream = build_pose_stream(stamps, np.stack([swung(time) for time in times]), np.tile(NONE, (len(times), 1, 1)))
     for time in (0.4, 1.5):
         for days in (-DAY, 0.0, DAY):
             pose = stream.at(time + DAY - 1.0 + days)
@@ -124,23 +124,25 @@ def test_clocks_are_compared_by_motion_with_an_error_that_holds():
     for true in rng.uniform(-0.9, 0.9, 60):
         times = np.arange(1.0, 4.0, 0.1)
         places = np.stack([swung(time + true)[:3, 3] for time in times]) + 2e-4 * rng.normal(size=(30, 3)) + 0.05
-        clock = clock_by_motion(times, places, samples, others + 1e-4 * rng.normal(size=others.shape))
+        clock = estimate_clock_by_motion(times, places, samples, others + 1e-4 * rng.normal(size=others.shape))
         off.append((clock.offset - true) / clock.error)
         assert abs(clock.offset - true) < 2e-3
     assert 0.7 < np.std(off) < 1.5
     still = np.tile(others[:1], (len(samples), 1)) + 1e-5 * rng.normal(size=others.shape)
     with pytest.raises(ValueError, match="Move the tool"):
-        clock_by_motion(times, places[:1] + 1e-5 * rng.normal(size=places.shape), samples, still)
+        estimate_clock_by_motion(times, places[:1] + 1e-5 * rng.normal(size=places.shape), samples, still)
     turning = np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in samples])
     with pytest.raises(ValueError, match="more than one offset"):
-        clock_by_motion(times, np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in times]), samples, turning)
+        estimate_clock_by_motion(
+            times, np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in times]), samples, turning
+        )
     with pytest.raises(ValueError, match="images show what the poses have"):
-        clock_by_motion(times[:3], places[:3], samples, others)
+        estimate_clock_by_motion(times[:3], places[:3], samples, others)
     with pytest.raises(ValueError, match="end before the images"):
-        clock_by_motion(3.0 * times, places, samples, others)
+        estimate_clock_by_motion(3.0 * times, places, samples, others)
     some = np.abs(samples - 2.5) > 0.06
     with pytest.raises(ValueError, match="gaps of more than"):
-        clock_by_motion(times, places, samples[some], others[some])
+        estimate_clock_by_motion(times, places, samples[some], others[some])
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +152,7 @@ def bodies(stage):
     scene = find_scene("palpate")
 
     def head(time):
-        return moved_about(TRACKER, np.zeros(3), np.array([0.0, 2e-3 * np.sin(4.0 * time), 0.0, 0.0, 0.0, 0.0]))
+        return move_about(TRACKER, np.zeros(3), np.array([0.0, 2e-3 * np.sin(4.0 * time), 0.0, 0.0, 0.0, 0.0]))
 
     return {
         "tool": lambda time: head(time) @ scene.pose(stage.site, scene.path(time)) @ np.linalg.inv(tool.T_cube_tool),
@@ -201,7 +203,7 @@ def test_a_picture_without_poses_is_stale(follower, bodies):
     other = ExternalTracker(*(sampled(bodies[name], times) for name in ("tool", "patient")))
     one, known, said = replace(follower, elsewhere=other), None, []
     one = replace(one, motion=replace(one.motion, deformer=Still()))
-    for each in timed(film_of(FILM / "film.mp4", 30.0)):
+    for each in read_timed(read_video(FILM / "film.mp4", 30.0)):
         if each.picture.time > 0.9:
             break
         known = one.step(each.picture.grey, each.picture.time, known)
@@ -215,7 +217,7 @@ def followed(follower, other, until=1.0):
     """What is known of the film's first pictures, by another tracker, and with a brain that does not move."""
     one, known, out = replace(follower, elsewhere=other), None, []
     one = replace(one, motion=replace(one.motion, deformer=Still()))
-    for each in timed(film_of(FILM / "film.mp4", 30.0)):
+    for each in read_timed(read_video(FILM / "film.mp4", 30.0)):
         if each.picture.time > until:
             break
         known = one.step(each.picture.grey, each.picture.time, known)
@@ -233,16 +235,14 @@ def test_poses_are_held_against_the_targets_that_pictures_show(follower, bodies,
     for each in followed(follower, right.swapped):
         assert each.state is TumourState.UNSURE and each.band is None
         assert "mm from its poses: are the two files of --poses swapped?" in each.words
-    aside = moved_about(
-        np.eye(4), np.zeros(3), np.array([0.05, 0.0, -0.03, 0.4, 0.0, 0.0])
-    )  # bodies beside their cubes
+    aside = move_about(np.eye(4), np.zeros(3), np.array([0.05, 0.0, -0.03, 0.4, 0.0, 0.0]))  # bodies beside their cubes
     mounted = replace(right, tool=sampled(lambda time: bodies["tool"](time) @ aside, times))
     assert all(each.relied for each in followed(follower, mounted))
     far = replace(
         right,
         tool=sampled(
             lambda time: (
-                bodies["tool"](time) @ moved_about(np.eye(4), np.zeros(3), np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.0]))
+                bodies["tool"](time) @ move_about(np.eye(4), np.zeros(3), np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.0]))
             ),
             times,
         ),
@@ -285,12 +285,12 @@ def test_a_tool_deep_in_the_brain_is_of_other_poses(stage, follower):
     pose[:3, 3] = nodes.mean(axis=0)
     pose[:3, 2] *= -1.0
     pose[:3, 0] *= -1.0
-    assert "tip would be" in buried(follower.tool, pose, stage)
+    assert "tip would be" in describe_penetration(follower.tool, pose, stage)
     away = pose @ follower.tool.T_cube_tool  # markers in the middle of the brain
-    assert "markers would be" in buried(follower.tool, away, stage)
+    assert "markers would be" in describe_penetration(follower.tool, away, stage)
     pose[:3, 3] = stage.site.origin + 0.02 * stage.site.axis  # a tip 20 mm into the opening
     pose[:3, :3] = np.column_stack([stage.site.right, stage.site.up, -stage.site.axis])
-    assert not buried(follower.tool, pose, stage)
+    assert not describe_penetration(follower.tool, pose, stage)
 
 
 class Still:
@@ -349,7 +349,7 @@ def test_the_command_takes_poses_and_finds_their_clock(bodies, tmp_path, capsys)
 def test_a_calibration_s_error_is_in_the_band_as_far_as_the_reference_does_not_take_it_up(follower, stage, tmp_path):
     follower = replace(follower, motion=replace(follower.motion, deformer=Still()))
     first, deviations = (
-        next(iter(film_of(FILM / "film.mp4", 30.0))),
+        next(iter(read_video(FILM / "film.mp4", 30.0))),
         np.array([2, 2, 2, 2, 5e-3, 0.05, 3e-4, 3e-4, 0.1]),
     )
     stored = {"format": "sulcus intrinsics 1", "covariance": np.diag(deviations**2).tolist()}
@@ -357,7 +357,7 @@ def test_a_calibration_s_error_is_in_the_band_as_far_as_the_reference_does_not_t
     known = replace(follower, intrinsic=read_intrinsic_covariance(tmp_path / "k.yaml")).step(first.grey, 0.0)
     rng, off = np.random.default_rng(0), []
     reference = known.tracked.poses["patient"].T_camera_target
-    corners = patient_reference().faces[0].corners
+    corners = build_patient_reference().faces[0].corners
     for step in deviations * rng.normal(size=(100, 9)):
         # What another camera would have seen, and what this one makes of it.
         focal, principal = (np.array(each) for each in (follower.calibration.focal, follower.calibration.principal))
@@ -367,7 +367,7 @@ def test_a_calibration_s_error_is_in_the_band_as_far_as_the_reference_does_not_t
         )
         pixels = other.camera(reference).project(corners)[0]
         tumour = np.linalg.inv(reference) @ [
-            *known.camera.in_frame(stage.tumour_at_rest.vertices.mean(axis=0)[None])[0],
+            *known.camera.to_camera_frame(stage.tumour_at_rest.vertices.mean(axis=0)[None])[0],
             1.0,
         ]
         camera = follower.calibration.camera(np.eye(4))
@@ -379,8 +379,8 @@ def test_a_calibration_s_error_is_in_the_band_as_far_as_the_reference_does_not_t
     )
     bare = follower.step(first.grey, 0.0)
     assert known.band > known.parts["camera"] > 1e-4 and "camera" not in bare.parts
-    assert head_lines(bare)[-1].startswith("error by tissue, camera and segmentation: not known")
-    assert head_lines(known)[-1].startswith("error by tissue and segmentation: not known")
+    assert format_head_lines(bare)[-1].startswith("error by tissue, camera and segmentation: not known")
+    assert format_head_lines(known)[-1].startswith("error by tissue and segmentation: not known")
     write_exactly_known(tmp_path / "k.json", follower.calibration)
     exact = replace(follower, intrinsic=read_intrinsic_covariance(tmp_path / "k.yaml")).step(first.grey, 0.0)
     assert exact.parts["camera"] == 0.0 and exact.band == pytest.approx(bare.band)

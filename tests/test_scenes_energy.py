@@ -15,12 +15,12 @@ from scenes.script.site import site_of
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, guess
-from sim.discretisation.resected_body import bodies
+from sim.discretisation.resected_body import list_remaining_bodies
 from sim.discretisation.term import Cases
 from sim.effects import Effect, Elasticity, Held, Inertia, Pulsation, Resection, Wave
 from sim.fem import Fem
 from sim.loads import Loads, Resected
-from sim.terms.inertia import lumped_mass
+from sim.terms.inertia import compute_lumped_mass
 
 TIGHT = Accuracy(tolerance=1e-10)
 # When the load of each scene is taken that then stays [s]: something acts, and tools are in the tissue.
@@ -50,14 +50,14 @@ BODY = sliding_box()
 def posed(name: str) -> tuple[Anatomy, tuple[Effect, ...], Loads, Deformation]:
     """The body, what acts without mass, the load that stays, and what the body starts from, at rest."""
     scene, time = find_scene(name), TAKEN[name]
-    effects = scene.effects_on(BODY)
+    effects = scene.get_effects_on(BODY)
     site = site_of(BODY)
     loads = scene.loads(site, scene.path(time), time)
     body, start = BODY, guess(np.zeros((1, len(BODY.mesh.nodes), 3)))
     if scene.surgery is not None:  # as it was before the last cut
-        stages, done = bodies(BODY, effects), scene.surgery.done(time)
+        stages, done = list_remaining_bodies(BODY, effects), scene.surgery.done(time)
         effects = (*(effect for effect in effects if not isinstance(effect, Held | Resection)), Held())
-        loads, body = loads.but(Resected), stages[done].anatomy
+        loads, body = loads.without_kind(Resected), stages[done].anatomy
         before = Fem(stages[done - 1].anatomy, effects, TIGHT, "cpu", element="p1").deform(loads)
         start = guess(np.where(body.orphaned[:, None], 0.0, before.displacement))
     if any(isinstance(effect, Pulsation) for effect in effects):
@@ -100,7 +100,7 @@ def potential(fem: Fem, loads: Loads, answer: Deformation) -> float:
 def test_energy_does_not_grow(name: str, step: float, damping: float) -> None:
     body, effects, loads, answer = posed(name)
     fem = Fem(body, (*effects, Inertia(damping=damping)), TIGHT, "cpu", element="p1")
-    mass, begun = lumped_mass(Inertia().density, fem.space), answer.time
+    mass, begun = compute_lumped_mass(Inertia().density, fem.space), answer.time
     kinetic, stored = [], []
     for number in range(1, STEPS + 1):
         answer = fem.deform(Loads(loads.causes, begun + number * step), answer)

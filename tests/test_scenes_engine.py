@@ -12,22 +12,22 @@ from urllib.request import urlopen
 
 import pytest
 from distributed import Client, Scheduler, Security, SpecCluster
-from tiny_work import Trouble, body_path, held, played, tiny_run, tried
+from tiny_work import Trouble, held, played, tiny_run, to_body_path, tried
 
-from scenes.episodes.engine import RunStatistics, still_missing
+from scenes.episodes.engine import RunStatistics, find_still_missing
 from scenes.episodes.run_folder import (
     Failure,
     begin,
-    failed,
-    failure_of,
-    failures,
-    finished,
+    list_failed,
+    list_failures,
+    list_finished,
     mark_failed,
+    read_failure,
     read_run,
 )
-from scenes.episodes.workers import own_workers, scheduled_workers
+from scenes.episodes.workers import connect_workers, start_own_workers
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.partial_files import remove_left_overs
 
 PLAN = 'title = "tiny"\n'
@@ -35,7 +35,7 @@ PLAN = 'title = "tiny"\n'
 
 @pytest.fixture(scope="module")
 def workers():
-    with own_workers(["cpu", "cpu"]) as found:
+    with start_own_workers(["cpu", "cpu"]) as found:
         yield found
 
 
@@ -69,30 +69,30 @@ def test_failures_are_kept_marked_and_counted(workers, tmp_path):
     trouble = Trouble({1: "does not converge", 2: "broken"}, {1: "does not mesh"})
     tally = played(tmp_path, workers, 11, trouble)
     assert (tally.made, tally.failed, tally.lost) == (4, 6, 1)
-    found = failures(tmp_path)
+    found = list_failures(tmp_path)
     assert found[1].reason == "does not converge" and not found[1].lost
     assert found[2].reason == "RuntimeError: the card has failed" and found[2].lost
     assert sum(line.startswith("2 ") for line in tried(tmp_path)) == 1 + 3  # retries
     assert all(found[number].reason == "its body 1: does not mesh" for number in range(5, 10))
-    assert finished(tmp_path) == {0, 3, 4, 10}
+    assert list_finished(tmp_path) == {0, 3, 4, 10}
     assert json.loads((tmp_path / "failed/episode_000001.json").read_text())["reason"] == "does not converge"
     tally = played(tmp_path, workers, 11)  # what was lost has more luck, what failed is not tried again
     assert (tally.made, tally.skipped, tally.failed, tally.lost) == (1, 4, 6, 0)
-    assert sorted(failures(tmp_path)) == [1, *range(5, 10)]
+    assert sorted(list_failures(tmp_path)) == [1, *range(5, 10)]
     tally = played(tmp_path, workers, 11, again=True)
-    assert (tally.made, tally.skipped, tally.failed) == (6, 5, 0) and not failures(tmp_path)
+    assert (tally.made, tally.skipped, tally.failed) == (6, 5, 0) and not list_failures(tmp_path)
 
 
 def test_a_full_disk_ends_the_run_and_says_so(workers, tmp_path):
     with pytest.raises(InputError, match="No space left on device"):
         played(tmp_path, workers, 12, Trouble({1: "full"}))
-    assert sum(line.startswith("1 ") for line in tried(tmp_path)) == 1 and not failures(tmp_path)
+    assert sum(line.startswith("1 ") for line in tried(tmp_path)) == 1 and not list_failures(tmp_path)
     assert played(tmp_path, workers, 12).failed == 0 and len(held(tmp_path)) == 12
 
 
 def test_each_process_has_a_card_of_its_own_and_is_replaced_if_it_fails(undisturbed, tmp_path):
     """A card that has failed answers nothing any more; the number of an episode that broke it is tried anew."""
-    with own_workers(["cuda:0", "cuda:1"]) as workers:
+    with start_own_workers(["cuda:0", "cuda:1"]) as workers:
         tally = played(tmp_path, workers, 12, Trouble({3: "broken once"}, seconds=0.05))
     assert tally.made == 12 and tally.failed == tally.lost == 0 and held(tmp_path) == undisturbed
     lines = [line.split() for line in tried(tmp_path)]
@@ -121,7 +121,7 @@ def test_scheduler_rejects_clients_without_its_keys(workers):
 def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path):
     address = "tcp://127.0.0.1:9"
     with pytest.raises(InputError, match=f"--scheduler {address}: no Dask scheduler answers"):
-        scheduled_workers(address, "cpu", patience=0.5).__enter__()
+        connect_workers(address, "cpu", patience=0.5).__enter__()
     counts, added = [], []
     with ExitStack() as closing:
         own = closing.enter_context(SpecCluster({}, {"cls": Scheduler, "options": {"host": "127.0.0.1", "port": 0}}))
@@ -140,7 +140,7 @@ def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path
             counts.append(count)
 
         add()
-        with scheduled_workers(address, "auto") as workers:
+        with connect_workers(address, "auto") as workers:
             assert workers.device == "cpu"
             folder = tmp_path / "more"
             assert played(folder, workers, 30, Trouble(seconds=0.2), heard).made == 30
@@ -152,7 +152,7 @@ def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path
 
         folder = tmp_path / "ended"
         ended = pytest.raises(InputError, match="scheduler ended")
-        with scheduled_workers(address, "cpu", patience=0.5) as workers, ended:
+        with connect_workers(address, "cpu", patience=0.5) as workers, ended:
             played(folder, workers, 30, Trouble(seconds=0.1), ending)
 
 
@@ -185,7 +185,7 @@ def test_left_overs_of_dead_processes_are_removed_and_others_are_not(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     remove = tmp_path / "probe.h5"
-    with written_whole(remove, ".h5") as partial:
+    with write_atomically(remove, ".h5") as partial:
         partial.write_text("mine")
         own = partial.name
         machine = own.split("-")[1]
@@ -209,17 +209,25 @@ def test_what_is_missing_is_known_by_name_alone(tmp_path):
     for number in (1, 3, 1234567):
         (tmp_path / f"episode_{number:06d}.h5").touch()
     (tmp_path / ".sulcus-0-0-episode_000002.h5").touch()
-    assert still_missing(tmp_path, finished(tmp_path), range(5), True) == (RunStatistics(skipped=2), [0, 2, 4])
-    assert still_missing(tmp_path, finished(tmp_path), range(1234567, 1234568), True)[1] == []
-    there, shuffled = still_missing(tmp_path, finished(tmp_path), range(100, 200), False)
+    assert find_still_missing(tmp_path, list_finished(tmp_path), range(5), True) == (
+        RunStatistics(skipped=2),
+        [0, 2, 4],
+    )
+    assert find_still_missing(tmp_path, list_finished(tmp_path), range(1234567, 1234568), True)[1] == []
+    there, shuffled = find_still_missing(tmp_path, list_finished(tmp_path), range(100, 200), False)
     assert sorted(shuffled) == list(range(100, 200)) != shuffled and there == RunStatistics()
-    assert not body_path(tmp_path, 0).exists()
+    assert not to_body_path(tmp_path, 0).exists()
 
 
 def test_of_what_failed_only_what_is_said_is_read(tmp_path, monkeypatch):
     for number in (3, 5):
         mark_failed(tmp_path, Failure(number, f"no {number}", lost=False))
-    assert failed(tmp_path) == {3, 5} and failure_of(tmp_path, 5) == Failure(5, "no 5", lost=False)
-    assert failure_of(tmp_path, 4) is None
+    assert list_failed(tmp_path) == {3, 5} and read_failure(tmp_path, 5) == Failure(5, "no 5", lost=False)
+    assert read_failure(tmp_path, 4) is None
     monkeypatch.setattr(Path, "read_text", lambda *given: pytest.fail("a file was read"))
-    assert failed(tmp_path) == {3, 5} and still_missing(tmp_path, set(), range(4), True, again=True)[1] == [0, 1, 2, 3]
+    assert list_failed(tmp_path) == {3, 5} and find_still_missing(tmp_path, set(), range(4), True, again=True)[1] == [
+        0,
+        1,
+        2,
+        3,
+    ]

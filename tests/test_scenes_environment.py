@@ -5,8 +5,8 @@ import pytest
 from gym_examples import DOWN, SIZE, made, many, played
 from gymnasium.utils.env_checker import check_env
 
-from scenes.gym.environment import many as made_apart
-from scenes.gym.scripted import scripted
+from scenes.gym.environment import make_many as made_apart
+from scenes.gym.scripted import compute_scripted_actions
 from sim.errors import InputError
 
 
@@ -24,7 +24,7 @@ def test_the_same_seed_and_actions_give_the_same_bytes_wherever_they_are():
     vector = many(3, observation="rgbd")
     seen, _ = vector.reset(seed=[0, 7, 3])
     for row, (expected, _, _) in enumerate(alone[1:]):
-        actions = np.stack([DOWN, scripted("palpate", seen["states"][1]), 0.0 * DOWN])
+        actions = np.stack([DOWN, compute_scripted_actions("palpate", seen["states"][1]), 0.0 * DOWN])
         seen, _, _, _, truth = vector.step(actions)
         for key in ("rgb", "depth", "states"):
             assert seen[key][1].tobytes() == expected[key].tobytes(), row
@@ -101,7 +101,7 @@ def test_hostile_input_is_refused():
     with pytest.raises(InputError, match=r"\(2, 6\)"):
         vector.step(np.zeros((3, 6)))
     with pytest.raises(InputError, match="no task"):
-        scripted("juggle", np.zeros(24))
+        compute_scripted_actions("juggle", np.zeros(24))
 
 
 def test_a_spatula_is_answered_by_its_model_alone_and_among_others():
@@ -111,7 +111,7 @@ def test_a_spatula_is_answered_by_its_model_alone_and_among_others():
     seen, _ = vector.reset(seed=[5, 2])
     true = alone[-1][2]
     for expected, _, _ in alone[1:]:
-        seen, _, _, _, truth = vector.step(scripted("retract", seen))
+        seen, _, _, _, truth = vector.step(compute_scripted_actions("retract", seen))
         assert seen[1].tobytes() == expected.tobytes()
     assert truth["reliable"].all() and truth["force"][1].tobytes() == true["force"].tobytes()
     assert np.linalg.norm(true["force"]) > 0.02 and 0.0 < true["model_error"] < 1e-3 and 0.0 < true["pressure"] < 4e3

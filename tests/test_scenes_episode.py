@@ -24,7 +24,7 @@ from sim.effects import Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import push
-from surrogate.data.answer_rows import stated_tissue
+from surrogate.data.answer_rows import read_tissue_statement
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def episode(theatre, tmp_path_factory):
         yield report, file, play, list(play.frames())
 
 
-def decoded(file, name, number, flag=cv2.IMREAD_UNCHANGED):
+def decode_recorded(file, name, number, flag=cv2.IMREAD_UNCHANGED):
     return cv2.imdecode(file["pictures"][name][number], flag)
 
 
@@ -58,14 +58,14 @@ class TestEpisode:
         assert file.attrs["depth_scale_m"] == DEPTH_SCALE and len(file["pictures/colour"]) == len(frames) == 7
         for frame in frames:
             for name, truth in (("colour", frame.picture.colour), ("overlay", frame.shown)):
-                picture = decoded(file, name, frame.number, cv2.IMREAD_COLOR)[..., ::-1]
+                picture = decode_recorded(file, name, frame.number, cv2.IMREAD_COLOR)[..., ::-1]
                 assert picture.shape == truth.shape
                 assert np.abs(picture.astype(int) - truth).mean() < 2.0
-            depth = decoded(file, "depth", frame.number)
+            depth = decode_recorded(file, "depth", frame.number)
             assert depth.dtype == np.uint16
             assert np.abs(depth * DEPTH_SCALE - frame.picture.depth).max() <= 0.51 * DEPTH_SCALE
             assert np.array_equal(depth == 0, frame.picture.depth == 0.0)
-            assert np.array_equal(decoded(file, "segmentation", frame.number), frame.picture.segmentation)
+            assert np.array_equal(decode_recorded(file, "segmentation", frame.number), frame.picture.segmentation)
 
     def test_validation_finds_nothing_wrong_and_knows_every_array(self, episode, box):
         _, file, _, _ = episode
@@ -78,7 +78,7 @@ class TestEpisode:
         """Tissue, element, tool and load are those that the file names; so is what solved it."""
         _, file, _, _ = episode
         said, number = file.attrs, 3
-        effects = (stated_tissue({name: str(text) for name, text in said.items()}), Held(), ToolForce())
+        effects = (read_tissue_statement({name: str(text) for name, text in said.items()}), Held(), ToolForce())
         fem = Fem(box, effects, TRAIN, "cpu", element=said["element"])
         assert said["anatomy"] == box.digest and said["finite_elements"] == fem.description
         load = push(file["contact"][number], file["force"][number], float(said["footprint_m"]))
@@ -112,7 +112,7 @@ class TestEpisode:
         for number in (0, 3):
             camera = Camera(file["K"][:], file["T_camera_world"][number], width, height)
             column, row = np.rint(project_cv2(camera, file["tumour_predicted"][number])).astype(int).T
-            mask = decoded(file, "tumour_mask", number) > 0
+            mask = decode_recorded(file, "tumour_mask", number) > 0
             assert mask.shape == (height, width) and 0.003 < mask.mean() < 0.2
             grown = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5)))  # a corner lies on the border
             assert grown[row, column].all()
@@ -123,8 +123,8 @@ class TestEpisode:
     def test_depth_and_camera_give_back_the_cortex(self, episode):
         _, file, play, frames = episode
         camera = Camera(file["K"][:], file["T_camera_world"][0], frames[0].camera.width, frames[0].camera.height)
-        pixels = np.argwhere(decoded(file, "segmentation", 0) == CORTEX)
-        depth = decoded(file, "depth", 0)[tuple(pixels.T)] * DEPTH_SCALE
+        pixels = np.argwhere(decode_recorded(file, "segmentation", 0) == CORTEX)
+        depth = decode_recorded(file, "depth", 0)[tuple(pixels.T)] * DEPTH_SCALE
         height = camera.unproject(pixels[:, ::-1].astype(float), depth) @ play.site.axis
         assert len(height) > 1000 and np.abs(height).max() < 2e-5  # the box is flat, its top at zero
 
@@ -199,7 +199,7 @@ class TestEpisode:
         """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
         resource = pytest.importorskip("resource")
         monkeypatch.setattr(
-            "scenes.episodes.episode.demand_space", lambda *asked: None
+            "scenes.episodes.episode.check_disk_space", lambda *asked: None
         )  # as if there had been room at first
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         drawn = []

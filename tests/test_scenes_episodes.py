@@ -12,7 +12,7 @@ from tiny_episodes import write_episode
 from tiny_work import tiny_run
 
 from scenes.cli import main
-from scenes.episodes.engine import sbatch_script
+from scenes.episodes.engine import write_sbatch_script
 from scenes.episodes.plan import load_plan
 from scenes.episodes.run_folder import Failure, begin, mark_failed, unmark
 
@@ -102,7 +102,7 @@ def test_a_clusters_script_is_one_command_for_all_machines(tmp_path, capsys):
     program = [sys.executable, "-c", "import sys, json; print(json.dumps(sys.argv[1:]))", "--out", "a b"]
     environment = {**os.environ, "SLURM_CPUS_PER_TASK": "16"}
     for device, workers in (("cuda", "24"), ("cpu", "16")):
-        script = sbatch_script(program, 4, device, "mine")
+        script = write_sbatch_script(program, 4, device, "mine")
         done = subprocess.run(["bash"], input=script, capture_output=True, text=True, env=environment, check=True)
         assert json.loads(done.stdout) == ["--out", "a b", "--workers", workers]
     assert script.startswith("#!/bin/bash\n#SBATCH --job-name=mine\n") and "--requeue" in script

@@ -16,14 +16,14 @@ from scenes.analysis.error_budget import (
     SHUTTER,
     TECHNICAL,
     Filmed,
-    budgeted,
-    errors_of,
+    compute_budget,
+    compute_errors,
 )
-from scenes.analysis.tracking_errors import changed, usual_covariance
+from scenes.analysis.tracking_errors import change_calibration, sample_usual_covariance
 from scenes.script.priors import OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION
 from scenes.script.site import site_of
 from scenes.script.uncertainty import SURROGATE
-from scenes.tracked.filming import USUAL, VIEW, reference_beside
+from scenes.tracked.filming import USUAL, VIEW, place_reference
 from sim.errors import InputError
 
 COUNT = 200
@@ -48,54 +48,54 @@ def filmed(box):
     rest = site.origin + 0.015 * site.axis + 5e-3 * ball
     bodies = 1e-3 * rng.normal(size=(100, 1, 3)) + np.zeros_like(rest)
     return Filmed(
-        site=site, viewpoint=VIEW, duration=2.0, T_scan_patient=reference_beside(site, VIEW.camera(site)),
-        covariance=usual_covariance(USUAL), time=1.0, rest=rest,
+        site=site, viewpoint=VIEW, duration=2.0, T_scan_patient=place_reference(site, VIEW.camera(site)),
+        covariance=sample_usual_covariance(USUAL), time=1.0, rest=rest,
         field=0.002 * site.axis + np.zeros_like(rest), normals=ball, velocity=np.zeros_like(rest), bodies=bodies,
         meshes=0.2 * DEVIATES, own_mesh=0.05 * DEVIATES, surrogate=0.3e-3,
     )  # fmt: skip
 
 
 def test_nothing_is_off_where_nobody_contributes(filmed):
-    none = errors_of(filmed, [], 20)
+    none = compute_errors(filmed, [], 20)
     for values in (none.across, none.along, none.pixels, none.worst):
         assert np.abs(values).max() < 1e-12
 
 
 def test_registration_segmentation_model_and_mesh_are_as_large_as_they_are_said_to_be(filmed):
-    moved = errors_of(filmed, [REGISTRATION], COUNT)
+    moved = compute_errors(filmed, [REGISTRATION], COUNT)
     assert np.sqrt(np.mean(moved.middle**2)) == pytest.approx(np.sqrt(3.0) * OF_REGISTRATION.range[1], rel=0.1)
     assert np.sqrt(np.mean(moved.along**2)) == pytest.approx(OF_REGISTRATION.range[1], rel=0.15)
-    wide = errors_of(filmed, [SEGMENTATION], COUNT)
+    wide = compute_errors(filmed, [SEGMENTATION], COUNT)
     assert np.quantile(wide.worst, 0.68) == pytest.approx(OF_SEGMENTATION.range[1], rel=0.15)
-    assert np.quantile(errors_of(filmed, [SURROGATE], COUNT).worst, 0.95) == pytest.approx(0.3e-3, rel=0.15)
+    assert np.quantile(compute_errors(filmed, [SURROGATE], COUNT).worst, 0.95) == pytest.approx(0.3e-3, rel=0.15)
     off = 0.002 * np.abs(DEVIATES).max()
-    assert errors_of(filmed, [MESH], COUNT).worst.max() == pytest.approx(0.05 * off, rel=0.02)
+    assert compute_errors(filmed, [MESH], COUNT).worst.max() == pytest.approx(0.05 * off, rel=0.02)
     alike = replace(filmed, bodies=np.broadcast_to(filmed.field, filmed.bodies.shape))
-    assert errors_of(alike, [MESH, PARAMETERS], COUNT).worst.max() == pytest.approx(0.2 * off, rel=0.02)
+    assert compute_errors(alike, [MESH, PARAMETERS], COUNT).worst.max() == pytest.approx(0.2 * off, rel=0.02)
 
 
 def test_latency_costs_what_the_camera_moves_meanwhile(filmed):
     moving = replace(filmed, viewpoint=replace(VIEW, path=sideways), latency=0.02, clock=0.0)
-    found = errors_of(moving, [LATENCY], 20)
+    found = compute_errors(moving, [LATENCY], 20)
     np.testing.assert_allclose(found.across, 0.02 * SPEED, rtol=0.05)
-    assert errors_of(replace(moving, latency=0.0), [LATENCY], 20).worst.max() < 1e-12
-    assert errors_of(replace(filmed, latency=0.02), [LATENCY], 20).worst.max() < 1e-12  # nothing moves
+    assert compute_errors(replace(moving, latency=0.0), [LATENCY], 20).worst.max() < 1e-12
+    assert compute_errors(replace(filmed, latency=0.02), [LATENCY], 20).worst.max() < 1e-12  # nothing moves
 
 
 def test_latency_costs_what_the_tumour_moves_meanwhile(filmed):
     sunk = replace(filmed, velocity=np.tile(SPEED * filmed.site.axis, (60, 1)), latency=0.02, clock=0.0)
-    found = errors_of(sunk, [LATENCY], 20)
+    found = compute_errors(sunk, [LATENCY], 20)
     for each in (found.middle, found.worst):
         assert each == pytest.approx(0.02 * SPEED, rel=0.02)
-    hasty = errors_of(replace(sunk, latency=0.0, clock=0.01), [LATENCY], COUNT)  # of either sign
+    hasty = compute_errors(replace(sunk, latency=0.0, clock=0.01), [LATENCY], COUNT)  # of either sign
     assert np.sqrt(np.mean(hasty.middle**2)) == pytest.approx(0.01 * SPEED, rel=0.1)
-    assert errors_of(sunk, [SHUTTER], 20).worst.max() < 1e-12
+    assert compute_errors(sunk, [SHUTTER], 20).worst.max() < 1e-12
 
 
 def test_coverage_of_patients_with_other_bodies_is_low(filmed):
     """Bodies that differ six times as much, that is, not those from which the band comes."""
     alike, others = (
-        budgeted(filmed, 100, twins=replace(filmed, bodies=k * filmed.bodies), progress=lambda names: ()).held
+        compute_budget(filmed, 100, twins=replace(filmed, bodies=k * filmed.bodies), progress=lambda names: ()).held
         for k in (1.0, 6.0)
     )
     assert alike is not None and others is not None and alike[0] > 0.9 and others[0] < 0.8
@@ -105,14 +105,14 @@ def test_coverage_of_patients_with_other_bodies_is_low(filmed):
 def test_worst_error_is_that_of_the_farthest_point(filmed):
     bodies = np.tile(filmed.field, (100, 1, 1))
     bodies[:, 7] += 3e-3 * filmed.site.right
-    found = errors_of(replace(filmed, bodies=bodies, meshes=np.zeros(100)), [PARAMETERS], 10)
+    found = compute_errors(replace(filmed, bodies=bodies, meshes=np.zeros(100)), [PARAMETERS], 10)
     assert found.worst == pytest.approx(3e-3, rel=0.02) and found.middle == pytest.approx(3e-3 / 60, rel=0.05)
 
 
 def test_deviation_of_coverage_counts_bodies_and_not_samples(filmed):
     """Of two bodies one is always covered, the other never: the deviation of a ratio of two clusters."""
     bodies = np.stack([filmed.field, filmed.field + 0.1 * filmed.site.right])
-    share, deviation = budgeted(
+    share, deviation = compute_budget(
         filmed, 60, twins=replace(filmed, bodies=bodies, meshes=np.zeros(2)), progress=lambda names: ()
     ).held
     assert 0.3 < share < 0.7 and deviation == pytest.approx(2.0 * share * (1.0 - share))
@@ -128,10 +128,10 @@ def test_registration_errs_along_the_axes_of_the_reference(filmed, axis):
     toward = VIEW.camera(filmed.site).T_camera_world[2, :3]
     for apart, size in ((T[:3, axis], 0.0), (T[:3, (axis + 1) % 3], 0.02)):
         registered = Registration(np.linalg.inv(T), np.diag(turn), middle - 0.05 * apart, 1e-3, 6)
-        found = errors_of(replace(filmed, T_scan_patient=T, registration=registered), [REGISTRATION], COUNT)
+        found = compute_errors(replace(filmed, T_scan_patient=T, registration=registered), [REGISTRATION], COUNT)
         assert np.sqrt(np.mean(found.middle**2)) == pytest.approx(0.05 * size, rel=0.1, abs=2e-6)
     registered = Registration(np.linalg.inv(T), np.diag(shift), middle, 1e-3, 6)
-    found = errors_of(replace(filmed, T_scan_patient=T, registration=registered), [REGISTRATION], COUNT)
+    found = compute_errors(replace(filmed, T_scan_patient=T, registration=registered), [REGISTRATION], COUNT)
     assert np.std(found.along) == pytest.approx(1e-3 * abs(toward @ T[:3, axis]), rel=0.15, abs=2e-6)
 
 
@@ -144,20 +144,20 @@ def test_a_rolling_shutter_costs_what_the_camera_moves_between_the_rows_of_refer
     ]
     apart = abs(rows[1] - rows[0]) / camera.height * 0.02 * SPEED
     once, twice = (
-        errors_of(replace(moving, viewpoint=replace(moving.viewpoint, calibration=each)), [SHUTTER], 20).across
+        compute_errors(replace(moving, viewpoint=replace(moving.viewpoint, calibration=each)), [SHUTTER], 20).across
         for each in (calibration, replace(calibration, readout=0.04))
     )
     # A sheared target is taken for one that is turned, too, which takes up some of it.
     assert 0.2 * apart < np.median(once) < 2.0 * apart and np.median(twice) == pytest.approx(
         2.0 * np.median(once), rel=0.1
     )
-    still = errors_of(replace(moving, viewpoint=replace(VIEW, calibration=calibration)), [SHUTTER], 20)
+    still = compute_errors(replace(moving, viewpoint=replace(VIEW, calibration=calibration)), [SHUTTER], 20)
     assert still.worst.max() < 1e-6
-    assert errors_of(replace(moving, viewpoint=replace(VIEW, path=sideways)), [SHUTTER], 20).worst.max() < 1e-12
+    assert compute_errors(replace(moving, viewpoint=replace(VIEW, path=sideways)), [SHUTTER], 20).worst.max() < 1e-12
 
 
 def test_twice_the_noise_of_corners_puts_the_tumour_off_by_twice_as_much(filmed):
-    once, twice = (errors_of(replace(filmed, corner=noise), [MARKERS], COUNT).worst for noise in (0.1, 0.2))
+    once, twice = (compute_errors(replace(filmed, corner=noise), [MARKERS], COUNT).worst for noise in (0.1, 0.2))
     assert np.median(twice) == pytest.approx(2.0 * np.median(once), rel=0.1)
     # Sixteen corners 60 mm wide, 80 mm beside the tumour.
     assert 0.05e-3 < np.median(once) < 0.5e-3
@@ -166,11 +166,11 @@ def test_twice_the_noise_of_corners_puts_the_tumour_off_by_twice_as_much(filmed)
 def test_a_calibration_is_as_sure_as_one_of_pictures_and_wrong_ones_cost_more(filmed):
     deviations = np.sqrt(np.diag(filmed.covariance))
     assert (deviations[:4] > 0.05).all() and (deviations[:4] < 3.0).all()
-    assert changed(USUAL, np.arange(9.0)).focal == (1400.0, 1401.0)
+    assert change_calibration(USUAL, np.arange(9.0)).focal == (1400.0, 1401.0)
     exact = replace(filmed, covariance=np.zeros((9, 9)))  # as of a film of `sulcus film`
-    assert np.abs(errors_of(exact, TECHNICAL[:1], 20).worst).max() < 1e-9
-    worse = errors_of(replace(filmed, covariance=100.0 * filmed.covariance), TECHNICAL[:1], 50)
-    assert np.median(worse.worst) > 5.0 * np.median(errors_of(filmed, TECHNICAL[:1], 50).worst)
+    assert np.abs(compute_errors(exact, TECHNICAL[:1], 20).worst).max() < 1e-9
+    worse = compute_errors(replace(filmed, covariance=100.0 * filmed.covariance), TECHNICAL[:1], 50)
+    assert np.median(worse.worst) > 5.0 * np.median(compute_errors(filmed, TECHNICAL[:1], 50).worst)
 
 
 def test_the_band_holds_for_twins_and_not_for_bodies_that_differ_more(filmed):
@@ -179,13 +179,13 @@ def test_the_band_holds_for_twins_and_not_for_bodies_that_differ_more(filmed):
     )
     meshes = 0.05 * np.random.default_rng(4).normal(size=600)
     first, twins = (replace(filmed, bodies=bodies, meshes=meshes) for bodies in (here, other))
-    band = np.quantile(errors_of(first, CLINICAL, 600).worst, 0.95)
-    assert 0.92 < (errors_of(twins, CLINICAL, 600, 1).worst <= band).mean() < 0.98
-    assert (errors_of(replace(twins, bodies=6.0 * other), CLINICAL, 200, 1).worst <= band).mean() < 0.8
+    band = np.quantile(compute_errors(first, CLINICAL, 600).worst, 0.95)
+    assert 0.92 < (compute_errors(twins, CLINICAL, 600, 1).worst <= band).mean() < 0.98
+    assert (compute_errors(replace(twins, bodies=6.0 * other), CLINICAL, 200, 1).worst <= band).mean() < 0.8
 
 
 def test_parts_add_up_in_quadrature_and_the_largest_is_named(filmed):
-    budget = budgeted(filmed, 100, twins=filmed)
+    budget = compute_budget(filmed, 100, twins=filmed)
     technical, clinical = (np.median(each.middle) for each in (budget.technical, budget.clinical))
     assert technical < clinical and set(budget.alone) == set(CLINICAL)
     squares = sum(np.mean(budget.alone[name].middle ** 2) for name in TECHNICAL)
@@ -197,4 +197,4 @@ def test_a_reference_out_of_sight_is_said(filmed):
     away = filmed.T_scan_patient.copy()
     away[:3, 3] += 0.5
     with pytest.raises(InputError, match="does not see the patient's reference"):
-        errors_of(replace(filmed, T_scan_patient=away), [MARKERS], 1)
+        compute_errors(replace(filmed, T_scan_patient=away), [MARKERS], 1)

@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from films import follower_of, truth_of
+from films import follower_of, solve_reference_frames
 from links import in_mm
 from scipy.spatial.transform import Rotation
 from theatres import template_theatre
 
-from ar.tracking.pose_stream import stream_of
-from ar.tracking.rigid import moved_about
+from ar.tracking.pose_stream import build_pose_stream
+from ar.tracking.rigid import move_about
 from scenes.link.answer import PoseResponder
 from scenes.link.heard import ReceivedTransforms, TransformNames
 from scenes.script.scene import find_scene
@@ -21,7 +21,7 @@ from scenes.tracked.run import Shown, write_rows
 from scenes.tracked.tool_motion import UNBOUND, BrainMotion, ToolMotion
 from scenes.tracked.truth import OverlayError
 from sim.loads import Touching
-from surrogate.model.learned import predicted
+from surrogate.model.learned import build_prediction
 
 
 def turned(axis, degrees):
@@ -42,8 +42,8 @@ def test_link_bound_of_registration_is_2_80_sigma(shift):
     """The ball that holds 95 % of an isotropic error of 1 mm along each axis."""
     follower, names = follower_of(template_theatre().stage(find_scene("palpate"))), TransformNames()
     given = replace(follower.registration, covariance=six(shift))
-    pose = truth_of(follower.motion.stage).T_scan_tool[10] @ np.linalg.inv(follower.tool.T_cube_tool)
-    heard = ReceivedTransforms(names, 1.0).hearing(names.tool, in_mm(given.T_patient_scan @ pose), 1, 0.0, 0)
+    pose = solve_reference_frames(follower.motion.stage).T_scan_tool[10] @ np.linalg.inv(follower.tool.T_cube_tool)
+    heard = ReceivedTransforms(names, 1.0).add_transform(names.tool, in_mm(given.T_patient_scan @ pose), 1, 0.0, 0)
     found = PoseResponder(follower.motion, follower.tool, 5e-4, given).answer(heard, 0.0, 0.0)
     assert found.known.parts["registration"] == pytest.approx(2.7955e-3, rel=1e-4)
     assert found.known.band == pytest.approx(np.hypot(2.7955e-3, found.known.motion.error), rel=1e-4)
@@ -52,10 +52,13 @@ def test_link_bound_of_registration_is_2_80_sigma(shift):
 def test_hand_eye_error_is_that_of_a_camera_moved_by_it():
     """A small shift and turn of the camera, in the axes of what carries it, along one direction of all six."""
     times, step = np.zeros(1), 1e-4 * np.array([1.0, -2.0, 3.0, 5.0, -3.0, 2.0])
-    T, far = turned("zx", [30.0, 50.0]) @ shifted(0.3), stream_of(times, shifted(0.5, 0.8)[None], np.zeros((1, 6, 6)))
+    T, far = (
+        turned("zx", [30.0, 50.0]) @ shifted(0.3),
+        build_pose_stream(times, shifted(0.5, 0.8)[None], np.zeros((1, 6, 6))),
+    )
     right, other = (
         ExternalTracker(far, far, eye=CameraMount(each, np.outer(step, step)))
-        for each in (T, moved_about(T, np.zeros(3), step))
+        for each in (T, move_about(T, np.zeros(3), step))
     )
     found, there = right.reference(0.0), other.reference(0.0).T_camera_target
     turn = Rotation.from_matrix(there[:3, :3] @ found.T_camera_target[:3, :3].T).as_rotvec()
@@ -81,7 +84,7 @@ class Sinking:
         (cause,), site, nodes = loads.every(Touching), self.stage.site, self.stage.tumour_vertices
         depth = np.maximum((cause.pose[:, 0, :3, 3] - site.origin) @ site.axis, 0.0)
         moved = np.broadcast_to(depth[:, None, None] * site.axis, (len(depth), len(nodes), 3))
-        return predicted(moved, nodes, loads, [False] * len(depth), 0.0, np.full((2, len(depth)), np.nan), "")
+        return build_prediction(moved, nodes, loads, [False] * len(depth), 0.0, np.full((2, len(depth)), np.nan), "")
 
 
 def test_tool_error_is_of_a_deeper_tool_and_each_start_the_last():

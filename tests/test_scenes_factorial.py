@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scenes.analysis import factorial
-from scenes.analysis.factorial import LEVELS, Cell, cells, panels, shares
+from scenes.analysis.factorial import LEVELS, Cell, build_panels, compute_variance_shares, solve_cells
 from scenes.cli import main
 
 FEW = {
@@ -19,7 +19,7 @@ FEW = {
 
 @pytest.fixture(scope="module")
 def few():
-    return list(cells(FEW, 2000, "cpu"))
+    return list(solve_cells(FEW, 2000, "cpu"))
 
 
 def made(rule):
@@ -31,7 +31,7 @@ def made(rule):
 
 def test_a_factor_that_multiplies_acts_alone():
     """The motion's logarithm is a sum, so that its variance is that of its parts."""
-    found = shares(
+    found = compute_variance_shares(
         made(lambda at: 2.0 * (3.0 if at["skull"] == "slide" else 1.0) * (np.e if at["nu"] == 0.45 else 1.0))
     )
     a, b = np.log(3.0) ** 2, 1.0
@@ -40,14 +40,16 @@ def test_a_factor_that_multiplies_acts_alone():
 
 
 def test_what_acts_only_together_is_an_interaction():
-    found = shares(made(lambda at: np.e if (at["skull"] == "slide") == (at["nu"] == 0.45) else 1.0))
+    found = compute_variance_shares(made(lambda at: np.e if (at["skull"] == "slide") == (at["nu"] == 0.45) else 1.0))
     assert found["nu x skull"] == pytest.approx(1.0) and next(iter(found)) == "nu x skull"
     assert found["opening [mm]"] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_what_did_not_converge_is_left_out():
     found = made(lambda at: np.nan if at["opening [mm]"] == 30.0 else 1.0 + (at["nu"] == 0.45))
-    assert "opening [mm]" not in shares(found) and shares(found)["nu"] == pytest.approx(1.0)
+    assert "opening [mm]" not in compute_variance_shares(found) and compute_variance_shares(found)[
+        "nu"
+    ] == pytest.approx(1.0)
 
 
 def test_every_combination_is_solved(few):
@@ -61,7 +63,7 @@ def test_every_combination_is_solved(few):
 
 
 def test_the_command_writes_table_and_plot(few, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(factorial, "cells", lambda nodes, device: iter(few))
+    monkeypatch.setattr(factorial, "solve_cells", lambda nodes, device: iter(few))
     words = ["sensitivity", "--factorial", "--out", str(tmp_path / "all.csv")]
     assert main(words) == 0
     said = capsys.readouterr().out
@@ -77,7 +79,7 @@ def test_the_command_writes_table_and_plot(few, tmp_path, monkeypatch, capsys):
 
 def test_the_plot_has_a_panel_for_each_opening_and_a_curve_for_each_change():
     whole = [Cell(dict(zip(LEVELS, each, strict=True)), 1.0, 1.0) for each in product(*LEVELS.values())]
-    drawn = panels(whole)
+    drawn = build_panels(whole)
     assert len(drawn) == 3 and [len(panel.curves) for panel in drawn] == [5, 5, 5]
     assert [len(curve.points) for curve in drawn[0].curves] == [3] * 5
     assert all(panel.y_range == (0.8, 1.5) for panel in drawn)  # one scale for all openings

@@ -1,16 +1,16 @@
 """Families of episodes in the plans that ship."""
 
 from scenes.episodes.families import FAMILIES, FamilyMotions
-from scenes.episodes.plan import load_plan, shipped
-from scenes.episodes.scripted import drawn_episode
+from scenes.episodes.plan import list_shipped, load_plan
+from scenes.episodes.scripted import sample_episode
 
 
 def test_the_plans_that_ship_can_be_drawn_from():
-    assert shipped() == ["hard", "small", "standard"]
+    assert list_shipped() == ["hard", "small", "standard"]
     families = set()
-    for name in shipped():
+    for name in list_shipped():
         plan = load_plan(name)
-        drawn = [drawn_episode(plan.contents, 0, number) for number in range(60)]
+        drawn = [sample_episode(plan.contents, 0, number) for number in range(60)]
         assert {each.body for each in drawn} == set(range(plan.contents.bodies.count))
         families |= {each.family for each in drawn}
     assert families == set(FAMILIES) == set(FamilyMotions.__struct_fields__)

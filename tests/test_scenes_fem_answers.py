@@ -8,7 +8,7 @@ from gym_examples import made, many, played
 
 import scenes.gym  # noqa: F401
 from scenes.gym.fem_answers import CutElements
-from scenes.gym.scripted import scripted
+from scenes.gym.scripted import compute_scripted_actions
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK
 from scenes.gym.touched import TissueRequest
@@ -43,7 +43,7 @@ def test_finite_elements_answer_together_what_they_answer_apart(boxed):
         if number == 12:
             for vector in vectors:
                 vector.episodes[1].over = True
-        actions = scripted("retract", seen[0][0])
+        actions = compute_scripted_actions("retract", seen[0][0])
         seen = [vector.step(actions) for vector in vectors]
         apart, together = (each[-1] for each in seen)
         assert np.allclose(apart["force"], together["force"], atol=2e-3)

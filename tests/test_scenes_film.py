@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from theatres import template_theatre
 
-from ar.tracking.drawn import CELL, WIDTH, read_stamp, stamped
-from ar.tracking.pictures import film_of
+from ar.tracking.drawn import CELL, WIDTH, read_stamp, stamp_time
+from ar.tracking.pictures import read_video
 from scenes.cli import main
 from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import read_intrinsic_covariance, write_calibration
@@ -20,7 +20,7 @@ from scenes.tracked.truth import read_truth
 from sim.errors import InputError
 from sim.tools import Ball
 
-SMALL = USUAL.sized(800, 600, scale=True)
+SMALL = USUAL.resize_calibration(800, 600, scale=True)
 
 
 def test_a_stamp_outlives_blur_and_noise_and_none_is_read_where_none_is():
@@ -28,19 +28,19 @@ def test_a_stamp_outlives_blur_and_noise_and_none_is_read_where_none_is():
     picture = random.integers(0, 256, (100, 500), np.uint8)
     assert read_stamp(picture) is None and read_stamp(picture[:4]) is None
     for time in (0.0, 1.2345, 86_400.0):
-        written = stamped(picture, time)
+        written = stamp_time(picture, time)
         np.testing.assert_array_equal(written[CELL:], picture[CELL:])
         worn = cv2.GaussianBlur(written, (0, 0), 1.0) + random.normal(0.0, 10.0, written.shape)
         assert read_stamp(np.clip(worn, 0, 255).astype(np.uint8)) == pytest.approx(time)
     for cell in range(4, 44):  # a bit that is read wrongly is noticed
-        broken = stamped(picture, 1.2345)
+        broken = stamp_time(picture, 1.2345)
         part = broken[:CELL, -WIDTH + CELL * cell : broken.shape[1] - WIDTH + CELL * (cell + 1)]
         part[:] = 255 - part
         assert read_stamp(broken) is None
     with pytest.raises(ValueError, match="0 to"):
-        stamped(picture, -1.0)
+        stamp_time(picture, -1.0)
     with pytest.raises(ValueError, match="a time needs"):
-        stamped(picture[:, :100], 1.0)
+        stamp_time(picture[:, :100], 1.0)
 
 
 def test_a_film_and_all_that_belongs_to_it_are_written(tmp_path, capsys):
@@ -55,7 +55,7 @@ def test_a_film_and_all_that_belongs_to_it_are_written(tmp_path, capsys):
     stage = theatre.stage(find_scene("press"))
     truth = read_truth(out / "truth.npz", theatre.anatomy.digest, len(stage.tumour_vertices))
     assert truth.at(1.0 / 3.0) == 1 and truth.at(0.1) is None
-    pictures = list(film_of(out / "frames", 3.0, colour=True))
+    pictures = list(read_video(out / "frames", 3.0, colour=True))
     assert [read_stamp(each.grey) for each in pictures] == pytest.approx(truth.times, abs=1e-4)
     assert pictures[0].colour is not None and pictures[0].colour.shape == (600, 800, 3)
     assert read_registration(out / "registration.json").covariance.max() == 0.0

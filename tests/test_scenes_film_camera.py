@@ -10,12 +10,14 @@ from films import FILM
 
 from scenes.cli import main
 from scenes.tracked.calibration_file import read_calibration, write_calibration
-from scenes.tracked.film_camera import demand_film
+from scenes.tracked.film_camera import check_video
 
 
 @pytest.mark.parametrize(("factor", "way"), [(1.15, "13% shorter"), (0.85, "18% longer")])
 def test_a_film_of_another_zoom_is_refused_before_it_is_followed(factor, way, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("scenes.tracked.elsewhere.followed", lambda *given: pytest.fail("the whole film is followed"))
+    monkeypatch.setattr(
+        "scenes.tracked.elsewhere.follow_body", lambda *given: pytest.fail("the whole film is followed")
+    )
     calibration = read_calibration(FILM / "camera.yaml")
     path = tmp_path / "camera.yaml"
     write_calibration(path, replace(calibration, focal=tuple(factor * each for each in calibration.focal)))
@@ -28,9 +30,9 @@ def test_a_film_of_another_zoom_is_refused_before_it_is_followed(factor, way, tm
         assert f"focal lengths that are {way}" in said and f"than {path} states" in said
         assert "calibrate this one" in said
     assert list(tmp_path.iterdir()) == [path]
-    demand_film(FILM / "film.mp4", 30.0, calibration, "the film's own")
+    check_video(FILM / "film.mp4", 30.0, calibration, "the film's own")
     nearly = replace(calibration, focal=tuple(1.02 * each for each in calibration.focal))
-    demand_film(FILM / "film.mp4", 30.0, nearly, "two per cent off")
+    check_video(FILM / "film.mp4", 30.0, nearly, "two per cent off")
 
 
 @pytest.mark.parametrize(

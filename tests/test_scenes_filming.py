@@ -9,17 +9,17 @@ from theatres import template_theatre
 
 from ar.tracking.drawn import read_stamp
 from ar.tracking.pose import Tracker
-from ar.tracking.targets import Detector, patient_reference, tool_cube
+from ar.tracking.targets import Detector, build_patient_reference, build_tool_cube
 from scenes.play.deformers import AtRest
 from scenes.play.player import Player
 from scenes.script.scene import find_scene
-from scenes.tracked.filming import USUAL, VIEW, Taking, Trouble, mounted, registered, shots_of
+from scenes.tracked.filming import USUAL, VIEW, Taking, Trouble, mount_targets, register_with_error, render_shots
 from sim.errors import InputError
 
-SMALL = USUAL.sized(800, 600, scale=True)
+SMALL = USUAL.resize_calibration(800, 600, scale=True)
 
 
-TARGETS = (tool_cube(), patient_reference())
+TARGETS = (build_tool_cube(), build_patient_reference())
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def shots(player):
     """Seven pictures, with a trouble of each kind but the first and the last."""
     kinds = ("reference", "tool", "bright", "smear", "gap")
     troubles = tuple(Trouble(kind, 0.1 * n + 0.05, 0.1 * n + 0.15) for n, kind in enumerate(kinds))
-    return list(shots_of(player, mounted(player), Taking(troubles=troubles), every=3))
+    return list(render_shots(player, mount_targets(player), Taking(troubles=troubles), every=3))
 
 
 def grey(shot):
@@ -43,7 +43,7 @@ def grey(shot):
 
 
 def test_both_targets_are_seen_where_they_are(player, shots):
-    mounts = mounted(player)
+    mounts = mount_targets(player)
     seen = Tracker(SMALL.camera(np.eye(4)), TARGETS).track(grey(shots[0]))
     wanted = {
         "tool": shots[0].T_scan_tool @ np.linalg.inv(mounts.tool.T_cube_tool),
@@ -74,14 +74,14 @@ def test_a_trouble_that_is_none_is_refused():
 
 
 def test_a_registration_is_off_as_it_says(player):
-    mounts, found = mounted(player), []
+    mounts, found = mount_targets(player), []
     for seed in range(200):
-        one = registered(player.site, mounts, 0.5, 0.4, seed)
+        one = register_with_error(player.site, mounts, 0.5, 0.4, seed)
         off = one.T_patient_scan @ mounts.T_scan_patient
         place, covariance = one.point(player.site.origin + [0.02, 0.0, 0.0])
         true = np.linalg.inv(mounts.T_scan_patient) @ [*(player.site.origin + [0.02, 0.0, 0.0]), 1.0]
         found.append((place - true[:3]) @ np.linalg.solve(covariance, place - true[:3]))
         assert not np.allclose(off, np.eye(4), atol=1e-6)
     assert np.mean(found) == pytest.approx(3.0, rel=0.2)
-    exact = registered(player.site, mounts, 0.0, 0.0, 0).T_patient_scan
+    exact = register_with_error(player.site, mounts, 0.0, 0.0, 0).T_patient_scan
     np.testing.assert_allclose(exact, np.linalg.inv(mounts.T_scan_patient), atol=1e-12)

@@ -12,7 +12,7 @@ from studies import study_of
 from scenes.report.finite_elements import FemVariant
 from scenes.report.learner import LearnerSpec
 from scenes.report.row import ReportRow
-from scenes.report.rows import apart, rows
+from scenes.report.rows import measure_in_process, measure_rows
 
 SPECS = (*(FemVariant(f"fem {k}") for k in range(4)), *(LearnerSpec(f"learner {k}") for k in range(9)))
 
@@ -45,14 +45,14 @@ class Rows:
 @pytest.mark.parametrize(("cores", "elements", "learners"), [(2, 1, 1), (4, 2, 2), (16, 2, 5)])
 def test_learners_are_measured_side_by_side_where_there_are_cores(study, cores, elements, learners):
     run = Rows()
-    assert [row.name for row in rows(study, SPECS, run, cores)] == [spec.name for spec in SPECS]
+    assert [row.name for row in measure_rows(study, SPECS, run, cores)] == [spec.name for spec in SPECS]
     assert run.most[FemVariant] == elements and run.most[LearnerSpec] == learners
 
 
 @pytest.mark.parametrize(("cores", "learners"), [(4, 2), (16, 4)])
 def test_beside_a_card_learners_are_measured_together_with_finite_elements(study, cores, learners):
     run = Rows()
-    found = [row.name for row in rows(study, SPECS, run, cores, on_card=True)]
+    found = [row.name for row in measure_rows(study, SPECS, run, cores, on_card=True)]
     assert found == [spec.name for spec in SPECS] and run.most == {FemVariant: 2, LearnerSpec: learners}
     begun_first = {spec.name for spec in SPECS[:4]}
     assert (set(run.begun[:4]) == begun_first) is (cores == 4)
@@ -61,14 +61,14 @@ def test_beside_a_card_learners_are_measured_together_with_finite_elements(study
 def test_a_stop_beside_a_card_ends_the_learners_too(study):
     run, many = Rows("fem 1"), tuple(LearnerSpec(f"learner {k}") for k in range(200))
     with pytest.raises(KeyboardInterrupt):
-        list(rows(study, (*SPECS[:4], *many), run, 16, on_card=True))
+        list(measure_rows(study, (*SPECS[:4], *many), run, 16, on_card=True))
     assert len([name for name in run.begun if name.startswith("learner")]) < len(many)
 
 
 def test_what_is_measured_in_this_process_is_measured_one_by_one(study, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 16)
     run = Rows()
-    assert len(list(rows(study, SPECS, run))) == len(SPECS)
+    assert len(list(measure_rows(study, SPECS, run))) == len(SPECS)
     assert run.most == {FemVariant: 1, LearnerSpec: 1}
 
 
@@ -76,7 +76,7 @@ def test_what_is_measured_in_this_process_is_measured_one_by_one(study, monkeypa
 def test_after_a_stop_no_row_begins(study, cores):
     run = Rows("learner 1")
     with pytest.raises(KeyboardInterrupt):
-        list(rows(study, SPECS, run, cores))
+        list(measure_rows(study, SPECS, run, cores))
     under_way = 0 if cores == 2 else 5
     assert set(run.begun) <= {spec.name for spec in SPECS[: 6 + under_way]}
     assert {spec.name for spec in SPECS[:6]} <= set(run.begun)
@@ -92,7 +92,7 @@ def test_a_row_has_its_turn_when_its_process_is_ready(study, tmp_path):
         yield
         turns.append("ends")
 
-    row = apart(turn(), study, FemVariant("FEM odd law", law="odd"), tmp_path / "odd.png")
+    row = measure_in_process(turn(), study, FemVariant("FEM odd law", law="odd"), tmp_path / "odd.png")
     assert turns == ["begins", "ends"] and "odd" in row.state and row.state != "measured"
 
 

@@ -9,14 +9,14 @@ from locators import dent, locator_of
 from benchmarks.studies.fit_study import row
 from benchmarks.studies.fit_twins import loads_of, patient, places
 from scenes.cli import main
-from scenes.commands.fit import fitted_beside, sentences
+from scenes.commands.fit import find_fitted_tissue, format_fit
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
 from sim.loads import Pushed
 from surrogate.fitting import fit
 from surrogate.fitting.responses import LINEAR, Responses
 from surrogate.fitting.tissue import FittedTissue, load_tissue, save_tissue
-from surrogate.locating.locator import telling_nodes
+from surrogate.locating.locator import find_observed_nodes
 from surrogate.locating.locator_store import save_locator
 
 
@@ -36,7 +36,7 @@ def folder(body, tmp_path_factory):
 
 def by_formula(body, loads, *_):
     """Responses that take no time: dents, other ones in each tissue."""
-    random, nodes = np.random.default_rng(0), telling_nodes(body)
+    random, nodes = np.random.default_rng(0), find_observed_nodes(body)
     count = len(loads.causes[0].point)
     motion = {
         name: np.array([[[dent(body, random)[nodes] for _ in range(count)] for _ in range(4)] for _ in range(3)])
@@ -46,7 +46,7 @@ def by_formula(body, loads, *_):
 
 
 def test_the_command_writes_what_it_says(body, folder, monkeypatch, capsys):
-    monkeypatch.setattr(fit, "responses", by_formula)
+    monkeypatch.setattr(fit, "solve_responses", by_formula)
     words = ["fit", str(folder / "box.vtu"), str(folder / "1.csv"), str(folder / "2.csv")]
     (folder / "box.fit.parts").mkdir()
     assert main([*words, "--json"]) == 0
@@ -82,13 +82,13 @@ def test_bad_input_is_one_sentence(folder, capsys):
 def test_fitted_tissue_lies_beside_its_anatomy(tmp_path):
     share = np.full((3, 13, 33), 1.0 / (3 * 13 * 33))
     save_tissue(tmp_path / "a.tissue.json", FittedTissue("digest", 5, share, np.zeros(0)))
-    found = fitted_beside(None, tmp_path / "a.vtu", "digest")
+    found = find_fitted_tissue(None, tmp_path / "a.vtu", "digest")
     assert found is not None and found.frames == 5
     assert set(found.not_known) == {"the tumour's stiffness", "the skull", "Poisson's ratio", "Young's modulus"}
-    assert sum("about as unknown as before" in line for line in sentences(found, tmp_path)) == 4
-    assert fitted_beside(None, tmp_path / "b.vtu", "digest") is None
+    assert sum("about as unknown as before" in line for line in format_fit(found, tmp_path)) == 4
+    assert find_fitted_tissue(None, tmp_path / "b.vtu", "digest") is None
     with pytest.raises(InputError, match="no such file"):
-        fitted_beside(tmp_path / "c.json", tmp_path / "a.vtu", "digest")
+        find_fitted_tissue(tmp_path / "c.json", tmp_path / "a.vtu", "digest")
 
 
 def test_a_row_counts_what_was_right(body):

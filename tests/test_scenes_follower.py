@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from films import follower_of, truth_of
+from films import follower_of, solve_reference_frames
 from test_scenes_error_parts import shifted, six, turned
 from test_scenes_overlay import pictures
 from theatres import template_theatre
@@ -14,9 +14,9 @@ from theatres import template_theatre
 from ar.tracking.pose import Pose, TrackedTargets
 from ar.tracking.registration import Registration
 from scenes.script.scene import find_scene
-from scenes.tracked.follower import HELD, PATIENT, TumourState, tip_covariance
+from scenes.tracked.follower import HELD, PATIENT, TumourState, compute_tip_covariance
 from scenes.tracked.picture import Painter
-from scenes.tracked.run import aged
+from scenes.tracked.run import to_aged
 from scenes.tracked.tracked_tool import TrackedTool
 from sim.tools import Ball
 
@@ -46,8 +46,8 @@ def test_a_camera_that_repeats_a_picture_or_stops_is_stale(follower):
     assert follower.step(few[0].grey, 0.0, known).words.startswith("stale, the camera repeats an image")
     assert follower.step(few[1].grey, 0.5, replace(known, interval=0.1)).state is TumourState.STALE
     assert follower.step(few[1].grey, 0.1, known).state is TumourState.REST
-    old = aged(known, 0.5)
-    assert old.state is TumourState.STALE and "0.5 s old" in old.words and aged(known, 0.1) is known
+    old = to_aged(known, 0.5)
+    assert old.state is TumourState.STALE and "0.5 s old" in old.words and to_aged(known, 0.1) is known
 
 
 def test_a_reference_that_was_never_seen_has_no_overlay(follower, stage):
@@ -86,7 +86,7 @@ def test_tip_covariance_is_turned_into_the_scan(source):
     own, none = np.outer(PARTS, PARTS), np.zeros((3, 3))
     into_patient = T_patient_cube[:3, :3] if source == "tool" else np.eye(3)
     expected = T_patient_scan[:3, :3].T @ into_patient @ PARTS
-    found = tip_covariance(
+    found = compute_tip_covariance(
         Registration(T_patient_scan, six(own if source == "registration" else none), np.zeros(3), 0.0, 8),
         TrackedTool(Ball(7e-3), np.eye(4), own if source == "tool" else none),
         Pose(T_patient_cube, six(own if source == "tracking" else none), 0.0, 4),
@@ -97,7 +97,9 @@ def test_tip_covariance_is_turned_into_the_scan(source):
 def looking(motion, **given):
     """Return what is known of pictures every 40 ms: `motion` moves the reference before the camera, from the first."""
     follower = replace(follower_of(template_theatre().stage(find_scene("palpate"))), tool=None, **given)
-    first = truth_of(follower.motion.stage).T_camera_scan[0] @ np.linalg.inv(follower.registration.T_patient_scan)
+    first = solve_reference_frames(follower.motion.stage).T_camera_scan[0] @ np.linalg.inv(
+        follower.registration.T_patient_scan
+    )
     seen = [TrackedTargets(0, {}, {PATIENT: Pose(T @ first, np.zeros((6, 6)), 0.0, 4)}, {}) for T in motion]
     vars(follower)["tracker"] = SimpleNamespace(track=lambda grey, before: seen[int(grey[0, 0])])
     known = [None]

@@ -10,7 +10,7 @@ from ar.page.browser import Browser
 from ar.rendering.renderer import Renderer
 from benchmarks.__main__ import main
 from benchmarks.studies import frame
-from benchmarks.studies.frame import STAGES, WARM_UP, batch_rate, frames_of, size_of, table
+from benchmarks.studies.frame import STAGES, WARM_UP, batch_rate, frames_of, measure_size, table
 from scenes.play.player import Player
 
 
@@ -72,4 +72,4 @@ def test_the_command_says_the_size_and_every_stage(box, tmp_path, capsys, monkey
 def test_what_is_no_size_is_refused(text, capsys):
     assert main(["frame", "--size", text]) == 2
     assert "--size" in capsys.readouterr().err
-    assert size_of("1280X720") == (1280, 720)
+    assert measure_size("1280X720") == (1280, 720)

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from scenes.page.text import tumour_trust
-from scenes.play.frame_text import error_lines, tumour_words
+from scenes.page.text import format_tumour_trust
+from scenes.play.frame_text import format_errors, format_tumour_error
 from scenes.script.uncertainty import TumourError, Uncertainty
 
 LISTS = {"times": (0.0, 1.0), "worst": (2e-3, 4e-3), "middle": (1e-3, 1e-3), "moved": (1e-3, 1e-3)}
@@ -28,11 +28,13 @@ def test_what_few_draws_or_folded_tissue_say_is_a_guess(counts, guess):
 
 def test_a_guess_is_called_so_and_blames_no_part():
     alone, seen = TumourError(4.11e-3, "E", guess=True), TumourError(4.11e-3, "E", 1e-3, guess=True)
-    assert error_lines(None, alone, False)[-1] == "tumour: within 4.2 mm of where it is (95 %), a guess"
-    assert tumour_words(seen).endswith("within 1.0 mm of where it is (95 %); without observation 4.2 mm, a guess")
+    assert format_errors(None, alone, False)[-1] == "tumour: within 4.2 mm of where it is (95 %), a guess"
+    assert format_tumour_error(seen).endswith(
+        "within 1.0 mm of where it is (95 %); without observation 4.2 mm, a guess"
+    )
     for error in (alone, seen):
         named = replace(error, registration=1.56e-3)
-        for words in (error_lines(None, named, False)[-1], tumour_trust(named)):
+        for words in (format_errors(None, named, False)[-1], format_tumour_trust(named)):
             assert "registration 1.6 mm" in words
-    assert tumour_words(alone, brief=True) == "tumour: within 4.2 mm, a guess"
-    assert tumour_words(seen, brief=True) == "tumour: within 1.0 mm"
+    assert format_tumour_error(alone, brief=True) == "tumour: within 4.2 mm, a guess"
+    assert format_tumour_error(seen, brief=True) == "tumour: within 1.0 mm"

@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 
 from benchmarks.__main__ import BENCHMARKS, make_parser
-from scenes.cli import COMMANDS, main, make_parsers, with_points
+from scenes.cli import COMMANDS, join_points, main, make_parsers
 from scenes.commands.guidance import EXAMPLES, NAMES, PLAYING
 from scenes.script.scene import SCENES
 from sim.errors import InputError
@@ -61,8 +61,8 @@ def test_scenes_are_those_that_there_are():
 
 
 def test_a_point_may_begin_with_a_minus():
-    assert with_points(["--opening-at", "-3,4.5,-6", "--nodes", "-3"]) == ["--opening-at=-3,4.5,-6", "--nodes", "-3"]
-    assert with_points(["--out", "-x", "-1,2,3"]) == ["--out", "-x", "-1,2,3"]
+    assert join_points(["--opening-at", "-3,4.5,-6", "--nodes", "-3"]) == ["--opening-at=-3,4.5,-6", "--nodes", "-3"]
+    assert join_points(["--out", "-x", "-1,2,3"]) == ["--out", "-x", "-1,2,3"]
 
 
 def test_it_is_said_why_there_is_no_cuda():

@@ -12,13 +12,13 @@ from conftest import make_box
 from tiny_work import tiny_run
 
 from scenes.episodes import bodies
-from scenes.episodes.half_made import DATA, TABLE, begun, gone_on
-from scenes.episodes.make import body_path, make_body
+from scenes.episodes.half_made import DATA, TABLE, check_resumed, is_begun
+from scenes.episodes.make import make_body, to_body_path
 from scenes.episodes.plan import load_plan, plan_from
 from scenes.episodes.run_folder import begin
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
-from sim.runtime.partial_files import partial_path, unfinished_path
+from sim.runtime.partial_files import to_partial_path, to_unfinished_path
 from surrogate.data.simulate import simulate
 
 PLAN = """
@@ -89,7 +89,7 @@ def solved(monkeypatch):
 
 def files_of(folder):
     """What a body's folder holds, by name."""
-    return {path.name: path.read_bytes() for path in body_path(folder, 0).iterdir()}
+    return {path.name: path.read_bytes() for path in to_body_path(folder, 0).iterdir()}
 
 
 def killed(folder, plan, after):
@@ -97,7 +97,7 @@ def killed(folder, plan, after):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     words = [sys.executable, "-c", KILLED, str(folder), str(plan.folder / "own.toml"), str(after)]
     assert subprocess.run(words, env=environment, check=False).returncode == -signal.SIGKILL
-    assert not body_path(folder, 0).exists()
+    assert not to_body_path(folder, 0).exists()
 
 
 def test_a_killed_body_goes_on_and_has_the_same_bytes(plan, undisturbed, solved, tmp_path):
@@ -105,19 +105,19 @@ def test_a_killed_body_goes_on_and_has_the_same_bytes(plan, undisturbed, solved,
     elsewhere, tmp_path = tmp_path / "elsewhere", tmp_path / "here"
     assert begin(tmp_path, tiny_run(), "")
     killed(tmp_path, plan, 64)
-    (left,) = body_path(tmp_path, 0).parent.iterdir()
-    assert not begin(tmp_path, tiny_run(), "") and begun(left)  # the next run, which removes what others left
+    (left,) = to_body_path(tmp_path, 0).parent.iterdir()
+    assert not begin(tmp_path, tiny_run(), "") and is_begun(left)  # the next run, which removes what others left
     killed(elsewhere, plan, 10**9)
     made = make_body(tmp_path, plan, 1, 0, "cpu")
     assert made.resumed and not made.failed and files_of(tmp_path) == undisturbed
     ((now, total),) = solved
     assert (total, now) in {(109, 70), (109, 6)}  # 39 unit responses; a batch of 64 loads may have been written
-    (other,) = body_path(elsewhere, 0).parent.iterdir()
+    (other,) = to_body_path(elsewhere, 0).parent.iterdir()
     other.rename(other.with_name(".sulcus-00000000-1-0000"))
     assert make_body(elsewhere, plan, 1, 0, "cpu").resumed and files_of(elsewhere) == undisturbed
     assert solved[1][0] == 0
     for folder, there in ((tmp_path, {"0000"}), (elsewhere, {"0000", ".sulcus-00000000-1-0000"})):
-        assert {path.name for path in body_path(folder, 0).parent.iterdir()} == there
+        assert {path.name for path in to_body_path(folder, 0).parent.iterdir()} == there
     left.mkdir()
     begin(tmp_path, tiny_run(), "")
     assert not left.exists()  # of a body that is there nobody goes on with it
@@ -149,8 +149,8 @@ def test_an_error_that_passes_keeps_what_was_solved(plan, undisturbed, solved, t
         held.setattr(bodies, "train", full)
         with pytest.raises(InputError, match="just now"):
             make_body(tmp_path, plan, 1, 0, "cpu")
-    partial = partial_path(body_path(tmp_path, 0))
-    assert begun(partial)
+    partial = to_partial_path(to_body_path(tmp_path, 0))
+    assert is_begun(partial)
     (partial / "anatomy.vtu").write_text("half")
     (partial / "other").write_text("half")
     assert make_body(tmp_path, plan, 1, 0, "cpu").resumed and solved[1][0] == 0
@@ -162,14 +162,14 @@ def test_the_most_that_anybody_has_is_taken_and_other_loads_are_not(tmp_path):
     for folder, size in zip(folders, (0, 10, 30, 50), strict=True):
         folder.mkdir()
         if size:
-            assert not gone_on(folder / DATA, {"seed": "2"} if size == 50 else stated, [])
-            unfinished_path(folder / DATA).write_bytes(bytes(size))
+            assert not check_resumed(folder / DATA, {"seed": "2"} if size == 50 else stated, [])
+            to_unfinished_path(folder / DATA).write_bytes(bytes(size))
     own = folders[0] / DATA
-    assert gone_on(own, stated, folders) and unfinished_path(own).stat().st_size == 30
+    assert check_resumed(own, stated, folders) and to_unfinished_path(own).stat().st_size == 30
     (folders[1] / DATA).write_bytes(b"whole")
     for folder in (folders[1], folders[3]):
         (folder / DATA).with_suffix(TABLE).write_text(folder.name)
-    assert gone_on(own, stated, folders) and own.read_bytes() == b"whole"
+    assert check_resumed(own, stated, folders) and own.read_bytes() == b"whole"
     assert own.with_suffix(TABLE).read_text() == "1"
-    assert not gone_on(own, {"seed": "3"}, folders) and not begun(folders[0])
+    assert not check_resumed(own, {"seed": "3"}, folders) and not is_begun(folders[0])
     assert {path.name for path in folders[0].iterdir()} == {Path(DATA).with_suffix(".json").name}

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from theatres import player, sinking
 
-from scenes.script.head_posture import SUPINE, Lying, drained_then_turned, supine
+from scenes.script.head_posture import SUPINE, Lying, build_drained_turn, get_supine_pose
 from scenes.script.tool_paths import Touch
 
 
 class TestLying:
     def test_the_fluid_falls_wholly_and_then_the_head_turns(self):
-        lie, angle = drained_then_turned(2.0, 1.0, 3.0, 0.5), 0.5
-        assert lie(0.0) == Lying(SUPINE, 1.0) == supine(7.0)
+        lie, angle = build_drained_turn(2.0, 1.0, 3.0, 0.5), 0.5
+        assert lie(0.0) == Lying(SUPINE, 1.0) == get_supine_pose(7.0)
         assert lie(2.0) == Lying(SUPINE, 0.0) == lie(3.0) and 0.4 < lie(1.0).fluid < 0.6
         for time in (6.0, 9.0):
             assert lie(time).direction == pytest.approx((-np.sin(angle), -np.cos(angle), 0.0))

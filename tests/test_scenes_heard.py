@@ -5,7 +5,7 @@ import pytest
 from test_scenes_messages import STAMP, matrix
 
 from scenes.link.frame import BadMessageError
-from scenes.link.heard import ReceivedTransforms, TransformNames, rigid
+from scenes.link.heard import ReceivedTransforms, TransformNames, to_rigid
 
 
 def changed(row, column, value):
@@ -27,20 +27,20 @@ def changed(row, column, value):
 )
 def test_a_matrix_that_moves_no_body_is_refused(T, why):
     with pytest.raises(BadMessageError, match=why):
-        rigid(T)
+        to_rigid(T)
 
 
 def test_a_rigid_matrix_of_single_precision_is_taken_in_metres():
-    T = rigid(matrix().astype(np.float32).astype(float))
+    T = to_rigid(matrix().astype(np.float32).astype(float))
     assert T[:3, 3] == pytest.approx([0.01, -0.02, 0.03]) and T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3))
 
 
 def test_bodies_in_the_trackers_frame_are_brought_to_the_reference():
     names = TransformNames(tool="StylusTipToTracker")
-    heard = ReceivedTransforms(names, 0.3).hearing(names.tool, matrix(), STAMP, 1.0, 0)
+    heard = ReceivedTransforms(names, 0.3).add_transform(names.tool, matrix(), STAMP, 1.0, 0)
     assert heard.beside(names.tool, 1.0) == "no ReferenceToTracker yet"
-    heard = heard.hearing(names.reference, matrix((0.0, 0.0, 100.0)), STAMP, 0.9, 0)
+    heard = heard.add_transform(names.reference, matrix((0.0, 0.0, 100.0)), STAMP, 0.9, 0)
     found = heard.beside(names.tool, 1.0)
-    expected = np.linalg.inv(rigid(matrix((0.0, 0.0, 100.0)))) @ rigid(matrix())
+    expected = np.linalg.inv(to_rigid(matrix((0.0, 0.0, 100.0)))) @ to_rigid(matrix())
     assert pytest.approx(expected) == found.T and found.arrived == 0.9
     assert heard.beside(names.tool, 1.25) == "no new ReferenceToTracker for 0.3 s"

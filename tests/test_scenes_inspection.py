@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from scenes.commands.inspection import axes_of
+from scenes.commands.inspection import describe_axes
 
 
 def test_axes_are_named_as_they_point():
     turned = np.eye(4)
     turned[:3, :3] = np.array([[0.0, 0.2, 1.0], [-1.0, 0.1, 0.0], [0.1, -1.0, 0.2]])
-    assert axes_of(turned) == "PIR"
+    assert describe_axes(turned) == "PIR"

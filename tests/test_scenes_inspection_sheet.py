@@ -15,14 +15,14 @@ from scenes.commands.inspection_sheet import COLOURS, SIDE
 RED, GREEN = COLOURS["tumour"], COLOURS["opening"]
 
 
-def inspected(capsys, folder, *words):
+def inspect_subject(capsys, folder, *words):
     code = main(["patient", *map(str, words), "--out", str(folder / "p.vtu"), "--inspect", "--json"])
     said = capsys.readouterr()
     assert code == 0, said.err
     return json.loads(said.out), np.asarray(Image.open(folder / "p.inspect.png"))
 
 
-def middle_of(panel, colour):
+def compute_middle(panel, colour):
     """Column and row of the middle of the pixels of a colour, in shares of the panel."""
     rows, columns = np.nonzero((panel == colour).all(axis=2))
     return columns.mean() / SIDE, rows.mean() / SIDE
@@ -31,7 +31,7 @@ def middle_of(panel, colour):
 def test_the_sheet_shows_where_things_are(tmp_path, capsys):
     """A ball of 55 mm round the origin, and one of 10 mm in it, 20 mm to the right and up."""
     ball(tmp_path)
-    found, picture = inspected(capsys, tmp_path, tmp_path / "labels.nii.gz", "--brain", 1, "--tumour", 2)
+    found, picture = inspect_subject(capsys, tmp_path, tmp_path / "labels.nii.gz", "--brain", 1, "--tumour", 2)
     assert found["brain_ml"] == pytest.approx(4 / 3 * np.pi * 55**3 / 1e3, rel=0.01)
     assert found["tumour_ml"] == pytest.approx(552 * 0.008)
     assert found["depth_mm"] == pytest.approx(55 - 10 - np.hypot(20, 20), abs=2.0)
@@ -49,10 +49,10 @@ def test_the_sheet_shows_where_things_are(tmp_path, capsys):
     sagittal, outside = picture[SIDE:, :SIDE], picture[SIDE:, SIDE : 2 * SIDE]
     # As radiologists have it, the right is on the left; half of the side is 61 mm.
     off = 20.0 / 122.0
-    np.testing.assert_allclose(middle_of(axial, RED), [0.5 - off, 0.5], atol=0.02)
-    np.testing.assert_allclose(middle_of(coronal, RED), [0.5 - off, 0.5 - off], atol=0.02)
-    np.testing.assert_allclose(middle_of(sagittal, RED), [0.5, 0.5 - off], atol=0.02)
-    column, row = middle_of(coronal, GREEN)
+    np.testing.assert_allclose(compute_middle(axial, RED), [0.5 - off, 0.5], atol=0.02)
+    np.testing.assert_allclose(compute_middle(coronal, RED), [0.5 - off, 0.5 - off], atol=0.02)
+    np.testing.assert_allclose(compute_middle(sagittal, RED), [0.5, 0.5 - off], atol=0.02)
+    column, row = compute_middle(coronal, GREEN)
     assert column < 0.25 and row < 0.25
     # From outside, the opening has its diameter, and the tumour's shadow lies in its middle.
     green = (outside[..., 1] > outside[..., 0] * 1.3) & (outside[..., 1] > outside[..., 2] * 1.3)
@@ -71,13 +71,13 @@ def test_what_looks_wrong_is_said(tmp_path, capsys):
     nibabel.save(nibabel.Nifti1Image(labels, affine), tmp_path / "mirrored.nii")
     nibabel.save(nibabel.Nifti1Image(np.ones((20, 64, 64), np.uint8), image.affine), tmp_path / "part.nii")
     words = (tmp_path / "mirrored.nii", "--brain", 1, "--tumour", 2, "--t1", tmp_path / "part.nii")
-    found, picture = inspected(capsys, tmp_path, *words, "--opening-at", "0,-55,0")
+    found, picture = inspect_subject(capsys, tmp_path, *words, "--opening-at", "0,-55,0")
     said = " ".join(found["warnings"])
     for part in ("touches the cortex", "lies in 2 pieces", "the T1 holds", "mm from the tumour: pressing"):
         assert part in said
     assert found["axes"] == "LAS" and found["mirrored"]
     assert [piece["side"] for piece in found["tumour_pieces"]] == ["left superior", "midline anterior"]
-    assert middle_of(picture[:SIDE, :SIDE], GREEN)[1] > 0.8
+    assert compute_middle(picture[:SIDE, :SIDE], GREEN)[1] > 0.8
     # From behind, the left is on the left: there is the larger piece, higher up.
     outside = picture[SIDE:, SIDE : 2 * SIDE].astype(float)
     shadow = (outside[..., 0] > 1.3 * outside[..., 1]) & (outside[..., 0] > 1.3 * outside[..., 2])
@@ -137,6 +137,6 @@ def test_the_side_of_a_tumour_is_stated_where_nothing_else_tells_it(tmp_path, ca
     labels = tmp_path / "labels.nii.gz"
     own = moved(tmp_path, "labels", "own.nii", nibabel.load(labels).affine, -2)
     for marked, count in ((own, 1), (labels, 0)):
-        found, _ = inspected(capsys, tmp_path, labels, "--brain", 1, "--tumour-in", marked, "--tumour", 2)
+        found, _ = inspect_subject(capsys, tmp_path, labels, "--brain", 1, "--tumour-in", marked, "--tumour", 2)
         notes = [one for one in found["warnings"] if one.startswith(f"{marked}: has a grid of its own")]
         assert len(notes) == count and all(note.endswith("tumour lies right superior") for note in notes)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from scenes.commands.interrupt import terminated_as_interrupted, until_ended
+from scenes.commands.interrupt import interrupt_on_termination, run_until_ended
 
 COMMAND = """
 import argparse, sys, threading, time
@@ -89,9 +89,9 @@ def test_what_goes_wrong_is_reported_and_handlers_are_given_back():
         raise TimeoutError("too late")
 
     with pytest.raises(TimeoutError, match="too late"):
-        until_ended(work)
+        run_until_ended(work)
     assert closed == [True]
-    assert until_ended(lambda closing: 7) == 7
+    assert run_until_ended(lambda closing: 7) == 7
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
@@ -102,13 +102,13 @@ def test_an_interrupt_that_a_finaliser_swallows_is_not_lost(number):
             signal.raise_signal(number)
 
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    with pytest.raises(KeyboardInterrupt), terminated_as_interrupted() as stop_if_asked:
+    with pytest.raises(KeyboardInterrupt), interrupt_on_termination() as stop_if_asked:
         stop_if_asked()
         Signalling()
         went_on = True
         stop_if_asked()
     assert went_on
-    with pytest.raises(KeyboardInterrupt), terminated_as_interrupted():  # and if nobody asks, repeated
+    with pytest.raises(KeyboardInterrupt), interrupt_on_termination():  # and if nobody asks, repeated
         Signalling()
         time.sleep(20.0)
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before

@@ -11,7 +11,7 @@ from programs import simulated
 from theatres import small, theatre_of
 
 from scenes.play.deformers import Theatre, open_theatre
-from scenes.play.reference import truth_of
+from scenes.play.reference import solve_reference_frames
 from scenes.script.scene import Scene
 from scenes.script.site import site_of
 from sim.accuracy import TRAIN
@@ -57,7 +57,7 @@ def test_models_are_judged_with_what_they_were_trained_on(box, body, tmp_path) -
     loads = [scene.loads(site_of(box), scene.path(1.0), 1.0)]
     others = tuple(effect for effect in scene.effects if not isinstance(effect, Elasticity))
     right = Fem(box, (Elasticity(STIFF), *others), TRAIN, "cpu", element="smoothed").deform(loads[0])
-    found = truth_of(theatre, scene, loads)
+    found = solve_reference_frames(theatre, scene, loads)
     assert np.array_equal(found.displacement, right.displacement) and found.displacement.any()
 
 

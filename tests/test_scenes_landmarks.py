@@ -6,7 +6,7 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from warped import bump
 
-from scenes.warp.landmarks import NEAREST, landmarks_of
+from scenes.warp.landmarks import NEAREST, list_landmarks
 from sim.geometry.locate import locate
 
 
@@ -28,7 +28,7 @@ def test_the_landmarks_of_a_tumour_that_is_hollow_say_so(box):
     tumour = np.flatnonzero(box.mesh.region == 2)
     hollow = box.without(tumour[np.linalg.norm(middles[tumour] + [0.0, 0.0, 22e-3], axis=1) < 5e-3])
     moved = bump(box.mesh.nodes)
-    nearest, cortex = landmarks_of(hollow, moved)
+    nearest, cortex = list_landmarks(hollow, moved)
     assert nearest.name == NEAREST and cortex.name == "open cortex"
     np.testing.assert_allclose(
         nearest.now, nearest.rest + locate(hollow.mesh, nearest.rest[None]).read(moved[None])[0, 0]

@@ -9,9 +9,9 @@ import pytest
 from test_sim_necrosis import hollowed
 from theatres import short, small
 
-from scenes.analysis.uncertainty import changed, tissue_of
+from scenes.analysis.uncertainty import apply_sample, get_tissue
 from scenes.builtin.retract import RELAXING
-from scenes.options.tissue_options import add_element_argument, add_tissue_arguments, dressed
+from scenes.options.tissue_options import add_element_argument, add_tissue_arguments, apply_tissue_options
 from scenes.play.deformers import open_theatre
 from scenes.script.priors import PatientSample
 from scenes.script.scene import find_scene
@@ -19,7 +19,7 @@ from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import BRAIN, MATERIALS, Material
-from surrogate.data.answer_rows import stating
+from surrogate.data.answer_rows import describe_tissue_source
 
 STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=500.0)
 
@@ -35,7 +35,7 @@ def theatre():
     """The template with a soft core, and a model that states that it learned from it."""
     whole = open_theatre(device="cpu")
     body, model = hollowed(whole.anatomy), whole.models["series-gp"]
-    learned = replace(model, anatomy=body, training={**model.training, **stating(TISSUE)})
+    learned = replace(model, anatomy=body, training={**model.training, **describe_tissue_source(TISSUE)})
     return replace(whole, anatomy=body, models={"series-gp": learned})
 
 
@@ -44,13 +44,13 @@ def asked(theatre, scene, *words):
     parser = argparse.ArgumentParser()
     add_tissue_arguments(parser)
     add_element_argument(parser)
-    return dressed(parser.parse_args(words), scene, theatre)
+    return apply_tissue_options(parser.parse_args(words), scene, theatre)
 
 
 class TestScenes:
     def test_have_what_the_models_learned(self, theatre):
         scene = asked(theatre, short())
-        assert scene.elasticity == TISSUE and theatre.refusals(scene) == {"series-gp": None}
+        assert scene.elasticity == TISSUE and theatre.list_rejections(scene) == {"series-gp": None}
 
     def test_that_ask_for_another_keep_the_rest_and_are_refused_the_model(self, theatre, capsys):
         scene = asked(theatre, short(), "--region", "5:400")
@@ -61,7 +61,7 @@ class TestScenes:
         assert capsys.readouterr().err == ""
         with pytest.raises(InputError, match=r"E 0\.5 kPa.*, and here it is .*\(necrosis\): neo-hookean, E 0\.4 kPa"):
             theatre.deformer("series-gp", scene)
-        assert theatre.refusals(short())["series-gp"] is not None  # as the scene has it, without a command
+        assert theatre.list_rejections(short())["series-gp"] is not None  # as the scene has it, without a command
 
     def test_of_another_brain_have_it_as_many_times_as_stiff(self, theatre):
         for scene in (asked(theatre, short(), "--young", "2100", "--poisson", "0.45"), find_scene("brain_shift")):
@@ -87,14 +87,16 @@ class TestScenes:
                 asked(theatre, short(), f"--region={word}")
 
     def test_draw_bodies_that_are_as_many_times_as_stiff(self):
-        scene = small().with_regions({NECROSIS_LABEL: SOFT})
-        assert tissue_of(scene) == BRAIN
+        scene = small().replace_regions({NECROSIS_LABEL: SOFT})
+        assert get_tissue(scene) == BRAIN
         draw = PatientSample(stiffness=2.0, poisson=0.45, ratio=3.0, skull=0.5, tip=(0.0, 0.0, 0.0), mesh=0.0)
-        found = changed(scene, draw).elasticity
+        found = apply_sample(scene, draw).elasticity
         assert found.of(TUMOUR_LABEL) == replace(BRAIN, young=6.0 * BRAIN.young, poisson=0.45)
         assert found.of(NECROSIS_LABEL) == replace(BRAIN, young=1000.0, poisson=0.45)
-        stated = changed(scene.with_regions({TUMOUR_LABEL: STIFF}), draw).elasticity  # three times as stiff, as such
+        stated = apply_sample(
+            scene.replace_regions({TUMOUR_LABEL: STIFF}), draw
+        ).elasticity  # three times as stiff, as such
         assert stated.of(TUMOUR_LABEL) == replace(BRAIN, young=18.0 * BRAIN.young, poisson=0.45)
         assert stated.of(NECROSIS_LABEL) == found.of(NECROSIS_LABEL) and stated.default == found.default
         with pytest.raises(InputError, match=r"the scene .* has another tissue: ogden"):
-            tissue_of(small().with_regions({TUMOUR_LABEL: MATERIALS["minutes"].tissue}))
+            get_tissue(small().replace_regions({TUMOUR_LABEL: MATERIALS["minutes"].tissue}))

@@ -9,7 +9,7 @@ from poison import poisoned
 from studies import study_of
 
 from scenes.report.learner import LearnerSpec, measure_learner
-from sim.runtime.threads import one_thread
+from sim.runtime.threads import limit_to_one_thread
 from surrogate.training.expansion import Expansion
 
 
@@ -22,15 +22,15 @@ def study(tmp_path_factory):
 @pytest.mark.parametrize("name", ["linear", "series-gp"])
 def test_no_answer_to_a_load_of_the_discs_reaches_a_row(study, tmp_path, name, monkeypatch):
     """Bit for bit, the table of the series made anew: wild answers to the loads of the discs change figures alone."""
-    monkeypatch.setattr("scenes.report.learner.counts", lambda most: [])
-    monkeypatch.setattr("scenes.report.learner.coverage_of", lambda *known: {})
+    monkeypatch.setattr("scenes.report.learner.list_counts", lambda most: [])
+    monkeypatch.setattr("scenes.report.learner.compute_coverage_beyond", lambda *known: {})
     path, _ = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
     found = []
     for data, folder in ((study.data, "as-it-is"), (path, "wild")):
         here = replace(study, data=data)
         kept = tmp_path / folder / "series.npz"
         vars(here)["expansion"] = Expansion(here.dataset, "cpu", kept=kept)
-        with one_thread():
+        with limit_to_one_thread():
             found.append(measure_learner(here, LearnerSpec(name)))
     (row, field), (wild, again) = found
     assert np.array_equal(field, again)

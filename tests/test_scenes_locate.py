@@ -14,10 +14,10 @@ from sim.bodies.meshfile import read_mesh, write_anatomy
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import Material
-from surrogate.data.answer_rows import stating
+from surrogate.data.answer_rows import describe_tissue_source
 from surrogate.locating.causes import KINDS
 from surrogate.locating.locator_store import load_locator, save_locator
-from surrogate.locating.observation import MOST, Observation, looked_at, placed
+from surrogate.locating.observation import MOST, Observation, choose_points, to_evidence
 from surrogate.locating.regions import Region
 from surrogate.model.store import save
 
@@ -195,7 +195,7 @@ def test_of_very_many_points_some_are_looked_at(files, body, named):
     folder, truth = files
     locator = load_locator(folder / "box.locator.npz", body)
     rest, motion = seen_dent(body, truth, 20_000)
-    some, now = looked_at(len(rest)), rest + motion  # one is off by half a kilometre, and makes no line of them
+    some, now = choose_points(len(rest)), rest + motion  # one is off by half a kilometre, and makes no line of them
     assert len(some) == MOST and some[0] == 0 and some[-1] == len(rest) - 1
     rest[some[7]] = now[some[7]] = now[some[7]] + [0.0, 0.0, 500.0]
     alone = locator.locate(Observation(now[some], rest[some] if named else None))
@@ -226,7 +226,7 @@ def test_an_observation_of_nothing_or_from_beyond_is_refused(body):
     rest = body.mesh.nodes[np.unique(body.open_surface)]
     for now, match in ((np.zeros((0, 3)), "0 points say too little"), (rest * 1e200, "not finite, or beyond")):
         with pytest.raises(InputError, match=match):
-            placed(body, Observation(now))
+            to_evidence(body, Observation(now))
 
 
 def test_a_folder_is_no_file_of_points(files, tmp_path, capsys):
@@ -313,5 +313,5 @@ def test_regions_are_those_that_the_models_beside_learned(body, tmp_path, capsys
     path = tmp_path / "box.vtu"
     write_anatomy(path, body)
     learned = Elasticity(Material("neo-hookean", 2000.0, 0.49), {2: Material("neo-hookean", 6000.0, 0.49)})
-    save(tmp_path / "box.model.npz", {"linear": knowing_nothing(body, stating(learned))})
+    save(tmp_path / "box.model.npz", {"linear": knowing_nothing(body, describe_tissue_source(learned))})
     assert main(["locator", str(path), "--device", "cpu"]) == 0 and asked == [TUMOUR]

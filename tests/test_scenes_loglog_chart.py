@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from scenes.analysis.loglog_chart import HEIGHT, PALE, WIDTH, ChartPanel, Curve, Dot, drawn
+from scenes.analysis.loglog_chart import HEIGHT, PALE, WIDTH, ChartPanel, Curve, Dot, draw_panels
 from scenes.cli import main
 
 FULL = np.array([31, 119, 180])
@@ -23,7 +23,7 @@ def ink(picture, colour):
 
 
 def test_points_that_rise_by_a_power_lie_on_a_line():
-    rows, columns = ink(drawn([panel((1e1, 1e0), (1e2, 1e1), (1e3, 1e2))]), FULL).T
+    rows, columns = ink(draw_panels([panel((1e1, 1e0), (1e2, 1e1), (1e3, 1e2))]), FULL).T
     assert np.ptp(columns) > 0.6 * WIDTH and np.ptp(rows) > 0.6 * HEIGHT
     slope, start = np.polyfit(columns, rows, 1)
     assert slope < 0.0
@@ -32,24 +32,24 @@ def test_points_that_rise_by_a_power_lie_on_a_line():
 
 def test_panels_stand_side_by_side_and_are_the_same_every_time():
     one = panel((1.0, 2.0), marks=((1.5, "here"),))
-    picture = drawn([one, one])
+    picture = draw_panels([one, one])
     assert picture.shape == (HEIGHT, 2 * WIDTH, 3) and picture.dtype == np.uint8
     np.testing.assert_array_equal(*np.split(picture, 2, axis=1))
-    np.testing.assert_array_equal(picture, drawn([one, one]))
+    np.testing.assert_array_equal(picture, draw_panels([one, one]))
 
 
 @pytest.mark.parametrize("points", [(), ((0.0, 1.0),), ((1.0, -1.0),)])
 def test_what_has_no_logarithm_is_refused(points):
     with pytest.raises(ValueError, match="positive"):
-        drawn([panel(*points)])
+        draw_panels([panel(*points)])
     with pytest.raises(ValueError, match="nothing"):
-        drawn([])
+        draw_panels([])
 
 
 def test_dots_lie_where_curves_do_and_pale_ones_are_pale():
     points = ((1e1, 1e0), (1e2, 1e1), (1e3, 1e2))
     dots = tuple(Dot("", "", x, y, pale=x == 1e2) for x, y in points)
-    picture = drawn([ChartPanel("title", "x", "y", dots=dots)])
+    picture = draw_panels([ChartPanel("title", "x", "y", dots=dots)])
     full, pale = ink(picture, FULL), ink(picture, PALE * FULL + (1.0 - PALE) * 255.0)
     centre = (full.min(axis=0) + full.max(axis=0)) / 2.0
     assert np.allclose(np.median(pale, axis=0), centre, atol=1.5)
@@ -61,7 +61,7 @@ def test_names_of_dots_near_each_other_do_not_cover_each_other():
 
     def dark(*names):
         dots = tuple(Dot(name, "g", 10.0 + 0.5 * k, 1.0) for k, name in enumerate(names))
-        return int((drawn([ChartPanel("t", "x", "y", dots=dots)]) < 110).all(axis=-1).sum())
+        return int((draw_panels([ChartPanel("t", "x", "y", dots=dots)]) < 110).all(axis=-1).sum())
 
     bare = dark("", "")
     assert dark("horse", "tiger") - bare > 0.95 * (dark("horse", "") - bare + dark("", "tiger") - bare)
@@ -72,7 +72,7 @@ def test_a_pale_dot_without_room_has_no_name():
 
     def picture(pale, full, crowd=60):
         pales = [Dot(pale, "g", 10.0 + 0.01 * k, 1.0 + 0.01 * k, pale=True) for k in range(crowd)]
-        return drawn([ChartPanel("t", "x", "y", dots=(*pales, Dot(full, "g", 10.3, 1.3)))])
+        return draw_panels([ChartPanel("t", "x", "y", dots=(*pales, Dot(full, "g", 10.3, 1.3)))])
 
     def changed(one, other):
         return (one != other).any(axis=-1).sum()
@@ -83,7 +83,7 @@ def test_a_pale_dot_without_room_has_no_name():
 
 def test_a_panel_has_its_size():
     panels = [ChartPanel("t", "x", "y", dots=(Dot("one", "g", 1.0, 2.0),), size=(300 + 100 * k, 360)) for k in range(2)]
-    assert drawn(panels).shape == (360, 700, 3)
+    assert draw_panels(panels).shape == (360, 700, 3)
 
 
 def test_a_chart_without_matplotlib_names_the_extra(monkeypatch, capsys):

@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_scenes_run_folder import PLAN, fails
 
-from scenes.episodes.make import body_path, make_body, noisy, sensed
+from scenes.episodes.make import add_noise, make_body, sense_columns, to_body_path
 from scenes.episodes.plan import load_plan
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 
 
 @pytest.fixture
@@ -28,15 +28,15 @@ def test_where_nothing_can_be_renamed_nothing_is_left(plan, tmp_path, monkeypatc
     monkeypatch.setattr(Path, "replace", fails)
     with (
         pytest.raises(InputError, match=r"one.h5: cannot be written"),
-        written_whole(tmp_path / "one.h5", ".h5") as part,
+        write_atomically(tmp_path / "one.h5", ".h5") as part,
     ):
         part.touch()
     assert not [left for left in tmp_path.rglob("*") if left.name.startswith(".sulcus")]
-    assert not body_path(tmp_path / "set", 0).exists()
+    assert not to_body_path(tmp_path / "set", 0).exists()
 
 
 def test_a_body_that_is_not_whole_is_named(plan, tmp_path):
-    body_path(tmp_path, 0).mkdir(parents=True)
+    to_body_path(tmp_path, 0).mkdir(parents=True)
     assert "bodies/0000: is no whole body. Remove it" in make_body(tmp_path, plan, 1, 0, "cpu").failed
 
 
@@ -44,10 +44,10 @@ def test_noise_has_its_deviation_and_no_mean():
     """Away from black and white, up to the greatest that a plan may ask for."""
     grey = np.full((200, 200, 3), 128, np.uint8)
     for deviation in (1.0, 6.0, 40.0):
-        added = noisy(grey, deviation, np.random.default_rng(3)).astype(float) - 128.0
+        added = add_noise(grey, deviation, np.random.default_rng(3)).astype(float) - 128.0
         assert added.std() == pytest.approx(deviation, rel=0.06)
         assert abs(added.mean()) < 0.02 * deviation
-    dark = noisy(np.zeros_like(grey), 40.0, np.random.default_rng(3))
+    dark = add_noise(np.zeros_like(grey), 40.0, np.random.default_rng(3))
     assert np.mean(dark == 0) == pytest.approx(0.5, abs=0.02)
 
 
@@ -56,7 +56,7 @@ def test_sensed_poses_err_by_the_stated_degrees_and_millimetres():
     true[:3, :3], true[:3, 3] = Rotation.from_rotvec([1.0, -0.5, 0.3]).as_matrix(), (0.4, -0.2, 0.3)
     columns = {name: np.tile(true, (4000, 1, 1)) for name in ("T_world_tool", "T_camera_world")}
     noise = {"tool_mm": 0.5, "tool_deg": 0.3, "camera_mm": 2.0, "camera_deg": 1.5}
-    found = sensed(columns | {"force": np.zeros((4000, 3))}, noise | {"force_n": 0.02}, 0, 0)
+    found = sense_columns(columns | {"force": np.zeros((4000, 3))}, noise | {"force_n": 0.02}, 0, 0)
     for name, whose in (("T_world_tool_tracked", "tool"), ("T_camera_world_tracked", "camera")):
         off = np.linalg.inv(true) @ found[name]  # along and about its own axes
         turns = np.degrees(Rotation.from_matrix(off[:, :3, :3]).as_rotvec())

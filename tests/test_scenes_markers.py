@@ -4,7 +4,7 @@ import json
 
 from PIL import Image
 
-from ar.tracking.pages import listed_targets
+from ar.tracking.pages import describe_targets
 from scenes.cli import main
 
 
@@ -15,7 +15,7 @@ def test_pages_and_their_list_are_written_and_written_again(tmp_path, capsys):
     assert "measure the rulers" in capsys.readouterr().out
     names = ["board.png", "markers.pdf", "patient.png", "targets.json", "tool.png"]
     assert sorted(path.name for path in out.iterdir()) == names
-    assert json.loads((out / "targets.json").read_text()) == listed_targets()
+    assert json.loads((out / "targets.json").read_text()) == describe_targets()
     with Image.open(out / "tool.png") as picture:
         assert picture.size == (4200, 5940)
 

@@ -9,7 +9,7 @@ from balls import ball
 from scenes.cli import main
 from scenes.options.placement_options import point_or_file
 from sim.bodies.meshfile import read_anatomy
-from sim.bodies.placement import within_outline
+from sim.bodies.placement import find_within_outline
 
 RADIUS = 55.0  # [mm] of the brain of `ball`, round the origin
 
@@ -48,7 +48,7 @@ def fcsv(path, system, *rows, end="\n"):
 def test_what_lies_within_an_outline_is_on_its_side_of_the_head():
     square = np.array([[-1.0, -1.0, 2.0], [1.0, -1.0, 2.1], [1.0, 1.0, 2.0], [-1.0, 1.0, 2.1]])
     points = np.array([[0.0, 0.0, 2.0], [0.9, -0.9, 2.5], [1.1, 0.0, 2.0], [0.0, -1.2, 2.0], [0.0, 0.0, -2.0]])
-    assert within_outline(points, square).tolist() == [True, True, False, False, False]
+    assert find_within_outline(points, square).tolist() == [True, True, False, False, False]
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import warp as wp
 from conftest import make_box
 from witness import slippery
 
-from scenes.play.effect_ablation import device_arrays, without
+from scenes.play.effect_ablation import list_device_arrays, remove_effect
 from scenes.script.scene import SCENES, Scene, find_scene
 from scenes.script.site import site_of
 from sim.compile import compile_problem
@@ -55,13 +55,13 @@ def reached(thing: object, arrays: set[int]) -> set[int]:
 
 def kept(scene: Scene) -> dict[str, int]:
     """Bytes of the arrays that each term of the scene's problem keeps, by name, after one look at a frame."""
-    effects = tuple(effect for effect in scene.effects_on(BODY) if not isinstance(effect, Resection))
+    effects = tuple(effect for effect in scene.get_effects_on(BODY) if not isinstance(effect, Resection))
     device, space = find_device("cpu", "float32"), discretise(BODY.mesh, scene.element)
     skin, time = ContactSurface(space.nodes, space.surface, device), 0.45 * scene.duration
-    loads = scene.loads(SITE, scene.path(time), time).but(Resected)
+    loads = scene.loads(SITE, scene.path(time), time).without_kind(Resected)
     u, out = device.zeros(3 * space.count, 1), device.zeros(3 * space.count, 1)
     flags = device.array(np.zeros(1), wp.int32)
-    before = {id(array) for array in device_arrays()}
+    before = {id(array) for array in list_device_arrays()}
     problem = compile_problem(effects, BODY, device, space, skin)
     problem.begin(Cases(loads, np.zeros(1)))
     problem.energy(u)
@@ -70,7 +70,7 @@ def kept(scene: Scene) -> dict[str, int]:
         term.linearise(u, flags)
     problem.add_curvature(u, out)
     problem.end(u)
-    new = {id(array): array for array in device_arrays() if id(array) not in before}
+    new = {id(array): array for array in list_device_arrays() if id(array) not in before}
     owned = {term.name: reached(term, set(new)) for term in problem.terms}
     owned["constraint"] = reached(problem.constraint, set(new))
     assert sum(map(len, owned.values())) == len(new)  # each is kept by one, and nothing else keeps any
@@ -85,7 +85,7 @@ def test_without_an_effect_its_own_bytes_are_gone_and_no_others(name):
     for effect in scene.effects:
         if isinstance(effect, Elasticity | Held):  # a body needs them
             continue
-        less, own = kept(without(scene, effect)), TERMS.get(type(effect).__name__)
+        less, own = kept(remove_effect(scene, effect)), TERMS.get(type(effect).__name__)
         if isinstance(effect, Pulsation):  # elasticity swells
             assert all((size < whole[term]) == ("elasticity" in term) for term, size in less.items())
             continue

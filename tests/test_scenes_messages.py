@@ -7,20 +7,29 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenes.link.frame import HEADER, BadMessageError, content_of, framed, metadata_of, read_header, stamp_of, time_of
+from scenes.link.frame import (
+    HEADER,
+    BadMessageError,
+    pack_message,
+    read_content,
+    read_header,
+    read_metadata,
+    to_stamp,
+    to_time,
+)
 from scenes.link.heard import ReceivedTransforms, TransformNames
 from scenes.link.messages import (
     Code,
     SentMesh,
-    image,
-    points,
-    polydata,
+    encode_image,
+    encode_points,
+    encode_polydata,
+    encode_status,
+    encode_string,
     read_image,
     read_points,
     read_position,
     read_transform,
-    status,
-    string,
     transform,
 )  # fmt: skip
 
@@ -28,7 +37,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     import pyigtl
 
-STAMP = stamp_of(1_700_000_000.25)
+STAMP = to_stamp(1_700_000_000.25)
 RANDOM = np.random.default_rng(0)
 
 
@@ -40,11 +49,11 @@ def matrix(shift=(10.0, -20.0, 30.0)):
 
 def theirs(kind, name, body):
     """Our message as pyigtl reads it."""
-    raw = framed(kind, name, body, STAMP)
+    raw = pack_message(kind, name, body, STAMP)
     fields = pyigtl.messages.MessageBase.parse_header(raw[: HEADER.size])
     message = pyigtl.messages.MessageBase.create_message(kind)
     message.unpack(fields, raw[HEADER.size :])
-    assert message.device_name == name and message.timestamp == pytest.approx(time_of(STAMP))
+    assert message.device_name == name and message.timestamp == pytest.approx(to_time(STAMP))
     assert pyigtl.messages.CRC64(raw[HEADER.size :]) == struct.unpack(">Q", raw[50:58])[0]
     return message
 
@@ -54,17 +63,17 @@ def ours(message, version=1, **metadata):
     message.header_version, message.metadata = version, metadata
     raw = message.pack()
     header = read_header(raw[: HEADER.size])
-    return header, content_of(header, raw[HEADER.size :])
+    return header, read_content(header, raw[HEADER.size :])
 
 
 def test_what_we_send_is_what_pyigtl_reads():
     assert theirs("TRANSFORM", "TumourToRas", transform(matrix())).matrix == pytest.approx(matrix(), abs=1e-5)
-    assert theirs("STRING", "TipToTumour", string("12.3 +- 0.4 mm")).string == "12.3 +- 0.4 mm"
+    assert theirs("STRING", "TipToTumour", encode_string("12.3 +- 0.4 mm")).string == "12.3 +- 0.4 mm"
     places = RANDOM.normal(size=(3, 3))
-    read = theirs("POINT", "PointsNow", points(["a", "b", "c"], places))
+    read = theirs("POINT", "PointsNow", encode_points(["a", "b", "c"], places))
     assert np.array(read.positions) == pytest.approx(places, abs=1e-6) and list(read.names) == ["a", "b", "c"]
     colour = RANDOM.integers(0, 255, (5, 7, 3), np.uint8)
-    read = theirs("IMAGE", "Overlay", image(colour))
+    read = theirs("IMAGE", "Overlay", encode_image(colour))
     assert np.array_equal(read.image, colour[None]) and read.world_coordinate_system == "ras"
 
 
@@ -74,7 +83,7 @@ def test_what_pyigtl_sends_is_what_we_read(version):
     sent = pyigtl.TransformMessage(matrix(), timestamp=1_700_000_000.25, device_name="StylusTipToReference")
     header, content = ours(sent, version, **more)
     assert (header.kind, header.name, header.version) == ("TRANSFORM", "StylusTipToReference", version)
-    assert time_of(header.stamp) == pytest.approx(1_700_000_000.25, abs=1e-6)
+    assert to_time(header.stamp) == pytest.approx(1_700_000_000.25, abs=1e-6)
     assert read_transform(content) == pytest.approx(matrix(), abs=1e-5)
     _, content = ours(pyigtl.PointMessage(np.arange(6.0).reshape(2, 3), ["a", "b"], device_name="P"), version, **more)
     names, places = read_points(content)
@@ -88,11 +97,11 @@ def test_what_pyigtl_sends_is_what_we_read(version):
 
 def test_polydata_and_status_have_the_layout_of_the_protocol():
     corners = RANDOM.normal(size=(4, 3)).astype(np.float32)
-    body = polydata(corners, SentMesh.of(np.array([[0, 1, 2], [0, 2, 3]])))
+    body = encode_polydata(corners, SentMesh.of(np.array([[0, 1, 2], [0, 2, 3]])))
     assert struct.unpack(">10I", body[:40]) == (4, 0, 0, 0, 0, 2, 32, 0, 0, 0)
     assert np.array_equal(np.frombuffer(body, ">f4", 12, 40).reshape(4, 3), corners)
     assert struct.unpack(">8I", body[88:]) == (3, 0, 1, 2, 3, 0, 2, 3)
-    body = status(Code.NOT_READY, "no pose yet")
+    body = encode_status(Code.NOT_READY, "no pose yet")
     assert struct.unpack(">Hq20s", body[:30])[0] == 13 and body[30:] == b"no pose yet\0"
 
 
@@ -105,31 +114,31 @@ def test_a_position_is_a_place_and_a_quaternion():
 
 
 def test_a_time_stamp_goes_through_to_its_last_bit():
-    raw = framed("TRANSFORM", "A", transform(np.eye(4)), STAMP + 1)
+    raw = pack_message("TRANSFORM", "A", transform(np.eye(4)), STAMP + 1)
     assert read_header(raw[:58]).stamp == STAMP + 1
 
 
 def test_the_checksum_is_that_of_the_catalogue():
-    assert read_header(framed("STRING", "A", b"123456789", 0)[:58]).checksum == 0x6C40DF5F0B497347
+    assert read_header(pack_message("STRING", "A", b"123456789", 0)[:58]).checksum == 0x6C40DF5F0B497347
 
 
 def messaged(value, value_size=None, count=1):
     """Header and body of a message of version 2 with one pair of metadata."""
     index = struct.pack(">HHHI", count, 3, 3, len(value) if value_size is None else value_size)
     body = struct.pack(">HHII", 12, len(index), 3 + len(value), 0) + b"content" + index + b"key" + value.encode()
-    raw = b"\0\2" + framed("STRING", "A", body, 0)[2:]
+    raw = b"\0\2" + pack_message("STRING", "A", body, 0)[2:]
     return read_header(raw[: HEADER.size]), body
 
 
 def test_metadata_stands_behind_the_content():
     header, body = messaged("OK\0")
-    assert content_of(header, body) == b"content" and metadata_of(header, body) == {"key": "OK"}
-    assert metadata_of(*messaged("", count=1)) == {"key": ""}
-    assert metadata_of(read_header(framed("STRING", "A", b"", 0)[:58]), b"") == {}
+    assert read_content(header, body) == b"content" and read_metadata(header, body) == {"key": "OK"}
+    assert read_metadata(*messaged("", count=1)) == {"key": ""}
+    assert read_metadata(read_header(pack_message("STRING", "A", b"", 0)[:58]), b"") == {}
 
 
 def body_of(raw):
-    return content_of(read_header(raw[:58]), raw[58:])
+    return read_content(read_header(raw[:58]), raw[58:])
 
 
 @pytest.mark.parametrize(
@@ -137,18 +146,18 @@ def body_of(raw):
     [
         (lambda: read_header(b"GET / HTTP/1.1\r\n".ljust(58)), "no OpenIGTLink"),
         (lambda: read_header(bytes(58)), "no OpenIGTLink"),
-        (lambda: body_of(framed("STRING", "A", b"abc", 0)[:-1] + b"d"), "wrong checksum"),
-        (lambda: body_of(b"\0\2" + framed("STRING", "A", b"abc", 0)[2:]), "too short for an extended"),
-        (lambda: body_of(b"\0\2" + framed("STRING", "A", b"\0\xff" + bytes(14), 0)[2:]), "extended header names"),
-        (lambda: metadata_of(*messaged("a", value_size=9)), "other sizes than its index"),
-        (lambda: metadata_of(*messaged("a", count=2)), "other sizes than its index"),
+        (lambda: body_of(pack_message("STRING", "A", b"abc", 0)[:-1] + b"d"), "wrong checksum"),
+        (lambda: body_of(b"\0\2" + pack_message("STRING", "A", b"abc", 0)[2:]), "too short for an extended"),
+        (lambda: body_of(b"\0\2" + pack_message("STRING", "A", b"\0\xff" + bytes(14), 0)[2:]), "extended header names"),
+        (lambda: read_metadata(*messaged("a", value_size=9)), "other sizes than its index"),
+        (lambda: read_metadata(*messaged("a", count=2)), "other sizes than its index"),
         (lambda: read_transform(bytes(44)), "wrong size: 44 bytes in place of 48"),
         (lambda: read_position(bytes(28)), "quaternion"),
         (lambda: read_points(bytes(135)), "wrong size"),
-        (lambda: read_points(points(["a"], np.array([[0.0, np.nan, 0.0]]))), "not finite"),
+        (lambda: read_points(encode_points(["a"], np.array([[0.0, np.nan, 0.0]]))), "not finite"),
         (lambda: read_image(bytes(20)), "too short"),
-        (lambda: read_image(image(np.zeros((4, 4, 3), np.uint8))[:-1]), "another number of pixels"),
-        (lambda: read_image(image(np.zeros((4, 4, 2), np.uint8))), "not one complete 8-bit image"),
+        (lambda: read_image(encode_image(np.zeros((4, 4, 3), np.uint8))[:-1]), "another number of pixels"),
+        (lambda: read_image(encode_image(np.zeros((4, 4, 2), np.uint8))), "not one complete 8-bit image"),
     ],
 )  # fmt: skip
 def test_what_is_no_message_is_refused(read, why):
@@ -160,7 +169,7 @@ def test_a_body_is_known_while_its_transforms_are_new():
     names = TransformNames()
     heard = ReceivedTransforms(names, 0.3)
     assert heard.beside(names.tool, 0.0) == "no StylusTipToReference yet"
-    heard = heard.hearing(names.tool, matrix(), STAMP, 1.0, 0)
+    heard = heard.add_transform(names.tool, matrix(), STAMP, 1.0, 0)
     found = heard.beside(names.tool, 1.2)
     assert found.stamp == STAMP and found.T[:3, 3] == pytest.approx([0.01, -0.02, 0.03])
     assert heard.beside(names.tool, 1.4) == "no new StylusTipToReference for 0.4 s"
@@ -172,7 +181,9 @@ def test_a_body_is_known_while_its_transforms_are_new():
         (matrix(), STAMP + 9, 1, "another client"),
     ):
         with pytest.raises(BadMessageError, match=why):
-            heard.hearing(names.tool, T, stamp, 1.1, sender)
-    assert heard.hearing(names.tool, matrix(), STAMP, 2.0, 1).sent[names.tool].sender == 1  # the first one is silent
-    clock_set = heard.hearing(names.tool, matrix(), stamp_of(time_of(STAMP) - 60.0), 1.1, 0)
+            heard.add_transform(names.tool, T, stamp, 1.1, sender)
+    assert (
+        heard.add_transform(names.tool, matrix(), STAMP, 2.0, 1).sent[names.tool].sender == 1
+    )  # the first one is silent
+    clock_set = heard.add_transform(names.tool, matrix(), to_stamp(to_time(STAMP) - 60.0), 1.1, 0)
     assert clock_set.sent[names.tool].arrived == 1.1

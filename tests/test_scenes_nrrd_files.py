@@ -8,7 +8,7 @@ import numpy as np
 import slicerio
 from warped import LPS, bump
 
-from sim.geometry.tetmesh import signed_volumes
+from sim.geometry.tetmesh import compute_signed_volumes
 
 
 def test_slicer_is_said_what_the_fields_are(warp_out):
@@ -28,7 +28,7 @@ def test_slicerio_reads_tumour_and_bound(box, warp_out):
     assert tumour["name"] == "tumour" and "95 %" in shell["name"]
     voxels, edge = read["voxels"], abs(read["ijkToLPS"][0, 0])
     now = box.mesh.nodes + bump(box.mesh.nodes)
-    size = signed_volumes(now, box.mesh.tets[box.mesh.region == 2]).sum()
+    size = compute_signed_volumes(now, box.mesh.tets[box.mesh.region == 2]).sum()
     assert np.isclose((voxels == tumour["labelValue"]).sum() * (1e-3 * edge) ** 3, size, rtol=0.03)
     middle = np.argwhere(voxels == 1).mean(axis=0)
     where = (read["ijkToLPS"] @ [*middle, 1.0])[:3] * LPS

@@ -142,7 +142,7 @@ def effects_of(name: str) -> list[str]:
     return [*(type(effect).__name__ for effect in scene.effects), *(["Resection"] if scene.surgery else [])]
 
 
-def law_of(name: str) -> str:
+def get_law_name(name: str) -> str:
     """The law of a built-in scene's tissue."""
     (tissue,) = (effect.default for effect in find_scene(name).effects if isinstance(effect, Elasticity))
     assert tissue is not None
@@ -154,9 +154,9 @@ def test_every_effect_and_law_has_its_line():
     assert set(OF_LAW) == {*LAWS, "ogden", "prony"}
 
 
-@pytest.mark.parametrize("scene", {(*effects_of(name), law_of(name)): name for name in SCENES}.values())
+@pytest.mark.parametrize("scene", {(*effects_of(name), get_law_name(name)): name for name in SCENES}.values())
 def test_a_scene_costs_its_effects_and_nothing_else(witnessed, scene):
-    check(witnessed(scene), effects_of(scene), law_of(scene))
+    check(witnessed(scene), effects_of(scene), get_law_name(scene))
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_a_scene_costs_its_effects_and_nothing_else(witnessed, scene):
     ],
 )
 def test_one_more_effect_costs_itself_alone(witnessed, more):
-    check(witnessed("press", more), [*effects_of("press"), *more.split("+")], law_of("press"))
+    check(witnessed("press", more), [*effects_of("press"), *more.split("+")], get_law_name("press"))
 
 
 @pytest.mark.parametrize("law", sorted(set(OF_LAW) - {"stable-neo-hookean"}))
@@ -184,7 +184,7 @@ def test_a_scene_of_one_law_knows_no_other(witnessed, law):
 @pytest.mark.parametrize("element", ["p2", "smoothed"])
 def test_elements_need_no_term_of_their_own(witnessed, element):
     found = witnessed("press", "", "", element)
-    check(found, effects_of("press"), law_of("press"))
+    check(found, effects_of("press"), get_law_name("press"))
     grids = {"sim.linalg.multigrid", "sim.linalg.block_sparse"}
     assert (grids <= {name.split(":")[0] for name in found["launched"]}) == (element == "p2")
 

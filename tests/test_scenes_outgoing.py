@@ -8,12 +8,12 @@ from links import NAMES, NOW, linked, peers, played
 
 from scenes.link.answer import NOT_SEEN, PoseResult
 from scenes.link.frame import HEADER
-from scenes.link.messages import points, read_points, transform
+from scenes.link.messages import encode_points, read_points, transform
 from scenes.link.outgoing import Outgoing
 from scenes.tracked.follower import TrackingResult, TumourState
 from scenes.tracked.tool_motion import BrainMotion
 from sim.loads import Loads, Touching
-from surrogate.model.learned import predicted
+from surrogate.model.learned import build_prediction
 
 
 def test_places_inside_the_tumour_move_with_its_volume(stage):
@@ -39,7 +39,7 @@ def motion_of(rest, nodes, displacement):
     positions = rest.copy()
     positions[nodes] += displacement
     nothing = Loads((Touching(np.eye(4)[None, None]),))
-    answer = predicted(displacement[None], nodes, nothing, [False], 0.0, np.full((2, 1), np.nan), "")
+    answer = build_prediction(displacement[None], nodes, nothing, [False], 0.0, np.full((2, 1), np.nan), "")
     return BrainMotion(positions, True, answer=answer)
 
 
@@ -50,10 +50,10 @@ def test_places_on_the_tumour_move_with_it_and_a_million_points_are_passed_over(
         async with linked(follower, registration) as port, peers(port, 1) as (tracker,):
             tracker.send("POINT", "P", bytes(136 * 10**6))
             assert "too long" in await tracker.said()
-            tracker.send("POINT", "P", points(["a"], rest[:1] + 100.0))
+            tracker.send("POINT", "P", encode_points(["a"], rest[:1] + 100.0))
             assert "nor on open cortex" in (said := await tracker.said()) and ": a 1" in said
             mixed = np.vstack([rest[:1], rest[:2] + 100.0, rest[1:2]])
-            tracker.send("POINT", "P", points(["a", "", "far", "b"], mixed))
+            tracker.send("POINT", "P", encode_points(["a", "", "far", "b"], mixed))
             assert "number 2 1" in (said := await tracker.said()) and "far 1" in said and "others are followed" in said
             tracker.send("TRANSFORM", NAMES.tool, transform(beside[10]), NOW)
             while not len(body := (await tracker.next("POINT", "PointsNow"))[1]):

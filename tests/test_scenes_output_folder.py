@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scenes.cli import main
-from scenes.warp.images import read_picture, warped_values, write_warped
+from scenes.warp.images import read_picture, warp_values, write_warped
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.fields.warp_fields import warp_fields
 
@@ -107,11 +107,11 @@ def test_intensities_keep_scale_and_type(folder, box, fields):
 def test_what_comes_from_outside_or_was_cut_is_zero_and_counted(box, fields):
     affine = np.diag([1e-3, 1e-3, 1e-3, 1.0])
     affine[:3, 3] = [-10e-3, -10e-3, -8e-3]  # its top lies below what is pushed into it
-    out, counts = warped_values(np.full((20, 20, 6), 9, np.uint8), affine, fields, 1)
+    out, counts = warp_values(np.full((20, 20, 6), 9, np.uint8), affine, fields, 1)
     assert counts.outside > 200 and (out[counts.blank] == 0).all() and (out[~counts.blank] == 9).all()
     cut = warp_fields(box, dimple(box.mesh.nodes), 2e-3, box.without(np.flatnonzero(box.mesh.region == 2)))
     affine[2, 3] = -40e-3
-    out, counts = warped_values(np.full((20, 20, 36), 9, np.uint8), affine, cut, 0)
+    out, counts = warp_values(np.full((20, 20, 36), 9, np.uint8), affine, cut, 0)
     assert counts.gone > 1000 and (out == 0).sum() == counts.gone + counts.outside
 
 

@@ -10,12 +10,18 @@ from boxes import base_held, top_forces
 from boxes import box as cube
 from programs import main
 
-from scenes.options.outputs import claimed, claimed_frames, demand_no_strangers, remove_data, strangers
-from sim.bodies.intensity import sidecar
+from scenes.options.outputs import (
+    check_no_foreign_files,
+    check_output_frames,
+    check_output_path,
+    find_foreign_files,
+    remove_data,
+)
+from sim.bodies.intensity import to_intensity_path
 from sim.bodies.meshfile import read_mesh, write_mesh
 from sim.errors import InputError
 from sim.runtime.atomic_files import check_output
-from sim.runtime.journal import opened
+from sim.runtime.journal import open_journal
 
 # None of what they read is there: whoever looks at it first says so, and not that nothing can be written.
 WRITING = {
@@ -72,11 +78,11 @@ def test_a_file_of_the_users_is_not_replaced(name, tmp_path, monkeypatch, capsys
 def test_by_force_it_is(tmp_path):
     mine = tmp_path / "x.vtu"
     mine.write_text("my own")
-    assert claimed(mine, ".vtu", force=True) == mine
+    assert check_output_path(mine, ".vtu", force=True) == mine
 
 
 def test_asking_leaves_no_folder_behind(tmp_path):
-    claimed(tmp_path / "a" / "b" / "x.vtu", ".vtu")
+    check_output_path(tmp_path / "a" / "b" / "x.vtu", ".vtu")
     assert not list(tmp_path.iterdir())
 
 
@@ -100,7 +106,7 @@ def test_solving_does_not_replace_its_own_mesh(tmp_path, capsys):
 
 
 def test_a_users_own_scan_is_neither_replaced_nor_removed(tmp_path, monkeypatch, capsys):
-    mine = sidecar(tmp_path / "me.vtu")
+    mine = to_intensity_path(tmp_path / "me.vtu")
     mine.write_bytes(b"my scan")
     assert main(["anatomy", "--out", str(tmp_path / "me.vtu")]) == 2
     assert "--force" in capsys.readouterr().err
@@ -112,11 +118,11 @@ def test_a_users_own_scan_is_neither_replaced_nor_removed(tmp_path, monkeypatch,
 def test_frames_are_removed_by_force_and_other_files_stay(tmp_path):
     frame, notes = tmp_path / "frame_0000.png", tmp_path / "frame_notes.png"
     notes.write_bytes(b"mine")
-    assert claimed_frames(tmp_path, force=False) == []
+    assert check_output_frames(tmp_path, force=False) == []
     frame.write_bytes(b"a frame")
     with pytest.raises(InputError, match=r"holds 1 frames\. Give --force"):
-        claimed_frames(tmp_path, force=False)
-    assert claimed_frames(tmp_path, force=True) == [frame]
+        check_output_frames(tmp_path, force=False)
+    assert check_output_frames(tmp_path, force=True) == [frame]
 
 
 def put_data(path, **stated):
@@ -126,15 +132,15 @@ def put_data(path, **stated):
 
 def test_data_and_models_of_another_anatomy_are_found_beside_a_mesh(tmp_path):
     mesh = tmp_path / "me.vtu"
-    assert strangers(mesh, "new") == []
+    assert find_foreign_files(mesh, "new") == []
     put_data(tmp_path / "me.h5", anatomy="new")
     np.savez(tmp_path / "me.model.npz", header=np.array(json.dumps({"format": "sulcus model 2", "anatomy": "old"})))
-    assert strangers(mesh, "new") == [tmp_path / "me.model.npz"]
-    with opened(tmp_path / "me.h5.partial", {"anatomy": "old"}):
+    assert find_foreign_files(mesh, "new") == [tmp_path / "me.model.npz"]
+    with open_journal(tmp_path / "me.h5.partial", {"anatomy": "old"}):
         pass
     with pytest.raises(InputError, match=r"me.h5.partial and me.model.npz beside it.*--force"):
-        demand_no_strangers(mesh, "new", force=False)
-    assert len(demand_no_strangers(mesh, "new", force=True)) == 2
+        check_no_foreign_files(mesh, "new", force=False)
+    assert len(check_no_foreign_files(mesh, "new", force=True)) == 2
 
 
 def test_force_removes_only_data_that_cannot_go_on(tmp_path):

@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 from films import FILM, Recorded
 
-from ar.overlay.outlines import changed_share, ink_of, of_ink, outline_gap, silhouette
+from ar.overlay.outlines import compute_changed_share, compute_ink, compute_silhouette, find_ink, measure_outline_gap
 from ar.rendering.layer import Layer
-from ar.rendering.real_picture import real_picture
-from ar.tracking.pictures import Named, film_of
+from ar.rendering.real_picture import build_real_image
+from ar.tracking.pictures import Named, read_video
 from scenes.cli import main
 from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
 from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.follower import TumourState
 from scenes.tracked.picture import Painter
-from scenes.tracked.run import Timed, overlaid, paced, timed
+from scenes.tracked.run import Timed, draw_overlay, pace_images, read_timed
 from scenes.tracked.tool_motion import ToolMotion
-from scenes.tracked.truth import off, read_truth, summary
+from scenes.tracked.truth import compute_overlay_error, read_truth, summarise_errors
 from sim.errors import InputError
 from sim.loads import Touching
-from surrogate.model.learned import predicted
+from surrogate.model.learned import build_prediction
 
 GIVEN = ["--camera", str(FILM / "camera.yaml"), "--registration", str(FILM / "registration.json")]
 GOOD, REST, LOST, TOOL, STALE = (
@@ -37,7 +37,7 @@ GOOD, REST, LOST, TOOL, STALE = (
 # Of a film of palpate that is over-exposed at 0.53 s, hides the cube from 0.93 to 1.07 s and the reference from
 # 1.33 to 1.73 s, and lacks a picture at 2 s. The ball lies on the cortex from 0.4 s on.
 STATES = [REST, REST, REST, GOOD, LOST, GOOD, GOOD, TOOL, TOOL, GOOD, LOST, LOST, LOST, LOST, GOOD, STALE, GOOD]
-INK = ink_of(TUMOUR_COLOUR)
+INK = compute_ink(TUMOUR_COLOUR)
 
 
 @pytest.fixture(scope="module")
@@ -46,12 +46,12 @@ def calibration():
 
 
 def pictures():
-    return timed(film_of(FILM / "film.mp4", 30.0, colour=True))
+    return read_timed(read_video(FILM / "film.mp4", 30.0, colour=True))
 
 
 @pytest.fixture(scope="module")
 def shown(follower, stage):
-    return list(overlaid(pictures(), follower, Painter(stage, follower.tool, "contour")))
+    return list(draw_overlay(pictures(), follower, Painter(stage, follower.tool, "contour")))
 
 
 def test_every_picture_shows_what_is_known_of_it(shown, truth):
@@ -70,14 +70,14 @@ def test_the_outline_in_the_pixels_is_where_the_tumour_is(shown, truth, calibrat
     vertices, triangles = follower.tool.mesh
     for each in shown:
         if not each.known.relied:
-            assert np.count_nonzero(of_ink(each.colour, INK)) < 5  # nothing looks as if it were known
+            assert np.count_nonzero(find_ink(each.colour, INK)) < 5  # nothing looks as if it were known
             continue
         row = truth.at(each.known.time)
         camera, pose = calibration.camera(truth.T_camera_scan[row]), truth.T_scan_tool[row]
         true = stage.tumour_at_rest.vertices + truth.displacement[row]
-        mask = silhouette(camera, true, stage.tumour_at_rest.triangles)
-        covered = silhouette(camera, vertices @ pose[:3, :3].T + pose[:3, 3], triangles)
-        assert outline_gap(each.colour, INK, mask, covered) < 2.5
+        mask = compute_silhouette(camera, true, stage.tumour_at_rest.triangles)
+        covered = compute_silhouette(camera, vertices @ pose[:3, :3].T + pose[:3, 3], triangles)
+        assert measure_outline_gap(each.colour, INK, mask, covered) < 2.5
 
 
 def test_under_the_drape_that_a_film_has_nothing_shines_through(shown, truth, calibration, stage, follower):
@@ -85,14 +85,16 @@ def test_under_the_drape_that_a_film_has_nothing_shines_through(shown, truth, ca
     painted = Painter(stage, follower.tool).paint(each.colour, known).colour
     camera, tumour = calibration.camera(truth.T_camera_scan[6]), stage.tumour(known.motion.positions)
     seen = stage.picture(camera, known.motion.positions, None).segmentation
-    mask = silhouette(camera, tumour.vertices, tumour.triangles)
-    under, through = (changed_share(each.colour, painted, mask & (seen == ground)) for ground in (DRAPE, CORTEX))
+    mask = compute_silhouette(camera, tumour.vertices, tumour.triangles)
+    under, through = (
+        compute_changed_share(each.colour, painted, mask & (seen == ground)) for ground in (DRAPE, CORTEX)
+    )
     assert under < 0.03 and through > 0.8
 
 
 def test_it_is_no_farther_off_than_it_says(shown, truth, calibration, stage):
-    errors = [off(each.known, truth, calibration, stage) for each in shown]
-    said = summary([each.known for each in shown], errors)
+    errors = [compute_overlay_error(each.known, truth, calibration, stage) for each in shown]
+    said = summarise_errors([each.known for each in shown], errors)
     assert said["pictures"] == 9 and said["wrong"] == 0 and said["held_percent"] == 100.0
     assert said["outline_px_p95"] < 0.5 and said["overlap_least"] > 0.98
     assert said["middle_mm_p95"] < 0.15 and 0.05 < said["band_mm_p50"] < 0.4
@@ -104,7 +106,7 @@ def test_a_tool_s_error_is_in_the_band_by_what_a_deeper_one_does(follower, truth
         def deform(self, loads, start=None, at=None):
             depth = (loads.only(Touching).pose[0, 0, :3, 3] - truth.T_scan_tool[5, :3, 3]) @ stage.site.axis
             moved = np.full((1, len(self.vertices), 3), 0.2 * depth / np.sqrt(3.0))
-            return predicted(moved, self.vertices, loads, [False], 0.0, np.full((2, 1), np.nan), "")
+            return build_prediction(moved, self.vertices, loads, [False], 0.0, np.full((2, 1), np.nan), "")
 
     falling = Falling(stage.anatomy, stage.tumour_vertices, truth.T_scan_tool, truth.displacement)
     motion = ToolMotion(stage, falling).under(truth.T_scan_tool[5], np.diag([1e-8, 4e-6, 1e-8]))
@@ -115,13 +117,13 @@ def test_a_film_that_plays_as_a_camera_loses_what_comes_too_fast():
     picture = np.zeros((8, 8), np.uint8)
     film = (Timed(Named(str(n), picture, 0.02 * n), False) for n in range(20))
     seen, ages = [], []
-    for taken, begun in paced(film):
+    for taken, begun in pace_images(film):
         ages.append(time.perf_counter() - begun - taken.picture.time)
         seen.append(taken.picture.name)
         time.sleep(0.05)
     assert 5 < len(seen) < 14 and seen == sorted(seen, key=int) and seen[0] == "0"
     assert min(ages) > -1e-3 and np.median(ages) < 0.03
-    assert not list(paced(iter([])))
+    assert not list(pace_images(iter([])))
 
 
 def test_layers_of_a_real_picture_are_where_the_box_is(calibration):
@@ -129,7 +131,7 @@ def test_layers_of_a_real_picture_are_where_the_box_is(calibration):
     corners = 0.02 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     near, far = (Layer(str(n), n, corners + [0.0, 0.0, z], np.array([[0, 1, 2]])) for n, z in ((1, 0.3), (2, 0.4)))
     colour = np.random.default_rng(0).integers(0, 256, (720, 960, 3), np.uint8)
-    picture = real_picture(colour, camera, [far, near], (slice(300, 500), slice(400, 600)))
+    picture = build_real_image(colour, camera, [far, near], (slice(300, 500), slice(400, 600)))
     np.testing.assert_array_equal(picture.colour, colour)
     middle = tuple(camera.project(near.vertices.mean(axis=0))[0].round().astype(int)[::-1])
     assert picture.segmentation[middle] == 1 and picture.depth[middle] == pytest.approx(0.3)
@@ -137,7 +139,7 @@ def test_layers_of_a_real_picture_are_where_the_box_is(calibration):
     outside[300:500, 400:600] = 0
     assert not outside.any() and {1, 2} >= set(np.unique(picture.segmentation[300:500])) - {0}
     with pytest.raises(ValueError, match="the camera"):
-        real_picture(colour[:100], camera, [], (slice(0, 1), slice(0, 1)))
+        build_real_image(colour[:100], camera, [], (slice(0, 1), slice(0, 1)))
 
 
 def test_the_command_draws_a_film_and_says_how_it_went(tmp_path, capsys):
@@ -159,7 +161,7 @@ def test_the_command_draws_a_film_and_says_how_it_went(tmp_path, capsys):
         and "tissue motion unknown" in rows[0]["words"]
         and rows[11]["tumour_x_mm"] == ""
     )
-    film = list(film_of(out, 30.0, colour=True))
+    film = list(read_video(out, 30.0, colour=True))
     assert len(film) == 17 and film[0].grey.shape == (720, 960)
 
 

@@ -13,7 +13,7 @@ from films import FILM
 from visitor import Visitor, free_port, wait_for
 
 from ar.page.elements import HISTORY, KEYS, PICTURE, SAID, SLICES, TABS
-from ar.tracking.pictures import film_of
+from ar.tracking.pictures import read_video
 from scenes.cli import main
 from scenes.tracked.follower import TumourState
 from scenes.tracked.page import OverlayPage
@@ -122,7 +122,7 @@ def test_a_film_plays_on_and_after_its_end_anew(follower, stage):
 
 
 def test_a_camera_s_picture_is_dimmed_once_it_is_old_and_goes_on_when_it_is_back(follower, stage):
-    first = next(film_of(FILM / "film.mp4", 30.0, colour=True))
+    first = next(read_video(FILM / "film.mp4", 30.0, colour=True))
 
     def pictures():
         yield replace(first, time=time.perf_counter())

@@ -10,7 +10,7 @@ import pytest
 from theatres import player
 
 from scenes.episodes.episode import collect
-from scenes.play.frame_text import acting
+from scenes.play.frame_text import format_acting
 from scenes.play.player import Player
 from scenes.script.scene import Scene, Viewpoint, find_scene
 from scenes.script.tool_paths import AIR, Touch
@@ -22,14 +22,14 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Touching, stacked
 from sim.material import Material
-from sim.tools import Ball, distances_to
+from sim.tools import Ball, compute_distances
 from surrogate.data.cortex_patch import open_patch
-from surrogate.model.applicability import refusal
-from surrogate.model.guarded import answering
+from surrogate.model.applicability import find_rejection
+from surrogate.model.guarded import find_first_model
 from surrogate.model.learned import Learned, ModelPart
 from surrogate.model.tool_contact import ForceModel
 from surrogate.model.training_range import Envelope
-from surrogate.training.fem_tables import condensed, side_by_side
+from surrogate.training.fem_tables import condense_exterior, join_bases
 
 NODES = np.zeros((1, 3))
 SMALL = Viewpoint(width=160, height=120)
@@ -51,10 +51,10 @@ def untrained(anatomy: Anatomy, scene: Scene) -> Learned:
     assert isinstance(ball, Ball)
     patch = open_patch(anatomy)
     fem = Fem(anatomy, (Elasticity(Material("linear", 5000.0, 0.49)), Held(), Slide()), REFERENCE, "cpu")
-    contact, bases = condensed(fem, [anatomy.tumour_nodes, np.setdiff1d(patch.nodes, anatomy.tumour_nodes)])
+    contact, bases = condense_exterior(fem, [anatomy.tumour_nodes, np.setdiff1d(patch.nodes, anatomy.tumour_nodes)])
     envelope = Envelope(patch.points, 1.0, 1.0, np.pi, (1e-6, 1.0), (ball.radius, ball.radius), np.inf)
     said = {"effects": repr(scene.effects)}
-    parts = (ModelPart("tool", replace(contact, grip=np.array([1.0, 0.0])), side_by_side(bases)),)
+    parts = (ModelPart("tool", replace(contact, grip=np.array([1.0, 0.0])), join_bases(bases)),)
     return Learned(anatomy, parts, envelope, training=said, tool=ball, force=ForceModel())
 
 
@@ -73,7 +73,7 @@ class TestPalpate:
             assert isinstance(cause, Touching)
             np.testing.assert_array_equal(cause.pose[0, 0], frame.pose)
             positions = theatre.anatomy.mesh.nodes + frame.deformation.displacement[0]
-            assert distances_to(shape, frame.pose, positions).min() > 0.0
+            assert compute_distances(shape, frame.pose, positions).min() > 0.0
 
     def test_scrubbing_back_answers_as_before(self, theatre, palpated):
         """A frame is a function of its loads and of the answer that it starts from."""
@@ -91,15 +91,15 @@ class TestPalpate:
     def test_what_a_learnt_model_does_not_know_is_not_said(self, palpated):
         """Trained on where a ball is, it answers without the force that it takes."""
         frame = palpated[6]
-        assert acting(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6))), NODES) == ""
+        assert format_acting(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6))), NODES) == ""
 
     def test_what_a_model_knows_of_the_force_is_said_with_its_bound(self, palpated):
         frame = palpated[6]
         reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
         answer = replace(frame.deformation, reaction_bound=np.array([[0.012], [0.02]]), outcome=(Outcome.PREDICTED,))
-        assert acting(frame.loads, answer, NODES) == f"tool force {reads:.2f} N within 0.02 N (model)"
+        assert format_acting(frame.loads, answer, NODES) == f"tool force {reads:.2f} N within 0.02 N (model)"
         far = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
-        assert acting(frame.loads, far, NODES) == f"tool force {reads:.2f} N"
+        assert format_acting(frame.loads, far, NODES) == f"tool force {reads:.2f} N"
 
     @pytest.mark.parametrize("force", [ForceModel(), None])
     def test_guarded_frames_are_the_model_s_or_the_finite_elements(self, theatre, palpated, force):
@@ -112,7 +112,7 @@ class TestPalpate:
         play, by_model = player(both, scene, "guarded"), 0
         frames = list(play.frames(10))
         for frame, solved in zip(frames, palpated, strict=True):
-            trained = answering(play.deformer, frame.deformation) is not None
+            trained = find_first_model(play.deformer, frame.deformation) is not None
             by_model += trained
             assert trained == (model.deform(frame.loads).outcome[0] is Outcome.PREDICTED)
             expected = model.deform(frame.loads) if trained else solved.deformation
@@ -147,7 +147,7 @@ class TestPalpate:
         """Nearly as finite elements of softer tissue that stiffens do, on tumour and cortex."""
         scene, anatomy = small("palpate"), theatre.anatomy
         model = untrained(anatomy, scene)
-        assert refusal(model, scene.effects) is None
+        assert find_rejection(model, scene.effects) is None
         drawn = Player(player(theatre, scene, "fem").stage, model)
         pressed = [frame for frame in palpated if frame.touch.depth > 1e-3]
         assert len(pressed) > 3

@@ -8,11 +8,11 @@ import pytest
 from balls import EGG, ball
 from programs import main
 
-from scenes.play.deformers import model_path
-from sim.bodies.intensity import sidecar
+from scenes.play.deformers import to_model_path
+from sim.bodies.intensity import to_intensity_path
 from sim.bodies.meshfile import read_anatomy
 from sim.material import BRAIN
-from sim.runtime.timing import stage
+from sim.runtime.timing import time_stage
 from surrogate.model.store import load
 
 
@@ -80,8 +80,8 @@ def test_a_patient_in_one_go(tmp_path, capsys, short_fits):
     for part in ("labels", "mesh", "set-up", "unit responses", "loads", "learn residual", "score", "save", "rest"):
         assert f"\n  {part} " in text
     anatomy = read_anatomy(out)
-    models = load(model_path(out), anatomy)
-    assert set(models) == {"linear", "residual"} and sidecar(out).is_file()
+    models = load(to_model_path(out), anatomy)
+    assert set(models) == {"linear", "residual"} and to_intensity_path(out).is_file()
     assert f"ready: sulcus demo --anatomy {out} --element p1" in text
     assert f"sulcus uncertainty press --anatomy {out} --element p1" in text
     here = ["--anatomy", str(out), "--element", "p1"]
@@ -98,7 +98,7 @@ def test_a_patient_in_one_go(tmp_path, capsys, short_fits):
 def test_a_patient_says_in_json_where_the_time_went(tmp_path, monkeypatch, capsys):
     def step(words):
         assert words[-1] == "--json"
-        with stage(words[0]):
+        with time_stage(words[0]):
             return 0
 
     monkeypatch.setattr("scenes.cli.main", step)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from scenes.report.picture import rested
+from scenes.report.picture import find_rested_tip
 from scenes.script.site import site_of
 
 
@@ -17,6 +17,6 @@ def test_the_tool_of_a_report_s_picture_rests_on_the_cortex_and_pierces_it_nowhe
     away = np.linalg.norm(nodes - top, axis=1)
     # A dent that is deepest under the tool, and narrower than the ball.
     nodes += 2e-3 * np.exp(-((away / 4e-3) ** 2))[:, None] * site.axis
-    middle = rested(site, top, nodes, radius) - radius * site.axis
+    middle = find_rested_tip(site, top, nodes, radius) - radius * site.axis
     surface = trimesh.Trimesh(nodes, box.open_surface, process=False)
     assert trimesh.proximity.closest_point_naive(surface, middle[None])[1][0] == pytest.approx(radius, abs=1e-8)

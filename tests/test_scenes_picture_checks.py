@@ -9,10 +9,10 @@ import pytest
 from theatres import LENS, REAL, player, small
 
 from ar.optics.camera import Camera, project_cv2
-from ar.overlay.outlines import iou, silhouette
+from ar.overlay.outlines import compute_iou, compute_silhouette
 from scenes.play.checks import measure
-from scenes.play.picture_checks import drawn_off
-from scenes.play.reference import truth_of
+from scenes.play.picture_checks import measure_outline_error
+from scenes.play.reference import solve_reference_frames
 from scenes.script.camera_paths import PATHS, Focus, Microscope
 from scenes.script.scene import Bounds
 from scenes.script.tool_paths import press
@@ -52,11 +52,14 @@ def test_the_overlay_is_in_register_under_each_path(theatre, path):
     assert len({id(frame.camera) for frame in frames}) == (1 if path is None else len(frames))
     for frame in frames:
         tumour = play.stage.tumour(play.believed(frame))
-        mask, ours = drawn_by_opencv(frame.camera, tumour), silhouette(frame.camera, tumour.vertices, tumour.triangles)
+        mask, ours = (
+            drawn_by_opencv(frame.camera, tumour),
+            compute_silhouette(frame.camera, tumour.vertices, tumour.triangles),
+        )
         middles = [np.argwhere(each).mean(axis=0) for each in (mask, ours)]
-        assert mask.sum() > 5000 and np.abs(middles[0] - middles[1]).max() < 0.1 and iou(mask, ours) > 0.985
-        assert drawn_off(frame, mask) < 1.5
-        assert drawn_off(frame, np.roll(mask, (4, 4), axis=(0, 1))) > 1.7
+        assert mask.sum() > 5000 and np.abs(middles[0] - middles[1]).max() < 0.1 and compute_iou(mask, ours) > 0.985
+        assert measure_outline_error(frame, mask) < 1.5
+        assert measure_outline_error(frame, np.roll(mask, (4, 4), axis=(0, 1))) > 1.7
         straight = project_cv2(replace(frame.camera, lens=None), tumour.vertices)
         assert np.abs(straight - by_opencv(frame.camera, tumour.vertices)).max() > 3.0
 
@@ -65,7 +68,7 @@ def test_the_overlay_is_in_register_under_each_path(theatre, path):
 def test_a_scene_passes_its_checks_under_each_path_and_not_another_camera(theatre, path):
     play = filmed(theatre, path=PATHS[path](1), eye="left")
     frames = list(play.frames(every=30))
-    truth = truth_of(theatre, play.scene, [frame.loads for frame in frames])
+    truth = solve_reference_frames(theatre, play.scene, [frame.loads for frame in frames])
     figures = measure(play, play.camera_at, frames, truth)
     assert not figures.broken(Bounds()) and figures.pixels < 1e-6
     assert measure(play, lambda time: play.camera_at(time + 0.3), frames, truth).broken(Bounds())
@@ -87,4 +90,4 @@ def test_episodes_hold_the_lens_and_the_camera_of_each_frame(theatre, tmp_path):
         positions[file["tumour_nodes"][:]] = file["tumour_predicted"][-1]
         camera = Camera(file["K_of_frame"][-1], file["T_camera_world"][-1], file.attrs["width"], file.attrs["height"])
         mask = cv2.imdecode(file["pictures/tumour_mask"][-1], cv2.IMREAD_GRAYSCALE) > 0
-        assert mask.sum() > 5000 and iou(mask, drawn_by_opencv(camera, play.stage.tumour(positions))) > 0.985
+        assert mask.sum() > 5000 and compute_iou(mask, drawn_by_opencv(camera, play.stage.tumour(positions))) > 0.985

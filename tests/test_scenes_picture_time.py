@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenes.commands.link import address_of
-from scenes.link.answer import placed_at
-from scenes.link.console import address_words
-from scenes.link.frame import stamp_of
+from scenes.commands.link import parse_address
+from scenes.link.answer import place_camera
+from scenes.link.console import format_address
+from scenes.link.frame import to_stamp
 from scenes.link.heard import ReceivedTransforms, TransformNames
 from sim.errors import InputError
 
@@ -31,8 +31,8 @@ def heard_of(times, stamped=True, sender=0):
     names = TransformNames()
     heard = ReceivedTransforms(names, 0.3)
     for time in times:
-        stamp = stamp_of(BEGUN + time) if stamped else 0
-        heard = heard.hearing(names.camera, camera(time), stamp, time + 5e-3, sender)
+        stamp = to_stamp(BEGUN + time) if stamped else 0
+        heard = heard.add_transform(names.camera, camera(time), stamp, time + 5e-3, sender)
     return heard
 
 
@@ -45,8 +45,8 @@ def off(placed, time):
 
 def at(heard, time, now=None, stamped=True):
     middle = camera(0.0)[:3, :3] @ TUMOUR + 1e-3 * camera(0.0)[:3, 3]
-    stamp = stamp_of(BEGUN + time) if stamped else 0
-    return placed_at(heard.course(heard.names.camera), time if now is None else now, stamp, middle, heard.stale)
+    stamp = to_stamp(BEGUN + time) if stamped else 0
+    return place_camera(heard.course(heard.names.camera), time if now is None else now, stamp, middle, heard.stale)
 
 
 def test_a_picture_between_two_poses_has_a_pose_between_and_its_error_says_what_is_left():
@@ -81,10 +81,10 @@ def test_where_no_two_poses_are_round_a_picture_the_newest_counts_with_how_far_t
 def test_poses_of_another_client_or_before_a_clock_was_set_back_are_no_neighbours():
     heard = heard_of(STEP * np.arange(9))
     name = heard.names.camera
-    taken_over = heard.hearing(name, camera(0.4), stamp_of(BEGUN + 0.4), 1.0, 1)
+    taken_over = heard.add_transform(name, camera(0.4), to_stamp(BEGUN + 0.4), 1.0, 1)
     assert len(heard.course(name)) == 9 and len(taken_over.course(name)) == 1
-    set_back = heard.hearing(name, camera(0.4), stamp_of(BEGUN - 60.0), 0.4, 0)
-    assert [sent.stamp for sent in set_back.course(name)] == [stamp_of(BEGUN - 60.0)]
+    set_back = heard.add_transform(name, camera(0.4), to_stamp(BEGUN - 60.0), 0.4, 0)
+    assert [sent.stamp for sent in set_back.course(name)] == [to_stamp(BEGUN - 60.0)]
     assert len(heard_of(STEP * np.arange(200)).course(name)) == 33
 
 
@@ -100,11 +100,11 @@ def test_poses_of_another_client_or_before_a_clock_was_set_back_are_no_neighbour
     ],
 )
 def test_an_address_is_a_host_or_one_of_ipv6_in_brackets(text, address):
-    assert address_of(text) == address
-    assert address_of(address_words(*address)) == address
+    assert parse_address(text) == address
+    assert parse_address(format_address(*address)) == address
 
 
 @pytest.mark.parametrize("text", ["", ":18944", "[::1", "[localhost]:3", "::1:99999", "host:65536", "host:x", "a:b:1"])
 def test_an_address_that_is_none_is_refused(text):
     with pytest.raises(InputError, match="in brackets"):
-        address_of(text)
+        parse_address(text)

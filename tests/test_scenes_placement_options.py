@@ -9,10 +9,10 @@ import pytest
 from balls import ball
 
 from scenes.cli import main
-from scenes.options.placement_options import opened
+from scenes.options.placement_options import place_craniotomy
 from sim.bodies.label_volume import volume_subject
 from sim.errors import InputError
-from sim.runtime.journal import opened as opened_journal
+from sim.runtime.journal import open_journal as opened_journal
 
 
 def two_foci(folder):
@@ -31,20 +31,20 @@ def test_the_skull_is_opened_over_the_piece_that_is_asked_for(tmp_path):
     large, small = subject.pieces
     assert large.volume > 3.0 * small.volume and large.centre[0] > 0.0 > small.centre[0]
     asked = dict.fromkeys(("opening_at", "opening_over"))
-    site = opened(subject, SimpleNamespace(**asked)).site
+    site = place_craniotomy(subject, SimpleNamespace(**asked)).site
     assert site[0] > 0.0 and site @ large.centre > 0.99 * np.linalg.norm(site) * np.linalg.norm(large.centre)
-    site = opened(subject, SimpleNamespace(**asked | {"opening_over": 2})).site
+    site = place_craniotomy(subject, SimpleNamespace(**asked | {"opening_over": 2})).site
     assert site @ small.centre > 0.99 * np.linalg.norm(site) * np.linalg.norm(small.centre)
-    at = opened(subject, SimpleNamespace(**asked | {"opening_at": (-50.0, 0.0, 20.0)})).site
+    at = place_craniotomy(subject, SimpleNamespace(**asked | {"opening_at": (-50.0, 0.0, 20.0)})).site
     assert np.linalg.norm(at - [-0.05, 0.0, 0.02]) < 5e-3
-    site = opened(subject, SimpleNamespace(**asked | {"opening_over": (-25.0, 25.0, 20.0)})).site
+    site = place_craniotomy(subject, SimpleNamespace(**asked | {"opening_over": (-25.0, 25.0, 20.0)})).site
     assert site[0] < -0.02 and site[1] > 0.02
     with pytest.raises(InputError, match=r"lies \d+ mm outside the brain"):
-        opened(subject, SimpleNamespace(**asked | {"opening_over": (-90.0, 0.0, 20.0)}))
+        place_craniotomy(subject, SimpleNamespace(**asked | {"opening_over": (-90.0, 0.0, 20.0)}))
     with pytest.raises(InputError, match="has 2 pieces: choose 1 to 2"):
-        opened(subject, SimpleNamespace(**asked | {"opening_over": 3}))
+        place_craniotomy(subject, SimpleNamespace(**asked | {"opening_over": 3}))
     with pytest.raises(InputError, match="has one piece: give no number"):
-        opened(replace(subject, pieces=(large,)), SimpleNamespace(**asked | {"opening_over": 2}))
+        place_craniotomy(replace(subject, pieces=(large,)), SimpleNamespace(**asked | {"opening_over": 2}))
 
 
 def test_an_anatomy_says_where_its_pieces_lie_and_refuses_to_leave_data_behind(tmp_path, capsys):

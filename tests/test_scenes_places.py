@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from scenes.cli import main
-from scenes.warp.landmarks import landmarks_of
+from scenes.warp.landmarks import list_landmarks
 from scenes.warp.moment import Cause, DeformedAnatomy
-from scenes.warp.places import ENOUGH, FINEST, fields_of, finer_spacing, folds_of, places_of
+from scenes.warp.places import ENOUGH, FINEST, find_finer_spacing, find_folds, list_fields, list_places
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.errors import InputError
 from sim.fields.warp_fields import warp_fields, warp_grid
-from sim.geometry.tetmesh import signed_volumes
+from sim.geometry.tetmesh import compute_signed_volumes
 
 
-def moment_of(body, displacement):
+def choose_moment(body, displacement):
     return DeformedAnatomy(Cause("a test", {}), body, body, displacement)
 
 
@@ -26,7 +26,7 @@ def kinked(small_box):
     """One vertex of the tumour goes 2.6 mm aside; its neighbours, 6 mm away, stay."""
     moved = np.zeros_like(small_box.mesh.nodes)
     moved[small_box.tumour_nodes[0]] = [0.0, 2.6e-3, 0.0]
-    return moment_of(small_box, moved)
+    return choose_moment(small_box, moved)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def fields(kinked):
 
 
 def test_the_error_of_each_part_is_that_of_the_worse_field(kinked, fields):
-    places = places_of(kinked)
+    places = list_places(kinked)
     errors = places.errors(fields)
     assert 0.05e-3 < errors[places.tumour].max() < 1e-3 and errors[places.cortex].max() < 1e-6
     # No field reaches beyond the grid.
@@ -57,33 +57,33 @@ def test_places_in_necrosis_are_the_tumours(kinked):
     region = mesh.region.copy()
     region[np.flatnonzero(region == TUMOUR_LABEL)[::2]] = NECROSIS_LABEL
     body = replace(kinked.anatomy, mesh=replace(mesh, region=region))
-    assert np.array_equal(places_of(moment_of(body, kinked.displacement)).tumour, places_of(kinked).tumour)
+    assert np.array_equal(list_places(choose_moment(body, kinked.displacement)).tumour, list_places(kinked).tumour)
 
 
 def test_a_spacing_follows_from_the_tumours_error(kinked, fields):
-    finer = finer_spacing(kinked, fields)
+    finer = find_finer_spacing(kinked, fields)
     assert FINEST <= finer < fields.grid.spacing
-    found = fields_of(kinked, None, lambda more: None)
-    places = places_of(kinked)
+    found = list_fields(kinked, None, lambda more: None)
+    places = list_places(kinked)
     assert places.errors(found)[places.tumour].max() <= ENOUGH and found.grid.spacing < 1e-3
-    assert finer_spacing(kinked, found) is None
-    still = moment_of(kinked.anatomy, 1e-2 * kinked.displacement)
-    assert fields_of(still, None, lambda more: None).grid.spacing == 1e-3
+    assert find_finer_spacing(kinked, found) is None
+    still = choose_moment(kinked.anatomy, 1e-2 * kinked.displacement)
+    assert list_fields(still, None, lambda more: None).grid.spacing == 1e-3
 
 
 @pytest.fixture(scope="module")
 def dented(small_box):
     """The open cortex's landmark goes 4.5 mm inwards, its neighbours, 6 mm away, stay; and the tumour."""
-    mesh, (_, mark) = small_box.mesh, landmarks_of(small_box, np.zeros_like(small_box.mesh.nodes))
+    mesh, (_, mark) = small_box.mesh, list_landmarks(small_box, np.zeros_like(small_box.mesh.nodes))
     moved = np.zeros_like(mesh.nodes)
     moved[np.linalg.norm(mesh.nodes - mark.rest, axis=1).argmin()] = [0.0, 0.0, -4.5e-3]
-    return moment_of(small_box, moved)
+    return choose_moment(small_box, moved)
 
 
 def test_a_dent_is_fitted_at_the_surface_by_what_lies_outside(dented):
     """Points of the tetrahedra alone leave the cortex 0.9 mm off."""
     fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
-    places = places_of(dented)
+    places = list_places(dented)
     errors = places.errors(fields)
     assert places.landmarks.sum() == 2 and not fields.folds
     assert errors[places.cortex].max() < 0.2e-3 and errors[places.landmarks].max() < 0.1e-3
@@ -91,9 +91,9 @@ def test_a_dent_is_fitted_at_the_surface_by_what_lies_outside(dented):
 
 def test_a_spacing_follows_from_the_landmarks_error_too(dented):
     fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
-    places = places_of(dented)
+    places = list_places(dented)
     assert places.errors(fields)[places.tumour].max() < ENOUGH / 10.0
-    finer = finer_spacing(dented, fields)
+    finer = find_finer_spacing(dented, fields)
     assert finer is not None and finer < 1.5e-3
 
 
@@ -105,15 +105,15 @@ def test_folds_are_found_however_slight_and_the_largest_comes_first(small_box):
     for vertex, times in ((first, 1.0001), (last, 2.0)):
         tet = mesh.tets[(mesh.tets == vertex).any(axis=1)][0]
         moved[vertex] = times * (mesh.nodes[tet[tet != vertex]].mean(axis=0) - mesh.nodes[vertex])
-    moment = moment_of(small_box, moved)
-    folds = folds_of(moment, warp_fields(small_box, moved, 2e-3))
+    moment = choose_moment(small_box, moved)
+    folds = find_folds(moment, warp_fields(small_box, moved, 2e-3))
     assert len(folds) == 2 and folds[0].volume >= folds[1].volume and folds[0].tetrahedra > folds[1].tetrahedra
     assert all(fold.off > 0.1e-3 for fold in folds)
 
 
 def test_a_spacing_of_too_many_nodes_is_refused(small_box):
     with pytest.raises(InputError, match="million are the most"):
-        fields_of(moment_of(small_box, np.full_like(small_box.mesh.nodes, 40e-3)), 0.3e-3, lambda more: None)
+        list_fields(choose_moment(small_box, np.full_like(small_box.mesh.nodes, 40e-3)), 0.3e-3, lambda more: None)
 
 
 def test_where_the_finite_elements_fold_the_fields_do_not_and_it_is_said(small_box, tmp_path, capsys):
@@ -122,10 +122,10 @@ def test_where_the_finite_elements_fold_the_fields_do_not_and_it_is_said(small_b
     vertex = int(np.linalg.norm(mesh.nodes - middle, axis=1).argmin())
     moved = np.zeros_like(mesh.nodes)
     moved[vertex] = [6.5e-3, 1e-3, 0.0]  # past its neighbours, 6 mm away
-    bad = signed_volumes(mesh.nodes + moved, mesh.tets) <= 0.0
-    moment = moment_of(small_box, moved)
+    bad = compute_signed_volumes(mesh.nodes + moved, mesh.tets) <= 0.0
+    moment = choose_moment(small_box, moved)
     fields = warp_fields(small_box, moved, 2e-3)
-    (fold,) = folds_of(moment, fields)
+    (fold,) = find_folds(moment, fields)
     assert not fields.folds and fields.least[2] < 0.0 and min(fields.least[:2]) > 0.0
     assert fold.tetrahedra == bad.sum() > 0 and fold.volume == pytest.approx(mesh.volumes[bad].sum())
     assert np.linalg.norm(fold.middle - mesh.nodes[vertex]) < 8e-3 and fold.off > 0.2e-3
@@ -143,8 +143,8 @@ def test_where_the_finite_elements_fold_the_fields_do_not_and_it_is_said(small_b
 
 
 def test_finer_spacing_wide_field_keeps_within_32_million_nodes(kinked):
-    wide = moment_of(kinked.anatomy, kinked.displacement + [40e-3, 0.0, 0.0])
-    finer = finer_spacing(wide, warp_fields(wide.anatomy, wide.displacement, 5e-3))
+    wide = choose_moment(kinked.anatomy, kinked.displacement + [40e-3, 0.0, 0.0])
+    finer = find_finer_spacing(wide, warp_fields(wide.anatomy, wide.displacement, 5e-3))
     grids = (warp_grid(wide.anatomy, wide.displacement[None], spacing) for spacing in (finer, finer - 0.05e-3))
     fits, too_many = (np.prod(grid.shape) for grid in grids)
     assert fits <= 32e6 < too_many

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from conftest import make_box
 
-from scenes.episodes.checksums import broken
-from scenes.episodes.make import episode_path, make_body, make_episode
+from scenes.episodes.checksums import find_broken
+from scenes.episodes.make import make_body, make_episode, to_episode_path
 from scenes.episodes.plan import load_plan, plan_from
-from scenes.episodes.scripted import drawn_episode
+from scenes.episodes.scripted import sample_episode
 from scenes.play.deformers import open_theatre
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
@@ -20,8 +20,8 @@ from sim.errors import InputError
 from sim.material import BRAIN, Material
 from sim.runtime.device import find_device
 from sim.runtime.memory import check_fits
-from surrogate.data.answer_rows import stated_tissue, stating
-from surrogate.model.applicability import refusal
+from surrogate.data.answer_rows import describe_tissue_source, read_tissue_statement
+from surrogate.model.applicability import find_rejection
 
 TINY = """
 title = "tiny"
@@ -114,11 +114,11 @@ def made(tmp_path_factory):
 
 def test_an_episode_says_what_it_was_drawn_from(made):
     folder, plan, episode = made
-    assert episode.path == episode_path(folder, 5) and episode.frames == 5 and not episode.failed
+    assert episode.path == to_episode_path(folder, 5) and episode.frames == 5 and not episode.failed
     with h5py.File(episode.path) as file:
-        assert file.attrs["plan"] == TINY and file.attrs["plan_digest"] == plan.digest and not broken(file)
+        assert file.attrs["plan"] == TINY and file.attrs["plan_digest"] == plan.digest and not find_broken(file)
         assert (file.attrs["seed"], file.attrs["episode"], file.attrs["solved_every"]) == (1, 5, 3)
-        drawn = drawn_episode(plan.contents, 1, 5)
+        drawn = sample_episode(plan.contents, 1, 5)
         stated = json.loads(file.attrs["parameters"])
         assert file.attrs["family"] == drawn.family and drawn.values.items() <= stated.items()
         assert file["fem_frames"][:].tolist() == [0, 3] and file["cortex_fem"].shape[0] == 2
@@ -138,7 +138,7 @@ def test_the_same_episode_has_the_same_bytes_wherever_it_is_made(made, tmp_path)
     make_episode(tmp_path, plan, 1, 6, "cpu")
     again = make_episode(tmp_path, plan, 1, 5, "cpu")
     assert again.path.read_bytes() == episode.path.read_bytes()
-    assert episode_path(tmp_path, 6).read_bytes() != episode.path.read_bytes()
+    assert to_episode_path(tmp_path, 6).read_bytes() != episode.path.read_bytes()
     assert make_episode(tmp_path, plan, 1, 5, "cpu").skipped and make_body(tmp_path, plan, 1, 0, "cpu").skipped
 
 
@@ -147,9 +147,9 @@ def test_a_changed_number_breaks_a_checksum(made, tmp_path):
     path.write_bytes(made[2].path.read_bytes())
     with h5py.File(path, "r+") as file:
         file["tumour_predicted"][1, 0, 0] += 1e-9
-        assert broken(file) == ["/tumour_predicted: is not as it was written"]
+        assert find_broken(file) == ["/tumour_predicted: is not as it was written"]
         file.attrs["seed"] = 2
-        assert "attributes" in broken(file)[1]
+        assert "attributes" in find_broken(file)[1]
 
 
 def test_what_cannot_be_meshed_fails_with_its_reason(tmp_path):
@@ -175,11 +175,15 @@ def test_want_of_memory_fails_no_body_for_good(tmp_path, monkeypatch):
 
 def test_a_model_knows_what_the_tumour_is_made_of():
     tissue = Elasticity(BRAIN, {TUMOUR_LABEL: Material("neo-hookean", 9000.0, 0.49)})
-    assert stated_tissue(stating(tissue)) == tissue and stated_tissue(stating(Elasticity(BRAIN))) == Elasticity(BRAIN)
+    assert read_tissue_statement(describe_tissue_source(tissue)) == tissue and read_tissue_statement(
+        describe_tissue_source(Elasticity(BRAIN))
+    ) == Elasticity(BRAIN)
     theatre = open_theatre()
     model = theatre.models["series-gp"]
-    other = replace(model, training={**model.training, **stating(tissue)})
+    other = replace(model, training={**model.training, **describe_tissue_source(tissue)})
     here = pushed_effects(theatre.anatomy, tissue)
-    assert refusal(other, here) is None
-    assert "region 2" in (refusal(model, here) or "") and refusal(other, pushed_effects(theatre.anatomy, BRAIN))
+    assert find_rejection(other, here) is None
+    assert "region 2" in (find_rejection(model, here) or "") and find_rejection(
+        other, pushed_effects(theatre.anatomy, BRAIN)
+    )
     assert "region 2" in other.source

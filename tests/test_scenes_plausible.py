@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from test_scenes_overlay import INK, pictures
 
-from ar.overlay.outlines import of_ink
+from ar.overlay.outlines import find_ink
 from scenes.tracked.follower import TumourState
 from scenes.tracked.picture import Painter
-from scenes.tracked.plausible import implausible
+from scenes.tracked.plausible import describe_implausible
 
 
 def test_a_registration_of_another_patient_is_noticed(follower, stage):
@@ -19,10 +19,10 @@ def test_a_registration_of_another_patient_is_noticed(follower, stage):
     known = other.step(first.grey, 0.0)
     assert known.state is TumourState.UNSURE and known.band is None and "mm from the reference" in known.words
     painted = Painter(stage, follower.tool).paint(first.colour, known).colour
-    assert np.count_nonzero(of_ink(painted, INK)) < 5
+    assert np.count_nonzero(find_ink(painted, INK)) < 5
     near = follower.step(first.grey, 0.0)
     behind = replace(near.camera, T_camera_world=np.diag([1.0, -1.0, -1.0, 1.0]) @ near.camera.T_camera_world)
-    assert "behind the camera" in implausible(follower.registration, stage, behind)
+    assert "behind the camera" in describe_implausible(follower.registration, stage, behind)
     long = follower.tool.T_cube_tool @ [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.4], [0, 0, 0, 1.0]]
     away = replace(follower, tool=replace(follower.tool, T_cube_tool=long))
     known = away.step(first.grey, 0.0)

@@ -10,15 +10,15 @@ from theatres import PUSHING, on_template, player, short, small
 
 from ar.optics.camera import project_cv2
 from ar.overlay.composite import WARNING
-from ar.overlay.hud import FINE, NARROW, WHITE, folded
-from ar.overlay.outlines import ink_of, stands
-from scenes.play.frame_text import shortened
+from ar.overlay.hud import FINE, NARROW, WHITE, wrap_line
+from ar.overlay.outlines import compute_ink, has_text
+from scenes.play.frame_text import shorten_source
 from scenes.play.player import CARRIED, IN_BONE, STAGES
 from scenes.play.stage import CORTEX, TOOL
 from scenes.script.scene import Viewpoint
 from scenes.script.tool_paths import Touch
 from sim.effects import Elasticity
-from sim.fem import solver_named
+from sim.fem import describe_solver
 from sim.material import Material, Ogden
 from surrogate.model.learned import Learned
 
@@ -33,7 +33,7 @@ def heights(play, frame, points):
 
 def says(picture, text, ink=WHITE):
     """Whether a picture (H, W, 3) says a sentence, folded as it has to be."""
-    return all(stands(picture, line, FINE, ink) for line in folded(text, NARROW * picture.shape[1]))
+    return all(has_text(picture, line, FINE, ink) for line in wrap_line(text, NARROW * picture.shape[1]))
 
 
 def test_the_pressing_tip_rests_on_the_deformed_surface(play):
@@ -64,7 +64,7 @@ def test_tissue_that_carries_the_tool_into_the_bone_is_not_relied_on(theatre):
     play = player(theatre, replace(small(), viewpoint=Viewpoint()), "fem")
     reach = play.site.reach(play.scene.tool.radius)
     frame = play.draw(0, 0.0, Touch(reach, 0.0, force=0.4, tilt=(np.radians(40.0), 0.0)))
-    assert frame.doubt == IN_BONE and all(says(frame.shown, part, ink_of(WARNING)) for part in IN_BONE.split(": "))
+    assert frame.doubt == IN_BONE and all(says(frame.shown, part, compute_ink(WARNING)) for part in IN_BONE.split(": "))
     assert play.site.across(frame.tip[None])[0] <= reach + 1e-9 and frame.distance_error is None
 
 
@@ -167,10 +167,10 @@ def test_the_overlay_lies_where_the_tumour_is(play):
 def test_a_frame_finds_the_resting_tool_and_the_nearest_point_once(play, monkeypatch):
     found = []
     for place, name in (
-        ("scenes.play.player", "resting_tip"),
-        ("sim.bodies.tip_distance", "resting_tips"),
-        ("scenes.play.player", "closest"),
-        ("sim.bodies.tip_distance", "closest"),
+        ("scenes.play.player", "find_resting_tip"),
+        ("sim.bodies.tip_distance", "find_resting_tips"),
+        ("scenes.play.player", "find_closest_points"),
+        ("sim.bodies.tip_distance", "find_closest_points"),
     ):
         whole = getattr(importlib.import_module(place), name)
 
@@ -180,7 +180,7 @@ def test_a_frame_finds_the_resting_tool_and_the_nearest_point_once(play, monkeyp
 
         monkeypatch.setattr(f"{place}.{name}", counted)
     frame = play.draw(3, 0.1, Touch(force=0.3))
-    assert sorted(found) == ["closest", "resting_tip"] and frame.distance is not None
+    assert sorted(found) == ["find_closest_points", "find_resting_tip"] and frame.distance is not None
 
 
 def test_the_distance_is_that_from_tip_to_tumour(play):
@@ -211,7 +211,7 @@ def test_learnt_and_finite_elements_are_interchangeable(theatre):
 
 def test_regions_of_a_tissue_of_their_own_are_named_in_short():
     own = Elasticity(regions={2: Material("neo-hookean", 9e3, 0.49), 3: Ogden(((1.0, 2.0), (3.0, 4.0)), 1e5)})
-    whole = solver_named("p1", [replace(own, regions=own.regions | {7: Material("linear", 1e3, 0.4)})])
-    brief = solver_named("p1", [Elasticity()]).removesuffix(")")
-    assert shortened(f"linear, from {whole}") == f"linear, from {brief}; own tissue: tumour, oedema, region 7)"
-    assert shortened(f"{brief})") == f"{brief})"
+    whole = describe_solver("p1", [replace(own, regions=own.regions | {7: Material("linear", 1e3, 0.4)})])
+    brief = describe_solver("p1", [Elasticity()]).removesuffix(")")
+    assert shorten_source(f"linear, from {whole}") == f"linear, from {brief}; own tissue: tumour, oedema, region 7)"
+    assert shorten_source(f"{brief})") == f"{brief})"

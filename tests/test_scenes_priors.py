@@ -7,14 +7,14 @@ import pytest
 from theatres import short
 
 from scenes.analysis.uncertainty import (
-    changed,
-    mesh_errors,
-    mesh_prior,
-    off_by,
-    skull_of,
-    skulls_of,
+    apply_sample,
+    build_skull,
+    compute_error,
+    find_mesh_prior,
+    list_skulls,
+    sample_mesh_errors,
 )
-from scenes.script.priors import POISSON, PRIORS, STIFFNESS, PatientSample, drawn
+from scenes.script.priors import POISSON, PRIORS, STIFFNESS, PatientSample, sample_priors
 from scenes.script.scene import find_scene
 from sim.effects import SKULLS
 from sim.material import BRAIN
@@ -29,31 +29,33 @@ class TestPriors:
 
     def test_draws_cover_each_prior_evenly(self):
         """One draw in each of so many parts of equal probability."""
-        found = drawn(20, 3)
+        found = sample_priors(20, 3)
         stiffness = np.sort([one.stiffness for one in found])
         edges = STIFFNESS.at(np.arange(21) / 20.0)
         assert (stiffness > edges[:-1]).all() and (stiffness < edges[1:]).all()
         poisson = np.sort([one.poisson for one in found])
         assert np.diff(POISSON.range)[0] > np.ptp(poisson) > 0.9 * np.diff(POISSON.range)[0]
         assert np.std([one.tip for one in found]) == pytest.approx(1.06e-3, rel=0.15)
-        assert found == drawn(20, 3) != drawn(20, 4)
+        assert found == sample_priors(20, 3) != sample_priors(20, 4)
 
     def test_each_skull_is_as_probable(self):
-        names = [changed(short(), one).effects[2] for one in drawn(30, 0)]
+        names = [apply_sample(short(), one).effects[2] for one in sample_priors(30, 0)]
         assert [names.count(skull) for skull in SKULLS.values()] == [10, 10, 10]
 
     def test_from_a_skull_that_lets_go_nothing_is_bonded(self):
-        assert skulls_of(find_scene("brain_shift")) == ("slide", "contact")
+        assert list_skulls(find_scene("brain_shift")) == ("slide", "contact")
 
     def test_meshes_are_farther_off_where_the_brain_slides_and_the_farthest_under_weight(self):
         press, sinking = find_scene("press"), find_scene("brain_shift")
-        assert skull_of(press) == "bonded" and skull_of(sinking) == "contact"
+        assert build_skull(press) == "bonded" and build_skull(sinking) == "contact"
         draws = [replace(SAME, skull=share, mesh=1.0) for share in (0.1, 0.5, 0.9)]
-        np.testing.assert_allclose(mesh_errors(press, draws), [0.05, 0.12, 0.12])
-        np.testing.assert_allclose(mesh_errors(sinking, draws), 0.25)
+        np.testing.assert_allclose(sample_mesh_errors(press, draws), [0.05, 0.12, 0.12])
+        np.testing.assert_allclose(sample_mesh_errors(sinking, draws), 0.25)
         loose = replace(press, effects=tuple(one for one in press.effects if one not in SKULLS.values()))
-        assert skull_of(loose) is None
-        np.testing.assert_allclose(mesh_errors(loose, draws), 0.05)
-        assert mesh_prior(sinking, "bonded").range[1] == 0.05
+        assert build_skull(loose) is None
+        np.testing.assert_allclose(sample_mesh_errors(loose, draws), 0.05)
+        assert find_mesh_prior(sinking, "bonded").range[1] == 0.05
         motion = np.ones((3, 2, 3))
-        np.testing.assert_allclose(off_by(motion, motion[0], mesh_errors(press, draws))[:, 0, 0], [0.05, 0.12, 0.12])
+        np.testing.assert_allclose(
+            compute_error(motion, motion[0], sample_mesh_errors(press, draws))[:, 0, 0], [0.05, 0.12, 0.12]
+        )

@@ -8,7 +8,7 @@ import numpy as np
 from test_scenes_palpate import small
 from theatres import player
 
-from scenes.play.reference import truth_of
+from scenes.play.reference import solve_reference_frames
 from sim.effects import Pulsation
 
 
@@ -24,5 +24,5 @@ class TestPulsation:
     def test_frames_after_one_another_are_the_truth(self, theatre):
         scene = small("pulsation")
         loads = [scene.loads(theatre.site, scene.path(time), time) for time in (0.0, 0.8, 1.25, 1.6)]
-        truth = truth_of(theatre, scene, loads)
+        truth = solve_reference_frames(theatre, scene, loads)
         assert all(outcome.good for outcome in truth.outcome) and truth.displacement[3].any()

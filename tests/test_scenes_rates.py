@@ -13,7 +13,7 @@ import pytest
 from conftest import make_box
 
 from scenes.episodes.rates import read_rates
-from scenes.episodes.run_folder import failed, finished
+from scenes.episodes.run_folder import list_failed, list_finished
 from sim.bodies.meshfile import write_anatomy
 
 pytestmark = pytest.mark.skipif(
@@ -145,15 +145,15 @@ def test_a_machine_of_a_scheduler_is_lost_and_comes_again(network, plan, undistu
         one = begun("one", [*work, "--host", ADDRESS["one"]])
         begun("two", [*work, "--host", ADDRESS["two"]])
         client = begun("lan", [*command(plan, folder), "--scheduler", SCHEDULER])
-        awaited(lambda: len(finished(folder)) >= 8)
+        awaited(lambda: len(list_finished(folder)) >= 8)
         lose(network, "one", one)
         before = files(folder)
         awaited(lambda: "Remove worker addr: tcp://" + ADDRESS["one"] in (tmp_path / "lan.txt").read_text())
-        awaited(lambda: len(finished(folder)) >= len(before) + 5)  # the other goes on
+        awaited(lambda: len(list_finished(folder)) >= len(before) + 5)  # the other goes on
         ip("-n", network + "lan", "link", "set", "one", "up")
         begun("one", [*work, "--host", ADDRESS["one"]])
         assert client.wait(timeout=240) == 0
-    assert held(folder) == undisturbed and before.items() <= files(folder).items() and not failed(folder)
+    assert held(folder) == undisturbed and before.items() <= files(folder).items() and not list_failed(folder)
     numbers = [rate.number for rate in read_rates(folder) if rate.kind == "episode"]
     assert len(set(numbers)) == len(numbers) <= COUNT
 
@@ -162,11 +162,11 @@ def test_machines_that_know_nothing_of_each_other_share_a_folder(network, plan, 
     folder = tmp_path / "set"
     words = [*command(plan, folder), "--workers", "1"]
     with machine(network, "one", words, folder) as one, machine(network, "two", words, folder) as two:
-        awaited(lambda: len(finished(folder)) >= 8)
+        awaited(lambda: len(list_finished(folder)) >= 8)
         lose(network, "one", one)
         before = files(folder)
         assert two.wait(timeout=240) == 0
-    assert held(folder) == undisturbed and before.items() <= files(folder).items() and not failed(folder)
+    assert held(folder) == undisturbed and before.items() <= files(folder).items() and not list_failed(folder)
     with machine(network, "one", words, folder) as one:  # as it comes again, there is nothing left to do
         assert one.wait(timeout=120) == 0
     assert before.items() <= files(folder).items() and held(folder) == undisturbed

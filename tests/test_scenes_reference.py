@@ -13,30 +13,30 @@ from theatres import small
 
 from scenes.builtin.retract import RELAXING
 from scenes.play.deformers import Theatre
-from scenes.play.reference import truth_of
-from scenes.report.reference import ReferenceSolutions, beyond_of, reference_of, solve_reference
-from scenes.report.row import against_reference
+from scenes.play.reference import solve_reference_frames
+from scenes.report.reference import ReferenceSolutions, get_reference, get_solutions_beyond, solve_reference
+from scenes.report.row import compare_with_reference
 from sim.accuracy import TRAIN
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Pushed, push
-from surrogate.model.training_range import envelope_of
+from surrogate.model.training_range import compute_training_range
 
 
 def test_only_loads_that_both_converged_for_are_compared(study, study_box, monkeypatch):
     truth = ReferenceSolutions(np.full((2, len(study.drawn), 3), 1e-3), np.array([True, False]), np.ones(2))
-    monkeypatch.setattr("scenes.report.row.reference_of", lambda study: truth)
+    monkeypatch.setattr("scenes.report.row.get_reference", lambda study: truth)
     answer = np.full((2, len(study_box.tumour_nodes), 3), [[[1e-3, 1e-3, 3e-3]], [[np.nan] * 3]])
     for good, loads in (([True, True], 1), ([True, False], 1)):
-        figures = against_reference(study, answer, np.array(good), study_box.tumour_nodes)
+        figures = compare_with_reference(study, answer, np.array(good), study_box.tumour_nodes)
         assert figures.loads == loads and figures.mm.mean == pytest.approx(2.0) == figures.mm.largest
-    assert against_reference(study, answer, np.array([False, True]), study_box.tumour_nodes) is None
+    assert compare_with_reference(study, answer, np.array([False, True]), study_box.tumour_nodes) is None
 
 
 def test_a_reference_goes_on_load_by_load(study, monkeypatch):
     deform = Fem.deform
-    before = reference_of(study)
+    before = get_reference(study)
     lost = sorted((study.folder / "answers").glob("reference-*"))[1]
     lost.unlink()
     solved = []
@@ -44,15 +44,15 @@ def test_a_reference_goes_on_load_by_load(study, monkeypatch):
     reported = []
     solve_reference(study, reported.append)
     assert solved == [1] and reported == [1, 1]
-    assert np.allclose(reference_of(study).displacement, before.displacement, atol=1e-12) and before.good.all()
+    assert np.allclose(get_reference(study).displacement, before.displacement, atol=1e-12) and before.good.all()
 
 
 def test_a_damaged_answer_is_named(study):
     """So is a damaged table of the series: a stopped run goes on from both."""
-    reference_of(study)
+    get_reference(study)
     kept = study.folder / "answers"
     answer, table = min(kept.glob("reference-*")), kept / f"series-{study.digest}.npz"
-    for path, ask in ((answer, lambda: reference_of(study)), (table, lambda: replace(study).expansion.tabulated)):
+    for path, ask in ((answer, lambda: get_reference(study)), (table, lambda: replace(study).expansion.tabulated)):
         path.write_bytes(b"PK" * 100)
         with pytest.raises(InputError, match=f"{path.name}.*Delete it: it is computed again"):
             ask()
@@ -64,7 +64,7 @@ def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path):
     one, fine = (replace(study, folder=tmp_path, loads=1, fine=fine) for fine in (False, True))
     for each in (one, fine):
         solve_reference(each, nothing, TRAIN)
-    coarse, finer = reference_of(one).displacement, reference_of(fine).displacement
+    coarse, finer = get_reference(one).displacement, get_reference(fine).displacement
     off = np.linalg.norm(coarse - finer, axis=2).mean() / np.linalg.norm(finer, axis=2).mean()
     assert 1e-3 < off < 0.3
 
@@ -72,11 +72,11 @@ def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path):
 def test_what_lies_beyond_is_outside_the_envelope(study):
     training = study.converged.rows(np.flatnonzero(study.discs.train)).of(Pushed)
     outside = study.outside.of(Pushed)
-    assert not envelope_of(study.patch, training).holds(study.patch, outside).any()
+    assert not compute_training_range(study.patch, training).holds(study.patch, outside).any()
     size = np.linalg.norm(outside.force, axis=1)
     assert (size[::3] > 1.19 * np.linalg.norm(training.force, axis=1).max()).all()
-    assert (study.patch.rim_distance(outside.point[2::3]) < outside.footprint[2::3]).all()
-    assert beyond_of(study).displacement.shape == (study.beyond, len(study.anatomy.tumour_nodes), 3)
+    assert (study.patch.compute_edge_distance(outside.point[2::3]) < outside.footprint[2::3]).all()
+    assert get_solutions_beyond(study).displacement.shape == (study.beyond, len(study.anatomy.tumour_nodes), 3)
 
 
 def test_the_truth_of_a_frame_knows_what_went_before() -> None:
@@ -86,7 +86,7 @@ def test_the_truth_of_a_frame_knows_what_went_before() -> None:
     scene = replace(small(), effects=(Elasticity(RELAXING), Held(), Slide(), ToolForce()), element="p1")
     moments = ((1.5, 0.5), (1.5, 2.0), (0.5, 2.2))
     loads = [scene.loads(theatre.site, scene.path(moment), time) for moment, time in moments]
-    found, fem, last = truth_of(theatre, scene, loads).displacement, theatre.fem(scene, TRAIN), None
+    found, fem, last = solve_reference_frames(theatre, scene, loads).displacement, theatre.fem(scene, TRAIN), None
     for row, load in zip(found, loads, strict=True):
         last = fem.deform(load, start=last)
         np.testing.assert_allclose(row, last.displacement[0], atol=1e-9)
@@ -98,7 +98,7 @@ def test_whoever_waits_for_the_truth_sees_it_go_by(pretender):
     theatre = SimpleNamespace(fem=lambda scene, accuracy, batch: pretender)
     loads = [push(np.array([0.001 * k, 0.0, 0.0]), np.array([0.0, 0.0, -0.1]), 6e-3) for k in range(20)]
     heard = []
-    found = truth_of(theatre, None, loads, heard.append)
+    found = solve_reference_frames(theatre, None, loads, heard.append)
     assert heard == [16, 4]
     alone = np.concatenate([pretender.deform(load).displacement for load in loads])
     np.testing.assert_allclose(found.displacement, alone, atol=1e-12)

@@ -10,7 +10,7 @@ import pytest
 from test_sim_necrosis import hollowed, necrotic_labels
 
 from scenes.cli import main
-from scenes.report.finite_elements import tissue_of as tissue_of_law
+from scenes.report.finite_elements import get_tissue as tissue_of_law
 from scenes.report.study import ReportStudy
 from sim.accuracy import TRAIN
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
@@ -18,7 +18,7 @@ from sim.bodies.meshfile import write_anatomy
 from sim.effects import Elasticity, pushed_effects
 from sim.fem import Fem
 from sim.material import BRAIN, Material
-from surrogate.data.answer_rows import stated_tissue
+from surrogate.data.answer_rows import read_tissue_statement
 from surrogate.data.dataset import read_dataset
 from surrogate.training.expansion import Expansion
 
@@ -42,7 +42,7 @@ RUN = "--count", "2", "--device", "cpu", "--element", "p1", "--json"
 class TestData:
     def test_are_of_the_regions_tissue_and_state_it(self, data):
         found = read_dataset(data)
-        assert stated_tissue(found.provenance) == TISSUE
+        assert read_tissue_statement(found.provenance) == TISSUE
         truth = Fem(found.anatomy, pushed_effects(found.anatomy, TISSUE), TRAIN, "cpu", element="p1").deform(
             found.loads
         )
@@ -55,7 +55,7 @@ class TestData:
         linear = tissue_of_law(study.tissue, "linear")
         assert linear.of(NECROSIS_LABEL) == Material("linear", 500.0, BRAIN.poisson)
         whole = study.anatomy.without(np.flatnonzero(study.anatomy.mesh.within(NECROSIS_LABEL)))
-        assert study.tissue_on(whole) == Elasticity(BRAIN, {TUMOUR_LABEL: STIFF})
+        assert study.get_tissue_on(whole) == Elasticity(BRAIN, {TUMOUR_LABEL: STIFF})
 
     def test_are_trained_on_with_it(self, data):
         assert TISSUE in Expansion(read_dataset(data), "cpu").fem().effects

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from test_ar_registration import SCAN, moved
 
-from ar.tracking.registration import registered
+from ar.tracking.registration import register_points
 from scenes.script.shipped_files import template_path
-from scenes.tracked.registration_file import other_mesh, read_registration, scanned_of, write_registration
+from scenes.tracked.registration_file import describe_other_mesh, describe_scan, read_registration, write_registration
 from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 
 
 def test_a_file_gives_back_what_was_written_and_damage_is_named(tmp_path):
     path, rng = tmp_path / "r.json", np.random.default_rng(0)
-    found = registered(SCAN, moved(SCAN) + 1e-3 * rng.normal(size=SCAN.shape))
+    found = register_points(SCAN, moved(SCAN) + 1e-3 * rng.normal(size=SCAN.shape))
     write_registration(path, found)
     again = read_registration(path)
     for name in ("T_patient_scan", "covariance", "centre"):
@@ -40,18 +40,18 @@ def test_a_file_gives_back_what_was_written_and_damage_is_named(tmp_path):
 
 def test_it_is_refused_for_another_body_and_not_for_another_mesh(tmp_path):
     anatomy, path = read_anatomy(template_path()), tmp_path / "r.json"
-    made = scanned_of(anatomy)
-    found = replace(registered(SCAN, moved(SCAN)), scanned=made)
+    made = describe_scan(anatomy)
+    found = replace(register_points(SCAN, moved(SCAN)), scanned=made)
     write_registration(path, found)
     again = read_registration(path)
     assert again.scanned.digest == made.digest and again.scanned.apart(made) < 1e-9
-    assert other_mesh(again, anatomy, path) == ""
-    assert "does not say of which anatomy" in other_mesh(replace(again, scanned=None), anatomy, path)
+    assert describe_other_mesh(again, anatomy, path) == ""
+    assert "does not say of which anatomy" in describe_other_mesh(replace(again, scanned=None), anatomy, path)
     meshed = replace(again, scanned=replace(made, digest="other", bounds=made.bounds + 2e-3))
-    assert "another mesh" in other_mesh(meshed, anatomy, path)
+    assert "another mesh" in describe_other_mesh(meshed, anatomy, path)
     for other in (replace(made, bounds=made.bounds + 2e-2), replace(made, target=made.target + [0.0, 1e-2, 0.0])):
         with pytest.raises(InputError, match="made for another anatomy: bounds or tumour are"):
-            other_mesh(replace(again, scanned=replace(other, digest="other")), anatomy, path)
+            describe_other_mesh(replace(again, scanned=replace(other, digest="other")), anatomy, path)
     stored = json.loads(path.read_text())
     path.write_text(json.dumps(stored | {"scanned": stored["scanned"] | {"tumour_mm": [1, 2]}}))
     with pytest.raises(InputError, match="a tumour's middle of 3"):

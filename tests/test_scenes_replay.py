@@ -18,11 +18,11 @@ from scenes.page.referee import FemWorker
 from scenes.page.requests import HAND, SCRIPT
 from scenes.page.view import move_bodies
 from scenes.play.deformers import AtRest, Theatre
-from scenes.play.effect_ablation import without
+from scenes.play.effect_ablation import remove_effect
 from scenes.play.player import Frame, Player
-from scenes.play.replay import IN_ORDER, FrameCache, ReplayOrder, ReplaySession, course_of
+from scenes.play.replay import IN_ORDER, FrameCache, ReplayOrder, ReplaySession, plan_replay_order
 from scenes.script.debulking import Debulking
-from scenes.script.head_posture import drained
+from scenes.script.head_posture import build_drainage
 from scenes.script.scene import SCENES, Scene, Viewpoint, find_scene
 from scenes.script.tool_paths import Touch, lay, press
 from sim.anatomy import Anatomy
@@ -49,7 +49,7 @@ def hasty(name: str, **values: object) -> Scene:
 REMEMBERING = {
     "tissue that relaxes under a blade": hasty("retract"),
     "mass under a ball": hasty("palpate", effects=(*find_scene("palpate").effects, Inertia())),
-    "cuts": hasty("resection", surgery=Debulking(times=(0.1, 0.15, 0.2)), lying=drained(0.3)),
+    "cuts": hasty("resection", surgery=Debulking(times=(0.1, 0.15, 0.2)), lying=build_drainage(0.3)),
 }
 
 
@@ -140,7 +140,7 @@ def test_jumps_go_by_frames_between_where_the_brain_comes_off_the_skull(theatre)
 
     def course(name: str, anatomy: Anatomy, **values: object) -> ReplayOrder | None:
         scene = replace(find_scene(name), **values)
-        return course_of(Player(Theatre(anatomy, None, {}, "cpu").stage(scene), AtRest(anatomy)))
+        return plan_replay_order(Player(Theatre(anatomy, None, {}, "cpu").stage(scene), AtRest(anatomy)))
 
     assert course("brain_shift", sliding) == ReplayOrder(6, back=True, kept=64)
     assert course("brain_shift", sliding, frames_per_second=10.0) == ReplayOrder(2, back=True, kept=64)
@@ -218,7 +218,7 @@ class TestPages:
     @pytest.fixture
     def pages(self, theatre):
         effects = (*find_scene("retract").effects, Gravity())
-        scene = hasty("retract", effects=effects, lying=drained(0.3))
+        scene = hasty("retract", effects=effects, lying=build_drainage(0.3))
         pages = [Demo(theatre, scene, "fem", "127.0.0.1", free_port()) for _ in range(2)]
         for page in pages:
             page.wish.set(plays=False)
@@ -229,7 +229,7 @@ class TestPages:
     def test_two_pages_scrub_switch_and_play_and_show_the_straight_run(self, theatre, pages, monkeypatch):
         scene = pages[0].stage.scene
         full = straight(theatre.player("fem", scene))
-        less = straight(theatre.player("fem", without(scene, Gravity())))
+        less = straight(theatre.player("fem", remove_effect(scene, Gravity())))
         assert not same(full[6], less[6])
         shown: dict[Demo, list] = {page: [] for page in pages}
         owners = {page.browser: page for page in pages}

@@ -11,7 +11,7 @@ from studies import SPECS, TISSUE
 
 from ar.screen import read_png
 from scenes.cli import main
-from scenes.report.finite_elements import HALVED, OWN, FemVariant, against
+from scenes.report.finite_elements import HALVED, OWN, FemVariant, describe_difference
 from scenes.report.page import Section, write_report
 from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, ReportRow
 from sim.accuracy import REFERENCE, TRAIN
@@ -88,26 +88,26 @@ def test_the_page_needs_nothing_but_itself(page, study_rows):
 def test_what_has_the_reference_s_own_elements_is_off_by_its_tolerance_alone(study, fine):
     here = replace(study, fine=fine)
     said = {
-        (element, mesh): against(here, FemVariant("it", element=element, mesh=mesh))
+        (element, mesh): describe_difference(here, FemVariant("it", element=element, mesh=mesh))
         for element in ("p1", "p2")
         for mesh in (OWN, HALVED)
     }
     alone = ("p2", HALVED if fine else OWN)
     assert said.pop(alone) == TOLERANCE_ALONE and set(said.values()) == {ERROR}
-    assert against(here, FemVariant("it", "linear", *alone)) == DIFFERENCE
+    assert describe_difference(here, FemVariant("it", "linear", *alone)) == DIFFERENCE
 
 
 def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, study_rows, monkeypatch, capsys):
     """Everything is solved already; the rows are those found."""
     words = ["report", "--quick", "--loads", str(study.loads), "--data", str(study.data), "--out", str(study.folder)]
     words += ["--device", "cpu"]
-    monkeypatch.setattr("scenes.report.rows.rows", lambda study, specs: iter(study_rows))
+    monkeypatch.setattr("scenes.report.rows.measure_rows", lambda study, specs: iter(study_rows))
     assert main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in said["sections"][0]["rows"]] == [row.name for row in study_rows]
     assert "quadratic tetrahedra (p2) on the same mesh" in (study.folder / "index.html").read_text()
     monkeypatch.setattr(
-        "scenes.report.rows.rows", lambda study, specs: iter([ReportRow("odd", "f", state="no memory")])
+        "scenes.report.rows.measure_rows", lambda study, specs: iter([ReportRow("odd", "f", state="no memory")])
     )
     assert main(words) == 1
     assert "no memory" in capsys.readouterr().out
@@ -115,6 +115,6 @@ def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, study
     def stopped(study, specs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("scenes.report.rows.rows", stopped)
+    monkeypatch.setattr("scenes.report.rows.measure_rows", stopped)
     assert main(words) == 130
     assert "the same command goes on" in capsys.readouterr().err

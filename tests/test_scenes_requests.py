@@ -10,7 +10,7 @@ from visitor import Visitor, report, wait_for
 
 from scenes.page.demo import READING
 from scenes.page.referee import FemWorker
-from scenes.page.requests import HAND, SCRIPT, Requests, holding
+from scenes.page.requests import HAND, SCRIPT, Requests, describe_holder
 from scenes.play.deformers import Theatre
 from scenes.play.player import Player
 from scenes.script.tool_paths import Touch
@@ -160,7 +160,7 @@ def test_each_visitor_reads_who_has_the_tool(running):
     other.set(page.inputs["place up [mm]"], 3.0)
     assert wait_for(lambda: "another visitor (number 2) holds" in read()[0] and "**you hold" in read()[1])
     other.wire.close()
-    assert wait_for(lambda: read() == [holding(1, 2, {1})])
+    assert wait_for(lambda: read() == [describe_holder(1, 2, {1})])
     assert "visitor 2 held the tool and has left" in read()[0]
     one.set(page.inputs["tool"], SCRIPT)
     assert wait_for(lambda: read() == ["the script moves the tool"])

@@ -11,13 +11,13 @@ import pytest
 from theatres import player, put, small
 from visitor import free_port, wait_for
 
-from ar.overlay.outlines import silhouette
+from ar.overlay.outlines import compute_silhouette
 from scenes.cli import main
 from scenes.episodes.episode import collect
 from scenes.page.demo import Demo
-from scenes.play.frame_text import acting
+from scenes.play.frame_text import format_acting
 from scenes.script.debulking import Debulking
-from scenes.script.head_posture import drained
+from scenes.script.head_posture import build_drainage
 from scenes.script.tool_paths import Touch
 from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import guess
@@ -30,7 +30,7 @@ SURGERY = Debulking(times=(0.05, 0.1, 0.15))
 @pytest.fixture(scope="module")
 def scene():
     """Seven small frames: corridor, a share, another share; the fluid is gone before."""
-    return small("resection", duration=0.2, surgery=SURGERY, lying=drained(0.04))
+    return small("resection", duration=0.2, surgery=SURGERY, lying=build_drainage(0.04))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def frames(play):
 
 
 def test_the_steps_are_a_corridor_and_shares_from_the_top(box, theatre):
-    corridor, *shares = (np.array(step) for step in SURGERY.resection(box).steps)
+    corridor, *shares = (np.array(step) for step in SURGERY.build_resection(box).steps)
     middle = box.mesh.nodes[box.mesh.tets].mean(axis=1)
     assert (np.linalg.norm(middle[corridor, :2], axis=1) < 6.1e-3).all() and middle[corridor, 2].max() > -4e-3
     assert (box.mesh.region[corridor] != TUMOUR_LABEL).all()
@@ -57,10 +57,10 @@ def test_the_steps_are_a_corridor_and_shares_from_the_top(box, theatre):
 
 
 def test_its_effects_and_causes_are_the_body_s(theatre, scene):
-    assert [type(effect) for effect in scene.effects_on(theatre.anatomy)][-1] is Resection
+    assert [type(effect) for effect in scene.get_effects_on(theatre.anatomy)][-1] is Resection
     loads = scene.loads(theatre.site, Touch(), 0.12)
     assert [type(cause) for cause in loads.causes] == [Posture, Resected]
-    assert loads.of(Resected).done.tolist() == [2] and "resection: 2 steps done" in acting(
+    assert loads.of(Resected).done.tolist() == [2] and "resection: 2 steps done" in format_acting(
         loads, guess(np.zeros((1, 3, 3))), theatre.site.anatomy.mesh.nodes
     )
     assert theatre.names(scene) == ("fem",)
@@ -71,7 +71,7 @@ def test_the_rest_of_the_tumour_is_drawn(play, frames):
     for frame in frames:
         stage = play.stage.at(frame.loads)
         layer = stage.tumour(play.positions(frame.deformation))
-        areas.append(int(silhouette(frame.camera, layer.vertices, layer.triangles).sum()))
+        areas.append(int(compute_silhouette(frame.camera, layer.vertices, layer.triangles).sum()))
         assert not stage.anatomy.orphaned[stage.tumour_vertices].any()
         assert frame.deformation.outcome[0].good and frame.moved >= 0.0
     done = [SURGERY.done(frame.time) for frame in frames]

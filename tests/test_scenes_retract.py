@@ -10,7 +10,7 @@ from theatres import player
 from scenes.script.tool_paths import AIR, Touch
 from sim.deformation import Outcome
 from sim.loads import Retracted
-from sim.tools import distances_to
+from sim.tools import compute_distances
 
 
 class TestRetract:
@@ -28,7 +28,7 @@ class TestRetract:
     def test_the_blade_is_laid_on_clear_of_the_tissue_and_moved_to_where_the_hand_is(self, theatre, touch):
         scene, site = small("retract"), theatre.site
         cause = scene.loads(site, touch, 0.0).of(Retracted)
-        apart = distances_to(scene.tool.shape, cause.pose[0], theatre.anatomy.mesh.nodes)
+        apart = compute_distances(scene.tool.shape, cause.pose[0], theatre.anatomy.mesh.nodes)
         upright = site.direction(touch) @ site.axis
         assert apart.min() == pytest.approx(AIR * upright, abs=0.3e-3)
         moved = cause.pose[0].copy()

@@ -11,7 +11,7 @@ from tiny_episodes import HEIGHT, WIDTH, Wanted, write_episode
 
 from scenes import read_episodes
 from scenes.cli import main
-from scenes.episodes.exports.columns import twists
+from scenes.episodes.exports.columns import build_twists
 
 ROBOMIMIC = os.environ.get("SULCUS_ROBOMIMIC_PYTHON")
 """A Python that has robomimic."""
@@ -60,7 +60,7 @@ np.savez(out, losses=losses, counts=[len(each) for each in sets.values()], actio
 def test_robomimics_own_reader_reads_what_ours_reads_and_trains_on_it(box, tmp_path):
     for number, (frames, family) in enumerate(((7, "press"), (9, "slide"))):
         write_episode(tmp_path / f"in/episode_{number:06d}.h5", box, Wanted(frames, 3, number, family))
-    path, out = tmp_path / "set.hdf5", tmp_path / "read.npz"
+    path, out = tmp_path / "set.open_hdf5", tmp_path / "read.npz"
     assert main(["convert", str(tmp_path / "in"), "--to", "robomimic", "--out", str(path)]) == 0
     words = [str(ROBOMIMIC), "-c", READ, str(path), str(out)]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
@@ -75,7 +75,7 @@ def test_robomimics_own_reader_reads_what_ours_reads_and_trains_on_it(box, tmp_p
 
 
 def test_robomimic_has_demonstrations_and_holds_one_out(folder, tmp_path, capsys):
-    out = tmp_path / "set.hdf5"
+    out = tmp_path / "set.open_hdf5"
     words = ["convert", str(folder), "--to", "robomimic", "--out", str(out), "--json"]
     assert main(words) == 0 and main(words) == 2 and main([*words, "--force"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["held_out"] == 1
@@ -88,7 +88,7 @@ def test_robomimic_has_demonstrations_and_holds_one_out(folder, tmp_path, capsys
         assert demo.attrs["num_samples"] == 7 and demo["dones"][:].tolist() == [0] * 6 + [1]
         assert np.array_equal(demo["obs/colour_image"], ours["colour"])
         assert np.array_equal(demo["obs/depth_image"][..., 0], ours["depth"])
-        assert np.allclose(demo["actions"], twists(ours["T_world_tool"]))
+        assert np.allclose(demo["actions"], build_twists(ours["T_world_tool"]))
         assert {len(demo[name]) for name in ("states", "rewards", "obs/tip", "obs/tumour_predicted")} == {7}
     out.write_text("mine")
     assert main(words) == 2 and out.read_text() == "mine"

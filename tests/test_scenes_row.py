@@ -11,8 +11,8 @@ from studies import read_back
 
 from scenes.cli import main
 from scenes.commands.report import QUICK
-from scenes.report.page import Section, against_time, front, write_report
-from scenes.report.row import ReportRow, figures_of, of_times
+from scenes.report.page import Section, find_front, plot_error_against_time, write_report
+from scenes.report.row import ReportRow, compute_distance_figures, summarise_times
 from sim.bodies.meshfile import write_anatomy
 from surrogate.data.dataset import read_dataset
 
@@ -21,17 +21,17 @@ def test_tenths_of_the_force_and_of_no_load_nothing():
     truth = np.ones((20, 2, 3))
     force = np.arange(20.0)[::-1]
     distance = np.column_stack([force, 3.0 * force]) * 1e-3
-    tenths = figures_of(distance, truth, force).tenths
+    tenths = compute_distance_figures(distance, truth, force).tenths
     assert [(tenth.least, tenth.greatest) for tenth in tenths] == [(2.0 * k, 2.0 * k + 1.0) for k in range(10)]
     assert [tenth.mean for tenth in tenths] == pytest.approx([4.0 * k + 1.0 for k in range(10)])
     assert [tenth.largest for tenth in tenths] == pytest.approx([6.0 * k + 3.0 for k in range(10)])
-    assert figures_of(distance[:0], truth[:0], force[:0]) is None
-    worst = figures_of(distance, truth, force).worst
+    assert compute_distance_figures(distance[:0], truth[:0], force[:0]) is None
+    worst = compute_distance_figures(distance, truth, force).worst
     assert (worst.mean, worst.p95, worst.largest) == pytest.approx((28.5, 3.0 * np.percentile(force, 95), 57.0))
 
 
 def test_the_front_is_what_nobody_beats():
-    figures = figures_of(np.ones((1, 1)), np.ones((1, 1, 3)), np.ones(1))
+    figures = compute_distance_figures(np.ones((1, 1)), np.ones((1, 1, 3)), np.ones(1))
 
     def row(name, time, error, against="error"):
         mm = replace(figures.mm, mean=error)
@@ -40,19 +40,21 @@ def test_the_front_is_what_nobody_beats():
     rows = [row("fast", 1.0, 9.0), row("near", 9.0, 1.0), row("between", 3.0, 3.0), row("beaten", 4.0, 3.0)]
     rows += [row("slow", 10.0, 10.0), row("other law", 0.5, 0.5, "model difference")]
     rows += [ReportRow("none", "f", state="it has no bound")]
-    assert front(rows) == {"fast", "near", "between"}
-    assert against_time(rows).std() > 5.0 and against_time(rows[-1:]) is None
+    assert find_front(rows) == {"fast", "near", "between"}
+    assert plot_error_against_time(rows).std() > 5.0 and plot_error_against_time(rows[-1:]) is None
 
 
 def test_times_are_milliseconds_and_p99_takes_a_thousand():
     seconds = 1e-3 * np.arange(1.0, 1001.0)
-    assert of_times(seconds) == pytest.approx({"median": 500.5, "p99": np.percentile(1e3 * seconds, 99), "timed": 1000})
-    assert of_times(seconds[:999])["p99"] is None
+    assert summarise_times(seconds) == pytest.approx(
+        {"median": 500.5, "p99": np.percentile(1e3 * seconds, 99), "timed": 1000}
+    )
+    assert summarise_times(seconds[:999])["p99"] is None
 
 
 def test_every_figure_stands_under_its_head(tmp_path):
     """Read back from the page: sets of loads, shares of them, minutes of solves and fitting."""
-    one = figures_of(np.full((4, 2), 1e-3), np.full((4, 2, 3), 1e-2), np.arange(4.0))
+    one = compute_distance_figures(np.full((4, 2), 1e-3), np.full((4, 2, 3), 1e-2), np.arange(4.0))
     sets = {
         name: replace(one, mm=replace(one.mm, mean=mean), loads=loads)
         for name, mean, loads in (("discs", 0.1, 7), ("sectors", 0.2, 8), ("beyond", 0.3, 9))
@@ -109,7 +111,7 @@ def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
 def test_a_command_without_data_makes_its_own(tmp_path, monkeypatch, capsys):
     """Neo-Hookean, smoothed, on two devices; what it says goes elsewhere than the line for machines."""
     box = make_box((6, 6, 4), tumour=9e-3, depth=14e-3, opening=20e-3)
-    monkeypatch.setattr("scenes.report.rows.rows", lambda study, specs: iter([]))
+    monkeypatch.setattr("scenes.report.rows.measure_rows", lambda study, specs: iter([]))
     write_anatomy(tmp_path / "box.vtu", box)
     words = ["report", "--quick", "--anatomy", str(tmp_path / "box.vtu"), "--out", str(tmp_path), "--device"]
     assert main([*words, "cpu,cpu", "--loads", "1", "--json"]) == 0

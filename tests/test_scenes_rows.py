@@ -8,16 +8,22 @@ import pytest
 from poison import poisoned
 from studies import SPECS, TISSUE, read_back
 
-from scenes.analysis.measurement import peak_memory
+from scenes.analysis.measurement import measure_peak_memory
 from scenes.report.finite_elements import OWN, FemVariant
-from scenes.report.learner import LearnerSpec, counts, measure_learner
-from scenes.report.rows import every, learners, measured, rows, star
-from scenes.report.study import series_seconds, tabulate_series
+from scenes.report.learner import LearnerSpec, list_counts, measure_learner
+from scenes.report.rows import (
+    list_all_combinations,
+    list_learner_specs,
+    list_one_factor_variants,
+    measure_row,
+    measure_rows,
+)
+from scenes.report.study import measure_series_seconds, tabulate_series
 from sim.accuracy import TRAIN
 from sim.loads import Pushed
-from sim.runtime.threads import one_thread
+from sim.runtime.threads import limit_to_one_thread
 from surrogate.data.dataset import read_dataset
-from surrogate.data.encode import directions, reduce, tool_features
+from surrogate.data.encode import compute_tool_features, reduce, split_forces
 from surrogate.data.splits import leave_sectors_out
 from surrogate.training.expansion import COARSE, EXPANDED
 from surrogate.training.learners import SVR, Tuned
@@ -29,16 +35,18 @@ def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, study_box,
     training, pushed, nodes = study.discs.train, study.pushed, study_box.tumour_nodes
     truth = study.dataset.displacement(nodes)[study.dataset.good]
     path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
-    monkeypatch.setattr("scenes.report.learner.counts", lambda most: [])
-    monkeypatch.setattr("scenes.report.learner.coverage_of", lambda *known: {})
-    with one_thread():
+    monkeypatch.setattr("scenes.report.learner.list_counts", lambda most: [])
+    monkeypatch.setattr("scenes.report.learner.compute_coverage_beyond", lambda *known: {})
+    with limit_to_one_thread():
         row, field = measure_learner(replace(study, data=path), LearnerSpec("svr"))
     lesson = Pushed(pushed.point[training], pushed.force[training], pushed.footprint[training])
-    size, (every, direction) = directions(lesson)[0], directions(pushed)
+    size, (every, direction) = split_forces(lesson)[0], split_forces(pushed)
     basis = reduce(nodes, truth[training] / size[:, None, None], *COARSE)
-    machine = Tuned(SVR).fit(tool_features(study.patch, lesson), basis.encode(truth[training] / size[:, None, None]))
+    machine = Tuned(SVR).fit(
+        compute_tool_features(study.patch, lesson), basis.encode(truth[training] / size[:, None, None])
+    )
     within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
-    guess = every[:, None, None] * basis.decode(machine.predict(tool_features(study.patch, within)))
+    guess = every[:, None, None] * basis.decode(machine.predict(compute_tool_features(study.patch, within)))
     played = [np.flatnonzero((pushed.point == point).all(axis=1))[0] for point in study.played.of(Pushed).point]
     np.testing.assert_allclose(field, guess[played], rtol=1e-3, atol=1e-9)
     wanted = 1e3 * np.linalg.norm(guess[study.discs.test] - wild[nodes], axis=2)
@@ -78,7 +86,7 @@ def test_rows_say_what_they_are(study_rows):
     assert (fem.timed, fem.p99, learner.timed) == (2, None, 30) and fem.median > learner.median > 0.0
     assert learner.adapt is None and fem.adapt > 0.0 and learner.curve[-1] == (learner.loads, learner.own_fem["discs"])
     assert read_back(learner) == learner
-    assert 0.05 < peak_memory() < 50.0
+    assert 0.05 < measure_peak_memory() < 50.0
 
 
 def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatch):
@@ -89,12 +97,14 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatc
     monkeypatch.setattr("surrogate.training.expansion.Expansion.fem", None)
     tabulate_series(study, lambda done, total: reported.append(None))
     assert None not in reported
-    row = measured(replace(study), LearnerSpec("series"), tmp_path / "series.png")
-    assert row.state == "measured" and row.solving > 0.1 * series_seconds(study, "series") > 0.0
+    row = measure_row(replace(study), LearnerSpec("series"), tmp_path / "series.png")
+    assert row.state == "measured" and row.solving > 0.1 * measure_series_seconds(study, "series") > 0.0
     assert row.series > 19 and row.inside > 0  # unit responses
-    assert series_seconds(study, "linear") == 0.0
-    assert row.own_fem["discs"].mm.mean < 0.5 * measured(study, SPECS[2], tmp_path / "l.png").own_fem["discs"].mm.mean
-    assert {spec.name for spec in learners()} > set(EXPANDED)
+    assert measure_series_seconds(study, "linear") == 0.0
+    assert (
+        row.own_fem["discs"].mm.mean < 0.5 * measure_row(study, SPECS[2], tmp_path / "l.png").own_fem["discs"].mm.mean
+    )
+    assert {spec.name for spec in list_learner_specs()} > set(EXPANDED)
 
 
 def test_only_what_lacks_is_measured_again(study, study_rows, tmp_path):
@@ -109,35 +119,40 @@ def test_only_what_lacks_is_measured_again(study, study_rows, tmp_path):
         return next(row for row in study_rows if row.name == spec.name)
 
     with pytest.raises(KeyboardInterrupt):
-        list(rows(here, SPECS, run))
-    assert tuple(rows(here, SPECS, run)) == study_rows
+        list(measure_rows(here, SPECS, run))
+    assert tuple(measure_rows(here, SPECS, run)) == study_rows
     assert asked == ["FEM", "linear law", "linear law", "linear"]
-    assert tuple(rows(here, SPECS, run)) == study_rows and len(asked) == 4
-    list(rows(replace(here, timed=31), SPECS[:1], run))
+    assert tuple(measure_rows(here, SPECS, run)) == study_rows and len(asked) == 4
+    list(measure_rows(replace(here, timed=31), SPECS[:1], run))
     assert asked[4:] == ["FEM"]
     kept = tmp_path / "rows" / "data-linear.json"
     stored = json.loads(kept.read_text())
     former = {"own_fem": "teacher", "loads": "taught"}
     row = {former.get(name, name): value for name, value in stored["row"].items()}
     kept.write_text(json.dumps({**stored, "row": row}))
-    assert tuple(rows(here, SPECS[2:3], run)) == study_rows[2:3] and "teacher" in row and len(asked) == 5
+    assert tuple(measure_rows(here, SPECS[2:3], run)) == study_rows[2:3] and "teacher" in row and len(asked) == 5
     kept.write_text(kept.read_text()[:-9])
-    list(rows(here, SPECS, run))
+    list(measure_rows(here, SPECS, run))
     assert asked[5:] == ["FEM", "linear"], (
         "the first file held other inputs, the last was not whole; names from before are read"
     )
 
 
 def test_plans(study):
-    names = [spec.name for spec in star(study)]
+    names = [spec.name for spec in list_one_factor_variants(study)]
     assert names[0] == "FEM" and len(set(names)) == len(names) == 12 and "FEM halved edges" in names
-    assert star(study)[0].accuracy == TRAIN and star(study)[-1].law != TISSUE.law
-    assert not any(spec.mesh != OWN for spec in star(study, remesh=False)) and len(star(study, remesh=False)) == 11
-    product = every(study)
+    assert (
+        list_one_factor_variants(study)[0].accuracy == TRAIN and list_one_factor_variants(study)[-1].law != TISSUE.law
+    )
+    assert (
+        not any(spec.mesh != OWN for spec in list_one_factor_variants(study, remesh=False))
+        and len(list_one_factor_variants(study, remesh=False)) == 11
+    )
+    product = list_all_combinations(study)
     assert len({spec.name for spec in product}) == len(product) == 4 * 3 * 2 * (3 + 5)
-    assert counts(300) == [64, 128, 256] and counts(64) == []
+    assert list_counts(300) == [64, 128, 256] and list_counts(64) == []
 
 
 def test_what_cannot_be_had_is_a_row_that_says_why(study, tmp_path):
-    row = measured(study, FemVariant("odd", element="cube"), tmp_path / "odd.png")
+    row = measure_row(study, FemVariant("odd", element="cube"), tmp_path / "odd.png")
     assert "no element is called 'cube'" in row.state and row.reference is None and row.family == "finite elements"

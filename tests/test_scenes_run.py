@@ -9,9 +9,9 @@ import pytest
 from theatres import template_theatre
 
 from ar.overlay.hud import FINE
-from ar.overlay.outlines import ink_of, of_ink, silhouette, stands
+from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_text
 from ar.screen import write_film
-from ar.tracking.pictures import Named, film_of
+from ar.tracking.pictures import Named, read_video
 from scenes.cli import main
 from scenes.play.stage import TUMOUR_COLOUR
 from scenes.script.scene import find_scene
@@ -19,11 +19,11 @@ from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.follower import Follower
 from scenes.tracked.picture import Painter
 from scenes.tracked.registration_file import read_registration
-from scenes.tracked.run import overlaid, timed
+from scenes.tracked.run import draw_overlay, read_timed
 from scenes.tracked.tool_motion import ToolMotion
 
 FILM = Path(__file__).parent / "data" / "film"
-INK = ink_of(TUMOUR_COLOUR)
+INK = compute_ink(TUMOUR_COLOUR)
 
 
 @pytest.fixture(scope="module")
@@ -34,30 +34,30 @@ def parts():
 
 
 def film(count):
-    return islice(film_of(FILM / "film.mp4", 30.0, colour=True), count)
+    return islice(read_video(FILM / "film.mp4", 30.0, colour=True), count)
 
 
 def test_nothing_is_drawn_over_what_is_white_and_the_picture_says_how_much_that_hides(parts):
     follower, painter = parts
-    (whole,) = overlaid(timed(film(1)), follower, painter)
+    (whole,) = draw_overlay(read_timed(film(1)), follower, painter)
     camera, tumour = whole.known.camera, painter.stage.tumour_at_rest
-    mask = silhouette(camera, tumour.vertices, tumour.triangles)
+    mask = compute_silhouette(camera, tumour.vertices, tumour.triangles)
     columns = np.flatnonzero(mask.any(axis=0))
     covered = np.zeros(mask.shape, np.uint8)
     covered[150:, : int(columns.mean())] = 255  # below the words of the head
-    (hidden,) = overlaid(timed(film(1), iter([Named("0.png", covered)])), follower, painter)
-    amber = [of_ink(each.colour, ink_of((0.92, 0.50, 0.05))) for each in (whole, hidden)]
+    (hidden,) = draw_overlay(read_timed(film(1), iter([Named("0.png", covered)])), follower, painter)
+    amber = [find_ink(each.colour, compute_ink((0.92, 0.50, 0.05))) for each in (whole, hidden)]
     assert amber[0][covered > 0].any() and not amber[1][covered > 0].any()
     np.testing.assert_array_equal(amber[0][covered == 0], amber[1][covered == 0])
     share = np.count_nonzero(mask & (covered > 0)) / np.count_nonzero(mask)
     assert 0.2 < share < 0.8
-    assert stands(hidden.colour, f"{share:.0%} of the tumour is behind what lies in front", FINE)
+    assert has_text(hidden.colour, f"{share:.0%} of the tumour is behind what lies in front", FINE)
     assert hidden.known.band == whole.known.band and not hidden.known.relied
 
 
 def test_what_is_frozen_is_hidden_too(parts):
     follower, painter = parts
-    (shown,) = overlaid(timed(film(1)), follower, painter)
+    (shown,) = draw_overlay(read_timed(film(1)), follower, painter)
     blank = np.full(shown.colour.shape, 120, np.uint8)
     lost = follower.step(blank[..., 0], 0.1, shown.known)
     covered = np.zeros(blank.shape[:2], bool)
@@ -68,19 +68,19 @@ def test_what_is_frozen_is_hidden_too(parts):
 
 def test_there_is_one_mask_for_each_picture_of_its_size():
     black = Named("a.png", np.zeros((720, 960), np.uint8))
-    assert [each.covered.any() for each in timed(film(2), iter([black, black]))] == [False, False]
+    assert [each.covered.any() for each in read_timed(film(2), iter([black, black]))] == [False, False]
     ones = black.grey.copy()
     ones[100:200] = 1  # a mask of 0 and 1
-    (shown,) = timed(film(1), iter([Named("a.PNG", ones)]))
+    (shown,) = read_timed(film(1), iter([Named("a.PNG", ones)]))
     np.testing.assert_array_equal(shown.covered, ones > 0)
     soft = replace(black, name="frame 0", grey=np.full_like(ones, 16))  # a video's black
-    assert not next(timed(film(1), iter([soft]))).covered.any()
+    assert not next(read_timed(film(1), iter([soft]))).covered.any()
     with pytest.raises(ValueError, match="frame 1 has no mask"):
-        list(timed(film(2), iter([black])))
+        list(read_timed(film(2), iter([black])))
     with pytest.raises(ValueError, match="more masks than images"):
-        list(timed(film(1), iter([black, black])))
+        list(read_timed(film(1), iter([black, black])))
     with pytest.raises(ValueError, match=r"the mask b\.png"):
-        list(timed(film(1), iter([Named("b.png", black.grey[1:])])))
+        list(read_timed(film(1), iter([Named("b.png", black.grey[1:])])))
 
 
 def test_the_command_takes_a_video_of_masks(tmp_path, capsys):

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from tiny_episodes import Wanted, write_episode
 
-from scenes.episodes.engine import still_missing
-from scenes.episodes.rates import written_rates
-from scenes.episodes.reading.contents import opened
+from scenes.episodes.engine import find_still_missing
+from scenes.episodes.rates import write_rates
+from scenes.episodes.reading.contents import open_episode
 from scenes.episodes.reading.validation import validate_episode
-from scenes.episodes.run_folder import RunSettings, begin, episode_name, finished, read_run
+from scenes.episodes.run_folder import RunSettings, begin, list_finished, read_run, to_episode_name
 from sim.errors import InputError
 from sim.runtime.partial_files import remove_left_overs
 
@@ -31,7 +31,7 @@ def test_a_file_that_another_holds_is_said_to_be_locked(box, tmp_path):
         (said,) = validate_episode(path).problems
         assert said.startswith("is locked: another program has it open for writing. Close it there")
         with pytest.raises(InputError, match=r"episode_000000.h5: is locked: another program"):
-            opened(path)
+            open_episode(path)
     assert validate_episode(path).problems == []
 
 
@@ -40,7 +40,7 @@ def test_a_folder_that_takes_no_files_is_named(tmp_path, monkeypatch):
     begin(tmp_path / "set", run, PLAN)
     with monkeypatch.context() as held:
         held.setattr(Path, "open", fails)
-        with pytest.raises(InputError, match=r"rates.*cannot be written"), written_rates(tmp_path / "set"):
+        with pytest.raises(InputError, match=r"rates.*cannot be written"), write_rates(tmp_path / "set"):
             pass
     monkeypatch.setattr(Path, "mkdir", fails)
     with pytest.raises(InputError, match=r"set: cannot be written to"):
@@ -53,12 +53,12 @@ def test_times_of_files_decide_nothing(tmp_path, monkeypatch):
     assert begin(tmp_path, run, PLAN) and not begin(tmp_path, run, PLAN) and read_run(tmp_path) == run
     left = tmp_path / ".sulcus-00000000-1-episode_000001.h5"  # another machine's, unfinished
     for path, time in (
-        (tmp_path / episode_name(0), 2 * DECADE * 10),
-        (tmp_path / episode_name(2), 1.0),
+        (tmp_path / to_episode_name(0), 2 * DECADE * 10),
+        (tmp_path / to_episode_name(2), 1.0),
         (left, DECADE),
     ):
         path.touch()
         os.utime(path, (time, time))
     remove_left_overs(tmp_path)
-    tally, missing = still_missing(tmp_path, finished(tmp_path), range(3), True)
+    tally, missing = find_still_missing(tmp_path, list_finished(tmp_path), range(3), True)
     assert (tally.skipped, missing) == (2, [1]) and left.exists()

@@ -16,7 +16,7 @@ from scenes.script.scene import find_scene
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.errors import InputError
 from sim.runtime.user_script import run_script
-from sim.tools import distances_to
+from sim.tools import compute_distances
 
 OWN = '''"""The tool nods twice."""
 
@@ -98,7 +98,7 @@ def test_a_tool_of_ones_own_is_seen_as_its_own_mesh_and_touches_as_its_own_shape
     reads = frames[-1].deformation.reaction[0]
     assert reads.shape == (1, 6) and np.linalg.norm(reads[0, :3]) > 1e-3
     there = frames[-1].pose
-    tip = distances_to(scene.tool.shape, there, box.anatomy.mesh.nodes + frames[-1].deformation.displacement[0])
+    tip = compute_distances(scene.tool.shape, there, box.anatomy.mesh.nodes + frames[-1].deformation.displacement[0])
     assert tip.min() > -1e-4  # no vertex is inside of it
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from theatres import player, short
 
-from ar.screen import shrunk
-from scenes.play.scene_costs import labelled, sheet
+from ar.screen import shrink_image
+from scenes.play.scene_costs import add_cost_label, tile_images
 from scenes.play.stage import TOOL
 from scenes.script.tool_paths import Touch
 from sim.deformation import Outcome
@@ -16,7 +16,7 @@ from sim.deformation import Outcome
 
 def test_the_label_is_drawn_above_the_picture(play):
     frame = play.draw(51, 1.7, play.scene.path(1.7))
-    plain = labelled(frame, "linear")
+    plain = add_cost_label(frame, "linear")
     assert plain.shape == frame.shown.shape
     changed, tool = (plain != frame.shown).any(axis=2), frame.picture.segmentation == TOOL
     assert changed.any() and tool.any() and not changed[tool].any()
@@ -26,10 +26,10 @@ def test_the_label_tells_source_time_and_motion(play, monkeypatch):
     said = []
     monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, lines, **more: said.extend(lines) or colour)
     frame = play.draw(51, 1.7, play.scene.path(1.7))
-    labelled(frame, "linear")
+    add_cost_label(frame, "linear")
     assert said[:2] == [f"linear: tumour moved {1e3 * frame.moved:.2f} mm", f"t 1.70 s, {frame.acts}"]
     assert said[-1] == frame.deformation.source
-    labelled(replace(frame, moved=1.33e-3, moved_error=5.31e-3), "linear")
+    add_cost_label(replace(frame, moved=1.33e-3, moved_error=5.31e-3), "linear")
     assert "linear: tumour moved 1.33 +- 5.4 mm" in said
 
 
@@ -40,14 +40,14 @@ def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch
     )
     play = player(theatre, short(), "linear")
     for force in (0.2, 0.6):
-        labelled(play.draw(0, 0.0, Touch(force=force)), "linear")
+        add_cost_label(play.draw(0, 0.0, Touch(force=force)), "linear")
     within, beyond = shown
     assert beyond[1] == Outcome.EXTRAPOLATED.value and len(beyond) == len(within) + 1
 
 
 def test_half_a_picture_keeps_its_light():
     colour = np.random.default_rng(0).integers(0, 256, (8, 10, 3), dtype=np.uint8)
-    small = shrunk(colour, colour.shape[1] // 2, colour.shape[0] // 2)
+    small = shrink_image(colour, colour.shape[1] // 2, colour.shape[0] // 2)
     assert small.shape == (4, 5, 3)
     np.testing.assert_allclose(small[1, 2], colour[2:4, 4:6].reshape(4, 3).mean(axis=0), atol=0.51)
-    assert sheet([small] * 4).shape == (8, 15, 3) and (sheet([small] * 4)[4:, 5:] == 12).all()
+    assert tile_images([small] * 4).shape == (8, 15, 3) and (tile_images([small] * 4)[4:, 5:] == 12).all()

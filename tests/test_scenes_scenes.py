@@ -11,7 +11,7 @@ import pytest
 from theatres import PUSHING, short
 
 from scenes.cli import main
-from scenes.play.scene_costs import thumbnail
+from scenes.play.scene_costs import render_thumbnail
 from scenes.script.scene import SCENES, find_scene
 from sim.effects import ToolForce
 
@@ -44,7 +44,7 @@ class TestScenes:
         scene = short()
         wide = replace(scene, viewpoint=replace(scene.viewpoint, width=480, height=360))
         player = theatre.player("linear", wide)
-        foot, kept = thumbnail(player, "linear").colour[-40:], []
+        foot, kept = render_thumbnail(player, "linear").colour[-40:], []
         for frame in player.frames():
             words = frame.taken[-40:] > 0
             kept.append(words.any() and np.array_equal(foot[words], frame.shown[-40:][words]))

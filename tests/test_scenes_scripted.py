@@ -4,9 +4,9 @@ import pytest
 from gym_examples import DOWN, made, played
 from test_scenes_plan import TINY
 
-from scenes.episodes.make import body_of
+from scenes.episodes.make import choose_body
 from scenes.episodes.plan import plan_from
-from scenes.episodes.scripted import drawn_episode
+from scenes.episodes.scripted import sample_episode
 from scenes.gym.episode import ENDED
 from scenes.gym.tasks import PALPATE
 from sim.errors import InputError
@@ -31,9 +31,9 @@ def test_the_scripted_policy_palpates_and_pushing_on_ends_at_the_limit():
 
 def test_an_episode_is_drawn_by_itself_and_each_value_by_its_name():
     plain, more = plan_from(TINY, "a"), plan_from(f"{TINY}tool_deg = [0, 1]\n[hand]\ntremor_mm = [0, 1]\n", "b")
-    first, again = drawn_episode(plain.contents, 4, 7), drawn_episode(plain.contents, 4, 7)
-    assert first == again and body_of(plain, 4, 7) == first.body
-    other = drawn_episode(more.contents, 4, 7)
+    first, again = sample_episode(plain.contents, 4, 7), sample_episode(plain.contents, 4, 7)
+    assert first == again and choose_body(plain, 4, 7) == first.body
+    other = sample_episode(more.contents, 4, 7)
     same = {name: value for name, value in other.values.items() if name not in ("noise.tool_deg", "hand.tremor_mm")}
     assert same == {name: first.values[name] for name in same}
-    assert drawn_episode(plain.contents, 4, 8).values != first.values != drawn_episode(plain.contents, 5, 7).values
+    assert sample_episode(plain.contents, 4, 8).values != first.values != sample_episode(plain.contents, 5, 7).values

@@ -3,12 +3,12 @@
 import numpy as np
 from films import FILM
 
-from ar.tracking.pictures import film_of
+from ar.tracking.pictures import read_video
 from scenes.tracked.seekable_film import SeekableFilm
 
 
 def test_a_film_is_gone_to_and_fro_in(tmp_path):
-    film, pictures = SeekableFilm(FILM / "film.mp4", 30.0), list(film_of(FILM / "film.mp4", 30.0, colour=True))
+    film, pictures = SeekableFilm(FILM / "film.mp4", 30.0), list(read_video(FILM / "film.mp4", 30.0, colour=True))
     assert film.count == len(pictures) == 17
     for number in (3, 4, 16, 0):
         found = film.at(number)

@@ -11,13 +11,22 @@ import pytest
 from conftest import make_box
 from theatres import knowing_nothing
 
-from scenes.analysis.sensitivity import Aim, BodyVariant, SensitivityStudy, aimed, change, moved_alike, rows, variants
+from scenes.analysis.sensitivity import (
+    Aim,
+    BodyVariant,
+    SensitivityStudy,
+    apply_aim,
+    change,
+    list_variants,
+    match_motion,
+    measure_variants,
+)
 from scenes.cli import main
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome, guess
-from sim.discretisation.footprint import footprint_weights
+from sim.discretisation.footprint import compute_footprint_weights
 from sim.effects import Bonded, Elasticity, Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
@@ -48,7 +57,7 @@ def anatomy():
 def found(anatomy):
     """All rows of the linear law, by what and now."""
     study = SensitivityStudy(anatomy, draw("palpation", anatomy, 4, 0), LINEAR, TIGHT, "cpu")
-    all_rows = list(rows(study, variants(anatomy, LINEAR, ["smoothed"])))
+    all_rows = list(measure_variants(study, list_variants(anatomy, LINEAR, ["smoothed"])))
     return {(row.variant.what, row.variant.now): row for row in all_rows}
 
 
@@ -121,7 +130,7 @@ def test_what_does_not_converge_is_counted_and_left_out(anatomy):
     """With a budget that suffices for none."""
     few = Accuracy(tolerance=1e-9, outer=1, inner=1, steps=0)
     study = SensitivityStudy(anatomy, draw("palpation", anatomy, 3, 0), BodyVariant(element="p1"), few, "cpu")
-    one = next(rows(study, []))
+    one = next(measure_variants(study, []))
     assert (one.force.solves, one.force.failed) == (0, 3)
     assert np.isnan(one.force.mean_mm)
 
@@ -155,8 +164,8 @@ def test_tools_are_off_by_what_is_asked(anatomy):
     loads, patch = draw("palpation", anatomy, 5, 1), open_patch(anatomy)
     drawn = loads.of(Pushed)
     size = np.linalg.norm(drawn.force, axis=1)
-    turned = aimed(loads, Aim(turn=0.2), patch).of(Pushed)
-    shifted = aimed(loads, Aim(shift=1e-3), patch).of(Pushed)
+    turned = apply_aim(loads, Aim(turn=0.2), patch).of(Pushed)
+    shifted = apply_aim(loads, Aim(shift=1e-3), patch).of(Pushed)
     assert (len(turned.force), len(shifted.force)) == (10, 20)
     np.testing.assert_allclose(np.linalg.norm(turned.force, axis=1), np.tile(size, 2))
     cosine = np.einsum("bi,bi->b", turned.force, np.tile(drawn.force, (2, 1))) / np.tile(size, 2) ** 2
@@ -173,18 +182,18 @@ def test_tools_are_off_by_what_is_asked(anatomy):
 def test_a_known_motion_is_the_footprints_mean(box, pretender):
     loads = draw("palpation", box, 2, 0)
     answer = pretender.deform(loads)
-    moved, pushed = moved_alike(box, loads, answer).of(Displaced), loads.of(Pushed)
-    weight = footprint_weights(box.mesh.nodes, box.mesh.surface, pushed.point, pushed.footprint)
+    moved, pushed = match_motion(box, loads, answer).of(Displaced), loads.of(Pushed)
+    weight = compute_footprint_weights(box.mesh.nodes, box.mesh.surface, pushed.point, pushed.footprint)
     for row in range(2):
         np.testing.assert_allclose(moved.displacement[row], (weight[[row]] @ answer.displacement[row])[0])
     with pytest.raises(InputError, match="Pushed"):
-        moved_alike(box, moved_alike(box, loads, answer), answer)
+        match_motion(box, match_motion(box, loads, answer), answer)
 
 
 def test_a_body_without_tumour_is_refused(anatomy):
     whole = replace(anatomy, mesh=replace(anatomy.mesh, region=np.ones_like(anatomy.mesh.region)))
     with pytest.raises(InputError, match="no tumour"):
-        next(rows(SensitivityStudy(whole, draw("palpation", anatomy, 1, 0), BodyVariant()), []))
+        next(measure_variants(SensitivityStudy(whole, draw("palpation", anatomy, 1, 0), BodyVariant()), []))
 
 
 def trained(anatomy):

@@ -14,11 +14,11 @@ import pytest
 from films import FILM
 from links import HOST, NAMES, in_mm, linked, peers, played
 
-from ar.overlay.outlines import ink_of, of_ink, outline_gap, silhouette
-from ar.tracking.pictures import film_of
-from scenes.link.frame import stamp_of
+from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, measure_outline_gap
+from ar.tracking.pictures import read_video
+from scenes.link.frame import to_stamp
 from scenes.link.heard import TransformNames
-from scenes.link.messages import image, read_image, transform
+from scenes.link.messages import encode_image, read_image, transform
 from scenes.link.session import OverlayCamera
 from scenes.play.stage import TUMOUR_COLOUR
 from scenes.tracked.picture import Painter
@@ -77,7 +77,7 @@ async def lines_until(stream, *wanted):
 async def sending(peer, beside, beat=0.03):
     """Send a pose again and again, each at its time."""
     while True:
-        peer.send("TRANSFORM", NAMES.tool, transform(beside), stamp_of(time.time()))
+        peer.send("TRANSFORM", NAMES.tool, transform(beside), to_stamp(time.time()))
         await asyncio.sleep(beat)
 
 
@@ -161,17 +161,17 @@ def test_pyigtl_sends_and_hears(follower, registration, beside):
 
 
 def test_a_cameras_picture_comes_back_with_the_tumour_in_it(follower, registration, truth, beside, stage):
-    picture = next(iter(film_of(FILM / "film.mp4", 30.0, colour=True))).colour
+    picture = next(iter(read_video(FILM / "film.mp4", 30.0, colour=True))).colour
     camera = follower.calibration.camera(truth.T_camera_scan[0])
     placed = in_mm(registration.T_patient_scan @ np.linalg.inv(truth.T_camera_scan[0]))
-    mask = silhouette(camera, stage.tumour_at_rest.vertices, stage.tumour_at_rest.triangles)
+    mask = compute_silhouette(camera, stage.tumour_at_rest.vertices, stage.tumour_at_rest.triangles)
     tool = follower.tool.at(truth.T_scan_tool[0])
     rest = in_mm(registration.T_patient_scan @ truth.T_scan_tool[0] @ np.linalg.inv(follower.tool.T_cube_tool))
 
     async def scene():
         eye = OverlayCamera(follower.calibration, Painter(stage, follower.tool, "contour"), 1e-4)
         async with linked(follower, registration, eye) as port, peers(port) as (tracker,):
-            tracker.send("IMAGE", "Camera", image(picture[:100]))
+            tracker.send("IMAGE", "Camera", encode_image(picture[:100]))
             assert "another size than the camera's: 960 x 100" in await tracker.said()
             moving = asyncio.create_task(sending(tracker, rest))
             await tracker.next("TRANSFORM", "TumourToRas")
@@ -181,12 +181,12 @@ def test_a_cameras_picture_comes_back_with_the_tumour_in_it(follower, registrati
                 (0.02, 30.0, "fast"),
                 (9.0, 0.0, "late"),
             ):
-                stamp = stamp_of(begun + apart)
+                stamp = to_stamp(begun + apart)
                 if where != "late":
                     moved = placed.copy()
                     moved[0, 3] += shift
                     tracker.send("TRANSFORM", NAMES.camera, transform(moved), stamp)
-                tracker.send("IMAGE", "Camera", image(picture), stamp + (where == "fast") * stamp_of(0.005))
+                tracker.send("IMAGE", "Camera", encode_image(picture), stamp + (where == "fast") * to_stamp(0.005))
                 header, body = await tracker.next("IMAGE", "Overlay")
                 shown[where] = read_image(body)
             assert header.stamp == stamp
@@ -198,9 +198,11 @@ def test_a_cameras_picture_comes_back_with_the_tumour_in_it(follower, registrati
     assert {where: found(drawn) for where, drawn in shown.items()} == {
         "one": False, "drawn": True, "fast": False, "late": False
     }  # fmt: skip
-    assert outline_gap(shown["drawn"], ink_of(TUMOUR_COLOUR), mask, silhouette(camera, *tool)) < 2.5
+    assert (
+        measure_outline_gap(shown["drawn"], compute_ink(TUMOUR_COLOUR), mask, compute_silhouette(camera, *tool)) < 2.5
+    )
 
 
 def found(drawn):
     """Whether a tumour is drawn as known."""
-    return np.count_nonzero(of_ink(drawn, ink_of(TUMOUR_COLOUR))) > 5
+    return np.count_nonzero(find_ink(drawn, compute_ink(TUMOUR_COLOUR))) > 5

@@ -9,29 +9,31 @@ from gym_examples import SIZE, made, played
 from programs import main
 from theatres import put, theatre_of
 
-from scenes.gym.episode import ENDED, FAR, OVER_LIMIT, SHARE, STEP, EpisodeScore, earned
+from scenes.gym.episode import ENDED, FAR, OVER_LIMIT, SHARE, STEP, EpisodeScore, compute_reward
 from scenes.gym.model_answers import PressedModel
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT
-from scenes.play.deformers import model_path
+from scenes.play.deformers import to_model_path
 from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import BRAIN, MATERIALS
-from surrogate.data.answer_rows import stating
+from surrogate.data.answer_rows import describe_tissue_source
 
 STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: replace(BRAIN, young=9000.0)})
 
 
 def test_a_reward_is_a_difference_of_potentials_and_its_limits():
     near, far = EpisodeScore(0.002, 0.1, 0, 0.5), EpisodeScore(0.012, 0.6, 0, 0.5)
-    assert earned(far, near, False, False) == pytest.approx(1.0 + 0.5 - STEP)
-    assert earned(near, near, False, False) == pytest.approx(-STEP)
-    assert earned(near, replace(near, load=1.1), False, False) == pytest.approx(-STEP - OVER_LIMIT)
-    assert earned(near, near, False, True) == pytest.approx(ENDED - STEP)
-    assert earned(near, replace(near, cut=2), False, False) == pytest.approx(2.0 * SHARE - STEP)
+    assert compute_reward(far, near, False, False) == pytest.approx(1.0 + 0.5 - STEP)
+    assert compute_reward(near, near, False, False) == pytest.approx(-STEP)
+    assert compute_reward(near, replace(near, load=1.1), False, False) == pytest.approx(-STEP - OVER_LIMIT)
+    assert compute_reward(near, near, False, True) == pytest.approx(ENDED - STEP)
+    assert compute_reward(near, replace(near, cut=2), False, False) == pytest.approx(2.0 * SHARE - STEP)
     lost, farther = EpisodeScore(FAR, 1.0, 0, 0.5), EpisodeScore(2.0 * FAR, 5.0, 0, 0.5)  # beyond, all count alike
-    assert earned(farther, lost, False, False) == pytest.approx(-STEP) != earned(lost, near, False, False)
+    assert (
+        compute_reward(farther, lost, False, False) == pytest.approx(-STEP) != compute_reward(lost, near, False, False)
+    )
 
 
 def test_the_goal_follows_the_tumour_and_its_middle_is_of_what_is_left(boxed):
@@ -62,7 +64,8 @@ def stiff(box, tmp_path_factory):
     """A body whose models, of pushes, learned from a stiff tumour."""
     theatre = theatre_of(box)
     learned = {
-        name: replace(each, training={**each.training, **stating(STIFF)}) for name, each in theatre.models.items()
+        name: replace(each, training={**each.training, **describe_tissue_source(STIFF)})
+        for name, each in theatre.models.items()
     }
     return put(replace(theatre, models=learned), tmp_path_factory.mktemp("stiff") / "stiff.vtu")
 
@@ -78,7 +81,7 @@ def test_a_body_has_the_tissue_of_its_models(stiff):
 def test_a_ball_presses_what_lies_at_the_cortex(stiff, box, tmp_path):
     shallow = replace(box, mesh=replace(box.mesh, region=np.full_like(box.mesh.region, TUMOUR_LABEL)))
     models = {
-        name: replace(each, anatomy=shallow, training={**each.training, **stating(STIFF)})
+        name: replace(each, anatomy=shallow, training={**each.training, **describe_tissue_source(STIFF)})
         for name, each in theatre_of(box).models.items()
     }
     path = put(replace(theatre_of(box), anatomy=shallow, models=models), tmp_path / "shallow.vtu")
@@ -88,7 +91,7 @@ def test_a_ball_presses_what_lies_at_the_cortex(stiff, box, tmp_path):
 
 def test_a_model_that_may_not_answer_is_named_with_the_reason(stiff):
     """One that is asked for is refused; one that lies beside the body is warned of."""
-    beside, force = str(model_path(stiff)), "it was trained on what a tool's force does, and here is none"
+    beside, force = str(to_model_path(stiff)), "it was trained on what a tool's force does, and here is none"
     with pytest.raises(InputError, match=rf"model\.npz: does not answer the task retract: {force}, but .*ToolContact"):
         open_setting(RETRACT, str(stiff), "auto", "cpu", SIZE, beside)
     with pytest.raises(InputError, match=r"model\.npz: does not answer the task debulk: tissue is cut away"):

@@ -8,16 +8,16 @@ import pytest
 from locators import locator_of
 from theatres import SIGHTED, short, small
 
-from ar.overlay.hud import FINE, NARROW, bound_words, folded, millimetres
-from ar.overlay.outlines import ink_of, of_ink, stands
+from ar.overlay.hud import FINE, NARROW, bound_words, format_millimetres, wrap_line
+from ar.overlay.outlines import compute_ink, find_ink, has_text
 from scenes.cli import main
-from scenes.page.text import estimated, legend, report
-from scenes.play.checks import measure, objections, within
+from scenes.page.text import compute_estimate, format_page_legend, report
+from scenes.play.checks import is_within_surface, list_objections, measure
 from scenes.play.deformers import Theatre, open_theatre
 from scenes.play.observer import ELLIPSOID_COLOUR
 from scenes.play.player import REFUSED
-from scenes.play.reference import truth_of
-from scenes.play.scene_costs import labelled
+from scenes.play.reference import solve_reference_frames
+from scenes.play.scene_costs import add_cost_label
 from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.scene import Bounds, find_scene
 from scenes.script.shipped_files import template_path
@@ -27,8 +27,8 @@ from scenes.script.uncertainty import TumourError, Uncertainty
 from sim.anatomy import PART_LABELS
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
-from surrogate.locating.locator_store import locator_path, save_locator
-from surrogate.locating.prior import middle_of
+from surrogate.locating.locator_store import save_locator, to_locator_path
+from surrogate.locating.prior import compute_middle
 from surrogate.locating.regions import Region
 
 # Small errors, as a tumour in a box moves little.
@@ -60,7 +60,7 @@ def frames(play):
 
 @pytest.fixture(scope="module")
 def truth(theatre, scene, frames):
-    return truth_of(theatre, scene, [frame.loads for frame in frames])
+    return solve_reference_frames(theatre, scene, [frame.loads for frame in frames])
 
 
 def test_what_the_tool_hides_is_not_seen_and_where_it_touches_is(still, play):
@@ -82,13 +82,13 @@ def test_the_picture_shows_estimate_truth_and_ellipsoid(play, frames):
     assert found.location is not None and found.held and found.off < 0.7 * np.linalg.norm(found.true)
     assert frame.moved == found.moved == pytest.approx(np.linalg.norm(found.location.centroid))
     for ink, least in ((TUMOUR_COLOUR, 200), (ELLIPSOID_COLOUR, 10), (TRUTH_COLOUR, 10)):
-        assert np.count_nonzero(of_ink(frame.shown, ink_of(ink))) >= least
+        assert np.count_nonzero(find_ink(frame.shown, compute_ink(ink))) >= least
     nodes = play.site.anatomy.tumour_nodes
     believed, positions = play.believed(frame), play.positions(frame.deformation)
     assert not np.allclose(believed[nodes], positions[nodes], atol=1e-5)
     others = np.setdiff1d(np.arange(len(positions)), nodes)
     assert np.array_equal(believed[others], positions[others])  # the camera sees the true cortex
-    moved = middle_of(play.site.anatomy, (believed - play.site.anatomy.mesh.nodes)[None])[0]
+    moved = compute_middle(play.site.anatomy, (believed - play.site.anatomy.mesh.nodes)[None])[0]
     assert moved == pytest.approx(found.motion, abs=1e-6)
     assert "locate" in frame.seconds and frame.remark.endswith(f"estimate error {1e3 * found.off:.1f} mm")
 
@@ -124,7 +124,7 @@ def test_an_ellipsoid_holds_what_its_covariance_says(frames):
     found = frames[1].estimate
     closed, root = found.ellipsoid(), np.linalg.cholesky(found.location.centroid_covariance)
     at, way = found.middle + found.motion, np.array([0.6, 0.0, 0.8])
-    assert within(closed, at + 2.7 * root @ way) and not within(closed, at + 2.85 * root @ way)
+    assert is_within_surface(closed, at + 2.7 * root @ way) and not is_within_surface(closed, at + 2.85 * root @ way)
     assert replace(found, true=found.motion + 2.79 * root @ way).held  # chi-square of three, 95 %: 2.795
     assert not replace(found, true=found.motion + 2.8 * root @ way).held
 
@@ -132,10 +132,10 @@ def test_an_ellipsoid_holds_what_its_covariance_says(frames):
 def test_where_nothing_moves_that_is_said(play, frames):
     found = frames[0].estimate
     assert not found.noticed and frames[0].remark.startswith("no significant motion detected; ")
-    assert "No significant motion detected." in " ".join(estimated(found))
+    assert "No significant motion detected." in " ".join(compute_estimate(found))
     tried, guess = (replace(found, location=replace(found.location, calibrated=known)) for known in (True, False))
-    assert "guess" not in tried.words + " ".join(estimated(tried))
-    assert "; a guess; " in guess.words and "It is a guess" in " ".join(estimated(guess))
+    assert "guess" not in tried.words + " ".join(compute_estimate(tried))
+    assert "; a guess; " in guess.words and "It is a guess" in " ".join(compute_estimate(guess))
 
 
 @pytest.fixture(scope="module")
@@ -170,10 +170,10 @@ def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
     assert frame.doubt == REFUSED and found.ellipsoid() is None and not found.held and frame.remark == ""
     nodes = play.site.anatomy.tumour_nodes
     assert np.array_equal(play.believed(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
-    assert not of_ink(frame.shown, ink_of(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
-    assert np.count_nonzero(of_ink(frame.shown, ink_of(TRUTH_COLOUR))) > 10
+    assert not find_ink(frame.shown, compute_ink(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
+    assert np.count_nonzero(find_ink(frame.shown, compute_ink(TRUTH_COLOUR))) > 10
     monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, lines, **more: said.extend(lines) or colour)
-    labelled(frame, "fem")
+    add_cost_label(frame, "fem")
     assert any(line == f"estimate: rejected, {found.refusal}" for line in said)
     assert "Observation rejected" in report(frame, play.stage, "fem", "", (), 100)
 
@@ -184,12 +184,12 @@ def test_check_says_what_the_locator_holds_against_its_answers(refused, frames):
     best = max(frames, key=lambda frame: np.linalg.norm(frame.estimate.true))
     slipped = replace(best.estimate, location=replace(best.estimate.location, slipped=True))
     still = replace(best, estimate=replace(best.estimate, true=np.zeros(3)))
-    assert objections([best, best]) == [] and objections([replace(best, estimate=None)]) == []
+    assert list_objections([best, best]) == [] and list_objections([replace(best, estimate=None)]) == []
     why = wild.estimate.refusal
-    assert objections([wild, best]) == [f"the locator rejects the observation in 1 of 2 frames: {why}"]
-    (doubt,) = objections([replace(best, estimate=slipped), best])
+    assert list_objections([wild, best]) == [f"the locator rejects the observation in 1 of 2 frames: {why}"]
+    (doubt,) = list_objections([replace(best, estimate=slipped), best])
     assert "doubts its result in 1 of 2 frames" in doubt and "may have slipped" in doubt
-    (sparse,) = objections([still, best, still])
+    (sparse,) = list_objections([still, best, still])
     assert "moves in 1 of 3 frames" in sparse and "give a smaller --every" in sparse
 
 
@@ -197,18 +197,18 @@ def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
     frame, said = frames[1], []
     found = frame.estimate
     monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, lines, **more: said.extend(lines) or colour)
-    labelled(replace(frame, named=False), "fem")
+    add_cost_label(replace(frame, named=False), "fem")
     truth = 1e3 * np.linalg.norm(found.true)
     off = bound_words(found.location.p95, 1)
     assert said[0] == f"truth: tumour moved {truth:.2f} mm"
     assert said[1] == f"estimate: tumour moved {1e3 * found.moved:.2f} +- {off}"
     assert f"truth: {frame.deformation.source}" in said and f"estimate: {found.source}" in said
     assert said[-1].startswith("lines: ") and not any("tumour moved" in line for line in said[2:])
-    foot = f"estimate moved {millimetres(found.moved, found.location.p95)}"
+    foot = f"estimate moved {format_millimetres(found.moved, found.location.p95)}"
     assert f"truth moved {truth:.1f} mm; estimate" in frame.remark
-    assert all(stands(frame.shown, line, FINE) for line in folded(foot, NARROW * frame.shown.shape[1]))
+    assert all(has_text(frame.shown, line, FINE) for line in wrap_line(foot, NARROW * frame.shown.shape[1]))
     said.clear()
-    labelled(replace(frame, named=True), "fem")
+    add_cost_label(replace(frame, named=True), "fem")
     assert not any(line.startswith("lines: ") for line in said)
 
 
@@ -231,14 +231,14 @@ def test_a_sight_tells_the_error_in_place_of_the_prior(play, frames):
 
 
 def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
-    said = legend(play.scene)
+    said = format_page_legend(play.scene)
     assert all(words in said for words in ("estimate", "truth", "95 %", "scan", "tip to tumour"))
-    assert "estimate" not in legend(replace(play.scene, sight=None))
+    assert "estimate" not in format_page_legend(replace(play.scene, sight=None))
     found = frames[1].estimate
-    words = " ".join(estimated(found))
+    words = " ".join(compute_estimate(found))
     assert f"error {1e3 * found.off:.1f} mm; the truth is inside the ellipsoid" in words
     assert f"{len(found.observation.now)} points of the cortex, and where the tool touches; no force" in words
-    assert "outside of" in " ".join(estimated(replace(found, true=np.ones(3))))
+    assert "outside of" in " ".join(compute_estimate(replace(found, true=np.ones(3))))
 
 
 def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
@@ -265,7 +265,7 @@ def test_no_trained_model_is_the_truth(scene):
 
 
 def test_what_ships_locates_its_tumour(capsys):
-    assert locator_path(template_path()).stat().st_size < 8_000_000
+    assert to_locator_path(template_path()).stat().st_size < 8_000_000
     assert main(["check", *SIGHTED, "--every", "40", "--device", "cpu", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["scenes"]
     assert [row["scene"] for row in rows] == list(SIGHTED)

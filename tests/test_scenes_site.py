@@ -10,7 +10,7 @@ from scenes.script.scene import SCENES, find_scene
 from scenes.script.site import site_of
 from sim.bodies.meshfile import read_anatomy
 from sim.compile import check_causes
-from sim.geometry.closest_point import closest
+from sim.geometry.closest_point import find_closest_points
 from sim.loads import Pushed
 
 LONG = np.array([0.8, 1.25, 0.9])
@@ -39,7 +39,7 @@ def test_the_opening_is_where_it_was_asked_for_and_its_axis_points_inwards(site)
 @pytest.mark.parametrize("name", SCENES)
 def test_each_scene_touches_the_open_cortex_of_another_head_from_outside(name, site):
     scene, cortex = find_scene(name), site.anatomy.mesh.nodes[site.anatomy.open_surface]
-    check_causes(scene.effects_on(site.anatomy), scene.loads(site, scene.path(0.0), 0.0))
+    check_causes(scene.get_effects_on(site.anatomy), scene.loads(site, scene.path(0.0), 0.0))
     stage = Stage(scene, site)
     for time in scene.times[:: len(scene.times) // 4]:
         touch = scene.path(time)
@@ -47,10 +47,10 @@ def test_each_scene_touches_the_open_cortex_of_another_head_from_outside(name, s
         left = stage.at(loads).anatomy
         assert 0 < len(left.mesh.tets) <= len(site.anatomy.mesh.tets)
         for pushed in loads.every(Pushed):
-            away = np.linalg.norm(closest(pushed.point, cortex).point - pushed.point, axis=1)
+            away = np.linalg.norm(find_closest_points(pushed.point, cortex).point - pushed.point, axis=1)
             assert away.max() < 1e-9 and (pushed.force @ site.axis >= -1e-12).all()
         if scene.tool is None:
             continue
         pose = scene.pose(site, touch)
         tip, shaft = pose[:3, 3], pose[:3, 2]
-        assert shaft @ site.axis < 0.0 and np.linalg.norm(closest(tip[None], cortex).point[0] - tip) < 20e-3
+        assert shaft @ site.axis < 0.0 and np.linalg.norm(find_closest_points(tip[None], cortex).point[0] - tip) < 20e-3

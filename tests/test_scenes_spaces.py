@@ -27,7 +27,7 @@ from scenes.play.deformers import Theatre
 from scenes.play.player import Player
 from scenes.play.stage import Stage
 from scenes.tracked.pose_file import TrackedRow, write_poses
-from scenes.tracked.registration_file import scanned_of, write_registration
+from scenes.tracked.registration_file import describe_scan, write_registration
 from scenes.tracked.run import write_rows
 from scenes.tracked.tracked_tool import TrackedTool, read_tool, write_tool
 from scenes.tracked.truth import VideoGroundTruth, write_table, write_truth
@@ -149,7 +149,7 @@ def test_data_sets_and_registrations_name_their_spaces(folder, pretender):
         nodes = file["anatomy/nodes"]
         assert nodes.attrs["unit"] == "m" and nodes.attrs["frame"] == "RAS"
         near(1e3 * nodes[:][file["anatomy/tets"][:][file["anatomy/region"][:] == 2]].mean(axis=(0, 1)), TUMOUR)
-    exact = Registration(np.eye(4), 1e-8 * np.eye(6), np.zeros(3), 0.0, 3, 0, scanned_of(anatomy))
+    exact = Registration(np.eye(4), 1e-8 * np.eye(6), np.zeros(3), 0.0, 3, 0, describe_scan(anatomy))
     write_registration(folder / "registration.json", exact)
     said = json.loads((folder / "registration.json").read_text())
     assert said["spaces"]["scan"] == "RAS [mm]"

@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from ar.rendering.real_picture import vignetted
+from ar.rendering.real_picture import add_vignette
 from scenes.play.player import Player
 from scenes.play.stage import CORTEX, Stage
 from scenes.script.viewpoint import Viewpoint
@@ -59,7 +59,7 @@ def test_a_scan_of_one_value_gives_one_colour_and_no_folds():
 
 def test_a_round_field_is_dark_beyond_its_rim_and_changes_nothing_else():
     grey = template_theatre().intensity.values
-    whole, field = seen(grey), vignetted(seen(grey), 1.0)
+    whole, field = seen(grey), add_vignette(seen(grey), 1.0)
     row, column = np.mgrid[:240, :320]
     away = np.hypot(column - 159.5, row - 119.5)
     assert not field.colour[away > 160.0].any()
@@ -71,7 +71,7 @@ def test_a_round_field_is_dark_beyond_its_rim_and_changes_nothing_else():
     with pytest.raises(InputError, match="round field"):
         Viewpoint(field=0.0)
     with pytest.raises(ValueError, match="round field"):
-        vignetted(seen(grey), float("nan"))
+        add_vignette(seen(grey), float("nan"))
 
 
 def test_a_scene_shows_its_field_and_the_same_bytes_again():

@@ -7,7 +7,7 @@ import pytest
 from programs import main
 from theatres import template_theatre
 
-from ar.overlay.outlines import silhouette
+from ar.overlay.outlines import compute_silhouette
 from benchmarks.studies.stereo_study import row
 from scenes.play.deformers import AtRest
 from scenes.play.player import REFUSED, Player
@@ -17,8 +17,8 @@ from scenes.script.shipped_files import template_path
 from scenes.script.sight import StereoSight
 from sim.deformation import Outcome
 from sim.errors import InputError
-from sim.geometry.closest_point import closest
-from surrogate.locating.locator_store import locator_path
+from sim.geometry.closest_point import find_closest_points
+from surrogate.locating.locator_store import to_locator_path
 
 EXACT = StereoSight(shift=0.0, turn=0.0)
 MICROSCOPE = find_scene("microscope")
@@ -27,7 +27,7 @@ NONE = np.zeros((0, 3))
 
 def observer_of(sight: StereoSight = EXACT) -> StereoObserver:
     """On few pixels."""
-    theatre = replace(template_theatre(), locator_file=locator_path(template_path()))
+    theatre = replace(template_theatre(), locator_file=to_locator_path(template_path()))
     scene = replace(MICROSCOPE, viewpoint=replace(MICROSCOPE.viewpoint, width=400, height=300), sight=sight)
     return theatre.stage(scene).observer
 
@@ -64,7 +64,7 @@ def truly(observer, moved, points):
     """How material points (n, 3) [m] at rest moved."""
     anatomy = observer.stage.site.anatomy
     surface = anatomy.open_surface
-    place = closest(points, anatomy.mesh.nodes[surface])
+    place = find_closest_points(points, anatomy.mesh.nodes[surface])
     return np.einsum("nc,nci->ni", place.weights, (moved - anatomy.mesh.nodes)[surface[place.triangle]])
 
 
@@ -107,7 +107,7 @@ def test_a_tool_hides_points_and_moves_none(observer, moved, seen):
     found = observer.seen(observer.shot(30, moved, corners), NONE)
     assert 20 < len(found.now) < len(seen.now)
     left = observer.shot(30, moved, corners).cameras[0]
-    hidden = silhouette(left, corners, np.asarray(scene.tool.mesh.faces))
+    hidden = compute_silhouette(left, corners, np.asarray(scene.tool.mesh.faces))
     column, row_ = left.project(found.now)[0].round().astype(int).T
     assert hidden.any() and not hidden[row_, column].any()
     off = found.now - found.rest - truly(observer, moved, found.rest)
@@ -118,7 +118,7 @@ def test_without_names_points_are_a_cloud_on_the_moved_cortex(moved, shot):
     observer = observer_of(replace(EXACT, named=False))
     found = observer.seen(shot, NONE)
     surface = observer.stage.site.anatomy.open_surface
-    off = np.linalg.norm(closest(found.now, moved[surface]).point - found.now, axis=1)
+    off = np.linalg.norm(find_closest_points(found.now, moved[surface]).point - found.now, axis=1)
     assert found.rest is None and len(found.now) > 60 and np.median(off) < 0.3e-3
 
 
@@ -155,13 +155,13 @@ class TestRefusals:
         assert "off the scan's" in said or "places of the cortex" in said or "pixels apart" in said
 
     def test_another_calibration(self, observer, shot, rest):
-        turned = shot.cameras[0], shot.cameras[1].perturbed(0.08, (1.0, 0.0, 0.0))
+        turned = shot.cameras[0], shot.cameras[1].perturb(0.08, (1.0, 0.0, 0.0))
         assert "calibrate the pair again" in self.refusal(observer, replace(shot, cameras=turned))
-        later = replace(shot, cameras=(shot.cameras[0], shot.cameras[1].perturbed(0.1)))
+        later = replace(shot, cameras=(shot.cameras[0], shot.cameras[1].perturb(0.1)))
         assert "round the opening seems to have moved" in self.refusal(observer, later)
         crossed = observer_of()
         first = crossed.shot(-1, rest)
-        vars(crossed)["_first_shot"] = replace(first, cameras=(first.cameras[0], first.cameras[1].perturbed(0.1)))
+        vars(crossed)["_first_shot"] = replace(first, cameras=(first.cameras[0], first.cameras[1].perturb(0.1)))
         assert "mm off the scan's" in self.refusal(crossed, shot)
 
     def test_no_texture(self, observer, shot):

@@ -2,13 +2,13 @@
 
 import pytest
 
-from scenes.report.study import note_seconds, noted_seconds
+from scenes.report.study import note_seconds, read_noted_seconds
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"seconds": "many"}', b"\xff"])
 def test_what_a_step_took_is_unknown_where_its_file_is_damaged(tmp_path, content):
     made = tmp_path / "made.npz"
     note_seconds(made, 1.25)
-    assert noted_seconds(made) == 1.25
+    assert read_noted_seconds(made) == 1.25
     made.with_suffix(".json").write_bytes(content)
-    assert noted_seconds(made) is None
+    assert read_noted_seconds(made) is None

@@ -5,19 +5,21 @@ from tiny_work import Made, tiny_run
 
 from scenes.episodes.run_folder import (
     begin,
-    unlike,
+    describe_versions,
 )
-from scenes.episodes.tasks import attempted
+from scenes.episodes.tasks import try_task
 
 
 def test_a_worker_that_does_not_fit_makes_nothing(tmp_path):
     def make(number):
         raise AssertionError
 
-    assert f"does not see {tmp_path}" in attempted(make, 0, tmp_path, tiny_run()).halt
+    assert f"does not see {tmp_path}" in try_task(make, 0, tmp_path, tiny_run()).halt
     begin(tmp_path, tiny_run(), PLAN)
     newer = tiny_run(versions={**tiny_run().versions, "sulcus": "9"})
-    assert "and not 9. Install the same there" in attempted(make, 0, tmp_path, newer).halt
-    assert "of another plan or seed" in attempted(make, 0, tmp_path, tiny_run(seed=2)).halt
-    assert attempted(lambda number: Made(tmp_path, 7), 0, tmp_path, tiny_run()).frames == 7
-    assert unlike({"a": "1"}, {"a": "1", "b": "2"}) == "b none and not 2" and not unlike({"a": "1"}, {"a": "1"})
+    assert "and not 9. Install the same there" in try_task(make, 0, tmp_path, newer).halt
+    assert "of another plan or seed" in try_task(make, 0, tmp_path, tiny_run(seed=2)).halt
+    assert try_task(lambda number: Made(tmp_path, 7), 0, tmp_path, tiny_run()).frames == 7
+    assert describe_versions({"a": "1"}, {"a": "1", "b": "2"}) == "b none and not 2" and not describe_versions(
+        {"a": "1"}, {"a": "1"}
+    )

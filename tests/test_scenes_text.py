@@ -7,7 +7,16 @@ import pytest
 from test_scenes_page import answer
 from theatres import short, sinking, small
 
-from scenes.page.text import RESEARCH, about, fem_words, plan_words, report, side, trust, words
+from scenes.page.text import (
+    RESEARCH,
+    describe_fem,
+    describe_scene,
+    describe_side_of_brain,
+    format_caption,
+    format_trust,
+    plan_words,
+    report,
+)
 from scenes.play.deformers import GUARDED, plan_of
 from scenes.play.player import Player
 from scenes.script.scene import find_scene
@@ -20,7 +29,7 @@ from sim.material import Material
 
 class TestTrust:
     def test_a_bound_is_reported_of_a_load_inside_the_range(self):
-        said = trust(answer(Outcome.PREDICTED), "svr")
+        said = format_trust(answer(Outcome.PREDICTED), "svr")
         assert (
             "in 95 of 100 loads" in said and "Error of the model" in said and "1.00 mm" in said and "warn" not in said
         )
@@ -30,24 +39,26 @@ class TestTrust:
     )
     def test_nothing_is_promised_of_an_answer_that_is_not_good(self, outcome):
         """It stands in another colour, with the reason."""
-        said = trust(answer(outcome), "svr")
+        said = format_trust(answer(outcome), "svr")
         assert "95 of 100" not in said and 'class="warn"' in said and "Do not rely on this result" in said
 
     def test_a_guarded_model_says_which_of_the_two_answered(self):
-        assert trust(answer(Outcome.PREDICTED), GUARDED).startswith(
+        assert format_trust(answer(Outcome.PREDICTED), GUARDED).startswith(
             "<p><b>trained model (guarded)</b>: inside the range"
         )
-        assert "as the error bound of the model is too large</b>: solved" in trust(answer(Outcome.CONVERGED), GUARDED)
+        assert "as the error bound of the model is too large</b>: solved" in format_trust(
+            answer(Outcome.CONVERGED), GUARDED
+        )
 
     def test_code_names_are_not_shown(self):
         for outcome in Outcome:
-            said = trust(answer(outcome), "fem")
+            said = format_trust(answer(outcome), "fem")
             assert "_" not in said and outcome.name not in said
 
     @pytest.mark.parametrize(("bound", "words"), [(1e-7, "0.01 mm"), (6e-6, "0.01 mm"), (1.231e-3, "1.24 mm")])
     def test_a_bound_is_not_reported_too_small(self, bound, words):
         bounded = replace(answer(Outcome.PREDICTED), bound=np.full((2, 1), bound))
-        assert f"is more than {words} from where its finite elements have it" in trust(bounded, "svr")
+        assert f"is more than {words} from where its finite elements have it" in format_trust(bounded, "svr")
 
     def test_undeformed_brain_has_no_motion_and_no_error_of_it(self, theatre):
         scene = small(path=press(0.2), duration=1.0)
@@ -60,32 +71,32 @@ class TestTrust:
     def test_where_nothing_moves_nothing_is_promised(self):
         still = answer(Outcome.PREDICTED)
         still = replace(still, displacement=0.0 * still.displacement)
-        said = trust(still, "svr")
+        said = format_trust(still, "svr")
         assert "Nothing moves the tumour." in said and "95 of 100" not in said
 
 
 class TestWords:
     def test_it_says_what_is_seen_and_that_it_is_research(self, theatre):
-        said = words(theatre, short(), "the <default> brain")
+        said = format_caption(theatre, short(), "the <default> brain")
         assert RESEARCH in said and "&lt;default&gt;" in said and "<default>" not in said
         assert "tumour now" in said and "tumour in the scan" in said and "tip to tumour" in said
-        assert "tip to tumour" not in words(theatre, sinking(), "brain")
+        assert "tip to tumour" not in format_caption(theatre, sinking(), "brain")
 
     def test_tissue_and_element_are_those_that_are_solved(self, theatre):
         default = "smoothed linear tetrahedra, neo-hookean tissue of Young's modulus 3 kPa"
-        assert fem_words(theatre, short()).startswith(default)
+        assert describe_fem(theatre, short()).startswith(default)
         stiff = Elasticity(Material("corotational", 5e3, 0.4, prony=()))
         plain = replace(theatre, models={})
         other = replace(short(), effects=(stiff, Held(), Slide(), ToolForce()), element="smoothed")
-        assert fem_words(plain, other) == (
+        assert describe_fem(plain, other) == (
             "smoothed linear tetrahedra, corotational tissue of Young's modulus 5 kPa and Poisson's ratio 0.4"
         )
-        assert fem_words(plain, find_scene("retract")).endswith("relaxes under a held load")
-        assert fem_words(plain, find_scene("sag")).endswith(
+        assert describe_fem(plain, find_scene("retract")).endswith("relaxes under a held load")
+        assert describe_fem(plain, find_scene("sag")).endswith(
             "Young's modulus 1.8 kPa and Poisson's ratio 0.45; the tumour of neo-hookean tissue of Young's modulus "
             "3.2 kPa and Poisson's ratio 0.45"
         )
-        assert "brain.vtu, opened" in about(theatre, short(), "brain.vtu")
+        assert "brain.vtu, opened" in describe_scene(theatre, short(), "brain.vtu")
 
     def test_a_plan_is_a_list_and_only_finite_elements_have_one(self, theatre):
         assert plan_words(("First <this>.", "Then that.")) == "<ul><li>First &lt;this&gt;.</li><li>Then that.</li></ul>"
@@ -98,7 +109,7 @@ class TestWords:
         site = theatre.site
         middle = 0.5 * (site.anatomy.mesh.nodes[:, 0].min() + site.anatomy.mesh.nodes[:, 0].max())
         at = [replace(site, origin=np.array([middle + x, 0.0, 0.0])) for x in (0.02, -0.02, 0.0)]
-        assert [side(place) for place in at] == [
+        assert [describe_side_of_brain(place) for place in at] == [
             "on the patient's right",
             "on the patient's left",
             "near the midline",

@@ -14,7 +14,7 @@ from boxes import box, top_forces
 from oracle import internal_forces
 from programs import main
 
-from scenes.options.tissue_options import add_tissue_arguments, regions_of, stiffness_doubt, tissue_of
+from scenes.options.tissue_options import add_tissue_arguments, assign_regions, check_stiffness, get_tissue
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
@@ -29,7 +29,7 @@ TWO_TERMS = "--material", "ogden", "--ogden", "1340,-19;700,2.5", "--bulk", "2e4
 def asked(*words: str) -> Tissue:
     parser = argparse.ArgumentParser()
     add_tissue_arguments(parser)
-    return tissue_of(parser.parse_args(words))
+    return get_tissue(parser.parse_args(words))
 
 
 @pytest.mark.parametrize(
@@ -78,16 +78,16 @@ def test_contradictions_are_refused_in_a_sentence(words: tuple[str, ...], senten
 
 
 def test_regions_obey_the_same_law() -> None:
-    found = regions_of(["2:9000,0.3", "-1:500,0.49"], MATERIALS["seconds"].tissue)
+    found = assign_regions(["2:9000,0.3", "-1:500,0.49"], MATERIALS["seconds"].tissue)
     assert found == {2: Material("neo-hookean", 9000.0, 0.3), -1: Material("neo-hookean", 500.0, 0.49)}
-    found = regions_of(["7:500,2;300,-4;1e4"], MATERIALS["minutes"].tissue)
+    found = assign_regions(["7:500,2;300,-4;1e4"], MATERIALS["minutes"].tissue)
     assert found == {7: Ogden(((500.0, 2.0), (300.0, -4.0)), 1e4)}
 
 
 @pytest.mark.parametrize(("name", "text"), [("seconds", "2:9000,0.3"), ("minutes", "2:500,2;1e4")])
 def test_regions_relax_as_the_rest_does(name: str, text: str) -> None:
     slow = replace(MATERIALS[name].tissue, prony=((0.3, 2.0),))
-    assert regions_of([text], slow)[2].prony == ((0.3, 2.0),)
+    assert assign_regions([text], slow)[2].prony == ((0.3, 2.0),)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_regions_relax_as_the_rest_does(name: str, text: str) -> None:
 )
 def test_regions_of_another_form_are_refused(text: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        regions_of([text], MATERIALS["minutes"].tissue)
+        assign_regions([text], MATERIALS["minutes"].tissue)
 
 
 def solve(folder: Path, *words: str) -> int:
@@ -167,7 +167,7 @@ def test_other_helps_name_the_tissues_and_say_where_more_stands(command: str, ca
     ("young", "doubted"), [(99.0, "is below 100,"), (101.0, ""), (9.9e5, ""), (1.1e6, "above 1e+06")]
 )
 def test_a_stiffness_that_no_tissue_has_is_doubted(young, doubted):
-    assert doubted in (said := stiffness_doubt(replace(BRAIN, young=young))) and bool(said) == bool(doubted)
+    assert doubted in (said := check_stiffness(replace(BRAIN, young=young))) and bool(said) == bool(doubted)
     if doubted:
         with pytest.warns(UserWarning, match=doubted.replace("+", r"\+")):
             asked("--young", str(young))

@@ -8,20 +8,20 @@ import pytest
 from theatres import template_theatre
 
 from scenes.cli import main
-from scenes.tracked.drawn_film import drawn_film
+from scenes.tracked.drawn_film import build_synthetic_video
 from scenes.tracked.follower import Follower, TumourState
 from scenes.tracked.picture import Painter
-from scenes.tracked.tracking_checks import TrackingFigures, measure_tracking, usual
+from scenes.tracked.tracking_checks import TrackingFigures, build_default_pipeline, measure_tracking
 
 
 @pytest.fixture(scope="module")
 def film():
-    return drawn_film(template_theatre())
+    return build_synthetic_video(template_theatre())
 
 
 @pytest.fixture(scope="module")
 def parts(film):
-    return usual(film, "contour")
+    return build_default_pipeline(film, "contour")
 
 
 def as_known(known):
@@ -107,7 +107,7 @@ def test_what_never_comes_back_fails():
 
 
 def test_check_exit_status_is_1_where_tracking_alone_fails(film, parts, monkeypatch, capsys):
-    names = {"drawn_film.drawn_film": film, "tracking_checks.usual": parts}
+    names = {"drawn_film.build_synthetic_video": film, "tracking_checks.usual": parts}
     names["tracking_checks.measure_tracking"] = TrackingFigures(16, 1, 0, 0.0, 0.0)
     for name, found in names.items():
         monkeypatch.setattr(f"scenes.tracked.{name}", lambda *given, found=found: found)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from scenes.cli import main
-from scenes.commands.train import notes_on
+from scenes.commands.train import list_notes
 
 
 def test_training_says_what_takes_long_and_what_too_few_loads_cannot_give():
     few, many = (SimpleNamespace(good=np.ones(count, bool)) for count in (20, 76))
-    series, bounds = notes_on(few, ["linear", "series-gp"])
+    series, bounds = list_notes(few, ["linear", "series-gp"])
     assert "minutes on a CPU" in series and "of 20 loads 5 are kept" in bounds and "--count 76" in bounds
-    assert notes_on(many, ["linear"]) == []
+    assert list_notes(many, ["linear"]) == []
 
 
 @pytest.mark.parametrize("learners", ["", "linear,,svr", " "])

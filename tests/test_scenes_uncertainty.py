@@ -7,24 +7,24 @@ import numpy as np
 import pytest
 from theatres import put, short, small
 
-from ar.overlay.hud import FINE, NARROW, folded, millimetres
-from ar.overlay.outlines import stands
+from ar.overlay.hud import FINE, NARROW, format_millimetres, wrap_line
+from ar.overlay.outlines import has_text
 from scenes.analysis.uncertainty import (
     SolvedMotions,
     SurfaceMotions,
-    causes,
-    changed,
+    apply_sample,
+    collect_contributor_values,
+    compute_worst_distances,
     coverage,
-    distances,
-    nominal,
-    parts,
-    solved,
-    uncertainty,
+    estimate_uncertainty,
+    get_nominal,
+    solve_scene,
+    split_contributions,
 )
 from scenes.cli import main
-from scenes.play.frame_text import NOT_KNOWN_WORDS, error_lines, worst
-from scenes.play.scene_costs import labelled
-from scenes.script.priors import POISSON, SKULL, STIFFNESS, TOOL, PatientSample, drawn
+from scenes.play.frame_text import NOT_KNOWN_WORDS, find_worst, format_errors
+from scenes.play.scene_costs import add_cost_label
+from scenes.script.priors import POISSON, SKULL, STIFFNESS, TOOL, PatientSample, sample_priors
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.tool_paths import Touch
 from scenes.script.uncertainty import (
@@ -33,7 +33,7 @@ from scenes.script.uncertainty import (
     Uncertainty,
     mark_of,
     read_uncertainties,
-    uncertainty_path,
+    to_uncertainty_path,
     write_uncertainties,
 )
 from sim.anatomy import TUMOUR_LABEL
@@ -65,7 +65,7 @@ class Hasty:
 
 def stated(scene, theatre, worst=(2e-3, 4e-3), **values):
     """An uncertainty that grows from the first frame to the last."""
-    mark = mark_of(scene, theatre.site, theatre.element_of(scene))
+    mark = mark_of(scene, theatre.site, theatre.choose_element(scene))
     flat = (1e-3, 1e-3)
     lists = {"times": (0.0, scene.duration), "worst": worst, "middle": flat, "moved": flat}
     return Uncertainty(
@@ -76,7 +76,7 @@ def stated(scene, theatre, worst=(2e-3, 4e-3), **values):
 class TestEnsemble:
     def test_a_drawn_scene_has_what_was_drawn(self):
         scene = find_scene("palpate")
-        found = changed(scene, PatientSample(2.0, 0.47, 0.5, 0.5, (1e-3, 2e-3, 3e-3), 0.1))
+        found = apply_sample(scene, PatientSample(2.0, 0.47, 0.5, 0.5, (1e-3, 2e-3, 3e-3), 0.1))
         elasticity, _, skull, _ = found.effects
         assert isinstance(elasticity, Elasticity) and skull == SKULLS["slide"]
         brain = replace(BRAIN, young=2.0 * BRAIN.young, poisson=0.47)
@@ -88,7 +88,7 @@ class TestEnsemble:
         """Under a known pose it cancels."""
         stiff = replace(SAME, stiffness=2.0)
         for scene, times in ((short(), 0.5), (small("palpate"), 1.0)):
-            ours, theirs = (solved(theatre, changed(scene, one)).motions[2] for one in (SAME, stiff))
+            ours, theirs = (solve_scene(theatre, apply_sample(scene, one)).motions[2] for one in (SAME, stiff))
             lengths = [np.linalg.norm(field, axis=1).mean() for field in (theirs, ours)]
             assert lengths[1] > 1e-5 and lengths[0] / lengths[1] == pytest.approx(times, rel=0.12)
 
@@ -96,24 +96,24 @@ class TestEnsemble:
         off = np.array([[[3.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
         normals = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         shift, wide = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), np.array([0.5, 0.0])
-        worst_point, middle = distances(off, normals, shift, wide)
+        worst_point, middle = compute_worst_distances(off, normals, shift, wide)
         np.testing.assert_allclose(worst_point, [[4.5, np.hypot(3.0, 2.0)]])
         np.testing.assert_allclose(middle, [[np.hypot(2.75, 0.25), 2.5]])
 
     def test_parts_are_found_each_by_itself(self):
         """Fields that depend on stiffness and tool, each by itself, are found as such; of nothing else is anything."""
-        scene, draws = short(), drawn(40, 5)
+        scene, draws = short(), sample_priors(40, 5)
         random = np.random.default_rng(0)
         field, of_stiffness, of_tool = random.normal(size=(3, 6, 3))
         motion = field + np.array([np.log(one.stiffness) * of_stiffness + one.tip[0] * of_tool for one in draws])
-        found = parts(motion, field, draws, scene)
+        found = split_contributions(motion, field, draws, scene)
         largest = np.linalg.norm(of_stiffness, axis=1).max()
         assert found[STIFFNESS.name] == pytest.approx(
             largest * np.sqrt(np.mean([np.log(one.stiffness) ** 2 for one in draws]))
         )
         assert found[TOOL] > 0.0 and max(found[name] for name in (POISSON.name, SKULL, "several together")) < 1e-12
-        assert TOOL not in causes(draws, find_scene("brain_shift"))
-        assert not any(column.any() for column in causes([SAME], scene).values())
+        assert TOOL not in collect_contributor_values(draws, find_scene("brain_shift"))
+        assert not any(column.any() for column in collect_contributor_values([SAME], scene).values())
 
     def test_a_bound_holds_for_other_draws(self, theatre):
         """Twins of a body whose motion is in inverse proportion to its stiffness: 95 in 100 lie within the bound."""
@@ -127,11 +127,14 @@ class TestEnsemble:
         def answers(draws):
             return [SolvedMotions((0.0 * field, field / one.stiffness)) for one in draws]
 
-        draws, twins = drawn(300, 0), drawn(300, 1)
-        found = uncertainty(theatre, scene, still, draws, answers(draws))
+        draws, twins = sample_priors(300, 0), sample_priors(300, 1)
+        found = estimate_uncertainty(theatre, scene, still, draws, answers(draws))
         tested = coverage(scene, still, found, twins, answers(twins), 1)
         assert tested.patients == 300 and 0.93 < tested.covered < 0.97
-        few = [coverage(scene, still, found, drawn(20, seed), answers(drawn(20, seed)), seed) for seed in range(2, 22)]
+        few = [
+            coverage(scene, still, found, sample_priors(20, seed), answers(sample_priors(20, seed)), seed)
+            for seed in range(2, 22)
+        ]
         scatter = np.std([one.covered for one in few])
         assert 0.5 * scatter < np.mean([one.deviation for one in few]) < 3.0 * scatter
         tight = replace(found, worst=tuple(0.7 * one for one in found.worst))
@@ -141,18 +144,18 @@ class TestEnsemble:
 
     def test_draws_without_equilibrium_are_counted_and_too_many_refused(self, theatre):
         field = np.ones((9, 3))
-        still, draws = SurfaceMotions((0.0,), (field,), (field,)), drawn(10, 0)
+        still, draws = SurfaceMotions((0.0,), (field,), (field,)), sample_priors(10, 0)
         answers = [SolvedMotions((field,), inverted) for inverted in [0, 0, 5, 1, 0, 0, 0, 0, 0]]
-        found = uncertainty(theatre, short(), still, draws, iter([*answers, None]))
+        found = estimate_uncertainty(theatre, short(), still, draws, iter([*answers, None]))
         assert (found.failed, found.folded) == (1, 2)
         with pytest.raises(InputError, match="too few"):
-            uncertainty(theatre, short(), still, draws, [*answers[:7], None, None, None])
+            estimate_uncertainty(theatre, short(), still, draws, [*answers[:7], None, None, None])
 
     @pytest.mark.parametrize(("failing", "asked"), [((), 5), ((1,), 9), ((1, 3), 4)])
     def test_a_moment_that_is_not_reached_at_once_is_by_way_of_times_between(self, theatre, failing, asked):
         """After a call that failed the solver is asked again from the moment before; failing again is no answer."""
         hasty = Hasty(theatre, failing)
-        found, whole = solved(hasty, short()), solved(theatre, short())
+        found, whole = solve_scene(hasty, short()), solve_scene(theatre, short())
         assert len(hasty.starts) == asked
         if len(failing) == 2:
             assert found is None
@@ -164,11 +167,11 @@ class TestEnsemble:
 
     def test_a_force_beyond_the_law_turns_tetrahedra_inside_out_and_is_counted(self, theatre):
         """The scene itself turns none; at a tenth of its stiffness some are."""
-        weak = solved(theatre, changed(short(), replace(SAME, stiffness=0.1)))
-        assert solved(theatre, short()).inverted == 0 and weak is not None and weak.inverted > 0
+        weak = solve_scene(theatre, apply_sample(short(), replace(SAME, stiffness=0.1)))
+        assert solve_scene(theatre, short()).inverted == 0 and weak is not None and weak.inverted > 0
 
     def test_the_moments_of_a_scene_end_where_it_does(self, theatre):
-        still = nominal(theatre, short())
+        still = get_nominal(theatre, short())
         assert still.times[0] == 0.0 and still.times[-1] == pytest.approx(0.2)
         assert [np.linalg.norm(one, axis=1).mean() > 1e-4 for one in still.fields] == [False, True, True, True, False]
         np.testing.assert_allclose(np.linalg.norm(still.normals[0], axis=1), 1.0)
@@ -249,8 +252,8 @@ class TestSaid:
         ],
     )  # fmt: skip
     def test_both_are_said_apart(self, trained, promised, error, said):
-        assert error_lines(promised, error, trained) == said
-        assert error_lines(promised, error, trained, "doubt") == said[-1:]
+        assert format_errors(promised, error, trained) == said
+        assert format_errors(promised, error, trained, "doubt") == said[-1:]
 
     @pytest.mark.parametrize(
         ("trained", "promised", "error", "said"),
@@ -262,11 +265,11 @@ class TestSaid:
         ],
     )
     def test_small_pictures_say_them_in_few_words(self, trained, promised, error, said):
-        assert error_lines(promised, error, trained, brief=True) == said
+        assert format_errors(promised, error, trained, brief=True) == said
 
     def test_the_worst_of_frames_is_known_where_all_are(self):
         errors = [TumourError(1e-3, "E"), TumourError(3e-3, "nu"), TumourError(2e-3, "E")]
-        assert worst(errors) == errors[1] and worst([*errors, NOT_KNOWN]) == worst([]) == NOT_KNOWN
+        assert find_worst(errors) == errors[1] and find_worst([*errors, NOT_KNOWN]) == find_worst([]) == NOT_KNOWN
 
     def test_a_picture_has_both_and_its_band_is_that_of_the_tumour(self, theatre, monkeypatch):
         scene = short()
@@ -284,16 +287,16 @@ class TestSaid:
         assert frame.model_error == frame.deformation.bound[0, 0]
         marks = drawn_with[0][5]
         assert marks.margin == marks.gauge.error == frame.tumour_error.prior
-        assert list(frame.head) == error_lines(frame.model_error, frame.tumour_error, True)
-        assert all(stands(frame.shown, line, FINE) for line in frame.head)
+        assert list(frame.head) == format_errors(frame.model_error, frame.tumour_error, True)
+        assert all(has_text(frame.shown, line, FINE) for line in frame.head)
         # The panel of figures begins under them.
-        assert all(stands(labelled(frame, "linear"), line, FINE) for line in frame.head)
+        assert all(has_text(add_cost_label(frame, "linear"), line, FINE) for line in frame.head)
         narrow = knowing.player("linear", scene).draw(3, 0.1, scene.path(0.1))
         assert narrow.shown.shape == (240, 320, 3)
-        assert list(narrow.head) == error_lines(narrow.model_error, narrow.tumour_error, True, brief=True)
-        moved = folded(f"moved {millimetres(narrow.moved, narrow.tumour_error.moved)}", NARROW * 320)
+        assert list(narrow.head) == format_errors(narrow.model_error, narrow.tumour_error, True, brief=True)
+        moved = wrap_line(f"moved {format_millimetres(narrow.moved, narrow.tumour_error.moved)}", NARROW * 320)
         for line in (*narrow.head, *moved, "frame 3"):
-            assert stands(narrow.shown, line, FINE)
+            assert has_text(narrow.shown, line, FINE)
 
     def test_in_a_hand_and_of_a_doubtful_answer_it_is_not_known(self, theatre):
         scene = short()
@@ -320,7 +323,7 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
     assert row["scene"] == "brief" and row["draws"] == 8 and row["patients"] == 2 and 0.5 < row["covered"] <= 1.0
     assert "on 2 synthetic patients that are not among them" in said.err and 0.0 <= row["covered_deviation"] < 0.5
     assert row["tumour_mm"] > 4.0 > row["model_mm"] and row["largest_part"] is None
-    stored = read_uncertainties(uncertainty_path(body))["brief"]
+    stored = read_uncertainties(to_uncertainty_path(body))["brief"]
     assert stored.covered == pytest.approx(row["covered"], abs=1e-6)
     assert main(["check", *words, "--deformer", "fem", "--every", "3", "--json"]) == 0
     (checked,) = json.loads(capsys.readouterr().out)["scenes"]
@@ -345,8 +348,8 @@ def test_other_tissues_are_refused(theatre, tmp_path, monkeypatch, capsys):
 
     scene = short().made_of(MATERIALS["minutes"].tissue, None)
     with pytest.raises(InputError, match="Young's modulus"):
-        changed(scene, SAME)
-    monkeypatch.setattr("scenes.analysis.uncertainty.nominal", None)  # before anything is solved
+        apply_sample(scene, SAME)
+    monkeypatch.setattr("scenes.analysis.uncertainty.get_nominal", None)  # before anything is solved
     out = tmp_path / "found.json"
     assert main(["uncertainty", "press", "--material", "minutes", "--device", "cpu", "--out", str(out)]) == 2
     assert "the scene press has another tissue: ogden" in capsys.readouterr().err

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from tiny_episodes import packed
 
-from scenes.episodes.reading.again import solved_again
+from scenes.episodes.reading.again import solve_again
 from scenes.episodes.reading.validation import validate_episode
 
 
@@ -84,7 +84,7 @@ def test_what_is_wrong_is_named(name, whole, tmp_path):
 
 
 def test_frames_are_not_solved_again_without_a_plan(whole):
-    report = solved_again(validate_episode(whole), 2, "cpu")
+    report = solve_again(validate_episode(whole), 2, "cpu")
     assert not report.problems and any("solved again: it states no" in words for words in report.skipped)
     assert report.again == 0 and report.again_mm is None
 

@@ -13,7 +13,7 @@ def test_eyes_of_a_microscope_meet_at_the_site(site):
     left, right = (replace(USUAL, eye=eye).camera(site) for eye in ("left", "right"))
     for one in (left, right):
         assert one.project(USUAL.target(site))[0] == pytest.approx([319.5, 239.5])
-    assert left.in_frame(right.centre)[0] > 0.023
+    assert left.to_camera_frame(right.centre)[0] > 0.023
     with pytest.raises(InputError, match="choose left or right"):
         Viewpoint(eye="third")  # type: ignore[arg-type]
 

@@ -7,7 +7,7 @@ import SimpleITK as sitk  # noqa: N813
 from warped import BLOBS, GRIDS, LPS, MAPPED, WIDTH, bump, places
 
 from sim.geometry.locate import locate
-from sim.geometry.tetmesh import signed_volumes
+from sim.geometry.tetmesh import compute_signed_volumes
 
 
 @pytest.fixture(scope="module")
@@ -19,8 +19,10 @@ def middles(box):
     for blob in BLOBS:
         at = locate(box.mesh, np.concatenate([blob + offsets, blob - offsets]))
         now = at.read((box.mesh.nodes + moved)[None])[0]
-        rest = signed_volumes(box.mesh.nodes, at.vertices)
-        found.append(np.average(now, axis=0, weights=signed_volumes(box.mesh.nodes + moved, at.vertices) / rest))
+        rest = compute_signed_volumes(box.mesh.nodes, at.vertices)
+        found.append(
+            np.average(now, axis=0, weights=compute_signed_volumes(box.mesh.nodes + moved, at.vertices) / rest)
+        )
     return np.array(found)
 
 

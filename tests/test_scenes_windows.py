@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from tiny_episodes import HEIGHT, SCALE, WIDTH, Wanted, packed, pictures_of, write_episode
+from tiny_episodes import HEIGHT, SCALE, WIDTH, Wanted, packed, read_images, write_episode
 from torch.utils.data import DataLoader
 
 from scenes import EpisodeDataset, read_episodes
@@ -45,7 +45,7 @@ def test_pictures_are_decoded_to_what_was_drawn(folder, box):
     names = ("colour", "depth", "segmentation", "tumour_mask")
     window = read_episodes(folder, names, window=4).at(2, 0)
     at = read_episodes(folder, ["tumour_predicted"], window=4).at(2, 0)["tumour_predicted"]
-    drawn = pictures_of(box, Wanted(4, seed=2), at)
+    drawn = read_images(box, Wanted(4, seed=2), at)
     assert window["colour"].shape == (4, HEIGHT, WIDTH, 3) and window["colour"].dtype == np.uint8
     assert np.abs(window["colour"].astype(int) - drawn["colour"]).max() < 6  # red is red
     assert window["depth"].dtype == np.float32 and np.allclose(window["depth"], drawn["depth"] * SCALE, atol=1e-8)

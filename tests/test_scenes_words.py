@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import ar.overlay.hud
-from ar.overlay.outlines import outlines, silhouette
+from ar.overlay.outlines import compute_silhouette, find_outlines
 from ar.overlay.styles import Style
-from scenes.page.demo import pictured
+from scenes.page.demo import render_page_image
 from scenes.play.deformers import open_theatre
-from scenes.play.player import Player, gauged
+from scenes.play.player import Player, measure_gauge
 from scenes.play.stage import TOOL
 from scenes.script.scene import find_scene
 from scenes.script.tool_paths import Touch
@@ -69,7 +69,7 @@ def seen(monkeypatch, name, size, touch=None, number=51, style="window"):
 
     monkeypatch.setattr(ar.overlay.hud.cv2, "putText", heard)
     frame = play.drawn(number, touch or play.touch(number), *answered(name, touch, number), 0.0)
-    picture = pictured(frame)
+    picture = render_page_image(frame)
     monkeypatch.undo()
     assert picture.shape == (size[1], size[0], 3)
     return play, frame, found
@@ -80,10 +80,10 @@ def lined(play, frame):
     lines = np.zeros(frame.picture.segmentation.shape, np.uint8)
     rest, now = (play.stage.tumour(at) for at in (play.site.anatomy.mesh.nodes, play.positions(frame.deformation)))
     for tumour in (rest, now):
-        mask = silhouette(frame.camera, tumour.vertices, tumour.triangles)
-        cv2.polylines(lines, outlines(mask), True, (1,), 2)
+        mask = compute_silhouette(frame.camera, tumour.vertices, tumour.triangles)
+        cv2.polylines(lines, find_outlines(mask), True, (1,), 2)
     middles = np.stack([rest.vertices.mean(axis=0), now.vertices.mean(axis=0)])
-    for ends in (middles, np.stack([frame.tip, gauged(frame.tip, now).nearest])):
+    for ends in (middles, np.stack([frame.tip, measure_gauge(frame.tip, now).nearest])):
         start, end = np.rint(frame.camera.project(ends)[0]).astype(int).tolist()
         cv2.line(lines, start, end, (1,), 2)
     return (lines > 0) & (frame.picture.segmentation != TOOL)

@@ -13,8 +13,8 @@ import h5py
 import pytest
 from tiny_work import held, played
 
-from scenes.episodes.run_folder import failures
-from scenes.episodes.workers import own_workers
+from scenes.episodes.run_folder import list_failures
+from scenes.episodes.workers import start_own_workers
 
 COUNT, KILLS = 80, 50
 CLIENT = """
@@ -103,9 +103,9 @@ def test_fifty_kills_lose_nothing_and_double_nothing(tmp_path):
         ended(client, False)
     assert kills == {"worker": 45, "client": 5} and COUNT > len(seen) > 5
     whole = tmp_path / "undisturbed"
-    with own_workers(["cpu"]) as workers:
+    with start_own_workers(["cpu"]) as workers:
         tally = played(folder, workers, COUNT)
-        assert tally.made + tally.skipped == COUNT and tally.skipped >= len(seen) and not failures(folder)
+        assert tally.made + tally.skipped == COUNT and tally.skipped >= len(seen) and not list_failures(folder)
         assert played(whole, workers, COUNT).made == COUNT
     assert held(folder) == held(whole) and len(held(folder)) == COUNT
     made = {path.name for path in whole.iterdir()}

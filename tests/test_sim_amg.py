@@ -10,8 +10,8 @@ from test_sim_multigrid import built, matrices, spread
 from sim.compile import compile_problem
 from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held
-from sim.linalg.amg import rigid_motions
-from sim.linalg.pcg import BlockJacobi, conjugate_gradients
+from sim.linalg.amg import build_rigid_motions
+from sim.linalg.pcg import BlockJacobi, solve_conjugate_gradients
 from sim.linalg.preconditioner import Preconditioning, name_of
 from sim.material import Material
 from sim.runtime.device import find_device
@@ -40,7 +40,7 @@ def test_refining_costs_few_iterations() -> None:
         problem.linearise(device.zeros(*r.shape), np.zeros(2, bool))
         preconditioner.prepare(problem, 2)
         tolerance = 1e-6 * np.linalg.norm(r, axis=0)
-        count.append(conjugate_gradients(problem, preconditioner, device.array(r), tolerance, 400).iterations)
+        count.append(solve_conjugate_gradients(problem, preconditioner, device.array(r), tolerance, 400).iterations)
     assert count[1] <= 25
     assert count[1] <= count[0] + 8
 
@@ -71,6 +71,6 @@ def test_rigid_motions_strain_nothing() -> None:
     anatomy = base_held(box((2, 2, 3), distortion=0.2))
     space, device = discretise(anatomy.mesh, "p1"), find_device("cpu", "float64")
     problem = compile_problem((Elasticity(Material("linear", 3000.0, 0.3)), Held()), anatomy, device, space)
-    K, R = problem.rest_curvature(), rigid_motions(anatomy.mesh.nodes)
+    K, R = problem.rest_curvature(), build_rigid_motions(anatomy.mesh.nodes)
     assert np.linalg.matrix_rank(R) == 6
     assert np.abs(K @ R).max() < 1e-12 * np.abs(K).max() * np.abs(R).max()

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import check_output, demand_space, written_stream, written_whole
+from sim.runtime.atomic_files import check_disk_space, check_output, write_atomically, write_stream_atomically
 
 
 class TestWriting:
@@ -33,7 +33,7 @@ class TestWriting:
         elsewhere = left.with_name(left.name.replace(f"{zlib.crc32(platform.node().encode()):08x}", "0" * 8))
         for file in (living, other, elsewhere):
             file.write_text("not ours")
-        with written_whole(path, ".txt") as partial:
+        with write_atomically(path, ".txt") as partial:
             assert not left.exists()
             partial.write_text("whole")
         assert sorted(tmp_path.iterdir()) == sorted([path, living, other, elsewhere])
@@ -57,18 +57,21 @@ class TestWriting:
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
         try:
-            with pytest.raises(InputError, match="File too large"), written_stream(tmp_path / "a.h5", ".h5") as file:
+            with (
+                pytest.raises(InputError, match="File too large"),
+                write_stream_atomically(tmp_path / "a.h5", ".h5") as file,
+            ):
                 assert file.write(bytes(200_000)) == 200_000
                 file.seek(0)
             with pytest.raises(InputError, match=r"files are limited to 0\.1 MB"):
-                demand_space(tmp_path / "a.h5", 1, 200_000)
-            demand_space(tmp_path / "a.h5", 1, 50_000)
+                check_disk_space(tmp_path / "a.h5", 1, 200_000)
+            check_disk_space(tmp_path / "a.h5", 1, 50_000)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
         assert not list(tmp_path.iterdir())
 
     def test_a_library_that_fails_says_nothing(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError) as caught, written_whole(tmp_path / "a.h5", ".h5"):
+        with pytest.raises(InputError) as caught, write_atomically(tmp_path / "a.h5", ".h5"):
             raise OSError("Unable to synchronously create file (errno = 2, flags = 13)")
         assert "flags" not in str(caught.value)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
-from sim.geometry.ball_at_rest import resting_tip, resting_tips
+from sim.geometry.ball_at_rest import find_resting_tip, find_resting_tips
 
 DOWN = np.array([0.0, 0.0, -1.0])
 RADIUS = 7e-3
@@ -49,7 +49,7 @@ def test_the_ball_touches_and_does_not_sink_in(seed):
         inward /= np.linalg.norm(inward)
         through = np.append(random.uniform(-0.01, 0.01, 2), 0.0) + random.uniform(-0.2, 0.2) * inward
         radius = random.uniform(1e-3, 8e-3)
-        tip = resting_tip(nodes, triangles, through, inward, radius)
+        tip = find_resting_tip(nodes, triangles, through, inward, radius)
         assert np.linalg.norm(np.cross(tip - through, inward)) < 1e-12  # it stays on its line
         deepest = radius - np.linalg.norm(points - (tip - radius * inward), axis=1).min()
         assert -2e-5 < deepest < 1e-12  # samples are a tenth of a millimetre apart
@@ -59,11 +59,11 @@ def test_the_ball_touches_and_does_not_sink_in(seed):
 
 def test_a_plane_stops_the_tip_where_they_meet():
     through = np.array([0.015, 0.015, 0.2])
-    assert resting_tip(CORNERS, ONE, through, DOWN, RADIUS) == pytest.approx([0.015, 0.015, 0.0], abs=1e-15)
-    assert resting_tip(CORNERS, ONE[:, ::-1], through, DOWN, RADIUS)[2] == pytest.approx(0.0, abs=1e-15)
+    assert find_resting_tip(CORNERS, ONE, through, DOWN, RADIUS) == pytest.approx([0.015, 0.015, 0.0], abs=1e-15)
+    assert find_resting_tip(CORNERS, ONE[:, ::-1], through, DOWN, RADIUS)[2] == pytest.approx(0.0, abs=1e-15)
     # Aslant: the ball touches before its tip is there, by r / cos - r.
     inward = np.array([0.6, 0.0, -0.8])
-    tip = resting_tip(CORNERS, ONE, np.array([0.015, 0.015, 0.0]) - 0.2 * inward, inward, 3e-3)
+    tip = find_resting_tip(CORNERS, ONE, np.array([0.015, 0.015, 0.0]) - 0.2 * inward, inward, 3e-3)
     assert tip[2] == pytest.approx(3e-3 - 3e-3 * 0.8, abs=1e-15)
 
 
@@ -71,13 +71,13 @@ def test_an_edge_and_a_vertex_stop_it_beside_the_face():
     beside = 4e-3
     down = RADIUS - np.sqrt(RADIUS**2 - beside**2)
     for through in ([0.02, -beside, 0.1], [-beside, 0.02, 0.1], [-0.6 * beside, -0.8 * beside, 0.1]):
-        tip = resting_tip(CORNERS, ONE, np.array(through), DOWN, RADIUS)
+        tip = find_resting_tip(CORNERS, ONE, np.array(through), DOWN, RADIUS)
         assert tip == pytest.approx([*through[:2], -down], abs=1e-15)
     # A steep edge between two roofs that fall off faster than the ball.
     ridge = np.array([[0.0, -0.05, 0.0], [0.0, 0.05, 0.02], [0.01, 0.0, -0.09], [-0.01, 0.0, -0.09]])
     roofs = np.array([[0, 2, 1], [0, 1, 3]])
     slope = np.hypot(0.1, 0.02) / 0.1  # 1 / cos of the ridge
-    tip = resting_tip(ridge, roofs, np.array([0.0, 0.0, 0.1]), DOWN, RADIUS)
+    tip = find_resting_tip(ridge, roofs, np.array([0.0, 0.0, 0.1]), DOWN, RADIUS)
     assert tip[2] == pytest.approx(0.01 + RADIUS * (slope - 1.0), abs=1e-15)
 
 
@@ -90,7 +90,7 @@ def test_on_a_sphere_it_stops_where_two_balls_touch():
     triangles = np.concatenate(
         [np.stack(t, axis=1) for t in ((first, first + 360, after + 360), (first, after + 360, after))]
     )
-    tip = resting_tip(nodes.reshape(-1, 3), triangles, np.array([beside, 0.0, 0.0]), DOWN, RADIUS)
+    tip = find_resting_tip(nodes.reshape(-1, 3), triangles, np.array([beside, 0.0, 0.0]), DOWN, RADIUS)
     assert tip[2] == pytest.approx(np.sqrt((size + RADIUS) ** 2 - beside**2) - RADIUS, abs=size * 1e-4)
 
 
@@ -105,7 +105,7 @@ def test_into_a_hole_that_is_too_narrow_it_does_not_fall():
             [5e-3, 0.05, 0.0],
         ]
     )
-    tip = resting_tip(wall, np.array([[0, 1, 2], [3, 4, 5]]), np.array([0.0, 0.0, 0.1]), DOWN, RADIUS)
+    tip = find_resting_tip(wall, np.array([[0, 1, 2], [3, 4, 5]]), np.array([0.0, 0.0, 0.1]), DOWN, RADIUS)
     assert tip[2] == pytest.approx(-(RADIUS - np.sqrt(RADIUS**2 - 5e-3**2)), abs=1e-15)
 
 
@@ -113,13 +113,13 @@ def test_triangles_without_area_are_edges_or_points():
     flat = np.array([[-0.05, 0.0, 0.0], [0.0, 0.0, 0.0], [0.05, 0.0, 0.0]])
     line = np.array([0.01, 3e-3, 0.1])
     down = RADIUS - np.sqrt(RADIUS**2 - 3e-3**2)
-    assert resting_tip(flat, ONE, line, DOWN, RADIUS)[2] == pytest.approx(-down, abs=1e-15)
-    assert resting_tip(np.zeros((3, 3)), ONE, np.array([0.0, 3e-3, 0.1]), DOWN, RADIUS)[2] == pytest.approx(-down)
+    assert find_resting_tip(flat, ONE, line, DOWN, RADIUS)[2] == pytest.approx(-down, abs=1e-15)
+    assert find_resting_tip(np.zeros((3, 3)), ONE, np.array([0.0, 3e-3, 0.1]), DOWN, RADIUS)[2] == pytest.approx(-down)
 
 
 def test_a_ball_that_passes_by_is_reported():
     with pytest.raises(InputError, match="passes the surface by"):
-        resting_tip(CORNERS, ONE, np.array([0.02, -0.008, 0.1]), DOWN, RADIUS)
+        find_resting_tip(CORNERS, ONE, np.array([0.02, -0.008, 0.1]), DOWN, RADIUS)
 
 
 def test_many_balls_rest_where_each_would_alone():
@@ -129,9 +129,11 @@ def test_many_balls_rest_where_each_would_alone():
     surfaces = nodes + random.normal(scale=1e-3, size=(9, *nodes.shape))
     through = np.append(random.uniform(-0.01, 0.01, (9, 2)), random.uniform(-0.1, 0.1, (9, 1)), axis=1)
     radius = random.uniform(1e-3, 8e-3, 9)
-    tips = resting_tips(surfaces, triangles, through, DOWN, radius)
-    alone = [resting_tip(*each, DOWN, r) for *each, r in zip(surfaces, [triangles] * 9, through, radius, strict=True)]
+    tips = find_resting_tips(surfaces, triangles, through, DOWN, radius)
+    alone = [
+        find_resting_tip(*each, DOWN, r) for *each, r in zip(surfaces, [triangles] * 9, through, radius, strict=True)
+    ]
     assert tips == pytest.approx(np.array(alone), abs=1e-15)
     through[7, 0] = 1.0
     with pytest.raises(InputError, match=rf"a ball of {1e3 * radius[7]:.3g} mm passes the surface by"):
-        resting_tips(surfaces, triangles, through, DOWN, radius)
+        find_resting_tips(surfaces, triangles, through, DOWN, radius)

@@ -17,9 +17,9 @@ from sim.compile import compile_part, compile_problem
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
-from sim.linalg.preconditioner import rest_solver
-from sim.linalg.schur import condensed
-from sim.local_solvers.batch_elimination import BatchElimination, batch_elimination, near_tetrahedra
+from sim.linalg.preconditioner import build_rest_solver
+from sim.linalg.schur import condense_exterior
+from sim.local_solvers.batch_elimination import BatchElimination, build_batch_elimination, find_near_tetrahedra
 from sim.local_solvers.outer_loop import CycleLimits
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from sim.runtime.device import find_device
@@ -36,7 +36,7 @@ def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
     anatomy = read_anatomy(template_path())
     effects = (Elasticity(), Held(), Slide(), ToolForce())
     fem, loads = Fem(anatomy, effects, TRAIN, "cpu", element="p1"), draw("spatula", anatomy, 3, 1)
-    near = batch_elimination(fem.problem, rest_solver(fem.problem), effects, fem.space)
+    near = build_batch_elimination(fem.problem, build_rest_solver(fem.problem), effects, fem.space)
     assert near is not None and 0.1 < len(near.rows) / fem.problem.rows < 0.3
     fem.problem.begin(Cases(loads, np.zeros(3)))
     rest, tolerance = fem.problem.device.zeros(fem.problem.rows, 3), np.full(3, TRAIN.tolerance)
@@ -50,7 +50,7 @@ def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
 
 def test_columns_go_each_by_itself() -> None:
     problem, space = begun(LAW)
-    elimination = descent_of(batch_elimination, problem, space, LAW)
+    elimination = descent_of(build_batch_elimination, problem, space, LAW)
     together = elimination.descend(problem.device.zeros(problem.rows, len(TOTAL)), np.full(len(TOTAL), 1e-5), 100)
     for row in range(len(TOTAL)):
         problem.begin(Cases(loads_of(TOTAL[[row]]), np.zeros(1)))
@@ -61,7 +61,7 @@ def test_columns_go_each_by_itself() -> None:
 
 def test_the_budget_leaves_the_last_finite_state_and_says_so() -> None:
     problem, space = begun(LAW)
-    elimination = descent_of(batch_elimination, problem, space, LAW)
+    elimination = descent_of(build_batch_elimination, problem, space, LAW)
     start = problem.device.zeros(problem.rows, len(TOTAL)).numpy()
     start[:, 1] = np.nan
     found = elimination.descend(problem.device.array(start), np.full(len(TOTAL), 1e-12), 1)
@@ -75,7 +75,7 @@ def test_the_budget_leaves_the_last_finite_state_and_says_so() -> None:
 
 def test_rounding_of_what_follows_leaves_no_plane() -> None:
     problem, space = begun(LAW)
-    elimination, random = descent_of(batch_elimination, problem, space, LAW), np.random.default_rng(0)
+    elimination, random = descent_of(build_batch_elimination, problem, space, LAW), np.random.default_rng(0)
 
     def rounded(x: wp.array, out: wp.array) -> None:
         elimination.follow(x, out)
@@ -89,11 +89,11 @@ def test_rounding_of_what_follows_leaves_no_plane() -> None:
 
 def test_the_condensed_surroundings_are_the_schur_complement() -> None:
     problem, space = begun("linear", "smoothed")
-    chosen = near_tetrahedra(space, problem.constraint)
+    chosen = find_near_tetrahedra(space, problem.constraint)
     assert chosen is not None and 0.15 < chosen.mean() < 0.25
     nodes = np.unique(space.table[chosen])
     own = compile_part((Elasticity(tissue("linear")), *EFFECTS), space, problem, chosen, nodes)
-    around = condensed(problem, nodes, own.rest_curvature())
+    around = condense_exterior(problem, nodes, own.rest_curvature())
     basis, whole = problem.constraint.basis(), problem.rest_curvature().toarray()
     part = (3 * nodes[:, None] + np.arange(3)).ravel()
     stays = np.ones(problem.rows, bool)
@@ -115,7 +115,7 @@ def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves() -> None:
     )
     many = np.repeat(TOTAL, 4, axis=0)
     plain = without.deform(loads_of(many))
-    near = batch_elimination(fem.problem, rest_solver(fem.problem), effects, space)
+    near = build_batch_elimination(fem.problem, build_rest_solver(fem.problem), effects, space)
     assert near is not None
     for cycles in (12, 3):
         some = replace(near, limits=CycleLimits(cycles=cycles))
@@ -149,7 +149,7 @@ def larger(force: wp.array, factor: float) -> wp.array:
 @LAWS_AND_ELEMENTS
 def test_it_ends_where_the_whole_does(law: str, element: str) -> None:
     problem, space = begun(law, element)
-    descent, expected = descent_of(batch_elimination, problem, space, law), equilibria(problem)
+    descent, expected = descent_of(build_batch_elimination, problem, space, law), equilibria(problem)
     problem.begin(Cases(loads_of(TOTAL), np.zeros(len(TOTAL))))
     found = descent.descend(problem.device.zeros(problem.rows, len(TOTAL)), np.full(len(TOTAL), FINE), 100)
     assert (found.status == DONE).all() and (found.residual <= FINE).all()
@@ -163,7 +163,7 @@ def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, fac
     anatomy, space = body()
     problem = compile_problem((Elasticity(tissue(LAW)), *EFFECTS), anatomy, find_device("cpu", "float32"), space)
     problem.begin(Cases(loads_of(TOTAL[:4]), np.zeros(4)))
-    descent, inside = descent_of(batch_elimination, problem, space, LAW), getattr(BatchElimination, STEP)
+    descent, inside = descent_of(build_batch_elimination, problem, space, LAW), getattr(BatchElimination, STEP)
     monkeypatch.setattr(BatchElimination, STEP, lambda *args: larger(inside(*args), factor))
     found = descent.descend(problem.device.zeros(problem.rows, 4), np.full(4, 1e-4), 100)
     assert (found.status == LIVE).all() and not found.u.numpy().any()
@@ -172,7 +172,7 @@ def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, fac
 
 def test_what_gets_no_nearer_is_left_to_others() -> None:
     problem, space = begun(LAW, total=TOTAL[:1])
-    found = descent_of(batch_elimination, problem, space, LAW).descend(
+    found = descent_of(build_batch_elimination, problem, space, LAW).descend(
         problem.device.zeros(problem.rows, 1), np.zeros(1), 100
     )
     assert found.status[0] == LIVE and found.residual[0] < 1e-12

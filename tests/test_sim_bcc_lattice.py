@@ -3,8 +3,14 @@
 import numpy as np
 import pytest
 
-from sim.bodies.bcc_lattice import graded_lattice
-from sim.geometry.tetmesh import FACES, dihedral_angles, faces_once, row_keys, signed_volumes
+from sim.bodies.bcc_lattice import build_graded_lattice
+from sim.geometry.tetmesh import (
+    FACES,
+    compute_dihedral_angles,
+    compute_row_keys,
+    compute_signed_volumes,
+    find_single_faces,
+)
 
 MIDDLE = np.array([0.03, 0.02, 0.01])
 
@@ -13,26 +19,26 @@ def lattice(levels):
     def size(points):
         return 0.003 + 0.5 * np.abs(np.linalg.norm(points - MIDDLE, axis=1) - 0.02)
 
-    return graded_lattice(np.full(3, -0.07), np.full(3, 0.07), 0.02, levels, size)
+    return build_graded_lattice(np.full(3, -0.07), np.full(3, 0.07), 0.02, levels, size)
 
 
 @pytest.mark.parametrize("levels", [0, 1, 2, 3])
 def test_tetrahedra_fit_and_have_good_angles(levels):
     made = lattice(levels)
-    assert signed_volumes(made.nodes, made.tets).min() > 0.0
-    angles = dihedral_angles(made.nodes, made.tets)
+    assert compute_signed_volumes(made.nodes, made.tets).min() > 0.0
+    angles = compute_dihedral_angles(made.nodes, made.tets)
     # BCC tetrahedra alone: 60 and 90 degrees; with changes of size, 45 to 120.
     assert angles.min() > (59.9 if levels == 0 else 44.9)
     assert angles.max() < (90.1 if levels == 0 else 120.1)
-    _, count = np.unique(row_keys(made.tets[:, FACES].reshape(-1, 3)), return_counts=True)
+    _, count = np.unique(compute_row_keys(made.tets[:, FACES].reshape(-1, 3)), return_counts=True)
     assert count.max() == 2
     # Were two neighbours split differently, faces inside the box would be left over, and count as its surface.
-    surface = faces_once(made.tets)
+    surface = find_single_faces(made.tets)
     corners = made.nodes[surface]
     enclosed = np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
-    assert enclosed == pytest.approx(signed_volumes(made.nodes, made.tets).sum(), rel=1e-12)
+    assert enclosed == pytest.approx(compute_signed_volumes(made.nodes, made.tets).sum(), rel=1e-12)
     edges = surface[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    assert set(np.unique(row_keys(edges), return_counts=True)[1]) == {2}
+    assert set(np.unique(compute_row_keys(edges), return_counts=True)[1]) == {2}
 
 
 def test_cells_follow_the_sizing():

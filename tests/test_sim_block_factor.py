@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.linalg.block_factor import functions_of
+from sim.linalg.block_factor import build_functions
 from sim.runtime.blocks import launch
 from sim.runtime.device import Device, forward_kernel
 
@@ -17,7 +17,7 @@ ON_A_CARD = pytest.param(
 def test_factor_and_solution_are_those_of_the_matrix(name: str) -> None:
     """Only `size` rows count, and of a matrix that is not positive that is said."""
     device, size, count = Device(name, "float64"), 37, 3
-    functions = functions_of(device)
+    functions = build_functions(device)
     factor, solve = functions.factor, functions.solve
 
     @forward_kernel(module="unique")

@@ -17,7 +17,7 @@ ACROSS = RANDOM.normal(size=(COUNT, BORDER))
 
 @pytest.mark.parametrize("block", [1, 5, 23, 100])
 def test_what_is_inverted_in_place_is_the_inverse(block: int) -> None:
-    rows = block_inverse.halved(sp.csc_array(MATRIX), block_inverse.cuts_of(COUNT, block), "cpu")
+    rows = block_inverse.to_half_rows(sp.csc_array(MATRIX), block_inverse.compute_block_cuts(COUNT, block), "cpu")
     assert len(rows) == -(-COUNT // block)
     block_inverse.invert(rows)
     expected, first = -np.linalg.inv(MATRIX), 0
@@ -30,7 +30,7 @@ def test_what_is_inverted_in_place_is_the_inverse(block: int) -> None:
 
 @pytest.mark.parametrize("block", [1, 5, 23, 100])
 def test_what_is_eliminated_is_the_solution_and_what_it_takes(block: int) -> None:
-    solution, taken = block_inverse.eliminated(sp.csc_array(MATRIX), sp.csc_array(ACROSS), "cpu", block)
+    solution, taken = block_inverse.eliminate_unknowns(sp.csc_array(MATRIX), sp.csc_array(ACROSS), "cpu", block)
     expected = np.linalg.solve(MATRIX, ACROSS)
     assert solution.dtype == np.float32
     np.testing.assert_allclose(solution, expected, atol=1e-6)
@@ -40,8 +40,8 @@ def test_what_is_eliminated_is_the_solution_and_what_it_takes(block: int) -> Non
 def test_what_is_not_positive_definite_is_refused() -> None:
     matrix = sp.csc_array(MATRIX - 1e3 * np.eye(COUNT))
     with pytest.raises(RuntimeError, match="positive"):
-        block_inverse.eliminated(matrix, sp.csc_array(ACROSS), "cpu")
+        block_inverse.eliminate_unknowns(matrix, sp.csc_array(ACROSS), "cpu")
 
 
 def test_a_device_is_asked_how_fast_it_multiplies() -> None:
-    assert block_inverse.rate("cpu", trial=8) > 0.0
+    assert block_inverse.measure_rate_of_work("cpu", trial=8) > 0.0

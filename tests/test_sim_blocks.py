@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.runtime.blocks import before, largest, launch, threads_of, total
+from sim.runtime.blocks import before, get_block_shape, largest, launch, total
 from sim.runtime.device import Device, forward_kernel
 
 ON_A_CARD = pytest.param(
@@ -15,7 +15,7 @@ ON_A_CARD = pytest.param(
 @pytest.mark.parametrize("name", ["cpu", ON_A_CARD])
 def test_every_thread_has_the_sum_the_largest_and_what_lies_before_it(name: str) -> None:
     device, count = Device(name, "float64"), 3
-    threads = int(np.prod(threads_of(device)))
+    threads = int(np.prod(get_block_shape(device)))
 
     @forward_kernel(module="unique")
     def run(given: wp.array2d(dtype=wp.float64), out: wp.array3d(dtype=wp.float64)):

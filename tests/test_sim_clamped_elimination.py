@@ -15,7 +15,7 @@ from sim.loads import Loads, push
 from sim.local_solvers.clamped_elimination import ClampedElimination
 from sim.local_solvers.clamped_part import ClampedPart
 from sim.minimisers.lbfgs_kernels import DONE, LIVE
-from sim.minimisers.residual import constants_of
+from sim.minimisers.residual import compute_constant_gradients
 from sim.strategy.plan import SolverStep
 from sim.terms.elasticity import ElasticTerm as ElasticityTerm
 
@@ -72,7 +72,7 @@ def test_a_part_is_settled_between_what_holds_its_rim() -> None:
     u = device.array(1e-4 * np.random.default_rng(0).normal(size=(problem.rows, 1)))
     problem.constraint.project(u)
     chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.08
-    constant, _ = constants_of(problem, u)
+    constant, _ = compute_constant_gradients(problem, u)
     part = ClampedPart(problem, EFFECTS, fem.space, chosen, constant, u)
     settled = part.settled(u, 1e-9)
     inside = np.setdiff1d(part.nodes, fem.space.table[~chosen])
@@ -116,5 +116,5 @@ def test_a_part_whose_forces_are_not_finite_stays_as_it_is() -> None:
     rest = problem.device.zeros(problem.rows, 1)
     folded = problem.device.array(-2.0 * fem.space.nodes.reshape(-1, 1) * (fem.space.nodes[:, 2:] > 0.0).repeat(3, 0))
     chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.04
-    part = ClampedPart(problem, fem.effects, fem.space, chosen, constants_of(problem, rest)[0], rest)
+    part = ClampedPart(problem, fem.effects, fem.space, chosen, compute_constant_gradients(problem, rest)[0], rest)
     np.testing.assert_array_equal(part.settled(folded, 1e-9).numpy(), folded.numpy())

@@ -19,10 +19,10 @@ from sim.linalg.compliance import Columns, Compliance
 from sim.linalg.pcg import Preconditioner
 from sim.loads import Loads, Touching
 from sim.local_solvers.contact_descent import ContactDescent
-from sim.local_solvers.contact_forces import ContactCompliance, ForceLimits, scratch_of, settled
+from sim.local_solvers.contact_forces import ContactCompliance, ForceLimits, allocate_scratch, solve_contact_forces
 from sim.local_solvers.contact_preconditioner import ContactPreconditioner
 from sim.material import Material
-from sim.minimisers.compact_lbfgs import CurvaturePairs, PairsOfColumns, no_pairs
+from sim.minimisers.compact_lbfgs import CurvaturePairs, PairsOfColumns, build_empty_history
 from sim.minimisers.lbfgs_kernels import PAIRS
 from sim.runtime.device import Device
 from sim.strategy.plan import SolverStep
@@ -89,9 +89,9 @@ def learnt_pairs(count: int) -> tuple[CurvaturePairs, np.ndarray, np.ndarray]:
     begun = np.linalg.inv(stiffness + size * np.eye(size))
     steps = rng.normal(size=(count, size))
     changes = steps @ (stiffness + change)
-    pairs = no_pairs(size, "float64")
+    pairs = build_empty_history(size, "float64")
     for s, y in zip(steps, changes, strict=True):
-        pairs = pairs.and_one(s, y, begun @ y)
+        pairs = pairs.add_pair(s, y, begun @ y)
     return pairs, begun, bfgs(begun, steps[-PAIRS:], changes[-PAIRS:])
 
 
@@ -112,7 +112,7 @@ def test_each_column_learns_and_forgets_by_itself() -> None:
         columns = np.array([0, 1, 2, 3] if turn < 2 else [0, 2] if turn < PAIRS else [2])
         s = rng.normal(size=(size, len(columns)))
         y = (stiffness + change) @ s
-        pairs.learn(columns, s, y, begun @ y)
+        pairs.update_history(columns, s, y, begun @ y)
         for place, column in enumerate(columns):
             known[column].append((s[:, place], y[:, place]))
     pairs.forget(np.array([3]))
@@ -252,8 +252,10 @@ def test_forces_are_those_of_tools_where_nodes_go_under_them(drag: float, rough:
     barrier = descent.barrier.reduced(np.arange(3))
     assert barrier is not None
     here, known = np.zeros((3 * n, 3)), np.zeros((3 * n, 3))
-    model, few = ContactCompliance(soft, device, partial(scratch_of, device)), ForceLimits(iterations=20)
-    force, found = settled(barrier, model, here, here + 1e-4, known, np.full(3, 1e-6), np.full(3, drag), few)
+    model, few = ContactCompliance(soft, device, partial(allocate_scratch, device)), ForceLimits(iterations=20)
+    force, found = solve_contact_forces(
+        barrier, model, here, here + 1e-4, known, np.full(3, 1e-6), np.full(3, drag), few
+    )
     assert found.all() and not force[:, 2].any()
     between = soft.between(np.ones(n, bool))
     w = here + 1e-4 - 0.5 * (between + between.T) @ force

@@ -18,7 +18,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed, Retracted, Touching
 from sim.material import Material, Tissue
-from sim.tools import Ball, Spatula, Tool, distances_to
+from sim.tools import Ball, Spatula, Tool, compute_distances
 
 SIDE, HEIGHT = 0.06, 0.03
 BLOCK = base_held(box((6, 6, 3), SIDE))
@@ -122,7 +122,7 @@ def test_hard_contact_ends_as_it_says(name: str) -> None:
         points = lattice(BLOCK, start)
         # Where the tools are that the answer is of, asked for or reached.
         for tool, pose in zip(hard.tools, start.memory["tool contact"][0], strict=True):
-            assert distances_to(tool, pose, points).min() > -YIELDS * hard.gap
+            assert compute_distances(tool, pose, points).min() > -YIELDS * hard.gap
         if start.outcome[0].good:
             np.testing.assert_array_equal(start.memory["tool contact"][0], np.stack(poses))
     assert start is not None

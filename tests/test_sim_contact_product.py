@@ -18,7 +18,7 @@ from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Touching
 from sim.material import Material
-from sim.tools import Ball, Capsule, Spatula, Tool, core_of, distances_to
+from sim.tools import Ball, Capsule, Spatula, Tool, compute_distances, get_core
 
 SIDE, DEPTH, GAP = 0.06, 1.5e-3, 1e-4
 TURNED = (90.0, 0.0, 0.0)
@@ -51,7 +51,7 @@ def block(ratio: bool) -> Anatomy:
 def laid(shape: str, x: float, top: float) -> np.ndarray:
     """T_world_tool (4, 4) of a tool whose lowest point is `DEPTH` under the top at x."""
     tool, turn = SHAPES[shape]
-    core, pose = core_of(tool), at(x, 0.012, top - DEPTH, turn=turn)  # type: ignore[arg-type]
+    core, pose = get_core(tool), at(x, 0.012, top - DEPTH, turn=turn)  # type: ignore[arg-type]
     pose[2, 3] -= (core.corners @ pose[:3, :3].T)[:, 2].min() - core.radius
     return pose
 
@@ -80,7 +80,7 @@ def test_contact_product_ends_outside_or_says_so(skull: str, element: str) -> No
             tool, pose = SHAPES[shape][0], laid(shape, x, top)
             assert found.outcome[row].good == (x == CENTRE), where
             assert (found.outcome[row] is Outcome.ON_BONE) == (x == EDGE), where
-            assert (distances_to(tool, pose, solid).min() < -3.0 * GAP) == (x == EDGE), where
+            assert (compute_distances(tool, pose, solid).min() < -3.0 * GAP) == (x == EDGE), where
             if found.outcome[row].good:
                 assert found.inverted[row] == 0, where
                 points = (
@@ -88,6 +88,6 @@ def test_contact_product_ends_outside_or_says_so(skull: str, element: str) -> No
                     if element != "p2"
                     else (anatomy.mesh.nodes + found.displacement[row])[anatomy.mesh.surface].reshape(-1, 3)
                 )
-                assert distances_to(tool, pose, points).min() > -(YIELDS + 0.5) * GAP, where
+                assert compute_distances(tool, pose, points).min() > -(YIELDS + 0.5) * GAP, where
                 assert found.reaction[row, TOOLS.index(tool), 2] < 0.0, where
                 assert found.iterations[row] <= TRAIN.most, where

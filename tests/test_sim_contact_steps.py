@@ -90,7 +90,7 @@ def test_replayed_steps_are_those_of_the_descent(
     strains = StrainLimits(least=least, cut=np.inf)
     ordinary, replayed = (replace(found, limits=limits, strains=strains, replays=which) for which in (False, True))
     expected = followed(fem, ordinary, many)
-    taken = counted(monkeypatch, ContactSteps, "accept")
+    taken = counted(monkeypatch, ContactSteps, "move_to_last_step")
     answers = followed(fem, replayed, many)
     for answer, other in zip(answers, expected, strict=True):
         assert answer.status[0] == other.status[0] and answer.steps[0] == other.steps[0]

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from test_sim_head_masks import AXES, EDGE, MIDDLE, TUMOUR, grid, head, mgz, nifti
 
-from sim.bodies.head_masks import Sources, head_masks
+from sim.bodies.head_masks import Sources, read_head_masks
 from sim.bodies.label_map import read_labels
-from sim.bodies.label_volume import masked_subject
+from sim.bodies.label_volume import build_masked_subject
 from sim.errors import InputError
 
 PIECES = (np.zeros(3), 20.0), (np.array([-45.0, -10.0, -5.0]), 12.0)  # shifts and radii [mm] of a tumour's
@@ -29,13 +29,13 @@ class TestConventions:
     @pytest.mark.parametrize("enhancing", [3, 4])
     def test_brats(self, tmp_path, enhancing):
         path = self.brats(tmp_path, enhancing)
-        masks = head_masks(Sources(path, convention="brats", mask=tmp_path / "t1.nii"))
-        assert masked_subject(masks).tumour_volume == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.05)
+        masks = read_head_masks(Sources(path, convention="brats", mask=tmp_path / "t1.nii"))
+        assert build_masked_subject(masks).tumour_volume == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.05)
         assert {name: int(mask.sum()) for name, mask in masks.parts.items()} == {
             "necrosis": (read_labels(path).layers == 1).sum(), "oedema": (read_labels(path).layers == 2).sum()
         }  # fmt: skip
         with pytest.raises(InputError, match="labels of brats do not mark the brain"):
-            head_masks(Sources(path, convention="brats"))
+            read_head_masks(Sources(path, convention="brats"))
 
     def test_a_cavity_is_no_tumour(self, tmp_path):
         affine, places = grid()
@@ -44,12 +44,14 @@ class TestConventions:
         nifti(tmp_path / "seg.nii", labels, affine)
         nifti(tmp_path / "t1.nii", head(places), affine)
         with pytest.raises(InputError, match=r"it has 3 and 4 together\. It looks like brats2015 or brats-post or"):
-            head_masks(Sources(tmp_path / "seg.nii", convention="brats", mask=tmp_path / "t1.nii"))
-        masks = head_masks(Sources(tmp_path / "seg.nii", tumour=(3,), convention="brats", mask=tmp_path / "t1.nii"))
+            read_head_masks(Sources(tmp_path / "seg.nii", convention="brats", mask=tmp_path / "t1.nii"))
+        masks = read_head_masks(
+            Sources(tmp_path / "seg.nii", tumour=(3,), convention="brats", mask=tmp_path / "t1.nii")
+        )
         assert masks.tumour.sum() == (labels == 3).sum()
         for parts, noted in (({}, True), ({"ventricles": (4,)}, False)):
             post = Sources(tmp_path / "seg.nii", convention="brats-post", mask=tmp_path / "t1.nii", parts=parts)
-            notes = " ".join(head_masks(post).notes)
+            notes = " ".join(read_head_masks(post).notes)
             assert ("1.7 ml are a cavity, label 4: " in notes and "--ventricles 4" in notes) == noted
 
     def tumour(self, folder, roles, missing=(), open_rim=False, depth=30.0):
@@ -71,17 +73,17 @@ class TestConventions:
         roles = ROLES[real]
         path = self.tumour(tmp_path, roles, **given)
         name = real.split()[0]
-        masks = head_masks(Sources(path, convention=name, mask=tmp_path / "t1.nii"))
+        masks = read_head_masks(Sources(path, convention=name, mask=tmp_path / "t1.nii"))
         assert masks.tumour.sum() == np.isin(read_labels(path).layers, [roles[0], roles[2]]).sum() > 0
         wrong = "brats" if name == "nnunet" else "nnunet"
         if name != "brats-ped":
             with pytest.raises(InputError, match=rf"is not labelled as {wrong} .* It looks like .*\b{name}\b"):
-                head_masks(Sources(path, convention=wrong, mask=tmp_path / "t1.nii"))
+                read_head_masks(Sources(path, convention=wrong, mask=tmp_path / "t1.nii"))
         if not given:  # numbers of one's own go before, with a note
             parts = {"oedema": (roles[0],)}
             own = Sources(path, (), (roles[1], roles[2]), wrong, tmp_path / "t1.nii", parts=parts)
-            assert "would be oedema and lies inside the tumour" in " ".join(head_masks(own).notes)
-            whole = head_masks(Sources(tmp_path / "t1.nii", brain=(1,), tumour_in=path))
+            assert "would be oedema and lies inside the tumour" in " ".join(read_head_masks(own).notes)
+            whole = read_head_masks(Sources(tmp_path / "t1.nii", brain=(1,), tumour_in=path))
             assert "are all taken for tumour: name those of the core by --tumour" in " ".join(whole.notes)
 
     @pytest.mark.parametrize(("order", "fits"), [((1, 2, 3), True), ((3, 1, 2), False), ((3, 2, 1), False)])
@@ -93,7 +95,7 @@ class TestConventions:
         labels[np.linalg.norm(places - TUMOUR, axis=-1) < 12.0] = 9
         sources = Sources(nifti(tmp_path / "a.nii", labels.astype(np.int16), affine), tumour=(9,), convention="fsl")
         with nullcontext() if fits else pytest.raises(InputError, match="label 3 lies outside of the others, "):
-            head_masks(sources)
+            read_head_masks(sources)
 
     def aseg(self, folder, name="aseg.mgz", mirrored=False):
         """White matter and cortex by halves, a ventricle on the left, and fluid around."""
@@ -111,8 +113,8 @@ class TestConventions:
     @pytest.mark.parametrize("name", ["freesurfer", "synthseg"])
     def test_freesurfer(self, tmp_path, name):
         path = self.aseg(tmp_path)
-        masks = head_masks(Sources(path, convention=name, tumour_in=tmp_path / "tumour.nii"))
-        subject = masked_subject(masks)
+        masks = read_head_masks(Sources(path, convention=name, tumour_in=tmp_path / "tumour.nii"))
+        subject = build_masked_subject(masks)
         assert masks.parts["ventricles"].any() and subject.notes == ()
         low, high = 1e3 * subject.cortex.min(axis=0), 1e3 * subject.cortex.max(axis=0)
         np.testing.assert_allclose([low, high], MIDDLE + np.outer([-1, 1], [46.0, 55.0, 42.0]), atol=EDGE)
@@ -120,7 +122,7 @@ class TestConventions:
     def test_left_on_the_right_is_refused(self, tmp_path):
         path = self.aseg(tmp_path, mirrored=True)
         with pytest.raises(InputError, match=r"left half lie \d+ mm to the right of .* Its affine is mirrored, or"):
-            head_masks(Sources(path, convention="freesurfer", tumour_in=tmp_path / "tumour.nii"))
+            read_head_masks(Sources(path, convention="freesurfer", tumour_in=tmp_path / "tumour.nii"))
 
     def test_labels_of_another_program_are_refused(self, tmp_path):
         aseg, brats, tumour = self.aseg(tmp_path), self.brats(tmp_path, 4), tmp_path / "tumour.nii"
@@ -137,14 +139,14 @@ class TestConventions:
             (Sources(brats, convention="fsl", tumour_in=tumour), "it lacks 3. It looks like brats"),
         ):
             with pytest.raises(InputError, match=re.escape(reason)):
-                head_masks(sources)
+                read_head_masks(sources)
 
     def test_fsl_with_a_tumour_of_a_number_of_ones_own(self, tmp_path):
         affine, places = grid()
         labels = head(places, brain=2, tumour=9)
         labels[(labels == 2) & (places[..., 2] > MIDDLE[2])] = 3
         path = nifti(tmp_path / "a.nii", labels, affine)
-        masks = head_masks(Sources(path, tumour=(9,), convention="fsl"))
+        masks = read_head_masks(Sources(path, tumour=(9,), convention="fsl"))
         assert masks.brain.sum() == np.isin(labels, (2, 3)).sum() and masks.tumour.sum() == (labels == 9).sum()
         with pytest.raises(InputError, match="no labels are called 'spm': choose one of brats, freesurfer"):
-            head_masks(Sources(path, convention="spm"))
+            read_head_masks(Sources(path, convention="spm"))

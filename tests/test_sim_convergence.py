@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from boxes import box, hold, quadratic, surface_nodes
-from oracle import piola, quadratic_shapes, tissue
+from oracle import compute_quadratic_shapes, piola, tissue
 from scipy.special import roots_jacobi
 
 from sim.accuracy import Accuracy
@@ -60,7 +60,7 @@ def error(material: Tissue, element: str, cells: int) -> float:
     places = np.einsum("qa,tai->tqi", shapes, mesh.nodes[mesh.tets])
     table = mesh.tets
     if element == "p2":  # with nodes of its own, so that the surface's values are exact at all of them
-        mesh, shapes = quadratic(mesh), quadratic_shapes(points)
+        mesh, shapes = quadratic(mesh), compute_quadratic_shapes(points)
         table = np.hstack([mesh.tets, mesh.middles])
     volume = 6.0 * mesh.volumes[:, None] * weight
     force = body_force(material, places.reshape(-1, 3)).reshape(places.shape)

@@ -24,7 +24,7 @@ from sim.effects import (
 )
 from sim.elements import ELEMENTS
 from sim.fem import Fem
-from sim.linalg.half_symv import add_product, tiles_of
+from sim.linalg.half_symv import add_product, list_tiles
 from sim.linalg.pcg import BlockJacobi
 from sim.loads import Displaced, Loads, Touching, posture, push
 from sim.material import Material
@@ -231,5 +231,5 @@ def test_half_of_a_symmetric_matrix_is_enough_to_multiply():
     whole = np.triu(matrix) + np.triu(matrix, 1).T
     matrix, x = wp.array(whole, dtype=wp.float16, device="cuda"), wp.array(x, device="cuda")
     y = wp.full(size, 1.0, dtype=wp.float32, device="cuda")
-    add_product(tiles_of(size, "cuda"), matrix, x, y)
+    add_product(list_tiles(size, "cuda"), matrix, x, y)
     np.testing.assert_allclose(y.numpy(), 1.0 + whole.astype(float) @ x.numpy(), atol=1e-3)

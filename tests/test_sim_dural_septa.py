@@ -10,10 +10,10 @@ import pytest
 from test_sim_head_masks import MIDDLE, grid, head, nifti
 
 from scenes.cli import main
-from sim.bodies.boundary_conditions import bounded
-from sim.bodies.dural_septa import Septum, drawn_falx, walled
-from sim.bodies.head_masks import Sources, head_masks
-from sim.bodies.label_volume import masked_subject
+from sim.bodies.boundary_conditions import add_boundary_conditions
+from sim.bodies.dural_septa import Septum, find_held_vertices, synthesise_falx
+from sim.bodies.head_masks import Sources, read_head_masks
+from sim.bodies.label_volume import build_masked_subject
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.bodies.subject import MeshPlan
@@ -37,7 +37,7 @@ def labels(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def subject(labels):
-    return masked_subject(head_masks(Sources(labels, (1,), (3,), parts={"falx": (7,)})))
+    return build_masked_subject(read_head_masks(Sources(labels, (1,), (3,), parts={"falx": (7,)})))
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_each_edge_that_meets_the_sheet_has_an_end_that_is_held(box, edge):
     y, z = np.meshgrid(steps, steps[steps > -20e-3], indexing="ij")
     sheet = np.column_stack([1e-3 + 0.2 * y.ravel(), y.ravel(), z.ravel()])
     reach = 0.5 * np.sqrt(3.0) * edge
-    held = walled(box.mesh, Septum("falx", sheet, reach))
+    held = find_held_vertices(box.mesh, Septum("falx", sheet, reach))
     side = nodes[:, 0] - 1e-3 - 0.2 * nodes[:, 1]
     a, b = tets[:, [0, 0, 0, 1, 1, 2]].ravel(), tets[:, [1, 2, 3, 2, 3, 3]].ravel()
     share = side[a] / np.where(side[a] == side[b], 1.0, side[a] - side[b])
@@ -67,7 +67,7 @@ def test_each_edge_that_meets_the_sheet_has_an_end_that_is_held(box, edge):
     assert cut.sum() > 500 and (held[a[cut]] | held[b[cut]]).all()
     away = np.abs(side[held]) / np.hypot(1.0, 0.2)
     assert away.max() < 0.5 * 6e-3 * np.sqrt(3.0) + reach and not held[nodes[:, 2] < -25e-3].any()
-    assert not walled(box.mesh, Septum("falx", sheet + [1.0, 0.0, 0.0], edge)).any()
+    assert not find_held_vertices(box.mesh, Septum("falx", sheet + [1.0, 0.0, 0.0], edge)).any()
 
 
 def test_a_drawn_falx_hangs_from_the_convexity_in_the_midline():
@@ -75,7 +75,7 @@ def test_a_drawn_falx_hangs_from_the_convexity_in_the_midline():
     directions = np.random.default_rng(1).normal(size=(4000, 3))
     radii, middle = np.array([70e-3, 90e-3, 65e-3]), np.array([3e-3, -20e-3, 10e-3])
     cortex = middle + radii * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    falx = drawn_falx(cortex, 30e-3)
+    falx = synthesise_falx(cortex, 30e-3)
     assert falx.name == "falx" and np.abs(falx.points[:, 0] - middle[0]).max() < 1e-3
     y, z = ((falx.points - middle) / radii)[:, 1:].T
     assert z.min() > -0.02 and 0.97 < np.hypot(y, z).max() < 1.0
@@ -85,14 +85,14 @@ def test_a_drawn_falx_hangs_from_the_convexity_in_the_midline():
     assert len(falx.points) * 1e-6 == pytest.approx(area, rel=0.05)
     for depth in (9e-3, 61e-3, np.nan):
         with pytest.raises(InputError, match="is outside 10 to 60 mm"):
-            drawn_falx(cortex, depth)
+            synthesise_falx(cortex, depth)
 
 
 def test_beyond_it_the_brain_moves_less(said, labels, subject):
     """The far hemisphere; the tumour goes on moving. Without a falx in the labels nothing but the stem is held."""
     walls = read_anatomy(labels.with_name("a.vtu"))
     mesh = walls.mesh
-    plain = bounded(mesh, subject.site, PLAN.craniotomy, PLAN.placement)
+    plain = add_boundary_conditions(mesh, subject.site, PLAN.craniotomy, PLAN.placement)
     assert said["septa_nodes"] == {"falx": walls.held.all(axis=1).sum() - plain.held.all(axis=1).sum()}
     assert not walls.slide_normal[walls.held.any(axis=1)].any() and not (walls.held.T & walls.craniotomy).any()
     place = open_cortex(plain).nearest(open_cortex(plain).origin)
@@ -109,17 +109,17 @@ def test_beyond_it_the_brain_moves_less(said, labels, subject):
 def test_an_opening_over_it_is_free(said, labels, subject):
     mesh = read_anatomy(labels.with_name("a.vtu")).mesh
     over = replace(subject, site=1e-3 * (MIDDLE + [0.0, 0.0, 42.0]))
-    anatomy = bounded(mesh, over.site, PLAN.craniotomy, PLAN.placement, septa=subject.septa)
+    anatomy = add_boundary_conditions(mesh, over.site, PLAN.craniotomy, PLAN.placement, septa=subject.septa)
     assert anatomy.craniotomy.sum() > 6 and not anatomy.held[anatomy.craniotomy].any()
 
 
 def test_it_counts_as_brain(labels, subject, tmp_path, capsys):
     assert subject.notes == () and [septum.name for septum in subject.septa] == ["falx"]
     with pytest.raises(InputError, match="label 3 is named by --tumour and by --tentorium"):
-        head_masks(Sources(labels, (1,), (3,), parts={"tentorium": (3,)}))
+        read_head_masks(Sources(labels, (1,), (3,), parts={"tentorium": (3,)}))
     for other in ("tentorium", "ventricles"):
         with pytest.raises(InputError, match=f"label 7 is named by --falx and by --{other}: give it to one of them"):
-            head_masks(Sources(labels, (1,), (3,), parts={"falx": (7,), other: (7,)}))
+            read_head_masks(Sources(labels, (1,), (3,), parts={"falx": (7,), other: (7,)}))
     assert main(["anatomy", "--falx", "7", "--out", str(tmp_path / "a.vtu")]) == 2
     assert "--falx belongs to a label volume" in capsys.readouterr().err
     words = ["patient", str(labels), "--tumour", "3", "--out", str(tmp_path / "a.vtu"), "--inspect"]

@@ -15,7 +15,7 @@ from sim.deformation import guess
 from sim.effects import Elasticity, Held, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, push
-from sim.strategy.extrapolation import BEFORE, PUSHES, moved_on, pushes_of, shares
+from sim.strategy.extrapolation import BEFORE, PUSHES, as_pushes, compute_shares, extrapolate_start
 
 EFFECTS = (Elasticity(), Held(), ToolForce())
 POINT, DOWN = np.array([2e-3, -1e-3, 0.0]), np.array([0.0, 0.0, -0.2])
@@ -34,14 +34,14 @@ def forgetting(warm: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in warm.items() if name != BEFORE}
 
 
-def row_of(load: Loads) -> np.ndarray:
-    row = pushes_of(load)
+def build_row(load: Loads) -> np.ndarray:
+    row = as_pushes(load)
     assert row is not None
     return row
 
 
 def share_of(now: Loads, last: Loads, before: Loads) -> float:
-    return shares(row_of(now), row_of(last), row_of(before))[0]
+    return compute_shares(build_row(now), build_row(last), build_row(before))[0]
 
 
 def test_as_far_as_the_load_goes_on_its_way():
@@ -66,13 +66,13 @@ def test_a_tool_that_stood_still_or_was_lifted_tells_no_way():
 
 def test_the_start_lies_on_the_line_through_two_answers_for_each_load_by_itself():
     last, before = np.random.default_rng(0).normal(size=(2, 12, 2))
-    pushes = np.stack([np.concatenate([row_of(pushed(x)) for x in (1e-3, 0.0)]).reshape(2, 7)] * 2)
+    pushes = np.stack([np.concatenate([build_row(pushed(x)) for x in (1e-3, 0.0)]).reshape(2, 7)] * 2)
     warm = {PUSHES: pushes, BEFORE: before.T}
     loads = push(np.array([POINT + [2e-3, 0.0, 0.0], POINT + [1e-3, 0.0, 0.0]]), np.array([DOWN, DOWN]), 8e-3)
-    start = moved_on(loads, last, warm)
+    start = extrapolate_start(loads, last, warm)
     np.testing.assert_allclose(start, np.column_stack([2.0 * last[:, 0] - before[:, 0], last[:, 1]]), atol=1e-12)
-    assert moved_on(loads, last, {}) is last
-    assert moved_on(loads, last, warm | {BEFORE: before.T[:, :9]}) is last  # another element's
+    assert extrapolate_start(loads, last, {}) is last
+    assert extrapolate_start(loads, last, warm | {BEFORE: before.T[:, :9]}) is last  # another element's
 
 
 def test_frames_of_a_moving_tool_take_fewer_steps_to_the_same_answers(body):

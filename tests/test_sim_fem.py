@@ -16,7 +16,7 @@ from oracle import internal_forces
 from sim.accuracy import DRAFT, LIVE, REFERENCE, TRAIN, Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Deformer, Outcome
-from sim.discretisation.footprint import footprint_weights
+from sim.discretisation.footprint import compute_footprint_weights
 from sim.effects import Elasticity, Held, NodalForce, ToolDisplacement, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
@@ -234,7 +234,7 @@ def test_several_causes_act_together() -> None:
     both = Fem(ANATOMY, [*EFFECTS, NodalForce()], REFERENCE, "cpu", element="p1")
     top = top_forces(MESH, FORCE / 3.0)
     found = both.deform(Loads((*loads().causes, Nodal(top)))).displacement
-    share = footprint_weights(MESH.nodes, MESH.surface, POINT, np.full(5, 0.02)).toarray()
+    share = compute_footprint_weights(MESH.nodes, MESH.surface, POINT, np.full(5, 0.02)).toarray()
     pushed = share[:, :, None] * FORCE[:, None]
     alone = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], REFERENCE, "cpu", element="p1").deform(
         Loads((Nodal(top + pushed),))
@@ -248,7 +248,7 @@ def test_a_tool_displacement_is_never_drowned_in_a_batch() -> None:
     motion = np.array([[0.0, 0.0, -1e-6], [0.0, 0.0, -1e-2], [1e-4, 0.0, 0.0]])
     found = body.deform(Loads((Displaced(POINT[:3], motion, np.full(3, 0.03)),)))
     assert all(outcome.good for outcome in found.outcome)
-    weight = footprint_weights(MESH.nodes, MESH.surface, POINT[:3], np.full(3, 0.03)).toarray()
+    weight = compute_footprint_weights(MESH.nodes, MESH.surface, POINT[:3], np.full(3, 0.03)).toarray()
     mean = np.einsum("bv,bvi->bi", weight, found.displacement)
     assert (np.linalg.norm(mean - motion, axis=1) < 1e-5 * np.linalg.norm(motion, axis=1)).all()
 

@@ -18,11 +18,11 @@ from boxes import base_held, box
 
 from sim.bodies.meshfile import read_anatomy, write_mesh
 from sim.bodies.volume import read_volume
-from sim.bodies.vtu_size import demand_small
+from sim.bodies.vtu_size import check_vtu_size
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
-from sim.runtime.atomic_files import demand_space
-from sim.runtime.file_limits import at_most
+from sim.runtime.atomic_files import check_disk_space
+from sim.runtime.file_limits import limit_memory
 
 BODY = base_held(box((2, 2, 2), 0.02))
 
@@ -45,15 +45,15 @@ def packed_vtu(path: Path, order: str, encoding: str) -> Path:
 @pytest.mark.parametrize("encoding", ["raw", "base64"])
 def test_appended_arrays_count_in_either_order_of_bytes(tmp_path: Path, order: str, encoding: str) -> None:
     path = packed_vtu(tmp_path / "a.vtu", order, encoding)
-    assert demand_small(path, 24) is (encoding == "base64")
+    assert check_vtu_size(path, 24) is (encoding == "base64")
     with pytest.raises(InputError, match="take more than"):
-        demand_small(path, 23)
+        check_vtu_size(path, 23)
 
 
 def test_memory_is_bounded_beyond_what_the_process_has() -> None:
-    with at_most(2**28):
+    with limit_memory(2**28):
         assert np.ones(2**21).all()
-    with pytest.raises(InputError, match=r"take more than 0\.268 GB"), at_most(2**28):
+    with pytest.raises(InputError, match=r"take more than 0\.268 GB"), limit_memory(2**28):
         np.ones(2**27)
 
 
@@ -62,7 +62,7 @@ def test_a_limit_that_was_set_before_stays_below() -> None:
     limit = 2**40
     try:
         resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
-        with at_most(2**50):
+        with limit_memory(2**50):
             assert resource.getrlimit(resource.RLIMIT_AS)[0] == limit
     finally:
         resource.setrlimit(resource.RLIMIT_AS, before)
@@ -78,9 +78,9 @@ def test_a_flat_body_is_measured_along_its_longest_side(tmp_path: Path) -> None:
 
 def test_the_disk_holds_all_that_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=2_000_000))
-    demand_space(tmp_path / "a.h5", 1_900_000)
+    check_disk_space(tmp_path / "a.h5", 1_900_000)
     with pytest.raises(InputError, match=r"needs 2\.1 MB, and the disk has 2\.0 MB left"):
-        demand_space(tmp_path / "a.h5", 2_100_000)
+        check_disk_space(tmp_path / "a.h5", 2_100_000)
 
 
 def volume(path: Path, edges: tuple[float, ...] = (1.0, 1.0, 1.0), unit: str = "mm", shift: float = 0.0) -> Path:

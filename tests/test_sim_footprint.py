@@ -10,7 +10,13 @@ import warp as wp
 from boxes import box
 from scipy.spatial import Delaunay
 
-from sim.discretisation.footprint import CHUNK, ContactSurface, EdgeSubdivision, footprint_weights, nearest_on
+from sim.discretisation.footprint import (
+    CHUNK,
+    ContactSurface,
+    EdgeSubdivision,
+    compute_footprint_weights,
+    find_nearest_on,
+)
 from sim.errors import InputError
 from sim.runtime.device import find_device
 
@@ -27,7 +33,7 @@ def sheet(count: int, seed: int = 0, half: float = 0.03) -> tuple[np.ndarray, np
 
 
 def weights(nodes: np.ndarray, triangles: np.ndarray, point: np.ndarray = POINT, radius: float = RADIUS) -> np.ndarray:
-    return footprint_weights(nodes, triangles, point[None], np.array([radius])).toarray()[0]
+    return compute_footprint_weights(nodes, triangles, point[None], np.array([radius])).toarray()[0]
 
 
 @pytest.mark.parametrize("radius", [0.0005, 0.005, RADIUS, 0.02, 0.5])
@@ -100,7 +106,7 @@ def test_a_point_off_the_surface_is_refused(offset: list[float]) -> None:
     nodes, triangles = sheet(300)
     points = np.stack([POINT, POINT + offset])
     with pytest.raises(InputError, match=r"load 1 .*does not touch the surface"):
-        footprint_weights(nodes, triangles, points, np.full(2, RADIUS))
+        compute_footprint_weights(nodes, triangles, points, np.full(2, RADIUS))
 
 
 @pytest.mark.parametrize("radius", [1e-12, 1e-300])
@@ -131,9 +137,9 @@ def test_rows_do_not_depend_on_each_other() -> None:
     mesh = box((3, 3, 3), 0.06)
     points = np.array([[0.03, 0.03, 0.06], [0.0, 0.02, 0.03], [0.06, 0.06, 0.06]])
     radii = np.array([0.01, 0.02, 0.015])
-    together = footprint_weights(mesh.nodes, mesh.surface, points, radii).toarray()
+    together = compute_footprint_weights(mesh.nodes, mesh.surface, points, radii).toarray()
     for row in range(3):
-        alone = footprint_weights(mesh.nodes, mesh.surface, points[[row]], radii[[row]]).toarray()[0]
+        alone = compute_footprint_weights(mesh.nodes, mesh.surface, points[[row]], radii[[row]]).toarray()[0]
         np.testing.assert_array_equal(alone, together[row])
 
 
@@ -179,7 +185,7 @@ def test_quadratic_triangles_take_over_force_moment_and_second_moments(count: in
 
 def test_no_rows() -> None:
     nodes, triangles = sheet(30)
-    assert footprint_weights(nodes, triangles, np.zeros((0, 3)), np.zeros(0)).shape == (0, len(nodes))
+    assert compute_footprint_weights(nodes, triangles, np.zeros((0, 3)), np.zeros(0)).shape == (0, len(nodes))
 
 
 @pytest.mark.parametrize("aspect", [1.0, 1e-3, 1e-6, 1e-10])
@@ -191,7 +197,7 @@ def test_nearest_point_against_a_search(aspect: float) -> None:
     share = rng.dirichlet([0.5, 0.5, 0.5], 4000)
     samples = np.einsum("qc,sci->sqi", share, corners).reshape(-1, 3)
     for point in rng.normal(size=(30, 3)):
-        found = nearest_on(corners, point)
+        found = find_nearest_on(corners, point)
         best = np.linalg.norm(samples - point, axis=1).min()
         length = np.linalg.norm(found - point)
         assert length <= best + 1e-9

@@ -86,7 +86,7 @@ def test_an_older_frame_leads_where_it_led_before(fem):
 
 def test_only_what_is_kept_leaves_the_device(fem, monkeypatch):
     read = []
-    monkeypatch.setattr(frame_sequence, "rows_first", lambda array: read.append(array) or array.numpy().copy())
+    monkeypatch.setattr(frame_sequence, "to_rows_first", lambda array: read.append(array) or array.numpy().copy())
     last = ride(fem, 3)[-1]
     read.clear()
     for number in range(5):

@@ -2,20 +2,20 @@
 
 import numpy as np
 
-from sim.bodies.bcc_lattice import graded_lattice
-from sim.bodies.isosurface_stuffing import cut, whole
-from sim.geometry.geodesic import distances
-from sim.geometry.tetmesh import faces_once
+from sim.bodies.bcc_lattice import build_graded_lattice
+from sim.bodies.isosurface_stuffing import build_whole, cut
+from sim.geometry.geodesic import compute_geodesic_distances
+from sim.geometry.tetmesh import find_single_faces
 
 
 def test_on_a_sphere_they_are_arcs():
     radius = 0.06
-    lattice = graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
-    body = cut(whole(lattice), lambda points: np.linalg.norm(points, axis=1) - radius)
+    lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
+    body = cut(build_whole(lattice), lambda points: np.linalg.norm(points, axis=1) - radius)
     body = body.kept(body.inside)
-    surface = faces_once(body.tets)
+    surface = find_single_faces(body.tets)
     source = radius * np.array([0.6, 0.0, 0.8])
-    found = distances(body.nodes, surface, source, 0.08)
+    found = compute_geodesic_distances(body.nodes, surface, source, 0.08)
     outer = np.unique(surface)
     arcs = radius * np.arccos(np.clip(body.nodes[outer] @ source / radius**2, -1.0, 1.0))
     near = arcs < 0.07
@@ -33,6 +33,6 @@ def test_they_go_round_a_gap():
     a, b = number[cells[:, 0], cells[:, 1]], number[cells[:, 0] + 1, cells[:, 1]]
     c, d = number[cells[:, 0] + 1, cells[:, 1] + 1], number[cells[:, 0], cells[:, 1] + 1]
     triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    found = distances(nodes, triangles, nodes[number[5, 0]], 0.1)
+    found = compute_geodesic_distances(nodes, triangles, nodes[number[5, 0]], 0.1)
     exact = 0.009 + 0.001 + 0.009
     assert exact <= found[number[6, 0]] + 1e-12 < 1.02 * exact

@@ -22,7 +22,7 @@ from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Posture, posture, push
 from sim.material import Material
 from sim.runtime.device import find_device
-from sim.terms.gravity import parts_under
+from sim.terms.gravity import cut_below_plane
 
 G = 9.80665
 DRY, FLUID = 1040.0 * G, 1007.0 * G  # [N/m^3]
@@ -33,7 +33,9 @@ ROCK = Material("linear", 3000.0, 0.3)
 HEIGHT = 0.1
 
 
-def nodal_forces(mesh: TetMesh, element: str, loads: Loads, effect: Gravity = UPRIGHT) -> tuple[np.ndarray, np.ndarray]:
+def build_nodal_forces(
+    mesh: TetMesh, element: str, loads: Loads, effect: Gravity = UPRIGHT
+) -> tuple[np.ndarray, np.ndarray]:
     """Forces (B, N, 3) [N] of the term, and the rest positions (N, 3) of its nodes."""
     space, device = discretise(mesh, element), find_device("cpu", "float64")
     problem = compile_problem([Elasticity(), Held(), effect], base_held(mesh), device, space)
@@ -52,7 +54,7 @@ def test_what_lies_under_a_plane_is_the_divided_differences() -> None:
     """Shares, and the means of corner coordinates over them, which are slopes of the mean of min(h, 0)."""
     height = np.random.default_rng(1).normal(size=(400, 4))
     height = height[(height < 0.0).any(axis=1) & (height > 0.0).any(axis=1)]
-    owner, parts = parts_under(height)
+    owner, parts = cut_below_plane(height)
     share, mean = np.abs(np.linalg.det(parts)), parts.mean(axis=1)
     found = np.stack([np.bincount(owner, share * mean[:, corner], len(height)) for corner in range(4)], axis=1)
     h = 1e-5 * np.eye(4)
@@ -66,7 +68,7 @@ def test_what_lies_under_a_plane_is_the_divided_differences() -> None:
 def test_forces_do_the_work_of_the_weight(element: str, level: float) -> None:
     """Under every motion down that the elements hold exactly: uniform, linear in x and z, quadratic if they are."""
     mesh = box((3, 3, 3), HEIGHT, distortion=0.2)
-    force, nodes = nodal_forces(mesh, element, posture(3.0 * DOWN, level))
+    force, nodes = build_nodal_forces(mesh, element, posture(3.0 * DOWN, level))
     wet, area = min(level, HEIGHT), HEIGHT**2
     for power in range(3 if element == "p2" else 2):
         # The scan was wet all over: what has drained weighs more by the fluid's own weight.
@@ -79,7 +81,7 @@ def test_forces_do_the_work_of_the_weight(element: str, level: float) -> None:
 
 def test_curved_elements_weigh_what_they_hold() -> None:
     mesh = quadratic(box((2, 2, 2), HEIGHT), curved=0.05)
-    force, nodes = nodal_forces(mesh, "p2", posture(DOWN, -1.0))
+    force, nodes = build_nodal_forces(mesh, "p2", posture(DOWN, -1.0))
     assert force[0, :, 2].sum() == pytest.approx(-FLUID * HEIGHT**3, rel=1e-12)
     assert force[0, :, 2] @ nodes[:, 2] == pytest.approx(-FLUID * HEIGHT**4 / 2.0, rel=1e-4)
 
@@ -87,7 +89,7 @@ def test_curved_elements_weigh_what_they_hold() -> None:
 def test_a_turned_head_weighs_aside() -> None:
     """Under fluid both times: what floats pulls along the new direction, and no longer along the old one."""
     way = np.array([0.6, 0.0, -0.8])
-    force, _ = nodal_forces(box((2, 2, 2), HEIGHT), "p1", posture(1e-20 * way, 1.0))
+    force, _ = build_nodal_forces(box((2, 2, 2), HEIGHT), "p1", posture(1e-20 * way, 1.0))
     np.testing.assert_allclose(force[0].sum(axis=0), (DRY - FLUID) * HEIGHT**3 * (way - DOWN), rtol=1e-9, atol=1e-14)
 
 
@@ -95,7 +97,7 @@ def test_a_turned_head_weighs_aside() -> None:
 def test_forces_follow_the_level_without_a_jump(element: str) -> None:
     """Each of 81 steps of the level shifts as much force as the fluid between weighs, through the mesh's own planes."""
     mesh, levels = box((2, 2, 2), HEIGHT, distortion=0.2), np.linspace(0.0, HEIGHT, 82)
-    force, _ = nodal_forces(mesh, element, posture(DOWN, levels))
+    force, _ = build_nodal_forces(mesh, element, posture(DOWN, levels))
     step = np.diff(force[:, :, 2], axis=0)
     slice_weight = FLUID * HEIGHT**2 * (levels[1] - levels[0])
     np.testing.assert_allclose(step.sum(axis=1), slice_weight, rtol=1e-9)
@@ -164,8 +166,8 @@ def test_the_posture_of_the_scan_moves_nothing(precision: str) -> None:
 def test_a_share_of_the_load_is_a_share_of_the_change() -> None:
     turned = posture([[1.0, 0.0, 0.0], [0.0, 1.0, -1.0]], [0.04, 0.06])
     mesh = box((2, 2, 2))
-    whole, _ = nodal_forces(mesh, "p1", turned)
-    part, _ = nodal_forces(mesh, "p1", turned.scaled(np.array([0.25, -2.0])))
+    whole, _ = build_nodal_forces(mesh, "p1", turned)
+    part, _ = build_nodal_forces(mesh, "p1", turned.scaled(np.array([0.25, -2.0])))
     np.testing.assert_allclose(part, np.array([0.25, -2.0])[:, None, None] * whole, rtol=1e-14)
 
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from sim.fields.extension import extended
-from sim.fields.folds import jacobians, unfold
-from sim.fields.grid import Grid, grid_around
-from sim.fields.in_tetrahedra import in_tetrahedra
-from sim.fields.inversion import inverted
-from sim.fields.warp_fields import faded, faint_of, warp_fields
+from sim.fields.extension import extend_field
+from sim.fields.folds import compute_jacobians, unfold
+from sim.fields.grid import Grid, build_grid_around
+from sim.fields.in_tetrahedra import interpolate_in_tetrahedra
+from sim.fields.inversion import invert_field
+from sim.fields.warp_fields import compute_faint_threshold, remove_faint, warp_fields
 from sim.geometry.locate import locate
 
 
@@ -33,8 +33,8 @@ def fields(box, moved):
 
 
 def test_nodes_in_tetrahedra_have_what_the_vertices_say(box, moved):
-    grid = grid_around(box.mesh.nodes, 1.7e-3, 4e-3)
-    field, inside = in_tetrahedra(grid, box.mesh.nodes, box.mesh.tets, moved)
+    grid = build_grid_around(box.mesh.nodes, 1.7e-3, 4e-3)
+    field, inside = interpolate_in_tetrahedra(grid, box.mesh.nodes, box.mesh.tets, moved)
     points = grid.points(np.arange(inside.size))
     low, high = box.mesh.nodes.min(axis=0), box.mesh.nodes.max(axis=0)
     assert np.array_equal(inside.ravel(), ((points > low - 1e-9) & (points < high + 1e-9)).all(axis=1))
@@ -48,8 +48,8 @@ def test_every_grid_node_on_a_shared_face_is_inside():
     """A lattice whose nodes are the grid's: none falls between two tetrahedra."""
     nodes = 1e-3 * np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4], [4, 4, 4]], float)
     tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
-    grid = grid_around(nodes, 1e-3, 0.0)
-    inside = in_tetrahedra(grid, nodes, tets, nodes)[1]
+    grid = build_grid_around(nodes, 1e-3, 0.0)
+    inside = interpolate_in_tetrahedra(grid, nodes, tets, nodes)[1]
     points = 1e3 * grid.points(np.arange(inside.size))
     x, y, z = points.T
     first = x + y + z <= 4 + 1e-9
@@ -74,10 +74,10 @@ def test_both_fields_lead_each_vertex_where_it_goes(box, moved, fields):
 
 def test_what_is_too_faint_to_count_is_left_and_the_grid_need_not_hold_it(box, moved, fields):
     rest = warp_fields(box, 1e-3 * moved, 1e-3)
-    faint = faint_of(moved)
-    assert faint_of(1e-3 * moved) == pytest.approx(2.5e-6 * np.linalg.norm(moved, axis=1).max())
-    assert faint_of(1e-3 * moved) < faint <= 2e-5
-    size, left = np.linalg.norm(moved, axis=1), faded(moved)
+    faint = compute_faint_threshold(moved)
+    assert compute_faint_threshold(1e-3 * moved) == pytest.approx(2.5e-6 * np.linalg.norm(moved, axis=1).max())
+    assert compute_faint_threshold(1e-3 * moved) < faint <= 2e-5
+    size, left = np.linalg.norm(moved, axis=1), remove_faint(moved)
     assert not left[size < faint].any() and np.array_equal(left[size > 2 * faint], moved[size > 2 * faint])
     assert np.linalg.norm(left - moved, axis=1).max() < 1.1 * faint
     assert np.prod(rest.grid.shape) < np.prod(fields.grid.shape) and rest.forward.any()
@@ -126,7 +126,7 @@ def test_a_twist_that_no_fixed_point_inverts_is_inverted():
     field[0] = x * np.cos(turn) - y * np.sin(turn) - x
     field[1] = x * np.sin(turn) + y * np.cos(turn) - y
     points = 1e-3 * np.random.default_rng(0).uniform(-9.0, 9.0, (300, 3))
-    found = inverted(grid, field, points, np.zeros_like(points))
+    found = invert_field(grid, field, points, np.zeros_like(points))
     assert np.abs(found + grid.read(field, points + found)).max() < 2e-6
 
 
@@ -135,19 +135,19 @@ def test_a_body_that_is_turned_inside_out_is_unfolded_too():
     x, y, z = np.indices((14, 14, 14)) - 6.5
     core = np.exp(-(x**2 + y**2 + z**2) / 6.0)
     field = np.stack([-4e-3 * x * core, 0.0 * y, 0.0 * z]).astype(np.float32)
-    assert jacobians(field, 1e-3).min() < -2.0
+    assert compute_jacobians(field, 1e-3).min() < -2.0
     inside = np.ones(field.shape[1:], bool)
-    assert unfold(field, inside, ~inside, 1e-3) == jacobians(field, 1e-3).min() > 0.0
+    assert unfold(field, inside, ~inside, 1e-3) == compute_jacobians(field, 1e-3).min() > 0.0
 
 
 def test_folds_are_undone_outside_a_body_first():
     rng = np.random.default_rng(1)
     field = np.zeros((3, 20, 20, 20), np.float32)
     field[:, 8:12, 8:12, 8:12] = rng.uniform(-1.5e-3, 1.5e-3, (3, 4, 4, 4))
-    assert jacobians(field, 1e-3).min() < 0.0
+    assert compute_jacobians(field, 1e-3).min() < 0.0
     inside, collar = np.zeros((2, *field.shape[1:]), bool)
     free = field.copy()
-    assert unfold(free, inside, collar, 1e-3) == jacobians(free, 1e-3).min() > 0.0
+    assert unfold(free, inside, collar, 1e-3) == compute_jacobians(free, 1e-3).min() > 0.0
     inside[:10] = True
     held = field.copy()
     assert unfold(held, inside, collar, 1e-3) > 0.0
@@ -163,14 +163,14 @@ def test_a_fold_at_any_corner_of_a_cell_is_found():
     for corner in np.ndindex(2, 2, 2):
         field = np.zeros((3, 2, 2, 2), np.float32)
         field[(slice(None), *corner)] = 0.7e-3 * (1 - 2 * np.array(corner))  # past the middle of its neighbours
-        assert jacobians(field, 1e-3).min() < 0.0 < jacobians(0.3 * field, 1e-3).min()
+        assert compute_jacobians(field, 1e-3).min() < 0.0 < compute_jacobians(0.3 * field, 1e-3).min()
 
 
 def test_what_is_filled_in_is_no_larger_than_what_is_known():
     known = np.zeros((24, 24, 24), bool)
     known[10:14, 10:14, 10:14] = True
     field = np.where(known, np.float32(2e-3), np.float32(0.0)) * np.ones((3, 1, 1, 1), np.float32)
-    filled = extended(field, known, 8.0)
+    filled = extend_field(field, known, 8.0)
     assert np.array_equal(filled[:, known], field[:, known]) and filled.max() <= 2e-3 * (1 + 1e-6)
     line = filled[0, 12, 12, 13:]
     assert (np.diff(line) <= 0).all() and line[-1] == 0.0 and line[2] > 1e-3

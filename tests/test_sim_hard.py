@@ -23,13 +23,13 @@ from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, NodalForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.geometry.tetmesh import MeshWarning, TetMesh, dihedral_angles
-from sim.linalg.preconditioner import rest_solver
+from sim.geometry.tetmesh import MeshWarning, TetMesh, compute_dihedral_angles
+from sim.linalg.preconditioner import build_rest_solver
 from sim.loads import Loads, Nodal
 from sim.material import Material, Tissue
 from sim.minimisers.newton_cg import NewtonCG
 from sim.runtime.device import find_device
-from sim.runtime.memory import check_fits, host_bytes
+from sim.runtime.memory import check_fits, measure_host_bytes
 
 TOLERANCE = 1e-7
 ACCURACY = Accuracy(tolerance=TOLERANCE)
@@ -245,7 +245,7 @@ def test_newton_itself_brings_a_lost_body_back(law: str, name: str) -> None:
     effects = [Elasticity(soft(law)[0]), Held(), NodalForce()]
     problem = compile_problem(effects, base_held(BLOCK), find_device("cpu", "float64"))
     problem.begin(Cases(Loads((Nodal(0.0 * pressed()[None]),)), np.zeros(1)))
-    descent = NewtonCG(rest_solver(problem), ACCURACY.inner)
+    descent = NewtonCG(build_rest_solver(problem), ACCURACY.inner)
     found = equilibrium_of(problem, descent, LOST[name].reshape(-1, 1), ACCURACY)
     assert found.outcome[0] is Outcome.CONVERGED
     assert np.abs(found.u).max() <= 1e-6 * HEIGHT
@@ -283,7 +283,7 @@ def test_a_doubtful_size_names_the_option(mesh: TetMesh) -> None:
 
 
 def test_slivers_are_as_thin_as_they_say() -> None:
-    assert 0.01 < dihedral_angles(SLIVERS.nodes, SLIVERS.tets).min() < 0.15
+    assert 0.01 < compute_dihedral_angles(SLIVERS.nodes, SLIVERS.tets).min() < 0.15
 
 
 def fem(anatomy: Anatomy, material: Tissue | None = SOFT, accuracy: Accuracy = TRAIN, batch: int = 64) -> Fem:
@@ -343,7 +343,10 @@ def _too_many(batch: int) -> None:
     """A fifth more loads than memory holds, if solved `batch` together: asked for, not stored."""
     rows = 3 * COUNT
     check_fits(
-        rows, batch, int(1.2 * host_bytes() / (24 * rows if batch == 64 else 184 * rows)), find_device("cpu", "float32")
+        rows,
+        batch,
+        int(1.2 * measure_host_bytes() / (24 * rows if batch == 64 else 184 * rows)),
+        find_device("cpu", "float32"),
     )
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sim.bodies.head_masks import Sources, head_masks
-from sim.bodies.label_volume import masked_subject, volume_subject
+from sim.bodies.head_masks import Sources, read_head_masks
+from sim.bodies.label_volume import build_masked_subject, volume_subject
 from sim.bodies.subject import MeshPlan, SubjectPart, make_anatomy
 from sim.bodies.volume import read_volume
 from sim.bodies.voxels import Voxels
@@ -231,7 +231,7 @@ class TestSeveralFiles:
 
     def test_a_mask_on_another_grid_widens_the_labels(self, files):
         sources = Sources(files / "tumour.nii.gz", tumour=(1,), mask=files / "brain.nii.gz")
-        subject = masked_subject(head_masks(sources))
+        subject = build_masked_subject(read_head_masks(sources))
         assert subject.notes == ()
         assert np.linalg.norm(subject.pieces[0].centre - 1e-3 * TUMOUR) < 5e-4
         low, high = 1e3 * subject.cortex.min(axis=0), 1e3 * subject.cortex.max(axis=0)
@@ -241,7 +241,7 @@ class TestSeveralFiles:
         affine, places = grid(AXES["oblique"])
         nrrd(files / "brain.nrrd", head(places, tumour=1), affine)
         sources = Sources(files / "brain.nrrd", brain=(1,), tumour_in=files / "tumour.nii.gz")
-        subject = masked_subject(head_masks(sources))
+        subject = build_masked_subject(read_head_masks(sources))
         assert np.linalg.norm(subject.pieces[0].centre - 1e-3 * TUMOUR) < 5e-4
         assert subject.tumour_volume == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.05)
 
@@ -258,7 +258,7 @@ class TestSeveralFiles:
         affine[:3, 3] += 0.0 if moved is None else moved
         nifti(files / "elsewhere.nii", np.asarray(image.dataobj), affine)
         with pytest.raises(InputError, match=reason) as caught:
-            head_masks(Sources(files / "elsewhere.nii", tumour=(1,), mask=files / "brain.nii.gz"))
+            read_head_masks(Sources(files / "elsewhere.nii", tumour=(1,), mask=files / "brain.nii.gz"))
         assert str(caught.value).count("(RAS)") == 2
 
     def test_one_grid_with_x_and_y_negated_is_refused(self, tmp_path):
@@ -266,13 +266,13 @@ class TestSeveralFiles:
         brain = nifti(tmp_path / "brain.nii", (head(places + MIDDLE) > 0).astype(np.uint8), affine)
         tumour = nifti(tmp_path / "tumour.nii", (head(places + MIDDLE) == 3).astype(np.uint8), LPS @ affine)
         with pytest.raises(InputError, match=r"has the grid of .*, but with x and y negated"):
-            head_masks(Sources(tumour, tumour=(1,), mask=brain))
+            read_head_masks(Sources(tumour, tumour=(1,), mask=brain))
 
     def test_a_tumour_that_a_mask_lacks_is_noted(self, tmp_path):
         affine, places = grid()
         brain = nifti(tmp_path / "brain.nii", (head(places, tumour=0) > 0).astype(np.uint8), affine)
         tumour = nifti(tmp_path / "tumour.nii", (head(places) == 3).astype(np.uint8), affine)
-        (note,) = head_masks(Sources(tumour, tumour=(1,), mask=brain)).notes
+        (note,) = read_head_masks(Sources(tumour, tumour=(1,), mask=brain)).notes
         assert re.fullmatch(r"7(\.\d)? ml of what is labelled lie outside of the mask: see that .*", note)
 
     def test_what_says_nothing_or_too_much_is_refused(self, files):
@@ -286,7 +286,7 @@ class TestSeveralFiles:
             (Sources(tumour, brain=(1,)), "at least one label of the tumour"),
         ):
             with pytest.raises(InputError, match=reason):
-                head_masks(sources)
+                read_head_masks(sources)
 
 
 def test_oedema_and_ventricles_become_regions(tmp_path):
@@ -298,9 +298,9 @@ def test_oedema_and_ventricles_become_regions(tmp_path):
     labels[np.linalg.norm(places - MIDDLE + [18.0, 0.0, 0.0], axis=-1) < 10.0] = 4
     path = nifti(tmp_path / "a.nii", labels, affine)
     sources = Sources(path, (1,), (3,), parts={"oedema": (5,), "ventricles": (4,)})
-    masks = head_masks(sources)
-    assert masks.brain.sum() == np.isin(labels, (1, 4, 5)).sum() and not masked_subject(masks).parts
-    subject = masked_subject(masks, regions=("oedema", "ventricles"))
+    masks = read_head_masks(sources)
+    assert masks.brain.sum() == np.isin(labels, (1, 4, 5)).sum() and not build_masked_subject(masks).parts
+    subject = build_masked_subject(masks, regions=("oedema", "ventricles"))
     mesh = make_anatomy(subject, MeshPlan(nodes=2500)).mesh
     for region, label, off in ((2, 3, 0.1), (3, 5, 0.02), (4, 4, 0.05)):
         marked = (labels == label).sum() * (1e-3 * EDGE) ** 3
@@ -311,6 +311,6 @@ def test_oedema_and_ventricles_become_regions(tmp_path):
     with pytest.raises(
         InputError, match=r"marks no necrosis.*\. Choose from oedema, ventricles, or name .* by --necrosis"
     ):
-        masked_subject(masks, regions=("necrosis",))
+        build_masked_subject(masks, regions=("necrosis",))
     with pytest.raises(InputError, match="label 3 is named by --tumour and by --oedema"):
-        head_masks(Sources(path, (1,), (3,), parts={"oedema": (3,)}))
+        read_head_masks(Sources(path, (1,), (3,), parts={"oedema": (3,)}))

@@ -14,10 +14,10 @@ from balls import EGG, ball
 from scipy.spatial import ConvexHull
 
 from scenes.cli import main
-from sim.bodies.enclosed_voxels import enclosed
+from sim.bodies.enclosed_voxels import fill_enclosed
 from sim.bodies.fif import read_surface
 from sim.bodies.healthy_heads import INNER_SKULL
-from sim.bodies.intensity import read_intensity, sidecar
+from sim.bodies.intensity import read_intensity, to_intensity_path
 from sim.bodies.meshfile import read_anatomy
 
 RADII = 0.080 * EGG
@@ -82,7 +82,7 @@ def test_fsaverage_is_what_its_inner_skull_holds_at_the_size_asked_for(skull, tm
 @pytest.mark.skipif(find_spec("mne") is None, reason="the package mne is not installed: pip install -e '.[heads]'")
 def test_the_skull_that_mne_ships_is_of_a_head():
     points, triangles = read_surface(Path(find_spec("mne").origin).parent / INNER_SKULL)
-    mask, _ = enclosed(points, triangles, 2e-3)
+    mask, _ = fill_enclosed(points, triangles, 2e-3)
     assert mask.sum() * 8e-3 == pytest.approx(2190, abs=10)
 
 
@@ -159,7 +159,7 @@ def test_a_tumour_is_drawn_in_a_mask_where_the_site_is_and_t1_goes_with_it(maske
     for one, border in ((own, 20.0), (large, 20.0 * factor)):
         across = np.arange(5.0, 40.0, 0.1)
         line = np.array([10.0 + across, *np.outer(one["opening"]["at_mm"][1:], np.ones(len(across)))]).T
-        grey = read_intensity(sidecar(one["mesh"])).at(1e-3 * line)
+        grey = read_intensity(to_intensity_path(one["mesh"])).at(1e-3 * line)
         assert np.ptp(grey) > 0.3 and across[np.searchsorted(grey, grey.mean())] == pytest.approx(border, abs=1.5)
 
 

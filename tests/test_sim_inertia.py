@@ -25,8 +25,8 @@ from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal, Touching
 from sim.material import Material
 from sim.runtime.device import find_device
-from sim.terms.inertia import lumped_mass
-from sim.tools import Ball, distances_to
+from sim.terms.inertia import compute_lumped_mass
+from sim.tools import Ball, compute_distances
 
 TIGHT = Accuracy(tolerance=1e-10)
 DENSITY, YOUNG, LENGTH = 1040.0, 3000.0, 0.1
@@ -90,7 +90,7 @@ def test_a_mode_decays_as_the_scheme_has_it(damping: float) -> None:
     """Backward Euler of q'' + c q' + w^2 q = 0, for steps of very different lengths in one batch."""
     effects = [Elasticity(Material("linear", YOUNG, 0.3)), Held(), Inertia(DENSITY, damping)]
     fem = Fem(BLOCK, effects, TIGHT, "cpu", batch=2, element="p1")
-    frequency, motion = mode(fem.problem, lumped_mass(DENSITY, fem.space))
+    frequency, motion = mode(fem.problem, compute_lumped_mass(DENSITY, fem.space))
     steps = np.array([1e-4, 0.01, 1.1e-4, 1.0, 0.012])
     answer = guess(np.repeat(motion[None], len(steps), axis=0))
     q, speed = np.ones(len(steps)), np.zeros(len(steps))
@@ -140,7 +140,7 @@ def test_energy_never_grows_under_loads_that_stay(step: float, poisson: float) -
     effects = [Elasticity(Material("neo-hookean", YOUNG, poisson)), Held(), NodalForce()]
     still = compile_problem(effects, BLOCK, fem.problem.device)
     still.begin(Cases(Loads((Nodal(force),)), np.zeros(1)))
-    mass = lumped_mass(DENSITY, fem.space)
+    mass = compute_lumped_mass(DENSITY, fem.space)
 
     def total(answer: Deformation) -> float:
         velocity = answer.memory.get("inertia", np.zeros((1, 1, 3)))[0]
@@ -201,7 +201,7 @@ def test_where_no_time_passes_a_body_stays_as_it_is() -> None:
 @pytest.mark.parametrize("element", ELEMENTS)
 def test_masses_are_positive_and_whole(element: str) -> None:
     mesh = box((2, 2, 3), LENGTH, distortion=0.2)
-    mass = lumped_mass(DENSITY, discretise(mesh, element))
+    mass = compute_lumped_mass(DENSITY, discretise(mesh, element))
     assert mass.min() > 0.0
     assert mass.sum() == pytest.approx(DENSITY * mesh.volumes.sum(), rel=1e-13)
 
@@ -209,7 +209,7 @@ def test_masses_are_positive_and_whole(element: str) -> None:
 def test_curved_elements_weigh_what_they_hold() -> None:
     """Their inner middles are moved: the outside, and so the whole, is a straight box."""
     mesh: TetMesh = quadratic(box((2, 2, 2), LENGTH), curved=0.05)
-    assert lumped_mass(DENSITY, discretise(mesh)).sum() == pytest.approx(DENSITY * LENGTH**3, rel=1e-12)
+    assert compute_lumped_mass(DENSITY, discretise(mesh)).sum() == pytest.approx(DENSITY * LENGTH**3, rel=1e-12)
 
 
 def dynamic(**given: float) -> Callable[[], object]:
@@ -274,7 +274,7 @@ def test_where_no_time_passes_tools_stay_where_they_are() -> None:
     np.testing.assert_allclose(stays.reaction, touched.reaction)
     moved = fem.deform(pressed(0.080, 1.0), stays)
     nodes = BLOCK.mesh.nodes + moved.displacement[0]
-    assert moved.outcome[0].good and distances_to(ball, moved.memory["tool contact"][0, 0], nodes).min() > 0.0
+    assert moved.outcome[0].good and compute_distances(ball, moved.memory["tool contact"][0, 0], nodes).min() > 0.0
     np.testing.assert_array_equal(moved.memory["tool contact"][0, 0, :3, 3], [0.04, 0.06, 0.080])
 
 

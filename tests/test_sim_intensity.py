@@ -4,7 +4,7 @@ import nibabel
 import numpy as np
 import pytest
 
-from sim.bodies.intensity import Intensity, Window, read_intensity, sidecar, write_intensity
+from sim.bodies.intensity import Intensity, Window, read_intensity, to_intensity_path, write_intensity
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
 
@@ -38,7 +38,7 @@ def test_the_crop_keeps_the_place_and_fits_the_brain(tmp_path):
     points = places([[18.0, 22.0, 14.0], [22.0, 28.0, 16.0]])
     crop = ramp().around(points, brain())
     assert crop.values.dtype == np.uint8 and np.prod(crop.values.shape) < 40 * 50 * 30
-    path = sidecar(tmp_path / "mesh.vtu")
+    path = to_intensity_path(tmp_path / "mesh.vtu")
     assert path.name == "mesh.t1.nii.gz"
     write_intensity(path, crop)
     again = read_intensity(path)
@@ -69,24 +69,24 @@ def waves():
 
 def test_windows_know_neither_a_scanners_scale_nor_its_zero():
     grey = waves()
-    usual = Intensity(grey, AFFINE).windowed(brain())
+    usual = Intensity(grey, AFFINE).apply_window(brain())
     inside = np.s_[8:32, 8:42, 5:26]
     assert np.percentile(usual[inside], [5, 90]) == pytest.approx([0.3, 0.97], abs=0.05)
     for other in (37.5 * grey, (grey - grey.mean()) / grey.std(), grey - 1e4):
-        np.testing.assert_allclose(Intensity(other, AFFINE).windowed(brain()), usual, atol=1e-4)
+        np.testing.assert_allclose(Intensity(other, AFFINE).apply_window(brain()), usual, atol=1e-4)
     coarse = np.rint(255 * (grey - grey.min()) / np.ptp(grey)).astype(np.uint8)
-    np.testing.assert_allclose(Intensity(coarse, AFFINE).windowed(brain()), usual, atol=0.02)
+    np.testing.assert_allclose(Intensity(coarse, AFFINE).apply_window(brain()), usual, atol=0.02)
 
 
 def test_voxels_that_are_no_tissue_leave_the_others_as_they_are():
     grey = waves()
-    usual = Intensity(grey, AFFINE).windowed(brain())
+    usual = Intensity(grey, AFFINE).apply_window(brain())
     wrong = np.random.default_rng(1).random(grey.shape) < 0.01
     for value in (np.nan, np.inf, 1e6):
-        found = Intensity(np.where(wrong, value, grey), AFFINE).windowed(brain())
+        found = Intensity(np.where(wrong, value, grey), AFFINE).apply_window(brain())
         np.testing.assert_allclose(found[~wrong], usual[~wrong], atol=0.02)
         assert np.ptp(found[wrong]) == 0.0 and 0.3 < found[wrong][0] < 0.97
-    assert (Intensity(np.full(grey.shape, -7.0), AFFINE).windowed(brain()) == np.float32(Window().plain)).all()
+    assert (Intensity(np.full(grey.shape, -7.0), AFFINE).apply_window(brain()) == np.float32(Window().plain)).all()
 
 
 def test_a_volume_elsewhere_or_without_numbers_is_refused(tmp_path):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sim.bodies.bcc_lattice import graded_lattice
-from sim.bodies.isosurface_stuffing import IsosurfaceStuffingOptions, cut, whole
-from sim.geometry.tetmesh import dihedral_angles, faces_once, row_keys, signed_volumes
+from sim.bodies.bcc_lattice import build_graded_lattice
+from sim.bodies.isosurface_stuffing import IsosurfaceStuffingOptions, build_whole, cut
+from sim.geometry.tetmesh import compute_dihedral_angles, compute_row_keys, compute_signed_volumes, find_single_faces
 
 RADIUS, INNER, MIDDLE = 0.06, 0.015, np.array([0.02, 0.01, 0.0])
 
@@ -20,32 +20,32 @@ def core(points):
 
 @pytest.fixture(scope="module")
 def carved():
-    lattice = graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
-    body = cut(whole(lattice), ball)
+    lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
+    body = cut(build_whole(lattice), ball)
     body = body.kept(body.inside)
     return body, cut(body, core, pinned=body.surface)
 
 
 def test_angles_of_one_surface_keep_the_bound_of_the_paper(carved):
-    assert dihedral_angles(carved[0].nodes, carved[0].tets).min() > 10.7
+    assert compute_dihedral_angles(carved[0].nodes, carved[0].tets).min() > 10.7
 
 
 def test_both_materials_are_closed_and_fill_the_body(carved):
     body, both = carved
-    assert signed_volumes(both.nodes, both.tets).min() > 0.0
+    assert compute_signed_volumes(both.nodes, both.tets).min() > 0.0
     for tets, volume in ((both.tets, 4 / 3 * np.pi * RADIUS**3), (both.tets[both.inside], 4 / 3 * np.pi * INNER**3)):
-        edges = faces_once(tets)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        assert set(np.unique(row_keys(edges), return_counts=True)[1]) == {2}
-        assert signed_volumes(both.nodes, tets).sum() == pytest.approx(volume, rel=0.1)
-    assert signed_volumes(both.nodes, both.tets).sum() == pytest.approx(
-        signed_volumes(body.nodes, body.tets).sum(), rel=1e-12
+        edges = find_single_faces(tets)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        assert set(np.unique(compute_row_keys(edges), return_counts=True)[1]) == {2}
+        assert compute_signed_volumes(both.nodes, tets).sum() == pytest.approx(volume, rel=0.1)
+    assert compute_signed_volumes(both.nodes, both.tets).sum() == pytest.approx(
+        compute_signed_volumes(body.nodes, body.tets).sum(), rel=1e-12
     )
 
 
 def test_surface_nodes_lie_on_the_surface(carved):
     body, both = carved
-    assert np.abs(ball(body.nodes[np.unique(faces_once(body.tets))])).max() < 1e-8
-    assert np.abs(core(both.nodes[np.unique(faces_once(both.tets[both.inside]))])).max() < 1e-8
+    assert np.abs(ball(body.nodes[np.unique(find_single_faces(body.tets))])).max() < 1e-8
+    assert np.abs(core(both.nodes[np.unique(find_single_faces(both.tets[both.inside]))])).max() < 1e-8
 
 
 def test_no_tetrahedron_crosses_the_interface(carved):
@@ -56,8 +56,8 @@ def test_no_tetrahedron_crosses_the_interface(carved):
 
 
 def test_pinned_nodes_stay():
-    lattice = graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
-    body = cut(whole(lattice), ball)
+    lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
+    body = cut(build_whole(lattice), ball)
     body = body.kept(body.inside)
 
     def half(points):
@@ -69,8 +69,8 @@ def test_pinned_nodes_stay():
 
 
 def test_nothing_is_snapped_where_no_share_of_an_edge_is():
-    lattice = graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
-    body = cut(whole(lattice), ball, settings=IsosurfaceStuffingOptions(snap_shortest=0.0))
+    lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
+    body = cut(build_whole(lattice), ball, settings=IsosurfaceStuffingOptions(snap_shortest=0.0))
     np.testing.assert_array_equal(body.nodes[: len(lattice.nodes)], lattice.nodes)
 
 

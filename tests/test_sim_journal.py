@@ -5,24 +5,24 @@ from dataclasses import dataclass
 import pytest
 
 from sim.errors import InputError
-from sim.runtime.journal import HEAD, DamageWarning, opened, run_of
+from sim.runtime.journal import HEAD, DamageWarning, open_journal, run_of
 
 
 def test_records_of_another_run_are_not_taken_up_where_its_beginning_is_damaged(tmp_path):
     """Their own run still finds them: only its beginning is lost."""
     path, batch = tmp_path / "data.h5.partial", ("answers", 0)
-    with opened(path, {"seed": "0"}) as journal:
+    with open_journal(path, {"seed": "0"}) as journal:
         journal.add(batch, b"what was solved")
     damaged = bytearray(path.read_bytes())
     damaged[HEAD.size + 2] ^= 1
     path.write_bytes(damaged)
     with (
         pytest.raises(InputError, match="is no unfinished run, or its beginning is damaged"),
-        opened(path, {"seed": "1"}),
+        open_journal(path, {"seed": "1"}),
     ):
         pass
     assert path.read_bytes() == damaged
-    with pytest.warns(DamageWarning, match="its beginning"), opened(path, {"seed": "0"}) as journal:
+    with pytest.warns(DamageWarning, match="its beginning"), open_journal(path, {"seed": "0"}) as journal:
         assert batch in journal and journal.read(batch) == b"what was solved"
 
 
@@ -37,16 +37,16 @@ ROWS = [Row(number, 0.5 * number) for number in range(3)]
 
 def test_rows_of_a_run_are_read_but_for_one_that_a_kill_tore(tmp_path):
     path = tmp_path / "trial.rows"
-    with opened(path, {"seed": "0"}) as journal:
+    with open_journal(path, {"seed": "0"}) as journal:
         for row in ROWS:
             journal.append(row)
     assert run_of(path) == {"seed": "0"}
     path.write_bytes(path.read_bytes()[:-3])
-    with opened(path, {"seed": "0"}) as journal:
+    with open_journal(path, {"seed": "0"}) as journal:
         assert journal.rows(Row) == ROWS[:2] and len(journal) == 2
         journal.append(ROWS[2])
         assert journal.rows(Row) == ROWS
-    with pytest.raises(InputError, match="was begun with seed 0, but now seed is 1"), opened(path, {"seed": "1"}):
+    with pytest.raises(InputError, match="was begun with seed 0, but now seed is 1"), open_journal(path, {"seed": "1"}):
         pass
 
 
@@ -56,6 +56,6 @@ def test_rows_of_a_run_are_read_but_for_one_that_a_kill_tore(tmp_path):
 def test_files_of_earlier_versions_and_of_others_are_rejected(tmp_path, content):
     path = tmp_path / "trial.rows"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=r"is no unfinished run.*delete it"), opened(path, {}):
+    with pytest.raises(InputError, match=r"is no unfinished run.*delete it"), open_journal(path, {}):
         pass
     assert path.read_bytes() == content and run_of(path) == {}

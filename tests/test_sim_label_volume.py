@@ -12,7 +12,7 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.label_volume import volume_subject
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.errors import InputError
-from sim.geometry.tetmesh import dihedral_angles, faces_once, row_keys
+from sim.geometry.tetmesh import compute_dihedral_angles, compute_row_keys, find_single_faces
 
 AXES = np.array([0.045, 0.055, 0.042])  # [m] half axes of the ellipsoid that stands for a brain
 MIDDLE = np.array([0.004, -0.020, 0.012])
@@ -67,11 +67,11 @@ def test_every_affine_gives_the_same_brain(tmp_path, kind):
     anatomy = make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=3000))
     mesh = anatomy.mesh
     assert abs(len(mesh.nodes) - 3000) <= 300
-    assert dihedral_angles(mesh.nodes, mesh.tets).min() > 10.0
-    assert faces_once(mesh.tets).size and len(np.unique(mesh.tets)) == len(mesh.nodes)
+    assert compute_dihedral_angles(mesh.nodes, mesh.tets).min() > 10.0
+    assert find_single_faces(mesh.tets).size and len(np.unique(mesh.tets)) == len(mesh.nodes)
     for triangles in (mesh.surface, anatomy.tumour_surface):
         edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        assert set(np.unique(row_keys(edges), return_counts=True)[1]) == {2}
+        assert set(np.unique(compute_row_keys(edges), return_counts=True)[1]) == {2}
     voxel = 1e-9 * abs(np.linalg.det(affine[:3, :3]))
     assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx((labels > 2).sum() * voxel, rel=0.02)
     # The frame is the volume's own: the ellipsoid that was sampled, in metres, whichever way its voxels lie.

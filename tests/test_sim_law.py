@@ -5,7 +5,7 @@ import pytest
 from oracle import EVERY_LAW, energy_density, nearest_rotation, piola, tissue
 
 from sim.material import MATERIALS, Ogden, Tissue
-from sim.terms.laws.conformance import Evaluator, evaluator
+from sim.terms.laws.conformance import Evaluator, build_evaluator
 
 POSITIVE = ("neo-hookean", "ogden")
 """Laws that are infinite where J <= 0."""
@@ -19,12 +19,12 @@ def name(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="module")
 def double(name: str) -> Evaluator:
-    return evaluator(tissue(name), "float64")
+    return build_evaluator(tissue(name), "float64")
 
 
 @pytest.fixture(scope="module")
 def single(name: str) -> Evaluator:
-    return evaluator(tissue(name), "float32")
+    return build_evaluator(tissue(name), "float32")
 
 
 def gradients(name: str, count: int = 60, spread: float = 0.6) -> np.ndarray:
@@ -152,14 +152,14 @@ def test_single_precision_at_large_strain(name: str, single: Evaluator, double: 
 
 @pytest.mark.parametrize("law", POSITIVE)
 def test_laws_with_a_logarithm_are_infinite_where_inverted(law: str) -> None:
-    evaluate = evaluator(tissue(law), "float64")
+    evaluate = build_evaluator(tissue(law), "float64")
     assert np.isposinf(evaluate(np.diag([-2.0, 0.0, 0.0])[None]).energy).all()
     assert np.isposinf(evaluate(np.diag([-1.0, 0.0, 0.0])[None]).energy).all()
 
 
 def test_corotational_rotation_is_proper_and_nearest() -> None:
     """With lambda = 0, F - P / (2 mu) is the rotation that the law used."""
-    evaluate = evaluator(tissue("corotational", poisson=0.0), "float64")
+    evaluate = build_evaluator(tissue("corotational", poisson=0.0), "float64")
     F = np.eye(3) + gradients("corotational")
     R = F - evaluate(F - np.eye(3)).stress / (2.0 * evaluate.of.lame[0])
     assert (np.linalg.det(F) < 0.0).any()
@@ -189,7 +189,7 @@ def test_equal_stretches_are_no_special_case(of: Tissue, turn: np.ndarray, stret
     """Against the published stress and its differences, which take no notice of what is equal; in both precisions."""
     F = np.repeat((turn @ np.diag(stretches) @ turn.T)[None], 40, axis=0)
     D = np.random.default_rng(9).normal(size=F.shape)
-    double, single = (evaluator(of, precision)(F - np.eye(3), D) for precision in ("float64", "float32"))
+    double, single = (build_evaluator(of, precision)(F - np.eye(3), D) for precision in ("float64", "float32"))
     # The fourth-order difference: a step wide enough for the oracle's round-off.
     h = 1e-4 * min(stretches)
     near, far = (
@@ -210,14 +210,14 @@ def test_ogden_without_change_of_volume_is_the_incompressible_solution(m: float,
     """Uniaxial: sigma_1 - sigma_2 = sum c / m (s^m - s^(-m/2)), whatever K."""
     of = Ogden(((1300.0, m), (200.0, 1.5)), 5e4)
     side = stretch**-0.5
-    P = evaluator(of, "float64")(np.diag([stretch - 1.0, side - 1.0, side - 1.0])[None]).stress[0]
+    P = build_evaluator(of, "float64")(np.diag([stretch - 1.0, side - 1.0, side - 1.0])[None]).stress[0]
     expected = sum(c / n * (stretch**n - stretch ** (-n / 2.0)) for c, n in of.terms)
     assert stretch * P[0, 0] - side * P[1, 1] == pytest.approx(expected, rel=1e-10)
     assert np.abs(P - np.diag(np.diag(P))).max() == 0.0
 
 
 def test_exponent_of_nineteen_in_single_precision() -> None:
-    single, double = (evaluator(MINUTES, precision) for precision in ("float32", "float64"))
+    single, double = (build_evaluator(MINUTES, precision) for precision in ("float32", "float64"))
     for spread, bound in ((1e-5, 1e-5), (1e-3, 1e-5), (0.1, 1e-5), (0.3, 1e-4)):
         H = gradients("ogden", 200, spread).astype(np.float32).astype(np.float64)
         exact = double(H)
@@ -231,7 +231,7 @@ def test_a_term_of_no_stiffness_adds_nothing() -> None:
     D = np.random.default_rng(10).normal(size=H.shape)
     of = tissue("ogden")
     assert isinstance(of, Ogden)
-    short = evaluator(of, "float64")(H, D)
-    filled = evaluator(Ogden((*of.terms, (0.0, 1.0)), of.bulk), "float64")(H, D)
+    short = build_evaluator(of, "float64")(H, D)
+    filled = build_evaluator(Ogden((*of.terms, (0.0, 1.0)), of.bulk), "float64")(H, D)
     np.testing.assert_array_equal(filled.stress, short.stress)
     np.testing.assert_array_equal(filled.change, short.change)

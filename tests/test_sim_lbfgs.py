@@ -15,7 +15,7 @@ from sim.discretisation.problem import Problem
 from sim.discretisation.term import Cases
 from sim.effects import Effect, Elasticity, Held, NodalForce
 from sim.linalg.pcg import BlockJacobi
-from sim.linalg.preconditioner import rest_solver
+from sim.linalg.preconditioner import build_rest_solver
 from sim.loads import Loads, Nodal
 from sim.minimisers.lbfgs import Descended, Lbfgs
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LEFT, LIVE, PAIRS
@@ -30,7 +30,7 @@ TOTAL = np.array([[0.0, 0.0, -0.1], [0.2, 0.1, -0.4], [0.0, 0.0, 2.0], [0.01, 0.
 FINE = 1e-9
 
 
-def problem_of(device: Device, law: str = "stable-neo-hookean", total: np.ndarray = TOTAL) -> Problem:
+def read_problem(device: Device, law: str = "stable-neo-hookean", total: np.ndarray = TOTAL) -> Problem:
     effects: list[Effect] = [Elasticity(tissue(law)), Held(), NodalForce()]
     problem = compile_problem(effects, ANATOMY, device)
     problem.begin(Cases(Loads((Nodal(top_forces(MESH, total)),)), np.zeros(len(total))))
@@ -40,7 +40,7 @@ def problem_of(device: Device, law: str = "stable-neo-hookean", total: np.ndarra
 def descended(problem: Problem, start: np.ndarray | None = None, tolerance: float = FINE, most: int = 300) -> Descended:
     count = len(TOTAL) if start is None else start.shape[1]
     start = np.zeros((ROWS, count)) if start is None else start
-    solver = rest_solver(problem)
+    solver = build_rest_solver(problem)
     return Lbfgs(problem, solver).descend(problem.device.array(start), np.full(count, tolerance), most)
 
 
@@ -49,7 +49,7 @@ def book(problem: Problem, steps: int) -> np.ndarray:
 
     Each is as long as the one before it should have been by the secant of its slopes, at most whole.
     """
-    device, solver = problem.device, rest_solver(problem)
+    device, solver = problem.device, build_rest_solver(problem)
 
     def gradient(u: np.ndarray) -> np.ndarray:
         g = problem.gradient(device.array(u[:, None]))
@@ -81,47 +81,47 @@ def test_the_steps_are_those_of_the_book(device: Device) -> None:
     """More steps than pairs: the oldest leave in turn."""
     mild = TOTAL[1:2]
     for steps in (1, 2, 5, PAIRS + 3):
-        found = descended(problem_of(device, total=mild), np.zeros((ROWS, 1)), 1e-300, steps + 1)
+        found = descended(read_problem(device, total=mild), np.zeros((ROWS, 1)), 1e-300, steps + 1)
         assert found.steps[0] == steps
-        expected = book(problem_of(device, total=mild), steps)
+        expected = book(read_problem(device, total=mild), steps)
         np.testing.assert_allclose(found.u.numpy()[:, 0], expected, atol=1e-7 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("law", ["linear", "corotational", "neo-hookean", "stable-neo-hookean", "ogden"])
 def test_it_ends_where_newton_does(device: Device, law: str) -> None:
-    problem = problem_of(device, law)
+    problem = read_problem(device, law)
     found = descended(problem)
     assert (found.status == DONE).all()
     assert (found.residual <= FINE).all()
-    problem = problem_of(device, law)
-    newton = NewtonCG(rest_solver(problem), 400)
+    problem = read_problem(device, law)
+    newton = NewtonCG(build_rest_solver(problem), 400)
     exact = equilibrium_of(problem, newton, np.zeros((ROWS, len(TOTAL))), Accuracy(tolerance=FINE))
     np.testing.assert_allclose(found.u.numpy(), exact.u, atol=1e-6 * np.abs(exact.u).max())
-    again = problem_of(device, law)
+    again = read_problem(device, law)
     _, free, scale = again.residual(found.u)
     np.testing.assert_allclose(found.residual[:-1], free[:-1] / scale[:-1], rtol=1e-4, atol=1e-15)
 
 
 def test_hookes_law_is_solved_by_the_first_step_and_no_load_by_none(device: Device) -> None:
-    found = descended(problem_of(device, "linear"))
+    found = descended(read_problem(device, "linear"))
     np.testing.assert_array_equal(found.steps, [1, 1, 1, 1, 1, 0])
     assert not found.u.numpy()[:, -1].any()
 
 
 def test_columns_are_steered_each_by_itself(device: Device) -> None:
     """Others that end sooner or later change nothing."""
-    whole = descended(problem_of(device))
+    whole = descended(read_problem(device))
     for row in range(len(TOTAL)):
-        alone = descended(problem_of(device, total=TOTAL[[row]]), np.zeros((ROWS, 1)))
+        alone = descended(read_problem(device, total=TOTAL[[row]]), np.zeros((ROWS, 1)))
         assert alone.steps[0] == whole.steps[row]
         np.testing.assert_allclose(alone.u.numpy()[:, 0], whole.u.numpy()[:, row], atol=1e-12)
 
 
 def test_what_the_budget_leaves_is_the_last_accepted_state(device: Device) -> None:
-    found = descended(problem_of(device), most=6)
+    found = descended(read_problem(device), most=6)
     np.testing.assert_array_equal(found.left, np.flatnonzero(found.status != DONE))
     assert len(found.left) >= 2
-    _, free, scale = problem_of(device).residual(found.u)
+    _, free, scale = read_problem(device).residual(found.u)
     np.testing.assert_allclose(free[:-1] / scale[:-1], found.residual[:-1], rtol=1e-5)
     assert (found.residual[found.left] > FINE).all()
 
@@ -129,7 +129,7 @@ def test_what_the_budget_leaves_is_the_last_accepted_state(device: Device) -> No
 def test_a_start_that_is_not_finite_is_given_up(device: Device) -> None:
     start = np.zeros((ROWS, len(TOTAL)))
     start[FREE, 1] = 1e200
-    found = descended(problem_of(device), start)
+    found = descended(read_problem(device), start)
     assert found.status[1] == BROKEN
     assert (np.delete(found.status, 1) == DONE).all()
 
@@ -137,24 +137,24 @@ def test_a_start_that_is_not_finite_is_given_up(device: Device) -> None:
 def test_forces_that_overflow_are_no_equilibrium() -> None:
     """In single precision, at held nodes first: what is free then looks like nothing beside them."""
     single, power = find_device("cpu", "float32"), np.arange(2, 34, 0.5)
-    problem = problem_of(single, total=np.tile(TOTAL[1], (len(power), 1)))
+    problem = read_problem(single, total=np.tile(TOTAL[1], (len(power), 1)))
     start = np.random.default_rng(0).normal(size=(ROWS, 1)) * FREE[:, None] * 10.0**power
     _, free, scale = problem.residual(single.array(start))
     with np.errstate(invalid="ignore"):
         assert not (free / scale <= 1e-4).any() and not np.isfinite(scale).all()
     tolerance = np.full(len(power), 1e-4)
-    found = Lbfgs(problem, rest_solver(problem)).descend(single.array(start), tolerance, 1)
+    found = Lbfgs(problem, build_rest_solver(problem)).descend(single.array(start), tolerance, 1)
     assert not (found.status == DONE).any() and (found.status == BROKEN).any()
 
 
 def test_steps_stay_inside_the_domain(device: Device) -> None:
     """Pulled towards a wall, none passes it on the way, nor at the end."""
-    problem = problem_of(device, "neo-hookean")
+    problem = read_problem(device, "neo-hookean")
     wall = Wall(device, MESH.nodes, 0.105, 4e-3, 1.0)
     walled = Problem((*problem.terms, wall), problem.constraint, device)
     walled.begin(Cases(Loads((Nodal(top_forces(MESH, TOTAL)),)), np.zeros(len(TOTAL))))
     for most in (1, 2, 3, 5, 8, 200):
-        found = Lbfgs(walled, rest_solver(problem)).descend(
+        found = Lbfgs(walled, build_rest_solver(problem)).descend(
             device.zeros(ROWS, len(TOTAL)), np.full(len(TOTAL), 1e-7), most
         )
         assert wall.distance(found.u.numpy()).min() > 0.0
@@ -165,49 +165,49 @@ def test_steps_stay_inside_the_domain(device: Device) -> None:
 
 
 def test_any_preconditioner_serves(device: Device) -> None:
-    problem = problem_of(device)
+    problem = read_problem(device)
     jacobi = Lbfgs(problem, BlockJacobi(device)).descend(
         device.zeros(ROWS, len(TOTAL)), np.full(len(TOTAL), 1e-6), 2000
     )
     assert (jacobi.status == DONE).all()
-    exact = descended(problem_of(device)).u.numpy()
+    exact = descended(read_problem(device)).u.numpy()
     np.testing.assert_allclose(jacobi.u.numpy(), exact, atol=1e-3 * np.abs(exact).max())
 
 
 def test_single_precision_ends_at_its_floor() -> None:
     single = find_device("cpu", "float32")
-    found = descended(problem_of(single), tolerance=2e-5)
+    found = descended(read_problem(single), tolerance=2e-5)
     assert (found.status == DONE).all()
 
 
 def test_what_was_learnt_shortens_the_next_descent(device: Device) -> None:
     """The load grows by a tenth: the pairs of the last descent know the way."""
     few, rest = TOTAL[:3], device.zeros(ROWS, 3)
-    problem = problem_of(device, total=few)
-    solver, tolerance = rest_solver(problem), np.full(3, 1e-6)
+    problem = read_problem(device, total=few)
+    solver, tolerance = build_rest_solver(problem), np.full(3, 1e-6)
     first = Lbfgs(problem, solver).descend(rest, tolerance, 300, {})
-    plain = Lbfgs(problem_of(device, total=1.1 * few), solver).descend(first.u, tolerance, 300)
-    carried = Lbfgs(problem_of(device, total=1.1 * few), solver).descend(first.u, tolerance, 300, first.learnt)
+    plain = Lbfgs(read_problem(device, total=1.1 * few), solver).descend(first.u, tolerance, 300)
+    carried = Lbfgs(read_problem(device, total=1.1 * few), solver).descend(first.u, tolerance, 300, first.learnt)
     assert (carried.status == DONE).all()
     assert carried.steps.sum() < plain.steps.sum()
     np.testing.assert_allclose(carried.u.numpy(), plain.u.numpy(), atol=1e-4 * np.abs(plain.u.numpy()).max())
-    assert not descended(problem_of(device)).learnt  # too many columns to have a next frame
+    assert not descended(read_problem(device)).learnt  # too many columns to have a next frame
 
 
 def test_a_column_ends_at_a_force_too(device: Device) -> None:
-    problem = problem_of(device)
+    problem = read_problem(device)
     force = np.array([0.0, 1e-3, 0.0, 1e-4, 0.0, 0.0])
     start, count = device.zeros(ROWS, len(TOTAL)), len(TOTAL)
-    found = Lbfgs(problem, rest_solver(problem)).descend(start, np.full(count, FINE), 300, force=force)
-    _, free, _ = problem_of(device).residual(found.u)
+    found = Lbfgs(problem, build_rest_solver(problem)).descend(start, np.full(count, FINE), 300, force=force)
+    _, free, _ = read_problem(device).residual(found.u)
     assert (found.status == DONE).all() and (found.residual[[1, 3]] > 100.0 * FINE).all()
     assert (free[[1, 3]] <= force[[1, 3]]).all()
 
 
 def test_stragglers_are_left_where_they_are(device: Device) -> None:
-    problem = problem_of(device)
+    problem = read_problem(device)
     start, count = device.zeros(ROWS, len(TOTAL)), len(TOTAL)
-    found = Lbfgs(problem, rest_solver(problem)).descend(start, np.full(count, FINE), 300, stragglers=0.4)
+    found = Lbfgs(problem, build_rest_solver(problem)).descend(start, np.full(count, FINE), 300, stragglers=0.4)
     assert 1 <= (found.status == LIVE).sum() <= 2
     assert (found.residual[found.status == LIVE] < 1.0).all()
 
@@ -215,11 +215,11 @@ def test_stragglers_are_left_where_they_are(device: Device) -> None:
 @pytest.mark.parametrize("law", ["stable-neo-hookean", "neo-hookean"])
 def test_a_known_gradient_saves_the_first_look(device: Device, law: str) -> None:
     """And no more: the same steps follow, the first of them within the domain."""
-    problem = problem_of(device, law)
-    solver, start = rest_solver(problem), device.zeros(ROWS, len(TOTAL))
+    problem = read_problem(device, law)
+    solver, start = build_rest_solver(problem), device.zeros(ROWS, len(TOTAL))
     tolerance = np.full(len(TOTAL), FINE)
     plain = Lbfgs(problem, solver).descend(start, tolerance, 300)
-    problem = problem_of(device, law)
+    problem = read_problem(device, law)
     g, _, _ = problem.residual(start)
     z = device.zeros(ROWS, len(TOTAL))
     solver.apply(g, np.ones(len(TOTAL), bool), z)
@@ -235,12 +235,12 @@ def test_a_known_gradient_saves_the_first_look(device: Device, law: str) -> None
 
 def test_a_batch_forgets_the_one_before(device: Device) -> None:
     """A narrower room stands where a wider one worked: what that left there is no scale of a residual."""
-    problem = problem_of(device, total=np.tile(50.0 * TOTAL[1], (8, 1)))
-    solver, few = rest_solver(problem), TOTAL[[0, 1, 3]]
+    problem = read_problem(device, total=np.tile(50.0 * TOTAL[1], (8, 1)))
+    solver, few = build_rest_solver(problem), TOTAL[[0, 1, 3]]
     lbfgs = Lbfgs(problem, solver)
     lbfgs.descend(device.zeros(ROWS, 8), np.full(8, FINE), 300)
     problem.begin(Cases(Loads((Nodal(top_forces(MESH, few)),)), np.zeros(3)))
     again = lbfgs.descend(device.zeros(ROWS, 3), np.full(3, 1e-4), 300)
-    fresh = Lbfgs(problem_of(device, total=few), solver).descend(device.zeros(ROWS, 3), np.full(3, 1e-4), 300)
+    fresh = Lbfgs(read_problem(device, total=few), solver).descend(device.zeros(ROWS, 3), np.full(3, 1e-4), 300)
     np.testing.assert_array_equal(again.u.numpy(), fresh.u.numpy())
     np.testing.assert_array_equal(again.residual, fresh.residual)

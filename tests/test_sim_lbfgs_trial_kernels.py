@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from sim.minimisers import lbfgs_trial_kernels
-from sim.minimisers.lbfgs_kernels import PAIRS, PRODUCTS, SOME, SUMS, kernels_of
+from sim.minimisers.lbfgs_kernels import PAIRS, PRODUCTS, SOME, SUMS, build_kernels
 from sim.minimisers.lbfgs_trial_kernels import multiply_of, spread_of
 from sim.runtime.device import find_device
 
@@ -31,7 +31,9 @@ def test_a_step():
     u, d, t, one, many = column(ROWS), column(ROWS), double(1), column(ROWS), column(ROWS)
     t.fill_(0.3)
     for spread, out in ((ONE, one), (MANY, many)):
-        DEVICE.launch(lbfgs_trial_kernels.kernels_of(DEVICE, spread).step, (spread.threads(ROWS), 1), [u, t, d], [out])
+        DEVICE.launch(
+            lbfgs_trial_kernels.build_kernels(DEVICE, spread).step, (spread.threads(ROWS), 1), [u, t, d], [out]
+        )
     np.testing.assert_array_equal(one.numpy(), many.numpy())
 
 
@@ -43,7 +45,7 @@ def test_a_gradient_is_finished():
     one, many, sums, other = wp.clone(total), wp.clone(total), double(SUMS, 1), double(SUMS, 1)
     inputs = [constant, held, normal, d]
     for spread, out in ((ONE, [one, sums]), (MANY, [many, other])):
-        DEVICE.launch(lbfgs_trial_kernels.kernels_of(DEVICE, spread).finish, (spread.threads(NODES), 1), inputs, out)
+        DEVICE.launch(lbfgs_trial_kernels.build_kernels(DEVICE, spread).finish, (spread.threads(NODES), 1), inputs, out)
     np.testing.assert_array_equal(one.numpy(), many.numpy())
     np.testing.assert_allclose(sums.numpy(), other.numpy(), rtol=1e-12)
 
@@ -55,6 +57,6 @@ def test_products_with_the_pairs_that_are_known(count):
     one, many = double(2 * PAIRS + PRODUCTS, 1), double(2 * PAIRS + PRODUCTS, 1)
     inputs, dim = [known, s, w, *vectors], (len(one), ONE.threads(ROWS))
     DEVICE.launch(multiply_of(DEVICE, PAIRS), dim, inputs, [one])
-    DEVICE.launch(kernels_of(DEVICE, PAIRS).multiply, (-(-ROWS // SOME), 1), inputs, [many])
+    DEVICE.launch(build_kernels(DEVICE, PAIRS).multiply, (-(-ROWS // SOME), 1), inputs, [many])
     np.testing.assert_allclose(one.numpy(), many.numpy(), rtol=1e-9, atol=1e-9)
     assert np.count_nonzero(one.numpy()) == 2 * count + PRODUCTS

@@ -11,8 +11,8 @@ from sim.compile import compile_problem
 from sim.discretisation.problem import Problem
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, NodalForce
-from sim.linalg.pcg import BlockJacobi, Preconditioner, conjugate_gradients
-from sim.linalg.preconditioner import rest_solver
+from sim.linalg.pcg import BlockJacobi, Preconditioner, solve_conjugate_gradients
+from sim.linalg.preconditioner import build_rest_solver
 from sim.loads import Loads, Nodal
 from sim.material import Material
 from sim.minimisers.line_search import search
@@ -37,10 +37,10 @@ def problem(device: Device) -> Problem:
 
 @pytest.fixture(params=["factor", "block jacobi"])
 def preconditioner(request: pytest.FixtureRequest, problem: Problem) -> Preconditioner:
-    return rest_solver(problem) if request.param == "factor" else BlockJacobi(problem.device)
+    return build_rest_solver(problem) if request.param == "factor" else BlockJacobi(problem.device)
 
 
-def right_hand_side(problem: Problem) -> np.ndarray:
+def compute_right_hand_side(problem: Problem) -> np.ndarray:
     """Projected, one column much larger than the other."""
     r = FORCE.reshape(2, -1).T * [1.0, 1e-6]
     array = problem.device.array(r)
@@ -63,11 +63,11 @@ def dense(problem: Problem, u: np.ndarray) -> np.ndarray:
 
 def solve(problem: Problem, preconditioner: Preconditioner, r: np.ndarray, tolerance: np.ndarray, most: int):
     preconditioner.prepare(problem, r.shape[1])
-    return conjugate_gradients(problem, preconditioner, problem.device.array(r), tolerance, most)
+    return solve_conjugate_gradients(problem, preconditioner, problem.device.array(r), tolerance, most)
 
 
 def test_solves_to_the_tolerance_column_by_column(problem: Problem, preconditioner: Preconditioner) -> None:
-    K, r = dense(problem, 1e-2 * CRUSHED), right_hand_side(problem)
+    K, r = dense(problem, 1e-2 * CRUSHED), compute_right_hand_side(problem)
     found = solve(problem, preconditioner, r, 1e-10 * np.linalg.norm(r, axis=0), 400)
     x = found.x.numpy()
     assert not np.delete(x, FREE, axis=0).any()
@@ -80,20 +80,20 @@ def test_solves_to_the_tolerance_column_by_column(problem: Problem, precondition
 def test_needs_no_more_iterations_than_unknowns(problem: Problem, preconditioner: Preconditioner) -> None:
     """Directions are conjugate: exact arithmetic ends after n steps; steepest descent takes hundreds."""
     dense(problem, 1e-2 * CRUSHED)
-    r = right_hand_side(problem)
+    r = compute_right_hand_side(problem)
     found = solve(problem, preconditioner, r, 1e-8 * np.linalg.norm(r, axis=0), 1000)
     assert found.iterations <= (1.2 * len(FREE) if isinstance(preconditioner, BlockJacobi) else 8)
 
 
 def test_the_factor_inverts_the_rest_stiffness(problem: Problem) -> None:
-    K, r = dense(problem, REST), right_hand_side(problem)
+    K, r = dense(problem, REST), compute_right_hand_side(problem)
     out = problem.device.zeros(*r.shape)
-    rest_solver(problem).apply(problem.device.array(r), np.ones(2, bool), out)
+    build_rest_solver(problem).apply(problem.device.array(r), np.ones(2, bool), out)
     np.testing.assert_allclose(out.numpy()[FREE], np.linalg.solve(K, r[FREE]), rtol=1e-9, atol=1e-18)
 
 
 def test_negative_curvature_gives_a_descent_direction(problem: Problem, preconditioner: Preconditioner) -> None:
-    K, r = dense(problem, CRUSHED), right_hand_side(problem)
+    K, r = dense(problem, CRUSHED), compute_right_hand_side(problem)
     assert np.linalg.eigvalsh(K)[0] < 0.0
     found = solve(problem, preconditioner, r, 1e-10 * np.linalg.norm(r, axis=0), 400)
     x = found.x.numpy()
@@ -111,7 +111,7 @@ def test_negative_curvature_gives_a_descent_direction(problem: Problem, precondi
 
 def test_a_budget_ends_the_iteration(problem: Problem) -> None:
     dense(problem, 1e-2 * CRUSHED)
-    r = right_hand_side(problem)
+    r = compute_right_hand_side(problem)
     found = solve(problem, BlockJacobi(problem.device), r, np.zeros(2), 5)
     assert found.iterations == 5
     assert np.isfinite(found.x.numpy()).all()
@@ -159,8 +159,8 @@ def test_search_does_not_move_what_it_is_given(problem: Problem) -> None:
 
 def test_a_radius_bounds_the_solution_in_the_preconditioners_norm(problem: Problem) -> None:
     """Half of what the whole solution takes, and less where the curvature is negative; a large one changes nothing."""
-    K, r = dense(problem, 1e-2 * CRUSHED), right_hand_side(problem)
-    rest, solver = dense(problem, REST), rest_solver(problem)
+    K, r = dense(problem, 1e-2 * CRUSHED), compute_right_hand_side(problem)
+    rest, solver = dense(problem, REST), build_rest_solver(problem)
     tolerance = 1e-10 * np.linalg.norm(r, axis=0)
 
     def size(x: np.ndarray) -> np.ndarray:
@@ -168,7 +168,7 @@ def test_a_radius_bounds_the_solution_in_the_preconditioners_norm(problem: Probl
 
     def solution(at: np.ndarray, radius: np.ndarray | None):
         problem.linearise(problem.device.array(at), np.zeros(2, bool))
-        return conjugate_gradients(problem, solver, problem.device.array(r), tolerance, 400, radius)
+        return solve_conjugate_gradients(problem, solver, problem.device.array(r), tolerance, 400, radius)
 
     whole = solution(1e-2 * CRUSHED, None)
     np.testing.assert_allclose(whole.size, size(whole.x.numpy()), rtol=1e-9)

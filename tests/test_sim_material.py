@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
-from sim.material import LAWS, MATERIALS, Material, Ogden, Tissue, coefficients_of, tissue_from_json, tissue_to_json
+from sim.material import (
+    LAWS,
+    MATERIALS,
+    Material,
+    Ogden,
+    Tissue,
+    collect_coefficients,
+    read_tissue_json,
+    to_tissue_json,
+)
 
 
 def test_engineering_constants_come_back_from_lames() -> None:
@@ -24,10 +33,11 @@ def test_ogdens_constants_at_small_strain() -> None:
 
 def test_coefficients_of_a_law_have_one_length() -> None:
     tissues = Ogden(((1.0, 2.0),), 9.0), Ogden(((3.0, 4.0), (5.0, 6.0), (7.0, 8.0)), 10.0)
-    rows = coefficients_of(tissues)
+    rows = collect_coefficients(tissues)
     np.testing.assert_array_equal(rows, [[9, 1, 2, 0, 1, 0, 1], [10, 3, 4, 5, 6, 7, 8]])
     np.testing.assert_array_equal(
-        coefficients_of([Material(law, 3000.0, 0.3) for law in LAWS]), [Material(LAWS[0], 3000.0, 0.3).lame] * len(LAWS)
+        collect_coefficients([Material(law, 3000.0, 0.3) for law in LAWS]),
+        [Material(LAWS[0], 3000.0, 0.3).lame] * len(LAWS),
     )
 
 
@@ -72,7 +82,7 @@ def test_engineering_constants_that_no_tissue_has(law: str, young: float, poisso
     "tissue", [*(known.tissue for known in MATERIALS.values()), Ogden(((0.1, -19.0), (1e3 / 3.0, 2.5)), 7.0)]
 )
 def test_a_tissue_written_is_the_tissue_read(tissue: Tissue) -> None:
-    assert tissue_from_json(tissue_to_json(tissue)) == tissue
+    assert read_tissue_json(to_tissue_json(tissue)) == tissue
 
 
 @pytest.mark.parametrize("name", MATERIALS)
@@ -102,8 +112,8 @@ SERIES = ((0.45, 0.5), (0.365, 50.0))
     "tissue", [Material("neo-hookean", 3000.0, 0.45, SERIES), Ogden(((1684.0, -4.7),), 4e4, SERIES), *PLAIN]
 )
 def test_tissues_come_back_from_their_line(tissue: Tissue) -> None:
-    line = tissue_to_json(tissue)
-    assert tissue_from_json(line) == tissue
+    line = to_tissue_json(tissue)
+    assert read_tissue_json(line) == tissue
     assert ("prony" in line) == bool(tissue.prony)
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from sim.errors import InputError
-from sim.runtime.columns import widest_within, width_of
+from sim.runtime.columns import find_widest_workspace, find_workspace_width
 from sim.runtime.device import Device, find_device
-from sim.runtime.memory import MemoryBudget, check_fits, column_bytes, fitting_batch, host_bytes
+from sim.runtime.memory import MemoryBudget, check_fits, choose_batch_size, estimate_column_bytes, measure_host_bytes
 
 ROWS = 3_000
 
@@ -23,10 +23,10 @@ def group(folder: Path, most: str, used: int, cached: int) -> MemoryBudget:
 
 def test_a_control_group_bounds_what_is_free(tmp_path: Path) -> None:
     """Less what it uses; files that are merely cached are given up."""
-    plain = host_bytes()
-    assert host_bytes(group(tmp_path, "50000000", 20_000_000, 3_000_000)) == 33_000_000
-    assert host_bytes(group(tmp_path, "max", 20_000_000, 0)) == pytest.approx(plain, rel=0.2)
-    assert host_bytes(MemoryBudget(group=tmp_path / "none")) == pytest.approx(plain, rel=0.2)
+    plain = measure_host_bytes()
+    assert measure_host_bytes(group(tmp_path, "50000000", 20_000_000, 3_000_000)) == 33_000_000
+    assert measure_host_bytes(group(tmp_path, "max", 20_000_000, 0)) == pytest.approx(plain, rel=0.2)
+    assert measure_host_bytes(MemoryBudget(group=tmp_path / "none")) == pytest.approx(plain, rel=0.2)
 
 
 @pytest.mark.parametrize(("batch", "count"), [(64, 2_000), (512, 400)])
@@ -59,16 +59,16 @@ CARD = Device("cuda:0", "float32")
 
 def test_columns_on_a_card_stand_in_rooms_of_few_widths() -> None:
     counts = (1, 4, 5, 64, 65, 96, 97, 16384, 16385)
-    assert [width_of(CARD, count) for count in counts] == [1, 4, 64, 64, 96, 96, 128, 16384, 32768]
-    assert [widest_within(CARD, count) for count in (-3, 0, *counts)] == [
+    assert [find_workspace_width(CARD, count) for count in counts] == [1, 4, 64, 64, 96, 96, 128, 16384, 32768]
+    assert [find_widest_workspace(CARD, count) for count in (-3, 0, *counts)] == [
         -3, 0, 1, 4, 4, 64, 64, 96, 96, 16384, 16384,
     ]  # fmt: skip
     processor = Device("cpu", "float32")
-    assert width_of(processor, 65) == widest_within(processor, 65) == 65
+    assert find_workspace_width(processor, 65) == find_widest_workspace(processor, 65) == 65
 
 
 def test_a_batch_that_fits_a_card_fills_its_room() -> None:
     """As many loads as are worth it, and at least one."""
-    column = column_bytes(ROWS, CARD)
-    batches = [fitting_batch(ROWS, CARD, free * column) for free in (0, 2, 9, 100, 200, 10**9)]
+    column = estimate_column_bytes(ROWS, CARD)
+    batches = [choose_batch_size(ROWS, CARD, free * column) for free in (0, 2, 9, 100, 200, 10**9)]
     assert batches == [1, 1, 4, 4, 96, MemoryBudget.widest_on_cuda]

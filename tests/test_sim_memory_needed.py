@@ -12,8 +12,8 @@ from sim.accuracy import TRAIN
 from sim.discretisation.space import discretise
 from sim.errors import InputError
 from sim.runtime.device import Device
-from sim.runtime.memory import column_bytes
-from sim.strategy.memory_needed import FIXED, PER_NODE, foreseen, needed
+from sim.runtime.memory import estimate_column_bytes
+from sim.strategy.memory_needed import FIXED, PER_NODE, compute_needed, estimate_needed
 
 SPACE = discretise(box((6, 6, 6)), "smoothed")
 TABLES = FIXED + PER_NODE["smoothed"] * SPACE.count
@@ -22,35 +22,35 @@ TABLES = FIXED + PER_NODE["smoothed"] * SPACE.count
 def test_what_a_card_must_have_is_the_tables_the_inverse_and_the_loads() -> None:
     """An inverse takes half its square in double precision at first, and is kept in half precision."""
     rows, free = 3 * SPACE.count, 2**40
-    one = needed(SPACE, CARD, 0, 1, 5, free)
+    one = compute_needed(SPACE, CARD, 0, 1, 5, free)
     assert one.peak == one.kept + one.column and one.kept == one.set_up == TABLES
-    assert one.column == column_bytes(rows, CARD)
-    many = needed(SPACE, CARD, 0, 64, 5, free)
+    assert one.column == estimate_column_bytes(rows, CARD)
+    many = compute_needed(SPACE, CARD, 0, 64, 5, free)
     assert many.batch == 5  # no more than there are loads
     assert many.peak - one.peak == 63 * one.column  # where 5 columns stand there is room for 64
-    assert needed(SPACE, CARD, 0, 4, 5, free).peak - one.peak == 3 * one.column
-    inverted = needed(SPACE, CARD, 50_000, 1, 1, free)
+    assert compute_needed(SPACE, CARD, 0, 4, 5, free).peak - one.peak == 3 * one.column
+    inverted = compute_needed(SPACE, CARD, 50_000, 1, 1, free)
     assert inverted.kept - TABLES == 2 * 50_000**2
     assert 4 * 50_000**2 < inverted.set_up - inverted.kept < 7 * 50_000**2 and inverted.peak == inverted.set_up
-    wide = needed(SPACE, Device("cuda:0", "float64"), 0, 1, 1, free)
+    wide = compute_needed(SPACE, Device("cuda:0", "float64"), 0, 1, 1, free)
     assert wide.column == 2 * one.column and wide.kept - FIXED == 2 * (one.kept - FIXED)
 
 
 def test_what_does_not_fit_on_a_card_is_refused_with_the_batch_that_does() -> None:
     free = 2 * FIXED
-    fits = needed(SPACE, CARD, 0, None, 10**6, free).demand()
+    fits = compute_needed(SPACE, CARD, 0, None, 10**6, free).demand()
     assert fits.peak <= 0.9 * free and fits.batch > 100
     assert f"{fits.batch} loads together: about" in str(fits) and "of cuda:0, 2 GiB free" in str(fits)
     with pytest.raises(InputError, match=r"343 nodes .smoothed., 9999 loads together: .*: a --batch") as refusal:
-        needed(SPACE, CARD, 0, 9999, 9999, free).demand()
+        compute_needed(SPACE, CARD, 0, 9999, 9999, free).demand()
     found = re.search(r"--batch of (\d+) fits", str(refusal.value))
     assert found
-    needed(SPACE, CARD, 0, int(found[1]), 9999, free).demand()
+    compute_needed(SPACE, CARD, 0, int(found[1]), 9999, free).demand()
     with pytest.raises(InputError, match="--batch"):
-        needed(SPACE, CARD, 0, int(found[1]) + 1, 9999, free).demand()
+        compute_needed(SPACE, CARD, 0, int(found[1]) + 1, 9999, free).demand()
     with pytest.raises(InputError, match=r"one load at a time.* free: take a coarser mesh, or a larger machine"):
-        needed(SPACE, CARD, 50_000, 1, 1, free).demand()
+        compute_needed(SPACE, CARD, 50_000, 1, 1, free).demand()
 
 
 def test_the_processor_is_asked_batch_by_batch() -> None:
-    assert foreseen(base_held(SPACE.mesh), None, TRAIN, "cpu", None, 10**9) is None
+    assert estimate_needed(base_held(SPACE.mesh), None, TRAIN, "cpu", None, 10**9) is None

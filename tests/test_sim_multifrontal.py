@@ -10,7 +10,7 @@ from boxes import base_held, box, hold
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
 from sim.effects import Elasticity, Held, Slide
-from sim.linalg.multifrontal import Factor, Factorisation, node_of
+from sim.linalg.multifrontal import Factor, Factorisation, find_moved_nodes
 from sim.runtime.device import Precision, find_device
 
 CELLS = (6, 6, 6)
@@ -44,7 +44,7 @@ def applied(factor: Factor, r: np.ndarray, precision: Precision, live: np.ndarra
 @pytest.mark.usefixtures("order")
 def test_it_is_the_inverse_over_the_free_motions(precision: Precision) -> None:
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", precision), precision)
+    factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
     L, r = motions.toarray(), np.random.default_rng(0).normal(size=(stiffness.shape[0], FEW + 2))
     expected = L @ np.linalg.solve(L.T @ stiffness @ L, L.T @ r)
     for columns in (1, FEW, FEW + 2):  # sweeps, and products of matrices
@@ -56,7 +56,7 @@ def test_it_is_the_inverse_over_the_free_motions(precision: Precision) -> None:
 @pytest.mark.parametrize("precision", EXACT)
 def test_its_compliance_at_some_rows_is_what_unit_forces_do_there(precision: Precision) -> None:
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", precision), precision)
+    factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
     rows = np.random.default_rng(1).choice(stiffness.shape[0], 2 * STRIP + 7, replace=False)
     unit = np.zeros((stiffness.shape[0], len(rows)))
     unit[rows, np.arange(len(rows))] = 1.0
@@ -69,7 +69,7 @@ def test_its_compliance_at_some_rows_is_what_unit_forces_do_there(precision: Pre
 def test_it_is_symmetric_in_single_precision(columns: int) -> None:
     """Conjugate gradients ask it of every preconditioner, to round-off."""
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", "float32"))
+    factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float32"))
     r = np.random.default_rng(1).normal(size=(stiffness.shape[0], columns))
     gram = r.T @ applied(factor, r, "float32")
     np.testing.assert_allclose(gram, gram.T, atol=1e-6 * np.abs(gram).max())
@@ -78,7 +78,7 @@ def test_it_is_symmetric_in_single_precision(columns: int) -> None:
 @pytest.mark.parametrize("count", [2, FEW + 3])
 def test_only_live_columns_are_solved(count: int) -> None:
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", "float64"), "float64")
+    factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float64"), "float64")
     r = np.random.default_rng(2).normal(size=(stiffness.shape[0], count))
     live = np.arange(count) != 1
     found, whole = applied(factor, r, "float64", live), applied(factor, r, "float64")
@@ -90,7 +90,7 @@ def test_only_live_columns_are_solved(count: int) -> None:
 def test_in_single_precision_it_solves_for_forces_of_any_size(columns: int) -> None:
     """Under a solver in double precision; a column without forces stays so. Processors round differently."""
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", "float64"))
+    factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float64"))
     r = np.random.default_rng(4).normal(size=(stiffness.shape[0], columns)) * 10.0 ** (-60 * np.arange(1, columns + 1))
     r[:, 1:2] = 0.0
     found = motions.T @ stiffness @ applied(factor, r, "float64")
@@ -131,9 +131,9 @@ def test_what_is_not_held_cannot_be_factorised() -> None:
     stiffness, _ = system(anatomy)
     every = sp.csc_array(sp.eye_array(stiffness.shape[0]))
     with pytest.raises(RuntimeError, match="positive definite"):
-        Factor(stiffness, every, node_of(every), find_device("cpu", "float32"))
+        Factor(stiffness, every, find_moved_nodes(every), find_device("cpu", "float32"))
     with pytest.raises(RuntimeError, match="positive definite"):
-        Factor(sp.csc_array(-stiffness), every, node_of(every), find_device("cpu", "float64"))
+        Factor(sp.csc_array(-stiffness), every, find_moved_nodes(every), find_device("cpu", "float64"))
     nothing = sp.csc_array((3, 3))
     with pytest.raises(RuntimeError, match="positive definite"):
         Factor(nothing, sp.csc_array(sp.eye_array(3)), np.zeros(3, int), find_device("cpu", "float64"))

@@ -14,7 +14,7 @@ from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held, Slide
 from sim.linalg.multigrid import TwoLevel
 from sim.linalg.pcg import BlockJacobi, Preconditioner
-from sim.linalg.preconditioner import Preconditioning, choose_preconditioner, why_none
+from sim.linalg.preconditioner import Preconditioning, choose_preconditioner, explain_no_factor
 from sim.material import Material
 from sim.runtime.device import Precision, find_device
 
@@ -117,5 +117,7 @@ def test_columns_that_are_done_change_nothing(kind: str) -> None:
 
 def test_a_device_without_memory_is_not_taken_for_a_body_that_is_not_held():
     full = RuntimeError("Failed to allocate 21322944 bytes on device 'cuda:0'")
-    assert why_none(full, "cuda:0").startswith("cuda:0 has too little free memory for this mesh: end what else runs")
-    assert why_none(RuntimeError("a pivot is 0"), "cpu").endswith("(a pivot is 0): is every part held?")
+    assert explain_no_factor(full, "cuda:0").startswith(
+        "cuda:0 has too little free memory for this mesh: end what else runs"
+    )
+    assert explain_no_factor(RuntimeError("a pivot is 0"), "cpu").endswith("(a pivot is 0): is every part held?")

@@ -8,8 +8,8 @@ from test_sim_head_masks import EDGE, TUMOUR, grid, head, nifti
 
 from scenes.script.debulking import Debulking
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
-from sim.bodies.head_masks import Sources, head_masks
-from sim.bodies.label_volume import masked_subject
+from sim.bodies.head_masks import Sources, read_head_masks
+from sim.bodies.label_volume import build_masked_subject
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.bodies.subject import MeshPlan, make_anatomy
@@ -75,10 +75,10 @@ class TestLabels:
 
     def test_of_every_source_they_are_the_same(self, files):
         found = [
-            head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (6,)})),
-            head_masks(Sources(files / "own.nii", (1,), (3, 6), parts={"necrosis": (6,)})),
-            head_masks(Sources(files / "brats.nii", convention="brats", mask=files / "brain.nii")),
-            head_masks(
+            read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (6,)})),
+            read_head_masks(Sources(files / "own.nii", (1,), (3, 6), parts={"necrosis": (6,)})),
+            read_head_masks(Sources(files / "brats.nii", convention="brats", mask=files / "brain.nii")),
+            read_head_masks(
                 Sources(files / "brain.nii", (1,), (4,), tumour_in=files / "brats.nii", parts={"necrosis": (1,)})
             ),
         ]
@@ -89,13 +89,13 @@ class TestLabels:
 
     def test_they_are_no_brain_and_must_be_there(self, files):
         with pytest.raises(InputError, match="label 1 is named by --brain and by --necrosis"):
-            head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (1,)}))
+            read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (1,)}))
         with pytest.raises(InputError, match="has no label 9"):
-            head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (9,)}))
+            read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (9,)}))
 
     def test_the_mesh_has_their_volume_in_a_tumour_that_is_the_same(self, files, tmp_path):
-        masks = head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (6,)}))
-        subject = masked_subject(masks, regions=("necrosis",))
+        masks = read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (6,)}))
+        subject = build_masked_subject(masks, regions=("necrosis",))
         (part,) = subject.parts
         assert part.volume == pytest.approx(masks.parts["necrosis"].sum() * (1e-3 * EDGE) ** 3)
         anatomy = make_anatomy(subject, MeshPlan(nodes=2500))
@@ -150,4 +150,4 @@ def test_what_is_left_of_a_tumour_keeps_its_law(small_box):
 
 
 def test_debulking_takes_it_with_the_tumour(hollow, small_box):
-    assert Debulking((0.1, 0.2)).resection(hollow) == Debulking((0.1, 0.2)).resection(small_box)
+    assert Debulking((0.1, 0.2)).build_resection(hollow) == Debulking((0.1, 0.2)).build_resection(small_box)

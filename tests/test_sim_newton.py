@@ -24,7 +24,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
 from sim.linalg.pcg import BlockJacobi
-from sim.linalg.preconditioner import rest_solver
+from sim.linalg.preconditioner import build_rest_solver
 from sim.loads import Loads, Nodal, Prescribed
 from sim.minimisers.newton_cg import Direction, NewtonCG
 from sim.runtime.device import Device, find_device
@@ -37,7 +37,7 @@ CEILING = 0.102
 TIGHT = Accuracy(tolerance=1e-10)
 
 
-def problem_of(device: Device, law: str = "stable-neo-hookean") -> Problem:
+def read_problem(device: Device, law: str = "stable-neo-hookean") -> Problem:
     """Elasticity, nodal forces, a spring with memory, and a wall 2 mm above the body."""
     material = tissue(law)
     plain = compile_problem([Elasticity(material), Held(), NodalForce()], ANATOMY, device)
@@ -58,21 +58,21 @@ def cases_of(total: np.ndarray = TOTAL, time: float = 0.7) -> Cases:
     return Cases(loads, np.zeros(count), {"spring": memory})
 
 
-def rows_of(cases: Cases, index: np.ndarray) -> Cases:
+def select_rows(cases: Cases, index: np.ndarray) -> Cases:
     memory = {name: value[index] for name, value in cases.memory.items()}
     return Cases(cases.loads.rows(index), cases.start_time[index], memory)
 
 
 def solve(problem: Problem, cases: Cases, accuracy: Accuracy = TIGHT, start: np.ndarray | None = None) -> Found:
     problem.begin(cases)
-    direction = NewtonCG(rest_solver(problem), accuracy.inner)
+    direction = NewtonCG(build_rest_solver(problem), accuracy.inner)
     guess = np.zeros((ROWS, len(cases.loads))) if start is None else start
     return equilibrium_of(problem, direction, guess, accuracy)
 
 
 @pytest.fixture(scope="module")
 def problem(device: Device) -> Problem:
-    return problem_of(device)
+    return read_problem(device)
 
 
 @pytest.fixture(scope="module")
@@ -88,14 +88,14 @@ def test_the_cases_leave_at_different_steps(batch: Found) -> None:
 
 def test_a_batch_is_its_rows_one_by_one(problem: Problem, batch: Found) -> None:
     for row in range(len(TOTAL)):
-        alone = solve(problem, rows_of(cases_of(), np.array([row])))
+        alone = solve(problem, select_rows(cases_of(), np.array([row])))
         np.testing.assert_allclose(alone.u[:, 0], batch.u[:, row], atol=1e-8 * max(np.abs(batch.u[:, row]).max(), 1e-3))
         assert alone.iterations[0] == batch.iterations[row]
 
 
 def test_rows_do_not_depend_on_their_order(problem: Problem, batch: Found) -> None:
     order = np.array([5, 0, 6, 2, 1, 4, 3])
-    shuffled = solve(problem, rows_of(cases_of(), order))
+    shuffled = solve(problem, select_rows(cases_of(), order))
     np.testing.assert_allclose(shuffled.u, batch.u[:, order], atol=1e-10)
 
 
@@ -257,7 +257,7 @@ class Scaled:
     """A direction of Newton times the numbers (b,) that a function gives of the lengths taken (b,)."""
 
     def __init__(self, problem: Problem, times: Callable[[np.ndarray], np.ndarray]):
-        self.plain, self.times = NewtonCG(rest_solver(problem), 400), times
+        self.plain, self.times = NewtonCG(build_rest_solver(problem), 400), times
 
     def begin(self) -> None:
         self.plain.begin()
@@ -275,7 +275,7 @@ class Scaled:
 def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, batch: Found) -> None:
     """Every other step is lost, the others take the curvature at rest: slower, but it arrives."""
     rows = np.array([1, 2, 4])
-    problem.begin(rows_of(cases_of(), rows))
+    problem.begin(select_rows(cases_of(), rows))
     patient = Accuracy(tolerance=1e-7, outer=300)
     uphill = Scaled(problem, lambda taken: np.where(taken == 0.0, 1.0, -1.0))
     found = equilibrium_of(problem, uphill, np.zeros((ROWS, 3)), patient)
@@ -295,7 +295,7 @@ def test_a_search_that_fails_twice_is_reported(problem: Problem) -> None:
 @pytest.mark.parametrize(("tiny", "outcome"), [(12, Outcome.CONVERGED), (1000, Outcome.STALLED)])
 def test_steps_below_the_last_digit_end_stalled(problem: Problem, batch: Found, tiny: int, outcome: Outcome) -> None:
     """Newton resumes after a few of them, and does not spend its budget on them."""
-    problem.begin(rows_of(cases_of(), np.array([4])))
+    problem.begin(select_rows(cases_of(), np.array([4])))
     sizes = chain(repeat(1e-20, tiny), repeat(1.0))
     timid = Scaled(problem, lambda taken: np.full(len(taken), next(sizes)))
     found = equilibrium_of(problem, timid, 0.9 * batch.u[:, [4]], TIGHT)

@@ -11,7 +11,7 @@ from sim.compile import compile_problem
 from sim.discretisation.problem import Problem
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, NodalForce
-from sim.linalg.preconditioner import rest_solver
+from sim.linalg.preconditioner import build_rest_solver
 from sim.loads import Loads, Nodal, Prescribed
 from sim.minimisers.line_search import search
 from sim.minimisers.newton import find_equilibrium
@@ -26,12 +26,12 @@ TOTAL = np.array([[0.0, 0.0, -0.1], [0.2, 0.1, -0.4], [0.0, 0.0, 2.0], [0.01, 0.
 LOADS = Loads((Nodal(top_forces(MESH, TOTAL)),))
 
 
-def problem_of(device: Device, law: str = "stable-neo-hookean") -> Problem:
+def read_problem(device: Device, law: str = "stable-neo-hookean") -> Problem:
     return compile_problem([Elasticity(tissue(law)), Held(), NodalForce()], ANATOMY, device)
 
 
 def descent_of(problem: Problem) -> Descent:
-    return NewtonCG(rest_solver(problem), 400)
+    return NewtonCG(build_rest_solver(problem), 400)
 
 
 def begun(problem: Problem, loads: Loads = LOADS) -> Problem:
@@ -53,7 +53,7 @@ def walk(problem: Problem, descent: Descent, steps: int) -> list[tuple[np.ndarra
 
 
 def test_directions_lead_downhill_and_promise_their_slope(device: Device) -> None:
-    problem = begun(problem_of(device))
+    problem = begun(read_problem(device))
     for _, g, found in walk(problem, descent_of(problem), 8):
         slope = (g * found.d.numpy()).sum(axis=0)
         assert (slope < 0.0).all()
@@ -63,10 +63,10 @@ def test_directions_lead_downhill_and_promise_their_slope(device: Device) -> Non
 def test_memory_leaves_with_its_columns(device: Device) -> None:
     """Three steps together, then some columns go on: as if they had always been alone."""
     rows = np.array([3, 0, 4])
-    problem = begun(problem_of(device))
+    problem = begun(read_problem(device))
     whole = descent_of(problem)
     path = walk(problem, whole, 4)
-    alone = begun(problem_of(device), LOADS.rows(rows))
+    alone = begun(read_problem(device), LOADS.rows(rows))
     u, taken = device.zeros(ROWS, 3), np.ones(3)
     apart = descent_of(alone)
     apart.begin()
@@ -102,13 +102,13 @@ def test_a_gap_is_closed_by_the_first_whole_step(device: Device) -> None:
 
 def test_newtons_radius_follows_the_steps(device: Device) -> None:
     """What follows a step that was cut to a tenth is at most twice that long, in the norm of the rest stiffness."""
-    problem = begun(problem_of(device))
+    problem = begun(read_problem(device))
     K = problem.rest_curvature()
 
     def size(d: np.ndarray) -> np.ndarray:
         return np.sqrt((d * (K @ d)).sum(axis=0))
 
-    descent, u = NewtonCG(rest_solver(problem), 400), device.zeros(ROWS, 5)
+    descent, u = NewtonCG(build_rest_solver(problem), 400), device.zeros(ROWS, 5)
     g, _, _ = problem.residual(u)
     first = descent.find(problem, u, g, None, np.full(5, 1e-9), np.ones(5)).d.numpy()
     second = descent.find(problem, u, g, None, np.full(5, 1e-9), np.full(5, 0.1)).d.numpy()

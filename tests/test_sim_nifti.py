@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from test_sim_label_volume import AFFINES, ball, ellipsoid, grid
 
-from sim.bodies.head_masks import Sources, head_masks
+from sim.bodies.head_masks import Sources, read_head_masks
 from sim.bodies.label_map import read_labels
-from sim.bodies.label_volume import masked_subject, volume_subject
+from sim.bodies.label_volume import build_masked_subject, volume_subject
 from sim.bodies.voxels import Voxels
 from sim.errors import InputError
 
@@ -30,8 +30,8 @@ def test_volume_without_orientation_needs_axes(tmp_path):
         read_labels(path, Voxels(axes="RAR"))
     where = {}
     for axes in ("RAS", "LPS", "PIR"):
-        masks = head_masks(Sources(path, (1,), (3,), axes=axes))
-        where[axes] = masked_subject(masks, path).pieces[0].centre  # the scan's axes are the same
+        masks = read_head_masks(Sources(path, (1,), (3,), axes=axes))
+        where[axes] = build_masked_subject(masks, path).pieces[0].centre  # the scan's axes are the same
     np.testing.assert_allclose(where["LPS"], where["RAS"] * [-1.0, -1.0, 1.0], atol=1e-6)
     np.testing.assert_allclose(where["PIR"], (where["RAS"] * [-1.0, -1.0, 1.0])[[2, 0, 1]], atol=1e-6)
 

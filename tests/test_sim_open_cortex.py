@@ -10,7 +10,7 @@ from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
-from sim.geometry.closest_point import closest
+from sim.geometry.closest_point import find_closest_points
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def test_closest_points_are_those_of_trimesh(template):
     nodes = template.mesh.nodes
     surface = trimesh.Trimesh(nodes, triangles, process=False)
     points = nodes[template.tumour_nodes].mean(axis=0) + random.normal(scale=0.015, size=(200, 3))
-    found = closest(points, nodes[triangles])
+    found = find_closest_points(points, nodes[triangles])
     there, distance, _ = trimesh.proximity.closest_point_naive(surface, points)
     assert np.linalg.norm(found.point - points, axis=1) == pytest.approx(distance, abs=1e-12)
     assert np.abs(found.point - there).max() < 1e-9
@@ -33,13 +33,13 @@ def test_closest_points_are_those_of_trimesh(template):
     assert np.allclose(np.einsum("bc,bci->bi", found.weights, corners), found.point, atol=1e-15)
     # Every surface its own point.
     shifts = random.normal(scale=1e-3, size=(200, 1, 1, 3))
-    moved = closest(points + shifts[:, 0, 0], nodes[triangles] + shifts)
+    moved = find_closest_points(points + shifts[:, 0, 0], nodes[triangles] + shifts)
     assert np.allclose(moved.point - shifts[:, 0, 0], found.point, atol=1e-12)
 
 
 def test_of_triangles_without_area_edges_are_closest():
     flat = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[5.0, 0.0, 0.0]] * 3])
-    found = closest(np.array([[0.5, 1.0, 0.0], [5.0, 2.0, 0.0]]), flat)
+    found = find_closest_points(np.array([[0.5, 1.0, 0.0], [5.0, 2.0, 0.0]]), flat)
     assert np.allclose(found.point, [[0.5, 0.0, 0.0], [5.0, 0.0, 0.0]])
 
 
@@ -51,8 +51,8 @@ def test_large_and_small_triangles_at_corners_far_off_and_in_the_middle():
     middle = corners.mean(axis=1)
     far = 1e3 * random.normal(size=(20, 3))
     points = np.concatenate([corners[:, 0], middle, middle + 1e-9, far, random.normal(size=(60, 3))])
-    found = closest(points, corners)
-    every = closest(points, np.tile(corners, (len(points), 1, 1, 1)))
+    found = find_closest_points(points, corners)
+    every = find_closest_points(points, np.tile(corners, (len(points), 1, 1, 1)))
     assert np.allclose(found.point, every.point, rtol=1e-12, atol=1e-13)
     assert np.abs(found.point[:80] - corners[:, 0]).max() < 1e-14
     assert np.allclose(np.einsum("bc,bci->bi", found.weights, corners[found.triangle]), found.point, atol=1e-12)

@@ -19,10 +19,10 @@ from boxes import base_held, box
 
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy, read_mesh, write_anatomy, write_mesh
-from sim.bodies.vtu_size import demand_small
+from sim.bodies.vtu_size import check_vtu_size
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
-from sim.material import BRAIN, tissue_from_json, tissue_to_json
+from sim.material import BRAIN, read_tissue_json, to_tissue_json
 from sim.runtime.file_limits import MeshBytes
 from sim.runtime.outside_files import read_as
 
@@ -97,9 +97,9 @@ class TestMeshes:
             tracemalloc.stop()
         few = zlib.compress(np.zeros(3).tobytes())
         small = with_raw_bytes(tmp_path / "b.vtu", struct.pack("<4Q", 1, 24, 0, len(few)) + few)
-        assert not demand_small(small, 24)  # it is small, but meshio's own way through it is bounded besides
+        assert not check_vtu_size(small, 24)  # it is small, but meshio's own way through it is bounded besides
         with pytest.raises(InputError):
-            demand_small(small, 23)
+            check_vtu_size(small, 23)
 
     def test_a_small_file_does_not_fill_the_memory(self, tmp_path: Path) -> None:
         write_mesh(tmp_path / "a.vtu", BODY.mesh, {})
@@ -141,7 +141,7 @@ class TestMeshes:
         path = with_raw_bytes(tmp_path / "a.vtu", struct.pack("<4Q", 1, 24, 0, len(block)) + block)
         path.write_bytes(path.read_bytes().replace(b"ZLib", b"LZMA"))
         with pytest.raises(InputError, match="inflates to more than its header says"):
-            demand_small(path, 2**30)
+            check_vtu_size(path, 2**30)
 
     def test_what_looks_raw_in_a_comment_hides_no_array(self, tmp_path: Path) -> None:
         write_mesh(tmp_path / "a.vtu", BODY.mesh, {})
@@ -246,9 +246,9 @@ class TestMeshes:
     "text", ["[]", "3", "null", "{}", "[" * 100_000, '{"law": []}', '{"law": "linear", "young": "a", "poisson": 0.3}']
 )
 def test_a_tissue_that_is_none_is_a_sentence(text: str) -> None:
-    assert tissue_from_json(tissue_to_json(BRAIN)) == BRAIN
+    assert read_tissue_json(to_tissue_json(BRAIN)) == BRAIN
     with pytest.raises(InputError) as caught:
-        tissue_from_json(text)
+        read_tissue_json(text)
     assert len(str(caught.value)) < 400 and "object" not in str(caught.value)
 
 

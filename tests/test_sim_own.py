@@ -10,7 +10,7 @@ from boxes import base_held, box
 
 from sim.accuracy import REFERENCE, TRAIN
 from sim.compile import compile_problem
-from sim.discretisation.footprint import footprint_weights
+from sim.discretisation.footprint import compute_footprint_weights
 from sim.effects import BuiltIn, Elasticity, Held, NodalForce, ToolForce, remember
 from sim.errors import InputError
 from sim.fem import Fem
@@ -150,7 +150,7 @@ class TestTwoTools:
         both = answer(Elasticity(), loads=Loads(TOOLS), element=element, live=live)
         force = np.zeros((2, len(MESH.nodes), 3))
         for tool in TOOLS:
-            share = footprint_weights(MESH.nodes, MESH.surface, tool.point, tool.footprint).toarray()
+            share = compute_footprint_weights(MESH.nodes, MESH.surface, tool.point, tool.footprint).toarray()
             force += share[:, :, None] * tool.force[:, None]
         summed = answer(Elasticity(), loads=Loads((Nodal(force),)), element=element)
         first = answer(Elasticity(), loads=Loads(TOOLS[:1]), element=element)

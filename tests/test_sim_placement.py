@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sim.bodies.mesher import INTRICATE, Meshing, too_few
-from sim.bodies.placement import Placement, opening_at, opening_over, side_of, site_over
+from sim.bodies.mesher import INTRICATE, Meshing, build_too_few_error
+from sim.bodies.placement import Placement, describe_side, find_opening_at, find_opening_over, find_reachable_site
 from sim.errors import InputError
 
 LOW, HIGH = np.array([-0.07, -0.09, -0.06]), np.array([0.07, 0.09, 0.08])
@@ -23,10 +23,10 @@ def cortex():
 
 def test_an_opening_is_centred_on_the_nearest_cortex_that_can_be_reached(cortex):
     asked = np.array([-0.055, 0.02, 0.05])
-    site = opening_at(cortex, asked)
+    site = find_opening_at(cortex, asked)
     assert np.linalg.norm(site - asked) == pytest.approx(np.linalg.norm(cortex - asked, axis=1).min())
     # From a point in the fissure the skull is reached over it, not in it.
-    site = opening_over(cortex, np.array([0.005, 0.0, 0.035]), 0.01)
+    site = find_opening_over(cortex, np.array([0.005, 0.0, 0.035]), 0.01)
     assert abs(np.linalg.norm(site / [0.07, 0.09, 0.07]) - 1.0) < Placement().hull_depth / 0.07 and site[2] > 0.06
 
 
@@ -41,22 +41,22 @@ def test_an_opening_is_centred_on_the_nearest_cortex_that_can_be_reached(cortex)
 )
 def test_an_opening_that_cannot_be_is_a_sentence(cortex, place, reason):
     with pytest.raises(InputError, match=reason):
-        opening_at(cortex, np.array(place))
+        find_opening_at(cortex, np.array(place))
 
 
 def test_how_far_off_a_point_may_lie_is_asked_for(cortex):
     asked = np.array([0.0, 0.0, 0.12])
     with pytest.raises(InputError, match="50 mm is the most"):
-        opening_at(cortex, 1.3 * asked, Placement(near=0.05))
-    assert opening_at(cortex, asked, Placement(near=0.06))[2] > 0.06
+        find_opening_at(cortex, 1.3 * asked, Placement(near=0.05))
+    assert find_opening_at(cortex, asked, Placement(near=0.06))[2] > 0.06
 
 
 def test_over_a_point_outside_nothing_is_opened(cortex):
     with pytest.raises(InputError, match="lies 30 mm outside the brain"):
-        opening_over(cortex, np.array([0.1, 0.0, 0.0]), -0.03)
+        find_opening_over(cortex, np.array([0.1, 0.0, 0.0]), -0.03)
     with pytest.raises(InputError, match="over the brainstem"):
-        opening_over(cortex, np.array([0.0, 0.0, -0.069]), 0.0)
-    deep = site_over(cortex, np.array([0.0, 0.0, 0.0]))
+        find_opening_over(cortex, np.array([0.0, 0.0, -0.069]), 0.0)
+    deep = find_reachable_site(cortex, np.array([0.0, 0.0, 0.0]))
     assert deep[2] >= -0.07 + Placement().base * 0.14 - 1e-3
 
 
@@ -70,7 +70,7 @@ def test_over_a_point_outside_nothing_is_opened(cortex):
     ],
 )
 def test_places_are_called_as_clinicians_call_them(place, words):
-    assert side_of(np.array(place), LOW, HIGH) == words
+    assert describe_side(np.array(place), LOW, HIGH) == words
 
 
 def test_too_few_nodes_are_refused_with_how_many_would_do():
@@ -80,6 +80,6 @@ def test_too_few_nodes_are_refused_with_how_many_would_do():
         asked.append(count)
         return count >= 4000
 
-    message = str(too_few(3000, INTRICATE, Meshing().more, would_do))
+    message = str(build_too_few_error(3000, INTRICATE, Meshing().more, would_do))
     assert "too intricate for 3000 nodes: ask for 4800, or smooth" in message and asked == [3800, 4800]
-    assert "for 1000 nodes: smooth the labels" in str(too_few(1000, INTRICATE, Meshing().more, would_do))
+    assert "for 1000 nodes: smooth the labels" in str(build_too_few_error(1000, INTRICATE, Meshing().more, would_do))

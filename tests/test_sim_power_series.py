@@ -8,14 +8,20 @@ import warp as wp
 from test_sim_multigrid import built
 
 from sim.accuracy import REFERENCE, TRAIN
-from sim.discretisation.footprint import footprint_weights
+from sim.discretisation.footprint import compute_footprint_weights
 from sim.effects import Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.linalg.rest_solver import RestStiffnessSolver
 from sim.loads import Displaced, Loads, Nodal, Pushed
 from sim.material import LAWS, Material
-from sim.minimisers.power_series import mixed, mixing_kernel, products, telling, terms_of
+from sim.minimisers.power_series import (
+    build_mixing_kernel,
+    choose_unit_directions,
+    compute_products,
+    count_terms,
+    mix_columns,
+)
 from sim.runtime.device import find_device
 
 EFFECTS = (Held(), Slide(), ToolForce(), NodalForce())
@@ -80,10 +86,10 @@ def test_several_loads_at_once_have_forms_in_their_sizes(box):
     point, radius = np.repeat(POINT[:1], 3, axis=0) + [[0, 0, 0], [0, 0, 0], [4e-3, 0, 0]], np.full(3, 7e-3)
     force = 0.15 * np.eye(3)[[2, 0, 1]]
     terms = series(fem, Loads((Pushed(point, force, radius),)), 3, nodes, 3)
-    assert terms.shape == (19, 1, len(nodes), 3) and terms_of(3, 3) == 19
+    assert terms.shape == (19, 1, len(nodes), 3) and count_terms(3, 3) == 19
     sizes, left = np.array([[-0.9, 0.3, -0.5], [-0.5, -0.8, 0.2]]), []
     for share in (0.4, 0.2):
-        factor = np.concatenate([products(share * sizes, order) for order in (1, 2, 3)])
+        factor = np.concatenate([compute_products(share * sizes, order) for order in (1, 2, 3)])
         predicted = np.einsum("tb,tnk->bnk", factor, terms[:, 0])
         shares = share * sizes
         nodal = np.einsum("bs,snk->bnk", shares, _nodal(box, point, force, radius))
@@ -93,7 +99,7 @@ def test_several_loads_at_once_have_forms_in_their_sizes(box):
 
 def _nodal(box, point, force, radius):
     """The forces (B, V, 3) at every vertex."""
-    weights = footprint_weights(box.mesh.nodes, box.mesh.surface, point, radius).toarray()
+    weights = compute_footprint_weights(box.mesh.nodes, box.mesh.surface, point, radius).toarray()
     return weights[:, :, None] * force[:, None, :]
 
 
@@ -104,14 +110,14 @@ def test_in_its_own_direction_a_form_is_the_series_of_one_load(box):
     terms = series(fem, Loads((three,)), 3, nodes, 3)[:, 0]
     single = series(fem, Loads((Pushed(POINT[:1], direction, RADIUS[:1]),)), 3, nodes)[:, 0]
     for order, (rows, wanted) in enumerate(zip(np.split(terms, [3, 9]), single, strict=True), start=1):
-        predicted = np.einsum("tb,tnk->nk", products(direction, order), rows)
+        predicted = np.einsum("tb,tnk->nk", compute_products(direction, order), rows)
         assert np.linalg.norm(predicted - wanted) < 2e-3 * np.linalg.norm(wanted)
 
 
 @pytest.mark.parametrize("sizes", [1, 2, 3])
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_directions_tell_every_form(sizes, order):
-    values = products(telling(sizes, order), order)
+    values = compute_products(choose_unit_directions(sizes, order), order)
     assert values.shape[0] == values.shape[1] and np.linalg.cond(values) < 14.0
 
 
@@ -120,9 +126,9 @@ def test_columns_are_mixed_alike_by_warp_and_by_numpy():
     random = np.random.default_rng(0)
     x, weight = device.array(random.normal(size=(7, 12))), random.normal(size=(3, 5))
     by_warp = device.zeros(7, 20)
-    device.launch(mixing_kernel(device), (7, 4), [x, device.array(weight)], [by_warp])
+    device.launch(build_mixing_kernel(device), (7, 4), [x, device.array(weight)], [by_warp])
     wanted = np.einsum("rgt,tj->rgj", x.numpy().reshape(7, 4, 3), weight).reshape(7, 20)
-    assert np.allclose(by_warp.numpy(), wanted) and np.allclose(mixed(device, x, weight).numpy(), wanted)
+    assert np.allclose(by_warp.numpy(), wanted) and np.allclose(mix_columns(device, x, weight).numpy(), wanted)
 
 
 @pytest.mark.gpu
@@ -163,7 +169,7 @@ def test_what_has_no_series_is_refused(box):
 def test_what_does_not_fit_into_memory_is_refused(box, monkeypatch):
     fem = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="p1")
     reading = fem.reading(box.tumour_nodes, np.ones((1, len(box.tumour_nodes), 3)))
-    monkeypatch.setattr("sim.runtime.memory.host_bytes", lambda budget: 2_000_000)
+    monkeypatch.setattr("sim.runtime.memory.measure_host_bytes", lambda budget: 2_000_000)
     with pytest.raises(InputError, match="free"):
         fem.series(pushes(1.0), 3, reading)
     with pytest.raises(InputError, match="free"):

@@ -7,7 +7,7 @@ from oracle import tissue
 
 from sim.compile import compile_problem
 from sim.effects import Elasticity, Held
-from sim.linalg.preconditioner import rest_solver
+from sim.linalg.preconditioner import build_rest_solver
 from sim.runtime.device import find_device
 
 
@@ -21,7 +21,7 @@ def test_two_cores_find_what_one_does(monkeypatch: pytest.MonkeyPatch) -> None:
         problem = compile_problem((Elasticity(tissue("neo-hookean")), Held()), base_held(mesh), device)
         g, _, _ = problem.residual(u)
         z = device.zeros(*u.shape)
-        rest_solver(problem).apply(g, np.ones(3, bool), z)
+        build_rest_solver(problem).apply(g, np.ones(3, bool), z)
         found.append((g.numpy().copy(), problem.longest_step(u, g), z.numpy().copy()))
     for one, two in zip(*found, strict=True):
         np.testing.assert_allclose(two, one, atol=1e-11 * np.abs(one).max())

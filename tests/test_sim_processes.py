@@ -12,7 +12,7 @@ import warp as wp
 from on_devices import doing, gone, named, refusing
 
 from sim.errors import InputError
-from sim.runtime.device import device_names, find_device
+from sim.runtime.device import find_device, parse_device_names
 from sim.runtime.processes import LostError, map_unordered, process_pool, run_on_each
 
 NO_CARD = pytest.mark.skipif(wp.is_cuda_available(), reason="there is a card here")
@@ -20,8 +20,8 @@ NO_CARD = pytest.mark.skipif(wp.is_cuda_available(), reason="there is a card her
 
 @pytest.mark.parametrize(("words", "names"), [("cpu", 1), ("cpu,cpu", 2), (" cpu , cpu,cpu", 3)])
 def test_a_list_names_devices_one_by_one(words, names):
-    assert device_names(words) == ("cpu",) * names
-    assert device_names("auto") == (find_device("auto", "float32").name,)
+    assert parse_device_names(words) == ("cpu",) * names
+    assert parse_device_names("auto") == (find_device("auto", "float32").name,)
 
 
 @pytest.mark.parametrize(
@@ -38,7 +38,7 @@ def test_a_list_names_devices_one_by_one(words, names):
 )
 def test_what_is_no_list_of_devices_is_a_sentence(words, reason):
     with pytest.raises(InputError, match=reason):
-        device_names(words)
+        parse_device_names(words)
 
 
 @pytest.mark.parametrize("words", ["cpu,cpu", "all", "cuda:0,cuda:1"])
@@ -53,10 +53,10 @@ def test_cards_are_listed_and_not_mixed_with_processors(monkeypatch):
             self.alias = alias
 
     monkeypatch.setattr(wp, "get_devices", lambda: [Card(name) for name in ("cpu", "cuda:0", "cuda:1")])
-    assert device_names("all") == ("cuda:0", "cuda:1") == device_names("cuda,cuda:1")
-    assert device_names("cuda:0,cuda:0") == ("cuda:0", "cuda:0")
+    assert parse_device_names("all") == ("cuda:0", "cuda:1") == parse_device_names("cuda,cuda:1")
+    assert parse_device_names("cuda:0,cuda:0") == ("cuda:0", "cuda:0")
     with pytest.raises(InputError, match="'cuda:0,cpu' names processors beside graphics cards"):
-        device_names("cuda:0,cpu")
+        parse_device_names("cuda:0,cpu")
 
 
 def test_every_task_is_answered_once_and_processes_end_with_the_block():

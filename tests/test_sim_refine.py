@@ -11,8 +11,8 @@ from sim.bodies.refine import refined
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
 from sim.errors import InputError
-from sim.geometry.surface import areas, edge_lengths
-from sim.geometry.tetmesh import TetMesh, row_keys
+from sim.geometry.surface import compute_areas, compute_edge_lengths
+from sim.geometry.tetmesh import TetMesh, compute_row_keys
 
 
 def test_the_body_stays_and_every_edge_is_halved():
@@ -28,7 +28,7 @@ def test_the_body_stays_and_every_edge_is_halved():
     # No gaps: each coarse surface triangle became four, and nothing else is surface.
     assert len(fine.surface) == 4 * len(mesh.surface)
     faces = np.sort(fine.tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
-    assert np.unique(row_keys(faces), return_counts=True)[1].max() == 2
+    assert np.unique(compute_row_keys(faces), return_counts=True)[1].max() == 2
 
 
 def test_what_holds_the_body_holds_it_still(box):
@@ -57,12 +57,14 @@ def test_refined_near_opening_halves_cells_there_and_nowhere_else(box):
     assert len(fine.open_surface) == 4 * len(box.open_surface)
     # Every inner face is of two tetrahedra, and the surface has the area and the closed shape that it had.
     faces = np.sort(mesh.tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
-    times = np.unique(row_keys(faces), return_counts=True)[1]
+    times = np.unique(compute_row_keys(faces), return_counts=True)[1]
     assert times.max() == 2 and (times == 1).sum() == len(mesh.surface)
-    assert areas(mesh.nodes[mesh.surface]).sum() == pytest.approx(areas(box.mesh.nodes[box.mesh.surface]).sum())
+    assert compute_areas(mesh.nodes[mesh.surface]).sum() == pytest.approx(
+        compute_areas(box.mesh.nodes[box.mesh.surface]).sum()
+    )
     opened = box.mesh.nodes[np.unique(box.open_surface)]
     far = np.linalg.norm(mesh.nodes[count:, None] - opened, axis=2).min(axis=1).max()
-    assert far < 2.5 * edge_lengths(box.mesh.nodes[box.open_surface]).mean()
+    assert far < 2.5 * compute_edge_lengths(box.mesh.nodes[box.open_surface]).mean()
     assert 0 < len(mesh.nodes) - count < 0.5 * (len(refined(box).mesh.nodes) - count)
 
 

@@ -13,7 +13,7 @@ from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
 from sim.deformation import guess
-from sim.discretisation.resected_body import bodies, remains
+from sim.discretisation.resected_body import compute_remains, list_remaining_bodies
 from sim.effects import Elasticity, Gravity, Held, Inertia, NodalForce, Resection, SkullContact, Slide, ToolContact
 from sim.elements import ELEMENTS
 from sim.errors import InputError
@@ -53,7 +53,9 @@ def test_what_is_left_answers_as_the_body_meshed_without_it(element: str) -> Non
     answer = made.deform(loads)
     for row, done in enumerate((2, 1)):
         body, used = compact(made.remains(done).anatomy)
-        alone = Fem(body, EFFECTS, TIGHT, "cpu", element=element).deform(loads.but(Resected).rows(np.array([row])))
+        alone = Fem(body, EFFECTS, TIGHT, "cpu", element=element).deform(
+            loads.without_kind(Resected).rows(np.array([row]))
+        )
         assert alone.outcome[0].good and answer.outcome[row].good
         size = np.abs(alone.displacement).max()
         assert size > 1e-4
@@ -167,7 +169,7 @@ class TestWhatComesLoose:
 
     def test_it_goes_too_and_is_reported(self) -> None:
         """A slice through the box leaves its upper third in the air."""
-        _, left = remains(BODY, Resection((self.SLICE,)))
+        _, left = compute_remains(BODY, Resection((self.SLICE,)))
         above = within((0, 0, 2), (3, 3, 4))
         assert tuple(left.loose.tolist()) == above
         assert f"{len(above)} tetrahedra that nothing held any more went too" in str(left)
@@ -180,7 +182,7 @@ class TestWhatComesLoose:
         np.testing.assert_array_equal(answers[0], answers[1])
 
     def test_it_may_be_taken_in_a_later_step(self) -> None:
-        left = remains(BODY, Resection((self.SLICE, within((0, 0, 2), (3, 3, 4)))))
+        left = compute_remains(BODY, Resection((self.SLICE, within((0, 0, 2), (3, 3, 4)))))
         assert len(left[1].loose) and not len(left[2].loose)
         np.testing.assert_array_equal(left[1].anatomy.mesh.tets, left[2].anatomy.mesh.tets)
 
@@ -188,7 +190,7 @@ class TestWhatComesLoose:
         """Two cubes of the top layer that share an edge only with the rest."""
         keep = set(within((0, 0, 1), (1, 1, 2)) + within((1, 1, 2), (2, 2, 4)))
         above = [number for number in within((0, 0, 1), (3, 3, 4)) if number not in keep]
-        _, left = remains(BODY, Resection((tuple(above),)))
+        _, left = compute_remains(BODY, Resection((tuple(above),)))
         assert set(left.loose.tolist()) == set(within((1, 1, 2), (2, 2, 4)))
 
     def test_what_slides_in_place_stays(self) -> None:
@@ -197,13 +199,13 @@ class TestWhatComesLoose:
         for axis in range(3):
             normal[(MESH.nodes[:, axis] < 1e-9) & ~normal.any(axis=1), axis] = -1.0
         corner = hold(MESH, np.zeros(len(MESH.nodes), bool), normal)
-        assert [len(one.loose) for one in remains(corner, Resection((TOP,)))] == [0, 0]
+        assert [len(one.loose) for one in compute_remains(corner, Resection((TOP,)))] == [0, 0]
 
     def test_a_piece_on_the_skull_alone_goes(self) -> None:
         """It slides, but nothing stops it."""
         wall = np.where((MESH.nodes[:, :1] > 0.06 - 1e-9) & (MESH.nodes[:, 2:] > 1e-9), [1.0, 0.0, 0.0], 0.0)
         sliding = hold(MESH, MESH.nodes[:, 2] < 1e-9, wall)
-        _, left = remains(sliding, Resection((self.SLICE,)))
+        _, left = compute_remains(sliding, Resection((self.SLICE,)))
         assert tuple(left.loose.tolist()) == within((0, 0, 2), (3, 3, 4))
 
 
@@ -259,7 +261,7 @@ class TestHardCases:
     )
     def test_steps_that_the_body_does_not_bear_are_sentences(self, step: tuple[int, ...], sentence: str) -> None:
         with pytest.raises(InputError, match=sentence):
-            remains(BODY, Resection((TOP, step)))
+            compute_remains(BODY, Resection((TOP, step)))
 
     def test_what_is_left_on_a_hinge_is_a_sentence(self) -> None:
         """One held edge: the piece turns about it."""
@@ -302,7 +304,7 @@ def test_bone_that_only_bars_the_way_keeps_nothing_on() -> None:
     wall = np.where((MESH.nodes[:, :1] > 0.06 - 1e-9) & (MESH.nodes[:, 2:] > 1e-9), [1.0, 0.0, 0.0], 0.0)
     body, cut = hold(MESH, MESH.nodes[:, 2] < 1e-9, wall), Resection((within((2, 2, 2), (3, 3, 4)),))
     effects = (Elasticity(SOFT), Held(), SkullContact(), Gravity(direction=(0.0, 0.0, -1.0)))
-    left = bodies(body, (*effects, cut))[1].anatomy
+    left = list_remaining_bodies(body, (*effects, cut))[1].anatomy
     assert left.slide_normal.any() and left.orphaned.any()
     aside = posture(np.array([1.0, 0.0, -0.2]), -1.0)
     answer = finite_elements(body, (*effects, cut), TIGHT, "cpu", element="p1").deform(aside)
@@ -311,7 +313,7 @@ def test_bone_that_only_bars_the_way_keeps_nothing_on() -> None:
     np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-9)
     assert 1e-6 < answer.displacement[0, left.slide_normal.any(axis=1), 0].max() < 1.1e-4  # the gap of the bone
     slice_ = Resection((TestWhatComesLoose.SLICE,))
-    assert len(bodies(body, (*effects, slice_))[1].loose) == len(within((0, 0, 2), (3, 3, 4)))
+    assert len(list_remaining_bodies(body, (*effects, slice_))[1].loose) == len(within((0, 0, 2), (3, 3, 4)))
 
 
 def test_what_nobody_asks_to_be_held_is_free() -> None:
@@ -323,12 +325,14 @@ def test_what_nobody_asks_to_be_held_is_free() -> None:
     sliding = (Elasticity(SOFT), Slide(), Gravity(direction=(0.0, 0.0, -1.0)))
     corner = Resection((within((2, 2, 2), (3, 3, 4)),))
     answer = finite_elements(body, (*sliding, corner), TIGHT, "cpu", element="p1").deform(lying([1]))
-    bare, used = compact(remains(hold(MESH, np.zeros(len(MESH.nodes), bool), normal), corner)[1].anatomy)
+    bare, used = compact(compute_remains(hold(MESH, np.zeros(len(MESH.nodes), bool), normal), corner)[1].anatomy)
     assert len(used) == len(MESH.nodes) - 1
     alone = Fem(bare, sliding, TIGHT, "cpu", element="p1").deform(posture(DOWN, -1.0))
     np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-12)
     with pytest.raises(InputError, match="can move rigidly in 6 of 6 ways"):
-        finite_elements(body, (Elasticity(SOFT), Resection((NEXT,))), TIGHT, "cpu").deform(lying([0]).but(Posture))
+        finite_elements(body, (Elasticity(SOFT), Resection((NEXT,))), TIGHT, "cpu").deform(
+            lying([0]).without_kind(Posture)
+        )
 
 
 def test_no_cases_have_no_answers() -> None:

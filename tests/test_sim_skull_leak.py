@@ -8,13 +8,13 @@ from scipy.spatial import Delaunay
 
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
-from sim.diagnostics.skull_leak import Leak, surface_vectors
-from sim.discretisation.element import quadratic_elements
+from sim.diagnostics.skull_leak import Leak, integrate_surface_normals
+from sim.discretisation.element import build_quadratic_elements
 from sim.discretisation.space import discretise
 from sim.effects import pushed_effects
 from sim.fem import MIDDLES, Fem
-from sim.geometry.surface import unit, vertex_normals
-from sim.geometry.tetmesh import TetMesh, oriented
+from sim.geometry.surface import compute_vertex_normals, normalise_vectors
+from sim.geometry.tetmesh import TetMesh, orient_tetrahedra
 from sim.loads import push
 from sim.material import BRAIN
 from sim.runtime.device import find_device
@@ -35,8 +35,8 @@ def test_the_surface_sweeps_the_volume_that_the_body_gains(kind):
     every = np.ones(len(mesh.tets), bool)
     volume = mesh.volumes.sum()
     if kind != "linear":
-        volume = quadratic_elements(space.nodes, space.table, every).weight.sum()
-    vectors = surface_vectors(space.nodes, space.surface)
+        volume = build_quadratic_elements(space.nodes, space.table, every).weight.sum()
+    vectors = integrate_surface_normals(space.nodes, space.surface)
     assert np.abs(vectors.sum(axis=0)).max() < 1e-15
     assert np.einsum("ni,ni->", vectors, space.nodes) == pytest.approx(3.0 * volume, rel=1e-12)
     swept = np.einsum("ni,ni->", vectors, space.nodes @ GRADIENT.T)
@@ -49,7 +49,7 @@ def egg():
     shell = trimesh.creation.icosphere(subdivisions=3, radius=0.045).vertices
     grid = np.stack(np.meshgrid(*[np.arange(-0.04, 0.041, 0.013)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     nodes = np.vstack([shell, grid[np.linalg.norm(grid, axis=1) < 0.037]])
-    tets, _ = oriented(nodes, Delaunay(nodes).simplices)
+    tets, _ = orient_tetrahedra(nodes, Delaunay(nodes).simplices)
     nodes = nodes * [0.9, 1.1, 1.0]
     size = np.abs(np.linalg.det(nodes[tets[:, 1:]] - nodes[tets[:, :1]]))
     thick = size > 1e-3 * np.median(size)
@@ -57,7 +57,7 @@ def egg():
     surface = np.zeros(len(nodes), bool)
     surface[mesh.surface] = True
     opened, held = surface & (nodes[:, 2] > 0.033), surface & (nodes[:, 2] < -0.04)
-    normal = np.where((surface & ~opened & ~held)[:, None], vertex_normals(nodes, mesh.surface), 0.0)
+    normal = np.where((surface & ~opened & ~held)[:, None], compute_vertex_normals(nodes, mesh.surface), 0.0)
     return Anatomy(mesh, np.repeat(held[:, None], 3, axis=1), normal, opened)
 
 
@@ -71,7 +71,7 @@ def pressed(anatomy, element):
 def test_leak_is_positive_flux_through_averaged_facets(egg, tilt):
     """Computed again facet by facet: mean displacement times vector area, averaged over 7 mm of covered facets."""
     slides = egg.slide_normal.any(axis=1)
-    tilted = unit(egg.slide_normal + tilt * np.random.default_rng(1).normal(size=egg.slide_normal.shape))
+    tilted = normalise_vectors(egg.slide_normal + tilt * np.random.default_rng(1).normal(size=egg.slide_normal.shape))
     other = Anatomy(egg.mesh, egg.held, np.where(slides[:, None], tilted, 0.0), egg.craniotomy)
     answer = pressed(other, "p1")
     corners, u = egg.mesh.nodes[egg.mesh.surface], answer.displacement[0][egg.mesh.surface].mean(axis=1)
@@ -90,11 +90,11 @@ def test_leak_is_positive_flux_through_averaged_facets(egg, tilt):
 def test_leak_shrinks_with_the_size_it_is_averaged_over(egg, element):
     """Sums at nodes vanish by construction on the surface's own normals; means over facets do not."""
     answer, space = pressed(egg, element), discretise(egg.mesh, element)
-    u = space.interpolated(answer.displacement[0])
+    u = space.interpolate_field(answer.displacement[0])
     if element == "p2":
         u[len(egg.mesh.nodes) :] += answer.memory[MIDDLES][0]
     else:
-        swept = np.einsum("ni,ni->n", surface_vectors(egg.mesh.nodes, egg.mesh.surface), u)
+        swept = np.einsum("ni,ni->n", integrate_surface_normals(egg.mesh.nodes, egg.mesh.surface), u)
         assert swept[egg.slide_normal.any(axis=1)].max() < 1e-5 * np.abs(swept[egg.craniotomy]).sum()
     device = find_device("cpu", "float64")
     shares = [
@@ -106,13 +106,13 @@ def test_leak_shrinks_with_the_size_it_is_averaged_over(egg, element):
 def test_mid_edge_nodes_count(egg):
     answer = pressed(egg, "p2")
     space = discretise(egg.mesh, "p2")
-    u = space.interpolated(answer.displacement[0])
+    u = space.interpolate_field(answer.displacement[0])
     u[len(egg.mesh.nodes) :] += answer.memory[MIDDLES][0]
     device = find_device("cpu", "float64")
     assert Leak(egg, space, device).share(device.array(u.reshape(-1, 1)))[0] == pytest.approx(
         answer.leaked[0], rel=1e-3
     )
-    swept = np.einsum("ni,ni->n", surface_vectors(space.nodes, space.surface), u)
+    swept = np.einsum("ni,ni->n", integrate_surface_normals(space.nodes, space.surface), u)
     assert np.abs(swept[: len(egg.mesh.nodes)]).max() < 1e-12 < np.abs(swept).max()
 
 

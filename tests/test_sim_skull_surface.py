@@ -15,7 +15,13 @@ from sim.effects import Elasticity, Held, NodalForce, SkullContact
 from sim.fem import Fem
 from sim.loads import Loads, Nodal
 from sim.material import Material
-from sim.terms.contact.skull_surface import BONE, bone_of, edge_of, inside_opening, rim_of
+from sim.terms.contact.skull_surface import (
+    BONE,
+    build_bone,
+    compute_edge_radius,
+    find_opening_edge,
+    measure_inside_opening,
+)
 
 MESH = box((10, 6, 3), 0.05)
 HEIGHT = MESH.nodes[:, 2].max()
@@ -36,9 +42,9 @@ def half_open(opened: np.ndarray = OPEN) -> Anatomy:
 def test_how_far_inside_a_straight_edge() -> None:
     """To a tenth of the edge's radius within its blur, and which way it is."""
     body = half_open()
-    edge = edge_of(MESH.nodes, rim_of(body))
+    edge = compute_edge_radius(MESH.nodes, find_opening_edge(body))
     points = MESH.nodes[TOP & MIDDLE]
-    inside, way = inside_opening(body, points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), edge)
+    inside, way = measure_inside_opening(body, points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), edge)
     near = np.abs(points[:, 0] - END) < edge
     np.testing.assert_allclose(inside[near], points[near, 0] - END, atol=0.1 * edge)
     np.testing.assert_allclose(way[near], np.tile([1.0, 0.0, 0.0], (near.sum(), 1)), atol=0.05)
@@ -53,9 +59,9 @@ def test_how_far_inside_a_round_opening() -> None:
     opened = top & (away < 0.018)
     lid = hold(mesh, mesh.nodes[:, 2] < 1e-9, (top & ~opened)[:, None] * [0.0, 0.0, 1.0])
     body = Anatomy(mesh, lid.held, lid.slide_normal, opened)
-    edge = edge_of(mesh.nodes, rim_of(body))
+    edge = compute_edge_radius(mesh.nodes, find_opening_edge(body))
     points = mesh.nodes[top]
-    inside, way = inside_opening(body, points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), edge)
+    inside, way = measure_inside_opening(body, points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), edge)
     radius = np.sqrt(opened.sum() / np.pi) * 0.005
     near = np.abs(away[top] - radius) < edge
     assert np.abs(inside[near] - (radius - away[top][near])).max() < edge / 3.0
@@ -65,7 +71,7 @@ def test_how_far_inside_a_round_opening() -> None:
 
 def test_a_body_without_an_opening_has_bone_alone() -> None:
     body = half_open(np.zeros(len(TOP), bool))
-    bone = bone_of(body, discretise(MESH, "p1"), GAP)
+    bone = build_bone(body, discretise(MESH, "p1"), GAP)
     np.testing.assert_array_equal(bone.nodes, np.flatnonzero(TOP & ~OPEN))
     np.testing.assert_array_equal(bone.felt, BONE.felt)
     assert (bone.inside < 0.0).all()
@@ -85,7 +91,7 @@ def dragged(body: Anatomy, element: str) -> np.ndarray:
 @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
 def test_open_cortex_slides_under_bone_and_not_into_it(element: str) -> None:
     """Round an edge as round as the mesh; where the opening is not given, it would be in the bone by millimetres."""
-    edge = edge_of(MESH.nodes, rim_of(half_open()))
+    edge = compute_edge_radius(MESH.nodes, find_opening_edge(half_open()))
 
     def depth(u: np.ndarray) -> np.ndarray:
         """How deep (n,) [m] open nodes in the middle are in a bone whose edge is round."""

@@ -11,7 +11,7 @@ from boxes import VTK_EDGES, base_held, box, hold, quadratic
 
 from sim.accuracy import Accuracy
 from sim.compile import compile_problem
-from sim.diagnostics.skull_leak import surface_vectors
+from sim.diagnostics.skull_leak import integrate_surface_normals
 from sim.discretisation.space import Discretisation, discretise
 from sim.effects import Elasticity, Held, NodalForce, ToolForce
 from sim.errors import InputError
@@ -124,7 +124,7 @@ def test_through_a_ball_that_slides_nothing_passes() -> None:
     radial = space.nodes / np.maximum(np.linalg.norm(space.nodes, axis=1, keepdims=True), 1e-9)
     assert (np.einsum("ni,ni->n", found[wall], radial[wall]) > np.cos(np.radians(20.0))).all()
     middles = wall[wall >= len(ROUND.nodes)]
-    swept = surface_vectors(space.nodes, space.surface)
+    swept = integrate_surface_normals(space.nodes, space.surface)
     np.testing.assert_allclose(np.cross(found, swept)[middles], 0.0, atol=1e-12)
     assert not np.delete(found, wall, axis=0).any()
 

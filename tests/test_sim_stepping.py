@@ -7,7 +7,7 @@ from sim.strategy.stepping import Shares
 
 def test_a_good_step_grows_and_a_failed_one_is_cut_and_begins_from_the_wider_gap_that_is_asked():
     shares, rows, good = Shares.at_rest(0.25, np.ones(2)), np.arange(2), np.array([True, False])
-    aim, _ = shares.aims(rows)
+    aim, _ = shares.propose_shares(rows)
     shares.take(rows, aim, good)
     shares.resize(rows, good, np.array([9.0, 9.0]), cut=0.5, wider=3.0)
     assert shares.reached.tolist() == [0.25, 0.0] and shares.step.tolist() == [0.5, 0.125]

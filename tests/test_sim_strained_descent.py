@@ -18,7 +18,7 @@ from sim.discretisation.space import Discretisation
 from sim.effects import Elasticity
 from sim.fem import Fem
 from sim.linalg.multifrontal import Factor
-from sim.linalg.preconditioner import rest_solver
+from sim.linalg.preconditioner import build_rest_solver
 from sim.local_solvers.strained_descent import (
     LEARNT,
     SINGLE,
@@ -26,7 +26,7 @@ from sim.local_solvers.strained_descent import (
     StiffenedPreconditioner,
     StiffnessUpdate,
     StrainedDescent,
-    strained_part,
+    build_strained_part,
 )
 from sim.local_solvers.strained_part import StrainLimits
 from sim.minimisers.lbfgs import Lbfgs
@@ -40,7 +40,7 @@ EVERY = StrainLimits(least=0.0, nodes=10**4, cut=np.inf, near=10**4)
 
 
 def factor_of(problem: Problem) -> Factor:
-    found = rest_solver(problem)
+    found = build_rest_solver(problem)
     assert isinstance(found, Factor)
     return found
 
@@ -49,7 +49,7 @@ def descent_on(
     problem: Problem, space: Discretisation, strains: StrainLimits = SINGLE, renewal: Renewal = RENEWAL
 ) -> StrainedDescent:
     factor = factor_of(problem)
-    return StrainedDescent(problem, factor, strained_part(problem, factor, space, strains), renewal)
+    return StrainedDescent(problem, factor, build_strained_part(problem, factor, space, strains), renewal)
 
 
 def hard(element: str = "smoothed") -> tuple[Problem, Discretisation, wp.array]:

@@ -16,8 +16,14 @@ from sim.discretisation.term import Cases
 from sim.fem import Fem
 from sim.linalg.multifrontal import Factor
 from sim.loads import Loads, push
-from sim.local_solvers.strained_descent import SINGLE, Renewal, StiffenedPreconditioner, StrainedDescent, strained_part
-from sim.local_solvers.strained_frame import MATRIX, NODES, UpdatedPreconditioner, bent_at
+from sim.local_solvers.strained_descent import (
+    SINGLE,
+    Renewal,
+    StiffenedPreconditioner,
+    StrainedDescent,
+    build_strained_part,
+)
+from sim.local_solvers.strained_frame import MATRIX, NODES, UpdatedPreconditioner, update_model_at
 from sim.strategy.captured_frame import SERVED
 from sim.strategy.frame_sequence import Kept
 
@@ -109,9 +115,9 @@ def test_the_matrix_does_what_the_factors_do(fem: Fem) -> None:
     assert isinstance(factor, Factor)
     last = ride(fem)[-1]
     u = problem.device.array(fem.guess(pressed(6), last))
-    part = strained_part(problem, factor, fem.space, SINGLE)
+    part = build_strained_part(problem, factor, fem.space, SINGLE)
     part.prepare()
-    bent = bent_at(part, problem.device, u)
+    bent = update_model_at(part, problem.device, u)
     problem.begin(Cases(pressed(6.5), np.zeros(1)))
     single = StrainedDescent(problem, factor, part, Renewal(served=8)).descend(u, np.full(1, 1e-2), 8, {})
     assert bent is not None and set(single.learnt)

@@ -118,7 +118,7 @@ def test_strain_is_the_largest_round_each_node() -> None:
     np.testing.assert_allclose(found.numpy()[:, 0], expected, rtol=1e-9)
 
 
-def model_of(strains: StrainLimits) -> tuple[Fem, ContactDescent, wp.array, StrainedModel]:
+def find_model(strains: StrainLimits) -> tuple[Fem, ContactDescent, wp.array, StrainedModel]:
     """Of two columns that are bent."""
     fem, descent = solver(strains=strains)
     u = bent(fem.problem, 4e-4)
@@ -130,7 +130,7 @@ def model_of(strains: StrainLimits) -> tuple[Fem, ContactDescent, wp.array, Stra
 
 def test_the_model_is_the_inverse_of_the_stiffness_now() -> None:
     """H + H E M E' H, against K0 + D over the free motions; and what it changes between the nodes that are touched."""
-    fem, descent, u, model = model_of(EVERY)
+    fem, descent, u, model = find_model(EVERY)
     problem, basis = fem.problem, fem.problem.constraint.basis()
     force = np.random.default_rng(4).normal(size=(problem.rows, 2))
     rest = descent.compliance.answered(force)
@@ -151,7 +151,7 @@ def test_the_model_is_the_inverse_of_the_stiffness_now() -> None:
 
 def test_those_are_chosen_that_are_strained_most() -> None:
     """As many as there is room for, and none that is hardly strained."""
-    fem, descent, u, model = model_of(StrainLimits(least=0.08, nodes=20, cut=1.0))
+    fem, descent, u, model = find_model(StrainLimits(least=0.08, nodes=20, cut=1.0))
     strain = fem.problem.device.zeros(fem.space.count, 2)
     every, columns = np.ones(fem.space.count, bool), fem.problem.device.array(BOTH, wp.int32)
     for term in fem.problem.terms:
@@ -169,9 +169,9 @@ def test_those_are_chosen_that_are_strained_most() -> None:
 
 
 def test_columns_of_different_widths_go_together() -> None:
-    _, _, _, narrow = model_of(StrainLimits(least=0.08, nodes=20, cut=1.0))
-    _, _, _, wide = model_of(EVERY)
-    both = narrow.with_columns(np.array([1]), wide.rows(np.array([0])))
+    _, _, _, narrow = find_model(StrainLimits(least=0.08, nodes=20, cut=1.0))
+    _, _, _, wide = find_model(EVERY)
+    both = narrow.merge_columns(np.array([1]), wide.rows(np.array([0])))
     size = narrow.matrix.shape[1]
     np.testing.assert_array_equal(both.matrix[0, :size, :size], narrow.matrix[0])
     assert not both.matrix[0, size:].any() and not both.matrix[0, :, size:].any()

@@ -27,7 +27,7 @@ from sim.bodies import mesher
 from sim.bodies.label_volume import volume_subject
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.errors import InputError
-from sim.geometry.tetmesh import dihedral_angles
+from sim.geometry.tetmesh import compute_dihedral_angles
 
 
 def test_the_same_volume_gives_the_same_anatomy(tmp_path):
@@ -43,7 +43,7 @@ def test_a_tumour_that_reaches_or_breaks_the_cortex_is_meshed(tmp_path, rise):
     voxel = 1e-9 * abs(np.linalg.det(affine[:3, :3]))
     anatomy = make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=4000))
     mesh = anatomy.mesh
-    assert dihedral_angles(mesh.nodes, mesh.tets).min() > 5.0
+    assert compute_dihedral_angles(mesh.nodes, mesh.tets).min() > 5.0
     assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx((labels > 2).sum() * voxel, rel=0.02)
     assert mesh.volumes.sum() == pytest.approx((labels > 0).sum() * voxel, rel=0.01)
     touching = np.intersect1d(np.unique(mesh.surface), anatomy.tumour_nodes)
@@ -93,16 +93,16 @@ def test_a_rough_cortex_is_meshed(tmp_path, monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         mesh = make_anatomy(subject, MeshPlan(nodes=2000)).mesh
-    assert dihedral_angles(mesh.nodes, mesh.tets).min() > 10.0
+    assert compute_dihedral_angles(mesh.nodes, mesh.tets).min() > 10.0
     assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx(subject.tumour_volume, rel=0.02)
-    monkeypatch.setattr(mesher, "unfolded", lambda nodes, moved, tets: moved)
+    monkeypatch.setattr(mesher, "prevent_folds", lambda nodes, moved, tets: moved)
     with pytest.raises(InputError, match="too intricate for 2000 nodes"):
         make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(more=())))
 
 
 def test_what_is_fitted_without_folds_is_left_as_it_is(tmp_path, monkeypatch):
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"])
-    monkeypatch.delattr(mesher, "unfolded")
+    monkeypatch.delattr(mesher, "prevent_folds")
     assert len(make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)).mesh.nodes)
 
 

@@ -7,10 +7,10 @@ import pytest
 import trimesh
 from boxes import blurred_faces
 
-from sim.geometry.surface import BlurRange, blurred_normals, unit, vertex_normals
+from sim.geometry.surface import BlurRange, compute_blurred_normals, compute_vertex_normals, normalise_vectors
 
 BALL = trimesh.creation.icosphere(subdivisions=5, radius=0.07)  # edges of 2.5 mm
-ARM = unit(BALL.vertices)
+ARM = normalise_vectors(BALL.vertices)
 
 
 def folded(height: float, waves: int) -> np.ndarray:
@@ -25,23 +25,23 @@ def off(normals: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def test_a_ball_faces_outward_from_its_centre():
-    assert off(vertex_normals(BALL.vertices, BALL.faces), ARM).max() < 0.2
-    assert off(blurred_normals(BALL.vertices, BALL.faces, BALL.vertices, 6e-3), ARM).max() < 0.2
+    assert off(compute_vertex_normals(BALL.vertices, BALL.faces), ARM).max() < 0.2
+    assert off(compute_blurred_normals(BALL.vertices, BALL.faces, BALL.vertices, 6e-3), ARM).max() < 0.2
 
 
 def test_of_folds_narrower_than_the_blur_little_is_left():
     """Waves of 18 mm and 1.5 mm height on a radius of 70 mm: Gaussian blurs of 6 mm take 90 % of them and more."""
     nodes = folded(1.5e-3, 24)
     belt = np.abs(ARM[:, 2]) < 0.3
-    assert off(vertex_normals(nodes, BALL.faces), ARM)[belt].max() > 20.0
-    assert off(blurred_normals(nodes, BALL.faces, nodes, 6e-3), ARM)[belt].max() < 4.0
+    assert off(compute_vertex_normals(nodes, BALL.faces), ARM)[belt].max() > 20.0
+    assert off(compute_blurred_normals(nodes, BALL.faces, nodes, 6e-3), ARM)[belt].max() < 4.0
 
 
 def test_what_is_wider_than_the_blur_stays():
     nodes = folded(4e-3, 3)
-    found = blurred_normals(nodes, BALL.faces, nodes, 2.5e-3)
+    found = compute_blurred_normals(nodes, BALL.faces, nodes, 2.5e-3)
     assert off(found, ARM).max() > 8.0
-    assert off(found, vertex_normals(nodes, BALL.faces)).max() < 1.0
+    assert off(found, compute_vertex_normals(nodes, BALL.faces)).max() < 1.0
 
 
 @pytest.mark.parametrize("blur", [3e-3, 6e-3])
@@ -52,8 +52,8 @@ def test_a_finer_mesh_of_the_same_body_has_the_same_normals(blur):
         coarse = coarse.subdivide()
     fine = coarse.subdivide()
     points = np.asarray(coarse.vertices)
-    one = blurred_normals(points, coarse.faces, points, blur)
-    other = blurred_normals(fine.vertices, fine.faces, points, blur)
+    one = compute_blurred_normals(points, coarse.faces, points, blur)
+    other = compute_blurred_normals(fine.vertices, fine.faces, points, blur)
     assert off(one, other).max() < 2.0
 
 
@@ -65,16 +65,24 @@ def test_the_kernel_is_a_gaussian_of_the_width_asked_for(blur):
     for _ in range(5):
         box = box.subdivide()
     points = np.asarray(box.vertices)[::5]
-    assert off(blurred_normals(box.vertices, box.faces, points, blur), blurred_faces(points, size, blur)).max() < 0.5
+    assert (
+        off(compute_blurred_normals(box.vertices, box.faces, points, blur), blurred_faces(points, size, blur)).max()
+        < 0.5
+    )
 
 
 def test_a_mesh_far_coarser_than_the_blur_faces_outward_too():
     """Edges of 40 mm: no triangle's middle is in sight of a corner through a blur of 6 mm."""
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.07)
-    assert off(blurred_normals(ball.vertices, ball.faces, ball.vertices, 6e-3), unit(ball.vertices)).max() < 0.2
+    assert (
+        off(
+            compute_blurred_normals(ball.vertices, ball.faces, ball.vertices, 6e-3), normalise_vectors(ball.vertices)
+        ).max()
+        < 0.2
+    )
 
 
 def test_more_points_than_are_summed_at_once():
-    whole = blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3)
-    parts = blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3, BlurRange(together=7))
+    whole = compute_blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3)
+    parts = compute_blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3, BlurRange(together=7))
     np.testing.assert_array_equal(parts, whole)

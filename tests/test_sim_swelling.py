@@ -22,7 +22,7 @@ from sim.effects import Elasticity, Held, Pulsation, Resection, Slide, Wave
 from sim.elements import ELEMENTS
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.geometry.surface import unit
+from sim.geometry.surface import normalise_vectors
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Resected
 from sim.material import Tissue
@@ -138,7 +138,7 @@ def closed(anatomy: Anatomy) -> Anatomy:
     facing = np.zeros_like(mesh.nodes)
     np.add.at(facing, mesh.surface, np.cross(b - a, c - a)[:, None])
     open_to = (facing != 0.0).any(axis=1) & ~anatomy.held.any(axis=1) & ~anatomy.slide_normal.any(axis=1)
-    normal = np.where(open_to[:, None], unit(facing), anatomy.slide_normal)
+    normal = np.where(open_to[:, None], normalise_vectors(facing), anatomy.slide_normal)
     return replace(anatomy, slide_normal=normal)
 
 

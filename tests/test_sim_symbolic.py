@@ -9,15 +9,15 @@ import pytest
 import scipy.sparse as sp
 from test_sim_multifrontal import sliding, system
 
-from sim.linalg.multifrontal import node_of
-from sim.linalg.symbolic import dissection, fronts_of
+from sim.linalg.multifrontal import find_moved_nodes
+from sim.linalg.symbolic import build_fronts, order_by_dissection
 
 
 @pytest.mark.usefixtures("order")
 def test_parts_do_not_touch_one_another_and_share_the_work() -> None:
     stiffness, motions = system(sliding())
     free = sp.csc_array(motions.T @ stiffness @ motions)
-    _, (first, second, last) = fronts_of(free, node_of(motions), 2)
+    _, (first, second, last) = build_fronts(free, find_moved_nodes(motions), 2)
     for front in first:
         assert not ((front.border >= first[-1].stop) & (front.border < second[-1].stop)).any()
     loads = [sum((front.stop - front.first) * len(front.rows) for front in part) for part in (first, second, last)]
@@ -30,7 +30,7 @@ def test_a_front_touches_later_unknowns_alone() -> None:
     """And every entry of the matrix lies within the front of its earlier unknown."""
     stiffness, motions = system(sliding())
     free = sp.csc_array(motions.T @ stiffness @ motions)
-    order, parts = fronts_of(free, node_of(motions), 2)
+    order, parts = build_fronts(free, find_moved_nodes(motions), 2)
     fronts = [front for part in parts for front in part]
     assert sorted(order) == list(range(free.shape[0]))
     assert len(fronts) > 4
@@ -48,12 +48,12 @@ def test_a_front_touches_later_unknowns_alone() -> None:
 @pytest.mark.parametrize("later", [False, True])
 def test_entries_stored_on_one_side_have_the_same_fronts(later: bool) -> None:
     stiffness, motions = system(sliding())
-    whole, node = sp.coo_array(motions.T @ stiffness @ motions), node_of(motions)
+    whole, node = sp.coo_array(motions.T @ stiffness @ motions), find_moved_nodes(motions)
     first, second = node[whole.row], node[whole.col]
     kept = (np.random.default_rng(4).random((node.max() + 1,) * 2)[first, second] > 0.02) | (first == second)
     kept |= (first < second) == later
     left = sp.coo_array((whole.data[kept], (whole.row[kept], whole.col[kept])), whole.shape)
-    (order, parts), (same, others) = (fronts_of(sp.csc_array(one), node, 2) for one in (whole, left))
+    (order, parts), (same, others) = (build_fronts(sp.csc_array(one), node, 2) for one in (whole, left))
     np.testing.assert_array_equal(order, same)
     for front, other in zip(chain(*parts), chain(*others), strict=True):
         np.testing.assert_array_equal(front.rows, other.rows)
@@ -63,7 +63,7 @@ def test_entries_stored_on_one_side_have_the_same_fronts(later: bool) -> None:
 def test_dissection_leaves_little_fill() -> None:
     """A chain of a thousand nodes: an order that ignores the graph fills it."""
     line = sp.csr_array(sp.diags_array([np.ones(999), np.ones(999)], offsets=[-1, 1]).astype(np.int8))
-    assert sorted(dissection(line)) == list(range(1000))
+    assert sorted(order_by_dissection(line)) == list(range(1000))
     matrix = sp.csc_array(sp.diags_array([-np.ones(999), np.full(1000, 3.0), -np.ones(999)], offsets=[-1, 0, 1]))
-    _, parts = fronts_of(matrix, np.arange(1000))
+    _, parts = build_fronts(matrix, np.arange(1000))
     assert max(len(front.border) for part in parts for front in part) <= 4

@@ -59,7 +59,7 @@ def test_what_bears_too_much_lets_go_and_nothing_passes_the_skull(slab, element)
     assert np.vdot(force, moved) > 1.001 * np.vdot(force, whole.displacement[0])
 
 
-def drawn_aside(slab):
+def sample_draw_scenario(slab):
     """The top is drawn aside at its far corner: nodes leave the skull and come back to it while the set is sought."""
     nodes = slab.mesh.nodes
     top = nodes[:, 2] > nodes[:, 2].max() - 1e-9
@@ -69,7 +69,7 @@ def drawn_aside(slab):
     return Loads((Nodal(force),))
 
 
-@pytest.mark.parametrize("load", [lambda slab: lifted(slab, 0.05), drawn_aside])
+@pytest.mark.parametrize("load", [lambda slab: lifted(slab, 0.05), sample_draw_scenario])
 def test_without_strength_the_skull_only_presses(slab, load):
     """Signorini's conditions: nothing passes, nothing is pulled, and what is off bears nothing."""
     loads = load(slab)

@@ -10,8 +10,8 @@ from sim.bodies.mesher import Meshing
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Head, Tumour, template_subject
 from sim.errors import InputError
-from sim.geometry.geodesic import distances
-from sim.geometry.tetmesh import dihedral_angles
+from sim.geometry.geodesic import compute_geodesic_distances
+from sim.geometry.tetmesh import compute_dihedral_angles
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_at_17k_nodes_angles_surface_and_volume_are_as_promised():
     subject = template_subject(Tumour(shape="lobed", seed=7))
     mesh = make_anatomy(subject, MeshPlan(nodes=17_000)).mesh
     assert abs(len(mesh.nodes) - 17_000) <= 1_700
-    assert dihedral_angles(mesh.nodes, mesh.tets).min() >= 10.0
+    assert compute_dihedral_angles(mesh.nodes, mesh.tets).min() >= 10.0
     assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.02)
     grey, affine = subject.intensity.values, subject.intensity.affine
     distance = distances_to_voxel_faces(
@@ -114,7 +114,7 @@ def test_the_boundary_is_stem_skull_and_craniotomy(subject, anatomy):
     sets = np.stack([stem, skull, anatomy.craniotomy])
     assert (sets.sum(axis=0)[outer] == 1).all() and not np.delete(sets, outer, axis=1).any()
     # 50 mm across, along the cortex, and at least the 90 nodes that the seed's experiment leaves free.
-    along = distances(mesh.nodes, mesh.surface, subject.site, 0.06)
+    along = compute_geodesic_distances(mesh.nodes, mesh.surface, subject.site, 0.06)
     np.testing.assert_array_equal(anatomy.craniotomy, along <= 0.025)
     assert anatomy.craniotomy.sum() >= 90
     # The held nodes are the medulla's: lowest, in the midline.

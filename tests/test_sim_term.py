@@ -11,7 +11,7 @@ from term_examples import EXAMPLES as OTHERS
 from term_examples import LOGARITHMIC, MESH, ROWS, Example
 
 from sim.discretisation.term import Term
-from sim.geometry.tetmesh import signed_volumes
+from sim.geometry.tetmesh import compute_signed_volumes
 from sim.runtime.device import Device
 from sim.terms.contact.tool_contact import ToolContactTerm
 from sim.terms.element_kernels import VOLUME_KEPT
@@ -233,7 +233,7 @@ def test_steps_of_the_logarithmic_laws_keep_a_tenth_of_every_volume(law: str, de
 
     def volumes(fraction: float) -> np.ndarray:
         moved = (example.u + fraction * longest * du).T.reshape(3, -1, 3) + MESH.nodes
-        return np.stack([signed_volumes(nodes, MESH.tets) for nodes in moved])
+        return np.stack([compute_signed_volumes(nodes, MESH.tets) for nodes in moved])
 
     floor = VOLUME_KEPT * volumes(0.0)
     fractions = np.linspace(0.0, 1.0, 101)

@@ -10,7 +10,14 @@ from boxes import base_held, box, hold
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
-from sim.geometry.tetmesh import MeshWarning, TetMesh, dihedral_angles, faces_once, oriented, signed_volumes
+from sim.geometry.tetmesh import (
+    MeshWarning,
+    TetMesh,
+    compute_dihedral_angles,
+    compute_signed_volumes,
+    find_single_faces,
+    orient_tetrahedra,
+)
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
 ONE = np.array([[0, 1, 2, 3]])
@@ -31,7 +38,7 @@ def changed(**fields: np.ndarray) -> TetMesh:
         ({"tets": np.array([[0, 1, 2, 4]])}, "name node 4, but the mesh has nodes 0 to 3"),
         ({"tets": np.array([[0, 1, 2, -1]])}, "name node -1"),
         ({"region": np.zeros(2, int)}, r"region has shape \(2,\)"),
-        ({"tets": np.array([[0, 2, 1, 3]])}, "tetrahedron 0 .*zero or negative.*`oriented`"),
+        ({"tets": np.array([[0, 2, 1, 3]])}, "tetrahedron 0 .*zero or negative.*`orient_tetrahedra`"),
         ({"nodes": CORNERS * [1.0, 1.0, 0.0]}, "zero or negative"),
         ({"tets": np.array([[0, 1, 2, 2]])}, "zero or negative"),
     ],
@@ -66,11 +73,11 @@ def test_volumes_and_orientation() -> None:
     mesh = box((3, 2, 4), 0.2, distortion=0.2)
     assert mesh.volumes.sum() == pytest.approx(0.15 * 0.1 * 0.2)
     mirrored = mesh.nodes * [-1.0, 1.0, 1.0]
-    np.testing.assert_allclose(signed_volumes(mirrored, mesh.tets), -mesh.volumes)
-    turned, count = oriented(mirrored, mesh.tets)
+    np.testing.assert_allclose(compute_signed_volumes(mirrored, mesh.tets), -mesh.volumes)
+    turned, count = orient_tetrahedra(mirrored, mesh.tets)
     assert count == len(mesh.tets)
     assert TetMesh(mirrored, turned, mesh.region).volumes.sum() == pytest.approx(mesh.volumes.sum())
-    same, none = oriented(mesh.nodes, mesh.tets)
+    same, none = orient_tetrahedra(mesh.nodes, mesh.tets)
     assert none == 0
     np.testing.assert_array_equal(same, mesh.tets)
 
@@ -89,10 +96,10 @@ def test_boundary_of_a_region_inside() -> None:
     mesh = box((4, 4, 4), 0.1)
     inner = (np.abs(mesh.nodes[mesh.tets].mean(axis=1) - 0.05) < 0.025).all(axis=1)
     mesh = TetMesh(mesh.nodes, mesh.tets, np.where(inner, 2, 1))
-    assert len(mesh.boundary_of(2)) == 2 * 6 * 4
+    assert len(mesh.find_boundary(2)) == 2 * 6 * 4
     assert len(mesh.nodes_of(2)) == 27
-    np.testing.assert_array_equal(np.unique(mesh.boundary_of(2)), np.setdiff1d(mesh.nodes_of(2), _centre(mesh)))
-    assert len(faces_once(mesh.tets)) == len(mesh.surface)
+    np.testing.assert_array_equal(np.unique(mesh.find_boundary(2)), np.setdiff1d(mesh.nodes_of(2), _centre(mesh)))
+    assert len(find_single_faces(mesh.tets)) == len(mesh.surface)
 
 
 def _centre(mesh: TetMesh) -> np.ndarray:
@@ -101,10 +108,10 @@ def _centre(mesh: TetMesh) -> np.ndarray:
 
 def test_dihedral_angles_of_known_tetrahedra() -> None:
     np.testing.assert_allclose(
-        np.sort(dihedral_angles(CORNERS, ONE)[0]), [np.degrees(np.arccos(1.0 / np.sqrt(3.0)))] * 3 + [90.0] * 3
+        np.sort(compute_dihedral_angles(CORNERS, ONE)[0]), [np.degrees(np.arccos(1.0 / np.sqrt(3.0)))] * 3 + [90.0] * 3
     )
     regular = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
-    np.testing.assert_allclose(dihedral_angles(regular, ONE), np.degrees(np.arccos(1.0 / 3.0)))
+    np.testing.assert_allclose(compute_dihedral_angles(regular, ONE), np.degrees(np.arccos(1.0 / 3.0)))
 
 
 def test_arrays_cannot_be_written_to() -> None:

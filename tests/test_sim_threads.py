@@ -7,7 +7,7 @@ import threading
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from sim.runtime.threads import Sharing, cores, one_thread, together
+from sim.runtime.threads import Sharing, choose_threads, limit_to_one_thread, run_together
 
 
 def threads() -> set[int]:
@@ -16,7 +16,7 @@ def threads() -> set[int]:
 
 def test_it_lasts_until_the_last_has_left_and_then_is_gone() -> None:
     with threadpool_limits(2, "blas"):
-        first, second = one_thread(), one_thread()
+        first, second = limit_to_one_thread(), limit_to_one_thread()
         first.__enter__()
         second.__enter__()
         assert threads() == {1}
@@ -29,13 +29,13 @@ def test_it_lasts_until_the_last_has_left_and_then_is_gone() -> None:
 def test_every_task_is_done_when_it_returns():
     done: list[int] = []
     for _ in range(50):
-        together([lambda number=number: done.append(number) for number in range(3)])
+        run_together([lambda number=number: done.append(number) for number in range(3)])
     assert sorted(done) == sorted([0, 1, 2] * 50)
 
 
 def test_tasks_run_at_the_same_time():
     meeting = threading.Barrier(2, timeout=5.0)
-    together([meeting.wait, meeting.wait])
+    run_together([meeting.wait, meeting.wait])
 
 
 @pytest.mark.parametrize("bad", [0, 1])
@@ -47,13 +47,13 @@ def test_errors_come_out_and_the_threads_stay(bad: int):
     tasks = [lambda: done.append(1), lambda: done.append(1)]
     tasks[bad] = fail
     with pytest.raises(ValueError, match="no"):
-        together(tasks)
+        run_together(tasks)
     assert done == [1]
-    together([lambda: done.append(2)] * 2)
+    run_together([lambda: done.append(2)] * 2)
     assert done == [1, 2, 2]
 
 
 def test_one_core_at_least_and_one_for_little() -> None:
-    assert cores(10**6) >= 1
-    assert cores(Sharing().least - 1) == 1
-    assert cores(10**6, Sharing(most=1)) == 1
+    assert choose_threads(10**6) >= 1
+    assert choose_threads(Sharing().least - 1) == 1
+    assert choose_threads(10**6, Sharing(most=1)) == 1

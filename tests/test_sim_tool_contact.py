@@ -17,7 +17,7 @@ from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.material import Material
 from sim.runtime.user_script import run_script
-from sim.tools import Ball, Capsule, Core, Spatula, Tool, distances_to
+from sim.tools import Ball, Capsule, Core, Spatula, Tool, compute_distances
 
 SOFT = Material("neo-hookean", 3000.0, 0.45)
 SIDE, HEIGHT = 0.08, 0.04
@@ -65,7 +65,7 @@ def seven_by_seven(fem: Fem, found: Deformation) -> np.ndarray:
     space = fem.space
     u = found.displacement[0]
     if len(space.edges):
-        middles = space.interpolated(u)[len(u) :] + found.memory["mid-edge nodes"][0]
+        middles = space.interpolate_field(u)[len(u) :] + found.memory["mid-edge nodes"][0]
         u = np.vstack([u, middles])
     steps = np.linspace(0.0, 1.0, 7)
     y, z = (grid.ravel() for grid in np.meshgrid(steps, steps))
@@ -82,7 +82,9 @@ def test_no_point_of_the_surface_is_inside_a_tool(name: str, element: str) -> No
     found = answer(name, element)
     assert found.outcome == (Outcome.CONVERGED,)
     points = seven_by_seven(body(name, element), found).reshape(-1, 3)
-    nearest = distances_to(TOOLS[name], at(0.5 * SIDE + 1e-3, 0.5 * SIDE - 2e-3, HEIGHT - DEPTHS[name]), points).min()
+    nearest = compute_distances(
+        TOOLS[name], at(0.5 * SIDE + 1e-3, 0.5 * SIDE - 2e-3, HEIGHT - DEPTHS[name]), points
+    ).min()
     assert 0.0 < nearest < 1e-4
 
 

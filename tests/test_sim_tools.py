@@ -8,18 +8,28 @@ from test_surrogate_rigid_contact import ROD_OF_4, SMALL_BLADE
 
 from sim.effects import ToolContact
 from sim.errors import InputError
-from sim.tools import Ball, Capsule, Core, Spatula, core_of, distances_to, foremost, named, tool_from_text
+from sim.tools import (
+    Ball,
+    Capsule,
+    Core,
+    Spatula,
+    compute_distances,
+    find_foremost_points,
+    get_core,
+    name_tool,
+    parse_tool,
+)
 
 
 def test_a_tool_is_read_from_what_it_prints_as_and_nothing_else_is() -> None:
     for tool in (Ball(7e-3), ROD_OF_4, SMALL_BLADE):
-        assert tool_from_text(repr(tool)) == tool
-    assert named(ROD_OF_4) == "a rod of 2 mm radius and 20 mm length"
+        assert parse_tool(repr(tool)) == tool
+    assert name_tool(ROD_OF_4) == "a rod of 2 mm radius and 20 mm length"
     for text in ("", "Ball", "Ball(7e-3)", "Ball(radius=x)", "Ball(radius=-1.0)", "print(radius=1.0)"):
         with pytest.raises(InputError, match="is no tool"):
-            tool_from_text(text)
+            parse_tool(text)
     with pytest.raises(InputError, match="is no tool"):
-        tool_from_text("(" * 100_000)
+        parse_tool("(" * 100_000)
 
 
 def test_the_foremost_point_is_on_the_tool_and_nothing_of_it_is_farther() -> None:
@@ -30,13 +40,13 @@ def test_the_foremost_point_is_on_the_tool_and_nothing_of_it_is_farther() -> Non
         pose[:, :3, :3] *= np.linalg.det(pose[:, :3, :3])[:, None, None]
         pose[:, :3, 3] = rng.normal(size=(5, 3))
         way = np.array([0.6, 0.0, -0.8])
-        found = foremost(tool, pose, way)
-        core = core_of(tool)
+        found = find_foremost_points(tool, pose, way)
+        core = get_core(tool)
         for row in range(5):
-            assert distances_to(tool, pose[row], found[row][None])[0] == pytest.approx(0.0, abs=1e-9)
+            assert compute_distances(tool, pose[row], found[row][None])[0] == pytest.approx(0.0, abs=1e-9)
             corners = core.corners @ pose[row, :3, :3].T + pose[row, :3, 3]
             assert found[row] @ way == pytest.approx((corners @ way).max() + core.radius)
-    flat = foremost(SMALL_BLADE, np.eye(4)[None], np.array([0.0, 0.0, -1.0]))
+    flat = find_foremost_points(SMALL_BLADE, np.eye(4)[None], np.array([0.0, 0.0, -1.0]))
     np.testing.assert_allclose(flat, 0.0, atol=1e-12)  # the middle of its face
 
 
@@ -69,7 +79,7 @@ def test_tool_surface_lies_where_its_sizes_say(tool, ends):
     turn[:3, :3], turn[:3, 3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0.1, -0.2, 0.3]
     signs = np.array([[x, y, 1.0] for x in (-1, 1) for y in (-1, 1)])
     points = (np.array(ends)[:, None] * signs).reshape(-1, 3)
-    assert distances_to(tool, turn, points @ turn[:3, :3].T + turn[:3, 3]) == pytest.approx(0.0, abs=1e-12)
+    assert compute_distances(tool, turn, points @ turn[:3, :3].T + turn[:3, 3]) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -83,4 +93,4 @@ def test_tool_surface_lies_where_its_sizes_say(tool, ends):
     ],
 )
 def test_foremost_point_lies_on_the_tool_in_the_direction(tool, direction, point):
-    assert foremost(tool, np.eye(4)[None], np.array(direction))[0] == pytest.approx(point, abs=1e-10)
+    assert find_foremost_points(tool, np.eye(4)[None], np.array(direction))[0] == pytest.approx(point, abs=1e-10)

@@ -11,7 +11,7 @@ from openings import EFFECTS, body, loads_of
 
 from sim.accuracy import Accuracy
 from sim.bodies.open_cortex import open_cortex
-from sim.deformation import Deformation, joined
+from sim.deformation import Deformation, join_deformations
 from sim.effects import Elasticity, Held, Inertia, ToolContact, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, Touching, push
@@ -73,8 +73,8 @@ def test_dropped_everywhere_the_answers_are_the_same(kind):
 def test_memory_and_warmth_travel_with_their_rows():
     fem, loads = cases()["p1"]
     first, second = ride(fem, loads[:2], drops=False)
-    both = joined([second, second])
+    both = join_deformations([second, second])
     assert set(both.warm) == set(second.warm) and all(len(value) == 2 for value in both.warm.values())
     again = both.rows(np.array([1]))
     np.testing.assert_array_equal(fem.deform(loads[2], again).displacement, fem.deform(loads[2], second).displacement)
-    assert not joined([first, replace(second, warm={})]).warm
+    assert not join_deformations([first, replace(second, warm={})]).warm

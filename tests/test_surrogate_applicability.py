@@ -14,20 +14,20 @@ from sim.accuracy import LIVE
 from sim.effects import Elasticity, Gravity, Held, NodalForce, ToolForce
 from sim.errors import InputError
 from sim.loads import Loads
-from sim.material import Material, tissue_to_json
-from surrogate.model.applicability import refusal, trained_effects
+from sim.material import Material, to_tissue_json
+from surrogate.model.applicability import find_rejection, read_trained_effects
 
 
 class TestLearnt:
     def test_it_refuses_effects_that_it_was_not_trained_on(self, theatre):
         model = theatre.models["linear"]
-        assert refusal(model, short().effects) is None
-        why = refusal(model, (*short().effects, Gravity()))
+        assert find_rejection(model, short().effects) is None
+        why = find_rejection(model, (*short().effects, Gravity()))
         assert why is not None and "not under Gravity" in why
         with pytest.raises(InputError, match=r"svr does not know the scene sinking.*but Gravity. Choose one of fem"):
             theatre.player("svr", sinking())
         # No force at all: it has nothing to say of that either.
-        assert "here is none" in (refusal(model, EFFECTS) or "") and theatre.names(
+        assert "here is none" in (find_rejection(model, EFFECTS) or "") and theatre.names(
             replace(short(), effects=EFFECTS)
         ) == ("fem",)
         assert theatre.names(short()) == ("linear", "svr", "guarded", "fem") and theatre.names(sinking()) == ("fem",)
@@ -42,24 +42,29 @@ class TestLearnt:
 
     def test_its_file_says_what_it_was_trained_under(self, theatre):
         model = theatre.models["linear"]
-        assert trained_effects(model.training) == {"Elasticity", "Held", "Slide", "ToolForce"}  # its file does not say
+        assert read_trained_effects(model.training) == {
+            "Elasticity",
+            "Held",
+            "Slide",
+            "ToolForce",
+        }  # its file does not say
         effects = (Elasticity(regions={2: Elasticity().default}), Held(), ToolForce(), NodalForce())  # type: ignore
         stated = replace(model, training={"effects": repr(effects)})
-        assert trained_effects(stated.training) == {"Elasticity", "Held", "ToolForce", "NodalForce"}
+        assert read_trained_effects(stated.training) == {"Elasticity", "Held", "ToolForce", "NodalForce"}
         # Nothing slides in this body, and nodal forces act where loads hold some.
-        assert refusal(stated, short().effects) is None
-        why = refusal(stated, (Elasticity(), ToolForce()))
+        assert find_rejection(stated, short().effects) is None
+        why = find_rejection(stated, (Elasticity(), ToolForce()))
         assert why is not None and "never without Held" in why
 
     def test_where_the_skull_slides_it_matters(self, theatre, box):
         normal = np.zeros_like(box.slide_normal)
         normal[0, 0] = 1.0
         model = replace(theatre.models["linear"], anatomy=replace(box, slide_normal=normal))
-        why = refusal(model, (Elasticity(), Held(), ToolForce()))
+        why = find_rejection(model, (Elasticity(), Held(), ToolForce()))
         assert why is not None and "never without Slide" in why
 
     def test_models_beside_an_anatomy_do_not_change_its_physics(self, theatre):
-        training = {"element": "p1", "tissue": tissue_to_json(Material("neo-hookean", 9000.0, 0.3))}
+        training = {"element": "p1", "tissue": to_tissue_json(Material("neo-hookean", 9000.0, 0.3))}
         other = replace(theatre, models={"linear": replace(theatre.models["linear"], training=training)})
         assert other.fem(short(), LIVE).description == "finite elements (smoothed; neo-hookean, E 3 kPa, nu 0.49)"
         for scene in (short(), sinking()):
@@ -70,7 +75,7 @@ class TestLearnt:
         ("training", "reason"),
         [
             ({"element": "p1"}, "learned from p1 elements, and here they are smoothed"),
-            ({"tissue": tissue_to_json(Material("neo-hookean", 9000.0, 0.3))}, "E 9 kPa, nu 0.3, and here it is .*E 3"),
+            ({"tissue": to_tissue_json(Material("neo-hookean", 9000.0, 0.3))}, "E 9 kPa, nu 0.3, and here it is .*E 3"),
         ],
     )
     def test_a_model_of_another_body_is_refused(self, theatre, training, reason):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surrogate.array_functions import Rounded, half_precision, product_of, taken
+from surrogate.array_functions import Rounded, multiply_rows, round_to_half, take_rows_of
 from surrogate.regressors.force_series import ForcePairs, Series
 from surrogate.regressors.gp import Gp
 
@@ -26,16 +26,16 @@ def test_step_grows_where_whole_numbers_would_overflow():
 
 def test_rows_and_products_are_those_of_the_values():
     rounded, rows = Rounded.of(TABLE, 0.01), np.array([3, 1, 3])
-    np.testing.assert_array_equal(taken(rows, rounded), rounded.values[rows])
-    np.testing.assert_array_equal(product_of(np.ones((1, 3)), rounded, rows)[0], rounded.values[rows].sum(axis=0))
+    np.testing.assert_array_equal(take_rows_of(rows, rounded), rounded.values[rows])
+    np.testing.assert_array_equal(multiply_rows(np.ones((1, 3)), rounded, rows)[0], rounded.values[rows].sum(axis=0))
 
 
 def test_half_precision_keeps_eleven_bits_of_any_size():
     numbers = np.array([1.0, -3.14159, 6.1e-9, 2.5e20, 0.0])
-    found = half_precision(numbers)
+    found = round_to_half(numbers)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, numbers, rtol=2.0**-11)
-    assert (half_precision(np.ldexp(np.arange(2048.0), -30)) == np.ldexp(np.arange(2048.0), -30)).all()
+    assert (round_to_half(np.ldexp(np.arange(2048.0), -30)) == np.ldexp(np.arange(2048.0), -30)).all()
 
 
 def test_tables_of_earlier_versions_are_read():

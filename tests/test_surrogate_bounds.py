@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim.bodies.tip_distance import tip_gauge
+from sim.bodies.tip_distance import build_tip_gauge
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.splits import APART
 from surrogate.data.tool_loads import draw
-from surrogate.model.learned import only_pushed
-from surrogate.training.bounds import ENOUGH, TUMOUR, bound_by, missed
+from surrogate.model.learned import get_only_pushes
+from surrogate.training.bounds import ENOUGH, TUMOUR, bound_by, collect_missed
 from surrogate.training.train import train
 
 
@@ -39,7 +39,7 @@ def test_where_many_loads_calibrate_one_in_three_tells_the_scale(pretender, tmp_
     apart = np.arange(len(good))[-trained.calibrated :]
     answer = model.deform(good.rows(apart), at=data.anatomy.tumour_nodes).displacement
     error = np.linalg.norm(answer - truth[apart], axis=2).max(axis=1)
-    near = missed(model, open_patch(data.anatomy), only_pushed(good.rows(apart)), error)
+    near = collect_missed(model, open_patch(data.anatomy), get_only_pushes(good.rows(apart)), error)
     bounds = bound_by(near, TUMOUR, float(model.bounds.growth))
     pairs = ((model.bounds.weights, bounds.weights), (model.bounds.quantile, bounds.quantile))
     assert [np.allclose(*pair) for pair in pairs] == 2 * [trained.calibrated >= ENOUGH] == 2 * [count > 600]
@@ -51,6 +51,6 @@ def test_a_correction_that_does_not_help_is_left_out(box, pretender, tmp_path):
     simulate(tmp_path / "data.h5", linear, draw("palpation", box, 120, 0), {"preset": "palpation"})
     model = train(read_dataset(tmp_path / "data.h5"), ["linear"]).models["linear"]
     loads = draw("palpation", box, 20, 5)
-    answer, gauge = linear.deform(loads), tip_gauge(box)
+    answer, gauge = linear.deform(loads), build_tip_gauge(box)
     truth = gauge.distances(loads, answer.displacement, answer.nodes)
     assert np.abs(model.distance(loads).value - truth).max() < 2e-5

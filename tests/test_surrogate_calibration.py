@@ -9,9 +9,17 @@ from scipy.stats import chi2
 
 from sim.errors import InputError
 from surrogate.locating import calibration
-from surrogate.locating.calibration import NEAREST, covering_factor, left_out, likeness, seen_patch, trials, was_tried
+from surrogate.locating.calibration import (
+    NEAREST,
+    assign_held_out,
+    compute_covering_factor,
+    compute_likeness,
+    is_within_trials,
+    run_trials,
+    sample_seen_patch,
+)
 from surrogate.locating.ensemble import Ensemble
-from surrogate.locating.prior import middle_of
+from surrogate.locating.prior import compute_middle
 
 MOTION = np.array([1e-3, -2e-3, 2e-3])
 
@@ -24,7 +32,7 @@ def body():
 @pytest.fixture(scope="module")
 def evidence(body):
     motion = np.tile(MOTION, (len(body.mesh.nodes), 1))
-    return seen_patch(body, motion, np.random.default_rng(0), 60, 0.5)
+    return sample_seen_patch(body, motion, np.random.default_rng(0), 60, 0.5)
 
 
 def test_points_lie_on_a_patch_of_the_open_cortex_and_move_with_it(body, evidence):
@@ -32,7 +40,7 @@ def test_points_lie_on_a_patch_of_the_open_cortex_and_move_with_it(body, evidenc
     places = evidence.at[::3]
     on = body.mesh.nodes[np.unique(body.open_surface)]
     assert np.ptp(places[:, 2]) == pytest.approx(0.0, abs=1e-12) and places[0, 2] == pytest.approx(on[:, 2].max())
-    whole = seen_patch(body, np.zeros_like(body.mesh.nodes), np.random.default_rng(0), 400, 1.0).at
+    whole = sample_seen_patch(body, np.zeros_like(body.mesh.nodes), np.random.default_rng(0), 400, 1.0).at
     assert np.ptp(places[:, :2], axis=0).max() < 0.95 * np.ptp(whole[:, :2], axis=0).max()
     triangles = np.unique(np.sort(evidence.place.vertices[:, :3], axis=1), axis=0)
     share = len(triangles) / len(body.open_surface)  # all of one size
@@ -43,40 +51,47 @@ def test_points_lie_on_a_patch_of_the_open_cortex_and_move_with_it(body, evidenc
 
 def test_likeness_is_of_motion_over_error_and_of_the_number_of_points(evidence):
     exact, shifted = (replace(evidence, sigma=np.full(180, 3e-4), shift=shift) for shift in (0.0, 4e-4))
-    assert likeness(exact)[:2] == pytest.approx(np.log([3e-3 / 3e-4, 60.0]))
-    assert likeness(shifted)[:2] == pytest.approx(np.log([3e-3 / 5e-4, 60.0]))
+    assert compute_likeness(exact)[:2] == pytest.approx(np.log([3e-3 / 3e-4, 60.0]))
+    assert compute_likeness(shifted)[:2] == pytest.approx(np.log([3e-3 / 5e-4, 60.0]))
 
 
 def test_likeness_is_of_the_size_of_the_patch_however_many_points_lie_on_it(body, evidence):
     """The same patch twice as wide is as far off for few points as for many; a patch of half the area is smaller."""
     wide = replace(evidence, at=2.0 * evidence.at)
-    few, many = (likeness(wide.rows(np.arange(n))) - likeness(evidence.rows(np.arange(n))) for n in (60, 180))
+    few, many = (
+        compute_likeness(wide.rows(np.arange(n))) - compute_likeness(evidence.rows(np.arange(n))) for n in (60, 180)
+    )
     assert few == pytest.approx(many) and few[2] > 1.0 and few[[0, 1, 3]] == pytest.approx(np.zeros(3))
     still, sizes = np.zeros_like(body.mesh.nodes), []
     for cover in (0.2, 0.4, 0.8):
-        sizes.append([likeness(seen_patch(body, still, np.random.default_rng(n), 60, cover))[2] for n in range(5)])
+        sizes.append(
+            [compute_likeness(sample_seen_patch(body, still, np.random.default_rng(n), 60, cover))[2] for n in range(5)]
+        )
     assert max(sizes[0]) < min(sizes[1]) and max(sizes[1]) < min(sizes[2])
 
 
 def test_trials_on_patches_of_its_size_say_how_far_a_covariance_grows(evidence):
     small = replace(evidence, at=0.5 * evidence.at)
     tried = np.concatenate(
-        [np.tile(np.append(likeness(of), square), (NEAREST, 1)) for of, square in ((evidence, 1.0), (small, 9.0))]
+        [
+            np.tile(np.append(compute_likeness(of), square), (NEAREST, 1))
+            for of, square in ((evidence, 1.0), (small, 9.0))
+        ]
     )
-    assert covering_factor(tried, small) == pytest.approx(9.0 * covering_factor(tried, evidence))
+    assert compute_covering_factor(tried, small) == pytest.approx(9.0 * compute_covering_factor(tried, evidence))
 
 
 def test_a_cloud_is_like_no_named_points(evidence):
     """One row a point, as clouds have, and three."""
     cloud = evidence.rows(np.arange(0, 180, 3))
-    assert np.array_equal(likeness(cloud)[1:3], likeness(evidence)[1:3])
-    assert likeness(cloud)[3] > 100.0 + likeness(evidence)[3]
+    assert np.array_equal(compute_likeness(cloud)[1:3], compute_likeness(evidence)[1:3])
+    assert compute_likeness(cloud)[3] > 100.0 + compute_likeness(evidence)[3]
     named, unnamed = (
-        np.tile(np.append(likeness(of), square), (NEAREST, 1)) for of, square in ((evidence, 1.0), (cloud, 9.0))
+        np.tile(np.append(compute_likeness(of), square), (NEAREST, 1)) for of, square in ((evidence, 1.0), (cloud, 9.0))
     )
     tried = np.concatenate([named, unnamed])
-    assert covering_factor(tried, cloud) == pytest.approx(9.0 * covering_factor(tried, evidence))
-    assert was_tried(named, evidence) and not was_tried(named, cloud) and was_tried(tried, cloud)
+    assert compute_covering_factor(tried, cloud) == pytest.approx(9.0 * compute_covering_factor(tried, evidence))
+    assert is_within_trials(named, evidence) and not is_within_trials(named, cloud) and is_within_trials(tried, cloud)
 
 
 def some_members(body, skull, group):
@@ -89,10 +104,10 @@ def some_members(body, skull, group):
 def test_whole_groups_are_left_out_one_of_each_skull(body):
     """A trial's tissue is unknown to its estimator, and each skull is known to every estimator."""
     some = some_members(body, [0, 0, 0, 0, 0, 1, 1, 1, 2, 2], [0, 0, 1, 1, 2, 3, 4, 4, 5, 5])
-    turn = left_out(some)
+    turn = assign_held_out(some)
     assert turn.tolist() == [0, 0, 1, 1, 2, 0, 1, 1, -1, -1]
     with pytest.raises(InputError, match="several Poisson's ratios"):
-        trials(some_members(body, [0, 0, 1], [0, 0, 1]), None)
+        run_trials(some_members(body, [0, 0, 1], [0, 0, 1]), None)
 
 
 def test_trial_prior_lacks_the_group_of_the_trial(body, monkeypatch):
@@ -101,19 +116,19 @@ def test_trial_prior_lacks_the_group_of_the_trial(body, monkeypatch):
     motion = random.normal(scale=2e-3, size=(24, *body.mesh.nodes.shape)).astype(np.float32)
     ensemble = Ensemble(body, motion, np.tile([0, 1], 12), group // 2, group)
     known, made, clouds = [], [], []
-    monkeypatch.setattr(calibration, "prior_of", lambda ensemble, presses, mask: known.append(mask))
+    monkeypatch.setattr(calibration, "build_prior", lambda ensemble, presses, mask: known.append(mask))
 
     def middle(anatomy, moved):
         made.append((known[-1], moved[0]))
-        return middle_of(anatomy, moved)
+        return compute_middle(anatomy, moved)
 
     def unsettled(prior, observation):
         clouds.append(observation.rest is None)
         raise InputError("no trial")
 
-    monkeypatch.setattr(calibration, "middle_of", middle)
-    monkeypatch.setattr(calibration, "settled", unsettled)
-    assert not len(trials(ensemble, None, count=40)) and len(made) == 40 and clouds == 20 * [True, False]
+    monkeypatch.setattr(calibration, "compute_middle", middle)
+    monkeypatch.setattr(calibration, "match_and_update", unsettled)
+    assert not len(run_trials(ensemble, None, count=40)) and len(made) == 40 and clouds == 20 * [True, False]
     assert [sorted(set(group[~mask])) for mask in known] == [[0, 2, 4], [1, 3, 5]]
     for mask, moved in made:
         share = np.linalg.lstsq(motion.reshape(24, -1).T.astype(float), moved.ravel(), rcond=None)[0]
@@ -126,22 +141,22 @@ def test_the_factor_makes_ellipsoids_hold_in_95_of_100_trials(evidence, times):
     random = np.random.default_rng(1)
     squares = times * chi2.ppf((np.arange(NEAREST) + 0.5) / NEAREST, 3)
     spread = 0.01 * random.standard_normal((NEAREST, 4)) * [1.0, 1.0, 1.0, 0.0]
-    tried = np.column_stack([likeness(evidence) + spread, squares])
+    tried = np.column_stack([compute_likeness(evidence) + spread, squares])
     rank = chi2.ppf(114.5 / 120.0, 3) / chi2.ppf(0.95, 3)
-    assert covering_factor(tried, evidence) == pytest.approx(times * rank) and abs(rank - 1.0) < 0.12
+    assert compute_covering_factor(tried, evidence) == pytest.approx(times * rank) and abs(rank - 1.0) < 0.12
     # Trials that are unlike it do not count.
-    other = np.column_stack([likeness(evidence) + np.full((500, 4), 3.0), np.full(500, 1e3)])
-    assert covering_factor(np.concatenate([other, tried]), evidence) == covering_factor(tried, evidence)
+    other = np.column_stack([compute_likeness(evidence) + np.full((500, 4), 3.0), np.full(500, 1e3)])
+    assert compute_covering_factor(np.concatenate([other, tried]), evidence) == compute_covering_factor(tried, evidence)
 
 
 def test_what_was_never_tried_is_said(evidence):
-    around = likeness(evidence) + np.array([[-0.1, -0.1, -0.1, 0.0], [0.1, 0.1, 0.1, 0.0]])
-    assert was_tried(np.column_stack([around, [1.0, 1.0]]), evidence)
-    assert not was_tried(np.column_stack([around + [0.2, 0.0, 0.0, 0.0], [1.0, 1.0]]), evidence)
-    assert not was_tried(np.column_stack([around - [0.0, 0.2, 0.0, 0.0], [1.0, 1.0]]), evidence)
+    around = compute_likeness(evidence) + np.array([[-0.1, -0.1, -0.1, 0.0], [0.1, 0.1, 0.1, 0.0]])
+    assert is_within_trials(np.column_stack([around, [1.0, 1.0]]), evidence)
+    assert not is_within_trials(np.column_stack([around + [0.2, 0.0, 0.0, 0.0], [1.0, 1.0]]), evidence)
+    assert not is_within_trials(np.column_stack([around - [0.0, 0.2, 0.0, 0.0], [1.0, 1.0]]), evidence)
     # A patch may be too small, and none is too large: trials lie on all of the open cortex.
     for larger, known in ((0.2, False), (-0.2, True)):
-        assert was_tried(np.column_stack([around + [0.0, 0.0, larger, 0.0], [1.0, 1.0]]), evidence) == known
+        assert is_within_trials(np.column_stack([around + [0.0, 0.0, larger, 0.0], [1.0, 1.0]]), evidence) == known
 
 
 def test_the_tumours_middle_is_that_of_its_volume(body):
@@ -150,4 +165,4 @@ def test_the_tumours_middle_is_that_of_its_volume(body):
     middle = np.average(body.mesh.nodes[body.mesh.tets[inside]].mean(axis=1), axis=0, weights=body.mesh.volumes[inside])
     motion = np.zeros((1, *body.mesh.nodes.shape))
     motion[0, :, 1] = 1.0 + 3.0 * body.mesh.nodes[:, 0]
-    assert middle_of(body, motion) == pytest.approx(np.array([[0.0, 1.0 + 3.0 * middle[0], 0.0]]))
+    assert compute_middle(body, motion) == pytest.approx(np.array([[0.0, 1.0 + 3.0 * middle[0], 0.0]]))

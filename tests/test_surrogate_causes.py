@@ -6,22 +6,22 @@ import numpy as np
 import pytest
 from test_surrogate_locator import FEW
 
-from surrogate.locating.causes import LETS_GO, drainages, groups, pushes
+from surrogate.locating.causes import LETS_GO, build_drainages, build_groups, build_pushes
 
 
 def test_draws_depend_on_the_seed_and_the_group_alone(body):
-    first, second = groups(body, 0, FEW)[:2]
+    first, second = build_groups(body, 0, FEW)[:2]
     draws = [(first, 0), (first, 0), (second, 0), (first, 1)]
-    force, again, other, later = (pushes(group, body, seed, FEW).causes[0].force for group, seed in draws)
+    force, again, other, later = (build_pushes(group, body, seed, FEW).causes[0].force for group, seed in draws)
     assert np.array_equal(force, again) and not np.array_equal(force, other) and not np.array_equal(force, later)
-    falling = drainages(first, body, 0, FEW)
+    falling = build_drainages(first, body, 0, FEW)
     assert [len(level) for level in falling] == [3, 3]
     down = [level.causes[1].direction for level in falling]
     assert np.array_equal(*down) and (falling[1].causes[1].csf_level < falling[0].causes[1].csf_level).all()
 
 
 def test_a_skull_that_lets_go_is_not_asked_for_swollen_fluid_tissue(body):
-    made = {(group.skull, group.poisson) for group in groups(body, 0, FEW)}
+    made = {(group.skull, group.poisson) for group in build_groups(body, 0, FEW)}
     assert (LETS_GO, 0.45) in made and (LETS_GO, 0.485) not in made and ("slide", 0.485) in made
 
 
@@ -30,7 +30,9 @@ def test_each_skull_has_soft_and_stiff_tumours_and_tissue_that_stiffens_little_a
     for seed in range(20):
         for skull in ("bonded", "slide"):
             some = [
-                group for group in groups(body, seed, replace(FEW, poisson=(0.45, 0.47, 0.49))) if group.skull == skull
+                group
+                for group in build_groups(body, seed, replace(FEW, poisson=(0.45, 0.47, 0.49)))
+                if group.skull == skull
             ]
             for name, (low, high) in (("ratio", FEW.stiffness), ("exponent", FEW.exponent)):
                 share = [np.log(getattr(group, name) / low) / np.log(high / low) for group in some]

@@ -5,7 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surrogate.model.conformal import LEVELS, MOST_GROWTH, USUAL_GROWTH, conformal, fitted_bound, fitted_growth
+from surrogate.model.conformal import (
+    LEVELS,
+    MOST_GROWTH,
+    USUAL_GROWTH,
+    compute_conformal_quantile,
+    fit_bound,
+    fit_growth,
+)
 from surrogate.model.training_range import Outside
 
 
@@ -26,7 +33,7 @@ def drawn(count, seed):
 @pytest.fixture(scope="module")
 def bound():
     features, _, error = drawn(600, 0)
-    return fitted_bound((features, error), *drawn(2000, 1))
+    return fit_bound((features, error), *drawn(2000, 1))
 
 
 def test_fresh_loads_are_covered_in_every_class(bound):
@@ -61,14 +68,14 @@ def far_and_near(growth, seed, near=400, far=300):
 
 @pytest.mark.parametrize("growth", [0.0, 300.0, 1500.0])
 def test_growth_is_that_by_which_errors_grow_with_the_distance(growth):
-    found = np.array([fitted_growth(*far_and_near(growth, seed)) for seed in range(20)])
+    found = np.array([fit_growth(*far_and_near(growth, seed)) for seed in range(20)])
     assert abs(np.median(found) - growth) < 0.3 * growth + 40.0
 
 
 def test_too_few_far_loads_tell_no_growth_and_none_is_beyond_all_bounds():
     near, far = far_and_near(300.0, 0)
-    assert fitted_growth(near, (far[0][:18], far[1][:18])) == USUAL_GROWTH
-    assert fitted_growth(near, (1e9 * far[0], far[1])) == MOST_GROWTH
+    assert fit_growth(near, (far[0][:18], far[1][:18])) == USUAL_GROWTH
+    assert fit_growth(near, (1e9 * far[0], far[1])) == MOST_GROWTH
 
 
 def test_bounds_that_grow_with_the_distance_hold_near_and_far():
@@ -77,7 +84,7 @@ def test_bounds_that_grow_with_the_distance_hold_near_and_far():
     error = error * (1.0 + 800.0 * away)
     near = np.flatnonzero(away < 2e-3)
     known = features[near], force[near], error[near]
-    bound = fitted_bound((features, error), *known, away=away[near], growth=800.0)
+    bound = fit_bound((features, error), *known, away=away[near], growth=800.0)
     stated = bound.of(features, force, Outside(away, 0.0 * away, 0.0 * away))[0]
     held = error <= stated
     assert abs(held[near].mean() - 0.95) < 0.02 and abs(held[away > 4e-3].mean() - 0.95) < 0.03
@@ -85,13 +92,13 @@ def test_bounds_that_grow_with_the_distance_hold_near_and_far():
 
 def test_conformal_takes_the_rank_that_covers_one_more():
     values = np.arange(1.0, 100.0)  # 99 of them
-    assert conformal(values, 0.95) == 95.0 and conformal(values, 0.99) == 99.0
-    assert conformal(values[:9], 0.95) == np.inf
+    assert compute_conformal_quantile(values, 0.95) == 95.0 and compute_conformal_quantile(values, 0.99) == 99.0
+    assert compute_conformal_quantile(values[:9], 0.95) == np.inf
 
 
 def test_loads_of_one_force_are_one_class():
     features, _, error = drawn(500, 4)
-    bound = fitted_bound((features, error), features, np.full(500, 0.2), error)
+    bound = fit_bound((features, error), features, np.full(500, 0.2), error)
     assert not len(bound.edges) and bound.quantile.shape == (2, 1)
     stated = bound.of(features, np.full(500, 0.2), lying(500))
     assert np.mean(error <= stated[0]) >= 0.95
@@ -111,7 +118,7 @@ def placed(count, seed, discs=None):
 def test_a_scale_seen_in_few_discs_does_not_run_away_between_them(curved):
     discs = np.array([[-12.0, -9.0, 5.0], [2.0, 11.0, -8.0], [13.0, -4.0, 9.0]])
     features, _, error = placed(400, 5, discs)
-    bound = fitted_bound((features, error), *placed(1000, 6), curved=curved)
+    bound = fit_bound((features, error), *placed(1000, 6), curved=curved)
     features, force, error = placed(5000, 7)
     stated = bound.of(features, force, lying(len(force)))
     assert abs(np.mean(error <= stated[0]) - 0.95) < 0.02
@@ -123,7 +130,7 @@ def test_a_scale_seen_in_few_discs_does_not_run_away_between_them(curved):
 @pytest.mark.parametrize("curved", [True, False])
 def test_a_scale_is_of_the_load_and_the_same_everywhere(curved):
     features, _, error = placed(400, 5)
-    bound = fitted_bound((features, error), *placed(1000, 6), curved=curved)
+    bound = fit_bound((features, error), *placed(1000, 6), curved=curved)
     elsewhere = features + [0.0, 0.0, 0.0, 0.0, 9.0, -9.0, 30.0]
     at = [bound.of(some, np.full(400, 0.2), lying(400)) for some in (features, elsewhere)]
     np.testing.assert_array_equal(*at)

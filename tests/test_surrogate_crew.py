@@ -21,7 +21,7 @@ from sim.effects import NodalForce, pushed_effects
 from sim.errors import InputError
 from sim.material import BRAIN
 from sim.runtime.processes import process_pool
-from surrogate.data.crew import LazyFem, even_batch, solving
+from surrogate.data.crew import LazyFem, choose_even_batch, open_solvers
 from surrogate.data.dataset import SEAL, read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.tasks import SolverPool
@@ -60,7 +60,7 @@ def test_a_file_does_not_depend_on_how_many_devices_made_it(tmp_path, body, batc
     effects, loads = (*pushed_effects(body, BRAIN), NodalForce()), draw("palpation", body, COUNT, 0)
     counts = []
     for devices in (["cpu"], ["cpu", "cpu"]):
-        with solving(LazyFem(body, effects, TRAIN, "smoothed", batch, COUNT), devices, print) as solver:
+        with open_solvers(LazyFem(body, effects, TRAIN, "smoothed", batch, COUNT), devices, print) as solver:
             assert (solver.element, solver.batch) == ("smoothed", batch)
             seen = []
             path = tmp_path / f"{len(devices)}.h5"
@@ -79,13 +79,13 @@ def test_two_processes_on_one_card_answer_as_one(tmp_path, body):
     effects, loads = (*pushed_effects(body, BRAIN), NodalForce()), draw("palpation", body, 64, 0)
     found = []
     for devices in (["cuda:0"], ["cuda:0", "cuda:0"]):
-        with solving(LazyFem(body, effects, TRAIN, None, 8, 64), devices, print) as solver:
+        with open_solvers(LazyFem(body, effects, TRAIN, None, 8, 64), devices, print) as solver:
             simulate(tmp_path / f"{len(devices)}.h5", solver.deformer, loads, SAID, 8)
         found.append(read_dataset(tmp_path / f"{len(devices)}.h5"))
     every = np.arange(len(body.mesh.nodes))
     one, two = (data.displacement(every) for data in found)
     assert all(data.good.all() for data in found) and np.abs(one - two).max() <= 2e-3 * np.abs(one).max()
-    units = [data.unit_response(every) for data in found]
+    units = [data.compute_unit_response(every) for data in found]
     assert np.abs(units[0] - units[1]).max() <= 2e-3 * np.abs(units[0]).max()
 
 
@@ -113,13 +113,13 @@ def test_a_batch_that_no_memory_holds_begins_no_file(body, devices):
     """A file keeps its batch, so that a smaller one would be refused beside it."""
     asked = LazyFem(body, (*pushed_effects(body, BRAIN), NodalForce()), TRAIN, "p1", 10**9, 2 * 10**9)
     refused = pytest.raises(InputError, match=r"the answers to 1000000000 loads take about .* are free: solve at most")
-    with refused, solving(asked, devices, print):
+    with refused, open_solvers(asked, devices, print):
         pytest.fail("it would begin")
 
 
 def test_batches_are_shared_evenly():
-    assert [even_batch(10_000, count, 4) for count in (5, 5_000, 40_000, 50_000)] == [2, 1_250, 10_000, 6_250]
-    assert even_batch(0, 7, 2) == 1 and even_batch(64, 7, 1) == 7
+    assert [choose_even_batch(10_000, count, 4) for count in (5, 5_000, 40_000, 50_000)] == [2, 1_250, 10_000, 6_250]
+    assert choose_even_batch(0, 7, 2) == 1 and choose_even_batch(64, 7, 1) == 7
 
 
 def test_the_command_goes_on_with_other_devices_and_the_same_batches(tmp_path, box_file, capsys):

@@ -22,10 +22,10 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import push
-from sim.material import tissue_from_json
+from sim.material import read_tissue_json
 from sim.runtime.journal import DamageWarning
-from surrogate.data.answer_rows import checksums, row_type
-from surrogate.data.dataset import FORMAT, SEAL, UNCHECKED, read_dataset, stored
+from surrogate.data.answer_rows import compute_row_checksums, get_row_type
+from surrogate.data.dataset import FORMAT, SEAL, UNCHECKED, read_dataset, read_stored
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.training.train import train
@@ -62,10 +62,10 @@ def put_right(path, group):
     """Make the checksums those of the rows that are there."""
     with h5py.File(path, "r+") as file:
         columns = file[group]
-        rows = np.empty(len(columns["residual"]), row_type(columns["displacement"].shape[1]))
+        rows = np.empty(len(columns["residual"]), get_row_type(columns["displacement"].shape[1]))
         for name in rows.dtype.names:
             rows[name] = columns[name][:]
-        columns["checksum"][:] = checksums(rows)
+        columns["checksum"][:] = compute_row_checksums(rows)
 
 
 class TestUnfinished:
@@ -136,7 +136,7 @@ class TestFinished:
         group = name.split("/")[0]
         with pytest.raises(InputError, match=rf"row {row} of `{group}` are damaged"):
             data = read_dataset(path)
-            (data.displacement if group == "answers" else data.unit_response)(pretender.anatomy.tumour_nodes)
+            (data.displacement if group == "answers" else data.compute_unit_response)(pretender.anatomy.tumour_nodes)
         with pytest.warns(DamageWarning, match=rf"row {row} of `{group}`: damaged"):
             solved = simulate(path, pretender, loads, SAID, 8)
         assert solved.rows == (4 if row == 17 else 8)
@@ -172,10 +172,10 @@ class TestFinished:
     def test_no_array_is_larger_than_the_limit(self, whole):
         """Not one whose length the file alone decides."""
         with h5py.File(whole) as file:
-            shape = stored(file, "anatomy/nodes", "f").shape
-            assert stored(file, "anatomy/nodes", "f", shape, 10_000).nbytes > 10_000
+            shape = read_stored(file, "anatomy/nodes", "f").shape
+            assert read_stored(file, "anatomy/nodes", "f", shape, 10_000).nbytes > 10_000
             with pytest.raises(InputError, match=r"`anatomy/nodes` declares more than such a file holds"):
-                stored(file, "anatomy/nodes", "f", None, 10_000)
+                read_stored(file, "anatomy/nodes", "f", None, 10_000)
 
     def test_a_tool_is_one(self, whole):
         data = read_dataset(whole)
@@ -281,7 +281,7 @@ class TestRoom:
         resource = pytest.importorskip("resource")
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         if not asked:
-            monkeypatch.setattr("surrogate.data.simulate.demand_space", lambda *sizes: None)
+            monkeypatch.setattr("surrogate.data.simulate.check_disk_space", lambda *sizes: None)
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
         try:
             with pytest.raises(InputError, match=sentence):
@@ -320,7 +320,7 @@ def test_a_data_set_explains_itself(tmp_path):
         part = file["anatomy"]
         mesh = TetMesh(part["nodes"][:], part["tets"][:], part["region"][:])
         anatomy = Anatomy(mesh, part["held"][:], part["slide_normal"][:], part["craniotomy"][:])
-        tissue, element = tissue_from_json(file.attrs["tissue"]), file.attrs["element"]
+        tissue, element = read_tissue_json(file.attrs["tissue"]), file.attrs["element"]
         tool = file["loads/Pushed"]
         load = push(tool["point"][1], tool["force"][1], tool["footprint"][1])
         stored = file["answers/displacement"][1]
@@ -335,6 +335,6 @@ def test_arrays_have_limits(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["a"] = np.zeros(3)
         with pytest.raises(InputError, match="holds float64"):
-            stored(file, "a", "iu")
+            read_stored(file, "a", "iu")
         with pytest.raises(InputError, match="measures 3, not n x 3"):
-            stored(file, "a", "f", (None, 3))
+            read_stored(file, "a", "f", (None, 3))

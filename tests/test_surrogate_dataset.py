@@ -62,12 +62,12 @@ def test_the_body_travels_with_its_data(tmp_path, mesh):
 
 def test_unit_responses_superpose_to_small_loads(tmp_path, box, pretender, loads):
     from surrogate.data.cortex_patch import open_patch
-    from surrogate.data.encode import nodal_shares
+    from surrogate.data.encode import compute_nodal_shares
 
     simulate(tmp_path / "data.h5", pretender, loads, SAID)
     small = loads.scaled(1e-4)
-    table = read_dataset(tmp_path / "data.h5").unit_response(box.tumour_nodes)
-    shares = nodal_shares(open_patch(box), small.of(Pushed))
+    table = read_dataset(tmp_path / "data.h5").compute_unit_response(box.tumour_nodes)
+    shares = compute_nodal_shares(open_patch(box), small.of(Pushed))
     size = np.linalg.norm(small.of(Pushed).force, axis=1)
     predicted = size[:, None, None] * np.einsum("bf,fni->bni", shares, table)
     truth = pretender.deform(small, at=box.tumour_nodes).displacement

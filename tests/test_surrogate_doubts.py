@@ -16,18 +16,18 @@ from sim.bodies.meshfile import read_anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.effects import SKULLS
 from sim.errors import InputError
-from surrogate.locating.calibration import seen_patch
+from surrogate.locating.calibration import sample_seen_patch
 from surrogate.locating.causes import DRAINAGE, KINDS, OEDEMA, SWELLING, TOOL
-from surrogate.locating.locator_store import load_locator, locator_path
+from surrogate.locating.locator_store import load_locator, to_locator_path
 from surrogate.locating.observation import Observation
-from surrogate.locating.prior import middle_of
+from surrogate.locating.prior import compute_middle
 
 NAMED, CLOUD = PointsSeen(100, 44, 1), PointsSeen(100, 44, 1, named=False)
 
 
 @pytest.fixture(scope="module")
 def locator():
-    return load_locator(locator_path(template_path()), read_anatomy(template_path()))
+    return load_locator(to_locator_path(template_path()), read_anatomy(template_path()))
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def test_locate_shifted_registration_warns(locator, sight, seed):
 def test_a_brain_that_sinks_is_not_taken_for_a_slip(locator, sunk, sight):
     """Its tumour is found, and the error holds."""
     found = locator.locate(observed(locator.anatomy, sunk, sight, (0, 0)))
-    off = np.linalg.norm(found.centroid - middle_of(locator.anatomy, sunk[None])[0])
+    off = np.linalg.norm(found.centroid - compute_middle(locator.anatomy, sunk[None])[0])
     assert not found.slipped and found.calibrated and not found.doubt and off < found.p95
     assert not found.within_errors and sum(found.causes.values()) == pytest.approx(1.0)
 
@@ -173,7 +173,7 @@ def test_a_dent_is_seen_by_its_form_though_it_is_no_larger_than_errors(locator):
 
 def test_a_locator_of_trials_without_the_size_of_patches_is_refused(locator, tmp_path):
     """Its format says so, before its arrays are looked at."""
-    with np.load(locator_path(template_path())) as file:
+    with np.load(to_locator_path(template_path())) as file:
         arrays = {name: file[name] for name in file.files}
     header = json.loads(str(arrays["header"])) | {"format": "sulcus locator 3"}
     path = tmp_path / "old.npz"
@@ -184,7 +184,7 @@ def test_a_locator_of_trials_without_the_size_of_patches_is_refused(locator, tmp
 
 @pytest.mark.parametrize("name", ["header", "tried", "shape", "kind", "place", "centre", "nodes"])
 def test_locator_of_another_content_than_sealed_is_rejected(locator, tmp_path, name):
-    with np.load(locator_path(template_path())) as file:
+    with np.load(to_locator_path(template_path())) as file:
         arrays = {name: file[name] for name in file.files}
     if name == "header":
         region = {"name": "tumour", "ratio": 3.0}
@@ -200,7 +200,7 @@ def test_points_on_a_few_millimetres_were_not_tried(locator, sunk):
     """On all of the open cortex they were, and on a tenth of it, named or not."""
     body = locator.anatomy
     for cover, known in ((0.12, True), (0.9, True), (0.01, False)):
-        evidence = seen_patch(body, sunk, np.random.default_rng(3), 60, cover)
+        evidence = sample_seen_patch(body, sunk, np.random.default_rng(3), 60, cover)
         rest = evidence.at[::3]
         now = rest + evidence.value.reshape(-1, 3)
         for seen in (Observation(now, rest), Observation(now)):

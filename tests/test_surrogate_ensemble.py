@@ -8,10 +8,10 @@ from locators import locator_of
 
 from sim import fem
 from sim.anatomy import BRAIN_LABEL, PART_LABELS
-from surrogate.locating.causes import OEDEMA, SWELLING, Causes, groups, swellings
-from surrogate.locating.ensemble import ACCURACY, members, round_tumour
-from surrogate.locating.observation import Observation, placed
-from surrogate.locating.posterior import conditioned
+from surrogate.locating.causes import OEDEMA, SWELLING, Causes, build_groups, build_swellings
+from surrogate.locating.ensemble import ACCURACY, round_tumour, solve_members
+from surrogate.locating.observation import Observation, to_evidence
+from surrogate.locating.posterior import condition_prior
 
 FEW = Causes(
     poisson=(0.45,), tools=(1, 1), drainages=1, levels=(0.5,), swellings=(0.02,), tumour_swellings=(0.1,),
@@ -35,7 +35,7 @@ def test_brain_within_reach_of_the_tumour_swells_and_oedema_that_is_marked(body)
 
 
 def test_oedema_reaches_near_and_far_in_each_skull(body):
-    made = groups(body, 0, replace(FEW, poisson=(0.45, 0.47, 0.49)))
+    made = build_groups(body, 0, replace(FEW, poisson=(0.45, 0.47, 0.49)))
     for skull, count in (("bonded", 6), ("contact", 2)):
         reach = np.concatenate([group.reach for group in made if group.skull == skull])
         share = np.log(reach / FEW.reach[0]) / np.log(FEW.reach[1] / FEW.reach[0])
@@ -43,7 +43,7 @@ def test_oedema_reaches_near_and_far_in_each_skull(body):
 
 
 def test_oedema_is_solved_and_bulges_over_the_tumour_more_than_a_brain_that_swells(body):
-    motion, kind = members(body, groups(body, 0, FEW)[0], 0, "cpu", FEW)
+    motion, kind = solve_members(body, build_groups(body, 0, FEW)[0], 0, "cpu", FEW)
     assert (kind == OEDEMA).sum() == len(FEW.oedema) * FEW.reaches[0]
     size = np.linalg.norm(motion[:, np.unique(body.open_surface)], axis=2)
     bulge = size.max(axis=1) / np.sqrt((size**2).mean(axis=1))
@@ -52,12 +52,14 @@ def test_oedema_is_solved_and_bulges_over_the_tumour_more_than_a_brain_that_swel
 
 def test_members_of_one_group_share_one_factor(body, monkeypatch):
     """Only changes of volume differ; results agree with those of factors of their own within the tolerance."""
-    group, made, choose = groups(body, 0, FEW)[0], [], fem.choose_preconditioner
+    group, made, choose = build_groups(body, 0, FEW)[0], [], fem.choose_preconditioner
     monkeypatch.setattr(fem, "choose_preconditioner", lambda *given: made.append(given) or choose(*given))
-    motion, kind = members(body, group, 0, "cpu", FEW)
+    motion, kind = solve_members(body, group, 0, "cpu", FEW)
     assert len(made) == 1
     marked, labels = round_tumour(body, group.reach[0])
-    apart = fem.Fem(marked, group.effects(FEW.oedema, labels), ACCURACY, "cpu").deform(swellings(marked, FEW.oedema))
+    apart = fem.Fem(marked, group.effects(FEW.oedema, labels), ACCURACY, "cpu").deform(
+        build_swellings(marked, FEW.oedema)
+    )
     largest = np.abs(apart.displacement).max()
     assert motion[kind == OEDEMA][: len(apart)] == pytest.approx(apart.displacement, abs=1e-2 * largest)
 
@@ -70,7 +72,7 @@ def test_a_cloud_is_not_taken_for_oedema(body):
     nodes = np.unique(body.open_surface)
     rest = body.mesh.nodes[nodes]
     for known, believed in ((rest, True), (None, False)):
-        found = conditioned(prior, placed(body, Observation(rest + moved[nodes], known)))
+        found = condition_prior(prior, to_evidence(body, Observation(rest + moved[nodes], known)))
         rows = np.concatenate([answer.rows for answer in found.answers])
         kinds = prior.kind[rows[rows < len(prior.kind)]]
         assert (OEDEMA in kinds) == believed

@@ -12,20 +12,20 @@ from sim.effects import NodalForce, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed
-from sim.material import Material, tissue_to_json
-from sim.runtime.journal import opened
+from sim.material import Material, to_tissue_json
+from sim.runtime.journal import open_journal
 from surrogate.array_functions import Rounded
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
-from surrogate.data.encode import ENCODERS, directions, tool_features
+from surrogate.data.encode import ENCODERS, compute_tool_features, split_forces
 from surrogate.data.simulate import simulate
 from surrogate.data.splits import DiscSplit
 from surrogate.model.store import load, save
 from surrogate.regressors.force_series import ORDERS, SPANS, Series
 from surrogate.training.examples import Examples
 from surrogate.training.expansion import ADDED, COARSE, EXPANDED, Expansion
-from surrogate.training.fem_tables import tabulated, with_middles
-from surrogate.training.train import learners_for, train
+from surrogate.training.fem_tables import add_edge_midpoints, tabulate
+from surrogate.training.train import list_learners, train
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 
@@ -53,9 +53,9 @@ def test_the_table_is_the_finite_elements_series(box, patch, tmp_path):
     loads = pushes(patch, 30, 3, (7e-3, 7e-3))
     reading = every_motion(fem, nodes)
     exact = fem.series(Loads((loads,)), ORDERS, reading)
-    (triangles, places), radii = with_middles(patch), np.array([7e-3])
+    (triangles, places), radii = add_edge_midpoints(patch), np.array([7e-3])
     heard = []
-    table = tabulated(fem, places, radii, reading, lambda done, total: heard.append((done, total)))
+    table = tabulate(fem, places, radii, reading, lambda done, total: heard.append((done, total)))
     series = Series(patch.points, triangles, radii, unrounded(table))
     assert heard[-1] == (len(places), len(places))
 
@@ -65,13 +65,13 @@ def test_the_table_is_the_finite_elements_series(box, patch, tmp_path):
             raise KeyboardInterrupt
 
     step, last = heard[0][0], []
-    with pytest.raises(KeyboardInterrupt), opened(tmp_path / "rows", {}) as journal:
-        tabulated(fem, places, radii, reading, stop, journal)
-    with opened(tmp_path / "rows", {}) as journal:
-        again = tabulated(fem, places, radii, reading, lambda done, total: last.append(done), journal)
+    with pytest.raises(KeyboardInterrupt), open_journal(tmp_path / "rows", {}) as journal:
+        tabulate(fem, places, radii, reading, stop, journal)
+    with open_journal(tmp_path / "rows", {}) as journal:
+        again = tabulate(fem, places, radii, reading, lambda done, total: last.append(done), journal)
     assert np.array_equal(again, table) and last == [done for done, _ in heard[2:]]
-    size, _ = directions(loads)
-    predicted = series.predict(tool_features(patch, loads)) * size[:, None]
+    size, _ = split_forces(loads)
+    predicted = series.predict(compute_tool_features(patch, loads)) * size[:, None]
     wanted = exact.sum(axis=1)
     # The box's triangles are as long as the tool is wide.
     assert np.linalg.norm(predicted - wanted) < 0.02 * np.linalg.norm(wanted)
@@ -83,7 +83,7 @@ def simulated(path, box, count=160):
     """Pushes of one width on a box."""
     fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
     loads = Loads((pushes(open_patch(box), count, 5, (7e-3, 7e-3), 0.25),))
-    simulate(path, fem, loads, {"tissue": tissue_to_json(TISSUE), "element": "p1"})
+    simulate(path, fem, loads, {"tissue": to_tissue_json(TISSUE), "element": "p1"})
     return read_dataset(path)
 
 
@@ -113,7 +113,7 @@ def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, p
     bases = expansion.bases(Examples(loads, *(data.displacement(at)[some] for at in nodes)), ADDED, COARSE)
     fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
     places = np.array([0, 17, 60, 120, 198])
-    point = np.repeat(with_middles(patch)[1][places], 3, axis=0)
+    point = np.repeat(add_edge_midpoints(patch)[1][places], 3, axis=0)
     units = Loads((Pushed(point, np.tile(np.eye(3), (len(places), 1)), np.full(len(point), 7e-3)),))
     predicted = expansion.on(bases, np.zeros(len(expansion.places), bool))
     for at, basis, found, exact in zip(nodes, bases, predicted, expansion.exact, strict=True):
@@ -128,10 +128,10 @@ def test_two_orders_of_the_tumour_are_exact_wherever_a_tool_presses(expansion, b
     """Of loads inside the rim nothing is left of them; over it the table holds what is missing."""
     fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
     loads = pushes(expansion.patch, 40, 8, (7e-3, 7e-3))
-    inside = expansion.patch.rim_distance(loads.point) > loads.footprint
+    inside = expansion.patch.compute_edge_distance(loads.point) > loads.footprint
     assert 10 < inside.sum() < 40
     exact = fem.series(Loads((loads,)), 2, every_motion(fem, expansion.tumour))
-    size = directions(loads)[0][:, None, None]
+    size = split_forces(loads)[0][:, None, None]
     found = [size * part.response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
     for order, (motion, limit) in enumerate(zip(found, (1e-3, 3e-2), strict=True)):
         off = np.linalg.norm(motion.reshape(40, -1) - exact[:, order], axis=1) / np.linalg.norm(exact[:, order], axis=1)
@@ -211,7 +211,7 @@ def test_every_solve_is_counted(trained, data):
     """
     linear, series, learnt = (row.solves for row in trained.scores)
     loads_given, units = int(trained.split.train.sum()), len(data.unit_good)
-    outside = int((~trained.split.covers(with_middles(open_patch(data.anatomy))[1])).sum())
+    outside = int((~trained.split.covers(add_edge_midpoints(open_patch(data.anatomy))[1])).sum())
     inside = 3 * int(trained.split.covers(open_patch(data.anatomy).points).sum())
     assert (linear.loads, linear.units, linear.series, linear.inside) == (loads_given, units, 0, inside) and inside
     assert series == learnt and (series.loads, series.units, series.inside) == (loads_given, units, inside)
@@ -242,6 +242,6 @@ def test_stored_series_answer_alike(trained, data, box, tmp_path):
 
 def test_series_need_a_tissue(data):
     untold = replace(data, provenance={})
-    assert not set(EXPANDED) & set(learners_for(untold)) and set(EXPANDED) < set(learners_for(data))
+    assert not set(EXPANDED) & set(list_learners(untold)) and set(EXPANDED) < set(list_learners(data))
     with pytest.raises(InputError, match="does not state its tissue"):
         train(untold, ["series"])

@@ -15,12 +15,12 @@ from scenes.script.shipped_files import template_path
 from sim.accuracy import TRAIN
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.deformation import Outcome
-from sim.discretisation.footprint import footprint_weights
+from sim.discretisation.footprint import compute_footprint_weights
 from sim.effects import NodalForce, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Pushed, push, stacked
-from sim.material import Material, tissue_to_json
+from sim.material import Material, to_tissue_json
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
@@ -48,7 +48,7 @@ def block():
 def models(block, tmp_path_factory):
     path = tmp_path_factory.mktemp("exchange") / "data.h5"
     fem = Fem(block, (*pushed_effects(block, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
-    provenance = {"tissue": tissue_to_json(TISSUE), "element": "p1"}
+    provenance = {"tissue": to_tissue_json(TISSUE), "element": "p1"}
     simulate(path, fem, draw("palpation", block, 100, 3), provenance)
     data = read_dataset(path)
     fit = Ann.fit
@@ -86,7 +86,9 @@ def asked(session, loads, patch):
     given = {name: getattr(pushed, name).astype(np.float32) for name in ("point", "force", "footprint")}
     heard = push(given["point"], given["force"], given["footprint"])
     if "weight" in {port.name for port in session.get_inputs()}:
-        weight = footprint_weights(patch.points, patch.triangles, heard.of(Pushed).point, heard.of(Pushed).footprint)
+        weight = compute_footprint_weights(
+            patch.points, patch.triangles, heard.of(Pushed).point, heard.of(Pushed).footprint
+        )
         given["weight"] = weight.toarray().astype(np.float32)
     names = [port.name for port in session.get_outputs()]
     return dict(zip(names, session.run(names, given), strict=True)), heard
@@ -124,7 +126,7 @@ def test_runtime_answers_as_the_model(models, block, loads, name, cortex):
 
 
 def test_a_graph_is_the_formula_that_numpy_runs(models, block, loads, monkeypatch):
-    monkeypatch.setattr("surrogate.regressors.gp.matern", lambda distance: np.exp(-distance))
+    monkeypatch.setattr("surrogate.regressors.gp.compute_matern", lambda distance: np.exp(-distance))
     answer, heard = asked(opened(onnx_model("gp", models["gp"])), loads, open_patch(block))
     assert_alike(answer, models["gp"].deform(heard, at=block.tumour_nodes))
 

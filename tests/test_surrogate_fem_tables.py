@@ -14,23 +14,23 @@ from sim.effects import Elasticity, Held, NodalForce, ToolContact, pushed_effect
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Touching
-from sim.material import Material, tissue_to_json
-from surrogate.data.answer_rows import checksums, row_type
-from surrogate.data.cortex_patch import barycentric_lattice, open_patch
+from sim.material import Material, to_tissue_json
+from surrogate.data.answer_rows import compute_row_checksums, get_row_type
+from surrogate.data.cortex_patch import build_barycentric_lattice, open_patch
 from surrogate.data.dataset import read_dataset
-from surrogate.data.encode import Basis, tool_features
-from surrogate.data.indentation import indented, posed
+from surrogate.data.encode import Basis, compute_tool_features
+from surrogate.data.indentation import get_poses, to_indentation
 from surrogate.data.simulate import simulate
-from surrogate.data.tool_poses import draw_poses, poses_at, tool_of
-from surrogate.evaluation.score import errors, judged_force
+from surrogate.data.tool_poses import choose_ball, compute_poses, draw_poses
+from surrogate.evaluation.score import compare_forces, compute_point_errors
 from surrogate.model.store import load, save
-from surrogate.model.tool_contact import wrench
+from surrogate.model.tool_contact import compute_wrench
 from surrogate.regressors.rigid_contact import THICKER, RigidContact
 from surrogate.training.expansion import TOUCHED
-from surrogate.training.fem_tables import condensed, unit_responses
-from surrogate.training.train import learners_for, train
+from surrogate.training.fem_tables import compute_unit_responses, condense_exterior
+from surrogate.training.train import list_learners, train
 
-BALL = tool_of("palpation")
+BALL = choose_ball("palpation")
 SOFT = Material("linear", 3000.0, 0.45)
 # What the pretender's forces do far away: at no depth, and more by so much a radius of depth.
 LINE = (0.97, 0.3)
@@ -40,7 +40,7 @@ GRIP = (1.05, 0.5)
 
 def features(anatomy: Anatomy, loads: Loads) -> np.ndarray:
     patch = open_patch(anatomy)
-    return tool_features(patch, indented(loads, BALL, patch))
+    return compute_tool_features(patch, to_indentation(loads, BALL, patch))
 
 
 def bodily(anatomy: Anatomy, tissue: Material) -> Fem:
@@ -49,7 +49,9 @@ def bodily(anatomy: Anatomy, tissue: Material) -> Fem:
 
 @pytest.fixture(scope="module")
 def pressed(box):
-    return condensed(bodily(box, SOFT), [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)])
+    return condense_exterior(
+        bodily(box, SOFT), [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)]
+    )
 
 
 def test_the_ball_enters_no_facet_and_pulls_nothing(box, pressed):
@@ -64,7 +66,7 @@ def test_the_ball_enters_no_facet_and_pulls_nothing(box, pressed):
     moved = contact.points + (force @ contact.compliance.astype(np.float64).T).reshape(len(X), -1, 3)
     middle = X[:, :3] + (X[:, 6] - X[:, 7])[:, None] * X[:, 3:6]
     arm, force = moved - middle[:, None], force.reshape(moved.shape)
-    facets = np.einsum("qc,bsci->bsqi", barycentric_lattice(12), arm[:, contact.triangles])
+    facets = np.einsum("qc,bsci->bsqi", build_barycentric_lattice(12), arm[:, contact.triangles])
     nearest = np.linalg.norm(facets, axis=3).min(axis=(1, 2))
     assert (nearest > BALL.radius + THICKER - 2e-6).all()
     assert (nearest < BALL.radius + THICKER + 1e-4).all()
@@ -110,7 +112,7 @@ def test_bone_under_the_ball_bears_nothing(box, pressed):
 
 def test_how_stiff_tissue_is_does_not_matter(box, pressed):
     soft = pressed[0]
-    stiff = condensed(bodily(box, replace(SOFT, young=7500.0)), [box.tumour_nodes])[0]
+    stiff = condense_exterior(bodily(box, replace(SOFT, young=7500.0)), [box.tumour_nodes])[0]
     X = features(box, draw_poses("palpation", box, 10, 3))
     force, more = soft.force(X), stiff.force(X)
     np.testing.assert_allclose(2.5 * force, more, atol=1e-3 * np.abs(more).max())
@@ -124,7 +126,7 @@ def test_how_stiff_tissue_is_does_not_matter(box, pressed):
 def test_unit_responses_are_those_of_small_forces(box):
     """Against solves under nodal forces."""
     nodes, at = open_patch(box).nodes[[3, 20]], box.tumour_nodes[:9]
-    found = unit_responses(bodily(box, SOFT), nodes, at)
+    found = compute_unit_responses(bodily(box, SOFT), nodes, at)
     force = np.zeros((6, len(box.mesh.nodes), 3))
     force[np.arange(6), np.repeat(nodes, 3), np.tile(np.arange(3), 2)] = 1e-4
     truth = Fem(box, [Elasticity(SOFT), Held(), NodalForce()], REFERENCE, "cpu", element="p1").deform(
@@ -158,7 +160,7 @@ class Stiffening:
             np.zeros(count, int),
             np.zeros(count),
             loads.times,
-            wrench(force, posed(loads, BALL), BALL),
+            compute_wrench(force, get_poses(loads, BALL), BALL),
         )
         return answer if at is None else answer.at(at)
 
@@ -171,7 +173,7 @@ def elements(box, pressed):
 @pytest.fixture(scope="module")
 def data(tmp_path_factory, elements):
     path = tmp_path_factory.mktemp("touched") / "data.h5"
-    said = {"shape": repr(BALL), "tissue": tissue_to_json(SOFT), "effects": "as given", "element": "p1"}
+    said = {"shape": repr(BALL), "tissue": to_tissue_json(SOFT), "effects": "as given", "element": "p1"}
     simulate(path, elements, draw_poses("palpation", elements.anatomy, 160, 0), said)
     return read_dataset(path)
 
@@ -192,10 +194,12 @@ def test_contact_learns_how_forces_grow_and_a_process_the_rest(trained, elements
     assert scores["contact-gp"] < 0.7 * scores["contact"]
     fresh, nodes = draw_poses("palpation", box, 60, 77), box.tumour_nodes
     truth = elements.deform(fresh, at=nodes).displacement
-    error, found = errors(both, fresh, truth, nodes), both.deform(fresh, at=nodes)
+    error, found = compute_point_errors(both, fresh, truth, nodes), both.deform(fresh, at=nodes)
     assert error.mean() < 0.02 * np.linalg.norm(truth, axis=2).mean()
     assert (error.max(axis=1) <= found.bound[0]).mean() > 0.8
-    assert (errors(contact, fresh, truth, nodes).max(axis=1) <= contact.deform(fresh, at=nodes).bound[0]).mean() > 0.8
+    assert (
+        compute_point_errors(contact, fresh, truth, nodes).max(axis=1) <= contact.deform(fresh, at=nodes).bound[0]
+    ).mean() > 0.8
     cortex = open_patch(box).nodes
     exact = elements.deform(fresh, at=cortex).displacement
     assert np.linalg.norm(both.deform(fresh, at=cortex).displacement - exact) < 0.05 * np.linalg.norm(exact)
@@ -219,11 +223,13 @@ def test_the_tool_s_force_is_answered_with_a_bound_of_its_own(data, trained, ele
         off = np.linalg.norm((answer.reaction - truth)[:, 0, :3], axis=1)
         assert (off <= answer.reaction_bound[0]).mean() > 0.75  # 40 loads calibrate
         assert (answer.reaction_bound[0] < size).mean() > 0.9
-    judged = judged_force(both, fresh, truth[:, 0, :3])
+    judged = compare_forces(both, fresh, truth[:, 0, :3])
     assert judged.mean_percent == pytest.approx(100.0 * (error / size).mean())
     assert judged.held is not None and judged.held[0] == pytest.approx((error <= found.reaction_bound[0]).mean())
     assert trained.force["contact-gp"].mean_percent < trained.force["contact"].mean_percent < 9.0
-    lifted = poses_at(BALL, np.array([[0.0, 0.0, 0.1]]), np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 0.0, -1e-3]]))
+    lifted = compute_poses(
+        BALL, np.array([[0.0, 0.0, 0.1]]), np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 0.0, -1e-3]])
+    )
     assert not both.deform(Loads((lifted,))).reaction.any()
 
 
@@ -232,11 +238,11 @@ def test_without_reactions_the_force_is_not_answered(tmp_path, data, box):
     older = tmp_path / "older.h5"
     shutil.copy(data.path, older)
     with h5py.File(older, "r+") as file:
-        rows = np.empty(len(data.loads), row_type(len(box.mesh.nodes)))
+        rows = np.empty(len(data.loads), get_row_type(len(box.mesh.nodes)))
         for name in rows.dtype.names or ():
             rows[name] = file[f"answers/{name}"][:]
         del file["answers/reaction"]
-        file["answers/checksum"][:] = checksums(rows)
+        file["answers/checksum"][:] = compute_row_checksums(rows)
     read = read_dataset(older)
     assert read.reaction() is None and data.reaction() is not None
     np.testing.assert_array_equal(read.displacement(box.tumour_nodes), data.displacement(box.tumour_nodes))
@@ -261,9 +267,9 @@ def test_it_is_stored_and_answers_alone_as_in_company(tmp_path, trained, box):
 
 
 def test_what_contact_needs_is_said(data):
-    assert set(TOUCHED) < set(learners_for(data))
+    assert set(TOUCHED) < set(list_learners(data))
     untold = replace(data, provenance={"ball": repr(BALL.radius)})
-    assert not set(TOUCHED) & set(learners_for(untold))
+    assert not set(TOUCHED) & set(list_learners(untold))
     with pytest.raises(InputError, match="does not state its tissue, so series and contact are not available"):
         train(untold, ["contact"])
     pushes = replace(data, provenance={name: said for name, said in data.provenance.items() if name != "shape"})

@@ -10,12 +10,12 @@ from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
 from surrogate.fitting import fit
-from surrogate.fitting.fit import SOFT, probability_of, weighed, young_moduli
-from surrogate.fitting.frame import Frame, Tool, foot
-from surrogate.fitting.responses import POISSONS, RATIOS, drained_loads, force_loads, responses
+from surrogate.fitting.fit import SOFT, compute_probability, estimate_young_moduli, weigh_tissues
+from surrogate.fitting.frame import Frame, Tool, find_foot
+from surrogate.fitting.responses import POISSONS, RATIOS, build_drained_loads, build_force_loads, solve_responses
 from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
-from surrogate.fitting.weighing import unsupported
-from surrogate.locating.calibration import seen_patch
+from surrogate.fitting.weighing import find_unsupported
+from surrogate.locating.calibration import sample_seen_patch
 from surrogate.locating.causes import YOUNG, Group
 from surrogate.locating.observation import Observation
 
@@ -32,12 +32,12 @@ def parts(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def drained(body, parts):
-    return responses(body, drained_loads(body), "cpu", parts)
+    return solve_responses(body, build_drained_loads(body), "cpu", parts)
 
 
-def frame_of(body, motion, seed=0):
+def build_tool_frame(body, motion, seed=0):
     """What is seen of a motion (V, 3) [m] without error, on most of the open cortex."""
-    evidence = seen_patch(body, motion, np.random.default_rng(seed), 60, 0.9)
+    evidence = sample_seen_patch(body, motion, np.random.default_rng(seed), 60, 0.9)
     rest, moved = evidence.at[::3], evidence.value.reshape(-1, 3)
     return Frame(Observation(rest + moved, rest, np.full(len(rest), 5e-5), rigid=0.0))
 
@@ -49,14 +49,14 @@ def drained_frames(body, drained, skull, poisson, ratio):
         motion = np.zeros_like(body.mesh.nodes)
         motion[drained.nodes] = drained.motion[skull][poisson, ratio, number]
         motion *= 3e-3 / np.linalg.norm(motion[np.unique(body.open_surface)], axis=1).max()
-        found.append(frame_of(body, motion, number))
+        found.append(build_tool_frame(body, motion, number))
     return found
 
 
 @pytest.mark.parametrize(("skull", "poisson", "ratio"), [("bonded", 0, 0), ("slide", 2, 3), ("slide", 0, 2)])
 def test_the_tissue_that_moved_so_is_found(body, locator, drained, skull, poisson, ratio):
     frames = drained_frames(body, drained, skull, poisson, ratio)
-    tissue = FittedTissue("", 3, probability_of(weighed(locator, frames, drained, None)), np.zeros(0))
+    tissue = FittedTissue("", 3, compute_probability(weigh_tissues(locator, frames, drained, None)), np.zeros(0))
     assert tissue.skulls[skull] > 0.9
     low, middle, high = tissue.ratio
     assert low < 1.05 * RATIOS[ratio] and high > 0.95 * RATIOS[ratio]
@@ -69,51 +69,51 @@ def test_more_frames_say_more(body, locator, drained):
     frames = drained_frames(body, drained, "slide", 1, 2)
     entropy = []
     for some in (frames[:1], frames):
-        share = probability_of(weighed(locator, some, drained, None))
+        share = compute_probability(weigh_tissues(locator, some, drained, None))
         entropy.append(-(share * np.log(share + 1e-300)).sum())
     assert entropy[1] < entropy[0] - 0.1
 
 
 def test_points_that_hardly_move_leave_the_prior(body, locator, drained):
-    frame = frame_of(body, np.random.default_rng(0).normal(scale=2e-5, size=body.mesh.nodes.shape))
+    frame = build_tool_frame(body, np.random.default_rng(0).normal(scale=2e-5, size=body.mesh.nodes.shape))
     frame = replace(frame, observation=replace(frame.observation, sigma=np.full(60, 5e-3), rigid=5e-3))
-    tissue = FittedTissue("", 1, probability_of(weighed(locator, [frame], drained, None)), np.zeros(0))
+    tissue = FittedTissue("", 1, compute_probability(weigh_tissues(locator, [frame], drained, None)), np.zeros(0))
     assert "the tumour's stiffness" in tissue.not_known and "Young's modulus" in tissue.not_known
 
 
 def test_a_force_that_is_read_gives_the_modulus(body):
-    tip = foot(body, Tool(tuple(body.mesh.nodes[np.unique(body.open_surface)].mean(axis=0).tolist())))
-    loads = force_loads(body, tip[None], np.array([6e-3]), np.array([[0.0, 0.02, -0.12]]))
+    tip = find_foot(body, Tool(tuple(body.mesh.nodes[np.unique(body.open_surface)].mean(axis=0).tolist())))
+    loads = build_force_loads(body, tip[None], np.array([6e-3]), np.array([[0.0, 0.02, -0.12]]))
     motion = Fem(body, Group(1, "slide", 0.47, 1.0, 14.0).effects((0.01,)), device="cpu").deform(loads).displacement[0]
     tool = Tool(tuple(tip.tolist()), 6e-3, force=2.0 * float(np.hypot(0.02, 0.12)), sigma=0.005)
-    frame = replace(frame_of(body, motion), tools=(tool,))
-    pressed = responses(body, force_loads(body, tip[None], np.array([6e-3])), "cpu")
+    frame = replace(build_tool_frame(body, motion), tools=(tool,))
+    pressed = solve_responses(body, build_force_loads(body, tip[None], np.array([6e-3])), "cpu")
     share = np.zeros((len(SKULLS), len(FINE_POISSONS), len(FINE_RATIOS)))
     share[list(SKULLS).index("slide"), 6, 14] = 1.0
-    young = young_moduli(body, [frame], FittedTissue("", 1, share, np.zeros(0)), pressed, "cpu")
+    young = estimate_young_moduli(body, [frame], FittedTissue("", 1, share, np.zeros(0)), pressed, "cpu")
     low, middle, high = np.quantile(young, [0.025, 0.5, 0.975])
     assert low < 2.0 * YOUNG < high and middle == pytest.approx(2.0 * YOUNG / SOFT, rel=0.1)  # here on one mesh
     silent = [replace(frame, tools=(replace(tool, force=None, sigma=None),))]
-    assert not len(young_moduli(body, silent, FittedTissue("", 1, share, np.zeros(0)), pressed, "cpu"))
+    assert not len(estimate_young_moduli(body, silent, FittedTissue("", 1, share, np.zeros(0)), pressed, "cpu"))
 
 
 def test_solved_tissues_are_read_again(body, parts, drained, monkeypatch):
     monkeypatch.setattr("surrogate.fitting.responses.Fem", None)
-    again = responses(body, drained_loads(body), "cpu", parts)
+    again = solve_responses(body, build_drained_loads(body), "cpu", parts)
     assert all(np.array_equal(again.motion[name], drained.motion[name]) for name in ("bonded", "slide"))
 
 
 def test_points_that_no_other_supports_are_left_out(body, locator, monkeypatch):
     """They are those that `locate` leaves out, and nothing is fitted to them; more than a third is refused."""
-    clean = frame_of(body, dent(body, np.random.default_rng(1)))
+    clean = build_tool_frame(body, dent(body, np.random.default_rng(1)))
     clean = replace(clean, observation=replace(clean.observation, sigma=np.full(60, 3e-4)))
     wild = np.where(np.isin(np.arange(60), (5, 17))[:, None], [0.0, 0.01, -0.012], 0.0)
     frames = [clean, replace(clean, observation=replace(clean.observation, now=clean.observation.now + wild))]
-    left_out = unsupported(locator, frames)
+    left_out = find_unsupported(locator, frames)
     assert [each.tolist() for each in left_out] == [[], [5, 17]]
     fitted_to = []
-    monkeypatch.setattr(fit, "responses", lambda *_: None)
-    monkeypatch.setattr(fit, "fitted", lambda locator, frames, *_: fitted_to.extend(frames))
+    monkeypatch.setattr(fit, "solve_responses", lambda *_: None)
+    monkeypatch.setattr(fit, "fit_from_evidence", lambda locator, frames, *_: fitted_to.extend(frames))
     fit.fit_tissue(locator, frames)
     assert fitted_to[0] is clean and np.array_equal(
         fitted_to[1].observation.rest, np.delete(clean.observation.rest, (5, 17), axis=0)
@@ -121,4 +121,4 @@ def test_points_that_no_other_supports_are_left_out(body, locator, monkeypatch):
     assert len(fitted_to[1].observation.now) == len(fitted_to[1].observation.sigma) == 58
     torn = replace(clean.observation, now=clean.observation.now + np.where(np.arange(60)[:, None] % 2, 0.012, 0.0))
     with pytest.raises(InputError, match=r"frame 2: .* of 60 points"):
-        unsupported(locator, [clean, replace(clean, observation=torn)])
+        find_unsupported(locator, [clean, replace(clean, observation=torn)])

@@ -6,14 +6,14 @@ from test_surrogate_expansion import pushes, unrounded
 
 from sim.errors import InputError
 from sim.loads import Pushed
-from surrogate.data.encode import directions, tool_features
-from surrogate.regressors.force_series import Series, filled, forms
-from surrogate.training.fem_tables import radii_between, with_middles
+from surrogate.data.encode import compute_tool_features, split_forces
+from surrogate.regressors.force_series import Series, compute_forms, fill_table
+from surrogate.training.fem_tables import add_edge_midpoints, choose_radii
 
 
 def test_fields_of_second_degree_are_met_between_the_places(patch):
-    triangles, places = with_middles(patch)
-    radii = radii_between(5e-3, 8e-3)
+    triangles, places = add_edge_midpoints(patch)
+    radii = choose_radii(5e-3, 8e-3)
     random = np.random.default_rng(1)
     shape = random.normal(size=(3, 3))
 
@@ -25,19 +25,19 @@ def test_fields_of_second_degree_are_met_between_the_places(patch):
     table[:, :, 18, 1] = 1.0  # the form d_z^3
     series = Series(patch.points, triangles, radii, unrounded(table))
     loads = pushes(patch, 200, 2, (5e-3, 8e-3))
-    size, direction = directions(loads)
-    predicted = series.predict(tool_features(patch, loads))
+    size, direction = split_forces(loads)
+    predicted = series.predict(compute_tool_features(patch, loads))
     wanted = direction[:, 0] * (field(loads.point) + np.log(loads.footprint / 5e-3) ** 2)
     assert np.allclose(predicted[:, 0], wanted, atol=1e-4 * np.abs(wanted).max())
     assert np.allclose(predicted[:, 1], size**2 * direction[:, 2] ** 3, atol=1e-6)
-    alone = np.concatenate([series.predict(tool_features(patch, _row(loads, k))) for k in range(5)])
+    alone = np.concatenate([series.predict(compute_tool_features(patch, _row(loads, k))) for k in range(5)])
     assert np.allclose(alone, predicted[:5], rtol=1e-5, atol=1e-7)
 
 
 def test_of_no_loads_there_are_no_responses(patch):
-    (triangles, places), radii = with_middles(patch), radii_between(5e-3, 8e-3)
+    (triangles, places), radii = add_edge_midpoints(patch), choose_radii(5e-3, 8e-3)
     series = Series(patch.points, triangles, radii, unrounded(np.ones((len(places), len(radii), 19, 2))))
-    none = tool_features(patch, Pushed(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))
+    none = compute_tool_features(patch, Pushed(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))
     assert series.predict(none).shape == (0, 2)
 
 
@@ -48,8 +48,8 @@ def _row(loads, k):
 def test_forms_are_those_of_their_degree():
     random = np.random.default_rng(0)
     direction = random.normal(size=(40, 3))
-    values = forms(direction, np.ones(40))
-    assert np.allclose(forms(2.0 * direction, np.ones(40)), values * np.repeat([2.0, 4.0, 8.0], [3, 6, 10]))
+    values = compute_forms(direction, np.ones(40))
+    assert np.allclose(compute_forms(2.0 * direction, np.ones(40)), values * np.repeat([2.0, 4.0, 8.0], [3, 6, 10]))
     for columns, degree in ((slice(0, 3), 1), (slice(3, 9), 2), (slice(9, 19), 3)):
         wanted = (direction @ random.normal(size=3)) ** degree
         found = np.linalg.lstsq(values[:, columns], wanted, rcond=None)[0]
@@ -58,11 +58,11 @@ def test_forms_are_those_of_their_degree():
 
 def test_what_is_left_out_is_interpolated(patch):
     """Fields that are linear in the place are met, on a flat cortex too; what is left out has no say."""
-    places = with_middles(patch)[1]
+    places = add_edge_midpoints(patch)[1]
     left_out = np.linalg.norm(places[:, :2] - [5e-3, 0.0], axis=1) < 6e-3
     wanted = (places @ np.random.default_rng(0).normal(size=(3, 4)) + 2.0).reshape(-1, 2, 2)
     wild = np.where(left_out[:, None, None], 1e9, wanted)
     assert 0 < left_out.sum() < len(places)
-    np.testing.assert_allclose(filled(places, wild, left_out), wanted, rtol=1e-9)
+    np.testing.assert_allclose(fill_table(places, wild, left_out), wanted, rtol=1e-9)
     with pytest.raises(InputError, match="hold all places"):
-        filled(places, wild, np.ones(len(places), bool))
+        fill_table(places, wild, np.ones(len(places), bool))

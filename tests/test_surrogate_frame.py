@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_surrogate_fit import frame_of
+from test_surrogate_fit import build_tool_frame
 
 from sim.errors import InputError
 from surrogate.fitting.frame import Tool, check_frames, read_tools
@@ -12,7 +12,7 @@ from surrogate.fitting.frame import Tool, check_frames, read_tools
 
 def test_bad_frames_are_refused(body):
     motion = np.zeros_like(body.mesh.nodes) + [0.0, 0.0, 1e-3]
-    good = frame_of(body, motion)
+    good = build_tool_frame(body, motion)
     tip = tuple((np.array(good.observation.rest)[0]).tolist())
     cases = {
         "no frame": [],

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from test_surrogate_protocol import RANDOM, rows
 
-from surrogate.regressors.gp import Gp, matern, negative_likelihood
+from surrogate.regressors.gp import Gp, compute_matern, compute_negative_likelihood
 
 
 def test_likelihood_is_that_of_an_independent_process():
@@ -14,18 +14,21 @@ def test_likelihood_is_that_of_an_independent_process():
     x, y = RANDOM.normal(size=(40, 3)), RANDOM.normal(size=(40, 1))
     for log in (np.log([1.0, 2.0, 0.5, 0.1]), np.log([3.0, 0.7, 1.5, 0.01])):
         u = x / np.exp(log[:3])
-        covariance = matern(np.linalg.norm(u[:, None] - u, axis=2)) + np.exp(log[3]) * np.eye(40)
+        covariance = compute_matern(np.linalg.norm(u[:, None] - u, axis=2)) + np.exp(log[3]) * np.eye(40)
         variance = (y.T @ np.linalg.solve(covariance, y)).item() / 40
         kernel = ConstantKernel(variance) * (Matern(np.exp(log[:3]), nu=2.5) + WhiteKernel(np.exp(log[3])))
         theirs = GaussianProcessRegressor(kernel, optimizer=None).fit(x, y).log_marginal_likelihood_value_
-        assert np.isclose(negative_likelihood(log, x, y)[0], -theirs - 20.0 * (1.0 + np.log(2.0 * np.pi)))
+        assert np.isclose(compute_negative_likelihood(log, x, y)[0], -theirs - 20.0 * (1.0 + np.log(2.0 * np.pi)))
 
 
 def test_likelihood_has_its_gradient():
     x, y, log = RANDOM.normal(size=(30, 3)), RANDOM.normal(size=(30, 4)), np.log([1.0, 2.0, 0.5, 0.1])
     steps = 1e-5 * np.eye(4)
-    slope = [(negative_likelihood(log + h, x, y)[0] - negative_likelihood(log - h, x, y)[0]) / 2e-5 for h in steps]
-    assert np.allclose(negative_likelihood(log, x, y)[1], slope, rtol=1e-6)
+    slope = [
+        (compute_negative_likelihood(log + h, x, y)[0] - compute_negative_likelihood(log - h, x, y)[0]) / 2e-5
+        for h in steps
+    ]
+    assert np.allclose(compute_negative_likelihood(log, x, y)[1], slope, rtol=1e-6)
 
 
 def test_the_process_finds_the_features_that_matter():
@@ -38,7 +41,7 @@ def test_the_process_finds_the_features_that_matter():
 def test_the_process_knows_how_wrong_it_is():
     """On functions drawn from the kernel itself, errors have the deviation that is stated."""
     x = np.random.default_rng(8).uniform(-1.0, 1.0, (300, 2))
-    covariance = matern(cdist(x / [0.8, 1.5], x / [0.8, 1.5])) + 1e-6 * np.eye(300)
+    covariance = compute_matern(cdist(x / [0.8, 1.5], x / [0.8, 1.5])) + 1e-6 * np.eye(300)
     y = 5.0 * np.linalg.cholesky(covariance) @ np.random.default_rng(9).normal(size=(300, 60))
     model = Gp().fit(x[:150], y[:150])
     stated = 5.0 * model.deviation(x[150:])

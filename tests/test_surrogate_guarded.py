@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from theatres import player, small
 
-from scenes.options.theatre_options import add_theatre, theatre_asked
+from scenes.options.theatre_options import add_theatre, build_requested_theatre
 from scenes.page.cast import ALL, SceneSolvers
 from scenes.play.deformers import GUARDED, AtRest
 from scenes.script.tool_paths import Touch
 from sim.deformation import Outcome
 from sim.errors import InputError
 from surrogate.data.tool_loads import draw
-from surrogate.model.guarded import answering, judged
-from surrogate.model.left_out import LIMIT, LeftOut, left_out_of
+from surrogate.model.guarded import describe_error, find_first_model
+from surrogate.model.left_out import LIMIT, LeftOut, measure_held_out
 from surrogate.model.store import load, save
 
 
@@ -99,7 +99,7 @@ def test_a_frame_says_who_answered(theatre, limit):
     play = player(theatre, small(), GUARDED)
     play = replace(play, deformer=replace(play.deformer, limit=limit))
     frame = play.draw(0, 0.0, Touch(force=0.1))
-    by_model = answering(play.deformer, frame.deformation) is not None
+    by_model = find_first_model(play.deformer, frame.deformation) is not None
     assert by_model == (limit == 1.0) == (frame.model_error is not None) == (frame.distance_error is not None)
     assert ("finite elements themselves" in " ".join(frame.head) or "FEM itself" in " ".join(frame.head)) != by_model
     moved = player(theatre, small(), "fem" if not by_model else theatre.best(small())).draw(0, 0.0, Touch(force=0.1))
@@ -123,11 +123,11 @@ def test_the_limit_is_the_user_s(theatre):
     parser = argparse.ArgumentParser()
     add_theatre(parser)
     asked = parser.parse_args(["--guard-mm", "0.05", "--device", "cpu"])
-    assert theatre_asked(asked).limit == pytest.approx(5e-5)
-    assert theatre_asked(parser.parse_args(["--device", "cpu"])).limit is None
+    assert build_requested_theatre(asked).limit == pytest.approx(5e-5)
+    assert build_requested_theatre(parser.parse_args(["--device", "cpu"])).limit is None
     for words in ("0", "-1", "nan"):
         with pytest.raises(InputError, match="give a positive number of millimetres"):
-            theatre_asked(parser.parse_args(["--guard-mm", words, "--device", "cpu"]))
+            build_requested_theatre(parser.parse_args(["--guard-mm", words, "--device", "cpu"]))
 
 
 def test_it_is_named_where_a_model_knows_the_scene_and_says_what_it_is(theatre):
@@ -138,24 +138,28 @@ def test_it_is_named_where_a_model_knows_the_scene_and_says_what_it_is(theatre):
 
 def test_errors_on_left_out_cortex_count_what_finite_elements_answer_as_exact():
     distance = 1e-3 * np.array([[0.1, 0.3], [0.02, 0.02], [0.4, 0.4]])
-    stated = left_out_of(distance, np.full(3, 10e-3), 1e-3 * np.array([0.5, 0.1, 0.1]), np.array([False, False, True]))
+    stated = measure_held_out(
+        distance, np.full(3, 10e-3), 1e-3 * np.array([0.5, 0.1, 0.1]), np.array([False, False, True])
+    )
     assert stated.mean == pytest.approx((0.02 + 0.002 + 0.04) / 3) and stated.guarded == pytest.approx(0.002 / 3)
     assert stated.solved == pytest.approx(2 / 3) and stated.p999 is None and not stated.enough
     assert "2.07 % of the motion alone; with FEM for" in str(stated)
-    many = left_out_of(np.full((1000, 2), 0.3e-3), np.full(1000, 1.0), np.full(1000, 0.1e-3), np.zeros(1000, bool))
+    many = measure_held_out(np.full((1000, 2), 0.3e-3), np.full(1000, 1.0), np.full(1000, 0.1e-3), np.zeros(1000, bool))
     assert many.p999 == pytest.approx(0.3e-3) and many.mean < 0.01 and not many.enough
-    assert left_out_of(distance[1:2], np.full(1, 10e-3), np.full(1, np.nan), np.zeros(1, bool)).solved == 1.0
+    assert measure_held_out(distance[1:2], np.full(1, 10e-3), np.full(1, np.nan), np.zeros(1, bool)).solved == 1.0
 
 
 def test_finite_elements_answer_as_much_as_a_model_s_errors_on_left_out_cortex_ask_for(theatre):
     """The widest limit that leaves 1 % of the motion, and 0.2 mm at 99.9 % of the vertices; at none all are solved."""
     bound, inside = 1e-3 * np.array([0.15, 0.08, 0.03, 0.005]), np.zeros(4, bool)
     distance = 1e-3 * np.array([[0.30], [0.06], [0.02], [0.004]])
-    wide, middle, none = (left_out_of(distance, np.full(4, size), bound, inside) for size in (1e-2, 1e-3, 5e-5))
+    wide, middle, none = (measure_held_out(distance, np.full(4, size), bound, inside) for size in (1e-2, 1e-3, 5e-5))
     assert (wide.limit, wide.solved) == (LIMIT, 0.0) and wide.guarded == pytest.approx(wide.mean)
     assert (middle.limit, middle.solved) == (0.05e-3, 0.5) and middle.guarded == pytest.approx(0.024 / 4)
     assert (none.limit, none.solved, none.guarded) == (0.0, 1.0, 0.0) and "above 0 mm) 0.00 %" in str(none)
-    many = left_out_of(np.full((1000, 1), 0.3e-3), np.full(1000, 1.0), np.full(1000, 0.15e-3), np.zeros(1000, bool))
+    many = measure_held_out(
+        np.full((1000, 1), 0.3e-3), np.full(1000, 1.0), np.full(1000, 0.15e-3), np.zeros(1000, bool)
+    )
     assert (many.limit, many.solved) == (0.1e-3, 1.0)
     (_, model), *_ = theatre.models.items()
     some = replace(theatre, models={"series-gp": replace(model, left_out=middle)})
@@ -178,7 +182,7 @@ def test_whoever_asks_for_nobody_gets_a_model_alone_only_where_it_may_be(theatre
     stated = None if mean is None else LeftOut(mean, 0.001, None, 0.3)
     some = replace(theatre, models={"series-gp": replace(model, bound=bound, left_out=stated)})
     assert some.usual(small()) == who and some.best(small()) == "series-gp"
-    said = judged(some.models["series-gp"])
+    said = describe_error(some.models["series-gp"])
     assert said.endswith(": scenes play it guarded" if who == GUARDED else ": it may answer alone")
 
 

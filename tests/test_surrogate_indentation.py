@@ -7,9 +7,9 @@ from test_surrogate_tool_poses import BALL
 
 from sim.loads import Loads, Pushed, Touching
 from surrogate.data.cortex_patch import Patch, open_patch
-from surrogate.data.indentation import indented
+from surrogate.data.indentation import to_indentation
 from surrogate.data.tool_loads import draw
-from surrogate.data.tool_poses import draw_poses, poses_at
+from surrogate.data.tool_poses import compute_poses, draw_poses
 
 
 def domed(points: np.ndarray) -> np.ndarray:
@@ -29,7 +29,7 @@ def test_a_pose_is_where_the_ball_is_deepest(box):
     patch = open_patch(box)
     bumpy = replace(patch, points=domed(patch.points))
     loads = draw_poses("palpation", box, 60, 3)
-    pushed = indented(loads, BALL, bumpy)
+    pushed = to_indentation(loads, BALL, bumpy)
     cause = loads.of(Touching)
     assert cause is not None
     pose = cause.pose[:, 0]
@@ -58,22 +58,22 @@ def test_how_a_ball_came_there_is_nothing(box):
     patch = open_patch(box)
     forces = draw("palpation", box, 40, 0).of(Pushed)
     assert forces is not None
-    normal = patch.normal_near(forces.point)
+    normal = patch.find_normals(forces.point)
     motion = 3e-3 * unit(forces.force)
     straight = np.einsum("bi,bi->b", motion, normal)[:, None] * normal
-    found = indented(Loads((poses_at(BALL, forces.point, normal, motion),)), BALL, patch)
+    found = to_indentation(Loads((compute_poses(BALL, forces.point, normal, motion),)), BALL, patch)
     np.testing.assert_allclose(found.point, forces.point + motion - straight, atol=1e-9)
     np.testing.assert_allclose(found.force, straight, atol=1e-9)
-    sunk = indented(Loads((poses_at(BALL, forces.point, normal, BALL.radius * normal),)), BALL, patch)
+    sunk = to_indentation(Loads((compute_poses(BALL, forces.point, normal, BALL.radius * normal),)), BALL, patch)
     np.testing.assert_allclose(sunk.force, BALL.radius * normal, atol=1e-9)
 
 
 def test_a_ball_in_the_air_or_beside_the_cortex_has_no_depth(box):
     patch = open_patch(box)
     point = patch.points[[3, 3]] + [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
-    away = poses_at(BALL, point, np.array([[0.0, 0.0, -1.0]] * 2), np.array([[0.0, 0.0, -1e-3]] * 2))
+    away = compute_poses(BALL, point, np.array([[0.0, 0.0, -1.0]] * 2), np.array([[0.0, 0.0, -1e-3]] * 2))
     away.pose[0, 0, 2, 3] += 2e-3
-    found = indented(Loads((away,)), BALL, patch)
+    found = to_indentation(Loads((away,)), BALL, patch)
     assert not found.force.any()
     assert np.isfinite(found.point).all()
 
@@ -81,5 +81,5 @@ def test_a_ball_in_the_air_or_beside_the_cortex_has_no_depth(box):
 def test_a_ball_half_in_the_tissue_presses_inward(box):
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, -BALL.radius]  # its middle is on the box's top
-    pushed = indented(Loads((Touching(pose[None, None]),)), BALL, open_patch(box))
+    pushed = to_indentation(Loads((Touching(pose[None, None]),)), BALL, open_patch(box))
     np.testing.assert_allclose(pushed.force[0], [0.0, 0.0, -BALL.radius], atol=1e-9)

@@ -3,15 +3,18 @@
 from types import SimpleNamespace
 
 from surrogate.model import kept_arrays
-from surrogate.model.kept_arrays import kept_path
+from surrogate.model.kept_arrays import find_kept_path
 
 
 def test_kept_path_states_version_device_and_the_rest(tmp_path, monkeypatch):
-    first = kept_path(tmp_path, "a-", "cpu", "digest", "smoothed")
-    assert first == kept_path(tmp_path, "a-", "cpu", "digest", "smoothed") and kept_path(None, "a-", "cpu") is None
-    others = [kept_path(tmp_path, "a-", "cpu", "digest", "p2")]
-    monkeypatch.setattr(kept_arrays, "version_of", lambda name: "9.9")
-    others.append(kept_path(tmp_path, "a-", "cpu", "digest", "smoothed"))
+    first = find_kept_path(tmp_path, "a-", "cpu", "digest", "smoothed")
+    assert (
+        first == find_kept_path(tmp_path, "a-", "cpu", "digest", "smoothed")
+        and find_kept_path(None, "a-", "cpu") is None
+    )
+    others = [find_kept_path(tmp_path, "a-", "cpu", "digest", "p2")]
+    monkeypatch.setattr(kept_arrays, "get_version", lambda name: "9.9")
+    others.append(find_kept_path(tmp_path, "a-", "cpu", "digest", "smoothed"))
     monkeypatch.setattr(kept_arrays, "find_device", lambda name, precision: SimpleNamespace(on_cuda=True))
-    others.append(kept_path(tmp_path, "a-", "cuda", "digest", "smoothed"))
+    others.append(find_kept_path(tmp_path, "a-", "cuda", "digest", "smoothed"))
     assert len({first, *others}) == 4

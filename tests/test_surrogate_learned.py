@@ -19,12 +19,12 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.splits import APART
 from surrogate.data.tool_loads import draw
-from surrogate.evaluation.coverage import coverage, covered, held_by
-from surrogate.evaluation.score import errors
+from surrogate.evaluation.coverage import coverage, measure_covered, measure_held
+from surrogate.evaluation.score import compute_point_errors
 from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
-from surrogate.training.bounds import TUMOUR, bound_by, growth_by, missed
+from surrogate.training.bounds import TUMOUR, bound_by, collect_missed, compute_growth
 from surrogate.training.expansion import EXPANDED
 from surrogate.training.train import LEARNERS, train
 
@@ -134,7 +134,7 @@ def test_what_is_used_was_trained_on_the_discs_too(trained, scored, data):
     truth = data.displacement(data.anatomy.tumour_nodes)[data.good][trained.split.test]
     for name in ("ann", "svr", "gp", "residual"):
         both = (trained.models[name], scored.models[name])
-        used, judged = (errors(model, held_out, truth, data.anatomy.tumour_nodes) for model in both)
+        used, judged = (compute_point_errors(model, held_out, truth, data.anatomy.tumour_nodes) for model in both)
         assert used.mean() < 0.9 * judged.mean()
     assert trained.calibrated == data.good.sum() // APART and scored.calibrated == 0
     assert [row.mean_mm for row in trained.scores] == [row.mean_mm for row in scored.scores]
@@ -170,12 +170,12 @@ def test_how_bounds_hold_in_the_discs_left_out_is_reported_of_a_model_that_knows
             loads = good.rows(rows)
             answer = model.deform(loads, at=data.anatomy.tumour_nodes).displacement
             error = np.linalg.norm(answer - truth[rows], axis=2).max(axis=1)
-            return missed(model, open_patch(data.anatomy), loads.of(Pushed), error)
+            return collect_missed(model, open_patch(data.anatomy), loads.of(Pushed), error)
 
         near, held, alone, stated = seen(beside), [], [], trained.models[name].left_out
         for disc in range(len(split.centres)):
             here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
-            bounds = bound_by(near, TUMOUR, growth_by(near, seen(others), TUMOUR))
+            bounds = bound_by(near, TUMOUR, compute_growth(near, seen(others), TUMOUR))
             bounded, asked = replace(model, bounds=bounds), good.rows(here)
             answer = bounded.deform(asked, at=data.anatomy.tumour_nodes)
             held.append(seen(here).error <= answer.bound)
@@ -242,10 +242,10 @@ def test_a_judge_counts_each_level_by_its_own_bound(trained, fresh, box):
     assert found.extrapolated == answer.outcome.count(Outcome.EXTRAPOLATED) and found.loads == len(fresh)
     weakest = np.argsort(np.linalg.norm(fresh.of(Pushed).force, axis=1))
     assert found.tenths == tuple((weakest[k : k + 6] % 4 == 0).mean() for k in range(0, 60, 6))
-    some = covered(np.ones(20), np.full(20, 3e-3), np.array([np.full(20, 4e-3), np.full(20, np.inf)]), 0)
+    some = measure_covered(np.ones(20), np.full(20, 3e-3), np.array([np.full(20, 4e-3), np.full(20, np.inf)]), 0)
     assert some.held == (1.0, None) and "100.0 % at 95 %, nothing is promised at 99 %;" in str(some)
     half = np.where(np.arange(20) < 10, 2e-3, np.inf)  # what promises nothing does not hold, either
-    assert held_by(np.full(20, 3e-3), half[None]) == (0.0,)
+    assert measure_held(np.full(20, 3e-3), half[None]) == (0.0,)
 
 
 def test_the_model_alone_in_numpy_answers_as_the_deformer_does(model, box, fresh):

@@ -5,11 +5,11 @@ from functools import partial
 import numpy as np
 
 from surrogate.regressors.baselines import Svr
-from surrogate.training.learners import SVR, Tuned, inner_discs
+from surrogate.training.learners import SVR, Tuned, find_inner_discs
 
 
 def nearby(count, seed):
-    """Rows of `tool_features`, and outputs that bend: the published tube is as wide as what it leaves."""
+    """Rows of `compute_tool_features`, and outputs that bend: the published tube is as wide as what it leaves."""
     X = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 8)) * 1e-2
     bend = 1e2 * X @ np.random.default_rng(1).normal(size=(8, 3))
     return X, np.sin(0.7 * bend) * [1.0, 0.3, 0.1]
@@ -26,7 +26,7 @@ def test_tuned_settings_halve_the_error_of_the_published_ones():
 def test_settings_are_chosen_on_discs_that_the_inner_fits_are_not_trained_on():
     """One fit for each of the settings without the discs, and one of the best to all."""
     X, Y = nearby(100, 0)
-    seen, left_out = [], inner_discs(X[:, :3])
+    seen, left_out = [], find_inner_discs(X[:, :3])
     assert 0.15 < left_out.mean() < 0.25
 
     class Off:

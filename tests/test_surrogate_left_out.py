@@ -48,7 +48,7 @@ def test_unit_responses_inside_the_discs_are_given_and_counted(trained, data, bo
     assert inside and trained.scores[0].solves.inside == 3 * inside
     model = train(data, ["linear"], split=trained.split).models["linear"]
     patch = open_patch(box)
-    unit = data.unit_response(box.tumour_nodes).reshape(len(patch.points), 3, -1, 3)
+    unit = data.compute_unit_response(box.tumour_nodes).reshape(len(patch.points), 3, -1, 3)
     for node in np.flatnonzero(trained.split.covers(patch.points))[:3]:
         force = np.zeros(3 * len(patch.points))
         force[3 * node + 2] = 1.0

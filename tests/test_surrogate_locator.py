@@ -7,12 +7,12 @@ import pytest
 
 from sim.errors import InputError
 from surrogate.locating import ensemble as ensembles
-from surrogate.locating.causes import KINDS, Causes, groups
-from surrogate.locating.ensemble import members, solved, surface_size
+from surrogate.locating.causes import KINDS, Causes, build_groups
+from surrogate.locating.ensemble import compute_surface_motion, solve_groups, solve_members
 from surrogate.locating.locator import Locator
 from surrogate.locating.locator_store import load_locator, make_locator, save_locator
-from surrogate.locating.observation import Observation, placed
-from surrogate.locating.prior import NOWHERE, PLACES, middle_of
+from surrogate.locating.observation import Observation, to_evidence
+from surrogate.locating.prior import NOWHERE, PLACES, compute_middle
 
 FEW = Causes(
     poisson=(0.45, 0.485), tools=(8, 3), drainages=3, levels=(0.6, 0.3), swellings=(0.04, 0.02, -0.02),
@@ -33,16 +33,16 @@ def locator(body, parts):
 @pytest.fixture(scope="module")
 def ensemble(body, parts, locator):
     """That which the locator was made of, read from where it was kept."""
-    return solved(body, causes=FEW, device="cpu", folder=parts)
+    return solve_groups(body, causes=FEW, device="cpu", folder=parts)
 
 
 @pytest.fixture(scope="module")
 def truth(body):
     """Motions of another tissue and of other loads than the ensemble's, of each skull, 3 mm at the surface."""
     found = []
-    for group in groups(body, seed=7, causes=FEW)[::2]:
-        motion, kind = members(body, replace(group, poisson=0.47), seed=7, device="cpu", causes=FEW)
-        size = surface_size(body, motion)
+    for group in build_groups(body, seed=7, causes=FEW)[::2]:
+        motion, kind = solve_members(body, replace(group, poisson=0.47), seed=7, device="cpu", causes=FEW)
+        size = compute_surface_motion(body, motion)
         found += [(3e-3 * motion[n] / size[n], KINDS[kind[n]]) for n in range(0, len(motion), 3)]
     return found
 
@@ -74,7 +74,7 @@ def test_shapes_of_each_place_and_skull_move_the_open_cortex_by_a_millimetre(loc
     for skull in (0, 1):
         for place in (NOWHERE, 0, int(prior.place.max())):
             rows = (prior.kind == 0) & (prior.skull == skull) & (prior.place == place)
-            size = surface_size(body, prior.shape[rows])
+            size = compute_surface_motion(body, prior.shape[rows])
             assert np.sqrt((size**2).sum()) == pytest.approx(1e-3, rel=1e-4)
     assert prior.place.max() == PLACES - 1 and not ((prior.kind == 0) & (prior.skull == 2)).any()
 
@@ -89,10 +89,10 @@ def test_a_stopped_ensemble_goes_on(body, tmp_path, monkeypatch, ensemble):
         chosen = ensemble.group == group.number
         return ensemble.motion[chosen], ensemble.kind[chosen]
 
-    monkeypatch.setattr(ensembles, "members", stopped)
+    monkeypatch.setattr(ensembles, "solve_members", stopped)
     with pytest.raises(KeyboardInterrupt):
-        solved(body, causes=FEW, device="cpu", folder=tmp_path)
-    found = solved(body, causes=FEW, device="cpu", folder=tmp_path)
+        solve_groups(body, causes=FEW, device="cpu", folder=tmp_path)
+    found = solve_groups(body, causes=FEW, device="cpu", folder=tmp_path)
     assert made == [0, 1, 2, 2, 3, 4]
     for name in ("motion", "kind", "skull", "group"):
         assert np.array_equal(getattr(found, name), getattr(ensemble, name)), name
@@ -125,7 +125,7 @@ def test_a_small_locator_refuses_what_it_does_not_know(locator, body, truth):
         with pytest.raises(InputError, match="this locator knows"):
             small.locate(seen).at(asked)
     with pytest.raises(InputError, match="this locator knows"):
-        small.prior.restricted(other)
+        small.prior.restrict(other)
     deep = replace(seen, rest=seen.rest - [0.0, 0.0, 11e-3], now=seen.now - [0.0, 0.0, 11e-3])
     deep = replace(
         deep, **{name: np.concatenate([getattr(seen, name), getattr(deep, name)]) for name in ("rest", "now")}
@@ -168,7 +168,7 @@ def test_most_of_the_tumours_motion_is_found_and_ellipsoids_hold_it(locator, bod
     left, all_of_it, held = 0.0, 0.0, []
     for seed, (motion, _) in enumerate(truth):
         found = locator.locate(observed(body, motion, seed))
-        middle = middle_of(body, motion[None])[0]
+        middle = compute_middle(body, motion[None])[0]
         off = found.centroid - middle
         left, all_of_it = left + np.linalg.norm(off), all_of_it + np.linalg.norm(middle)
         held.append(off @ np.linalg.solve(found.centroid_covariance, off) < 7.815)
@@ -213,7 +213,7 @@ def test_a_rigid_error_that_is_stated_is_found(locator, body, truth):
         tipped = replace(seen, tips=seen.now[:1], rigid=0.0)
         for exact in (found[0], locator.locate(cloud), locator.locate(tipped)):
             assert exact.slipped or np.abs([exact.bias, exact.rotation]).max() < 1e-6
-        off += [np.linalg.norm(each.centroid - middle_of(body, motion[None])[0]) for each in found]
+        off += [np.linalg.norm(each.centroid - compute_middle(body, motion[None])[0]) for each in found]
     assert off[2] < off[1] < off[0]
 
 
@@ -222,7 +222,7 @@ def test_a_cloud_without_names_tells_the_motion_along_the_surfaces_normal(locato
     for seed, (motion, _) in enumerate(truth):
         named = observed(body, motion, seed, count=150, noise=0.2)
         found = locator.locate(Observation(named.now, sigma=np.full(150, 0.15e-3)))
-        middle = middle_of(body, motion[None])[0]
+        middle = compute_middle(body, motion[None])[0]
         left, all_of_it = left + abs((found.centroid - middle)[2]), all_of_it + abs(middle[2])
     assert left < 0.4 * all_of_it
 
@@ -231,10 +231,10 @@ def test_a_cloud_may_lie_as_far_off_as_brains_sink(locator, body):
     """Its points are where the surface is now; named points are looked for at rest, and not so far off."""
     rest = observed(body, np.zeros_like(body.mesh.nodes)).rest
     sunk = rest - [0.0, 0.0, 14e-3]
-    assert placed(body, Observation(sunk)).value == pytest.approx(-14e-3)
+    assert to_evidence(body, Observation(sunk)).value == pytest.approx(-14e-3)
     for far in (Observation(rest - [0.0, 0.0, 19e-3]), Observation(rest, sunk)):
         with pytest.raises(InputError, match="from the open cortex"):
-            placed(body, far)
+            to_evidence(body, far)
 
 
 def test_wild_points_change_nothing_much(locator, body, truth):

@@ -5,7 +5,7 @@ import pytest
 from conftest import make_box
 
 from sim.errors import InputError
-from surrogate.locating.observation import Observation, placed
+from surrogate.locating.observation import Observation, to_evidence
 
 
 def test_points_far_from_vertices_lie_on_the_cortex_all_the_same():
@@ -14,7 +14,7 @@ def test_points_far_from_vertices_lie_on_the_cortex_all_the_same():
     middle = body.mesh.nodes[body.open_surface].mean(axis=1)
     for above, kept in ((0.0, len(middle)), (11e-3, len(middle)), (13e-3, len(middle) - 3)):
         rest = middle + np.where(np.arange(len(middle)) < 3, above, 0.0)[:, None] * [0.0, 0.0, 1.0]
-        evidence = placed(body, Observation(rest + 1e-3, rest))
+        evidence = to_evidence(body, Observation(rest + 1e-3, rest))
         assert len(np.unique(evidence.point)) == kept
     with pytest.raises(InputError, match="half of the points lie more than 7 mm from the open cortex"):
-        placed(body, Observation(middle + [0.0, 0.0, 7e-3], middle + [0.0, 0.0, 7e-3]))
+        to_evidence(body, Observation(middle + [0.0, 0.0, 7e-3], middle + [0.0, 0.0, 7e-3]))

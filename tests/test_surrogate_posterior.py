@@ -9,11 +9,18 @@ from scipy.stats import multivariate_normal
 
 from sim.geometry.locate import Located
 from surrogate.locating.causes import SWELLING, TOOL
-from surrogate.locating.evidence import SHIFT, SIGMA, SLIPPED, TURN, of_motions
-from surrogate.locating.observation import Observation, placed_anew
-from surrogate.locating.posterior import COARSENED, MIXED, ObservedPrior, Posterior, conditioned, seen_prior
+from surrogate.locating.evidence import SHIFT, SIGMA, SLIPPED, TURN, build_motion_evidence
+from surrogate.locating.observation import Observation, place_again
+from surrogate.locating.posterior import (
+    COARSENED,
+    MIXED,
+    ObservedPrior,
+    Posterior,
+    build_observed_prior,
+    condition_prior,
+)
 from surrogate.locating.prior import BESIDE, NOWHERE, RIGIDS, SETS, WITH_PLACE, MotionPrior
-from surrogate.locating.whitened import whitened
+from surrogate.locating.whitened import whiten
 
 POINTS = 30
 
@@ -36,7 +43,7 @@ def seen(prior, motion, count=POINTS):
     """Some vertices as points that are seen to move."""
     some = np.random.default_rng(9).permutation(len(motion))[:count]
     place = Located(np.repeat(some[:, None], 4, axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
-    return of_motions(place, prior.anatomy.mesh.nodes[some], motion[some], np.full(count, SIGMA))
+    return build_motion_evidence(place, prior.anatomy.mesh.nodes[some], motion[some], np.full(count, SIGMA))
 
 
 # Of a rigid error, as it is unless something else is known.
@@ -70,7 +77,7 @@ def test_what_is_seen_of_shapes_is_their_motion_at_the_points(prior):
 def test_rigid_error_at_places_is_what_their_rows_have_of_it(prior):
     evidence = drawn(prior, np.random.default_rng(3))[1]
     found = Posterior(evidence, [], np.arange(1.0, 7.0), 1.0, np.zeros(0, int), 0.0, 0.0)
-    own = np.einsum("mi,mi->m", found.bias_at(evidence.at), evidence.axis)
+    own = np.einsum("mi,mi->m", found.compute_bias(evidence.at), evidence.axis)
     assert own == pytest.approx(evidence.rigid @ found.rigid, abs=1e-12)
 
 
@@ -79,7 +86,7 @@ def test_cloud_is_compared_without_its_rigid_error(prior):
     open_nodes = body.mesh.nodes[np.unique(body.open_surface)]
     rest = open_nodes[np.linalg.norm(open_nodes - open_nodes.mean(axis=0), axis=1) < 10e-3]
     still, number = np.zeros_like(body.mesh.nodes), np.arange(len(rest))
-    found = placed_anew(body, Observation(rest + shift), number, still, lambda at: np.tile(shift, (len(at), 1)))
+    found = place_again(body, Observation(rest + shift), number, still, lambda at: np.tile(shift, (len(at), 1)))
     assert len(rest) > 3 and found.at == pytest.approx(rest, abs=1e-9)
 
 
@@ -109,7 +116,7 @@ def test_an_answer_is_that_of_the_normal_equations_and_its_evidence_that_of_the_
     kept = np.ones(len(prior.kind), bool)
     kept[np.flatnonzero((prior.kind == SWELLING) & (prior.skull == 1))[1:]] = False
     prior = replace(prior, **{name: getattr(prior, name)[kept] for name in ("shape", "kind", "skull", "place")})
-    sight = seen_prior(prior, evidence)
+    sight = build_observed_prior(prior, evidence)
     noise = evidence.noise(np.sqrt((evidence.value**2).sum() / POINTS))
     unknown = seen_unknowns(prior, evidence).T
     logs, density = [], []
@@ -156,9 +163,9 @@ def test_rows_of_unknowns_and_their_products_are_those_of_all_points(prior, coun
     some = random.integers(40, size=(count, 4))
     place = Located(box.mesh.tets[some[:, 0]], random.dirichlet(np.ones(4), count))
     at = np.einsum("nc,nci->ni", place.weights, box.mesh.nodes[place.vertices])
-    whole = of_motions(place, at, 1e-3 * random.standard_normal((count, 3)), np.full(count, SIGMA))
+    whole = build_motion_evidence(place, at, 1e-3 * random.standard_normal((count, 3)), np.full(count, SIGMA))
     for evidence in (whole, whole.rows(random.permutation(len(whole)))):
-        found, unknown = whitened(prior, evidence, 1e-3), seen_unknowns(prior, evidence)
+        found, unknown = whiten(prior, evidence, 1e-3), seen_unknowns(prior, evidence)
         rows = np.column_stack([unknown, evidence.value])
         precise = np.linalg.solve(evidence.noise(1e-3), rows)
         assert found.products == pytest.approx(rows.T @ precise, abs=1e-9 * np.abs(rows.T @ precise).max())
@@ -172,7 +179,7 @@ def test_ellipsoids_hold_what_is_drawn(prior):
     for _ in range(200):
         truth, evidence = drawn(prior, random, 3)
         # What shapes lack is no part of these draws, and their size is known.
-        sight = ObservedPrior(prior, 3.0, whitened(prior, evidence, 0.0), np.zeros(3))
+        sight = ObservedPrior(prior, 3.0, whiten(prior, evidence, 0.0), np.zeros(3))
         answer = sight.answer(hypothesis, hypothesis.places[0], 1.0)
         scale = np.append(np.ones(len(prior.kind)), RIGID)
         off = answer.mean - (truth / scale)[answer.rows]
@@ -183,9 +190,9 @@ def test_ellipsoids_hold_what_is_drawn(prior):
 
 def test_a_mixture_lies_between_its_hypotheses(prior):
     _, evidence = drawn(prior, np.random.default_rng(4))
-    found = conditioned(prior, evidence)
+    found = condition_prior(prior, evidence)
     assert not len(found.outliers) and 0.2 < found.surprise < 1.6
-    answers = seen_prior(prior, evidence).answers()
+    answers = build_observed_prior(prior, evidence).answers()
     assert len(answers) == MIXED and sum(answer.share for answer in answers) == pytest.approx(1.0)
     means = np.zeros((len(answers), len(prior.kind) + 6))
     spreads = np.zeros((len(answers), *2 * means.shape[1:]))
@@ -207,7 +214,7 @@ def test_gross_errors_are_left_out_and_named(prior):
     truth, evidence = drawn(prior, np.random.default_rng(5))
     wrong = np.isin(evidence.point, [3, 11, 24])
     spoilt = replace(evidence, value=evidence.value + np.where(wrong, 0.03, 0.0))
-    found, clean = conditioned(prior, spoilt), conditioned(prior, evidence)
+    found, clean = condition_prior(prior, spoilt), condition_prior(prior, evidence)
     assert found.outliers.tolist() == [3, 11, 24] and not len(clean.outliers)
     off, without = (np.linalg.norm((each.weight - truth[:-6]) @ prior.middle) for each in (found, clean))
     assert off < 2.0 * without + 0.3e-3
@@ -218,7 +225,7 @@ def test_point_is_left_out_once_one_in_ten_thousand_is_so_far(prior, deviations,
     """The root of chi-square of three numbers is 4.6 at 1e-4, and 7.9 at 1e-12; half of the error is predictable."""
     still = seen(prior, np.zeros(prior.anatomy.mesh.nodes.shape))
     far = np.where(still.point == 7, deviations * still.sigma / np.sqrt(3.0), 0.0)
-    found = conditioned(prior, replace(still, value=still.value + far))
+    found = condition_prior(prior, replace(still, value=still.value + far))
     assert found.outliers.tolist() == left_out
 
 
@@ -226,15 +233,15 @@ def test_points_with_one_row_are_left_out_too(prior):
     """Motions along one axis only, as those of a cloud."""
     _, evidence = drawn(prior, np.random.default_rng(6))
     single = replace(evidence.rows(np.arange(0, len(evidence), 3)), point=np.arange(POINTS))
-    assert not len(conditioned(prior, single).outliers)
+    assert not len(condition_prior(prior, single).outliers)
     wrong = np.arange(POINTS) == 7
-    found = conditioned(prior, replace(single, value=single.value + np.where(wrong, 0.05, 0.0)))
+    found = condition_prior(prior, replace(single, value=single.value + np.where(wrong, 0.05, 0.0)))
     assert found.outliers.tolist() == [7] and np.isfinite(found.weight).all()
 
 
 def test_what_no_shape_explains_surprises(prior):
     motion = 0.01 * np.random.default_rng(7).standard_normal(prior.anatomy.mesh.nodes.shape)
-    found = conditioned(prior, seen(prior, motion))
+    found = condition_prior(prior, seen(prior, motion))
     assert found.surprise > 2.5 or len(found.outliers) > 10
 
 
@@ -242,8 +249,8 @@ def test_a_tool_is_believed_to_press_where_its_tip_touches(prior):
     """The odds of a place fall with its distance from the nearest tip; without tips all are alike."""
     _, evidence = drawn(prior, np.random.default_rng(8))
     without, near = (
-        seen_prior(prior, evidence),
-        seen_prior(prior, evidence, np.array([[0.02, 0.004, 0.0], [1.0, 1.0, 1.0]])),
+        build_observed_prior(prior, evidence),
+        build_observed_prior(prior, evidence, np.array([[0.02, 0.004, 0.0], [1.0, 1.0, 1.0]])),
     )
     assert not without.odds.any()
     assert near.odds == pytest.approx([np.log(0.05), -0.5 * (0.02**2 + 0.004**2) / 0.004**2, -0.5])
@@ -254,10 +261,10 @@ def test_a_tool_is_believed_to_press_where_its_tip_touches(prior):
 def test_what_is_seen_may_be_little_because_a_motion_and_a_rigid_error_cancel(prior):
     """Motions may then be as large as a rigid error: its prior's translation has a length of 1.4 mm."""
     little, much = (seen(prior, np.full_like(prior.anatomy.mesh.nodes, each)) for each in (1e-5, 3e-3))
-    assert seen_prior(prior, little).scale == pytest.approx(np.sqrt(3.0) * 0.8, rel=1e-3)
-    assert seen_prior(prior, much).scale == pytest.approx(np.sqrt(3.0 * (3.0**2 + 0.8**2)), rel=1e-3)
+    assert build_observed_prior(prior, little).scale == pytest.approx(np.sqrt(3.0) * 0.8, rel=1e-3)
+    assert build_observed_prior(prior, much).scale == pytest.approx(np.sqrt(3.0 * (3.0**2 + 0.8**2)), rel=1e-3)
     exact = replace(much, shift=0.0)
-    assert seen_prior(prior, exact).scale == pytest.approx(np.sqrt(3.0) * 3.0, rel=1e-3)
+    assert build_observed_prior(prior, exact).scale == pytest.approx(np.sqrt(3.0) * 3.0, rel=1e-3)
 
 
 def test_a_rigid_error_is_believed_to_be_as_large_as_is_stated(prior):
@@ -266,7 +273,7 @@ def test_a_rigid_error_is_believed_to_be_as_large_as_is_stated(prior):
     shifted = replace(evidence, value=evidence.value + evidence.rigid[:, :3] @ [2e-3, -2e-3, 2e-3])
     off, bias = [], []
     for shift in (0.0, 0.2e-3, 2e-3):
-        found = conditioned(prior, replace(shifted, shift=shift))
+        found = condition_prior(prior, replace(shifted, shift=shift))
         off.append(np.linalg.norm((found.weight - truth[:-6]) @ prior.middle))
         bias.append(np.linalg.norm(found.rigid[:3]))
     assert bias[0] < 1e-5 and bias[1] < 0.5 * bias[2] and off[2] < 0.5 * off[0]

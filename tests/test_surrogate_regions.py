@@ -10,13 +10,19 @@ from sim.anatomy import PART_LABELS
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import BRAIN, Material, Ogden
-from surrogate.fitting.fit import beside_tumour
-from surrogate.fitting.responses import force_loads, responses
-from surrogate.locating.causes import Causes, groups
-from surrogate.locating.ensemble import members, surface_size
+from surrogate.fitting.fit import list_fitted_regions
+from surrogate.fitting.responses import build_force_loads, solve_responses
+from surrogate.locating.causes import Causes, build_groups
+from surrogate.locating.ensemble import compute_surface_motion, solve_members
 from surrogate.locating.locator_store import load_locator, make_locator, save_locator
 from surrogate.locating.observation import Observation
-from surrogate.locating.regions import Region, check_regions, differing, known_regions, regions_words
+from surrogate.locating.regions import (
+    Region,
+    check_regions,
+    describe_regions,
+    find_differing_regions,
+    list_known_regions,
+)
 
 OEDEMA = PART_LABELS["oedema"]
 STIFF = Region(OEDEMA, 20.0)
@@ -53,9 +59,9 @@ def locators(body):
 def test_who_knows_a_stiff_region_finds_the_tumour_better(body, locators):
     """Motions by other draws of a brain with the slab, seen at all nodes of the open cortex, without errors."""
     nodes, off = np.unique(body.open_surface), []
-    for group in groups(body, seed=5, causes=replace(FEW, regions=(STIFF,)))[:2]:
-        motion, _ = members(body, group, seed=5, device="cpu", causes=FEW)
-        for one in motion[:6] * (3e-3 / surface_size(body, motion[:6]))[:, None, None]:
+    for group in build_groups(body, seed=5, causes=replace(FEW, regions=(STIFF,)))[:2]:
+        motion, _ = solve_members(body, group, seed=5, device="cpu", causes=FEW)
+        for one in motion[:6] * (3e-3 / compute_surface_motion(body, motion[:6]))[:, None, None]:
             seen = Observation(body.mesh.nodes[nodes] + one[nodes], body.mesh.nodes[nodes], rigid=0.0)
             truth = one[body.tumour_nodes]
             off.append([np.linalg.norm(each.locate(seen).at(body.tumour_nodes) - truth) for each in locators])
@@ -66,7 +72,7 @@ def test_who_knows_a_stiff_region_finds_the_tumour_better(body, locators):
 def test_a_region_is_in_every_group_and_beside_every_force(body):
     """Its stiffness goes with the brain's; its Poisson's ratio is its own where it is given."""
     known = (replace(STIFF, poisson=0.3),)
-    for group in groups(body, causes=replace(FEW, regions=known)):
+    for group in build_groups(body, causes=replace(FEW, regions=known)):
         tissue = group.effects(FEW.swellings)[0]
         assert isinstance(tissue, Elasticity)
         slab, brain = tissue.regions[OEDEMA], tissue.default
@@ -74,8 +80,8 @@ def test_a_region_is_in_every_group_and_beside_every_force(body):
         (mu, lam), (soft, _) = slab.lame, brain.lame
         assert mu * (1.0 + 0.3) == pytest.approx(20.0 * soft * (1.0 + group.poisson))
         assert lam / (2.0 * (lam + mu)) == pytest.approx(0.3)
-    loads = force_loads(body, body.mesh.nodes[np.unique(body.open_surface)][:1], np.array([6e-3]))
-    stiff, plain = (responses(body, loads, "cpu", regions=regions) for regions in (known, ()))
+    loads = build_force_loads(body, body.mesh.nodes[np.unique(body.open_surface)][:1], np.array([6e-3]))
+    stiff, plain = (solve_responses(body, loads, "cpu", regions=regions) for regions in (known, ()))
     assert stiff.regions == known and np.abs(stiff.motion["slide"] - plain.motion["slide"]).max() > 1e-6
 
 
@@ -89,20 +95,20 @@ def test_a_file_keeps_the_regions_and_an_older_one_has_none(body, locators, tmp_
 
 def test_a_fit_finds_the_tumours_stiffness_whatever_the_locator_knew(locators):
     both = replace(locators[0], regions=(Region(2, 3.0), STIFF))
-    assert beside_tumour(both) == (STIFF,)
+    assert list_fitted_regions(both) == (STIFF,)
 
 
 def test_what_regions_are_known_by(body):
     soft = Material("neo-hookean", 1500.0, 0.45)
-    assert known_regions(Elasticity(BRAIN, {OEDEMA: soft, 2: replace(BRAIN, young=9000.0)})) == (
+    assert list_known_regions(Elasticity(BRAIN, {OEDEMA: soft, 2: replace(BRAIN, young=9000.0)})) == (
         Region(2, 3.0), Region(OEDEMA, 0.5, 0.45),
     )  # fmt: skip
-    assert known_regions(Elasticity(BRAIN)) == ()
-    assert regions_words((Region(OEDEMA, 0.5, 0.45),)) == (
+    assert list_known_regions(Elasticity(BRAIN)) == ()
+    assert describe_regions((Region(OEDEMA, 0.5, 0.45),)) == (
         "region 3 (oedema) 0.5 times as stiff as the brain, Poisson's ratio 0.45"
     )
     with pytest.raises(InputError, match="--region"):
-        known_regions(Elasticity(BRAIN, {2: Ogden(((1340.0, -19.0),), 148000.0)}))
+        list_known_regions(Elasticity(BRAIN, {2: Ogden(((1340.0, -19.0),), 148000.0)}))
     with pytest.raises(InputError, match=r"no region 4 \(ventricles\)"):
         check_regions((Region(PART_LABELS["ventricles"], 0.5),), body)
     for bad in ((2, -1.0), (2, float("nan")), (2, 1.0, 0.6), ([2], 1.0), (2.5, 1.0)):
@@ -114,11 +120,11 @@ def test_a_locator_is_held_against_a_scenes_own_regions(body):
     """But for the tumour; a region as stiff as the brain is none."""
     own, tumour = Region(OEDEMA, 0.5, 0.45), Region(2, 3.0)
     scene = Elasticity(BRAIN, {OEDEMA: Material("neo-hookean", 1500.0, 0.45), 2: replace(BRAIN, young=5000.0)})
-    assert not differing(scene, (own,)) and not differing(scene, (own, tumour))
-    assert not differing(Elasticity(BRAIN, {OEDEMA: BRAIN}), (tumour,))
+    assert not find_differing_regions(scene, (own,)) and not find_differing_regions(scene, (own, tumour))
+    assert not find_differing_regions(Elasticity(BRAIN, {OEDEMA: BRAIN}), (tumour,))
     for known in ((), (STIFF,), (replace(own, poisson=None),)):
-        assert differing(scene, known) == (OEDEMA,)
-    assert differing(Elasticity(BRAIN), (own,)) == (OEDEMA,)
+        assert find_differing_regions(scene, known) == (OEDEMA,)
+    assert find_differing_regions(Elasticity(BRAIN), (own,)) == (OEDEMA,)
 
 
 def test_a_file_whose_label_is_a_list_is_refused(body, locators, tmp_path):

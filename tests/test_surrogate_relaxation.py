@@ -15,23 +15,23 @@ from sim.effects import Elasticity, Held, ToolContact, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed, Touching
-from sim.material import Material, tissue_to_json
+from sim.material import Material, to_tissue_json
 from sim.tools import Ball
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
-from surrogate.data.encode import tool_features
-from surrogate.data.holding import BROUGHT, HISTORY, drawn_times, stated_series
-from surrogate.data.indentation import Relaxing, indented, posed, relaxed_of, with_relaxed
+from surrogate.data.encode import compute_tool_features
+from surrogate.data.holding import BROUGHT, HISTORY, read_series, sample_times
+from surrogate.data.indentation import Relaxing, add_relaxation, get_poses, get_relaxation, to_indentation
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import draw_poses
-from surrogate.evaluation.score import errors
-from surrogate.model.applicability import refusal
-from surrogate.model.guarded import Guarded, judged
-from surrogate.model.relaxation import MEMORY, Relaxed, followed
+from surrogate.evaluation.score import compute_point_errors
+from surrogate.model.applicability import find_rejection
+from surrogate.model.guarded import Guarded, describe_error
+from surrogate.model.relaxation import MEMORY, Relaxed, follow_relaxation
 from surrogate.model.store import load, save
-from surrogate.model.tool_contact import wrench
+from surrogate.model.tool_contact import compute_wrench
 from surrogate.onnx_export.export import onnx_model
-from surrogate.training.fem_tables import condensed
+from surrogate.training.fem_tables import condense_exterior
 from surrogate.training.train import train
 
 SERIES = ((0.4, 0.5), (0.3, 20.0))
@@ -40,7 +40,7 @@ BALL = Ball(6e-3)
 EFFECTS = (Elasticity(SOFT), Held(), ToolContact((BALL,)))
 SAID = {
     "shape": repr(BALL),
-    "tissue": tissue_to_json(SOFT),
+    "tissue": to_tissue_json(SOFT),
     "effects": repr(EFFECTS),
     "element": "p1",
     "history": HISTORY,
@@ -57,10 +57,10 @@ def start_of(past: Relaxed, time: float) -> Deformation:
 
 def played(depths: list[float], times: list[float], x: list[float] | None = None) -> list[Relaxed]:
     """The frames of a tool that was in the air before."""
-    found = [followed(SERIES, pressed(0.0), np.zeros(1), None, 1e-4)]
+    found = [follow_relaxation(SERIES, pressed(0.0), np.zeros(1), None, 1e-4)]
     for depth, before, time, place in zip(depths, [0.0, *times], times, x or [0.0] * len(times), strict=False):
         start = start_of(found[-1], before)
-        found.append(followed(SERIES, pressed(depth, place), np.array([time]), start, 1e-4))
+        found.append(follow_relaxation(SERIES, pressed(depth, place), np.array([time]), start, 1e-4))
     return found[1:]
 
 
@@ -88,9 +88,9 @@ def test_pasts_that_no_training_has_are_strange():
 def test_a_start_without_that_past_is_refused():
     late = start_of(played([1e-3], [2.0])[0], 2.0)
     with pytest.raises(InputError, match=r"the start is 1 s later than the loads"):
-        followed(SERIES, pressed(1e-3), np.ones(1), late, 1e-4)
+        follow_relaxation(SERIES, pressed(1e-3), np.ones(1), late, 1e-4)
     with pytest.raises(InputError, match="does not say how far the tissue has relaxed"):
-        followed(SERIES, pressed(1e-3), np.ones(1), replace(late, memory={}), 1e-4)
+        follow_relaxation(SERIES, pressed(1e-3), np.ones(1), replace(late, memory={}), 1e-4)
 
 
 class Fading:
@@ -100,18 +100,18 @@ class Fading:
         self.anatomy, self.patch = anatomy, open_patch(anatomy)
         fem = Fem(anatomy, pushed_effects(anatomy, SOFT), REFERENCE, "cpu", element="p1")
         cortex = np.setdiff1d(self.patch.nodes, anatomy.tumour_nodes)
-        self.contact, self.bases = condensed(fem, [anatomy.tumour_nodes, cortex], BALL)
+        self.contact, self.bases = condense_exterior(fem, [anatomy.tumour_nodes, cortex], BALL)
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        pushed = indented(loads, BALL, self.patch)
-        share = followed(SERIES, pushed, loads.times, start, 1e-4).share[:, None]
-        X, count = tool_features(self.patch, pushed), len(loads)
+        pushed = to_indentation(loads, BALL, self.patch)
+        share = follow_relaxation(SERIES, pushed, loads.times, start, 1e-4).share[:, None]
+        X, count = compute_tool_features(self.patch, pushed), len(loads)
         answered = self.contact.linear(X) * X[:, 6:7] * (1.0 - 0.3 * share)
         split, moved = len(self.bases[0].modes), np.zeros((count, len(self.anatomy.mesh.nodes), 3))
         for basis, coefficients in zip(self.bases, (answered[:, :split], answered[:, split:]), strict=True):
             moved[:, basis.nodes] = basis.decode(coefficients)
         force = self.contact.force(X).reshape(count, -1, 3).sum(axis=1) * (1.0 - share)
-        reaction, nodes = wrench(force, posed(loads, BALL), BALL), np.arange(moved.shape[1])
+        reaction, nodes = compute_wrench(force, get_poses(loads, BALL), BALL), np.arange(moved.shape[1])
         outcome = (Outcome.CONVERGED,) * count
         answer = Deformation(moved, nodes, outcome, np.zeros(count, int), np.zeros(count), loads.times, reaction)
         return answer if at is None else answer.at(at)
@@ -121,7 +121,7 @@ class Fading:
 def data(tmp_path_factory, box):
     path = tmp_path_factory.mktemp("relaxing") / "data.h5"
     causes = draw_poses("palpation", box, 80, 0, BALL).causes
-    simulate(path, Fading(box), Loads(causes, drawn_times(80, 0)), SAID)
+    simulate(path, Fading(box), Loads(causes, sample_times(80, 0)), SAID)
     return read_dataset(path)
 
 
@@ -134,10 +134,10 @@ def test_a_model_learns_what_time_does_and_keeps_it(tmp_path, model, box):
     """Motion and force at fresh places and times, from a file too; `train` cannot know this without the times."""
     assert model.series == SERIES
     causes, nodes = draw_poses("palpation", box, 30, 77, BALL).causes, box.tumour_nodes
-    fresh, truth = Loads(causes, drawn_times(30, 77)), Fading(box)
+    fresh, truth = Loads(causes, sample_times(30, 77)), Fading(box)
     answer, right = model.deform(fresh), truth.deform(fresh)
     moved = right.at(nodes).displacement
-    assert errors(model, fresh, moved, nodes).mean() < 0.01 * np.linalg.norm(moved, axis=2).mean()
+    assert compute_point_errors(model, fresh, moved, nodes).mean() < 0.01 * np.linalg.norm(moved, axis=2).mean()
     force = np.linalg.norm(right.reaction[:, 0, :3], axis=1)
     assert np.linalg.norm((answer.reaction - right.reaction)[:, 0, :3], axis=1).mean() < 0.02 * force.mean()
     assert np.isfinite(answer.bound).any() and np.isfinite(answer.reaction_bound).any()
@@ -168,29 +168,29 @@ def test_answers_follow_from_the_ones_before(model, box):
 
 
 def test_features_end_with_what_is_gone(box):
-    pushed = indented(draw_poses("palpation", box, 2, 0, BALL), BALL, open_patch(box))
-    assert relaxed_of(pushed) is None
-    known = with_relaxed(pushed, np.array([0.1, 0.2]))
+    pushed = to_indentation(draw_poses("palpation", box, 2, 0, BALL), BALL, open_patch(box))
+    assert get_relaxation(pushed) is None
+    known = add_relaxation(pushed, np.array([0.1, 0.2]))
     assert isinstance(known, Relaxing)
-    np.testing.assert_array_equal(relaxed_of(known), [0.1, 0.2])
+    np.testing.assert_array_equal(get_relaxation(known), [0.1, 0.2])
 
 
 def test_a_model_plays_the_series_that_it_learned_and_no_other(model, box):
-    assert refusal(model, EFFECTS) is None
+    assert find_rejection(model, EFFECTS) is None
 
     def under(series: tuple) -> str:
-        return str(refusal(model, (Elasticity(replace(SOFT, prony=series)), *EFFECTS[1:])))
+        return str(find_rejection(model, (Elasticity(replace(SOFT, prony=series)), *EFFECTS[1:])))
 
     off = replace(model, tool=Ball(BALL.radius * (1.0 + 1e-15)))
-    assert off.tool != BALL and refusal(off, EFFECTS) is None  # sizes that were read in millimetres
-    assert "on the poses of a ball" in str(refusal(replace(model, tool=Ball(5e-3)), EFFECTS))
+    assert off.tool != BALL and find_rejection(off, EFFECTS) is None  # sizes that were read in millimetres
+    assert "on the poses of a ball" in str(find_rejection(replace(model, tool=Ball(5e-3)), EFFECTS))
     words = "it learned from tissue that relaxes by 40 % in 0.5 s and 30 % in 20 s, and here it "
     assert under(((0.4, 0.5),)) == f"{words}relaxes by 40 % in 0.5 s"
     assert under(()) == f"{words}does not relax"
     timeless = replace(model, training={name: said for name, said in model.training.items() if name != "history"})
-    assert "from loads without time, and here the tissue relaxes" in str(refusal(timeless, EFFECTS))
+    assert "from loads without time, and here the tissue relaxes" in str(find_rejection(timeless, EFFECTS))
     with pytest.raises(InputError, match="unsupported histories"):
-        stated_series({**SAID, "history": "the tool fell"})
+        read_series({**SAID, "history": "the tool fell"})
 
 
 def test_it_plays_alone_frame_by_frame(model, box):
@@ -199,7 +199,9 @@ def test_it_plays_alone_frame_by_frame(model, box):
     theatre = Theatre(box, None, {"contact": model}, "cpu")
     scene = replace(scene, element="p1")
     assert theatre.names(scene) == ("contact", "fem") and theatre.usual(scene) == "contact"
-    assert judged(replace(model, bound=1e-3)).endswith("enough: it plays alone nevertheless, as its tissue relaxes")
+    assert describe_error(replace(model, bound=1e-3)).endswith(
+        "enough: it plays alone nevertheless, as its tissue relaxes"
+    )
     with pytest.raises(InputError, match="its tissue relaxes, so that finite elements would have to solve"):
         theatre.deformer(GUARDED, scene)
     with pytest.raises(InputError, match="would need every earlier frame"):

@@ -14,20 +14,20 @@ from sim.deformation import Deformation, Outcome
 from sim.effects import Elasticity, Held, Retraction, ToolContact, pushed_effects
 from sim.fem import Fem
 from sim.loads import Loads, Retracted, Touching
-from sim.material import BRAIN, Material, tissue_to_json
-from sim.tools import Ball, BuiltIn, Capsule, Spatula, core_of, distances_to
-from surrogate.data.cortex_patch import barycentric_lattice, open_patch
+from sim.material import BRAIN, Material, to_tissue_json
+from sim.tools import Ball, BuiltIn, Capsule, Spatula, compute_distances, get_core
+from surrogate.data.cortex_patch import build_barycentric_lattice, open_patch
 from surrogate.data.dataset import read_dataset
-from surrogate.data.encode import Basis, core_features, tool_features
-from surrogate.data.indentation import Indented, indented, posed
+from surrogate.data.encode import Basis, compute_core_features, compute_tool_features
+from surrogate.data.indentation import Indented, get_poses, to_indentation
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import BLADE, LEAN, ROD, SHALLOW, draw_poses
-from surrogate.evaluation.score import errors
-from surrogate.model.applicability import refusal
+from surrogate.evaluation.score import compute_point_errors
+from surrogate.model.applicability import find_rejection
 from surrogate.model.store import load, save
-from surrogate.model.tool_contact import wrench
+from surrogate.model.tool_contact import compute_wrench
 from surrogate.regressors.rigid_contact import THICKER, RigidContact
-from surrogate.training.fem_tables import condensed
+from surrogate.training.fem_tables import condense_exterior
 from surrogate.training.train import train
 
 ROD_OF_4 = Capsule(2e-3, 0.02)
@@ -38,11 +38,11 @@ SOFT = Material("linear", 3000.0, 0.45)
 
 def condensed_box(box: Anatomy, tool: BuiltIn | None) -> tuple[RigidContact, list[Basis]]:
     fem = Fem(box, pushed_effects(box, SOFT), REFERENCE, "cpu", element="p1")
-    return condensed(fem, [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)], tool)
+    return condense_exterior(fem, [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)], tool)
 
 
 def asked(box: Anatomy, loads: Loads, tool: BuiltIn) -> Indented:
-    found = indented(loads, tool, open_patch(box))
+    found = to_indentation(loads, tool, open_patch(box))
     assert isinstance(found, Indented)
     return found
 
@@ -59,32 +59,32 @@ def upright(box: Anatomy, tool: BuiltIn, depth: float) -> Loads:
 def test_drawn_poses_go_in_from_where_they_touch_first(box, preset):
     tool, patch = TOOLS[preset], open_patch(box)
     loads = draw_poses(preset, box, 40, 3, tool)
-    pose = posed(loads, tool)
-    few = posed(draw_poses(preset, box, 9, 3, tool), tool)
+    pose = get_poses(loads, tool)
+    few = get_poses(draw_poses(preset, box, 9, 3, tool), tool)
     np.testing.assert_allclose(few, pose[:9], atol=1e-12)
-    assert not np.allclose(posed(draw_poses(preset, box, 9, 4, tool), tool), pose[:9])
+    assert not np.allclose(get_poses(draw_poses(preset, box, 9, 4, tool), tool), pose[:9])
     deepest = ROD * ROD_OF_4.radius if isinstance(tool, Capsule) else BLADE * SMALL_BLADE.width
-    surface = np.einsum("qc,scx->sqx", barycentric_lattice(4), patch.points[patch.triangles]).reshape(-1, 3)
+    surface = np.einsum("qc,scx->sqx", build_barycentric_lattice(4), patch.points[patch.triangles]).reshape(-1, 3)
     back = np.arange(0.0, 2.0 * deepest, 2e-5)
     for each in pose:
         way = np.tile(each, (len(back), 1, 1))
         way[:, :3, 3] += back[:, None] * each[:3, 2]
-        touches = [bool(distances_to(tool, one, surface).min() < 0.0) for one in way]
+        touches = [bool(compute_distances(tool, one, surface).min() < 0.0) for one in way]
         depth = back[np.flatnonzero(touches)[-1]]
-        assert SHALLOW * core_of(tool).radius - 4e-5 < depth < deepest + 4e-5
-        cosine = -patch.normal_near(each[None, :3, 3])[0] @ each[:3, 2]
+        assert SHALLOW * get_core(tool).radius - 4e-5 < depth < deepest + 4e-5
+        cosine = -patch.find_normals(each[None, :3, 3])[0] @ each[:3, 2]
         assert cosine >= np.cos(LEAN if isinstance(tool, Spatula) else np.pi / 4.0) - 1e-9
 
 
 def test_a_rod_that_stands_upright_is_the_ball_at_its_end(box):
     """Where its side touches nothing: the same indentation, the same forces, and how it is turned does not matter."""
     loads, ball = upright(box, ROD_OF_4, 1.2e-3), Ball(ROD_OF_4.radius)
-    rod, round_ = asked(box, loads, ROD_OF_4), indented(loads, ball, open_patch(box))
+    rod, round_ = asked(box, loads, ROD_OF_4), to_indentation(loads, ball, open_patch(box))
     for name in ("point", "force", "footprint"):
         np.testing.assert_allclose(getattr(rod, name), getattr(round_, name), atol=1e-9)
     patch = open_patch(box)
-    force = condensed_box(box, ROD_OF_4)[0].force(core_features(patch, rod))
-    alike = condensed_box(box, ball)[0].force(tool_features(patch, round_))
+    force = condensed_box(box, ROD_OF_4)[0].force(compute_core_features(patch, rod))
+    alike = condensed_box(box, ball)[0].force(compute_tool_features(patch, round_))
     np.testing.assert_allclose(force, alike, atol=0.02 * np.abs(alike).max())
     turned = loads.of(Touching)
     assert turned is not None
@@ -96,18 +96,24 @@ def test_a_rod_that_stands_upright_is_the_ball_at_its_end(box):
 def test_a_blade_may_be_laid_on_and_moved(box):
     """`Retracted` loads are the pose that they end in; either way round the blade is the same to a learner."""
     there = upright(box, SMALL_BLADE, 2e-3)
-    pose = posed(there, SMALL_BLADE)
+    pose = get_poses(there, SMALL_BLADE)
     above = pose.copy()
     above[:, :3, 3] -= [1e-3, 0.0, -9e-3]
     moved = Loads((Retracted(above, np.array([[1e-3, 0.0, -9e-3]])),))
     one, other = asked(box, there, SMALL_BLADE), asked(box, moved, SMALL_BLADE)
-    np.testing.assert_allclose(core_features(open_patch(box), one), core_features(open_patch(box), other), atol=1e-12)
+    np.testing.assert_allclose(
+        compute_core_features(open_patch(box), one), compute_core_features(open_patch(box), other), atol=1e-12
+    )
     turned = pose.copy()
     turned[:, :3, :2] *= -1.0
     back = asked(box, Loads((Touching(turned[:, None]),)), SMALL_BLADE)
-    np.testing.assert_allclose(tool_features(open_patch(box), back), tool_features(open_patch(box), one), atol=1e-12)
+    np.testing.assert_allclose(
+        compute_tool_features(open_patch(box), back), compute_tool_features(open_patch(box), one), atol=1e-12
+    )
     with pytest.raises(TypeError, match="only rods and blades"):
-        core_features(open_patch(box), indented(upright(box, Ball(5e-3), 1e-3), Ball(5e-3), open_patch(box)))
+        compute_core_features(
+            open_patch(box), to_indentation(upright(box, Ball(5e-3), 1e-3), Ball(5e-3), open_patch(box))
+        )
 
 
 @pytest.mark.parametrize("preset", TOOLS)
@@ -116,12 +122,12 @@ def test_no_facet_is_entered_and_finite_elements_answer_so(box, preset):
     tool, patch = TOOLS[preset], open_patch(box)
     contact, bases = condensed_box(box, tool)
     loads = draw_poses(preset, box, 5, 5, tool)
-    X = core_features(patch, asked(box, loads, tool))
+    X = compute_core_features(patch, asked(box, loads, tool))
     force = contact.force(X)
     moved = contact.points + (force @ contact.compliance.astype(np.float64).T).reshape(len(X), -1, 3)
-    for row, pose in enumerate(posed(loads, tool)):
-        facets = np.einsum("qc,sci->sqi", barycentric_lattice(12), moved[row][contact.triangles]).reshape(-1, 3)
-        nearest = distances_to(tool, pose, facets).min()
+    for row, pose in enumerate(get_poses(loads, tool)):
+        facets = np.einsum("qc,sci->sqi", build_barycentric_lattice(12), moved[row][contact.triangles]).reshape(-1, 3)
+        nearest = compute_distances(tool, pose, facets).min()
         assert THICKER - 3e-5 < nearest < THICKER + 1e-4
     fem = Fem(box, [Elasticity(SOFT), Held(), ToolContact((tool,))], device="cpu", batch=1, element="p1")
     truth = fem.deform(loads)
@@ -142,7 +148,7 @@ class Stiffening:
         self.contact, self.bases = condensed_box(anatomy, ROD_OF_4)
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        X = core_features(open_patch(self.anatomy), asked(self.anatomy, loads, ROD_OF_4))
+        X = compute_core_features(open_patch(self.anatomy), asked(self.anatomy, loads, ROD_OF_4))
         grown = 1.0 + 0.2 * X[:, 6:7] / X[:, 7:8]
         answered = self.contact.linear(X) * X[:, 6:7] * grown
         split, displacement = len(self.bases[0].modes), np.zeros((len(loads), len(self.anatomy.mesh.nodes), 3))
@@ -150,7 +156,7 @@ class Stiffening:
             displacement[:, basis.nodes] = basis.decode(coefficients)
         force = self.contact.force(X).reshape(len(loads), -1, 3).sum(axis=1) * grown
         nodes, count = np.arange(len(self.anatomy.mesh.nodes)), len(loads)
-        reaction = np.nan_to_num(wrench(force, posed(loads, ROD_OF_4), ROD_OF_4))
+        reaction = np.nan_to_num(compute_wrench(force, get_poses(loads, ROD_OF_4), ROD_OF_4))
         outcome = (Outcome.CONVERGED,) * count
         answer = Deformation(displacement, nodes, outcome, np.zeros(count, int), np.zeros(count), loads.times, reaction)
         return answer if at is None else answer.at(at)
@@ -165,7 +171,7 @@ def elements(box):
 def data(tmp_path_factory, elements):
     path = tmp_path_factory.mktemp("rod") / "data.h5"
     effects = repr((Elasticity(), Held(), ToolContact((ROD_OF_4,))))
-    said = {"shape": repr(ROD_OF_4), "tissue": tissue_to_json(SOFT), "effects": effects, "element": "p1"}
+    said = {"shape": repr(ROD_OF_4), "tissue": to_tissue_json(SOFT), "effects": effects, "element": "p1"}
     simulate(path, elements, draw_poses("dissector", elements.anatomy, 80, 0, ROD_OF_4), said)
     return read_dataset(path)
 
@@ -180,7 +186,7 @@ def test_a_model_learns_a_rod_and_keeps_it(tmp_path, data, model, elements, box)
     fresh, nodes = draw_poses("dissector", box, 30, 77, ROD_OF_4), box.tumour_nodes
     truth, found = elements.deform(fresh), model.deform(fresh)
     moved = truth.at(nodes).displacement
-    assert errors(model, fresh, moved, nodes).mean() < 0.01 * np.linalg.norm(moved, axis=2).mean()
+    assert compute_point_errors(model, fresh, moved, nodes).mean() < 0.01 * np.linalg.norm(moved, axis=2).mean()
     size = np.linalg.norm(truth.reaction[:, 0, :3], axis=1)
     assert (np.linalg.norm((found.reaction - truth.reaction)[:, 0, :3], axis=1) < 0.02 * size).all()
     assert np.isnan(found.reaction[:, 0, 3:]).all()  # of a rod's moment a model knows nothing
@@ -191,7 +197,7 @@ def test_a_model_learns_a_rod_and_keeps_it(tmp_path, data, model, elements, box)
 
 
 def test_a_rod_that_leans_more_than_any_in_training_is_extrapolated(model, box):
-    pose = posed(upright(box, ROD_OF_4, 1e-3), ROD_OF_4)
+    pose = get_poses(upright(box, ROD_OF_4, 1e-3), ROD_OF_4)
     angle = np.radians(70.0)
     pose[0, :3, :3] = [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]
     assert model.deform(upright(box, ROD_OF_4, 1e-3)).outcome == (Outcome.PREDICTED,)
@@ -200,16 +206,16 @@ def test_a_rod_that_leans_more_than_any_in_training_is_extrapolated(model, box):
 
 def test_models_of_blades_play_retraction_on_tissue_that_does_not_relax(model):
     blade = SMALL_BLADE
-    tissue = tissue_to_json(BRAIN)
+    tissue = to_tissue_json(BRAIN)
     effects = (Elasticity(), Held(), ToolContact((blade,)))
     known = replace(model, tool=blade, training={"effects": repr(effects), "tissue": tissue})
     laid = (Elasticity(), Held(), Retraction(blade))
-    assert refusal(known, laid) is None
-    other = str(refusal(known, (Elasticity(), Held(), Retraction(Spatula(9e-3, 12e-3, 1e-3)))))
+    assert find_rejection(known, laid) is None
+    other = str(find_rejection(known, (Elasticity(), Held(), Retraction(Spatula(9e-3, 12e-3, 1e-3)))))
     assert "a blade of 8 x 12 mm, its edge of 1.5 mm, and here is a blade of 9 x 12 mm, its edge of 1 mm" in other
     relaxing = find_scene("retract").effects[0]
     words = "it learned from tissue that does not relax, and here it relaxes by 45 % in 0.5 s and 36.5 % in 50 s"
-    assert refusal(known, (relaxing, Held(), Retraction(blade))) == words
+    assert find_rejection(known, (relaxing, Held(), Retraction(blade))) == words
 
 
 def test_the_command_presses_rods_and_blades(tmp_path, box, capsys):

@@ -7,8 +7,8 @@ import pytest
 from locators import dent, in_a_skull, locator_of
 
 from surrogate.locating import rounds
-from surrogate.locating.observation import Observation, placed_anew
-from surrogate.locating.posterior import conditioned
+from surrogate.locating.observation import Observation, place_again
+from surrogate.locating.posterior import condition_prior
 
 
 @pytest.fixture(scope="module")
@@ -31,16 +31,16 @@ def test_settled_round_starts_from_the_last_result(prior, monkeypatch, named, lo
     def condition(prior, evidence, tips, free):
         given.append((tips, free))
         outliers = np.array([1, *(count + 1 + one for one in lost)])
-        results.append(replace(conditioned(prior, evidence, tips, free), outliers=outliers))
+        results.append(replace(condition_prior(prior, evidence, tips, free), outliers=outliers))
         return results[-1]
 
     def place(body, observation, near, motion, bias):
         starts.append((near, motion.copy(), bias(rest)))
-        return placed_anew(body, observation, near, motion, bias)
+        return place_again(body, observation, near, motion, bias)
 
-    monkeypatch.setattr(rounds, "conditioned", condition)
-    monkeypatch.setattr(rounds, "placed_anew", place)
-    found, near = rounds.settled(prior, seen, free=True)
+    monkeypatch.setattr(rounds, "condition_prior", condition)
+    monkeypatch.setattr(rounds, "place_again", place)
+    found, near = rounds.match_and_update(prior, seen, free=True)
     assert found is results[-1] and 2 <= len(results) <= rounds.ROUNDS + 1
     np.testing.assert_array_equal(near, np.arange(count))  # without the one that is off the cortex
     every = prior.at(np.arange(len(body.mesh.nodes)))
@@ -48,7 +48,7 @@ def test_settled_round_starts_from_the_last_result(prior, monkeypatch, named, lo
         np.testing.assert_array_equal(points, near)
         np.testing.assert_allclose(motion[cortex], np.tensordot(result.weight, every[:, cortex], 1), atol=1e-12)
         assert not np.delete(motion, cortex, axis=0).any()
-        np.testing.assert_array_equal(bias, result.bias_at(rest))
+        np.testing.assert_array_equal(bias, result.compute_bias(rest))
     assert [free for _, free in given] == [True] * len(results)
     kept = np.delete(seen.tips, lost, axis=0).tolist()
     assert [each.tolist() for each, _ in given] == [tips.tolist(), *[kept] * (len(given) - 1)]

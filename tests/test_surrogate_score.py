@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surrogate.data.tool_loads import draw
-from surrogate.evaluation.score import SolveCounts, force_score, score, spread, table, winner
+from surrogate.evaluation.score import SolveCounts, find_best, format_scores, score, score_forces, spread
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def test_score_sees_a_shift(pretender, box, fresh):
     bent[:, 3, 1] += 1e-3 * np.arange(60)
     one = score("one vertex", pretender, fresh, bent, box.tumour_nodes)
     assert (one.worst_mean_mm, one.worst_p95_mm) == pytest.approx((29.5, np.percentile(np.arange(60), 95)))
-    assert winner([shifted, one, nothing]) is nothing
+    assert find_best([shifted, one, nothing]) is nothing
     assert one.mean_mm == pytest.approx(29.5 / len(box.tumour_nodes)) and one.max_mm == pytest.approx(59.0)
 
 
@@ -38,18 +38,18 @@ def test_a_table_says_what_learners_were_given(pretender, box, fresh):
             ("fem", None),
         )
     ]
-    heads, *lines = table(rows, 1.0).splitlines()[-3:]
+    heads, *lines = format_scores(rows, 1.0).splitlines()[-3:]
     assert heads.split() == ["learner", "loads", "unit", "series", "all", "inside", "seconds"]
     assert lines[0].split() == ["it", "400", "60", "9000", "9460", "12", "75.5"]
     assert lines[1].split() == ["dumb", "400", "0", "0", "400", "0", "unknown"]
-    assert "solves" not in table(rows[2:], 1.0)
+    assert "solves" not in format_scores(rows[2:], 1.0)
 
 
 def test_a_single_learner_wins_nothing(pretender, box, fresh):
     truth = pretender.deform(fresh, at=box.tumour_nodes).displacement + 1e-4
     one, other = (score(name, pretender, fresh, truth, box.tumour_nodes) for name in ("one", "other"))
-    assert "one wins: 0.17" in table([one, other], 1.0) and " is fastest, " in table([one, other], 1.0)
-    alone = table([one], 1.0)
+    assert "one wins: 0.17" in format_scores([one, other], 1.0) and " is fastest, " in format_scores([one, other], 1.0)
+    alone = format_scores([one], 1.0)
     assert "wins" not in alone and "fastest" not in alone
     assert "one: 0.1732 mm mean error at a mean motion of 1.000 mm" in alone
 
@@ -63,14 +63,14 @@ def test_of_few_loads_no_percentile_of_a_thousand_is_reported(pretender, box, fr
     truth = pretender.deform(fresh, at=box.tumour_nodes).displacement + 1e-4
     row = score("few", pretender, fresh, truth, box.tumour_nodes)
     assert row.p999_mm is row.p999_percent is row.worst_p999_mm is None
-    said = table([row], 1.0).splitlines()
+    said = format_scores([row], 1.0).splitlines()
     assert said[2].split().count("-") == 3 and "not known from fewer than 1000 loads" in said[3]
-    known = table([replace(row, p999_mm=0.25, p999_percent=2.5, worst_p999_mm=0.5)], 1.0).splitlines()
+    known = format_scores([replace(row, p999_mm=0.25, p999_percent=2.5, worst_p999_mm=0.5)], 1.0).splitlines()
     assert len(known[2]) == len(said[2]) and "0.2500" in known[2] and "fewer" not in known[3]
 
 
 def test_force_score_leaves_out_tools_that_do_not_press():
     truth = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0], [0.0, 4.0, 0.0]])
-    found = force_score(np.array([9.0, 0.2, 0.2]), truth, np.array([[0.1, 0.3, 0.1], [0.1, 0.5, 0.4]]))
+    found = score_forces(np.array([9.0, 0.2, 0.2]), truth, np.array([[0.1, 0.3, 0.1], [0.1, 0.5, 0.4]]))
     assert (found.loads, found.force, found.held) == (2, 3.0, (0.5, 1.0))
     assert (found.mean, found.mean_percent, found.bound) == pytest.approx((0.2, 7.5, 0.2))

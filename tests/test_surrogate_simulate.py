@@ -10,7 +10,7 @@ from scenes.cli import main
 from sim.bodies.meshfile import write_anatomy
 from surrogate.data.dataset import read_dataset
 from surrogate.data.tool_loads import BEYOND_TISSUE
-from surrogate.model.store import load, stated_errors
+from surrogate.model.store import load, read_reported_errors
 from surrogate.training.train import LEARNERS
 
 
@@ -104,7 +104,7 @@ def test_stiffer_tissue_moves_less(folder, tmp_path, capsys):
     assert said["loads_per_second"] == pytest.approx(2 / said["seconds"]["loads"])
     soft, stiff = read_dataset(folder / "data.h5"), read_dataset(out)
     tumour = soft.anatomy.tumour_nodes
-    ratio = np.linalg.norm(soft.unit_response(tumour)) / np.linalg.norm(stiff.unit_response(tumour))
+    ratio = np.linalg.norm(soft.compute_unit_response(tumour)) / np.linalg.norm(stiff.compute_unit_response(tumour))
     assert ratio == pytest.approx(2.0, rel=1e-3)
 
 
@@ -174,7 +174,7 @@ def test_models_are_judged_by_loads_that_they_have_never_seen(folder, small_box,
     count = ["--count", "40", "--device", "cpu", "--json"]  # of which too few calibrate
     assert main(["simulate", str(folder / "box.vtu"), "--out", little, *count]) == 0
     assert main(["train", little, "--out", few, "--learners", "linear"]) == 0
-    printed, (weak,) = capsys.readouterr().out, [known.weak for known in stated_errors(few).values()]
+    printed, (weak,) = capsys.readouterr().out, [known.weak for known in read_reported_errors(few).values()]
     assert f"enough: {'scenes play it guarded' if weak else 'it may answer alone'}" in printed
     assert main(["judge", few, fresh]) == 0
     printed = capsys.readouterr().out

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.options.outputs import stated as stated_beside
+from scenes.options.outputs import read_statements as stated_beside
 from scenes.tracked.truth import read_truth
 from sim.errors import InputError
-from sim.geometry.tetmesh import digest_of
+from sim.geometry.tetmesh import compute_digest
 from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import Basis
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.model.conformal import GROWTH, Bound
 from surrogate.model.learned import ModelPart
-from surrogate.model.store import learned_tissue, load, save, stated_errors
+from surrogate.model.store import load, read_learned_tissue, read_reported_errors, save
 from surrogate.model.training_range import Outside
 from surrogate.training.train import train
 
@@ -151,7 +151,7 @@ def rewritten(stored, path, change, seal=""):
     ("old", "new"),
     [('"bound": 0.', '"bound": 1.'), ('"svr"', '"gp"'), ('"reach": ', '"reach": 1'), ('"space"', '"space2"')],
 )
-@pytest.mark.parametrize("read", [load, learned_tissue, lambda path, _: stated_errors(path)])
+@pytest.mark.parametrize("read", [load, read_learned_tissue, lambda path, _: read_reported_errors(path)])
 def test_header_of_another_content_than_sealed_is_rejected(stored, box, tmp_path, read, old, new):
     path = rewritten(stored, tmp_path / "model.npz", lambda text: text.replace(old, new), r"\g<0>")
     with pytest.raises(InputError, match=r"do not have the digest that it states: it is damaged\. Make one with"):
@@ -163,7 +163,7 @@ def test_header_of_another_content_than_sealed_is_rejected(stored, box, tmp_path
 def test_model_with_another_array_than_named_is_rejected(stored, models, box, tmp_path, change):
     with np.load(stored) as file:
         arrays = {name: file[name] for name in file.files}
-    modes = digest_of(models["svr"].parts[0].basis.modes)
+    modes = compute_digest(models["svr"].parts[0].basis.modes)
     np.savez(tmp_path / "model.npz", **arrays | {modes: change(arrays[modes])})
     with pytest.raises(InputError, match=rf"its array '{modes}' has another digest: it is damaged\. Make one with"):
         load(tmp_path / "model.npz", box)

@@ -7,13 +7,13 @@ import pytest
 import trimesh
 
 from scenes.play.deformers import open_theatre
-from scenes.play.tip_reading import TipDistance, reading
-from scenes.play.tip_reading import measured as drawn_distance
+from scenes.play.tip_reading import TipDistance, read_tip_distance
+from scenes.play.tip_reading import measure_tip_distance as drawn_distance
 from scenes.script.scene import find_scene
 from scenes.script.tool import Blade, Probe
 from sim.accuracy import LIVE
 from sim.bodies.open_cortex import open_cortex
-from sim.bodies.tip_distance import tip_gauge
+from sim.bodies.tip_distance import build_tip_gauge
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, Touching
@@ -23,17 +23,24 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.data.tool_poses import draw_poses
-from surrogate.evaluation.coverage import distance_coverage
-from surrogate.model.learned import only_pushed
+from surrogate.evaluation.coverage import measure_distance_coverage
+from surrogate.model.learned import get_only_pushes
 from surrogate.model.store import load, save
 from surrogate.model.tip_distance import TipModel
-from surrogate.training.bounds import TIP, KnownDistances, bound_by, distance_errors, growth_by, missed
+from surrogate.training.bounds import (
+    TIP,
+    KnownDistances,
+    bound_by,
+    collect_missed,
+    compute_distance_errors,
+    compute_growth,
+)
 from surrogate.training.train import train
 
 
 @pytest.fixture(scope="module")
 def gauge(box):
-    return tip_gauge(box)
+    return build_tip_gauge(box)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +75,7 @@ def surface(positions, triangles):
 def test_it_is_measured_from_a_ball_that_rests_on_the_deformed_cortex(box, pretender, gauge):
     loads = draw("palpation", box, 6, 3)
     answer = pretender.deform(loads)
-    pushed, axis = only_pushed(loads), open_cortex(box).axis
+    pushed, axis = get_only_pushes(loads), open_cortex(box).axis
     found = gauge.distances(loads, answer.displacement, answer.nodes)
     lifted = gauge.distances(loads, answer.displacement, answer.nodes, lift=2e-3)
     for row in range(6):
@@ -110,11 +117,11 @@ def test_what_it_needs_it_asks_for(box, gauge, fresh):
         gauge.distances(loads, np.zeros((1, len(nodes), 3)), nodes)
     whole = replace(box, mesh=replace(box.mesh, region=np.ones(len(box.mesh.tets), int)))
     with pytest.raises(InputError, match="has no tumour"):
-        tip_gauge(whole).distances(loads, np.zeros((1, len(box.mesh.nodes), 3)), np.arange(len(box.mesh.nodes)))
+        build_tip_gauge(whole).distances(loads, np.zeros((1, len(box.mesh.nodes), 3)), np.arange(len(box.mesh.nodes)))
 
 
 def test_the_bound_holds_as_often_as_it_says(model, fresh):
-    found = distance_coverage(model, *fresh)
+    found = measure_distance_coverage(model, *fresh)
     # Of 200 loads that calibrate and 300 that judge the share scatters by 0.02.
     assert 0.89 <= found.held[0] <= 0.99 and found.held[1] >= found.held[0]
     # It follows the load: bounds of one size would be the 95th percentile for all.
@@ -130,11 +137,13 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
         return KnownDistances(loads, gauge.distances(loads, answer.displacement, answer.nodes))
 
     def seen(some):
-        return missed(model, open_patch(model.anatomy), model.asked(some.loads), distance_errors(model, some))
+        return collect_missed(
+            model, open_patch(model.anatomy), model.asked(some.loads), compute_distance_errors(model, some)
+        )
 
     kept, later = known(1500, 21), known(1000, 22)
     bounded = replace(model, tip=replace(model.tip, bound=bound_by(seen(kept), TIP, 0.0)))
-    found = distance_coverage(bounded, later.loads, later.distance)
+    found = measure_distance_coverage(bounded, later.loads, later.distance)
     assert 0.93 <= found.held[0] <= 0.97 and min(found.tenths) > 0.85 and found.held[1] > 0.975
 
 
@@ -142,19 +151,19 @@ def test_how_its_bound_holds_in_the_discs_left_out_is_reported_of_a_model_that_k
     """Recomputed: the scored model, a bound from the loads that are apart and outside every disc."""
     good, split = data.loads.rows(np.flatnonzero(data.good)), trained.split
     distance = gauge.distances(good, data.displacement(gauge.nodes)[data.good], gauge.nodes)
-    place = np.linalg.norm(only_pushed(good).point[:, None] - split.centres, axis=2).min(axis=1)
+    place = np.linalg.norm(get_only_pushes(good).point[:, None] - split.centres, axis=2).min(axis=1)
     beside = np.flatnonzero((np.arange(len(good)) >= len(good) - trained.calibrated) & (place > split.radius))
     scored = train(data, ["linear"], split=split).models["linear"]
 
     def seen(rows):
         loads = good.rows(rows)
         error = np.abs(scored.distance(loads).value - distance[rows])
-        return missed(scored, open_patch(data.anatomy), only_pushed(loads), error)
+        return collect_missed(scored, open_patch(data.anatomy), get_only_pushes(loads), error)
 
     near, held = seen(beside), []
     for disc in range(len(split.centres)):
         here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
-        bound = bound_by(near, TIP, growth_by(near, seen(others), TIP))
+        bound = bound_by(near, TIP, compute_growth(near, seen(others), TIP))
         bounded = replace(scored, tip=replace(scored.tip, bound=bound))
         held.append(seen(here).error <= bounded.distance(good.rows(here)).bound)
     found = trained.distance_left_out["linear"]
@@ -173,7 +182,7 @@ def test_without_a_push_nothing_is_off_and_far_outside_the_bound_is_wide(model, 
     loads = fresh[0].rows(slice(0, 20))
     idle = model.distance(loads.scaled(0.0))
     still = np.zeros((20, len(model.nodes), 3))
-    assert np.array_equal(idle.value, tip_gauge(model.anatomy).distances(loads, still, model.nodes))
+    assert np.array_equal(idle.value, build_tip_gauge(model.anatomy).distances(loads, still, model.nodes))
     assert (idle.bound == 0.0).all()
     strong = model.distance(loads.scaled(2.5))
     assert (strong.bound[0] > 2.0 * model.distance(loads).bound[0]).all() and (strong.value >= 0.0).all()
@@ -181,7 +190,7 @@ def test_without_a_push_nothing_is_off_and_far_outside_the_bound_is_wide(model, 
 
 def test_an_answer_at_hand_is_taken(model, fresh):
     loads = fresh[0].rows(slice(0, 3))
-    answer = model.deform(loads, at=tip_gauge(model.anatomy).nodes)
+    answer = model.deform(loads, at=build_tip_gauge(model.anatomy).nodes)
     given, asked = model.distance(loads, answer), model.distance(loads)
     assert given.value == pytest.approx(asked.value, abs=1e-9) and np.array_equal(given.bound, asked.bound)
 
@@ -202,7 +211,7 @@ def test_the_models_that_ship_bound_the_distance_of_a_strong_press_within_a_mill
     theatre, scene = open_theatre(device="cpu"), find_scene("press")
     at = open_cortex(theatre.anatomy).place()
     loads = Loads((Pushed(at.point[None], 0.3 * at.inward[None], np.array([7e-3])),))
-    truth, gauge = theatre.fem(scene, LIVE).deform(loads), tip_gauge(theatre.anatomy)
+    truth, gauge = theatre.fem(scene, LIVE).deform(loads), build_tip_gauge(theatre.anatomy)
     apart = gauge.distances(loads, truth.displacement, truth.nodes)
     for name, model in theatre.models.items():
         predicted = model.distance(loads)
@@ -216,14 +225,21 @@ def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender,
     answer, truth = model.deform(loads), pretender.deform(loads)
     predicted = model.distance(loads)
     apart = gauge.distances(loads, answer.displacement, answer.nodes)[0]
-    assert reading(model, loads, answer, tool, apart) == TipDistance(predicted.value[0], predicted.bound[0, 0])
-    assert reading(pretender, loads, truth, tool, fresh[1][2]) == TipDistance(fresh[1][2], None)
+    assert read_tip_distance(model, loads, answer, tool, apart) == TipDistance(
+        predicted.value[0], predicted.bound[0, 0]
+    )
+    assert read_tip_distance(pretender, loads, truth, tool, fresh[1][2]) == TipDistance(fresh[1][2], None)
     high = gauge.distances(loads, truth.displacement, truth.nodes, lift=2e-3)[0]
     assert drawn_distance(model.anatomy, loads, truth, tool, 2e-3).distance == high > fresh[1][2] + 1e-3
-    assert reading(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(predicted.value[0] + 2e-3)
+    assert read_tip_distance(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(
+        predicted.value[0] + 2e-3
+    )
     plain = replace(model, tip=None).distance(loads).value[0]
     outside = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
-    assert reading(model, loads, outside, tool, apart) == TipDistance(predicted.value[0], None)
-    assert reading(replace(model, tip=None), loads, answer, tool, apart) == TipDistance(plain, None)
-    assert reading(model, loads, answer, Blade(), apart) is None and reading(model, loads, answer, None, apart) is None
+    assert read_tip_distance(model, loads, outside, tool, apart) == TipDistance(predicted.value[0], None)
+    assert read_tip_distance(replace(model, tip=None), loads, answer, tool, apart) == TipDistance(plain, None)
+    assert (
+        read_tip_distance(model, loads, answer, Blade(), apart) is None
+        and read_tip_distance(model, loads, answer, None, apart) is None
+    )
     assert str(TipDistance(5.53e-3, 0.62e-3)) == "5.5 +- 0.7 mm" and str(TipDistance(5.53e-3, None)) == "5.5 mm"

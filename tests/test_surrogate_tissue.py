@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scenes.script.priors import drawn_from
+from scenes.script.priors import sample_from_fit
 from sim.errors import InputError
 from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue, load_tissue, save_tissue
 
@@ -15,12 +15,12 @@ def test_what_is_drawn_is_what_was_fitted():
     names, poisson, ratio = tissue.drawn(400, 1)
     assert names.count("bonded") == 100 and (ratio == FINE_RATIOS[30]).sum() == 200
     assert ((poisson == FINE_POISSONS[9]) == (ratio == FINE_RATIOS[30])).all()
-    draws = drawn_from(tissue, 3000.0, ("slide", "contact"), 30, 2)
+    draws = sample_from_fit(tissue, 3000.0, ("slide", "contact"), 30, 2)
     assert {draw.stiffness for draw in draws} == {0.5} and all(draw.skull == 0.25 for draw in draws)
-    stiff = drawn_from(tissue, 3000.0, ("slide", "contact"), 30, 2, ratio=2.0)
+    stiff = sample_from_fit(tissue, 3000.0, ("slide", "contact"), 30, 2, ratio=2.0)
     assert [draw.ratio for draw in stiff] == [draw.ratio / 2.0 for draw in draws]  # of a tumour that is stated as such
     with pytest.raises(InputError, match="cannot have"):
-        drawn_from(tissue, 3000.0, ("contact",), 8)
+        sample_from_fit(tissue, 3000.0, ("contact",), 8)
 
 
 def test_a_file_keeps_the_tissue_and_refuses_others(tmp_path):

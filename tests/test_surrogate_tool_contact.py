@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.script.shipped_files import spatula_model_path, template_path
+from scenes.script.shipped_files import get_spatula_model_path, template_path
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy
 from sim.contact_pressure import pressure
-from sim.deformation import joined
+from sim.deformation import join_deformations
 from sim.effects import Elasticity, Held, ToolContact, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
@@ -18,13 +18,13 @@ from sim.loads import Loads, Touching
 from sim.material import Material
 from sim.tools import Spatula
 from surrogate.data.cortex_patch import open_patch
-from surrogate.data.indentation import indented
-from surrogate.model.guarded import knows_pressure, tool_pressure
+from surrogate.data.indentation import to_indentation
+from surrogate.model.guarded import compute_tool_pressure, has_tool_pressure
 from surrogate.model.learned import Learned, ModelPart
 from surrogate.model.store import load
 from surrogate.model.tool_contact import HELD, ForceModel
-from surrogate.model.training_range import envelope_of
-from surrogate.training.fem_tables import condensed, side_by_side
+from surrogate.model.training_range import compute_training_range
+from surrogate.training.fem_tables import condense_exterior, join_bases
 
 BLADE = Spatula(8e-3, 12e-3, 1.5e-3)
 SOFT = Material("linear", 3000.0, 0.45)
@@ -44,11 +44,11 @@ def over(body: Anatomy, *places: tuple[float, float]) -> Loads:
 def model(box):
     """Contact on linear tissue, of which nothing is learned."""
     parts = [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)]
-    contact, bases = condensed(Fem(box, pushed_effects(box, SOFT), device="cpu", element="p1"), parts, BLADE)
+    contact, bases = condense_exterior(Fem(box, pushed_effects(box, SOFT), device="cpu", element="p1"), parts, BLADE)
     contact = replace(contact, grip=np.array([1.0, 0.0]))
-    asked = indented(over(box, (0.0, 0.2), (1.0, 4.0)), BLADE, open_patch(box))
-    known = envelope_of(open_patch(box), asked)
-    part = ModelPart("core", contact, side_by_side(bases))
+    asked = to_indentation(over(box, (0.0, 0.2), (1.0, 4.0)), BLADE, open_patch(box))
+    known = compute_training_range(open_patch(box), asked)
+    part = ModelPart("core", contact, join_bases(bases))
     return Learned(box, (part,), known, tool=BLADE, force=ForceModel())
 
 
@@ -74,7 +74,7 @@ def test_it_comes_straight_in_where_that_is_nearer(model, box):
     """From the air, from far aside, and out of the tissue again; each row goes its own way."""
     starts = [model.deform(over(box, place)) for place in ((0.0, -2.0), (9.0, 0.5), (0.3, 1.5))]
     there = over(box, (0.0, 1.0), (0.0, 1.0), (0.0, 1.5))
-    found, straight = model.deform(there, joined(starts)), model.deform(there)
+    found, straight = model.deform(there, join_deformations(starts)), model.deform(there)
     for row in (0, 1):
         assert found.displacement[row].tobytes() == straight.displacement[row].tobytes()
     assert found.displacement[2].tobytes() != straight.displacement[2].tobytes()
@@ -91,22 +91,22 @@ def test_pressure_is_that_of_the_finite_elements(model, box):
     """Its sum over areas is the force; its highest is that of the barrier's forces."""
     loads = over(box, (0.0, 2.0), (2.0, 3.0), (0.0, -1.0))
     answer = model.deform(loads)
-    found = tool_pressure(model, loads, answer)
-    assert knows_pressure(model) and not found[2].any()
-    np.testing.assert_array_equal(tool_pressure(model, loads, replace(answer, warm={})), found)
+    found = compute_tool_pressure(model, loads, answer)
+    assert has_tool_pressure(model) and not found[2].any()
+    np.testing.assert_array_equal(compute_tool_pressure(model, loads, replace(answer, warm={})), found)
     fem = Fem(box, (Elasticity(SOFT), Held(), ToolContact((BLADE,))), device="cpu", batch=1, element="p1")
     touching = loads.rows(np.array([0, 1]))
     truth = pressure(fem, touching, fem.deform(touching))
     np.testing.assert_allclose(found[:2].max(axis=1), truth.max(axis=1), rtol=0.2)
     with pytest.raises(InputError, match="give the complete result"):
-        tool_pressure(model, loads, answer.at(box.tumour_nodes))
+        compute_tool_pressure(model, loads, answer.at(box.tumour_nodes))
     with pytest.raises(InputError, match="train the learner contact"):
-        tool_pressure(replace(model, force=None), loads, answer)
+        compute_tool_pressure(replace(model, force=None), loads, answer)
 
 
 def test_the_spatula_that_ships_has_the_finite_elements_answers():
     """Fresh poses, two of which have contacts whose single precision is no longer positive definite."""
-    model = load(spatula_model_path(), read_anatomy(template_path()))["contact-gp"]
+    model = load(get_spatula_model_path(), read_anatomy(template_path()))["contact-gp"]
     kept = np.load(Path(__file__).parent / "data" / "spatula_poses.npz")
     answer = model.deform(Loads((Touching(kept["pose"][:, None]),)))
     off = np.linalg.norm(answer.at(model.anatomy.tumour_nodes).displacement - kept["tumour"], axis=2)

@@ -11,9 +11,9 @@ from surrogate.data.tool_loads import (
     PLANE_MODULUS,
     PUBLISHED_FOOTPRINT,
     TOOLS,
+    compute_rejected_share,
+    describe_rejected,
     draw,
-    refused_share,
-    refused_words,
     spread,
 )
 
@@ -33,7 +33,7 @@ def test_tools_stay_in_their_ranges(box, patch, name):
     assert pressure.max() <= HARDEST and pressure.min() >= tool.pressure[0]
     assert (3 * force / (4 * PLANE_MODULUS * loads.footprint)).max() <= tool.depth
     assert cosine.min() >= np.cos(tool.cone) - 1e-12
-    assert (patch.rim_distance(loads.point) >= loads.footprint).all()
+    assert (patch.compute_edge_distance(loads.point) >= loads.footprint).all()
 
 
 def test_points_are_uniform_by_area_directions_by_solid_angle_and_forces_by_logarithm(box, patch):
@@ -130,10 +130,12 @@ def test_the_share_of_nominal_loads_that_are_not_drawn(name):
     force = np.exp(random.uniform(*np.log(tool.force), 40_000))
     pressure, depth = force / (np.pi * radius**2), 3.0 * force / (4.0 * PLANE_MODULUS * radius)
     refused = (pressure < tool.pressure[0]) | (pressure > tool.pressure[1]) | (depth > tool.depth)
-    assert refused_share(name) == pytest.approx(refused.mean(), abs=0.01)
+    assert compute_rejected_share(name) == pytest.approx(refused.mean(), abs=0.01)
 
 
 def test_nominal_loads_of_palpation_are_refused_in_words():
-    assert refused_words("palpation").startswith("10 % of the nominal loads of palpation")
-    assert refused_share("mixed") == pytest.approx(np.mean([refused_share(name) for name in TOOLS]))
-    assert refused_share("seed") == refused_share("anything") == 0.0 and refused_words("seed") == ""
+    assert describe_rejected("palpation").startswith("10 % of the nominal loads of palpation")
+    assert compute_rejected_share("mixed") == pytest.approx(np.mean([compute_rejected_share(name) for name in TOOLS]))
+    assert (
+        compute_rejected_share("seed") == compute_rejected_share("anything") == 0.0 and describe_rejected("seed") == ""
+    )

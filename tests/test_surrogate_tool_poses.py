@@ -17,19 +17,19 @@ from sim.loads import Loads, Touching
 from sim.tools import Ball, Capsule
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
-from surrogate.data.indentation import indented
+from surrogate.data.indentation import to_indentation
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import TOOLS, draw
-from surrogate.data.tool_poses import DEEP, SHALLOW, draw_poses, poses_at, tool_of
-from surrogate.evaluation.score import errors
-from surrogate.model.applicability import refusal
+from surrogate.data.tool_poses import DEEP, SHALLOW, choose_ball, compute_poses, draw_poses
+from surrogate.evaluation.score import compute_point_errors
+from surrogate.model.applicability import find_rejection
 from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
-from surrogate.model.training_range import envelope_of
+from surrogate.model.training_range import compute_training_range
 from surrogate.training.learners import POSED
-from surrogate.training.train import learners_for, train
+from surrogate.training.train import list_learners, train
 
-BALL = tool_of("palpation")
+BALL = choose_ball("palpation")
 EFFECTS = (Elasticity(), Held(), ToolContact((BALL,)))
 SAID = {"shape": repr(BALL), "effects": repr(EFFECTS)}
 
@@ -43,7 +43,7 @@ def test_draws_are_each_of_their_own_number(box):
     other = draw_poses("palpation", box, 10, 5).of(Touching)
     assert other is not None
     assert not np.array_equal(some.pose, other.pose)
-    depth = np.linalg.norm(indented(many, BALL, open_patch(box)).force, axis=1) / BALL.radius
+    depth = np.linalg.norm(to_indentation(many, BALL, open_patch(box)).force, axis=1) / BALL.radius
     assert depth.min() >= SHALLOW * np.cos(TOOLS["palpation"].cone) - 1e-9
     assert depth.max() <= DEEP + 1e-9
 
@@ -59,7 +59,7 @@ class PosedPretender:
         return self.pretender.anatomy
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        pushed = indented(loads, BALL, open_patch(self.anatomy))
+        pushed = to_indentation(loads, BALL, open_patch(self.anatomy))
         depth = np.linalg.norm(pushed.force, axis=1, keepdims=True)
         force = 400.0 * np.sqrt(BALL.radius) * np.sqrt(depth) * pushed.force
         return self.pretender.deform(Loads((replace(pushed, force=force),), loads.times), start, at)
@@ -80,11 +80,11 @@ def trained(data):
 
 def test_poses_train_where_there_is_no_force(data, trained, pretender, box):
     """Fresh poses, as drawn: learnt to a few per cent, and bounds hold about as often as they say."""
-    assert learners_for(data) == POSED
+    assert list_learners(data) == POSED
     model, fresh = trained.models["gp"], draw_poses("palpation", box, 100, 77)
     nodes = box.tumour_nodes
     truth = PosedPretender(pretender).deform(fresh).at(nodes).displacement
-    error = errors(model, fresh, truth, nodes)
+    error = compute_point_errors(model, fresh, truth, nodes)
     assert error.mean() < 0.05 * np.linalg.norm(truth, axis=2).mean()
     found = model.deform(fresh, at=nodes)
     assert found.outcome.count(Outcome.PREDICTED) > 90
@@ -98,12 +98,12 @@ def test_poses_train_where_there_is_no_force(data, trained, pretender, box):
 def test_deeper_or_elsewhere_than_in_training_is_said(trained, box):
     model, patch = trained.models["gp"], open_patch(box)
     middle = patch.points.mean(axis=0, keepdims=True)
-    way = patch.normal_near(middle)
-    deep = Loads((poses_at(BALL, middle, way, 1.2 * BALL.radius * way),))
+    way = patch.find_normals(middle)
+    deep = Loads((compute_poses(BALL, middle, way, 1.2 * BALL.radius * way),))
     assert model.deform(deep).outcome == (Outcome.EXTRAPOLATED,)
-    off = Loads((poses_at(BALL, middle + [0.024, 0.0, 0.0], way, 2e-3 * way),))
+    off = Loads((compute_poses(BALL, middle + [0.024, 0.0, 0.0], way, 2e-3 * way),))
     assert model.deform(off).outcome == (Outcome.EXTRAPOLATED,)
-    air = Loads((poses_at(BALL, middle - 0.02 * way, way, 2e-3 * way),))
+    air = Loads((compute_poses(BALL, middle - 0.02 * way, way, 2e-3 * way),))
     assert not model.deform(air).displacement.any()
     assert model.deform(air).outcome == (Outcome.PREDICTED,)
 
@@ -120,9 +120,10 @@ def test_poses_nearest_to_the_same_corner_are_not_taken_for_the_same_poses():
     template = read_anatomy(template_path())
     patch, corners = open_patch(template), template.mesh.nodes
     first, same, other = (
-        indented(draw_poses("palpation", template, 900, seed), tool_of("palpation"), patch) for seed in (0, 0, 1)
+        to_indentation(draw_poses("palpation", template, 900, seed), choose_ball("palpation"), patch)
+        for seed in (0, 0, 1)
     )
-    known = envelope_of(patch, first)
+    known = compute_training_range(patch, first)
     shared = (known.points[:, None] == other.point.astype(np.float32)).all(axis=2).any(axis=1)
     assert shared.sum() > 3 and not known.repeats(other.point, corners)
     assert known.repeats(same.point, corners)
@@ -140,12 +141,12 @@ def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(train
         forces.deform(None)
     with pytest.raises(InputError, match="trained on pushing forces only"):
         forces.deform(draw_poses("palpation", box, 2, 0))
-    assert refusal(model, EFFECTS) is None
+    assert find_rejection(model, EFFECTS) is None
     for tools in ((Ball(5e-3),), (BALL, BALL), (Capsule(BALL.radius, 0.01),)):
-        assert "and here is a " in str(refusal(model, (Elasticity(), Held(), ToolContact(tools))))
-    assert "and here is none that is moved" in str(refusal(model, (Elasticity(), Held(), ToolForce())))
-    assert "not under ToolForce" in str(refusal(model, (*EFFECTS, ToolForce())))
-    assert "here is none, but ToolContact" in str(refusal(forces, EFFECTS))
+        assert "and here is a " in str(find_rejection(model, (Elasticity(), Held(), ToolContact(tools))))
+    assert "and here is none that is moved" in str(find_rejection(model, (Elasticity(), Held(), ToolForce())))
+    assert "not under ToolForce" in str(find_rejection(model, (*EFFECTS, ToolForce())))
+    assert "here is none, but ToolContact" in str(find_rejection(forces, EFFECTS))
 
 
 def test_what_poses_cannot_train_is_refused(data, box):

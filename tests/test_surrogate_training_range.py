@@ -5,7 +5,7 @@ import pytest
 
 from sim.loads import Pushed, push
 from surrogate.data.cortex_patch import open_patch
-from surrogate.model.training_range import Envelope, Measured, envelope_of
+from surrogate.model.training_range import Envelope, Measured, compute_training_range
 
 
 def test_an_envelope_reaches_as_far_as_training_loads_lie_apart(box):
@@ -13,11 +13,11 @@ def test_an_envelope_reaches_as_far_as_training_loads_lie_apart(box):
     points = [[0.0, 0.0, 0.0], [3e-3, 0.0, 0.0], [3e-3, 4e-3, 0.0]]
     training = push(points, [[0.0, 0.0, -0.1], [0.0, 0.0, -0.2], [0.0, 0.0, -0.15]], [5e-3, 6e-3, 5e-3]).of(Pushed)
     held = push([[13e-3, 0.0, 0.0], [0.0, 4e-3, 0.0]], [[0.3, 0.0, -0.9], [0.0, 0.0, -0.9]], [9e-3, 9e-3]).of(Pushed)
-    found = envelope_of(patch, training)
+    found = compute_training_range(patch, training)
     assert found.reach == pytest.approx(4e-3) and np.allclose(found.points, training.point)
     alone = Pushed(training.point[:1], training.force[:1], training.footprint[:1])
-    assert envelope_of(patch, alone).reach == 0.0
-    overhang = training.footprint - patch.rim_distance(training.point)
+    assert compute_training_range(patch, alone).reach == 0.0
+    overhang = training.footprint - patch.compute_edge_distance(training.point)
     assert found.overhang == pytest.approx(overhang.max()) and found.angle == pytest.approx(0.0, abs=1e-7)
     assert (found.force, found.footprint) == ((0.1, 0.2), (5e-3, 6e-3))
     assert found.line_force == pytest.approx(0.2 / 6e-3)

@@ -10,16 +10,16 @@ import numpy as np
 
 from ar.optics.calibration import Calibration
 from ar.optics.lens import Lens
-from scenes.play.deformers import Theatre, model_path
+from scenes.play.deformers import Theatre, to_model_path
 from scenes.play.player import Player
 from scenes.play.stage import Stage
-from scenes.script.head_posture import drained_then_turned
+from scenes.script.head_posture import build_drained_turn
 from scenes.script.scene import SCENES, Scene, Viewpoint, find_scene
 from scenes.script.shipped_files import template_path
 from scenes.script.tool_paths import idle, press
 from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
-from sim.bodies.intensity import Intensity, read_intensity, sidecar, write_intensity
+from sim.bodies.intensity import Intensity, read_intensity, to_intensity_path, write_intensity
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
@@ -33,7 +33,7 @@ from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.model.learned import Learned, ModelPart
 from surrogate.model.store import load, save
-from surrogate.model.training_range import envelope_of
+from surrogate.model.training_range import compute_training_range
 from surrogate.regressors.protocol import Linear
 from surrogate.training.train import train
 
@@ -54,7 +54,7 @@ def knowing_nothing(anatomy: Anatomy, training: dict[str, str]) -> Learned:
         "nodal", Linear().fit(np.eye(width), np.zeros((width, 1))), Basis(nodes, np.zeros((1, 3 * len(nodes))))
     )
     pushed = draw("palpation", anatomy, 2, 0).of(Pushed)
-    return Learned(anatomy, (part,), envelope_of(patch, pushed), 1.23e-4, training=training)
+    return Learned(anatomy, (part,), compute_training_range(patch, pushed), 1.23e-4, training=training)
 
 
 def trained_on(anatomy: Anatomy) -> dict[str, Learned]:
@@ -101,7 +101,7 @@ def coarse_brain() -> Anatomy:
 def template_theatre() -> Theatre:
     """The anatomy that ships, and finite elements that every scene on it shares."""
     path = template_path()
-    return Theatre(read_anatomy(path), read_intensity(sidecar(path)), {}, "cpu")
+    return Theatre(read_anatomy(path), read_intensity(to_intensity_path(path)), {}, "cpu")
 
 
 @cache
@@ -119,8 +119,8 @@ def put(theatre: Theatre, path: Path) -> Path:
     """The theatre as files: anatomy, scan and models beside it."""
     write_anatomy(path, theatre.anatomy)
     assert theatre.intensity is not None
-    write_intensity(sidecar(path), theatre.intensity)
-    save(model_path(path), theatre.models)
+    write_intensity(to_intensity_path(path), theatre.intensity)
+    save(to_model_path(path), theatre.models)
     return path
 
 
@@ -136,7 +136,7 @@ def short() -> Scene:
 
 def sinking() -> Scene:
     """Seven small frames without a tool: the fluid drains, and the head turns on its side."""
-    lying = drained_then_turned(0.1, 0.0, 0.1, np.radians(60.0))
+    lying = build_drained_turn(0.1, 0.0, 0.1, np.radians(60.0))
     effects = (Elasticity(), Held(), Slide(), Gravity())
     return replace(small(path=idle, duration=0.2, effects=effects, tool=None, lying=lying), name="sinking")
 

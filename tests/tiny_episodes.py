@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ar.optics.camera import Camera
-from ar.overlay.outlines import silhouette
-from scenes.episodes.reading.bodies import surface_rows
+from ar.overlay.outlines import compute_silhouette
+from scenes.episodes.reading.bodies import find_surface_rows
 from scenes.episodes.reading.schema import ARRAYS
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy
@@ -38,7 +38,7 @@ def poses(frames: int) -> np.ndarray:
     return found
 
 
-def camera_of(anatomy: Anatomy, width: int = WIDTH) -> Camera:
+def read_episode_camera(anatomy: Anatomy, width: int = WIDTH) -> Camera:
     """A camera that looks down on the middle of the tumour."""
     middle = anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0)
     T = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -47,17 +47,17 @@ def camera_of(anatomy: Anatomy, width: int = WIDTH) -> Camera:
     return Camera(K, T, width, HEIGHT)
 
 
-def pictures_of(anatomy: Anatomy, wanted: Wanted, tumour: np.ndarray) -> dict[str, np.ndarray]:
+def read_images(anatomy: Anatomy, wanted: Wanted, tumour: np.ndarray) -> dict[str, np.ndarray]:
     """Pictures as they were before they are packed, each (frames, H, W, ...)."""
     draws = np.random.default_rng(wanted.seed)
     shape = (wanted.frames, HEIGHT, wanted.width)
-    triangles = surface_rows(anatomy.tumour_surface, anatomy.tumour_nodes)
-    camera = camera_of(anatomy, wanted.width)
+    triangles = find_surface_rows(anatomy.tumour_surface, anatomy.tumour_nodes)
+    camera = read_episode_camera(anatomy, wanted.width)
     return {
         "colour": np.repeat(draws.integers(0, 255, (wanted.frames, 1, 1, 3), np.uint8), HEIGHT, 1).repeat(shape[2], 2),
         "depth": draws.integers(0, 60000, shape).astype(np.uint16),
         "segmentation": draws.integers(0, 4, shape).astype(np.uint8),
-        "tumour_mask": np.stack([silhouette(camera, at, triangles) for at in tumour]).astype(np.uint8),
+        "tumour_mask": np.stack([compute_silhouette(camera, at, triangles) for at in tumour]).astype(np.uint8),
     }
 
 
@@ -74,7 +74,7 @@ def write_episode(path: Path, anatomy: Anatomy, wanted: Wanted = Wanted()) -> Pa
     rest = anatomy.mesh.nodes[nodes]
     tumour = rest + np.linspace(0.0, 2e-3, frames)[:, None, None] * [1.0, 0.5, -1.0]
     solved = np.arange(frames) if not wanted.every else np.arange(0, frames, wanted.every)
-    camera, tool = camera_of(anatomy, wanted.width), poses(frames)
+    camera, tool = read_episode_camera(anatomy, wanted.width), poses(frames)
     arrays = {
         "time": np.arange(frames) / 30.0, "K": camera.K,
         "T_camera_world": np.tile(camera.T_camera_world, (frames, 1, 1)),
@@ -87,7 +87,7 @@ def write_episode(path: Path, anatomy: Anatomy, wanted: Wanted = Wanted()) -> Pa
     with h5py.File(path, "w") as file:
         for name, values in arrays.items():
             file.create_dataset(name, data=values).attrs["unit"] = ARRAYS[name].unit or "1"
-        for name, pictures in pictures_of(anatomy, wanted, tumour).items():
+        for name, pictures in read_images(anatomy, wanted, tumour).items():
             store = file.create_dataset(f"pictures/{name}", (frames,), h5py.vlen_dtype(np.uint8))
             for frame, picture in enumerate(pictures):
                 store[frame] = packed(name, picture)

@@ -7,7 +7,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from sim.discretisation.term import Cases
-from sim.runtime.columns import combined, dots, gathered
+from sim.runtime.columns import combine_columns, compute_dots, gather_columns
 from sim.runtime.device import Device
 
 
@@ -30,11 +30,11 @@ class Spring:
         self._creep = 1.0 - np.exp(-(cases.loads.times - cases.start_time) / self._tau)
 
     def keep(self, columns: np.ndarray) -> None:
-        self._anchor, self._creep = gathered(self._device, self._anchor, columns), self._creep[columns]
+        self._anchor, self._creep = gather_columns(self._device, self._anchor, columns), self._creep[columns]
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         away = self._away(u)
-        out.assign(out.numpy() + 0.5 * self._stiffness * dots(self._device, away, away))
+        out.assign(out.numpy() + 0.5 * self._stiffness * compute_dots(self._device, away, away))
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
         self.add_curvature(self._away(u), out)
@@ -43,7 +43,7 @@ class Spring:
         pass
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
-        combined(self._device, out, np.full(p.shape[1], self._stiffness), p, out)
+        combine_columns(self._device, out, np.full(p.shape[1], self._stiffness), p, out)
 
     def add_diagonal(self, out: wp.array) -> None:
         out.assign(out.numpy() + self._stiffness * np.eye(3))
@@ -59,7 +59,7 @@ class Spring:
         return anchor.T.reshape(len(self._creep), -1, 3)
 
     def _away(self, u: wp.array) -> wp.array:
-        return combined(self._device, u, np.full(u.shape[1], -1.0), self._anchor, wp.empty_like(u))
+        return combine_columns(self._device, u, np.full(u.shape[1], -1.0), self._anchor, wp.empty_like(u))
 
 
 class Wall:

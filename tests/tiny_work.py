@@ -9,10 +9,10 @@ from functools import partial
 import h5py
 import numpy as np
 
-from scenes.episodes.engine import make_all, still_missing
-from scenes.episodes.run_folder import BODIES, RunSettings, begin, episode_name, finished, versions_here
+from scenes.episodes.engine import find_still_missing, make_all
+from scenes.episodes.run_folder import BODIES, RunSettings, begin, get_versions, list_finished, to_episode_name
 from scenes.episodes.tasks import Made, RunWork
-from sim.runtime.atomic_files import written_stream
+from sim.runtime.atomic_files import write_stream_atomically
 
 PER_BODY = 5
 CARD = "CUDA_VISIBLE_DEVICES"
@@ -32,18 +32,18 @@ def body_of(number):
 
 
 def write(path, values):
-    with written_stream(path, path.suffix, sweep=False) as stream, h5py.File(stream, "w") as file:
+    with write_stream_atomically(path, path.suffix, sweep=False) as stream, h5py.File(stream, "w") as file:
         for name, value in values.items():
             file[name] = value
     return Made(path, len(values), path.stat().st_size)
 
 
-def body_path(folder, number):
+def to_body_path(folder, number):
     return folder / BODIES / f"{number:04d}" / "body.h5"
 
 
 def make_body(folder, seed, trouble, number):
-    path = body_path(folder, number)
+    path = to_body_path(folder, number)
     if number in trouble.bodies:
         return Made(path, failed=trouble.bodies[number])
     if path.exists():
@@ -52,7 +52,7 @@ def make_body(folder, seed, trouble, number):
 
 
 def make_episode(folder, seed, trouble, number):
-    path = folder / episode_name(number)
+    path = folder / to_episode_name(number)
     if path.exists():
         return Made(path, skipped=True)
     wrong = trouble.episodes.get(number, "")
@@ -66,7 +66,7 @@ def make_episode(folder, seed, trouble, number):
         raise RuntimeError("the card has failed")
     if wrong.startswith("does not"):
         return Made(path, failed=wrong)
-    with h5py.File(body_path(folder, body_of(number))) as file:
+    with h5py.File(to_body_path(folder, body_of(number))) as file:
         body = np.asarray(file["body"])
     time.sleep(trouble.seconds)
     frames = np.random.default_rng([seed, number]).random((3, 4096)) + body[0]
@@ -84,7 +84,7 @@ def tiny_work(folder, trouble=None, seed=1):
 
 
 def tiny_run(seed=1, device="cpu", **changed):
-    usual = {"digest": "0123456789abcdef", "seed": seed, "device": device, "versions": versions_here()}
+    usual = {"digest": "0123456789abcdef", "seed": seed, "device": device, "versions": get_versions()}
     return RunSettings("tiny", **{**usual, **changed})
 
 
@@ -92,7 +92,7 @@ def played(folder, workers, count, trouble=None, heard=lambda *words: None, agai
     """A run as the command makes one."""
     run = tiny_run(device=workers.device)
     first = begin(folder, run, 'title = "tiny"\n')
-    there, missing = still_missing(folder, finished(folder), range(count), first, again)
+    there, missing = find_still_missing(folder, list_finished(folder), range(count), first, again)
     return make_all(tiny_work(folder, trouble), folder, run, missing, workers, heard, there)
 
 

@@ -44,7 +44,7 @@ def name_of(kernel: wp.Kernel) -> str:
     return f"{kernel.func.__module__}:{kernel.func.__name__}"
 
 
-def listened(launch):
+def listen_to_stages(launch):
     """`wp.launch` that notes what it launches."""
 
     def noting(kernel, *words, **more):
@@ -54,7 +54,7 @@ def listened(launch):
     return noting
 
 
-def scene_of(name: str, more: str, law: str, element: str) -> Scene:
+def build_scene(name: str, more: str, law: str, element: str) -> Scene:
     """A built-in scene with more effects, another law for all tissue, another element."""
     scene = find_scene(name)
     effects = tuple(MADE[kind] if kind in MADE else getattr(known, kind)() for kind in more.split("+") if kind)
@@ -97,11 +97,11 @@ def played(scene: Scene) -> dict[str, list[str]]:
 
 
 if __name__ == "__main__":
-    wp.launch = listened(wp.launch)
+    wp.launch = listen_to_stages(wp.launch)
     for line in sys.stdin:
         child = os.fork()
         if child == 0:
-            print(json.dumps(played(scene_of(*json.loads(line)))), flush=True)
+            print(json.dumps(played(build_scene(*json.loads(line)))), flush=True)
             os._exit(0)
         if os.waitpid(child, 0)[1]:
             print("null", flush=True)

@@ -87,7 +87,7 @@ class Calibration:
         """Return the camera at a pose, (4, 4) as in `Camera`; errors as there."""
         return Camera(self.K, T_camera_world, self.width, self.height, self.lens)
 
-    def sized(self, width: int, height: int, scale: bool = False) -> Calibration:
+    def resize_calibration(self, width: int, height: int, scale: bool = False) -> Calibration:
         """Return the calibration for another image size, if `scale` is set and the aspect ratio is the same.
 
         Raises
@@ -107,25 +107,25 @@ class Calibration:
         return Calibration((fx, fy), (cx, cy), width, height, self.lens, self.name, self.readout)
 
 
-def opencv_text(calibration: Calibration) -> str:
+def to_opencv_text(calibration: Calibration) -> str:
     """Write a calibration as YAML of `cv2.FileStorage`; five coefficients, or eight of a rational lens."""
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", calibration.width)
     storage.write("image_height", calibration.height)
     storage.write("camera_name", calibration.name)
     storage.write("camera_matrix", calibration.K)
-    storage.write("distortion_coefficients", coefficients_of(calibration.lens)[:, None])
+    storage.write("distortion_coefficients", collect_coefficients(calibration.lens)[:, None])
     if calibration.readout > 0.0:
         storage.write(READOUT, calibration.readout)
     return storage.releaseAndGetString()
 
 
-def ros_text(calibration: Calibration) -> str:
+def to_ros_text(calibration: Calibration) -> str:
     """Write a calibration as YAML of ROS's camera_info, of the model plumb_bob, or rational_polynomial if needed.
 
     Without rectification; the projection is that of the camera matrix.
     """
-    coefficients = coefficients_of(calibration.lens)
+    coefficients = collect_coefficients(calibration.lens)
     lines = [
         f"image_width: {calibration.width}",
         f"image_height: {calibration.height}",
@@ -140,7 +140,7 @@ def ros_text(calibration: Calibration) -> str:
     return "\n".join(lines) + "\n"
 
 
-def coefficients_of(lens: Lens) -> np.ndarray:
+def collect_coefficients(lens: Lens) -> np.ndarray:
     """Return coefficients (5,) or, of a rational lens, (8,), in OpenCV's order."""
     return lens.coefficients if lens.coefficients[5:].any() else lens.coefficients[:5]
 
@@ -175,7 +175,7 @@ WANTED = (
 )
 
 
-def parsed(text: str) -> Calibration:
+def parse_calibration(text: str) -> Calibration:
     """Parse a calibration from YAML of `cv2.FileStorage`, or of ROS's camera_info.
 
     Four coefficients (k1 k2 p1 p2) are read as five. More than eight are accepted if those after the eighth are 0.

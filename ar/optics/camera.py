@@ -17,7 +17,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from .lens import Lens, straightened, with_focus, without_focus
+from .lens import Lens, to_normalised, to_pixels, undistort_pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class Camera:
         """Angle between the upper and the lower border [rad]; exact without lens, if the principal point is centred."""
         return float(2.0 * np.arctan(0.5 * self.height / self.K[1, 1]))
 
-    def in_frame(self, points: np.ndarray) -> np.ndarray:
+    def to_camera_frame(self, points: np.ndarray) -> np.ndarray:
         """Transform world points (..., 3) to the camera frame, (..., 3) [m]."""
         return points @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
 
@@ -87,11 +87,11 @@ class Camera:
 
         Pixels are NaN where depth <= 0 (behind), and beyond the reach of the lens (`Lens.reach`).
         """
-        in_camera = self.in_frame(np.asarray(points, np.float64))
+        in_camera = self.to_camera_frame(np.asarray(points, np.float64))
         if self.lens is not None:
             depth = in_camera[..., 2]
             places = in_camera[..., :2] / np.where(depth > 0.0, depth, np.nan)[..., None]
-            return with_focus(self.K, self.lens.bent(places)), depth
+            return to_pixels(self.K, self.lens.bent(places)), depth
         homogeneous = in_camera @ self.K.T
         depth = homogeneous[..., 2]
         return homogeneous[..., :2] / np.where(depth > 0.0, depth, np.nan)[..., None], depth
@@ -102,7 +102,7 @@ class Camera:
         NaN at pixels where the lens sees nothing.
         """
         if self.lens is not None:
-            pixels = with_focus(self.K, self.lens.straight(without_focus(self.K, np.asarray(pixels, np.float64))))
+            pixels = to_pixels(self.K, self.lens.straight(to_normalised(self.K, np.asarray(pixels, np.float64))))
         homogeneous = np.concatenate([pixels, np.ones((*np.shape(pixels)[:-1], 1))], axis=-1)
         in_camera = homogeneous @ np.linalg.inv(self.K).T * np.asarray(depth)[..., None]
         return (in_camera - self.T_camera_world[:3, 3]) @ self.T_camera_world[:3, :3]
@@ -113,9 +113,9 @@ class Camera:
         if self.lens is None:
             rows, columns = np.mgrid[: self.height, : self.width].astype(np.float64)
             return np.stack([columns, rows], axis=-1)
-        return straightened(self.lens, tuple(self.K.ravel().tolist()), self.width, self.height)
+        return undistort_pixels(self.lens, tuple(self.K.ravel().tolist()), self.width, self.height)
 
-    def perturbed(self, degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Camera:
+    def perturb(self, degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Camera:
         """Return the same camera with the world rotated about its centre by an angle [degree].
 
         Right-handed round `axis` (camera frame): round y, the default, the scene ahead moves to the right.
@@ -145,7 +145,7 @@ class Camera:
         K[:2, :2] *= factor
         return replace(self, K=K)
 
-    def refocused(self, focal_length: float, before: float, now: float) -> Camera:
+    def refocus(self, focal_length: float, before: float, now: float) -> Camera:
         """Return the same camera focused on another distance, which changes its magnification.
 
         A thin lens of focal length f forms the image of an object at d at the distance f d / (d - f) behind it.
@@ -181,7 +181,7 @@ class Camera:
         )
         return replace(self, K=resize @ self.K, width=width, height=height)
 
-    def cropped(self, rows: slice, columns: slice) -> Camera:
+    def crop_to(self, rows: slice, columns: slice) -> Camera:
         """Return the camera of `picture[rows, columns]`, slices with start and stop."""
         shift = np.zeros((3, 3))
         shift[:2, 2] = columns.start, rows.start
@@ -256,7 +256,7 @@ def stereo_pair(
         raise ValueError(f"a baseline of {baseline} m, a distance of {working_distance} m: give numbers above 0.")
     inwards = 0.0 if working_distance is None else float(np.degrees(np.arctan2(0.5 * baseline, working_distance)))
     half = np.array([0.5 * baseline, 0.0, 0.0])
-    return camera.moved(-half).perturbed(-inwards), camera.moved(half).perturbed(inwards)
+    return camera.moved(-half).perturb(-inwards), camera.moved(half).perturb(inwards)
 
 
 # Largest motion of points during a band of rows [pixel]: the error of a row is then at most half of it.
@@ -265,12 +265,14 @@ STEP = 0.4
 MOMENTS, FEWEST, STEPS = 33, 4, 6
 
 
-def row_time(row: np.ndarray | float, height: int, readout: float) -> np.ndarray | float:
+def compute_row_time(row: np.ndarray | float, height: int, readout: float) -> np.ndarray | float:
     """Compute the time [s] of a row in an image of `height` rows; rows outside as the first or last one."""
     return readout * (np.clip(np.asarray(row) / max(height - 1, 1), 0.0, 1.0) - 0.5)
 
 
-def row_bands(camera_at: Callable[[float], Camera], readout: float, points: np.ndarray) -> list[tuple[slice, Camera]]:
+def split_row_bands(
+    camera_at: Callable[[float], Camera], readout: float, points: np.ndarray
+) -> list[tuple[slice, Camera]]:
     """Split the rows, from top to bottom, into bands, each with the camera at its time, cropped to these rows.
 
     There are as many as needed for points (n, 3) [m] to move by at most `STEP` pixels in each.
@@ -283,12 +285,12 @@ def row_bands(camera_at: Callable[[float], Camera], readout: float, points: np.n
     edges = np.linspace(0, middle.height, count + 1).round().astype(int).tolist()
     bands = []
     for top, low in pairwise(edges):
-        camera = camera_at(float(row_time(0.5 * (top + low - 1), middle.height, readout)))
-        bands.append((slice(top, low), camera.cropped(slice(top, low), slice(0, middle.width))))
+        camera = camera_at(float(compute_row_time(0.5 * (top + low - 1), middle.height, readout)))
+        bands.append((slice(top, low), camera.crop_to(slice(top, low), slice(0, middle.width))))
     return bands
 
 
-def time_of_point(camera_at: Callable[[float], Camera], readout: float, point: np.ndarray) -> float:
+def find_row_time(camera_at: Callable[[float], Camera], readout: float, point: np.ndarray) -> float:
     """Compute the time [s] of the row in which a point (3,) [m] is seen; 0 if it has no pixel."""
     time = 0.0
     for _ in range(STEPS):
@@ -296,5 +298,5 @@ def time_of_point(camera_at: Callable[[float], Camera], readout: float, point: n
         (pixel,), _ = camera.project(point[None])
         if not np.isfinite(pixel).all():
             return 0.0
-        time = float(row_time(float(pixel[1]), camera.height, readout))
+        time = float(compute_row_time(float(pixel[1]), camera.height, readout))
     return time

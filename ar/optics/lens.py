@@ -154,19 +154,19 @@ class Lens:
 
 
 @lru_cache(maxsize=4)
-def straightened(lens: Lens, K: tuple[float, ...], width: int, height: int) -> np.ndarray:
+def undistort_pixels(lens: Lens, K: tuple[float, ...], width: int, height: int) -> np.ndarray:
     """Undistort each pixel, (H, W, 2) [pixel]; NaN where nothing is seen. K (9,): row by row."""
     matrix = np.reshape(K, (3, 3))
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
-    places = lens.straight(without_focus(matrix, np.stack([columns, rows], axis=-1)))
-    return with_focus(matrix, places)
+    places = lens.straight(to_normalised(matrix, np.stack([columns, rows], axis=-1)))
+    return to_pixels(matrix, places)
 
 
-def with_focus(K: np.ndarray, places: np.ndarray) -> np.ndarray:
+def to_pixels(K: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Map normalised positions (..., 2) to pixels (..., 2) by K (3, 3)."""
     return places @ K[:2, :2].T + K[:2, 2]
 
 
-def without_focus(K: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def to_normalised(K: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Map pixels (..., 2) to normalised positions (..., 2) by K (3, 3)."""
     return (pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T

@@ -10,21 +10,30 @@ import numpy as np
 
 from ..optics.camera import Camera
 from ..rendering import rasteriser, real_picture, shade, surfaces
-from ..rendering.layer import Layer, vertex_normals
+from ..rendering.layer import Layer, compute_vertex_normals
 from ..rendering.parallel import load
-from ..rendering.rasteriser import RasterisedSurface, seen
+from ..rendering.rasteriser import RasterisedSurface, rasterise_surface
 from ..rendering.renderer import Picture
 from . import distances, window
-from .distances import lines_of
+from .distances import list_lines
 from .gauge import draw_line, write_gauge
-from .hud import FINE, FONT, HEAD, NARROW, ROW, Below, folded, lay, millimetres
-from .legend import Entry, legend, place_sheet
+from .hud import FINE, FONT, HEAD, NARROW, ROW, Below, format_millimetres, lay, wrap_line
+from .legend import Entry, draw_legend, place_sheet
 from .marks import BEFORE, DOTTED, NO_COVER, NO_MARKS, NO_WORDS, Cover, Marks, Words, draw_before, draw_trace
 from .measured import Measure
-from .outlines import blank, box_around, dash, ink_of, joined, key_of, outlines, pieces
+from .outlines import (
+    allocate_sheet,
+    compute_ink,
+    cut_outlines,
+    draw_dashes,
+    find_outlines,
+    find_pixel_box,
+    join_boxes,
+    to_key,
+)
 from .places import CLEAR, PAD
 from .styles import STYLES, Opening, Style
-from .window import DARK, FRONT, SHUT, Lines, Roles, overlaid
+from .window import DARK, FRONT, SHUT, Lines, Roles, draw_overlay
 
 # Unreliable overlays are amber and broken; their text has a paler colour, so that pixels of the outline's colour are
 # the outline's alone.
@@ -148,19 +157,19 @@ def composite(
         marks = replace(marks, margin=0.0, gauge=gauge)
     grown = None
     if np.any(np.asarray(marks.margin) > 0.0):
-        normals = vertex_normals(hidden.vertices, hidden.triangles)
+        normals = compute_vertex_normals(hidden.vertices, hidden.triangles)
         grown = replace(hidden, vertices=hidden.vertices + np.reshape(marks.margin, (-1, 1)) * normals)
     roles = Roles(tuple(cover.occluders), None if cover.opening is None else cover.opening.ids, cover.covered)
     measure = Measure(style, picture, camera, hidden, roles, marks.gauge, words.names.now, words.error)
     surfaces = [layer.vertices for layer in (hidden, grown, marks.before) if layer is not None]
     surfaces += [trace.layer.vertices for trace in marks.traces]
-    box = box_around(camera, np.concatenate([*surfaces, measure.reached]))
+    box = find_pixel_box(camera, np.concatenate([*surfaces, measure.reached]))
     sketch = _sketched(measure, grown, marks, cover.opening, bool(words.doubt), box)
     motion = "" if box is None or marks.before is None else _motion(hidden, marks.before, words)
     drawn = _written(sketch, camera, words, motion)
     if marks.gauge is None and cover.opening is None and style not in ("depth", "rings", "cut"):
         return drawn
-    return _explained(drawn, sketch, measure, legend_entries(hidden, grown, marks, words))
+    return _explained(drawn, sketch, measure, list_legend_entries(hidden, grown, marks, words))
 
 
 def _sketched(
@@ -171,42 +180,44 @@ def _sketched(
     picture, camera, hidden, style, gauge = measure.picture, measure.camera, measure.hidden, measure.style, marks.gauge
     shape = camera.height, camera.width
     taken, faint, thin = np.zeros(shape, np.uint8), np.zeros(shape, bool), np.zeros(shape, bool)
-    around = box if gauge is None else joined(box, box_around(camera, np.stack([gauge.tip, gauge.nearest])))
+    around = box if gauge is None else join_boxes(box, find_pixel_box(camera, np.stack([gauge.tip, gauge.nearest])))
     if around is None:
         return Sketch(picture.colour.copy(), taken, faint, thin)
-    part, device = camera.cropped(*around), str(picture.drawn.colour.device)
-    found = seen(part, hidden.vertices, hidden.triangles, device=device)
-    under, above, ground = blank(part), None, None
+    part, device = camera.crop_to(*around), str(picture.drawn.colour.device)
+    found = rasterise_surface(part, hidden.vertices, hidden.triangles, device=device)
+    under, above, ground = allocate_sheet(part), None, None
     if marks.before is not None:
         draw_before(under, camera, around, marks.before, hidden)
     if grown is not None:
         bare = under[..., 3] == 0
-        wider = seen(part, grown.vertices, grown.triangles, device=device).mask
-        dash(under, outlines(wider), margin_ink(hidden), DASHED, 1)
+        wider = rasterise_surface(part, grown.vertices, grown.triangles, device=device).mask
+        draw_dashes(under, find_outlines(wider), get_margin_ink(hidden), DASHED, 1)
         faint[around] = bare & (under[..., 3] > 0)
     if opening is not None:
         role = measure.roles.of(picture.segmentation, around)
-        ground = ground_over(picture.segmentation[around], role, found, opening)
+        ground = find_ground(picture.segmentation[around], role, found, opening)
     for trace in marks.traces:
         draw_trace(under, part, trace)
-    draw_broken(under, found, ink_of(hidden.colour), ground, doubtful)
+    draw_broken(under, found, compute_ink(hidden.colour), ground, doubtful)
     if gauge is not None or style == "cut":
-        above = blank(part)
+        above = allocate_sheet(part)
     if gauge is not None and above is not None:
         draw_line(above, part, gauge)
     bare = under[..., 3] == 0
     measure.draw(under, under if above is None else above, around)
     if style == "rings":
-        thin[around] = lines_of(bare & (under[..., 3] > 0))
-    lines = Lines(ink_of(hidden.colour), not doubtful, under, above)
-    out, taken[around] = overlaid(picture.drawn, around, part, hidden, found, measure.roles, style, lines)
+        thin[around] = list_lines(bare & (under[..., 3] > 0))
+    lines = Lines(compute_ink(hidden.colour), not doubtful, under, above)
+    out, taken[around] = draw_overlay(picture.drawn, around, part, hidden, found, measure.roles, style, lines)
     return Sketch(out, taken, faint, thin, around, ground)
 
 
 def _motion(hidden: Layer, before: Layer, words: Words) -> str:
     """Describe the surface's mean motion, or the given motion."""
     mean = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
-    return f"{words.names.motion} {millimetres(mean) if words.moved is None else millimetres(*words.moved)}"
+    return (
+        f"{words.names.motion} {format_millimetres(mean) if words.moved is None else format_millimetres(*words.moved)}"
+    )
 
 
 def _written(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overlaid:
@@ -218,7 +229,7 @@ def _written(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overl
     write_head(drawn, words.head)
     if motion:
         firm = drawn.taken * ~sketch.faint  # it keeps its place, although it is on the margin's line
-        lay(drawn.colour, firm, folded(motion, NARROW * camera.width), (0, camera.height))
+        lay(drawn.colour, firm, wrap_line(motion, NARROW * camera.width), (0, camera.height))
         np.bitwise_or(drawn.taken, firm, out=drawn.taken)
     write_doubt(drawn, words.doubt)
     return drawn
@@ -245,7 +256,7 @@ def _explained(drawn: Overlaid, sketch: Sketch, measure: Measure, keys: Sequence
     for each in (sights, needed):
         each[around] |= ground.mask
     measure.lay(out, taken, sights | apart, needed)
-    return replace(drawn, named=bool(keys) and place_sheet(out, taken, legend(keys), sights))
+    return replace(drawn, named=bool(keys) and place_sheet(out, taken, draw_legend(keys), sights))
 
 
 def _check(picture: Picture, camera: Camera, style: str, covered: np.ndarray | None) -> None:
@@ -260,7 +271,7 @@ def _check(picture: Picture, camera: Camera, style: str, covered: np.ndarray | N
         raise ValueError(f"covered is {given}: give a mask (H, W) of bool as large as the image, {shape}.")
 
 
-def ground_over(segmentation: np.ndarray, role: np.ndarray, found: RasterisedSurface, opening: Opening) -> Ground:
+def find_ground(segmentation: np.ndarray, role: np.ndarray, found: RasterisedSurface, opening: Opening) -> Ground:
     """Determine the ground over a surface in a box, from the segmentation and roles (h, w) uint8."""
     mask = found.mask
     counts = np.bincount(segmentation[mask & (role != FRONT)], minlength=256)
@@ -273,25 +284,25 @@ def draw_broken(
 ) -> None:
     """Draw the broken parts of an outline, in place: all of an unreliable one, and those under closed ground."""
     if doubtful:
-        dash(sheet, outlines(found.mask), ink, BROKEN)
+        draw_dashes(sheet, find_outlines(found.mask), ink, BROKEN)
     elif ground is not None and ground.shut.any():
-        dash(sheet, pieces(outlines(ground.mask), ground.shut), ink, HIDDEN, BOLD)
+        draw_dashes(sheet, cut_outlines(find_outlines(ground.mask), ground.shut), ink, HIDDEN, BOLD)
 
 
-def margin_ink(hidden: Layer) -> tuple[float, ...]:
+def get_margin_ink(hidden: Layer) -> tuple[float, ...]:
     """Compute the colour of the margin line round a surface."""
-    return tuple(FAINT * share for share in ink_of(hidden.colour))
+    return tuple(FAINT * share for share in compute_ink(hidden.colour))
 
 
-def legend_entries(hidden: Layer, grown: Layer | None, marks: Marks, words: Words) -> tuple[Entry, ...]:
+def list_legend_entries(hidden: Layer, grown: Layer | None, marks: Marks, words: Words) -> tuple[Entry, ...]:
     """List legend entries of the drawn lines that have a name."""
     names = words.names
     named = zip(marks.traces, names.traces, strict=False)
     entries = [
-        Entry(names.now, key_of(ink_of(hidden.colour)), BROKEN if words.doubt else None, BOLD),
-        *([] if grown is None else [Entry(names.margin, margin_ink(hidden), DASHED, 1)]),
-        *(Entry(name, key_of(ink_of(trace.layer.colour)), trace.pattern) for trace, name in named),
-        *([] if marks.before is None else [Entry(names.before, ink_of(BEFORE), DOTTED)]),
+        Entry(names.now, to_key(compute_ink(hidden.colour)), BROKEN if words.doubt else None, BOLD),
+        *([] if grown is None else [Entry(names.margin, get_margin_ink(hidden), DASHED, 1)]),
+        *(Entry(name, to_key(compute_ink(trace.layer.colour)), trace.pattern) for trace, name in named),
+        *([] if marks.before is None else [Entry(names.before, compute_ink(BEFORE), DOTTED)]),
     ]
     return tuple(entry for entry in entries if entry.name)
 
@@ -314,22 +325,22 @@ def write_ground(
     if not ground.words:
         return
     there = cv2.moments((ground.mask & ground.shut).view(np.uint8), binaryImage=True)
-    lines = ground_lines(ground.words)
+    lines = format_ground(ground.words)
     wide = max(cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines)
     column, row = there["m10"] / there["m00"] + box[1].start, there["m01"] / there["m00"] + box[0].start
     wish = round(column - wide / 2), round(row - ROW * len(lines) / 2)
     lay(drawn.colour, drawn.taken, lines, wish, FINE, needed=True, below=Below(front, lines_there))
 
 
-def ground_lines(words: str) -> list[str]:
+def format_ground(words: str) -> list[str]:
     """Break the ground's label into short lines, which fit into a silhouette."""
-    return folded(words, SHORT)
+    return wrap_line(words, SHORT)
 
 
-def head_lines(texts: Sequence[str], tool: np.ndarray) -> list[str]:
+def format_head_lines(texts: Sequence[str], tool: np.ndarray) -> list[str]:
     """Break text for the top of an image into lines, as wide as possible without covering a tool (H, W) bool."""
     width = tool.shape[1]
-    tried = [[part for text in texts for part in folded(text, share * width)] for share in HEAD_WIDTHS]
+    tried = [[part for text in texts for part in wrap_line(text, share * width)] for share in HEAD_WIDTHS]
     for lines in tried:
         long = max((cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines), default=0)
         if not tool[HEAD - CLEAR : HEAD + ROW * len(lines) + CLEAR, : PAD + long + CLEAR].any():
@@ -350,9 +361,9 @@ def write_head(drawn: Overlaid, lines: Sequence[str]) -> None:
 def write_doubt(drawn: Overlaid, doubt: str) -> None:
     """Write the reason why a result is unreliable in the bottom-left corner, in place; may cover other text."""
     height, width = drawn.taken.shape
-    lay(drawn.colour, drawn.taken, doubt_lines(doubt, width), (0, height), FINE, ink_of(WARNING), needed=True)
+    lay(drawn.colour, drawn.taken, format_warning(doubt, width), (0, height), FINE, compute_ink(WARNING), needed=True)
 
 
-def doubt_lines(doubt: str, width: int) -> list[str]:
+def format_warning(doubt: str, width: int) -> list[str]:
     """Break a warning into lines for an image of this width [pixel]: its reason, and its consequence."""
-    return [line for part in doubt.split(": ") for line in folded(part, NARROW * width)]
+    return [line for part in doubt.split(": ") for line in wrap_line(part, NARROW * width)]

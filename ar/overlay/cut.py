@@ -13,9 +13,9 @@ import numpy as np
 
 from ..optics.camera import Camera
 from ..rendering.layer import Layer
-from .distances import signed_distance, tree_of
-from .hud import WHITE, haloed
-from .outlines import dash, outlines
+from .distances import build_tree, compute_signed_distance
+from .hud import WHITE, write_haloed
+from .outlines import draw_dashes, find_outlines
 from .window import FRONT, SHUT
 
 # Smallest distance of a tip from the line of sight that gives a direction; below, the image's right is used [m].
@@ -56,7 +56,7 @@ class CutPlane:
         return self.middle + coordinates @ np.stack([self.across, self.along])
 
 
-def plane_through(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) -> CutPlane:
+def build_plane(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) -> CutPlane:
     """Build the plane of a camera's centre, a centre (3,) [m] and a tip (3,) [m], which is on its right in the image.
 
     Without a tip, or with one on the line of sight, the plane is horizontal in the image.
@@ -71,7 +71,7 @@ def plane_through(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) ->
     return CutPlane(middle, across if across @ level >= 0.0 else -across, along)
 
 
-def profile(
+def compute_profile(
     camera: Camera, plane: CutPlane, depth: np.ndarray, roles: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Extract the visible surface along the plane: positions (n, 2) [m], in order across, and their roles (n,).
@@ -90,7 +90,7 @@ def profile(
     return places[order], role[kept][order]
 
 
-def section(
+def draw_section(
     camera: Camera,
     hidden: Layer,
     plane: CutPlane,
@@ -105,7 +105,7 @@ def section(
     Parameters
     ----------
     seen
-        As returned by `profile`.
+        As returned by `compute_profile`.
     size
         Width and height [pixel].
     tip
@@ -117,8 +117,8 @@ def section(
     low, scale = _frame(plane, hidden, seen[0], tip, size)
     columns, rows = np.meshgrid(np.arange(wide), np.arange(tall))
     places = low + np.stack([columns, rows], axis=2) / scale
-    distance = signed_distance(
-        tree_of(hidden.vertices, hidden.triangles), plane.points(places).reshape(-1, 3), FAR
+    distance = compute_signed_distance(
+        build_tree(hidden.vertices, hidden.triangles), plane.points(places).reshape(-1, 3), FAR
     ).reshape(tall, wide)
     tone = np.nan_to_num(distance / BAND, nan=len(TONES)).clip(0, len(TONES) - 1).astype(int)
     out = TONES[tone]
@@ -127,7 +127,7 @@ def section(
         out[places[..., 1] < np.interp(places[..., 0], seen[0][:, 0], seen[0][:, 1])] = EMPTY
     out = out.astype(np.uint8)
     if error is not None:
-        dash(out, outlines(distance < error), ink, STROKES, 2)
+        draw_dashes(out, find_outlines(distance < error), ink, STROKES, 2)
     at = np.rint((seen[0] - low) * scale).astype(np.int32)
     for (column, row), role in zip(at.tolist(), seen[1].tolist(), strict=True):
         cv2.circle(out, (column, row), 1, (*(CLOSED if role == SHUT else WHITE), 255), -1)
@@ -137,18 +137,18 @@ def section(
         cv2.circle(out, (column, row), 3, (*WHITE, 255), -1, cv2.LINE_AA)
     _write_bands(out, distance, places, seen[0])
     for letter, column in zip(ENDS, (4, wide - 12), strict=True):
-        haloed(out, letter, (column, 12), SMALL)
+        write_haloed(out, letter, (column, 12), SMALL)
     bar = round(SCALE * scale)
     cv2.line(out, (6, tall - 6), (6 + bar, tall - 6), (*WHITE, 255), 2)
-    haloed(out, f"{1e3 * SCALE:.0f} mm", (6, tall - 11), SMALL)
+    write_haloed(out, f"{1e3 * SCALE:.0f} mm", (6, tall - 11), SMALL)
     return out
 
 
-def captioned(inset: np.ndarray, lines: list[str]) -> np.ndarray:
+def add_caption(inset: np.ndarray, lines: list[str]) -> np.ndarray:
     """Add lines of text below an inset (h, w, 3) uint8, and a thin frame."""
     foot = np.full((LEADING * len(lines) + 4, inset.shape[1], 3), np.array(EMPTY), np.uint8)
     for number, line in enumerate(lines):
-        haloed(foot, line, (5, LEADING * (number + 1) - 2), SMALL)
+        write_haloed(foot, line, (5, LEADING * (number + 1) - 2), SMALL)
     out = np.concatenate([inset, foot])
     cv2.rectangle(out, (0, 0), (out.shape[1] - 1, out.shape[0] - 1), (150, 154, 158, 255), 1)
     return out
@@ -180,4 +180,4 @@ def _write_bands(out: np.ndarray, distance: np.ndarray, places: np.ndarray, surf
         columns = np.flatnonzero((distance[row] < step * BAND) & tissue)
         column = int(columns[0 if left else -1]) if len(columns) else 0
         if WIDE < column < wide - WIDE and tissue[column - WIDE : column + WIDE].all():
-            haloed(out, f"{1e3 * step * BAND:.0f}", (column - WIDE // 2, row + 4), SMALL)
+            write_haloed(out, f"{1e3 * step * BAND:.0f}", (column - WIDE // 2, row + 4), SMALL)

@@ -11,20 +11,20 @@ import warp as wp
 from ..optics.camera import Camera
 from ..rendering.parallel import forward_kernel, launch_in_bands, load
 from .hud import FINE, FONT
-from .outlines import OPAQUE, inner, outlines, pieces
+from .outlines import OPAQUE, clip_to_sheet, cut_outlines, find_outlines
 from .window import DARK
 
 # Rays of the inside test: an odd number, so that there is always a majority.
 RAYS = wp.constant(3)
 
 
-def tree_of(vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> wp.Mesh:
+def build_tree(vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> wp.Mesh:
     """Build a BVH of the triangles (F, 3) of vertices (V, 3) [m]."""
     points = wp.array(vertices, dtype=wp.vec3f, device=device)
     return wp.Mesh(points, wp.array(np.asarray(triangles, np.int32).ravel(), dtype=wp.int32, device=device))
 
 
-def signed_distance(tree: wp.Mesh, points: np.ndarray, reach: float) -> np.ndarray:
+def compute_signed_distance(tree: wp.Mesh, points: np.ndarray, reach: float) -> np.ndarray:
     """Compute distances (n,) float32 of points (n, 3) to a closed surface, < 0 inside, NaN beyond `reach`; all [m]."""
     device = str(tree.device)
     load(device, __name__)
@@ -34,7 +34,7 @@ def signed_distance(tree: wp.Mesh, points: np.ndarray, reach: float) -> np.ndarr
     return found.numpy()
 
 
-def distance_of_seen(
+def compute_seen_distance(
     tree: wp.Mesh, camera: Camera, box: tuple[slice, slice], depth: wp.array, where: np.ndarray, reach: float
 ) -> np.ndarray:
     """Compute the distance of the visible point at each pixel of a box from a surface: (h, w) float32 [m].
@@ -148,8 +148,8 @@ def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels
     rings: dict[str, list[np.ndarray]] = {}
     for level in levels:
         near = np.nan_to_num(distance, nan=np.inf) < level
-        lines = [line for line in pieces(outlines(near), within) if len(line) >= SHORTEST]
-        lines = [line for piece in lines for line in inner(piece, sheet.shape[1], sheet.shape[0])]
+        lines = [line for line in cut_outlines(find_outlines(near), within) if len(line) >= SHORTEST]
+        lines = [line for piece in lines for line in clip_to_sheet(piece, sheet.shape[1], sheet.shape[0])]
         if lines:
             rings[f"{1e3 * level:.0f}"] = sorted(lines, key=len, reverse=True)
     for lines in rings.values():
@@ -168,7 +168,7 @@ def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels
     return list(rings)
 
 
-def lines_of(drawn: np.ndarray) -> np.ndarray:
+def list_lines(drawn: np.ndarray) -> np.ndarray:
     """Separate rings (h, w) bool from their numbers, given the mask `drawn` (h, w) of both."""
     numbers = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_OPEN, np.ones((THICK,) * 2, np.uint8))
     return drawn & (numbers == 0)

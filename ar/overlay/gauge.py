@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from .hud import Below, lay, millimetres
+from .hud import Below, format_millimetres, lay
 from .outlines import OPAQUE
 
 # Scale of the number; its distance from the tip [pixel].
@@ -46,12 +46,12 @@ class Gauge:
 
     def __str__(self) -> str:
         """Text next to the tip."""
-        return gauge_words(self.distance, self.error, self.inside)
+        return format_gauge(self.distance, self.error, self.inside)
 
 
-def gauge_words(distance: float, error: float | None, inside: bool) -> str:
+def format_gauge(distance: float, error: float | None, inside: bool) -> str:
     """Format the distance [m] of a tip from a surface, with its error bound [m]."""
-    length = millimetres(distance, error)
+    length = format_millimetres(distance, error)
     return f"inside, {length} from its edge" if inside else length
 
 

@@ -12,7 +12,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from .places import PAD, free_place
+from .places import PAD, find_free_place
 
 Corner = Literal["top left", "top right", "bottom left", "bottom right"]
 FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -53,7 +53,7 @@ def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5
     cv2.putText(colour, text, (column, row), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
 
 
-def haloed(sheet: np.ndarray, text: str, at: tuple[int, int], scale: float, ink: Sequence[float] = WHITE) -> None:
+def write_haloed(sheet: np.ndarray, text: str, at: tuple[int, int], scale: float, ink: Sequence[float] = WHITE) -> None:
     """Write one line of ASCII text with a dark halo at (column, row), its baseline's left end, in place.
 
     sheet (h, w, 3) or (h, w, 4) uint8: colour, or colour times coverage, and coverage.
@@ -109,7 +109,7 @@ def lay(
     colour, taken
         The image (H, W, 3) uint8; (H, W) uint8, above 0 at lines and text.
     wish
-        Desired column and row of the upper left corner of the lines, as `free_place` takes it.
+        Desired column and row of the upper left corner of the lines, as `find_free_place` takes it.
     below
         Parts of the image that the text may hide.
     """
@@ -119,15 +119,15 @@ def lay(
     above, under = sizes[0][0][1], sizes[0][1]
     size = max(width for (width, _), _ in sizes), above + under + ROW * (len(lines) - 1)
     sights, thin = below.sights, below.thin
-    place = None if sights is None else free_place(taken | sights, size, wish)
-    place = place or free_place(taken, size, wish)
+    place = None if sights is None else find_free_place(taken | sights, size, wish)
+    place = place or find_free_place(taken, size, wish)
     if thin is not None and (place is None or np.hypot(place[0] - wish[0], place[1] - wish[1]) > NEAR):
         shut = taken * ~thin
-        place = free_place(shut if sights is None else shut | sights, size, wish) or place
+        place = find_free_place(shut if sights is None else shut | sights, size, wish) or place
     if place is None and needed and below.lines is not None:
-        place = free_place(taken & (1 - below.lines), size, wish)
+        place = find_free_place(taken & (1 - below.lines), size, wish)
     if place is None and needed:
-        place = free_place(np.zeros_like(taken), size, wish) or (PAD, PAD)
+        place = find_free_place(np.zeros_like(taken), size, wish) or (PAD, PAD)
     if place is None:
         return
     column, row = place
@@ -136,7 +136,7 @@ def lay(
     taken[row : row + size[1], column : column + size[0]] = 1
 
 
-def folded(text: str, room: float, scale: float = FINE) -> list[str]:
+def wrap_line(text: str, room: float, scale: float = FINE) -> list[str]:
     """Break a line of text into as few lines as fit into `room` [pixel], at allowed breaks, of about equal width.
 
     A number stays next to its name, its error and its unit, even if that takes more space.
@@ -163,7 +163,7 @@ def _broken(text: str, room: float, scale: float) -> list[str]:
     return lines
 
 
-def millimetres(length: float, error: float | None = None) -> str:
+def format_millimetres(length: float, error: float | None = None) -> str:
     """Format a length [m] in millimetres, with its error bound [m] rounded up if that is finite."""
     if error is None or not math.isfinite(error):
         return f"{1e3 * length:.1f} mm"
@@ -172,15 +172,15 @@ def millimetres(length: float, error: float | None = None) -> str:
 
 def bound_words(metres: float, digits: int) -> str:
     """Format a bound [m] in millimetres, rounded up: at least one unit of the last digit."""
-    return f"{max(rounded_up(1e3 * metres, digits), 10.0**-digits):.{digits}f} mm"
+    return f"{max(round_up(1e3 * metres, digits), 10.0**-digits):.{digits}f} mm"
 
 
-def rounded_up(value: float, digits: int) -> float:
+def round_up(value: float, digits: int) -> float:
     """Return the smallest number with `digits` decimals that is >= a value: a bound must not be rounded down."""
     return math.ceil(round(value * 10**digits, 6)) / 10**digits
 
 
-def panel(
+def draw_text_panel(
     colour: np.ndarray,
     lines: Sequence[str],
     corner: Corner = "top left",
@@ -212,17 +212,17 @@ def panel(
     height, width = out.shape[:2]
     rooms = [share * width for share in PANEL_WIDTHS]
     shapes = [
-        (letters, [folded(line, room, letters) for line in lines])
+        (letters, [wrap_line(line, room, letters) for line in lines])
         for letters, room in itertools.product((scale, SMALLER * scale), rooms)
     ]
     wish = 0 if "left" in corner else width, PAD + below if "top" in corner else height
     for sight, kept, (letters, parts) in itertools.product(sights, range(len(lines), 0, -1), shapes):
         broken = [part for line in parts[:kept] for part in line]
         size, step = _size(broken, letters)
-        place = free_place(sight, size, wish)
+        place = find_free_place(sight, size, wish)
         if place is not None:
             return _lettered(out, broken, place, size, step, letters)
-    broken = [part for line in lines for part in folded(line, width - 4 * PAD, scale)]
+    broken = [part for line in lines for part in wrap_line(line, width - 4 * PAD, scale)]
     broken = broken[: max((height - below - 3 * PAD) // _size(broken, scale)[1], 1)]
     size, step = _size(broken, scale)
     top = PAD + below if "top" in corner else max(height - size[1] - PAD, 0)
@@ -249,7 +249,7 @@ def _lettered(
     return out
 
 
-def towards(direction: np.ndarray) -> str:
+def name_direction(direction: np.ndarray) -> str:
     """Describe a direction (3,) of RAS by orientation letters: "R", or "AS" between two, the larger component first.
 
     L left, R right, A anterior, P posterior, S superior, I inferior; of the patient.
@@ -259,20 +259,25 @@ def towards(direction: np.ndarray) -> str:
     return "".join(SIDES[axis][int(part[axis] < 0.0)] for axis in axes)
 
 
-def bearings(rotation: np.ndarray) -> dict[str, str]:
+def name_bearings(rotation: np.ndarray) -> dict[str, str]:
     """Return orientation letters of an image's edges: `rotation` (3, 3) from RAS to x right, y down, z forward."""
     right, down = np.asarray(rotation)[:2]
-    return {"left": towards(-right), "right": towards(right), "top": towards(-down), "bottom": towards(down)}
+    return {
+        "left": name_direction(-right),
+        "right": name_direction(right),
+        "top": name_direction(-down),
+        "bottom": name_direction(down),
+    }
 
 
-def marked(colour: np.ndarray, rotation: np.ndarray, taken: np.ndarray) -> np.ndarray:
+def draw_orientation_labels(colour: np.ndarray, rotation: np.ndarray, taken: np.ndarray) -> np.ndarray:
     """Return a copy of the image (H, W, 3) uint8 with orientation letters at its edges.
 
-    rotation (3, 3): of the camera, as `bearings` takes it; taken (H, W) uint8: above 0 at lines and text.
+    rotation (3, 3): of the camera, as `name_bearings` takes it; taken (H, W) uint8: above 0 at lines and text.
     """
     out, taken = colour.copy(), taken.copy()
     height, width = taken.shape
-    for edge, letters in bearings(rotation).items():
+    for edge, letters in name_bearings(rotation).items():
         (long, tall), below = cv2.getTextSize(letters, FONT, SIGN, 1)
         # Not at the centre of the top and bottom edges: tools enter there, and a tumour may extend to the bottom.
         strip, wish = {

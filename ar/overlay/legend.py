@@ -8,7 +8,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from .hud import FONT, HEAD, WHITE, haloed
+from .hud import FONT, HEAD, WHITE, write_haloed
 from .outlines import OPAQUE
 from .places import CLEAR, PAD
 from .window import DARK, FAINTEST, STEP, STEPS, STRONGEST
@@ -55,7 +55,7 @@ class Entry:
 
 
 @lru_cache(maxsize=16)
-def legend(entries: tuple[Entry, ...]) -> np.ndarray:
+def draw_legend(entries: tuple[Entry, ...]) -> np.ndarray:
     """Draw a sheet (h, w, 4) uint8, colour times coverage and coverage: a sample of each line, and its name."""
     wide = max(cv2.getTextSize(entry.name, FONT, SMALL, 1)[0][0] for entry in entries)
     sheet = np.zeros((LEADING * len(entries), SAMPLE + AFTER + wide + 4, 4), np.uint8)
@@ -67,18 +67,18 @@ def legend(entries: tuple[Entry, ...]) -> np.ndarray:
         for ink, width in (*rim, (entry.ink, entry.width)):
             for left, right in strokes:
                 cv2.line(sheet, (left, row), (right, row), (*ink, OPAQUE), width, cv2.LINE_AA)
-        haloed(sheet, entry.name, (SAMPLE + AFTER, row + 4), SMALL)
+        write_haloed(sheet, entry.name, (SAMPLE + AFTER, row + 4), SMALL)
     return sheet
 
 
 @lru_cache(maxsize=4)
-def depth_scale(ink: tuple[float, ...], caption: str) -> np.ndarray:
+def draw_depth_scale(ink: tuple[float, ...], caption: str) -> np.ndarray:
     """Draw a sheet (h, w, 4) uint8: the tint of the depth style by depth, with millimetres and a caption."""
     lines = caption.split("\n")
     wide = max(cv2.getTextSize(line, FONT, SMALL, 1)[0][0] for line in lines)
     sheet = np.zeros((LEADING * len(lines) + STEPS * TALL + 10, wide + 4, 4), np.uint8)
     for number, line in enumerate(lines):
-        haloed(sheet, line, (0, LEADING * number + 12), SMALL)
+        write_haloed(sheet, line, (0, LEADING * number + 12), SMALL)
     top = LEADING * len(lines) + 4
     for step in range(STEPS):
         tint = STRONGEST - (STRONGEST - FAINTEST) * step / (STEPS - 1)
@@ -87,7 +87,7 @@ def depth_scale(ink: tuple[float, ...], caption: str) -> np.ndarray:
         sheet[row : row + TALL, 2:16, 3] = OPAQUE
         if step % 2 == 0:
             cv2.line(sheet, (16, row), (20, row), (*WHITE, OPAQUE), 1)
-            haloed(sheet, f"{1e3 * STEP * step:.0f}", (24, row + 4), SMALL)
+            write_haloed(sheet, f"{1e3 * STEP * step:.0f}", (24, row + 4), SMALL)
     return sheet
 
 

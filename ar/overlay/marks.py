@@ -13,7 +13,15 @@ from ..optics.camera import Camera
 from ..rendering.layer import Layer
 from .gauge import Gauge
 from .legend import LegendNames
-from .outlines import OPAQUE, blank, box_around, dash, ink_of, outlines, silhouette
+from .outlines import (
+    OPAQUE,
+    allocate_sheet,
+    compute_ink,
+    compute_silhouette,
+    draw_dashes,
+    find_outlines,
+    find_pixel_box,
+)
 from .styles import Opening
 from .window import DARK
 
@@ -41,28 +49,30 @@ def draw_before(sheet: np.ndarray, camera: Camera, box: tuple[slice, slice], bef
 
     In place, on the sheet of the image's rows and columns `box`, which hold both surfaces.
     """
-    there = box_around(camera, before.vertices)
+    there = find_pixel_box(camera, before.vertices)
     if there is not None:
         rows, columns = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(there, box, strict=True))
-        sheet[rows, columns] = dotted(camera, before)
+        sheet[rows, columns] = draw_dotted(camera, before)
     middles = np.stack([before.vertices.mean(axis=0), hidden.vertices.mean(axis=0)])
-    ends, _ = camera.cropped(*box).project(middles)
+    ends, _ = camera.crop_to(*box).project(middles)
     length = float(np.linalg.norm(ends[1] - ends[0]))
     if not length >= LEAST_ARROW:  # nor where one has no pixel
         return
     start, end = (tuple(each) for each in np.clip(ends, -1e4, 1e4).round().astype(int).tolist())
-    for ink, width in ((DARK, 4), (ink_of(BEFORE), 2)):
+    for ink, width in ((DARK, 4), (compute_ink(BEFORE), 2)):
         cv2.arrowedLine(sheet, start, end, (*ink, OPAQUE), width, cv2.LINE_AA, tipLength=min(0.5, 6.0 / length))
 
 
 @lru_cache(maxsize=4)
-def dotted(camera: Camera, layer: Layer) -> np.ndarray:
+def draw_dotted(camera: Camera, layer: Layer) -> np.ndarray:
     """Draw the dotted outline of a fixed layer, on the sheet of the box around it; cached for a camera."""
-    box = box_around(camera, layer.vertices)
+    box = find_pixel_box(camera, layer.vertices)
     assert box is not None
-    part = camera.cropped(*box)
-    sheet = blank(part)
-    dash(sheet, outlines(silhouette(part, layer.vertices, layer.triangles)), ink_of(BEFORE), DOTTED)
+    part = camera.crop_to(*box)
+    sheet = allocate_sheet(part)
+    draw_dashes(
+        sheet, find_outlines(compute_silhouette(part, layer.vertices, layer.triangles)), compute_ink(BEFORE), DOTTED
+    )
     return sheet
 
 
@@ -71,8 +81,13 @@ def draw_trace(sheet: np.ndarray, camera: Camera, trace: Trace) -> None:
     (at,), _ = camera.project(np.asarray(trace.dot)[None])
     if not np.isfinite(at).all():
         return
-    ink = ink_of(trace.layer.colour)
-    dash(sheet, outlines(silhouette(camera, trace.layer.vertices, trace.layer.triangles)), ink, trace.pattern)
+    ink = compute_ink(trace.layer.colour)
+    draw_dashes(
+        sheet,
+        find_outlines(compute_silhouette(camera, trace.layer.vertices, trace.layer.triangles)),
+        ink,
+        trace.pattern,
+    )
     column, row = np.clip(at, -1e4, 1e4).round().astype(int).tolist()
     pale = [0.5 * (share + 255.0) for share in ink]  # so that pixels of this colour are the outline's alone
     for colour, radius in ((DARK, 4), (pale, 3)):
@@ -129,7 +144,7 @@ class Words:
     Parameters
     ----------
     doubt
-        Reason why the surface's position is unreliable. It is written at the bottom of the image, see `doubt_lines`, in
+        Reason why the surface's position is unreliable. It is written at the bottom of the image, see `format_warning`, in
         any style. The outline is amber and broken. No error is guaranteed: no margin is drawn, and the number next to
         the tip has no error.
     head

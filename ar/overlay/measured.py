@@ -11,13 +11,13 @@ import numpy as np
 from ..optics.camera import Camera
 from ..rendering.layer import Layer
 from ..rendering.renderer import Picture
-from .cut import ENDS, CutPlane, captioned, plane_through, profile, section
-from .distances import RING, RINGS, distance_of_seen, draw_rings, tree_of
+from .cut import ENDS, CutPlane, add_caption, build_plane, compute_profile, draw_section
+from .distances import RING, RINGS, build_tree, compute_seen_distance, draw_rings
 from .gauge import Gauge
-from .hud import FINE, HEAD, Below, bound_words, folded, haloed, lay
-from .legend import SMALL, depth_scale, paste, place_sheet
-from .outlines import OPAQUE, dash, ink_of, key_of
-from .places import PAD, free_place
+from .hud import FINE, HEAD, Below, bound_words, lay, wrap_line, write_haloed
+from .legend import SMALL, draw_depth_scale, paste, place_sheet
+from .outlines import OPAQUE, compute_ink, draw_dashes, to_key
+from .places import PAD, find_free_place
 from .styles import Style
 from .window import FRONT, Roles
 
@@ -74,7 +74,7 @@ class Measure:
     def plane(self) -> CutPlane:
         """Plane of a cut."""
         middle = self.hidden.vertices.mean(axis=0)
-        return plane_through(self.camera, middle, None if self.gauge is None else self.gauge.tip)
+        return build_plane(self.camera, middle, None if self.gauge is None else self.gauge.tip)
 
     def draw(self, sheet: np.ndarray, above: np.ndarray, box: tuple[slice, slice]) -> None:
         """Draw the rings, or the cutting line in the image, on the sheet of a box; in place.
@@ -83,22 +83,22 @@ class Measure:
         """
         if self.style == "rings":
             free = self.roles.of(self.picture.segmentation, box) == 0
-            tree = tree_of(self.hidden.vertices, self.hidden.triangles, str(self.picture.drawn.depth.device))
+            tree = build_tree(self.hidden.vertices, self.hidden.triangles, str(self.picture.drawn.depth.device))
             reach = RINGS[-1] + BEYOND
             draw_rings(
                 sheet,
-                distance_of_seen(tree, self.camera, box, self.picture.drawn.depth[0], free, reach),
+                compute_seen_distance(tree, self.camera, box, self.picture.drawn.depth[0], free, reach),
                 free & (sheet[..., 3] == 0) & (above[..., 3] == 0),
             )
         if self.style == "cut":
-            plane, part = self.plane, self.camera.cropped(*box)
+            plane, part = self.plane, self.camera.crop_to(*box)
             far = 1.45 * float(np.abs(plane.coordinates(self.hidden.vertices)[:, 0]).max())
             steps = np.linspace(-far, far, 2 * part.width)
             pixels, _ = part.project(plane.points(np.stack([steps, 0.0 * steps], axis=1)))
             line = pixels[np.isfinite(pixels).all(axis=1)].round().astype(np.int32)
             line = line[np.diff(line, axis=0, append=-1).any(axis=1)]
             lines = np.ascontiguousarray(sheet[..., 3] > 0).astype(np.uint8)
-            dash(sheet, [line[:, None]], RING, CUT_STROKES, 1)
+            draw_dashes(sheet, [line[:, None]], RING, CUT_STROKES, 1)
             line = line[((line >= EDGE) & (line < (part.width - EDGE, part.height - EDGE))).all(axis=1)]
             # Letters are outside of tools, where the line is visible.
             front = (self.roles.of(self.picture.segmentation, box) == FRONT).astype(np.uint8)
@@ -112,7 +112,7 @@ class Measure:
                 clear = cv2.dilate(lines, np.ones((2 * HALF + 1,) * 2, np.uint8))[places[:, 1], places[:, 0]] == 0
                 places = places[clear] if clear.any() else places
                 for letter, (column, row) in zip(ENDS, places[[0, -1]].tolist(), strict=True):
-                    haloed(above, letter, (column - 4, row + 4), FINE, RING)
+                    write_haloed(above, letter, (column - 4, row + 4), FINE, RING)
 
     def lay(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
         """Add the explanation of the lines to a composite image, with arguments of `place_sheet`; in place.
@@ -122,19 +122,19 @@ class Measure:
         width = taken.shape[1]
         if self.style == "depth":
             caption = f"{self.name or 'surface'}: mm under\nwhat is seen\n{self.off}"
-            scale = depth_scale(key_of(ink_of(self.hidden.colour)), caption)
+            scale = draw_depth_scale(to_key(compute_ink(self.hidden.colour)), caption)
             if not place_sheet(colour, taken, scale, sights):
                 # A tint needs its scale: rather over cortex than not at all.
                 wish = colour.shape[1], HEAD
                 places = (
-                    free_place(shut, scale.shape[1::-1], wish) for shut in (taken | sights, taken | needed, taken)
+                    find_free_place(shut, scale.shape[1::-1], wish) for shut in (taken | sights, taken | needed, taken)
                 )
                 place = next((each for each in places if each is not None), None)
                 if place is not None:
                     paste(colour, taken, scale, place)
         if self.style == "rings":
             said = f"rings: mm to the {self.name or 'surface'}; {self.off}"
-            lay(colour, taken, folded(said, 0.3 * width), (width, HEAD), below=Below(sights))
+            lay(colour, taken, wrap_line(said, 0.3 * width), (width, HEAD), below=Below(sights))
         if self.style == "cut":
             self._lay_cut(colour, taken, sights, needed)
 
@@ -142,24 +142,24 @@ class Measure:
         roles = self.roles.of(self.picture.segmentation)
         plane = self.plane
         reach = ACROSS * float(np.abs(plane.coordinates(self.hidden.vertices)[:, 0]).max())
-        seen = profile(self.camera, plane, self.picture.depth, roles, reach)
+        seen = compute_profile(self.camera, plane, self.picture.depth, roles, reach)
         tip = None if self.gauge is None else self.gauge.tip
-        ink = key_of(ink_of(self.hidden.colour))
+        ink = to_key(compute_ink(self.hidden.colour))
         for shut, share in itertools.product((taken | sights, taken | needed), WIDTHS):
             wide = round(share * taken.shape[1])
             lines = [
                 line
                 for text in (f"cut: mm to the {self.name or 'surface'}", self.off)
-                for line in folded(text, wide - PAD, SMALL)
+                for line in wrap_line(text, wide - PAD, SMALL)
             ]
-            inset = captioned(np.zeros((round(ASPECT * wide), wide, 3), np.uint8), lines)
+            inset = add_caption(np.zeros((round(ASPECT * wide), wide, 3), np.uint8), lines)
             shut[-HEAD:] = 1  # for the text at the bottom
-            place = free_place(shut, inset.shape[1::-1], (taken.shape[1], HEAD))
+            place = find_free_place(shut, inset.shape[1::-1], (taken.shape[1], HEAD))
             if place is not None:
-                drawn = section(
+                drawn = draw_section(
                     self.camera, self.hidden, plane, seen, (wide, round(ASPECT * wide)), ink, tip, self.error
                 )
-                whole = captioned(drawn, lines)
+                whole = add_caption(drawn, lines)
                 paste(colour, taken, np.dstack([whole, np.full(whole.shape[:2], OPAQUE, np.uint8)]), place)
                 return
         lay(colour, taken, [NO_ROOM], (taken.shape[1], HEAD))

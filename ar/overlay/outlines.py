@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from ..rendering.rasteriser import seen
+from ..rendering.rasteriser import rasterise_surface
 from .hud import FONT, WHITE
 from .window import DARK, NEAR_EDGE, SURROUND
 
@@ -19,18 +19,18 @@ OPAQUE = 255
 COARSE = 16
 
 
-def ink_of(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
+def compute_ink(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
     """Compute the mean of colours (3,) or (V, 3), sRGB in [0, 1], as a line colour: whole numbers of 0 .. 255."""
     red, green, blue = np.rint(255.0 * np.asarray(colour, np.float64).reshape(-1, 3).mean(axis=0)).tolist()
     return red, green, blue
 
 
-def blank(camera: Camera) -> np.ndarray:
+def allocate_sheet(camera: Camera) -> np.ndarray:
     """Create a sheet (h, w, 4) uint8 for lines: colour times coverage, and coverage."""
     return np.zeros((camera.height, camera.width, 4), np.uint8)
 
 
-def joined(a: tuple[slice, slice] | None, b: tuple[slice, slice] | None) -> tuple[slice, slice] | None:
+def join_boxes(a: tuple[slice, slice] | None, b: tuple[slice, slice] | None) -> tuple[slice, slice] | None:
     """Return the rows and columns of the smallest box that holds two boxes."""
     if a is None or b is None:
         return a or b
@@ -38,13 +38,13 @@ def joined(a: tuple[slice, slice] | None, b: tuple[slice, slice] | None) -> tupl
     return rows, columns
 
 
-def box_around(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None:
+def find_pixel_box(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None:
     """Return rows and columns that hold the pixels of points (V, 3) and `SURROUND` more; None if outside the image."""
     pixels, depth = camera.project(points)
     if not (depth > 0.0).all():
         return slice(0, camera.height), slice(0, camera.width)
     if camera.lens is not None:
-        pixels = corners_between(camera, points)
+        pixels = find_pixel_corners(camera, points)
         if not len(pixels):
             return None
     low = np.maximum(np.floor(pixels.min(axis=0)) - SURROUND, 0.0).astype(int).tolist()
@@ -53,7 +53,7 @@ def box_around(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None
     return box if all(side.start < side.stop for side in box) else None
 
 
-def corners_between(camera: Camera, points: np.ndarray) -> np.ndarray:
+def find_pixel_corners(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Find corners (n, 2) of the pixels that may be between points (V, 3) in front of a camera with a lens.
 
     A lens bends the lines between points, but not out of the box that holds them in its undistorted image.
@@ -81,26 +81,26 @@ def _inside(straight: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np
     return np.flatnonzero(np.any(inside, axis=1)), np.flatnonzero(np.any(inside, axis=0))
 
 
-def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> np.ndarray:
+def compute_silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> np.ndarray:
     """Compute the mask (H, W) bool of pixels whose centres a surface covers. vertices (V, 3) [m], triangles (F, 3).
 
     `device` is the Warp device that draws it.
     """
-    return seen(camera, vertices, triangles, device=device).mask
+    return rasterise_surface(camera, vertices, triangles, device=device).mask
 
 
-def iou(a: np.ndarray, b: np.ndarray) -> float:
+def compute_iou(a: np.ndarray, b: np.ndarray) -> float:
     """Compute intersection over union of two masks (H, W); 0 if both are empty."""
     union = np.count_nonzero(a | b)
     return float(np.count_nonzero(a & b) / union) if union else 0.0
 
 
-def outlines(mask: np.ndarray) -> list[np.ndarray]:
+def find_outlines(mask: np.ndarray) -> list[np.ndarray]:
     """Extract closed outlines of a mask (H, W), each (n, 1, 2) int32 pixels."""
     return list(cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
 
 
-def dash(
+def draw_dashes(
     out: np.ndarray, lines: Sequence[np.ndarray], ink: Sequence[float], pattern: tuple[int, int], width: int = 2
 ) -> None:
     """Draw outlines, each (n, 1, 2), with strokes and gaps of lengths `pattern` [pixel], in place.
@@ -108,25 +108,25 @@ def dash(
     A line of more than one pixel has a dark border. Nothing is drawn along the sheet's edge, where an outline is cut.
     """
     stroke, gap = pattern
-    lines = [piece for line in lines for piece in inner(line, out.shape[1], out.shape[0])]
+    lines = [piece for line in lines for piece in clip_to_sheet(line, out.shape[1], out.shape[0])]
     strokes = [line[start : start + stroke] for line in lines for start in range(0, len(line), stroke + gap)]
     if width > 1:
         cv2.polylines(out, strokes, False, (*DARK, OPAQUE), width + 2, cv2.LINE_AA)
     cv2.polylines(out, strokes, False, (*ink, OPAQUE), width, cv2.LINE_AA)
 
 
-def inner(line: np.ndarray, width: int, height: int) -> list[np.ndarray]:
+def clip_to_sheet(line: np.ndarray, width: int, height: int) -> list[np.ndarray]:
     """Return the pieces of an outline (n, 1, 2) inside a sheet, away from its edge."""
     inside = (line >= NEAR_EDGE) & (line < (width - NEAR_EDGE, height - NEAR_EDGE))
-    return runs(line, inside.all(axis=(1, 2)))
+    return split_runs(line, inside.all(axis=(1, 2)))
 
 
-def pieces(lines: Sequence[np.ndarray], where: np.ndarray) -> list[np.ndarray]:
+def cut_outlines(lines: Sequence[np.ndarray], where: np.ndarray) -> list[np.ndarray]:
     """Return the pieces of outlines, each (n, 1, 2), whose pixels are in a mask (H, W) bool."""
-    return [piece for line in lines for piece in runs(line, where[line[:, 0, 1], line[:, 0, 0]])]
+    return [piece for line in lines for piece in split_runs(line, where[line[:, 0, 1], line[:, 0, 0]])]
 
 
-def runs(line: np.ndarray, kept: np.ndarray) -> list[np.ndarray]:
+def split_runs(line: np.ndarray, kept: np.ndarray) -> list[np.ndarray]:
     """Return the pieces of a line (n, 1, 2) whose points are kept (n,) bool; none for an empty line."""
     if not len(line):
         return []
@@ -134,7 +134,7 @@ def runs(line: np.ndarray, kept: np.ndarray) -> list[np.ndarray]:
     return [piece for piece, wanted in zip(np.split(line, cuts), np.split(kept, cuts), strict=True) if wanted[0]]
 
 
-def key_of(ink: Sequence[float]) -> tuple[float, ...]:
+def to_key(ink: Sequence[float]) -> tuple[float, ...]:
     """Return a shade (3,) slightly different from a colour in 0 .. 255: the outline's colour is the outline's alone."""
     return tuple(share + 8.0 if share < 128.0 else share - 8.0 for share in ink)
 
@@ -151,7 +151,7 @@ BESIDE, FEW = 6, 60
 APART = 8
 
 
-def outline_gap(
+def measure_outline_gap(
     colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, covered: np.ndarray, least: int = 1, gap: float = 0.0
 ) -> float:
     """Compute the distance of the outline drawn in an image from the expected one [pixel].
@@ -173,9 +173,9 @@ def outline_gap(
     gap
         Length of the gaps of a broken line [pixel]: the true outline may be half of that from it.
     """
-    found = of_ink(colour, ink)
+    found = find_ink(colour, ink)
     true = np.zeros(mask.shape, np.uint8)
-    for outline in outlines(mask):
+    for outline in find_outlines(mask):
         cv2.polylines(true, [outline], True, (1,))
     shut = cv2.dilate(np.pad(covered, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT + 1,) * 2, np.uint8))
     seen = shut[1:-1, 1:-1] == 0
@@ -189,7 +189,7 @@ def outline_gap(
     return float(max(np.percentile(each, SHARE) for each in apart if len(each)))
 
 
-def of_ink(colour: np.ndarray, ink: Sequence[float], off: int = SAME) -> np.ndarray:
+def find_ink(colour: np.ndarray, ink: Sequence[float], off: int = SAME) -> np.ndarray:
     """Return the mask (H, W) bool of pixels of an image (H, W, 3) uint8 within `off` of a colour (3,) in 0 .. 255."""
     low, high = (tuple(np.clip(np.rint(ink) + by, 0, 255).tolist()) for by in (-off, off))
     return cv2.inRange(np.ascontiguousarray(colour), low, high) > 0
@@ -200,12 +200,12 @@ def _distance(mask: np.ndarray) -> np.ndarray:
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
-def stands(colour: np.ndarray, text: str, scale: float, ink: Sequence[float] = WHITE) -> bool:
+def has_text(colour: np.ndarray, text: str, scale: float, ink: Sequence[float] = WHITE) -> bool:
     """Return True if `hud.write` wrote exactly this text at this scale anywhere into the image (H, W, 3) uint8."""
-    return found_at(colour, text, scale, ink) is not None
+    return find_text(colour, text, scale, ink) is not None
 
 
-def found_at(
+def find_text(
     colour: np.ndarray, text: str, scale: float, ink: Sequence[float] = WHITE
 ) -> tuple[int, int, int, int] | None:
     """Locate a line of text written by `hud.write`: left, top, right and bottom [pixel]; None if not found."""
@@ -213,7 +213,7 @@ def found_at(
     blank = np.zeros((above + below + 2, width + 2 * APART, 3), np.uint8)
     cv2.putText(blank, text, (APART, above + 1), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
     shape = (blank == ink).all(axis=2).astype(np.float32)
-    here = np.pad(of_ink(colour, ink, 0), APART).astype(np.float32)
+    here = np.pad(find_ink(colour, ink, 0), APART).astype(np.float32)
     if shape.shape[0] > here.shape[0] or shape.shape[1] > here.shape[1]:
         return None
     right = cv2.matchTemplate(here, shape, cv2.TM_CCORR)
@@ -227,24 +227,24 @@ def found_at(
     return left, foot - below - above, left + width, foot
 
 
-def inked_share(colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, covered: np.ndarray) -> float:
+def compute_inked_share(colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, covered: np.ndarray) -> float:
     """Compute the share of a silhouette's outline that has a colour; NaN for an outline of fewer than `FEW` pixels.
 
-    Parameters as in `outline_gap`: pixels near occluders and near the border are left out.
+    Parameters as in `measure_outline_gap`: pixels near occluders and near the border are left out.
     """
     outline = np.zeros(mask.shape, np.uint8)
-    cv2.drawContours(outline, outlines(mask), -1, (1,))
+    cv2.drawContours(outline, find_outlines(mask), -1, (1,))
     shut = cv2.dilate(np.pad(covered, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT + 1,) * 2, np.uint8))
-    return _share(of_ink(colour, ink), (outline > 0) & (shut[1:-1, 1:-1] == 0))
+    return _share(find_ink(colour, ink), (outline > 0) & (shut[1:-1, 1:-1] == 0))
 
 
-def changed_share(before: np.ndarray, after: np.ndarray, where: np.ndarray) -> float:
+def compute_changed_share(before: np.ndarray, after: np.ndarray, where: np.ndarray) -> float:
     """Compute the share of pixels that differ between images (H, W, 3) uint8, in a mask (H, W) bool without its edge.
 
     NaN for fewer than `FEW` pixels.
     """
     inner = cv2.erode(where.astype(np.uint8), np.ones((2 * BESIDE + 1,) * 2, np.uint8), borderValue=0) > 0
-    return _share(~of_ink(cv2.absdiff(before, after), (0, 0, 0)), inner)
+    return _share(~find_ink(cv2.absdiff(before, after), (0, 0, 0)), inner)
 
 
 def _share(found: np.ndarray, where: np.ndarray) -> float:

@@ -15,7 +15,7 @@ REACHES = 64, 256
 ASIDE = 2
 
 
-def free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) -> tuple[int, int] | None:
+def find_free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) -> tuple[int, int] | None:
     """Find the free place for a box closest to the desired one; None if there is no space.
 
     Parameters
@@ -37,7 +37,7 @@ def free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) 
     whole = ASIDE * width + height
     for reach in (*REACHES, whole):
         # All places within this radius, and the taken pixels round them.
-        columns, rows = within(column, reach // ASIDE, right), within(row, reach, low)
+        columns, rows = list_places_within(column, reach // ASIDE, right), list_places_within(row, reach, low)
         top, left = rows[0] - CLEAR, columns[0] - CLEAR
         there = taken[top : rows[-1] + tall + CLEAR, left : columns[-1] + wide + CLEAR]
         # Integral image: the number of taken pixels in a box is a sum of four values.
@@ -53,7 +53,7 @@ def free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) 
     return None
 
 
-def within(middle: int, reach: int, last: int) -> np.ndarray:
+def list_places_within(middle: int, reach: int, last: int) -> np.ndarray:
     """List the candidate places PAD, PAD + STEP, ... up to `last` that are at most `reach` from a centre."""
     places = np.arange(PAD, last + 1, STEP)
     return places[np.abs(places - middle) <= reach]

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..optics.camera import Camera
-from ..rendering.layer import Layer, vertex_normals
+from ..rendering.layer import Layer, compute_vertex_normals
 from ..rendering.lens_rasteriser import pixel_at
 from ..rendering.parallel import forward_kernel, launch_in_bands, load
 from ..rendering.rasteriser import NOTHING, RasterisedSurface, depth_of, face_of
@@ -60,7 +60,7 @@ class Lines:
     above: np.ndarray | None = None
 
 
-def overlaid(
+def draw_overlay(
     drawn: Pictures,
     box: tuple[slice, slice],
     camera: Camera,
@@ -88,7 +88,7 @@ def overlaid(
     """
     device = str(drawn.colour.device)
     load(device, __name__)
-    towards = vertex_normals(hidden.vertices, hidden.triangles) @ camera.T_camera_world[2, :3]
+    towards = compute_vertex_normals(hidden.vertices, hidden.triangles) @ camera.T_camera_world[2, :3]
     looks = np.column_stack([towards, 255.0 * np.asarray(hidden.colour)])
     front = wp.empty((0, 0), dtype=wp.uint8, device=device)
     if roles.covered is not None:
@@ -96,8 +96,8 @@ def overlaid(
     inputs = [
         box[0].start, box[1].start, camera.width, seen.nearest[0], seen.points, seen.triangles, seen.unbent.pixels,
         from_edge(seen), wp.array(looks, dtype=wp.vec4f, device=device), drawn.depth[0], drawn.segmentation[0],
-        on_device(roles.front, roles.open, device), front, int(SHADES.get(style, 0)), lines.solid, wp.vec3f(lines.ink),
-        sheet(lines.under, device), sheet(lines.above, device),
+        get_on_device(roles.front, roles.open, device), front, int(SHADES.get(style, 0)), lines.solid, wp.vec3f(lines.ink),
+        to_flat_sheet(lines.under, device), to_flat_sheet(lines.above, device),
     ]  # fmt: skip
     ground = wp.clone(drawn.colour[0])
     taken = wp.empty((camera.height, camera.width), dtype=wp.uint8, device=device)
@@ -125,14 +125,14 @@ class Roles:
 
     def of(self, segmentation: np.ndarray, box: tuple[slice, slice] = np.s_[:, :]) -> np.ndarray:
         """Return the roles (h, w) uint8, `FRONT`, `SHUT` or 0, in a box of an image's segmentation (H, W) uint8."""
-        found = cv2.LUT(segmentation[box], role_table(self.front, self.open))
+        found = cv2.LUT(segmentation[box], build_role_table(self.front, self.open))
         if self.covered is not None:
             found[self.covered[box]] = FRONT
         return found
 
 
 @lru_cache(maxsize=8)
-def role_table(front: tuple[int, ...], open_to: tuple[int, ...] | None) -> np.ndarray:
+def build_role_table(front: tuple[int, ...], open_to: tuple[int, ...] | None) -> np.ndarray:
     """Return the table (256,) uint8 of roles by the id of a layer: `FRONT`, `SHUT` or 0."""
     ids = np.arange(256)
     shut = np.zeros(256, bool) if open_to is None else ~np.isin(ids, open_to)
@@ -140,12 +140,12 @@ def role_table(front: tuple[int, ...], open_to: tuple[int, ...] | None) -> np.nd
 
 
 @lru_cache(maxsize=8)
-def on_device(front: tuple[int, ...], open_to: tuple[int, ...] | None, device: str) -> wp.array:
-    """Return `role_table` on a device, copied there once."""
-    return wp.array(role_table(front, open_to), dtype=wp.uint8, device=device)
+def get_on_device(front: tuple[int, ...], open_to: tuple[int, ...] | None, device: str) -> wp.array:
+    """Return `build_role_table` on a device, copied there once."""
+    return wp.array(build_role_table(front, open_to), dtype=wp.uint8, device=device)
 
 
-def sheet(lines: np.ndarray | None, device: str) -> wp.array:
+def to_flat_sheet(lines: np.ndarray | None, device: str) -> wp.array:
     """Copy a sheet (h, w, 4) of lines to a device, flattened; empty if there is none."""
     if lines is None:
         return wp.empty(0, dtype=wp.vec4ub, device=device)
@@ -161,12 +161,12 @@ def from_edge(seen: RasterisedSurface) -> wp.array:
     beside = wp.empty(shape, dtype=wp.uint8, device=device)
     launch_in_bands(find_edge, [seen.nearest[0]], [beside], beside.size, device)
     if device != "cpu":
-        return chamfer(beside, device)
+        return compute_chamfer_distance(beside, device)
     distance = cv2.distanceTransform(beside.numpy(), cv2.DIST_L2, cv2.DIST_MASK_3)
     return wp.array(distance, dtype=wp.float32, device=device, copy=False)
 
 
-def chamfer(beside: wp.array, device: str) -> wp.array:
+def compute_chamfer_distance(beside: wp.array, device: str) -> wp.array:
     """Compute the chamfer distance (h, w) of each pixel from those where `beside` is 0 [pixel], up to `REACH`."""
     aside = wp.empty(beside.shape, dtype=wp.int32, device=device)
     distance = wp.empty(beside.shape, dtype=wp.float32, device=device)

@@ -15,13 +15,27 @@ import cv2
 import numpy as np
 import viser
 
-from .control_lock import Clients, Inputs, noted
-from .elements import ASIDE_SPOT, BACK, KEYS, LIVE_KEYS, ON, PICTURE, RECORD, SAID, SPACE, aside, coded, sight, unparted
-from .guard import LIMITS, ConnectionLimits, bracketed, check_address, open_server
+from .control_lock import Clients, Inputs, format_note
+from .elements import (
+    ASIDE_SPOT,
+    BACK,
+    KEYS,
+    LIVE_KEYS,
+    ON,
+    PICTURE,
+    RECORD,
+    SAID,
+    SPACE,
+    build_image_element,
+    build_tabs,
+    keep_together,
+    to_data_url,
+)
+from .guard import LIMITS, ConnectionLimits, check_address, open_server, to_bracketed
 from .parts import Control, Fold, LastChange, Note, Playback, SceneSurface, SceneViewpoint, Sign
 from .recording import Recorder
-from .scene import add_body, dress
-from .style import PAGE, STATUS, style
+from .scene import add_body, set_up_scene
+from .style import PAGE, STATUS, build_style
 
 # Sort order after all elements that are added later.
 LAST = 1e9
@@ -72,21 +86,21 @@ class Browser:
         check_address(host, port)
         self.limits, self.origins = limits, origins
         self.server, self.token = open_server(host, port, title, limits, origins)
-        dress(self.server, viewpoint, signs)
+        set_up_scene(self.server, viewpoint, signs)
         gui = self.server.gui
-        gui.add_html(style(size[0] / size[1]))
+        gui.add_html(build_style(size[0] / size[1]))
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
-        gui.add_html(held(PICTURE, ""))
+        gui.add_html(build_element(PICTURE, ""))
         # Last: if a low window has no space for them under the image, the controls come before them.
-        self.words = gui.add_html(held(PAGE, unparted(words)), order=LAST)
+        self.words = gui.add_html(build_element(PAGE, keep_together(words)), order=LAST)
         self.line = gui.add_html("")
-        self.text = gui.add_html(held(SAID, ""))
+        self.text = gui.add_html(build_element(SAID, ""))
         # Shown and requested state: frame, image and words. Last encoded image, and number of images sent.
         self.shown: Shown = (0, blank, "", 0)
         self.wanted: Shown = self.shown
-        self.coded, self.sent = coded(blank), 0
-        self.sight = gui.add_html(sight(0, self.coded, ""))
-        gui.add_html(aside(KEYS if playback.frames else LIVE_KEYS))
+        self.coded, self.sent = to_data_url(blank), 0
+        self.sight = gui.add_html(build_image_element(0, self.coded, ""))
+        gui.add_html(build_tabs(KEYS if playback.frames else LIVE_KEYS))
         self.beside = gui.add_html("")
         # Function that draws slices and charts, if not yet sent; earliest time to send them [s].
         self.drawn: Callable[[], tuple[np.ndarray, str]] | None = None
@@ -123,7 +137,7 @@ class Browser:
                 self.folder.remove()
             self.server.gui.set_panel_label(title)
             self.title = title
-            self.words.content, self.line.content = held(PAGE, unparted(words)), ""
+            self.words.content, self.line.content = build_element(PAGE, keep_together(words)), ""
             self.wanted, self.shown = (0, self.shown[1], "", 0), (0, self.shown[1], self.shown[2], 0)
             self.report("")
             self.controls.clear()
@@ -150,7 +164,7 @@ class Browser:
     def address(self) -> str:
         """Address of the page as seen from this machine, with the token that other machines need."""
         host = self.server.get_host()
-        name = "localhost" if host in EVERYWHERE else bracketed(host)
+        name = "localhost" if host in EVERYWHERE else to_bracketed(host)
         return f"http://{name}:{self.server.get_port()}" + (f"/?token={self.token}" if self.token else "")
 
     @property
@@ -189,7 +203,7 @@ class Browser:
             _, colour, words, place = wanted = self.wanted
         at = self.shown[3]
         if colour is not self.shown[1]:
-            self.coded = coded(colour)
+            self.coded = to_data_url(colour)
         if colour is not self.shown[1] or words != self.shown[2]:
             self.put_sight(self.coded, words)
         self.shown = wanted
@@ -198,9 +212,9 @@ class Browser:
             self.controls.assign(self.frame, place)
 
     def put_sight(self, code: str, words: str) -> None:
-        """Send a `coded` image and words (HTML) at once."""
+        """Send a `to_data_url` image and words (HTML) at once."""
         self.sent += 1
-        self.sight.content = sight(self.sent, code, unparted(words))
+        self.sight.content = build_image_element(self.sent, code, keep_together(words))
         self.recorder.take(code)
 
     def show_beside(self, drawn: Callable[[], tuple[np.ndarray, str]]) -> None:
@@ -220,7 +234,7 @@ class Browser:
             self.drawn, self.due = None, clock.monotonic() + 1.0 / self.limits.asides
         colour, words = drawn()
         self.sent += 1
-        self.beside.content = sight(self.sent, coded(colour), words, ASIDE_SPOT)
+        self.beside.content = build_image_element(self.sent, to_data_url(colour), words, ASIDE_SPOT)
 
     def move(self, name: str, vertices: np.ndarray, triangles: np.ndarray | None = None) -> None:
         """Replace the vertices (V, 3) [m] of a body in the 3-D view; also the triangles (F, 3) if they changed."""
@@ -240,7 +254,7 @@ class Browser:
 
     def status(self, words: str) -> None:
         """Show a line (HTML) over the image; empty: none."""
-        said = held(STATUS, f"<span>{words}</span>") if words else ""
+        said = build_element(STATUS, f"<span>{words}</span>") if words else ""
         self.note("status", lambda: setattr(self.line, "content", said))
 
     def plays(self, playing: bool) -> None:
@@ -282,7 +296,7 @@ class Browser:
         folder, text = self.controls.notes[label]
 
         def send() -> None:
-            text.content, folder.visible = noted(words), bool(words)
+            text.content, folder.visible = format_note(words), bool(words)
 
         self.note(f"note {label}", send)
 
@@ -327,7 +341,7 @@ class Browser:
 
         self.controls.press(self.button, toggle)
         # A slider needs a length, so that of a single frame has two positions.
-        self.controls.hear(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
+        self.controls.receive_input(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
         self.controls.command(SPACE, toggle)
         if seekable:
             self.controls.command(BACK, lambda _: step(-1))
@@ -352,6 +366,6 @@ class Browser:
         self.controls.command(RECORD, record)
 
 
-def held(name: str, words: str) -> str:
+def build_element(name: str, words: str) -> str:
     """Wrap words in an element with an id, for the style rules."""
     return f'<div id="{name}">{words}</div>'

@@ -55,7 +55,7 @@ SCRIPT = """
 
 
 @lru_cache(maxsize=4)
-def own_document(document: bytes, is_zipped: bool) -> bytes:
+def build_document(document: bytes, is_zipped: bool) -> bytes:
     """Insert this page's title, icon and script into viser's document."""
     text = (gzip.decompress(document) if is_zipped else document).decode()
     icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON)}" />'

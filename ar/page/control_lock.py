@@ -205,7 +205,7 @@ class Inputs:
         gui = self.server.gui
         if isinstance(control, Note):
             with gui.add_folder(control.label, expand_by_default=False, visible=bool(control.words)) as folder:
-                self.notes[control.label] = folder, gui.add_html(noted(control.words))
+                self.notes[control.label] = folder, gui.add_html(format_note(control.words))
             return
         if isinstance(control, Fold):
             with gui.add_folder(control.label, expand_by_default=False):
@@ -221,7 +221,7 @@ class Inputs:
             case Dropdown():
                 handle = gui.add_dropdown(words, control.options, initial_value=control.start, hint=hint)
         self.handles[control.label] = handle
-        self.hear(handle, control.changed)
+        self.receive_input(handle, control.changed)
         if isinstance(control, Dropdown) and control.key is not None:
             self.command(control.key, partial(self.next, handle, control))
 
@@ -232,7 +232,7 @@ class Inputs:
         self.assign(handle, name)
         choice.changed(name)
 
-    def hear(self, control: viser.GuiInputHandle, changed: Callable[[Any], None]) -> None:
+    def receive_input(self, control: viser.GuiInputHandle, changed: Callable[[Any], None]) -> None:
         """Pass on values set by the client with control, on the receiving thread, before anything else there."""
         self.kept[id(control)] = control.value
 
@@ -249,6 +249,6 @@ class Inputs:
             changed(control.value)
 
 
-def noted(words: str) -> str:
+def format_note(words: str) -> str:
     """Wrap the words of a note in an element with a class, for the style rules."""
     return f'<div class="{NOTE}">{words}</div>'

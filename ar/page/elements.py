@@ -52,7 +52,7 @@ if (number >= Number(picture.dataset.number || 0)) {
 """
 
 
-def unparted(words: str) -> str:
+def keep_together(words: str) -> str:
     """Keep numbers on one line with their name, error and unit: replace spaces in words (HTML) by no-break spaces."""
     return re.sub(
         r"<[^>]*>|\s+",
@@ -61,14 +61,14 @@ def unparted(words: str) -> str:
     )
 
 
-def coded(colour: np.ndarray) -> str:
+def to_data_url(colour: np.ndarray) -> str:
     """Encode an image (H, W, 3) uint8 as a data URL."""
     written = cv2.imencode(".jpg", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
     return f"data:image/jpeg;base64,{base64.b64encode(written.tobytes()).decode()}"
 
 
-def sight(number: int, picture: str, words: str, spot: Spot = MAIN) -> str:
-    """Build the element that puts a `coded` image and words (HTML) into their places; `number` counts them."""
+def build_image_element(number: int, picture: str, words: str, spot: Spot = MAIN) -> str:
+    """Build the element that puts a `to_data_url` image and words (HTML) into their places; `number` counts them."""
     swap = escape(" ".join(SWAP.replace("PICTURE", spot.picture).replace("SAID", spot.words).split()))
     # Decoded synchronously: otherwise the words would be painted first.
     image = f'<img alt="{spot.alt}" decoding="sync" data-number="{number}" onload="{swap}" src="{picture}">'
@@ -128,7 +128,7 @@ if (!window.sulcusKeys) {
 """
 
 
-def aside(keys: Sequence[Key] = KEYS) -> str:
+def build_tabs(keys: Sequence[Key] = KEYS) -> str:
     """Build the element with the tabs, empty places for slices and charts, and the list of keys."""
     tabs = "".join(
         f'<input type="radio" name="{ASIDE}" id="{name}"{" checked" if number == 0 else ""}>'

@@ -28,8 +28,8 @@ from viser import _messages
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from .client_page import own_document
-from .messages import LARGEST, MessageError, checked
+from .client_page import build_document
+from .messages import LARGEST, MessageError, check_message
 
 # The guard relies on internals of this viser release line: others are rejected.
 KNOWN = "1.1."
@@ -97,7 +97,7 @@ class AccessPolicy:
 
     def refusal(self, request: Request, address: str, port: int) -> str | None:
         """Return the reason to reject a request received at an address and a port; None to accept it."""
-        names = {"localhost", "127.0.0.1", "[::1]", bracketed(self.host), bracketed(address)}
+        names = {"localhost", "127.0.0.1", "[::1]", to_bracketed(self.host), to_bracketed(address)}
         if self.token is not None:
             names.add(socket.gethostname())
         places = {f"{name}:{port}".lower() for name in names}
@@ -105,7 +105,7 @@ class AccessPolicy:
             places |= {name.lower() for name in names}
         allowed = {f"http://{place}" for place in places} | set(self.origins)
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        if len(hosts) != 1 or hosts[0].lower() not in places.union(*map(hosts_of, self.origins)):
+        if len(hosts) != 1 or hosts[0].lower() not in places.union(*map(list_hosts, self.origins)):
             return (
                 f"This page is not served under that host name. Open it as it was printed, at port {port}, or start it "
                 "with --address and the address that your browser shows.\n"
@@ -119,7 +119,7 @@ class AccessPolicy:
     def is_encrypted(self, request: Request) -> bool:
         """Return True if a request's address is served by https only."""
         schemes = [
-            each.split(":")[0] for each in self.origins if request.headers.get("Host", "").lower() in hosts_of(each)
+            each.split(":")[0] for each in self.origins if request.headers.get("Host", "").lower() in list_hosts(each)
         ]
         return set(schemes) == {"https"}
 
@@ -129,11 +129,11 @@ class AccessPolicy:
 
     def tokens(self, request: Request, port: int) -> Iterator[str]:
         """Yield the tokens of a request, from its address and its cookies."""
-        yield from parse_qs(urlsplit(plain(request.path)).query).get("token", [])
+        yield from parse_qs(urlsplit(to_plain_text(request.path)).query).get("token", [])
         for header in request.headers.get_all("Cookie"):
-            for pair in plain(header).split(";"):
+            for pair in to_plain_text(header).split(";"):
                 name, _, value = pair.strip().partition("=")
-                if name == cookie(port):
+                if name == name_cookie(port):
                     yield value
 
 
@@ -161,7 +161,7 @@ class Connection(ServerConnection):
             message = await super().recv(decode)
             try:
                 self.count()
-                return checked(message, self.controls)
+                return check_message(message, self.controls)
             except MessageError as error:
                 self.logger.warning("A client's message was rejected: %s.", error)
                 if self.credit < 0.0:
@@ -229,7 +229,7 @@ def open_server(
     if not viser.__version__.startswith(KNOWN):
         raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {KNOWN}*.")
     door, controls = AccessPolicy.of(host, origins), Controls()
-    with guarding(door, controls, limits) as opened:
+    with guard_server(door, controls, limits) as opened:
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     try:
         assert opened
@@ -247,7 +247,7 @@ PATCHING = threading.Lock()
 
 
 @contextmanager
-def guarding(door: AccessPolicy, controls: Controls, limits: ConnectionLimits) -> Iterator[list[bool]]:
+def guard_server(door: AccessPolicy, controls: Controls, limits: ConnectionLimits) -> Iterator[list[bool]]:
     """Guard the server that viser opens within this context; the yielded list is non-empty once it is open."""
     opened: list[bool] = []
     serve = websockets.asyncio.server.serve
@@ -258,7 +258,7 @@ def guarding(door: AccessPolicy, controls: Controls, limits: ConnectionLimits) -
         opened.append(True)
         visit = partial(Connection, controls=controls, limits=limits)
         settings |= {"max_size": LARGEST, "logger": log, "create_connection": visit}
-        return serve(*args, process_request=partial(answer, door, limits, process_request), **settings)
+        return serve(*args, process_request=partial(handle_request, door, limits, process_request), **settings)
 
     with PATCHING:
         websockets.asyncio.server.serve = guarded
@@ -268,7 +268,7 @@ def guarding(door: AccessPolicy, controls: Controls, limits: ConnectionLimits) -
             websockets.asyncio.server.serve = serve
 
 
-def answer(
+def handle_request(
     door: AccessPolicy, limits: ConnectionLimits, served: Callable, connection: ServerConnection, request: Request
 ) -> Response | None:
     """Respond to a request as viser does, if it is accepted; None opens a WebSocket connection."""
@@ -288,11 +288,11 @@ def answer(
     if response is not None:
         response.headers.update(HEADERS)
         if response.headers.get("Content-Type", "").startswith("text/html"):
-            response.body = own_document(bytes(response.body), response.headers.get("Content-Encoding") == "gzip")
+            response.body = build_document(bytes(response.body), response.headers.get("Content-Encoding") == "gzip")
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
         if door.token is not None:
-            secret = f"{cookie(port)}={door.token}; HttpOnly; SameSite=Strict; Path=/"
+            secret = f"{name_cookie(port)}={door.token}; HttpOnly; SameSite=Strict; Path=/"
             response.headers["Set-Cookie"] = secret + "; Secure" * door.is_encrypted(request)
     return response
 
@@ -308,7 +308,7 @@ def origin_of(address: str) -> str:
     try:
         parts = urlsplit(address)
         scheme, name, port = parts.scheme.lower(), parts.hostname or "", parts.port
-        rebuilt = f"{bracketed(name)}{'' if port is None else f':{port}'}"
+        rebuilt = f"{to_bracketed(name)}{'' if port is None else f':{port}'}"
         if ":" in name:
             ipaddress.IPv6Address(name)
     except ValueError:
@@ -316,26 +316,26 @@ def origin_of(address: str) -> str:
     plain_name = ":" in name or bool(NAME.fullmatch(name))
     if scheme not in PORTS or not plain_name or port == 0 or address.lower().rstrip("/") != f"{scheme}://{rebuilt}":
         raise ValueError(f"{address!r}: must be https://NAME or https://NAME:PORT, without a path.")
-    return f"{scheme}://{bracketed(name)}" + ("" if port in (None, PORTS[scheme]) else f":{port}")
+    return f"{scheme}://{to_bracketed(name)}" + ("" if port in (None, PORTS[scheme]) else f":{port}")
 
 
-def hosts_of(origin: str) -> set[str]:
+def list_hosts(origin: str) -> set[str]:
     """Return the host names of requests to an address, with and without the port that the scheme implies."""
     scheme, _, place = origin.partition("://")
     return {place} if place.rpartition(":")[2].isdecimal() else {place, f"{place}:{PORTS[scheme]}"}
 
 
-def bracketed(host: str) -> str:
+def to_bracketed(host: str) -> str:
     """Write a host as part of an address (IPv6 in brackets)."""
     return f"[{host}]" if ":" in host else host
 
 
-def cookie(port: int) -> str:
+def name_cookie(port: int) -> str:
     """Return the name of a page's cookie; pages on other ports of the same host have others."""
     return f"page-{port}"
 
 
-def plain(text: str) -> str:
+def to_plain_text(text: str) -> str:
     """Return a header's text as ASCII; websockets keeps bytes that are no characters."""
     return text.encode("ascii", "replace").decode()
 

@@ -81,14 +81,14 @@ def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
     top, end = HIGH * number + ABOVE, samples[-1].time if samples else 0.0
     room = HIGH - ABOVE - BELOW
     ends = [(each.values[number] or 0.0, each.errors[number] or 0.0) for each in known]
-    high = ceiling(max((value + error for value, error in ends), default=0.0))
+    high = round_up_scale(max((value + error for value, error in ends), default=0.0))
 
     def at(time: float, value: float) -> str:
         across = LEFT + (WIDE - LEFT - 6.0) * (1.0 - (end - time) / SPAN)
         return f"{across:.1f},{top + room * (1.0 - min(max(value / high, 0.0), 1.0)):.1f}"
 
     drawn = []
-    for piece in pieces(samples, number):
+    for piece in split_line(samples, number):
         # An isolated sample is as wide as its dot.
         moments = [(each.time + aside, each) for each in piece for aside in ((0.0,) if len(piece) > 1 else (-DOT, DOT))]
         if piece[-1].errors[number] is not None:
@@ -116,7 +116,7 @@ def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
     return f'<text x="{LEFT:g}" y="{top - 6:g}">{escape(said)}</text>{scale}{times}{"".join(drawn)}'
 
 
-def pieces(samples: Iterable[Sample], number: int) -> list[list[Sample]]:
+def split_line(samples: Iterable[Sample], number: int) -> list[list[Sample]]:
     """Split a line into joined pieces, each with or without an error throughout.
 
     They end where the value is not available.
@@ -137,7 +137,7 @@ def pieces(samples: Iterable[Sample], number: int) -> list[list[Sample]]:
     return found
 
 
-def ceiling(value: float) -> float:
+def round_up_scale(value: float) -> float:
     """Return the upper end of a scale for a value: 1, 2 or 5 times a power of ten."""
     if not value > 0.0:
         return 1.0

@@ -71,7 +71,7 @@ class Command(msgspec.Struct, tag_field="type", tag="CommandTriggerMessage", for
 DECODER = msgspec.msgpack.Decoder(PageCamera | ControlSetting | Command)
 
 
-def checked(message: str | bytes, control: Callable[[str], object]) -> bytes:
+def check_message(message: str | bytes, control: Callable[[str], object]) -> bytes:
     """Return the checked message, encoded again; `control` finds a control or command by its identifier.
 
     Raises
@@ -88,13 +88,13 @@ def checked(message: str | bytes, control: Callable[[str], object]) -> bytes:
     except (ValueError, RecursionError) as error:
         raise MessageError("it cannot be read", malformed=True) from error
     if isinstance(said, ControlSetting):
-        said.updates.value = ranged(control(said.uuid), said.updates.value)
+        said.updates.value = clamp_value(control(said.uuid), said.updates.value)
     if isinstance(said, Command) and not isinstance(control(said.uuid), viser.CommandHandle):
         raise MessageError("it is a command that is not there")
     return msgspec.msgpack.encode(said)
 
 
-def ranged(control: object, value: bool | int | float | str) -> bool | int | float | str:
+def clamp_value(control: object, value: bool | int | float | str) -> bool | int | float | str:
     """Return the value that a control takes.
 
     Raises

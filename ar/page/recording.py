@@ -54,11 +54,11 @@ class PageRecording:
         """
         with tempfile.TemporaryDirectory(prefix="sulcus-") as folder:
             path = Path(folder) / "page.mp4"
-            write_film(path, played(self.taken, min(ended, self.began + LONGEST), RATE), RATE)
+            write_film(path, replay_images(self.taken, min(ended, self.began + LONGEST), RATE), RATE)
             return path.read_bytes()
 
 
-def played(taken: Sequence[tuple[float, str]], ended: float, rate: float) -> Iterator[np.ndarray]:
+def replay_images(taken: Sequence[tuple[float, str]], ended: float, rate: float) -> Iterator[np.ndarray]:
     """Yield the image (H, W, 3) uint8 shown at each step of a clock with `rate` steps a second."""
     size: tuple[int, int] | None = None
     for number, (began, code) in enumerate(taken):
@@ -69,7 +69,7 @@ def played(taken: Sequence[tuple[float, str]], ended: float, rate: float) -> Ite
             stop = max(stop, start + 1)
         if stop == start:
             continue
-        colour = decoded(code)
+        colour = decode_recorded(code)
         size = size or (colour.shape[1], colour.shape[0])
         if (colour.shape[1], colour.shape[0]) != size:
             colour = cv2.resize(colour, size, interpolation=cv2.INTER_AREA)
@@ -77,7 +77,7 @@ def played(taken: Sequence[tuple[float, str]], ended: float, rate: float) -> Ite
             yield colour
 
 
-def decoded(code: str) -> np.ndarray:
+def decode_recorded(code: str) -> np.ndarray:
     """Decode an image (H, W, 3) uint8 from an address written by `coded`."""
     written = np.frombuffer(base64.b64decode(code.partition(",")[2]), np.uint8)
     return cv2.cvtColor(cv2.imdecode(written, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from .parts import SceneSurface, SceneViewpoint, Sign
 PANEL = 676.0
 
 
-def dress(server: viser.ViserServer, viewpoint: SceneViewpoint, signs: Sequence[Sign]) -> None:
+def set_up_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, signs: Sequence[Sign]) -> None:
     """Set up colours, light, labels, the panel's place and the first view of the 3-D scene."""
     gui, scene = server.gui, server.scene
     gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")

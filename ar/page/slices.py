@@ -12,9 +12,9 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 from ..overlay.composite import BROKEN, DASHED, DOUBTFUL
-from ..overlay.hud import FINE, WHITE, bound_words, towards, write
+from ..overlay.hud import FINE, WHITE, bound_words, name_direction, write
 from ..overlay.marks import BEFORE, DOTTED
-from ..overlay.outlines import dash, ink_of
+from ..overlay.outlines import compute_ink, draw_dashes
 from ..rendering.layer import Layer, Solid
 
 # Half the side of a view [m], its side [pixel], sampling distance of the scan [m]: finer adds nothing.
@@ -94,45 +94,47 @@ class Cut:
     whose: str = "tumour"
 
 
-def sliced(scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
+def draw_slices(scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
     """Draw three views (SIDE, 3 SIDE, 3) uint8 through a centre (3,) [m], side by side; plain ground without a scan."""
     return np.concatenate([view(plane, scan, np.asarray(middle, np.float64), cut) for plane in PLANES], axis=1)
 
 
 def view(plane: SliceView, scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
     """Draw one view (SIDE, SIDE, 3) uint8."""
-    grey = np.full((SIDE, SIDE), NOWHERE, np.uint8) if scan is None else resampled(plane, scan, middle)
+    grey = np.full((SIDE, SIDE), NOWHERE, np.uint8) if scan is None else resample_view(plane, scan, middle)
     colour = np.repeat(grey[..., None], 3, axis=2)
-    ink = ink_of(DOUBTFUL if cut.doubtful else cut.now.colour if len(cut.now.vertices) else BEFORE)
+    ink = compute_ink(DOUBTFUL if cut.doubtful else cut.now.colour if len(cut.now.vertices) else BEFORE)
     if cut.error is not None and not cut.doubtful:
-        inside = within(plane, middle, cut.now, cut.error)
+        inside = find_pixels_within(plane, middle, cut.now, cut.error)
         colour[inside] = (1.0 - TINT) * colour[inside] + TINT * np.array(ink)
         edges = cv2.findContours(inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
-        dash(colour, list(edges), ink, DASHED, 1)
+        draw_dashes(colour, list(edges), ink, DASHED, 1)
     for layer in cut.others:
-        stroke(colour, lines_of(plane, layer, middle), ink_of(layer.colour))
-    dash(colour, [dense(line) for line in lines_of(plane, cut.before, middle)], ink_of(BEFORE), DOTTED)
-    now = lines_of(plane, cut.now, middle)
+        draw_strokes(colour, list_lines(plane, layer, middle), compute_ink(layer.colour))
+    draw_dashes(
+        colour, [to_pixel_line(line) for line in list_lines(plane, cut.before, middle)], compute_ink(BEFORE), DOTTED
+    )
+    now = list_lines(plane, cut.now, middle)
     if cut.doubtful:
-        dash(colour, [dense(line) for line in now], ink, BROKEN)
+        draw_dashes(colour, [to_pixel_line(line) for line in now], ink, BROKEN)
     else:
-        stroke(colour, now, ink, 2)
+        draw_strokes(colour, now, ink, 2)
     if cut.tip is not None:
         mark(colour, plane, np.asarray(cut.tip), middle)
     label(colour, plane, middle)
-    write(colour, said_of(cut), (PAD, 4 * PAD + 6), FINE)
+    write(colour, describe_band(cut), (PAD, 4 * PAD + 6), FINE)
     colour[:, -1] = EDGE
     return colour
 
 
-def said_of(cut: Cut) -> str:
+def describe_band(cut: Cut) -> str:
     """Describe the band in a few words."""
     if cut.doubtful or cut.error is None:
         return f"{cut.whose}: not known"
     return f"{cut.whose}: within {bound_words(cut.error, 1)}"
 
 
-def resampled(plane: SliceView, scan: Solid, middle: np.ndarray) -> np.ndarray:
+def resample_view(plane: SliceView, scan: Solid, middle: np.ndarray) -> np.ndarray:
     """Resample the scan in a view, (SIDE, SIDE) uint8; `NOWHERE` outside it."""
     count = round(2.0 * REACH / GRAIN)
     matrix = scan.T_index_world
@@ -145,7 +147,7 @@ def resampled(plane: SliceView, scan: Solid, middle: np.ndarray) -> np.ndarray:
     return np.where(inside, np.clip(large, 0.0, 255.0), NOWHERE).astype(np.uint8)
 
 
-def within(plane: SliceView, middle: np.ndarray, layer: Layer, error: float) -> np.ndarray:
+def find_pixels_within(plane: SliceView, middle: np.ndarray, layer: Layer, error: float) -> np.ndarray:
     """Compute the mask (SIDE, SIDE) bool of pixels within a distance (error [m]) of a surface, in 3-D."""
     count = SIDE // COARSE
     if not len(layer.triangles):
@@ -159,7 +161,7 @@ def within(plane: SliceView, middle: np.ndarray, layer: Layer, error: float) -> 
     return cv2.resize(grid, (SIDE, SIDE), interpolation=cv2.INTER_LINEAR) <= error
 
 
-def section(vertices: np.ndarray, triangles: np.ndarray, point: np.ndarray, normal: np.ndarray) -> list[np.ndarray]:
+def cut_surface(vertices: np.ndarray, triangles: np.ndarray, point: np.ndarray, normal: np.ndarray) -> list[np.ndarray]:
     """Cut a surface by a plane; return lines (n, 3) [m]. A closed line ends at its start.
 
     vertices (V, 3) [m], triangles (F, 3), point (3,) [m] and normal (3,) of the plane.
@@ -176,10 +178,10 @@ def section(vertices: np.ndarray, triangles: np.ndarray, point: np.ndarray, norm
     start, end = unique.T
     share = (height[start] / (height[start] - height[end]))[:, None]
     points = (1.0 - share) * vertices[start] + share * vertices[end]
-    return [points[line] for line in chained(segments.reshape(-1, 2))]
+    return [points[line] for line in join_segments(segments.reshape(-1, 2))]
 
 
-def chained(segments: np.ndarray) -> list[list[int]]:
+def join_segments(segments: np.ndarray) -> list[list[int]]:
     """Chain segments (n, 2) of numbered points to lines of such numbers; a closed line ends at its start."""
     beside: dict[int, list[int]] = defaultdict(list)
     for a, b in segments.tolist():
@@ -198,20 +200,20 @@ def chained(segments: np.ndarray) -> list[list[int]]:
     return lines
 
 
-def lines_of(plane: SliceView, layer: Layer, middle: np.ndarray) -> list[np.ndarray]:
+def list_lines(plane: SliceView, layer: Layer, middle: np.ndarray) -> list[np.ndarray]:
     """Cut a surface by a view's plane; return lines, each (n, 2) as columns and rows."""
-    found = section(layer.vertices, layer.triangles, middle, plane.normal)
+    found = cut_surface(layer.vertices, layer.triangles, middle, plane.normal)
     return [plane.pixels(line, middle) for line in found]
 
 
-def stroke(colour: np.ndarray, lines: Sequence[np.ndarray], ink: Sequence[float], width: int = 1) -> None:
+def draw_strokes(colour: np.ndarray, lines: Sequence[np.ndarray], ink: Sequence[float], width: int = 1) -> None:
     """Draw lines, each (n, 2), with subpixel accuracy into an image (H, W, 3), in place."""
     fine = [np.rint(line * 2**DIGITS).astype(np.int32)[:, None] for line in lines]
     cv2.polylines(colour, fine, False, tuple(ink), width, cv2.LINE_AA, DIGITS)
 
 
-def dense(line: np.ndarray) -> np.ndarray:
-    """Resample a line (n, 2) for `dash`: (m, 1, 2) int32, a pixel apart."""
+def to_pixel_line(line: np.ndarray) -> np.ndarray:
+    """Resample a line (n, 2) for `draw_dashes`: (m, 1, 2) int32, a pixel apart."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     steps = np.arange(0.0, along[-1] + 1.0)
     at = np.stack([np.interp(steps, along, line[:, axis]) for axis in (0, 1)], axis=1)
@@ -239,7 +241,7 @@ def label(colour: np.ndarray, plane: SliceView, middle: np.ndarray) -> None:
         (down, (half, SIDE - PAD)),
     )
     for way, at in places:
-        write(colour, towards(way), at)
+        write(colour, name_direction(way), at)
     length, row = round(0.5 * SIDE * BAR / REACH), SIDE - PAD
     for ink, width in (((12, 14, 16), 4), (WHITE, 2)):
         cv2.line(colour, (PAD, row), (PAD + length, row), ink, width)

@@ -129,7 +129,7 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
 """
 
 
-def style(aspect: float) -> str:
+def build_style(aspect: float) -> str:
     """Build the style element for an image with width / height `aspect`."""
     rules = RULES
     for name, value in (

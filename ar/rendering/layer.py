@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .rasteriser import checked_mesh
+from .rasteriser import check_mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class Layer:
     still: bool = False
 
     def __post_init__(self) -> None:
-        vertices, triangles = checked_mesh(self.vertices, self.triangles)
+        vertices, triangles = check_mesh(self.vertices, self.triangles)
         if not 1 <= self.id <= 255:
             raise ValueError(f"layer {self.name!r} has the id {self.id}: choose 1 .. 255 (0 is the background).")
         if (self.solid is None) != (self.rest is None):
@@ -109,7 +109,7 @@ class Layer:
         object.__setattr__(self, "colour", np.broadcast_to(colour, vertices.shape))
 
 
-def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def compute_vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Compute unit vertex normals (V, 3): face normals weighted by area; zero for vertices without a triangle."""
     a, b, c = (vertices[triangles[:, k]].T for k in range(3))
     (x, y, z), (u, v, w) = b - a, c - a

@@ -31,15 +31,15 @@ class Unbent:
     scale: wp.array(dtype=wp.vec2d)
 
 
-def unbent(cameras: Sequence[Camera], device: str) -> Unbent:
+def build_undistortion(cameras: Sequence[Camera], device: str) -> Unbent:
     """Compute undistorted pixels of cameras of one size; unchanged for one without a lens among others with one."""
     if all(camera.lens is None for camera in cameras):
-        return without_lens(device)
-    return with_lens(tuple(cameras), device)
+        return get_no_undistortion(device)
+    return get_undistortion(tuple(cameras), device)
 
 
 @lru_cache(maxsize=4)
-def without_lens(device: str) -> Unbent:
+def get_no_undistortion(device: str) -> Unbent:
     """Build the empty argument for kernels without a lens."""
     out = Unbent()
     out.pixels = wp.empty((0, 0, 0), dtype=wp.vec2d, device=device)
@@ -47,8 +47,8 @@ def without_lens(device: str) -> Unbent:
 
 
 @lru_cache(maxsize=4)
-def with_lens(cameras: tuple[Camera, ...], device: str) -> Unbent:
-    """Compute `unbent`, cached: a fixed camera is used in every image, and a part of it by each surface."""
+def get_undistortion(cameras: tuple[Camera, ...], device: str) -> Unbent:
+    """Compute `build_undistortion`, cached: a fixed camera is used in every image, and a part of it by each surface."""
     straight = np.stack([camera.straight for camera in cameras])
     count, height, width = straight.shape[:3]
     side = max(int(np.sqrt(height * width / CELL)), 1)

@@ -39,7 +39,7 @@ def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, 
     def launch(begin: int, end: int) -> None:
         wp.launch(kernel, -(-(end - begin) // run), [begin, end, run, *inputs], outputs, device=device)
 
-    in_bands(launch, count, device, bands)
+    run_in_bands(launch, count, device, bands)
 
 
 def run_length(device: str) -> int:
@@ -47,12 +47,12 @@ def run_length(device: str) -> int:
     return 64 if device == "cpu" else 1
 
 
-def in_bands(draw: Callable[[int, int], None], count: int, device: str, bands: int = 1) -> None:
+def run_in_bands(draw: Callable[[int, int], None], count: int, device: str, bands: int = 1) -> None:
     """Call `draw(begin, end)` on ranges that cover 0 .. count: `bands` for each core, on a CPU.
 
     The ranges must not write to the same places; the modules of their kernels must be loaded.
     """
-    pool, cores = workers()
+    pool, cores = get_workers()
     if device != "cpu" or cores == 1:
         return draw(0, count)
     edges = np.linspace(0, count, bands * cores + 1).astype(int).tolist()
@@ -60,7 +60,7 @@ def in_bands(draw: Callable[[int, int], None], count: int, device: str, bands: i
 
 
 @cache
-def workers() -> tuple[ThreadPoolExecutor, int]:
+def get_workers() -> tuple[ThreadPoolExecutor, int]:
     """Return the drawing threads and their number: Warp runs a CPU kernel on the calling thread and releases the GIL.
 
     One, if `OMP_NUM_THREADS` is 1, as for several processes on the same cores.

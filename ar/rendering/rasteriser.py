@@ -19,8 +19,8 @@ import numpy as np
 import warp as wp
 
 from ..optics.camera import Camera
-from .lens_rasteriser import Unbent, keep_nearest_through_lens, pixel_at, unbent
-from .parallel import forward_kernel, in_bands, launch_in_bands, load, run_length
+from .lens_rasteriser import Unbent, build_undistortion, keep_nearest_through_lens, pixel_at
+from .parallel import forward_kernel, launch_in_bands, load, run_in_bands, run_length
 from .triangle import box_of, edge, first_row, weights_of
 
 NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
@@ -77,7 +77,7 @@ def rasterise(
     ValueError
         Wrong shapes, indices out of range, vertices that are not finite, or near <= 0.
     """
-    found = seen(camera, vertices, triangles, near, device)
+    found = rasterise_surface(camera, vertices, triangles, near, device)
     shape, rows = (camera.height, camera.width), found.rows
     face = wp.full(shape, value=-1, dtype=wp.int32, device=device)
     weights = wp.zeros(shape, dtype=wp.vec3f, device=device)
@@ -94,7 +94,7 @@ class RasterisedSurface:
     """Surface in one image, on a device.
 
     points (1, V) vec3d: homogeneous, undistorted; triangles (F,) vec3i; nearest (1, H, W): z-buffer of (depth, face);
-    rows: those that may be covered. `unbent` holds the undistorted pixels.
+    rows: those that may be covered. `build_undistortion` holds the undistorted pixels.
     """
 
     points: wp.array
@@ -111,24 +111,26 @@ class RasterisedSurface:
         return mask.numpy().reshape(self.nearest.shape[1:]).view(bool)
 
 
-def seen(
+def rasterise_surface(
     camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR, device: str = "cpu"
 ) -> RasterisedSurface:
     """Draw one surface into a z-buffer. Arguments and errors as in `rasterise`."""
-    vertices, triangles = checked_mesh(vertices, triangles)
+    vertices, triangles = check_mesh(vertices, triangles)
     if not near > 0.0:
         raise ValueError(f"near is {near} m: the near plane must lie in front of the camera.")
-    homogeneous = camera.in_frame(vertices) @ camera.K.T
-    rows = slice(*rows_reached(homogeneous, near, camera.height)) if camera.lens is None else slice(0, camera.height)
+    homogeneous = camera.to_camera_frame(vertices) @ camera.K.T
+    rows = (
+        slice(*find_rows_reached(homogeneous, near, camera.height)) if camera.lens is None else slice(0, camera.height)
+    )
     points = wp.array(homogeneous[None], dtype=wp.vec3d, device=device)
     corners = wp.array(triangles, dtype=wp.vec3i, device=device, copy=False)
-    nearest = empty_buffer(1, camera.height, camera.width, device)
-    through = unbent([camera], device)
+    nearest = allocate_z_buffer(1, camera.height, camera.width, device)
+    through = build_undistortion([camera], device)
     draw(points, corners, 0, rows, nearest, device, near, through)
     return RasterisedSurface(points, corners, nearest, rows, through)
 
 
-def empty_buffer(count: int, height: int, width: int, device: str) -> wp.array:
+def allocate_z_buffer(count: int, height: int, width: int, device: str) -> wp.array:
     """Create empty z-buffers (count, height, width) of (depth, face)."""
     return wp.full((count, height, width), value=NOTHING, dtype=wp.uint64, device=device)
 
@@ -160,10 +162,10 @@ def draw(
         inputs = [points, triangles, since, wp.float64(near), rows.start + begin, rows.start + end, parts, run]
         wp.launch(kernel, size, inputs + [through] * bent, [nearest], device=device)
 
-    in_bands(scan, rows.stop - rows.start, device)
+    run_in_bands(scan, rows.stop - rows.start, device)
 
 
-def rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int, int]:
+def find_rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int, int]:
     """Return the row range of the image that points (V, 3) (u w, v w, w) can cover: all, if one is too near."""
     if not len(homogeneous):
         return 0, 0
@@ -174,7 +176,7 @@ def rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int
     return first, last
 
 
-def checked_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def check_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Convert to vertices (V, 3) float64 and triangles (F, 3) int32; ValueError with the reason for an invalid mesh."""
     vertices = np.asarray(vertices, np.float64)
     triangles = np.asarray(triangles, np.int32)

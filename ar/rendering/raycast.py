@@ -7,12 +7,12 @@ import warp as wp
 
 from ..optics.camera import Camera
 from .parallel import forward_kernel
-from .rasteriser import Fragments, checked_mesh
+from .rasteriser import Fragments, check_mesh
 
 
 def raycast(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = 1e-3) -> Fragments:
     """Find the nearest triangle at every pixel centre, as `rasterise`, on the CPU and several times slower."""
-    vertices, triangles = checked_mesh(vertices, triangles)
+    vertices, triangles = check_mesh(vertices, triangles)
     shape = camera.height, camera.width
     if not len(triangles):
         return Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32))
@@ -20,7 +20,7 @@ def raycast(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: f
     with wp.ScopedDevice("cpu"):
         # In the camera frame a ray with z = 1 has its depth as parameter.
         mesh = wp.Mesh(
-            wp.array(camera.in_frame(vertices), dtype=wp.vec3f), wp.array(triangles.reshape(-1), dtype=wp.int32)
+            wp.array(camera.to_camera_frame(vertices), dtype=wp.vec3f), wp.array(triangles.reshape(-1), dtype=wp.int32)
         )
         rays = wp.array(pixels @ np.linalg.inv(camera.K).T, dtype=wp.vec3f)
         face = wp.empty(shape, dtype=wp.int32)

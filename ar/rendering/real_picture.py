@@ -17,7 +17,7 @@ from .renderer import Picture, Pictures
 SOFT = wp.constant(0.12)
 
 
-def vignetted(picture: Picture, field: float) -> Picture:
+def add_vignette(picture: Picture, field: float) -> Picture:
     """Darken an image outside a round field with radius `field` x half its longer side; depths and ids are unchanged.
 
     Its colours change in place, on their device.
@@ -69,7 +69,7 @@ def darken(
             )
 
 
-def real_picture(
+def build_real_image(
     colour: np.ndarray, camera: Camera, layers: Sequence[Layer], box: tuple[slice, slice], device: str = "cpu"
 ) -> Picture:
     """Combine a camera image (H, W, 3) uint8 with the depth and segmentation of layers that should be visible.
@@ -95,7 +95,7 @@ def real_picture(
         triangles = [layer.triangles + start for layer, start in zip(layers, starts, strict=False)]
         ids = np.repeat([layer.id for layer in layers], [len(each) for each in triangles]).astype(np.uint8)
         vertices = np.concatenate([layer.vertices for layer in layers])
-        found = rasterise(camera.cropped(*box), vertices, np.concatenate(triangles), device=device)
+        found = rasterise(camera.crop_to(*box), vertices, np.concatenate(triangles), device=device)
         depth[0][box] = found.depth
         segmentation[0][box] = np.where(found.mask, ids[found.face], 0)
     drawn = Pictures(

@@ -11,9 +11,9 @@ import warp as wp
 
 from ..optics.camera import Camera, look_at
 from .layer import Layer
-from .lens_rasteriser import Unbent, unbent
+from .lens_rasteriser import Unbent, build_undistortion
 from .parallel import launch_in_bands, load
-from .rasteriser import NEAR, draw, empty_buffer, rows_reached
+from .rasteriser import NEAR, allocate_z_buffer, draw, find_rows_reached
 from .shade import BRIGHTEST, SOFT, TILE, bound, remember, shade
 from .surfaces import Light, PlacedSurface, Shadow, Stack, place
 
@@ -127,7 +127,7 @@ class Renderer:
         load(device, shade.module, place.module)
         self.device, self.stack = device, Stack(layers, device)
         self.light, self.lamp_camera = as_light(lamp), lamp.camera()
-        self.curve = wp.array(tone_curve(), dtype=wp.uint8, device=device)
+        self.curve = wp.array(build_tone_curve(), dtype=wp.uint8, device=device)
         self.unshaded = wp.empty(0, dtype=wp.vec3i, device=device)
         self.nowhere = wp.empty(0, dtype=wp.vec3f, device=device)
         self.seen_by: Camera | None = None
@@ -177,14 +177,14 @@ class Renderer:
             raise ValueError(f"{count} images of {width} x {height} are too many at once: draw fewer.")
         stack, vertex, face = self.stack, 0, 0
         if backdrop is None:
-            nearest, placed = empty_buffer(count, height, width, self.device), stack.unplaced(count)
-            pictures, lit_at = empty_pictures(count, height, width, self.device), self.nowhere
+            nearest, placed = allocate_z_buffer(count, height, width, self.device), stack.allocate_placed(count)
+            pictures, lit_at = allocate_images(count, height, width, self.device), self.nowhere
         else:
             vertex, face, lit_at = stack.still_vertices, stack.still_faces, backdrop.lit_at
-            nearest, placed = wp.clone(backdrop.nearest), copied(backdrop.placed)
+            nearest, placed = wp.clone(backdrop.nearest), copy_placed(backdrop.placed)
             pictures = Pictures(*(wp.clone(array) for array in backdrop.pictures.arrays))
         self._place(cameras, moved, placed, vertex)
-        through = unbent(cameras, self.device)
+        through = build_undistortion(cameras, self.device)
         rows = slice(0, height) if through.pixels.size else self._rows(placed.seen, vertex, height)
         draw(placed.seen, stack.surfaces.triangles, face, rows, nearest, self.device, through=through)
         self._shade(cameras, placed, nearest, stack.casting, face, lit_at, through, pictures)
@@ -214,9 +214,9 @@ class Renderer:
     def _place(self, cameras: Sequence[Camera], moved: wp.array, placed: PlacedSurface, since: int) -> None:
         """Project the vertices from number `since` on in each image."""
         stack = self.stack
-        matrices = wp.array([projection(camera) for camera in cameras], dtype=wp.mat44d, device=self.device)
+        matrices = wp.array([compute_projection(camera) for camera in cameras], dtype=wp.mat44d, device=self.device)
         inputs = [
-            since, stack.still, moved, matrices, wp.mat44d(projection(self.lamp_camera)), stack.surfaces.triangles,
+            since, stack.still, moved, matrices, wp.mat44d(compute_projection(self.lamp_camera)), stack.surfaces.triangles,
             stack.around, stack.faces,
         ]  # fmt: skip
         launch_in_bands(place, inputs, [placed], len(cameras) * (stack.vertices - since), self.device)
@@ -225,7 +225,7 @@ class Renderer:
         """Return the rows that vertices from number `since` on can cover: on a GPU all, as a test would take longer."""
         if self.device != "cpu":
             return slice(0, height)
-        return slice(*rows_reached(seen.numpy()[:, since:].reshape(-1, 3), NEAR, height))
+        return slice(*find_rows_reached(seen.numpy()[:, since:].reshape(-1, 3), NEAR, height))
 
     def _shadow(self, placed: PlacedSurface, casting: wp.array) -> Shadow:
         """Draw the shadow map of each image."""
@@ -234,7 +234,7 @@ class Renderer:
         shadow.size = SHADOW_PIXELS
         shadow.depth = wp.empty(count * SHADOW_PIXELS**2, dtype=wp.float32, device=self.device)
         shadow.bounds = wp.empty(count * tiles**2, dtype=wp.vec2f, device=self.device)
-        nearest = empty_buffer(count, SHADOW_PIXELS, SHADOW_PIXELS, self.device)
+        nearest = allocate_z_buffer(count, SHADOW_PIXELS, SHADOW_PIXELS, self.device)
         draw(placed.lit, casting, 0, slice(0, SHADOW_PIXELS), nearest, self.device)
         launch_in_bands(bound, [nearest], [shadow], count * tiles**2, self.device)
         return shadow
@@ -247,11 +247,11 @@ class Renderer:
         if self.backdrop is not None and self.backdrop.camera is camera:
             return self.backdrop
         stack, height, width = self.stack, camera.height, camera.width
-        placed, nearest = stack.unplaced(1), empty_buffer(1, height, width, self.device)
-        pictures = empty_pictures(1, height, width, self.device)
+        placed, nearest = stack.allocate_placed(1), allocate_z_buffer(1, height, width, self.device)
+        pictures = allocate_images(1, height, width, self.device)
         self._place([camera], moved, placed, 0)
         there = stack.surfaces.triangles[: stack.still_faces]
-        through = unbent([camera], self.device)
+        through = build_undistortion([camera], self.device)
         draw(placed.seen, there, 0, slice(0, height), nearest, self.device, through=through)
         self._shade([camera], placed, nearest, self.unshaded, 0, self.nowhere, through, pictures)
         lit_at = wp.zeros(height * width, dtype=wp.vec3f, device=self.device)
@@ -261,17 +261,17 @@ class Renderer:
         return self.backdrop
 
 
-def empty_pictures(count: int, height: int, width: int, device: str) -> Pictures:
+def allocate_images(count: int, height: int, width: int, device: str) -> Pictures:
     """Create images with the background only."""
     shape = count, height, width
     colour = wp.empty(shape, dtype=wp.vec3ub, device=device)
     for row in range(count):
-        wp.copy(colour[row], background(width, height, device))
+        wp.copy(colour[row], draw_background(width, height, device))
     depth = wp.zeros(shape, dtype=wp.float32, device=device)
     return Pictures(colour, depth, wp.zeros(shape, dtype=wp.uint8, device=device))
 
 
-def copied(placed: PlacedSurface) -> PlacedSurface:
+def copy_placed(placed: PlacedSurface) -> PlacedSurface:
     """Copy the arrays."""
     out = PlacedSurface()
     for name in ("seen", "lit", "vertices", "normals"):
@@ -279,7 +279,7 @@ def copied(placed: PlacedSurface) -> PlacedSurface:
     return out
 
 
-def projection(camera: Camera) -> np.ndarray:
+def compute_projection(camera: Camera) -> np.ndarray:
     """Build the matrix (4, 4) that maps a world point (x, 1) [m] to (u w, v w, w, 1)."""
     P = np.eye(4)
     P[:3] = camera.K @ camera.T_camera_world[:3]
@@ -294,14 +294,14 @@ def as_light(lamp: Lamp) -> Light:
     light.position, light.axis = wp.vec3f(lamp.position), wp.vec3f(axis / np.linalg.norm(axis))
     angle = np.arctan(lamp.radius / np.linalg.norm(axis))
     light.outer, light.steepness = float(np.cos(angle)), float(1.0 / (np.cos(0.55 * angle) - np.cos(angle)))
-    light.strength, light.ambient, light.P = lamp.strength, lamp.ambient, wp.mat44f(projection(camera))
+    light.strength, light.ambient, light.P = lamp.strength, lamp.ambient, wp.mat44f(compute_projection(camera))
     # The offset equals the filter width: then the surface itself is never under the filter, at any slant to the lamp.
     light.offset = float(1.05 * (SOFT + 0.5) * np.linalg.norm(axis) / camera.K[0, 0])
     return light
 
 
 @lru_cache(maxsize=4)
-def background(width: int, height: int, device: str) -> wp.array:
+def draw_background(width: int, height: int, device: str) -> wp.array:
     """Draw the background (H, W, 3) uint8 on a device: a drape, brighter in the centre."""
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
     fall = 1.0 - 0.45 * np.clip(np.hypot(x, y) / np.sqrt(2.0), 0.0, 1.0)
@@ -309,7 +309,7 @@ def background(width: int, height: int, device: str) -> wp.array:
 
 
 @lru_cache(maxsize=1)
-def tone_curve() -> np.ndarray:
+def build_tone_curve() -> np.ndarray:
     """Compute the table (4096,) uint8 from scene-linear light to display: filmic (Narkowicz 2016), then gamma 2."""
     x = np.linspace(0.0, float(BRIGHTEST), 4096)
     filmic = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)

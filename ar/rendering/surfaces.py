@@ -116,7 +116,7 @@ class Point:
     base: wp.vec3f
 
 
-def faces_around(triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def find_faces_around(triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """List the faces at each of `count` vertices: start of each list (count + 1,), and the faces (3 F,), int32."""
     corners = triangles.reshape(-1)
     begins = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=count))])
@@ -181,7 +181,7 @@ class Stack:
     """Layers one after the other, fixed ones first.
 
     `still` (S,) [m] are the vertices that never move, `still_faces` the number of their triangles. `casting` (C,) are
-    the triangles that cast shadows; `around` and `faces` are as in `faces_around`.
+    the triangles that cast shadows; `around` and `faces` are as in `find_faces_around`.
     """
 
     def __init__(self, layers: Sequence[Layer], device: str) -> None:
@@ -195,11 +195,11 @@ class Stack:
         triangles = np.concatenate([np.zeros((0, 3), np.int32), *parts]).astype(np.int32)
         casting = [part for layer, part in zip(layers, parts, strict=True) if layer.casts_shadow]
         numbers = np.repeat(np.arange(len(layers)), [len(part) for part in parts])
-        begins, faces = faces_around(triangles, int(starts[-1]))
+        begins, faces = find_faces_around(triangles, int(starts[-1]))
         still = [layer for layer in layers if layer.still]
         here = partial(wp.array, device=device)
         vectors = partial(here, dtype=wp.vec3f)
-        texels, looks = dressed(layers, device)
+        texels, looks = collect_textures(layers, device)
 
         self.device, self.vertices = device, int(starts[-1])
         self.still_vertices, self.still_faces = int(starts[len(still)]), sum(len(layer.triangles) for layer in still)
@@ -236,7 +236,7 @@ class Stack:
             raise ValueError("a vertex is not finite: every coordinate must be a finite number of metres.")
         return wp.array(vertices, dtype=wp.vec3d, device=self.device)
 
-    def unplaced(self, count: int) -> PlacedSurface:
+    def allocate_placed(self, count: int) -> PlacedSurface:
         """Allocate positions of the surface in `count` images."""
         placed, shape = PlacedSurface(), (count, self.vertices)
         placed.seen, placed.lit = (wp.empty(shape, dtype=wp.vec3d, device=self.device) for _ in range(2))
@@ -244,7 +244,7 @@ class Stack:
         return placed
 
 
-def dressed(layers: Sequence[Layer], device: str) -> tuple[wp.array, list[LayerShading]]:
+def collect_textures(layers: Sequence[Layer], device: str) -> tuple[wp.array, list[LayerShading]]:
     """Build the texels of all solid textures, and the appearance of the layers."""
     solids = list(dict.fromkeys(layer.solid for layer in layers if layer.solid is not None))
     begins = np.cumsum([0, *(solid.values.size for solid in solids)])

@@ -118,7 +118,7 @@ class Cloud:
     sigma: np.ndarray
 
 
-def viewed(
+def compute_stereo_view(
     geometry: Rectified, left: np.ndarray, right: np.ndarray, tool: tuple[np.ndarray, np.ndarray] | None = None
 ) -> StereoView:
     """Build the stereo view of two images (H, W, 3) uint8; `tool` holds the masks of a tool in each, (H, W) bool.
@@ -133,29 +133,29 @@ def viewed(
     for grey, name in zip(greys, ("left", "right"), strict=True):
         if grey.mean() < BLACK:
             raise ValueError(f"the {name} eye sees nothing: check its light and its cable.")
-    covers = [glare(window) for window in windows]
+    covers = [find_glare(window) for window in windows]
     if tool is not None:
         shadows = geometry.windows(*(mask.astype(np.uint8) for mask in tool))
         covers = [cover | (shadow > 0) for cover, shadow in zip(covers, shadows, strict=True)]
     square = 2 * int(0.5 * SQUARE * geometry.focal / geometry.depth) + 1
-    hidden = [grown(cover, RIM) for cover in covers]
-    (one, varies), (other, _) = (equalised(*each, square) for each in zip(greys, hidden, strict=True))
+    hidden = [grow_mask(cover, RIM) for cover in covers]
+    (one, varies), (other, _) = (equalise(*each, square) for each in zip(greys, hidden, strict=True))
     return StereoView(geometry, one, other, hidden[0] | (varies < TEXTURE), hidden[1])
 
 
-def glare(window: np.ndarray) -> np.ndarray:
+def find_glare(window: np.ndarray) -> np.ndarray:
     """Return the mask (H, W) bool of bright pixels without colour in an image (H, W, 3) uint8."""
     red, green, blue = cv2.split(window)
     most, least = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
     return (most >= BRIGHT) & (most - least < COLOURLESS * most)
 
 
-def grown(mask: np.ndarray, by: int) -> np.ndarray:
+def grow_mask(mask: np.ndarray, by: int) -> np.ndarray:
     """Dilate a mask (H, W) bool by `by` pixels."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by + 1, 2 * by + 1), np.uint8)) > 0
 
 
-def equalised(grey: np.ndarray, covered: np.ndarray, square: int) -> tuple[np.ndarray, np.ndarray]:
+def equalise(grey: np.ndarray, covered: np.ndarray, square: int) -> tuple[np.ndarray, np.ndarray]:
     """Normalise grey levels (H, W) uint8 by the mean and standard deviation in a square of `square` pixels a side.
 
     Pixels that are covered (H, W) bool are excluded, and become grey. The standard deviation (H, W) is returned too.
@@ -169,7 +169,7 @@ def equalised(grey: np.ndarray, covered: np.ndarray, square: int) -> tuple[np.nd
     return np.clip(level * (STEEP / (varies + FLAT)) + 128.0, 0.0, 255.0).astype(np.uint8), varies
 
 
-def cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
+def triangulate_cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
     """Compute 3-D points at pixels (n, 2) of the left window, where the right eye sees them too.
 
     Raises
@@ -216,7 +216,7 @@ BACK = 1.0
 NEIGHBOURS, DEVIATIONS, FREE = 8, 4.0, 0.5e-3
 
 
-def followed(before: StereoView, now: StereoView, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def follow_pixels(before: StereoView, now: StereoView, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Track the pixels (n, 2) of one left window into another; return the numbers (k,) found, and positions (k, 2).
 
     Both windows have the same resolution and target, so that pixels have equal size.
@@ -233,7 +233,7 @@ def followed(before: StereoView, now: StereoView, pixels: np.ndarray) -> tuple[n
     return which[kept], there[kept].astype(float)
 
 
-def supported(places: np.ndarray, motions: np.ndarray) -> np.ndarray:
+def find_supported(places: np.ndarray, motions: np.ndarray) -> np.ndarray:
     """Return the mask (n,) of motions (n, 3) [m] at positions (n, 3) [m] that agree with those of their neighbours."""
     if len(places) <= NEIGHBOURS:
         return np.ones(len(places), bool)

@@ -74,7 +74,7 @@ class Rectified:
 
 
 @lru_cache(maxsize=4)
-def rectified(
+def rectify(
     left: Camera, right: Camera, target: tuple[float, float, float], reach: float, fineness: float
 ) -> Rectified:
     """Rectify about a target [m]: windows with half width `reach` [m] and `fineness` pixels per metre at its depth.

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from .targets import BORDER, Face, Target, seen_from_front, window_round
+from .targets import BORDER, Face, Target, find_window, is_seen_from_front
 
 # Texture pixels along a square; samples of the image along a pixel.
 TEXTURE, SAMPLES = 48, 4
@@ -20,7 +20,7 @@ MARGIN = 3.0
 INK, PAPER = 25.0, 225.0
 
 
-def drawn(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, np.ndarray]]) -> np.ndarray:
+def render_targets(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, np.ndarray]]) -> np.ndarray:
     """Render targets in front of an image (H, W) or (H, W, 3) uint8, sharp and evenly lit.
 
     Every pixel is the mean of `SAMPLES`^2 rays, each traced through the lens to the first face that it meets.
@@ -40,8 +40,8 @@ def drawn(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, n
         for target, T_world_target in targets
         for face in target.faces
     ]
-    windows = [(face, T, window_round(own, _edge(face) @ T[:3, :3].T + T[:3, 3], 0.0, MARGIN)) for face, T in placed]
-    seen = [(face, T, where) for face, T, where in windows if where is not None and seen_from_front(T)]
+    windows = [(face, T, find_window(own, _edge(face) @ T[:3, :3].T + T[:3, 3], 0.0, MARGIN)) for face, T in placed]
+    seen = [(face, T, where) for face, T, where in windows if where is not None and is_seen_from_front(T)]
     if not seen:
         return picture.copy()
     box = tuple(
@@ -118,7 +118,7 @@ WIDTH = CELL * CELLS
 BLACK, WHITE = 90.0, 165.0
 
 
-def stamped(colour: np.ndarray, time: float) -> np.ndarray:
+def stamp_time(colour: np.ndarray, time: float) -> np.ndarray:
     """Return a copy of an image (H, W, 3) or (H, W) uint8 with a time [s] in its upper right corner.
 
     Raises

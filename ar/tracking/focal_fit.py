@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, minimize_scalar
 
 from ..optics.camera import Camera
-from .pose import LEAST, squares_of
+from .pose import LEAST, fit_least_squares
 from .targets import DetectedCorners, Target
 
 # Minimum number of corners in a view; search range and tolerance of the factor on the focal length.
@@ -33,7 +33,7 @@ class FocalFit:
         return abs(self.factor - 1.0) > max(TOLERATED, SURE * self.deviation)
 
 
-def focal_fit(camera: Camera, seen: Sequence[tuple[Target, DetectedCorners]]) -> FocalFit | None:
+def fit_focal_length(camera: Camera, seen: Sequence[tuple[Target, DetectedCorners]]) -> FocalFit | None:
     """Estimate the factor on both focal lengths that fits targets' corners best; None: too few corners.
 
     Each target has its best-fitting pose. The deviation is that of least squares, from the curvature of the sum at its
@@ -48,7 +48,7 @@ def focal_fit(camera: Camera, seen: Sequence[tuple[Target, DetectedCorners]]) ->
     def squares(factor: float) -> float:
         K = camera.K.copy()
         K[[0, 1], [0, 1]] *= factor
-        return sum(squares_of(replace(camera, K=K), target, corners) for target, corners in enough)
+        return sum(fit_least_squares(replace(camera, K=K), target, corners) for target, corners in enough)
 
     found = minimize_scalar(squares, bounds=BOUNDS, method="bounded", options={"xatol": EXACT})
     assert isinstance(found, OptimizeResult)

@@ -78,7 +78,7 @@ def _sharpness(grey: np.ndarray, pixels: np.ndarray) -> float:
     return float(min(slopes) / max(bright - dark, 1.0))
 
 
-def chosen(views: Sequence[BoardView], face: Face, most: int) -> list[BoardView]:
+def choose_views(views: Sequence[BoardView], face: Face, most: int) -> list[BoardView]:
     """Select at most `most` of the sharp views, each as different from those before it as possible.
 
     Views are compared by the position of the board's outline in the image. Gonzalez (1985), "Clustering to minimize the
@@ -98,7 +98,7 @@ def chosen(views: Sequence[BoardView], face: Face, most: int) -> list[BoardView]
     return [sharp[index] for index in sorted(order)]
 
 
-def directions(views: Sequence[BoardView], width: int, height: int) -> float:
+def measure_tilt_range(views: Sequence[BoardView], width: int, height: int) -> float:
     """Compute the largest angle [rad] between planes of the board in two views, by their vanishing lines.
 
     The focal length, which is not known yet, is taken as the longer side of the image. Hartley and Zisserman (2004),
@@ -113,7 +113,7 @@ def directions(views: Sequence[BoardView], width: int, height: int) -> float:
     return float(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0)).max())
 
 
-def covered(views: Sequence[BoardView], width: int, height: int) -> float:
+def measure_covered_share(views: Sequence[BoardView], width: int, height: int) -> float:
     """Compute the share of an image that is inside the convex hull of the corners of at least one view."""
     mask = np.zeros((height, width), np.uint8)
     for view in views:
@@ -134,7 +134,7 @@ SMALLEST_ANGLE, UNSURE = np.radians(12.0), 0.02
 TILT = "Tilt the board by 20 to 45 degrees to all sides, near and far, and also in the image's corners."
 
 
-def calibration_error(
+def compute_calibration_error(
     camera: Camera, T_camera_target: np.ndarray, corners: np.ndarray, place: np.ndarray, covariance: np.ndarray
 ) -> np.ndarray:
     """Compute the covariance (3, 3) [m^2], in the camera's frame, of a target point by that of the calibration.
@@ -166,7 +166,7 @@ def calibration_error(
     return across @ covariance @ across.T
 
 
-def values_of(calibration: Calibration) -> np.ndarray:
+def to_values(calibration: Calibration) -> np.ndarray:
     """Return a calibration's values (9,) of `PARAMETERS`."""
     return np.array([*calibration.focal, *calibration.principal, *calibration.lens.coefficients[:5]])
 
@@ -199,7 +199,7 @@ class Intrinsics:
     @property
     def values(self) -> np.ndarray:
         """(9,) of `PARAMETERS`."""
-        return values_of(self.calibration)
+        return to_values(self.calibration)
 
     @property
     def deviations(self) -> np.ndarray:
@@ -207,7 +207,7 @@ class Intrinsics:
         return np.sqrt(np.diag(self.covariance))
 
 
-def calibrated(views: Sequence[BoardView], width: int, height: int, name: str = "") -> Intrinsics:
+def calibrate_intrinsics(views: Sequence[BoardView], width: int, height: int, name: str = "") -> Intrinsics:
     """Calibrate the camera of these views, taken in images of `width` x `height`.
 
     Zhang (2000), "A flexible new technique for camera calibration", by OpenCV; a lens of Brown and Conrady with five
@@ -229,11 +229,16 @@ def calibrated(views: Sequence[BoardView], width: int, height: int, name: str = 
         kept = [view for view, worse in zip(kept, bad, strict=True) if not worse]
     calibration = Calibration((K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), width, height, Lens(*coefficients.tolist()), name)
     try:
-        covariance, rms = covariance_of(calibration, kept, poses)
+        covariance, rms = compute_intrinsics_covariance(calibration, kept, poses)
     except np.linalg.LinAlgError as error:
         raise ValueError(f"the views determine no camera. {TILT}") from error
     found = Intrinsics(
-        calibration, covariance, rms, tuple(v.name for v in kept), tuple(left_out), covered(kept, width, height)
+        calibration,
+        covariance,
+        rms,
+        tuple(v.name for v in kept),
+        tuple(left_out),
+        measure_covered_share(kept, width, height),
     )
     unsure = found.deviations[:2] / calibration.focal
     if not unsure.max() <= UNSURE:
@@ -249,7 +254,7 @@ def _demand_views(views: Sequence[BoardView], left_out: int, width: int, height:
             f"{len(views)} sharp views show the board{without}, but {FEWEST_VIEWS} are needed: take 20 images or "
             "more, in good light and without motion."
         )
-    angle = directions(views, width, height)
+    angle = measure_tilt_range(views, width, height)
     if angle < SMALLEST_ANGLE:
         raise ValueError(
             f"the board is seen from one direction in all {len(views)} views, to {np.degrees(angle):.0f} degrees. "
@@ -276,7 +281,7 @@ def _solved(
     return np.asarray(K), np.ravel(coefficients)[:5], poses, np.ravel(errors)
 
 
-def covariance_of(
+def compute_intrinsics_covariance(
     calibration: Calibration, views: Sequence[BoardView], poses: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray, float]:
     """Compute the covariance (9, 9) of `PARAMETERS` at the least-squares solution, and the rms distance [pixel].

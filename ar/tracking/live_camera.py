@@ -10,7 +10,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from .pictures import Named, in_colour
+from .pictures import Named, to_named_image
 
 # Consecutive failed images before the camera is opened again; pause between tries [s].
 FAILURES, PAUSE = 10, 0.05
@@ -32,7 +32,7 @@ class FrameSource(Protocol):
         ...
 
 
-def opened(number: int, width: int, height: int) -> FrameSource:
+def open_camera(number: int, width: int, height: int) -> FrameSource:
     """Open the camera of this machine with a number, for images of a size, without buffering."""
     camera = cv2.VideoCapture(number)
     camera.set(cv2.CAP_PROP_FRAME_WIDTH, width)
@@ -41,7 +41,7 @@ def opened(number: int, width: int, height: int) -> FrameSource:
     return camera
 
 
-def camera_pictures(
+def read_camera_images(
     source: FrameSource, name: str, again: Callable[[], FrameSource], now: Callable[[], float] = clock.perf_counter
 ) -> Generator[Named | None]:
     """Yield images of a camera, each with its arrival time [s] by `now`; None if there was none.
@@ -54,7 +54,7 @@ def camera_pictures(
             good, frame = source.read() if source.isOpened() else (False, None)
             if good and frame is not None:
                 failed = 0
-                yield in_colour(name, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), now())
+                yield to_named_image(name, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), now())
                 continue
             yield None
             failed += 1
@@ -66,7 +66,7 @@ def camera_pictures(
         source.release()
 
 
-def newest(pictures: Generator[Named | None], patience: float) -> Iterator[Named | None]:
+def read_newest(pictures: Generator[Named | None], patience: float) -> Iterator[Named | None]:
     """Yield the newest image at each request; None if none arrived within `patience` [s].
 
     A thread of its own takes the images: those that arrive between requests are dropped, and none waits. It ends, and

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 
-from .targets import BORDER, MARKER, MARKERS, TIP, Face, Target, all_targets, tool_cube
+from .targets import BORDER, MARKER, MARKERS, TIP, Face, Target, build_tool_cube, list_targets
 
 # Pixels per millimetre: each module of each marker takes a whole number of them.
 PER_MM = 20
@@ -69,38 +69,38 @@ class Page:
     placed: tuple[PlacedFace, ...]
 
 
-def printed_pages() -> tuple[Page, ...]:
+def build_printed_pages() -> tuple[Page, ...]:
     """Draw the pages of the tool's cube, the patient's reference and the calibration board."""
-    cube, plate, board = all_targets()
+    cube, plate, board = list_targets()
     return _cube_page(cube), _plate_page(plate), _board_page(board)
 
 
-def face_name(face: Face) -> str:
+def to_face_name(face: Face) -> str:
     """Return the axis of the target that a face looks along: "+x", "-z"."""
     outwards = -face.T_target_face[:3, 2]
     axis = int(np.abs(outwards).argmax())
     return f"{'+' if outwards[axis] > 0.0 else '-'}{'xyz'[axis]}"
 
 
-def png_bytes(page: Page) -> bytes:
+def to_png(page: Page) -> bytes:
     """Encode a page as a PNG of one bit a pixel, with its resolution."""
     said = PngInfo()
     said.add_text("Source", MAKER)
     return _saved([page], "PNG", dpi=(DPI, DPI), pnginfo=said)
 
 
-def pdf_bytes(pages: Sequence[Page]) -> bytes:
+def to_pdf(pages: Sequence[Page]) -> bytes:
     """Encode pages as one PDF, each as large as its paper."""
     return _saved(pages, "PDF", resolution=DPI, creator=MAKER, title="Targets of sulcus")
 
 
-def dictionary_name() -> str:
+def get_dictionary_name() -> str:
     """Return OpenCV's name of the markers' dictionary."""
     names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
     return next(name for name in names if getattr(cv2.aruco, name) == MARKERS)
 
 
-def listed_targets() -> dict:
+def describe_targets() -> dict:
     """List all targets for JSON, in millimetres: sizes, markers, and positions of corners in the target's frame.
 
     Corners are the inner ones of the chessboard in OpenCV's order, row by row as the face is seen. The outline is that
@@ -109,17 +109,17 @@ def listed_targets() -> dict:
     return {
         "format": "sulcus targets 1",
         "unit": "mm",
-        "dictionary": dictionary_name(),
+        "dictionary": get_dictionary_name(),
         "targets": [
-            {"name": target.name, "faces": [_listed(face) for face in target.faces]} for target in all_targets()
+            {"name": target.name, "faces": [_listed(face) for face in target.faces]} for target in list_targets()
         ],
-        "nominal_tip_mm": {tool_cube().name: [0.0, 0.0, _mm(-TIP)]},
+        "nominal_tip_mm": {build_tool_cube().name: [0.0, 0.0, _mm(-TIP)]},
     }
 
 
 def _listed(face: Face) -> dict:
     return {
-        "name": face_name(face),
+        "name": to_face_name(face),
         "columns": face.columns,
         "rows": face.rows,
         "square_mm": _mm(face.square),
@@ -145,7 +145,7 @@ def _cube_page(target: Target) -> Page:
     placed = tuple(PlacedFace(face, x + border, y + border, turns) for face, x, y, turns in cells)
     for each, (face, x, y, _) in zip(placed, cells, strict=True):
         _print(page, each)
-        _write(ink, face_name(face), x + 0.8, y + 0.4, TINY)
+        _write(ink, to_face_name(face), x + 0.8, y + 0.4, TINY)
     right, below, flap = left + wide, top + wide, 10.0
     folds = [((left, below), (right, below)), ((right, below), (right, below + wide)), ((right, top), (right, below))]
     for start, end in folds:
@@ -228,7 +228,7 @@ def _sizes(target: Target) -> tuple[str, str]:
     return (
         f"Each face has {face.columns} x {face.rows} squares of {_mm(face.square):g} mm, "
         f"and markers of {_mm(MARKER * face.square):g} mm.",
-        f"The markers are numbers {ids.min()} to {ids.max()} of OpenCV's {dictionary_name()}.",
+        f"The markers are numbers {ids.min()} to {ids.max()} of OpenCV's {get_dictionary_name()}.",
     )
 
 

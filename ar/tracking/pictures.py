@@ -53,7 +53,7 @@ class Named:
     colour: np.ndarray | None = None
 
 
-def pictures_of(path: Path) -> Iterator[Named]:
+def read_images(path: Path) -> Iterator[Named]:
     """Read at most `MOST_PICTURES` of the PNG and JPEG files of a folder, or of the frames of a video, in their order.
 
     Raises
@@ -67,7 +67,7 @@ def pictures_of(path: Path) -> Iterator[Named]:
     return islice(_in_video(path, None), MOST_PICTURES)
 
 
-def film_of(path: Path, rate: float, colour: bool = False, first: int = 0) -> Iterator[Named]:
+def read_video(path: Path, rate: float, colour: bool = False, first: int = 0) -> Iterator[Named]:
     """Read every image, from the `first` on, of a video or of a folder, with its time [s].
 
     The order in a folder is that of the numbers in the names. Pixels are used as stored: a video's orientation metadata
@@ -78,23 +78,23 @@ def film_of(path: Path, rate: float, colour: bool = False, first: int = 0) -> It
     Raises
     ------
     ValueError
-        As `pictures_of`.
+        As `read_images`.
     """
     if path.is_dir():
         files = islice(enumerate(_files(path)), first, None)
         if colour:
-            return (in_colour(file.name, _read(file, "RGB"), number / rate) for number, file in files)
+            return (to_named_image(file.name, _read(file, "RGB"), number / rate) for number, file in files)
         return (Named(file.name, _read(file), number / rate) for number, file in files)
     return _in_video(path, 1, colour, first)
 
 
-def length_of(path: Path) -> int:
-    """Count the images that `film_of` yields; for a video this is its metadata, which may be wrong.
+def count_frames(path: Path) -> int:
+    """Count the images that `read_video` yields; for a video this is its metadata, which may be wrong.
 
     Raises
     ------
     ValueError
-        As `pictures_of`.
+        As `read_images`.
     """
     if path.is_dir():
         return len(_files(path))
@@ -106,7 +106,7 @@ def length_of(path: Path) -> int:
     return count if count > 0 else sum(1 for _ in _in_video(path, 1))
 
 
-def in_colour(name: str, colour: np.ndarray, time: float) -> Named:
+def to_named_image(name: str, colour: np.ndarray, time: float) -> Named:
     """Build a named image from colour (H, W, 3) uint8 sRGB, with its grey image."""
     return Named(name, cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), time, colour)
 
@@ -188,7 +188,7 @@ def _in_video(path: Path, step: int | None, colour: bool = False, first: int = 0
                 time = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
                 good, frame = video.retrieve()
                 if good and colour:
-                    yield in_colour(f"frame {number}", cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), time)
+                    yield to_named_image(f"frame {number}", cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), time)
                 elif good:
                     yield Named(f"frame {number}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), time)
             number += 1
@@ -228,7 +228,7 @@ def _demand_size(path: Path, width: int, height: int) -> None:
         raise ValueError(f"{path}: {TOO_LARGE}")
 
 
-def rate_of(path: Path) -> float | None:
+def measure_rate(path: Path) -> float | None:
     """Return the frame rate [1/s] in a video's metadata; None for a folder, or if not given."""
     if not path.is_file():
         return None

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from .rigid import angles_of, cross_matrices
-from .targets import DetectedCorners, Detector, Target, seen_from_front, window_round
+from .rigid import build_cross_matrices, compute_angles
+from .targets import DetectedCorners, Detector, Target, find_window, is_seen_from_front
 
 # Minimum number of corners of a pose; lower bound of the residual's deviation, and largest residual [pixel].
 FEWEST, LEAST, MOST = 6, 0.1, 1.0
@@ -57,7 +57,7 @@ class Pose:
         into, away = other.T_camera_target[:3, :3].T, self.T_camera_target[:3, 3] - other.T_camera_target[:3, 3]
         none = np.zeros((3, 3))
         own = np.block([[into, none], [none, into]])
-        theirs = np.block([[-into, into @ cross_matrices(away)], [none, -into]])
+        theirs = np.block([[-into, into @ build_cross_matrices(away)], [none, -into]])
         covariance = own @ self.covariance @ own.T + theirs @ other.covariance @ theirs.T
         T = np.linalg.inv(other.T_camera_target) @ self.T_camera_target
         return Pose(T, covariance, max(self.residual, other.residual), min(self.corners, other.corners))
@@ -65,11 +65,11 @@ class Pose:
     def point(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a point of the target (3,) [m] in the camera's frame (3,) [m], and its covariance (3, 3) [m^2]."""
         arm = self.T_camera_target[:3, :3] @ place
-        slope = np.hstack([np.eye(3), -cross_matrices(arm)])
+        slope = np.hstack([np.eye(3), -build_cross_matrices(arm)])
         return arm + self.T_camera_target[:3, 3], slope @ self.covariance @ slope.T
 
 
-def pose_of(
+def find_pose(
     camera: Camera, target: Target, corners: DetectedCorners | None, before: np.ndarray | None = None
 ) -> tuple[Verdict, Pose | None]:
     """Estimate the pose of a target; none unless it is certain.
@@ -107,7 +107,7 @@ def pose_of(
     return Verdict.GOOD, Pose(best, variance * _inverse_normal(camera, best, corners.points), residual, count)
 
 
-def squares_of(camera: Camera, target: Target, corners: DetectedCorners) -> float:
+def fit_least_squares(camera: Camera, target: Target, corners: DetectedCorners) -> float:
     """Return the smallest sum of squared distances [pixel^2] of a target's corners over its poses; inf if none."""
     return min((squares for _, squares in _fits(camera, target, corners)), default=np.inf)
 
@@ -143,7 +143,7 @@ def _faces_camera(target: Target, corners: DetectedCorners, T: np.ndarray) -> bo
     """Return True if every face with corners is seen from its front, and is before the camera."""
     for number in np.unique(corners.face):
         T_camera_face = T @ target.faces[number].T_target_face
-        if T_camera_face[2, 3] <= 0.0 or not seen_from_front(T_camera_face):
+        if T_camera_face[2, 3] <= 0.0 or not is_seen_from_front(T_camera_face):
             return False
     return True
 
@@ -153,7 +153,7 @@ def _inverse_normal(camera: Camera, T: np.ndarray, points: np.ndarray) -> np.nda
     arm = points @ T[:3, :3].T
     slopes = cv2.projectPoints(arm + T[:3, 3], np.zeros(3), np.zeros(3), camera.K, camera.distortion)[1][:, 3:6]
     by_place = slopes.reshape(-1, 2, 3)
-    J = np.concatenate([by_place, -by_place @ cross_matrices(arm)], axis=2).reshape(-1, 6)
+    J = np.concatenate([by_place, -by_place @ build_cross_matrices(arm)], axis=2).reshape(-1, 6)
     return np.linalg.inv(J.T @ J)
 
 
@@ -165,7 +165,7 @@ def _rigid(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
 
 def _turn(one: np.ndarray, other: np.ndarray) -> float:
     """Compute the angle [rad] between two poses."""
-    return float(angles_of(one[:3, :3] @ other[:3, :3].T))
+    return float(compute_angles(one[:3, :3] @ other[:3, :3].T))
 
 
 def _alike(one: np.ndarray, other: np.ndarray) -> bool:
@@ -228,14 +228,14 @@ class Tracker:
         ValueError
             An image of another size or kind.
         """
-        demand_picture(grey, self.camera.width, self.camera.height)
+        check_image_size(grey, self.camera.width, self.camera.height)
         number = 0 if before is None else before.number + 1
         last = {} if before is None else {k: each for k, each in before.last.items() if number - each[1] <= STALE}
         found = self._seen(grey, number, last)
         verdicts, poses = {}, {}
         for target in self.targets:
             expected = last[target.name][0] if target.name in last else None
-            verdicts[target.name], pose = pose_of(self.camera, target, found.get(target.name), expected)
+            verdicts[target.name], pose = find_pose(self.camera, target, found.get(target.name), expected)
             if pose is not None:
                 poses[target.name] = pose
                 last[target.name] = pose.T_camera_target, number
@@ -249,8 +249,8 @@ class Tracker:
         for target in self.targets:
             if target.name in last:
                 T, outline = last[target.name][0], target.outline
-                window = window_round(self.camera, outline @ T[:3, :3].T + T[:3, 3], AROUND, MARGIN)
-                seen = None if window is None else self._detector.seen_in(target, grey, window)
+                window = find_window(self.camera, outline @ T[:3, :3].T + T[:3, 3], AROUND, MARGIN)
+                seen = None if window is None else self._detector.detect_in_window(target, grey, window)
                 found |= {target.name: seen} if seen is not None and len(seen.points) >= FEWEST else {}
         missing = [target.name for target in self.targets if target.name not in found]
         just_left = any(last.get(name, (None, -2))[1] == number - 1 for name in missing)
@@ -259,7 +259,7 @@ class Tracker:
         return found
 
 
-def demand_picture(grey: np.ndarray, width: int, height: int) -> None:
+def check_image_size(grey: np.ndarray, width: int, height: int) -> None:
     """Check that an image has the camera's size.
 
     Raises

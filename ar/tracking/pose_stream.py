@@ -24,7 +24,7 @@ ROUNDS = 20
 MOVE = "Move the tool to and fro by centimetres, quickly and unevenly, while markers and poses are both seen."
 
 
-def unwrapped(times: np.ndarray) -> np.ndarray:
+def unwrap_times(times: np.ndarray) -> np.ndarray:
     """Unwrap times (n,) [s] of a 24-hour clock at midnight; times of other clocks are unchanged."""
     back = np.diff(times) < -0.5 * DAY
     return times + DAY * np.concatenate([[0], np.cumsum(back)]) if _of_a_day(times) else times
@@ -63,7 +63,7 @@ class PoseStream:
         extrapolated for `AHEAD`. The covariance includes the interpolation error for a body that accelerates as
         observed here.
         """
-        time = self.in_its_day(time)
+        time = self.to_stream_day(time)
         first = int(np.searchsorted(self.times, time + ROUNDING, side="right")) - 1
         if first < 0:
             return None
@@ -80,11 +80,11 @@ class PoseStream:
 
     def age(self, time: float) -> float:
         """Return the time [s] since the last sample before `time`; infinite before the first."""
-        time = self.in_its_day(time)
+        time = self.to_stream_day(time)
         first = int(np.searchsorted(self.times, time, side="right")) - 1
         return np.inf if first < 0 else float(time - self.times[first])
 
-    def in_its_day(self, time: float) -> float:
+    def to_stream_day(self, time: float) -> float:
         """Convert a time [s] to this stream's clock: for a 24-hour clock, to the day nearest to its samples."""
         if not self.daily:
             return time
@@ -118,7 +118,7 @@ class PoseStream:
         return np.array([each[near].max(initial=0.0) for each in changes])
 
 
-def stream_of(times: np.ndarray, poses: np.ndarray, covariances: np.ndarray) -> PoseStream:
+def build_pose_stream(times: np.ndarray, poses: np.ndarray, covariances: np.ndarray) -> PoseStream:
     """Build a stream from a tracker's samples; a 24-hour clock is unwrapped at midnight.
 
     Raises
@@ -128,7 +128,7 @@ def stream_of(times: np.ndarray, poses: np.ndarray, covariances: np.ndarray) -> 
     """
     if not len(times):
         raise ValueError("holds no pose: record some while both bodies are seen.")
-    going_on = unwrapped(times)
+    going_on = unwrap_times(times)
     back = np.flatnonzero(np.diff(going_on) <= 0.0)
     if len(back):
         raise ValueError(f"pose {back[0] + 2} is not later than the one before it: sort the rows by time_s.")
@@ -143,7 +143,7 @@ class Clock:
     error: float = 0.0
 
 
-def clock_by_motion(times: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray) -> Clock:
+def estimate_clock_by_motion(times: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray) -> Clock:
     """Estimate the time offset between a point's motion in images (n,) [s], (n, 3) [m], and by a tracker (m,), (m, 3).
 
     Both points may differ by a constant. The error is that of least squares, from the scatter of residuals.

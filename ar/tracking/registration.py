@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from scipy.stats import chi2, f
 
-from .rigid import cross_matrices, moved_about
+from .rigid import build_cross_matrices, move_about
 
 FEWEST_PAIRS, FEWEST_SURFACE = 3, 20
 # Lower bound of the error of a touched point [m]; largest rms residual of pairs [m].
@@ -83,11 +83,11 @@ class Registration:
     def point(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a scan position (3,) [m] in the reference's frame (3,) [m], and its covariance (3, 3) [m^2]."""
         T = self.T_patient_scan
-        slope = np.hstack([np.eye(3), -cross_matrices(T[:3, :3] @ (place - self.centre))])
+        slope = np.hstack([np.eye(3), -build_cross_matrices(T[:3, :3] @ (place - self.centre))])
         return T[:3, :3] @ place + T[:3, 3], slope @ self.covariance @ slope.T
 
 
-def registered(scan: np.ndarray, patient: np.ndarray) -> Registration:
+def register_points(scan: np.ndarray, patient: np.ndarray) -> Registration:
     """Fit the rigid motion from points of the scan (n, 3) [m] to their positions in the reference's frame (n, 3) [m].
 
     Least squares (Horn 1987, "Closed-form solution of absolute orientation using unit quaternions", J. Opt. Soc. Am. A
@@ -105,12 +105,12 @@ def registered(scan: np.ndarray, patient: np.ndarray) -> Registration:
     _demand_fit(scan, patient, off)
     centre = scan.mean(axis=0)
     freedom = 3 * len(scan) - 6
-    J = slopes_of(T, scan, centre) / _scatter(off, freedom)
+    J = compute_jacobian(T, scan, centre) / _scatter(off, freedom)
     return Registration(T, _widened(J.T @ J, freedom), centre, _rms(off), len(scan))
 
 
 def refined(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Nearest) -> Registration:
-    """Fit like `registered`, with additional points `seen` (m, 3) [m] of the surface, in the reference's frame.
+    """Fit like `register_points`, with additional points `seen` (m, 3) [m] of the surface, in the reference's frame.
 
     Pairs (n, 3) and distances from the surface's tangent planes (Chen, Medioni 1992, "Object modelling by registration
     of multiple range images") are weighted by their own scatter. A surface that moved since the scan biases the result.
@@ -118,11 +118,11 @@ def refined(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Ne
     Raises
     ------
     ValueError
-        As `registered`; too few points, or points that remain farther than 5 mm from the surface (root mean square).
+        As `register_points`; too few points, or points that remain farther than 5 mm from the surface (root mean square).
     """
     if len(seen) < FEWEST_SURFACE:
         raise ValueError(f"{len(seen)} points of the surface are too few: trace {FEWEST_SURFACE} or more.")
-    start = registered(scan, patient)
+    start = register_points(scan, patient)
     T, centre = start.T_patient_scan, start.centre
     freedom = 3 * len(scan) - 6
     touched = _scatter(scan @ T[:3, :3].T + T[:3, 3] - patient, freedom)
@@ -133,11 +133,11 @@ def refined(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Ne
         turned = outward @ T[:3, :3].T
         away = np.einsum("ni,ni->n", turned, place @ T[:3, :3].T + T[:3, 3] - seen)
         traced = _scatter(away, len(seen))
-        J = slopes_of(T, scan, centre) / touched
-        K = np.einsum("ni,nij->nj", turned, slopes_of(T, place, centre).reshape(-1, 3, 6)) / traced
+        J = compute_jacobian(T, scan, centre) / touched
+        K = np.einsum("ni,nij->nj", turned, compute_jacobian(T, place, centre).reshape(-1, 3, 6)) / traced
         normal = J.T @ J + K.T @ K
         step = -np.linalg.solve(normal, J.T @ off.ravel() / touched + K.T @ away / traced)
-        T = moved_about(T, centre, step)
+        T = move_about(T, centre, step)
         if np.abs(step).max() < SMALL:
             break
     if not max(_rms(off), _rms(away[:, None])) <= MOST:
@@ -212,10 +212,12 @@ def _fitted(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return T, scan @ T[:3, :3].T + T[:3, 3] - patient
 
 
-def slopes_of(T: np.ndarray, scan: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def compute_jacobian(T: np.ndarray, scan: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Compute the Jacobian (3 n, 6) of scan positions (n, 3), in the reference, by shift and turn about `centre`."""
     arms = (scan - centre) @ T[:3, :3].T
-    return np.concatenate([np.broadcast_to(np.eye(3), (len(scan), 3, 3)), -cross_matrices(arms)], axis=2).reshape(-1, 6)
+    return np.concatenate([np.broadcast_to(np.eye(3), (len(scan), 3, 3)), -build_cross_matrices(arms)], axis=2).reshape(
+        -1, 6
+    )
 
 
 def _widened(normal: np.ndarray, freedom: int) -> np.ndarray:
@@ -270,7 +272,7 @@ class PairResiduals:
         return self.chance < FALSE_ALARM
 
 
-def pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResiduals:
+def compute_pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResiduals:
     """Compute residuals of pairs of points (n, 3) [m], in the scan and in the reference's frame.
 
     Externally studentised residuals, of three coordinates each (Cook, Weisberg 1982, "Residuals and influence in
@@ -280,16 +282,16 @@ def pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResiduals:
     Raises
     ------
     ValueError
-        As `registered`.
+        As `register_points`.
     """
-    found = registered(scan, patient)
+    found = register_points(scan, patient)
     T, count = found.T_patient_scan, len(scan)
     off = scan @ T[:3, :3].T + T[:3, 3] - patient
     if count == FEWEST_PAIRS:
         # Two pairs, the remainder of three, determine no registration.
         none = np.full(count, np.nan)
         return PairResiduals(np.linalg.norm(off, axis=1), none, none, np.nan)
-    J = slopes_of(T, scan, found.centre)
+    J = compute_jacobian(T, scan, found.centre)
     hat = J @ np.linalg.solve(J.T @ J, J.T)
     freedom = 3 * count - 9
     free = np.stack([np.eye(3) - hat[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(count)])

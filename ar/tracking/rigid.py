@@ -6,19 +6,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 
-def cross_matrices(vectors: np.ndarray) -> np.ndarray:
+def build_cross_matrices(vectors: np.ndarray) -> np.ndarray:
     """Build matrices (..., 3, 3) of the cross product with vectors (..., 3) from the left."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     none = np.zeros_like(x)
     return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*vectors.shape, 3)
 
 
-def angles_of(rotations: np.ndarray) -> np.ndarray:
+def compute_angles(rotations: np.ndarray) -> np.ndarray:
     """Compute the angles (...) [rad] of rotations (..., 3, 3)."""
     return np.arccos(np.clip(0.5 * (np.trace(rotations, 0, -2, -1) - 1.0), -1.0, 1.0))
 
 
-def moved_about(T: np.ndarray, centre: np.ndarray, step: np.ndarray) -> np.ndarray:
+def move_about(T: np.ndarray, centre: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Apply a shift [m] and a turn [rad], `step` (6,), about T `centre` (3,) [m], to a rigid motion T (4, 4)."""
     out = np.eye(4)
     out[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ T[:3, :3]
@@ -39,7 +39,7 @@ def turn_vectors(rotations: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(rotations).as_rotvec()
 
 
-def reread(poses: np.ndarray) -> dict[str, np.ndarray]:
+def read_conventions(poses: np.ndarray) -> dict[str, np.ndarray]:
     """Return poses (n, 4, 4), and their reinterpretations under other quaternion conventions, by the convention."""
     read = Rotation.from_matrix(poses[:, :3, :3])
     forms = {"": read, "as w, x, y, z": Rotation.from_quat(np.roll(read.as_quat(), -1, axis=1)), "inverted": read.inv()}

@@ -104,7 +104,7 @@ class Target:
         return np.concatenate([face.outline for face in self.faces])
 
 
-def seen_from_front(T_camera_face: np.ndarray) -> bool:
+def is_seen_from_front(T_camera_face: np.ndarray) -> bool:
     """Return True if a face at a pose (4, 4) turns its print to the camera."""
     return bool(T_camera_face[:3, 2] @ T_camera_face[:3, 3] > 0.0)
 
@@ -116,7 +116,7 @@ TIP = 150e-3
 
 
 @lru_cache
-def tool_cube() -> Target:
+def build_tool_cube() -> Target:
     """Build a cube of three faces, 48 mm wide with borders; its frame has its origin in the centre, z along the shaft.
 
     The faces look along +x, +y and +z, so that a camera before the corner between them sees all three. The tool's tip
@@ -139,20 +139,20 @@ def tool_cube() -> Target:
 
 
 @lru_cache
-def patient_reference() -> Target:
+def build_patient_reference() -> Target:
     """Build a plate of 60 mm to be fixed next to the craniotomy; its frame is the face's own, z into the plate."""
     return Target("patient", (Face(5, 5, 12e-3, 36, np.eye(4)),))
 
 
 @lru_cache
-def calibration_board() -> Target:
+def build_calibration_board() -> Target:
     """Build a board of 9 x 7 squares of 24 mm, which fits A4; its frame is the face's own."""
     return Target("board", (Face(9, 7, 24e-3, 48, np.eye(4)),))
 
 
-def all_targets() -> tuple[Target, Target, Target]:
+def list_targets() -> tuple[Target, Target, Target]:
     """Build the tool's cube, the patient's reference and the calibration board."""
-    return tool_cube(), patient_reference(), calibration_board()
+    return build_tool_cube(), build_patient_reference(), build_calibration_board()
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +211,7 @@ class Detector:
         found = {target.name: self._between(target, grey, corners, known) for target in wanted}
         return {name: each for name, each in found.items() if len(each.points)}
 
-    def seen_in(self, target: Target, grey: np.ndarray, window: Window) -> DetectedCorners | None:
+    def detect_in_window(self, target: Target, grey: np.ndarray, window: Window) -> DetectedCorners | None:
         """Detect corners of one target in a window of an image (H, W) uint8, if any: faster, with one threshold."""
         part = np.ascontiguousarray(grey[window])
         if min(part.shape) < SMALLEST:
@@ -237,7 +237,7 @@ class Detector:
         return DetectedCorners(np.concatenate(points), np.concatenate(pixels), np.concatenate(on))
 
 
-def window_round(camera: Camera, points: np.ndarray, share: float, least: float) -> Window | None:
+def find_window(camera: Camera, points: np.ndarray, share: float, least: float) -> Window | None:
     """Return rows and columns round points (n, 3) [m] in a camera's frame; None if they are out of view.
 
     The margin is a `share` of their extent, and `least` pixels at least. The camera is at the world's origin.

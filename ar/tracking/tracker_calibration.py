@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .rigid import angles_of, cross_matrices
+from .rigid import build_cross_matrices, compute_angles
 
 FEWEST_POSES = 4
 # Smallest and largest rotation of a motion [rad]: the axis of smaller ones is uncertain; near pi, its sign is.
@@ -61,7 +61,7 @@ class HandEye:
         return f"{found}: at most {np.degrees(LARGEST_TURN):.0f} and {1e3 * LARGEST_SHIFT:.0f} are required"
 
 
-def hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
+def solve_hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
     """Compute X with A X = X B for all motions A and B of two bodies, given by poses (n, 4, 4) [m] in their trackers.
 
     Motions lead from pose i to pose j: A = P_i^-1 P_j of the first, B = Q_i^-1 Q_j of the second. Daniilidis (1999),
@@ -77,7 +77,7 @@ def hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
     if len(first) < FEWEST_POSES:
         raise ValueError(f"{len(first)} poses are too few: record {FEWEST_POSES} or more. {TURN}")
     A, B, ends = _motions(first, second)
-    (a, a_dual), (b, b_dual) = dual_quaternions(A), dual_quaternions(B)
+    (a, a_dual), (b, b_dual) = to_dual_quaternions(A), to_dual_quaternions(B)
     axes = a[:, 1:] / np.linalg.norm(a[:, 1:], axis=1, keepdims=True)
     across = 1.0 - np.linalg.eigvalsh(axes.T @ axes / len(axes))[-1]
     spread = float(np.arcsin(np.sqrt(np.clip(across, 0.0, 1.0))))
@@ -88,7 +88,7 @@ def hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
         )
     X = _solved(a, a_dual, b, b_dual)
     left, right = A @ X, X @ B
-    turns = angles_of(left[:, :3, :3] @ right[:, :3, :3].transpose(0, 2, 1))
+    turns = compute_angles(left[:, :3, :3] @ right[:, :3, :3].transpose(0, 2, 1))
     shifts = np.linalg.norm(left[:, :3, 3] - right[:, :3, 3], axis=1)
     squares, counts = (np.bincount(ends.ravel(), each, len(first)) for each in (np.tile(shifts**2, 2), None))
     return HandEye(X, _rms(turns), _rms(shifts), len(A), spread, np.sqrt(squares / np.maximum(counts, 1)))
@@ -99,7 +99,7 @@ def _motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndar
     kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), MOST_POSES)).round().astype(int))
     start, end = np.triu_indices(len(kept), 1)
     A, B = (np.linalg.inv(poses[kept])[start] @ poses[kept][end] for poses in (first, second))
-    angles = np.array([angles_of(M[:, :3, :3]) for M in (A, B)])
+    angles = np.array([compute_angles(M[:, :3, :3]) for M in (A, B)])
     good = np.flatnonzero((angles.min(axis=0) > LEAST_TURN) & (angles.max(axis=0) < MOST_TURN))
     if len(good) < FEWEST_POSES:
         raise ValueError(
@@ -110,7 +110,7 @@ def _motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndar
     return A[best], B[best], kept[[start[best], end[best]]]
 
 
-def dual_quaternions(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def to_dual_quaternions(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Convert rigid motions (n, 4, 4) to real and dual parts (n, 4), scalars first and >= 0; the dual is t q / 2."""
     R = T[:, :3, :3]
     # Bar-Itzhack (2000), "New method for extracting the quaternion": an eigenvector, whatever the angle.
@@ -136,9 +136,9 @@ def _solved(a: np.ndarray, a_dual: np.ndarray, b: np.ndarray, b_dual: np.ndarray
     rows = np.zeros((len(a), 6, 8))
     for place, one, other in ((0, a, b), (3, a_dual, b_dual)):
         rows[:, place : place + 3, 0] = (one - other)[:, 1:]
-        rows[:, place : place + 3, 1:4] = cross_matrices((one + other)[:, 1:])
+        rows[:, place : place + 3, 1:4] = build_cross_matrices((one + other)[:, 1:])
     rows[:, 3:, 4] = (a - b)[:, 1:]
-    rows[:, 3:, 5:] = cross_matrices((a + b)[:, 1:])
+    rows[:, 3:, 5:] = build_cross_matrices((a + b)[:, 1:])
     one, other = np.linalg.svd(rows.reshape(-1, 8), full_matrices=False)[2][-2:]
     u, v, w, z = one[:4], one[4:], other[:4], other[4:]
     # (k u + m w, k v + m z) is a unit dual quaternion: its parts are at right angles, and the real one has length 1.
@@ -154,7 +154,7 @@ def _solved(a: np.ndarray, a_dual: np.ndarray, b: np.ndarray, b_dual: np.ndarray
     real, dual = reals[best] / lengths[best], duals[best] / lengths[best]
     X = np.eye(4)
     x, y = real[0], real[1:]
-    X[:3, :3] = (x * x - y @ y) * np.eye(3) + 2.0 * np.outer(y, y) + 2.0 * x * cross_matrices(y[None])[0]
+    X[:3, :3] = (x * x - y @ y) * np.eye(3) + 2.0 * np.outer(y, y) + 2.0 * x * build_cross_matrices(y[None])[0]
     X[:3, 3] = 2.0 * _product(dual, real * [1.0, -1.0, -1.0, -1.0])[1:]
     return X
 
@@ -205,7 +205,7 @@ class Pivot:
         return f"the tip moves by {1e3 * self.rms:.1f} mm (rms): at most {1e3 * LARGEST_RMS:.0f} mm are required"
 
 
-def pivoted(poses: np.ndarray) -> Pivot:
+def calibrate_pivot(poses: np.ndarray) -> Pivot:
     """Compute the tip from poses of the tool (n, 4, 4) [m], x_world = T x_tool: all R_i tip + p_i coincide.
 
     Algebraic least squares. Yaniv (2015), "Which pivot calibration?", the one-step method: R_i tip - centre = -p_i.

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from scenes.commands.interrupt import INTERRUPTED, terminated_as_interrupted
-from scenes.options.outputs import add_force, claimed
+from scenes.commands.interrupt import INTERRUPTED, interrupt_on_termination
+from scenes.options.outputs import add_force, check_output_path
 from scenes.script.shipped_files import template_path
 from sim.errors import InputError
 
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     for path in args.tables:
         read_page(path)
     try:
-        with terminated_as_interrupted() as stop_if_asked:
+        with interrupt_on_termination() as stop_if_asked:
             record = read_record(args.source) if args.source else _measured(args, stop_if_asked)
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on from {args.json or OUT}", file=sys.stderr)
@@ -97,7 +97,7 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
     out = args.json or OUT
     found: dict[str, Entry] = {}
     if not args.quick:
-        out = claimed(out, ".json", inputs=[args.anatomy, args.against, *args.tables], resumed=True)
+        out = check_output_path(out, ".json", inputs=[args.anatomy, args.against, *args.tables], resumed=True)
         found = {entry.name: entry for entry in _begun(out, args.force)}
     body = read_anatomy(args.anatomy or template_path()).digest
     run = Run(version_here(), body, args.anatomy, args.quick)

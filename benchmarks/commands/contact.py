@@ -8,8 +8,8 @@ from dataclasses import asdict
 
 import numpy as np
 
-from scenes.options.shared_options import add_anatomy, add_device, add_json, json_line
-from scenes.options.tissue_options import add_tissue_arguments, tissue_of
+from scenes.options.shared_options import add_anatomy, add_device, add_json, to_json_line
+from scenes.options.tissue_options import add_tissue_arguments, get_tissue
 from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy
 from sim.elements import ELEMENTS, RECOMMENDED
@@ -48,17 +48,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if an answer is not good."""
-    from scenes.analysis.measurement import machine
+    from scenes.analysis.measurement import describe_machine
 
     from ..studies.contact_mesh import rows
 
     if min(*args.depths, args.ball) <= 0.0:
         raise InputError("--depths and --ball are lengths in mm: give numbers above 0.")
-    table, where = sys.stderr if args.json else sys.stdout, machine(args.device)
+    table, where = sys.stderr if args.json else sys.stdout, describe_machine(args.device)
     anatomy, found = read_anatomy(args.anatomy or template_path()), []
     print(f"{where}\n\n| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", file=table)
     depths = [depth / 1e3 for depth in args.depths]
-    for row in rows(anatomy, args.elements, depths, args.ball / 1e3, tissue_of(args), args.device):
+    for row in rows(anatomy, args.elements, depths, args.ball / 1e3, get_tissue(args), args.device):
         force = f"{row.element} | {1e3 * row.depth:g} | {1e3 * row.along.mean():.1f}"
         shares = f"{row.share:+.1%} | {row.scatter:.1%} | {(row.sideways / row.along).max():.1%}"
         print(f"| {force} | {shares} | {row.seconds:.1f} | {row.fine_seconds:.1f} |", file=table, flush=True)
@@ -66,5 +66,5 @@ def run(args: argparse.Namespace) -> int:
     print(LEGEND, file=table)
     if args.json:
         lists = [{name: np.asarray(value).tolist() for name, value in asdict(row).items()} for row in found]
-        print(json_line({"machine": where, "rows": lists}))
+        print(to_json_line({"machine": where, "rows": lists}))
     return 0 if all(np.isfinite(row.along + row.fine).all() for row in found) else 1

@@ -32,14 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a solve did not converge."""
-    from scenes.analysis.measurement import machine
+    from scenes.analysis.measurement import describe_machine
 
     from ..studies.elements import Press, limits, rows
 
     bodies = [read_anatomy(path) for path in args.anatomies or [template_path()]]
     anatomies = bodies if args.coarse else [mesh for body in bodies for mesh in (body, refined(body))]
     table = sys.stderr if args.json else sys.stdout
-    where = machine(args.device)
+    where = describe_machine(args.device)
     print(f"{where}\n\n| nu | element | vertices | tumour moves [mm] | set-up [s] | solve [s] | outer |", file=table)
     print("|---|---|---|---|---|---|---|", file=table)
     found = []

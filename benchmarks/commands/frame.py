@@ -9,8 +9,8 @@ from contextlib import redirect_stdout
 from dataclasses import asdict, replace
 
 from scenes.options.shared_options import add_json
-from scenes.options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
-from sim.arguments import at_least
+from scenes.options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
+from sim.arguments import check_at_least
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,20 +34,20 @@ def run(args: argparse.Namespace) -> int:
     """Play the scene to a page that nobody looks at."""
     from tqdm import tqdm
 
-    from scenes.analysis.measurement import machine
+    from scenes.analysis.measurement import describe_machine
 
-    from ..studies.frame import batch_rate, frames_of, size_of, table
+    from ..studies.frame import batch_rate, frames_of, measure_size, table
 
-    at_least("--frames", args.frames, 1)
+    check_at_least("--frames", args.frames, 1)
     if args.batch is not None:
-        at_least("--batch", args.batch, 1)
-    width, height = size_of(args.size)
-    theatre = theatre_asked(args, args.scene)
-    scene = scene_asked(args, args.scene, theatre)
+        check_at_least("--batch", args.batch, 1)
+    width, height = measure_size(args.size)
+    theatre = build_requested_theatre(args, args.scene)
+    scene = build_requested_scene(args, args.scene, theatre)
     scene = replace(scene, viewpoint=replace(scene.viewpoint, width=width, height=height))
-    name = deformer_name(args, theatre, scene)
+    name = choose_deformer(args, theatre, scene)
     player = theatre.player(name, scene)
-    where = f"{machine(args.device)}; {scene.name} by {name}, {width} x {height}"
+    where = f"{describe_machine(args.device)}; {scene.name} by {name}, {width} x {height}"
     with redirect_stdout(sys.stderr):  # viser says there where it serves
         frames = frames_of(player, args.frames)
         found = table(list(tqdm(frames, "frames", args.frames, unit="frame", file=sys.stderr)))

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from scenes.options.outputs import add_force, claimed
+from scenes.options.outputs import add_force, check_output_path
 from scenes.options.shared_options import add_device, add_json
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.elements import ELEMENTS, RECOMMENDED
 
 if TYPE_CHECKING:
@@ -40,21 +40,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a load did not converge."""
     from ar.screen import write_png
-    from scenes.analysis.loglog_chart import drawn
-    from scenes.analysis.measurement import machine, write_table
+    from scenes.analysis.loglog_chart import draw_panels
+    from scenes.analysis.measurement import describe_machine, write_table
     from sim.bodies.subject import MeshPlan
     from sim.runtime.device import find_device
-    from sim.runtime.journal import opened
+    from sim.runtime.journal import open_journal
 
     from ..studies.scaling import Row, Trial, panels, rows
 
-    at_least("--batch", min(args.batch), 1)
+    check_at_least("--batch", min(args.batch), 1)
     for size in args.sizes:
         MeshPlan(size)
     find_device(args.device, "float32")
-    where, record, kept = machine(args.device), args.out.with_suffix(".csv"), args.out.with_suffix(".rows")
+    where, record, kept = describe_machine(args.device), args.out.with_suffix(".csv"), args.out.with_suffix(".rows")
     for path, suffix in ((args.out, ".png"), (record, ".csv")):
-        claimed(path, suffix, args.force, resumed=kept.exists())
+        check_output_path(path, suffix, args.force, resumed=kept.exists())
     if args.force:
         kept.unlink(missing_ok=True)
     trial = Trial(args.element, args.device, args.out.parent)
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     table = sys.stderr if args.json else sys.stdout
     print(where, file=table)
     with (
-        opened(kept, stated) as journal,
+        open_journal(kept, stated) as journal,
         tqdm(total=len(args.sizes) * len(args.batch), unit="row", file=sys.stderr) as bar,
     ):
         found = [row for row in journal.rows(Row) if row.size in args.sizes and row.asked in args.batch]
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
             bar.update()
     found.sort(key=lambda row: (row.nodes, row.batch))
     write_table(record, [asdict(row) for row in found])
-    write_png(args.out, drawn(panels(found)))
+    write_png(args.out, draw_panels(panels(found)))
     _print(found, table)
     print(f"\n{args.out}: written; its rows are in {record}, its meshes beside it", file=table)
     if args.json:

@@ -6,8 +6,8 @@ import argparse
 import sys
 from dataclasses import asdict
 
-from scenes.options.shared_options import add_device, add_json, json_line
-from sim.arguments import at_least
+from scenes.options.shared_options import add_device, add_json, to_json_line
+from sim.arguments import check_at_least
 
 # The tasks of scenes.gym, which loads Gymnasium and is imported only as this runs.
 TASKS = ("palpate", "retract", "debulk")
@@ -42,28 +42,28 @@ def run(args: argparse.Namespace) -> int:
     """Step the environments under their scripted policies."""
     from tqdm import tqdm
 
-    from scenes.analysis.measurement import machine
-    from scenes.gym.environment import many
+    from scenes.analysis.measurement import describe_machine
+    from scenes.gym.environment import make_many
 
-    from ..studies.frame import size_of
-    from ..studies.gym_rates import rate_of
+    from ..studies.frame import measure_size
+    from ..studies.gym_rates import measure_rate
 
     for name in ("envs", "steps", "repeats"):
-        at_least(f"--{name}", getattr(args, name), 1)
-    size, rows = size_of(args.size), []
+        check_at_least(f"--{name}", getattr(args, name), 1)
+    size, rows = measure_size(args.size), []
     apart = ", each in a process of its own" if args.processes else ""
-    where = f"{machine(args.device)}; {args.envs} environments{apart}, pictures of {size[0]} x {size[1]}"
+    where = f"{describe_machine(args.device)}; {args.envs} environments{apart}, pictures of {size[0]} x {size[1]}"
     for task in args.tasks or TASKS:
         for observation in args.observation:
-            environment = many(
+            environment = make_many(
                 task, args.envs, args.processes, anatomy=args.anatomy, observation=observation, physics=args.physics,
                 device=args.device, size=size, model=args.model,
             )  # fmt: skip
             with tqdm(desc=f"{task}, {observation}", total=args.repeats + 1, unit="repeat", file=sys.stderr) as bar:
-                rows.append(rate_of(environment, task, observation, args.steps, args.repeats, bar.update))
+                rows.append(measure_rate(environment, task, observation, args.steps, args.repeats, bar.update))
             environment.close()
     if args.json:
-        print(json_line({"machine": where, "rows": [asdict(row) for row in rows]}))
+        print(to_json_line({"machine": where, "rows": [asdict(row) for row in rows]}))
         return 0
     print(f"{where}\n\n| task | observation | steps/s: median | least | most | in contact |\n|---|---|---|---|---|---|")
     for row in rows:

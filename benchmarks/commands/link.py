@@ -8,7 +8,7 @@ import os
 from dataclasses import asdict
 
 from scenes.options.shared_options import add_json
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.errors import InputError
 
 from .locate import bar
@@ -25,12 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure. Returns 0."""
-    from scenes.analysis.measurement import machine
+    from scenes.analysis.measurement import describe_machine
 
     from ..studies.link_latency import CLIENTS, measured
 
-    at_least("--points", args.points, 3)
-    at_least("--runs", args.runs, 1)
+    check_at_least("--points", args.points, 3)
+    check_at_least("--runs", args.runs, 1)
     if not (0.0 < args.rate <= 1000.0 and 0.0 < args.seconds <= 3600.0):
         raise InputError("--rate and --seconds: give up to 1000 poses a second, and up to 3600 seconds, both above 0.")
     found = []
@@ -41,7 +41,9 @@ def run(args: argparse.Namespace) -> int:
     best = min(found, key=lambda each: each.p99)
     middle = sorted(found, key=lambda each: each.p99)[len(found) // 2]
     load = os.getloadavg()[0]
-    where = f"{machine('cpu')}; {os.cpu_count()} cores, load {load:.1f}; {CLIENTS} clients, {args.points} points"
+    where = (
+        f"{describe_machine('cpu')}; {os.cpu_count()} cores, load {load:.1f}; {CLIENTS} clients, {args.points} points"
+    )
     if args.json:
         print(json.dumps({"machine": where, "best": asdict(best), "middle": asdict(middle)}))
         return 0

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from scenes.options.shared_options import add_anatomy, add_device, add_json
-from scenes.options.tissue_options import add_tissue_arguments, elasticity_of
+from scenes.options.tissue_options import add_tissue_arguments, parse_elasticity
 from scenes.script.shipped_files import template_path
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.effects import pushed_effects
 from sim.elements import ELEMENTS, RECOMMENDED
@@ -44,20 +44,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Play every tool; 1 if a frame did not converge, or was farther off than promised."""
     from scenes.analysis.budget import PROMISED
-    from scenes.analysis.measurement import machine
+    from scenes.analysis.measurement import describe_machine
     from scenes.script.scene import find_scene
     from scenes.script.site import site_of
 
     from ..studies.live import RIDES, errors, frames_of, live_fem, loads_of, tally
 
-    at_least("--frames", args.frames, 1)
+    check_at_least("--frames", args.frames, 1)
     checked = min(CHECKED, args.frames) if args.checked is None else args.checked
     if not 1 <= checked <= args.frames:
         raise InputError(
             f"--frames {args.frames} --checked {checked} measures nothing: give 1 <= --checked <= --frames."
         )
     site = site_of(read_anatomy(args.anatomy or template_path()))
-    scene = replace(find_scene("press"), effects=pushed_effects(site.anatomy, elasticity_of(args, site.anatomy.mesh)))
+    scene = replace(
+        find_scene("press"), effects=pushed_effects(site.anatomy, parse_elasticity(args, site.anatomy.mesh))
+    )
     fem = live_fem(scene, site, args.device, args.element)
     found = []
     for ride in RIDES:
@@ -65,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         frames = list(tqdm(frames_of(fem, loads), ride.name, args.frames, unit="frame", file=sys.stderr))
         sample = frames[:: args.frames // checked][:checked]
         found.append(tally(ride, frames, errors(sample, scene, site, args.element)))
-    where = f"{machine(args.device)}; {len(site.anatomy.mesh.nodes)} nodes, {args.element}"
+    where = f"{describe_machine(args.device)}; {len(site.anatomy.mesh.nodes)} nodes, {args.element}"
     if args.json:
         print(json.dumps({"machine": where, "promised_mm": 1e3 * PROMISED, "rides": [asdict(item) for item in found]}))
     else:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scenes.options.shared_options import add_anatomy, add_device, add_json, add_seed
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 
@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if of some twin no equilibrium was found."""
-    from scenes.analysis.measurement import machine
+    from scenes.analysis.measurement import describe_machine
     from scenes.script.shipped_files import template_path
     from sim.bodies.meshfile import read_anatomy
 
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     some = [twin for twin in found if twin is not None]
     locator = locator_of(args, body)
     table = sys.stderr if args.json else sys.stdout
-    where = f"{machine(args.device)}; truths of {len(finer.mesh.nodes)} nodes, {args.element}"
+    where = f"{describe_machine(args.device)}; truths of {len(finer.mesh.nodes)} nodes, {args.element}"
     print(f"{where}\n\n{len(some)} twins\n\n| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", file=table)
     others = {"named": not args.clouds, "slip": 1e-3 * args.slip, "wrong": args.wrong_registration}
     sights = sights_of(args.points, args.cover, args.noise, **others)
@@ -122,10 +122,10 @@ def _check(args: argparse.Namespace) -> None:
     InputError
         Counts, shares or a seed that cannot be; a brain of one's own without its finer mesh.
     """
-    at_least("--twins", args.twins, 1)
-    at_least("--seed", args.seed, 0)
+    check_at_least("--twins", args.twins, 1)
+    check_at_least("--seed", args.seed, 0)
     for count in args.points:
-        at_least("--points", count, 6)
+        check_at_least("--points", count, 6)
     for cover in args.cover:
         if not 1 <= cover <= 100:
             raise InputError(f"--cover {cover}: give a share of the open cortex, from 1 to 100 [%].")

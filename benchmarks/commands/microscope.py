@@ -7,8 +7,8 @@ import json
 from dataclasses import asdict, replace
 
 from scenes.options.shared_options import add_json
-from scenes.options.theatre_options import add_theatre, scene_asked, theatre_asked
-from sim.arguments import at_least
+from scenes.options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre
+from sim.arguments import check_at_least
 
 from .locate import bar
 
@@ -37,10 +37,10 @@ def run(args: argparse.Namespace) -> int:
 
     from ..studies.stereo_study import rows
 
-    at_least("--seeds", args.seeds, 1)
-    at_least("--every", args.every, 1)
-    theatre = theatre_asked(args, args.scene)
-    scene = scene_asked(args, args.scene, theatre)
+    check_at_least("--seeds", args.seeds, 1)
+    check_at_least("--every", args.every, 1)
+    theatre = build_requested_theatre(args, args.scene)
+    scene = build_requested_scene(args, args.scene, theatre)
     if isinstance(scene.sight, StereoSight):
         sight = replace(scene.sight, named=not args.cloud, vessels=not args.plain)
         scene = replace(scene, sight=sight)

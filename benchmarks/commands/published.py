@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from scenes.options.shared_options import add_json
 from surrogate.data.dataset import read_dataset
-from surrogate.evaluation.score import score, table
+from surrogate.evaluation.score import format_scores, score
 
 from ..published.models import MACHINES, published_nodes
 from ..published.protocol import positions_of, trained_in_turn
@@ -48,6 +48,6 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({"rows": rows, "motion_mm": motion, **sizes}))
         return 0
     print(f"{len(loads)} loads, each answered without its position, at {len(nodes)} vertices of the tumour:")
-    print(table(scores, motion))
+    print(format_scores(scores, motion))
     print("training [s]: " + ", ".join(f"{row.name} {spent:.0f}" for row, spent in zip(scores, seconds, strict=True)))
     return 0

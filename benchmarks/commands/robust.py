@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from scenes.options.outputs import add_force, claimed
+from scenes.options.outputs import add_force, check_output_path
 from scenes.options.shared_options import add_anatomy, add_device, add_json, add_seed
-from scenes.options.tissue_options import add_tissue_arguments, elasticity_of
+from scenes.options.tissue_options import add_tissue_arguments, parse_elasticity
 from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy
 from sim.effects import pushed_effects
@@ -42,25 +42,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
-    from scenes.analysis.measurement import machine, write_table
-    from sim.runtime.journal import opened
+    from scenes.analysis.measurement import describe_machine, write_table
+    from sim.runtime.journal import open_journal
 
     from ..studies.robustness import Record, Trial, records, tallies
 
     if args.count < 2 or args.batch < 1:
         raise InputError(f"--count {args.count} --batch {args.batch} tries nothing: give --count >= 2, --batch >= 1.")
     anatomy = read_anatomy(args.anatomy or template_path())
-    effects = pushed_effects(anatomy, elasticity_of(args, anatomy.mesh))
+    effects = pushed_effects(anatomy, parse_elasticity(args, anatomy.mesh))
     trial = Trial(anatomy, effects, args.element, args.device, args.batch)
     stated = {"anatomy": anatomy.digest, "effects": repr(effects), "element": args.element}
     stated |= {"count": str(args.count), "seed": str(args.seed)}
     kept = args.out and args.out.with_suffix(".rows")
     if kept:
-        claimed(args.out, ".csv", args.force, resumed=kept.exists())
+        check_output_path(args.out, ".csv", args.force, resumed=kept.exists())
         if args.force:
             kept.unlink(missing_ok=True)
     with (
-        opened(kept, stated) if kept else nullcontext() as journal,
+        open_journal(kept, stated) if kept else nullcontext() as journal,
         tqdm(total=args.count, unit="load", file=sys.stderr) as bar,
     ):
         found = journal.rows(Record) if journal is not None else []
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     if kept:
         write_table(args.out, [asdict(record) for record in found])
     sets = tallies(found)
-    where = machine(args.device)
+    where = describe_machine(args.device)
     if args.json:
         print(json.dumps({"machine": where, "sets": [asdict(item) for item in sets]}))
     else:

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from scenes.options.shared_options import add_device, add_json
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
@@ -37,17 +37,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a solve did not converge."""
-    from scenes.analysis.measurement import machine
+    from scenes.analysis.measurement import describe_machine
 
     from ..studies.skull_models import rows
 
-    at_least("--loads", args.loads, 1)
+    check_at_least("--loads", args.loads, 1)
     plans = [MeshPlan(count) for count in args.nodes]
     bodies = [read_anatomy(path) for path in args.anatomies]
     bodies = bodies or [make_anatomy(template_subject(Tumour()), plan) for plan in plans]
     loads = draw(args.preset, bodies[0], args.loads, 0)
     table = sys.stderr if args.json else sys.stdout
-    where = machine(args.device)
+    where = describe_machine(args.device)
     print(f"{where}\n\n{len(loads)} {args.preset} loads\n", file=table)
     print("| skull | nu | vertices | tumour moves [mm] | leaks | bond bears | a load [s] |", file=table)
     print("|---|---|---|---|---|---|---|", file=table)

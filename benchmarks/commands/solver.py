@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from scenes.options.shared_options import add_json, add_seed, json_line
+from scenes.options.shared_options import add_json, add_seed, to_json_line
 from scenes.script.shipped_files import template_path
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 
@@ -62,17 +62,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare; 1 if one of our answers is off."""
-    from scenes.analysis.measurement import machine
+    from scenes.analysis.measurement import describe_machine
     from sim.runtime.device import find_device
 
-    from ..peers.comparison import LEAST, OWN, PEERS, case_of, compare, judge_of
+    from ..peers.comparison import LEAST, OWN, PEERS, build_judge, case_of, compare
 
     for name, value, least in (
         ("--loads", args.loads, 2),
         ("--starts", args.starts, 1),
         ("--threads", args.threads, 1),
     ):
-        at_least(name, value, least)
+        check_at_least(name, value, least)
     if wrong := [tolerance for tolerance in args.tolerance if not LEAST <= tolerance < 1.0]:
         raise InputError(f"--tolerance {wrong[0]:g} cannot be judged: give numbers from {LEAST:g} to below 1.")
     find_device(args.device, "float64")
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     engines = [engine.on(args.device) for engine in (OWN, *(peer for peer in PEERS if peer.name in asked))]
     cases = [case_of(read_anatomy(path), args.loads, args.seed) for path in args.mesh or [template_path()]]
     table = sys.stderr if args.json else sys.stdout
-    where = machine(args.device)
+    where = describe_machine(args.device)
     print(
         f"{where}\n\nLog neo-Hookean, E 3 kPa, nu 0.45, linear tetrahedra, skull nodes held (not sliding: not every "
         f"peer can). {args.loads} palpation loads as nodal forces, each from rest and alone. One routine measures all "
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         size = {"nodes": len(case.nodes), "tets": len(case.tets)}
         print(f"\n{size['nodes']} nodes, {size['tets']} tetrahedra\n\n| {' | '.join(COLUMNS)} |", file=table)
         print(f"|{'---|' * len(COLUMNS)}", file=table, flush=True)
-        judge = judge_of(case)
+        judge = build_judge(case)
         with tqdm(total=len(args.tolerance) * started * each, unit="answer", file=sys.stderr) as bar:
             for tolerance in args.tolerance:
                 to_this = replace(case, tolerance=tolerance)
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
                 _print(rows, table)
                 found.append({**size, "tolerance": tolerance, "rows": [_plain(row) for row in rows]})
     if args.json:
-        print(json_line({"machine": where, "threads": args.threads, "meshes": found}))
+        print(to_json_line({"machine": where, "threads": args.threads, "meshes": found}))
     return 0 if all(answer["good"] for mesh in found for answer in mesh["rows"][0]["answers"]) else 1
 
 

@@ -8,8 +8,8 @@ import sys
 from dataclasses import asdict
 
 from scenes.options.shared_options import add_json
-from scenes.options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
-from sim.arguments import at_least
+from scenes.options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
+from sim.arguments import check_at_least
 from sim.errors import InputError
 
 
@@ -27,25 +27,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
-    from scenes.analysis.measurement import machine
+    from scenes.analysis.measurement import describe_machine
     from scenes.play.deformers import plan_of
     from scenes.script.scene import SCENES, find_scene
     from sim.effects import ToolForce
 
     from ..studies.stages import rows
 
-    at_least("--batch", args.batch, 1)
-    theatre = theatre_asked(args, args.scene)
-    scene = scene_asked(args, args.scene, theatre)
+    check_at_least("--batch", args.batch, 1)
+    theatre = build_requested_theatre(args, args.scene)
+    scene = build_requested_scene(args, args.scene, theatre)
     if not any(isinstance(effect, ToolForce) for effect in scene.effects):
         pushing = ", ".join(
             name for name in SCENES if find_scene(name).sight is None and ToolForce() in find_scene(name).effects
         )
         raise InputError(f"in the scene {scene.name} no tool pushes, which is what is measured: choose {pushing}.")
-    name = deformer_name(args, theatre, scene)
+    name = choose_deformer(args, theatre, scene)
     player = theatre.player(name, scene)
     found, solvers = [], []
-    where = machine(args.device)
+    where = describe_machine(args.device)
     table = sys.stderr if args.json else sys.stdout
     print(f"{where}\n\n| stage | median | p95 | | what |\n|---|---|---|---|---|", file=table)
     for row in rows(theatre, player, name, args.solves, args.batch, solvers.append):

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from scenes.options.shared_options import add_anatomy, add_devices, add_json
 from scenes.script.shipped_files import template_path
 from sim.accuracy import TRAIN
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.material import LAWS, Material
@@ -66,29 +66,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a load did not converge."""
-    from scenes.analysis.measurement import machine
+    from scenes.analysis.measurement import describe_machine
     from sim.effects import ToolContact
-    from sim.runtime.device import device_names
-    from surrogate.data.tool_poses import ROUND, tool_of
+    from sim.runtime.device import parse_device_names
+    from surrogate.data.tool_poses import ROUND, choose_ball
 
     from ..studies.robustness import Trial
     from ..studies.throughput import drawn, rows, together
 
-    devices = device_names(args.device)
+    devices = parse_device_names(args.device)
     on_cuda = devices[0].startswith("cuda")
     count = args.count if args.count is not None else (CUDA_COUNT if on_cuda else CPU_COUNT)
     batch = args.batch if args.batch is not None else (count if on_cuda else CPU_BATCH)
     for name, value in (("--count", count), ("--batch", batch), ("--repeats", args.repeats)):
-        at_least(name, value, 1)
+        check_at_least(name, value, 1)
     materials = [Material(law, YOUNG, poisson) for law in args.laws for poisson in args.poisson]
     anatomy = read_anatomy(args.anatomy or template_path())
     trial = Trial(anatomy, (), args.element, devices[0], batch)
     sets = drawn(anatomy, args.presets or (ROUND if args.poses else PRESETS), count, args.poses)
     groups: list[tuple[dict[str, Drawn], tuple[Effect, ...]]] = [(sets, ())]
     if args.poses:
-        groups = [({name: loads}, (ToolContact((tool_of(name),)),)) for name, loads in sets.items()]
+        groups = [({name: loads}, (ToolContact((choose_ball(name),)),)) for name, loads in sets.items()]
     table = sys.stderr if args.json else sys.stdout
-    where = machine(devices[0]) + (f"; at once on {', '.join(devices)}" if len(devices) > 1 else "")
+    where = describe_machine(devices[0]) + (f"; at once on {', '.join(devices)}" if len(devices) > 1 else "")
     print(where, file=table)
     found: list[Row] = []
     with tqdm(total=len(materials) * len(sets) * (args.repeats + 2), unit="solve", file=sys.stderr) as bar:

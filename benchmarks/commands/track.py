@@ -8,7 +8,7 @@ import sys
 from dataclasses import asdict
 
 from scenes.options.shared_options import add_json, add_seed
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 
 from .locate import bar
 
@@ -28,8 +28,8 @@ def run(args: argparse.Namespace) -> int:
     """Measure; 1 if a wrong pose was called certain."""
     from ..studies.track_study import studied
 
-    at_least("--pictures", args.pictures, 2)
-    at_least("--seed", args.seed, 0)
+    check_at_least("--pictures", args.pictures, 2)
+    check_at_least("--seed", args.seed, 0)
     with bar("pictures") as heard:
         rows = studied(args.pictures, args.seed, heard)
     if args.json:

@@ -11,7 +11,7 @@ from typing import Literal
 
 import msgspec
 
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as
 
 from .figure_readings import Better
@@ -100,5 +100,5 @@ def read_record(path: Path) -> Record:
 
 def write_record(path: Path, record: Record) -> None:
     """Write a file, whole or not at all."""
-    with written_whole(path, ".json") as partial:
+    with write_atomically(path, ".json") as partial:
         partial.write_text(json.dumps(asdict(record), indent=1, allow_nan=False) + "\n")

@@ -13,11 +13,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from scenes.analysis.measurement import machine
+from scenes.analysis.measurement import describe_machine
 from sim.errors import InputError
-from sim.geometry.tetmesh import digest_of
+from sim.geometry.tetmesh import compute_digest
 from sim.runtime.optional_packages import install_hint
-from sim.runtime.versions import version_of
+from sim.runtime.versions import get_version
 
 from ..peers.child_process import HOUSE, Ended, run_to_end
 from .figure_readings import number_at
@@ -35,7 +35,7 @@ def version_here() -> str:
         path for room in ("ar", "benchmarks", "scenes", "sim", "surrogate") for path in (HOUSE / room).rglob("*.py")
     )
     code = b"\0".join(path.relative_to(HOUSE).as_posix().encode() + b"\0" + path.read_bytes() for path in paths)
-    return f"{version_of('sulcus')} (code {digest_of(np.frombuffer(code, np.uint8))})"
+    return f"{get_version('sulcus')} (code {compute_digest(np.frombuffer(code, np.uint8))})"
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Run:
         InputError
             A device that is not here.
         """
-        where, _, today = machine(device).rpartition("; ")
+        where, _, today = describe_machine(device).rpartition("; ")
         return Origin(self.version, where, self.digest, today)
 
 

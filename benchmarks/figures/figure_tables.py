@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as
 
 from .figure_record import Entry, Record
@@ -82,7 +82,7 @@ def write_page(path: Path, record: Record) -> bool:
     before = read_page(path)
     after = MARKED.sub(lambda block: f"{block[1]}\n{_marked(block[2].split(), record)}\n\n{block[4]}", before)
     if after != before:
-        with written_whole(path, ".md") as partial:
+        with write_atomically(path, ".md") as partial:
             partial.write_bytes(after.encode())
     return after != before
 

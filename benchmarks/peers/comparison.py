@@ -19,7 +19,7 @@ import numpy as np
 
 from sim.anatomy import Anatomy
 from sim.deformation import guess
-from sim.discretisation.footprint import footprint_weights
+from sim.discretisation.footprint import compute_footprint_weights
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Pushed
 from sim.material import Material
@@ -148,7 +148,7 @@ class Judge:
     fields: np.ndarray
 
 
-def judge_of(case: Case) -> Judge:
+def build_judge(case: Case) -> Judge:
     """The judge of a case, whatever its tolerance; a load that it cannot solve so well has NaN for an answer."""
     fem = fem_of(replace(case, tolerance=FINEST))
     found = fem.deform(Loads((Nodal(case.force),)))
@@ -166,7 +166,7 @@ def case_of(anatomy: Anatomy, loads: int, seed: int) -> Case:
     held = np.asarray((anatomy.held | (anatomy.slide_normal != 0.0)).any(axis=1))
     (pushed,) = draw("palpation", anatomy, loads, seed).every(Pushed)
     mesh = anatomy.mesh
-    weights = footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()
+    weights = compute_footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()
     force = weights[:, :, None] * pushed.force[:, None, :]
     return Case(mesh.nodes, mesh.tets, held, TISSUE.young, TISSUE.poisson, *TISSUE.lame, force, TOLERANCE)
 

@@ -21,11 +21,11 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.loads import Loads, Pushed
-from sim.runtime.threads import one_thread
+from sim.runtime.threads import limit_to_one_thread
 from surrogate.data.cortex_patch import Patch, open_patch
-from surrogate.data.encode import directions
-from surrogate.model.learned import only_pushed, predicted
-from surrogate.model.training_range import Envelope, envelope_of
+from surrogate.data.encode import split_forces
+from surrogate.model.learned import build_prediction, get_only_pushes
+from surrogate.model.training_range import Envelope, compute_training_range
 from surrogate.regressors.baselines import Svr
 from surrogate.regressors.protocol import Regressor
 
@@ -74,12 +74,14 @@ class Published:
             Loads of another kind, or a vertex in `at` that the model does not know.
         """
         begun = time.perf_counter()
-        pushed = only_pushed(loads)
+        pushed = get_only_pushes(loads)
         features = thirteen(*self._sites, pushed)
         angular = [machine.predict(X) for machine, X in zip(self.machines, features, strict=True)]
         displacement = from_angles(np.stack(angular, axis=1).astype(np.float64))
         outside = ~self.envelope.holds(self._patch, pushed)
-        answer = predicted(displacement, self.nodes, loads, outside, begun, np.array(np.nan), "published protocol")
+        answer = build_prediction(
+            displacement, self.nodes, loads, outside, begun, np.array(np.nan), "published protocol"
+        )
         return answer if at is None else answer.at(np.asarray(at))
 
 
@@ -100,7 +102,7 @@ def thirteen(sites: np.ndarray, centroid: np.ndarray, pushed: Pushed) -> np.ndar
     angle [rad] between force and the way to the site, and the axis (3) and angle [rad] of the rotation from one to the
     other.
     """
-    _, direction = directions(pushed)
+    _, direction = split_forces(pushed)
     way = sites[:, None] - pushed.point
     distance = np.linalg.norm(way, axis=2, keepdims=True)
     way = way / np.maximum(distance, np.finfo(float).tiny)
@@ -142,16 +144,16 @@ def published_model(
     """
     if name not in MACHINES:
         raise InputError(f"no published learner is called {name!r}: choose from {', '.join(MACHINES)}.")
-    pushed, nodes = only_pushed(loads), published_nodes(anatomy)
+    pushed, nodes = get_only_pushes(loads), published_nodes(anatomy)
     angular = to_angles(np.asarray(truth, np.float64))
 
-    def learn(X: np.ndarray, Y: np.ndarray) -> Regressor:
+    def update_history(X: np.ndarray, Y: np.ndarray) -> Regressor:
         machine = MACHINES[name]().fit(X, Y)
         progress()
         return machine
 
-    envelope = envelope_of(open_patch(anatomy), pushed)
+    envelope = compute_training_range(open_patch(anatomy), pushed)
     # Matrices of 61 rows are no work for several cores: their threads would wait for each other, twelve times as long.
-    with one_thread(), ThreadPoolExecutor() as pool:
-        machines = pool.map(learn, thirteen(*sites_of(anatomy, nodes), pushed), angular.transpose(1, 0, 2))
+    with limit_to_one_thread(), ThreadPoolExecutor() as pool:
+        machines = pool.map(update_history, thirteen(*sites_of(anatomy, nodes), pushed), angular.transpose(1, 0, 2))
         return Published(anatomy, nodes, tuple(machines), envelope)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.deformation import Deformation, joined
+from sim.deformation import Deformation, join_deformations
 from sim.errors import InputError
 from sim.loads import Loads
-from surrogate.data.cortex_patch import nearest
-from surrogate.model.learned import only_pushed
+from surrogate.data.cortex_patch import find_nearest
+from surrogate.model.learned import get_only_pushes
 
 from .models import Published, published_model
 
@@ -53,16 +53,16 @@ class InTurn:
         InputError
             Loads of another kind, or a vertex in `at` that the models do not know.
         """
-        position = nearest(only_pushed(loads).point, self.positions)[0]
+        position = find_nearest(get_only_pushes(loads).point, self.positions)[0]
         rows = [np.flatnonzero(position == which) for which in np.unique(position)]
         answers = [self.models[position[some[0]]].deform(loads.rows(some), at=at) for some in rows]
-        return joined(answers).rows(np.argsort(np.concatenate(rows)))
+        return join_deformations(answers).rows(np.argsort(np.concatenate(rows)))
 
 
 def positions_of(loads: Loads) -> np.ndarray:
     """The distinct points (m, 3) [m] of the loads, in an order that depends on nothing else."""
-    whole = np.round(only_pushed(loads).point / SAME).astype(np.int64)
-    return only_pushed(loads).point[np.unique(whole, axis=0, return_index=True)[1]]
+    whole = np.round(get_only_pushes(loads).point / SAME).astype(np.int64)
+    return get_only_pushes(loads).point[np.unique(whole, axis=0, return_index=True)[1]]
 
 
 def trained_in_turn(
@@ -85,7 +85,7 @@ def trained_in_turn(
             f"the loads have {len(positions)} positions, and leaving out one in turn takes 2 to {MOST}: simulate "
             "--preset seed."
         )
-    position = nearest(only_pushed(loads).point, positions)[0]
+    position = find_nearest(get_only_pushes(loads).point, positions)[0]
     models = []
     for which in range(len(positions)):
         others = np.flatnonzero(position != which)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.analysis.measurement import timed
+from scenes.analysis.measurement import time_work
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
 from sim.bodies.refine import refined
@@ -16,7 +16,7 @@ from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.material import Tissue
 from sim.tools import Ball
-from surrogate.data.tool_loads import axes_about
+from surrogate.data.tool_loads import build_axes_about
 
 from .elements import above_tumour
 
@@ -73,7 +73,7 @@ def rows(
     """
     normal, places = _line(anatomy)
     T = np.zeros((len(places), 1, 4, 4))
-    T[..., :3, :3], T[..., 3, 3] = axes_about(normal[None]), 1.0
+    T[..., :3, :3], T[..., 3, 3] = build_axes_about(normal[None]), 1.0
     fine = refined(anatomy, near_opening=True)
     for element in elements:
         solvers = [_solver(body, element, radius, tissue, device) for body in (anatomy, fine)]
@@ -81,7 +81,7 @@ def rows(
             T[:, 0, :3, 3] = places - depth * normal
             forces, seconds = [], []
             for fem in solvers:
-                found, took = timed(fem.deform, Loads((Touching(T.copy()),)))
+                found, took = time_work(fem.deform, Loads((Touching(T.copy()),)))
                 seconds.append(took)
                 good = np.array([outcome.good for outcome in found.outcome])
                 forces.append(np.where(good[:, None], found.reaction[:, 0, :3], np.nan))

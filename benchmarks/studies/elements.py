@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.analysis.measurement import timed
+from scenes.analysis.measurement import time_work
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
-from sim.discretisation.footprint import nearest_on
+from sim.discretisation.footprint import find_nearest_on
 from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
@@ -101,16 +101,16 @@ def above_tumour(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
         raise InputError("the anatomy has no tumour, or no open cortex above it: make one with `sulcus anatomy`.")
     nodes = anatomy.mesh.nodes
     centre = nodes[anatomy.tumour_nodes].mean(axis=0)
-    return nearest_on(nodes[anatomy.open_surface], centre), centre
+    return find_nearest_on(nodes[anatomy.open_surface], centre), centre
 
 
 def _measured(anatomy: Anatomy, element: str, poisson: float, press: Press, device: str) -> Row:
     mesh = anatomy.mesh
     effects = pushed_effects(anatomy, Material(press.law, press.young, poisson))
-    fem, set_up = timed(Fem, anatomy, effects, ACCURACY, device, element=element)
+    fem, set_up = time_work(Fem, anatomy, effects, ACCURACY, device, element=element)
     loads = _loads(anatomy, press)
     fem.deform(loads.scaled(1e-3))  # kernels are compiled or loaded at their first launch
-    answer, seconds = timed(fem.deform, loads)
+    answer, seconds = time_work(fem.deform, loads)
     motion = np.linalg.norm(tumour_motion(anatomy, answer.displacement)[0])
     return Row(
         poisson=poisson, element=element, vertices=len(mesh.nodes), nodes=fem.space.count,

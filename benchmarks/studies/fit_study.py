@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from sim.loads import Pushed
-from surrogate.fitting.fit import fitted
+from surrogate.fitting.fit import fit_from_evidence
 from surrogate.fitting.frame import Frame, Tool
-from surrogate.fitting.responses import Responses, drained_loads, force_loads, responses
+from surrogate.fitting.responses import Responses, build_drained_loads, build_force_loads, solve_responses
 from surrogate.fitting.tissue import CLASSES, FittedTissue
 from surrogate.locating.locator import Locator
 
@@ -72,8 +72,8 @@ class Library:
 def library_of(locator: Locator, device: str, folder: Path | None, progress: Callable[[int, int], object]) -> Library:
     """Solve it; what a `folder` keeps is read."""
     body, tools = locator.anatomy, places(locator.anatomy)
-    drained = responses(body, drained_loads(body), device, folder, progress)
-    pressed = responses(body, force_loads(body, tools.point, tools.footprint), device, folder, progress)
+    drained = solve_responses(body, build_drained_loads(body), device, folder, progress)
+    pressed = solve_responses(body, build_force_loads(body, tools.point, tools.footprint), device, folder, progress)
     return Library(tools, drained, pressed)
 
 
@@ -86,7 +86,7 @@ def fitted_to(
         observation = observed(locator.anatomy, motion, sight, (seed, patient.number, number))
         frames.append(Frame(observation, _tools(library.tools, patient, number, read and not number)))
     pressed = library.pressed_on(patient.places) if patient.places else None
-    return fitted(locator, frames, library.drained, pressed, device)
+    return fit_from_evidence(locator, frames, library.drained, pressed, device)
 
 
 def _tools(tools: Pushed, patient: Patient, number: int, read: bool) -> tuple[Tool, ...]:

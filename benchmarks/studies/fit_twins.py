@@ -10,15 +10,15 @@ import numpy as np
 
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL, Anatomy
-from sim.bodies.fluid_level import fluid_level
+from sim.bodies.fluid_level import compute_fluid_level
 from sim.bodies.open_cortex import open_cortex
-from sim.discretisation.space import recommended
+from sim.discretisation.space import recommend_element
 from sim.effects import Effect, Elasticity, Gravity, Held, ToolForce
 from sim.fem import Fem
 from sim.geometry.locate import locate
 from sim.loads import Loads, Posture, Pushed
 from surrogate.data.tool_loads import draw as drawn_loads
-from surrogate.model.kept_arrays import kept_arrays, kept_path
+from surrogate.model.kept_arrays import find_kept_path, keep_arrays
 
 from .locate_twins import LEFT, PROBABLE, RATIO, SKULLS, STIFFNESS, TILT, check_same, ogden
 
@@ -115,7 +115,7 @@ def loads_of(anatomy: Anatomy, tools: Pushed, patient: Patient) -> Loads:
     down = np.concatenate([np.tile(Gravity().direction, (len(patient.places), 1)), drained])
     down /= np.linalg.norm(down, axis=1, keepdims=True)
     left = np.append(np.ones(len(patient.places)), patient.left)
-    level = np.array([fluid_level(anatomy.mesh.nodes, *each) for each in zip(down, left, strict=True)])
+    level = np.array([compute_fluid_level(anatomy.mesh.nodes, *each) for each in zip(down, left, strict=True)])
     pushed = Pushed(tools.point[chosen], force, tools.footprint[chosen])
     return Loads((pushed, Posture(down, level, np.ones(len(chosen)))))
 
@@ -152,12 +152,12 @@ def patients(
 
 def _kept(finer: Anatomy, loads: Loads, patient: Patient, device: str, folder: Path | None) -> np.ndarray:
     """Motions (frames, V, 3) [m] of a patient's own mesh, from the folder if they are there; (0, V, 3): none."""
-    stated = finer.digest, recommended(finer.mesh), patient, ACCURACY
-    path = kept_path(folder, f"patient-{patient.number:04d}-", device, *stated)
+    stated = finer.digest, recommend_element(finer.mesh), patient, ACCURACY
+    path = find_kept_path(folder, f"patient-{patient.number:04d}-", device, *stated)
 
     def solved() -> dict[str, np.ndarray]:
         answer = Fem(finer, effects_of(patient), ACCURACY, device).deform(loads)
         good = all(outcome.good for outcome in answer.outcome)
         return {"motion": (answer.displacement if good else answer.displacement[:0]).astype(np.float32)}
 
-    return kept_arrays(path, "a patient's motions", ["motion"], solved)["motion"]
+    return keep_arrays(path, "a patient's motions", ["motion"], solved)["motion"]

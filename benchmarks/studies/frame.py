@@ -10,10 +10,10 @@ import numpy as np
 import warp as wp
 
 from ar.page.browser import Browser
-from ar.page.elements import coded
+from ar.page.elements import to_data_url
 from ar.page.parts import Playback, SceneSurface, SceneViewpoint
 from ar.rendering.renderer import Renderer
-from scenes.page.demo import pictured
+from scenes.page.demo import render_page_image
 from scenes.play.player import Player
 from scenes.play.stage import CORTEX_COLOUR, TUMOUR_COLOUR
 from sim.errors import InputError
@@ -34,7 +34,7 @@ class Spent:
     mean: float
 
 
-def size_of(text: str) -> tuple[int, int]:
+def measure_size(text: str) -> tuple[int, int]:
     """The width and height [pixel] that a text such as 640x480 asks for.
 
     Raises
@@ -64,9 +64,9 @@ def frames_of(player: Player, count: int) -> Iterator[tuple[float, ...]]:
             last = player.answer(loads, last)
             deformed = clock.perf_counter()
             frame = player.drawn(number, touch, loads, last, deformed - loaded)
-            picture = pictured(frame)
+            picture = render_page_image(frame)
             drawn = clock.perf_counter()
-            code = coded(picture)
+            code = to_data_url(picture)
             encoded = clock.perf_counter()
             positions = player.positions(last)
             stage = player.stage.at(loads)
@@ -98,7 +98,7 @@ def batch_rate(player: Player, count: int, seconds: float = 2.0) -> float:
         scenes.append(stage.layers(positions, None if held is None else held.pose))
     moved = np.stack([np.concatenate([layer.vertices for layer in each if not layer.still]) for each in scenes])
     # All within half a degree.
-    cameras = [player.camera.perturbed(0.5 * (row - 0.5 * count) / count) for row in range(count)]
+    cameras = [player.camera.perturb(0.5 * (row - 0.5 * count) / count) for row in range(count)]
     renderer = Renderer(scenes[0], stage.lamp, stage.device)
     renderer.pictures(moved, cameras)
     wp.synchronize()

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.analysis.measurement import timed
+from scenes.analysis.measurement import time_work
 from scenes.gym.environment import VectorEnv
-from scenes.gym.scripted import scripted
+from scenes.gym.scripted import compute_scripted_actions
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Rate:
     touching: float
 
 
-def rate_of(
+def measure_rate(
     environment: VectorEnv,
     task: str,
     observation: str,
@@ -59,8 +59,8 @@ def rate_of(
     for _ in range(repeats + 1):
         spent = 0.0
         for _ in range(steps):
-            action = scripted(task, seen if isinstance(seen, np.ndarray) else seen["states"])
-            (seen, *_, truth), seconds = timed(environment.step, action)
+            action = compute_scripted_actions(task, seen if isinstance(seen, np.ndarray) else seen["states"])
+            (seen, *_, truth), seconds = time_work(environment.step, action)
             spent += seconds
             touched.append(np.linalg.norm(truth["force"], axis=1) > 0.0)
         rates.append(environment.num_envs * steps / spent)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.link.answer import NOT_SEEN, CameraView, PoseResult
-from scenes.link.frame import HEADER, BadMessageError, framed, read_header, stamp_of, time_of
+from scenes.link.frame import HEADER, BadMessageError, pack_message, read_header, to_stamp, to_time
 from scenes.link.heard import ReceivedTransforms, TransformNames
-from scenes.link.messages import Code, SentMesh, polydata, status, transform
+from scenes.link.messages import Code, SentMesh, encode_polydata, encode_status, transform
 from scenes.link.outgoing import SentPlaces
 from scenes.link.session import LinkSession
 from scenes.tracked.follower import TrackingResult, TumourState
@@ -64,16 +64,16 @@ class Moved:
 
     def scan(self, stamp: int) -> bytes:
         """The points where they were."""
-        return framed("POLYDATA", "TumourInScan", polydata(1e3 * self._points, self._mesh), stamp)
+        return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * self._points, self._mesh), stamp)
 
     def messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """The surface."""
-        body = polydata(1e3 * answer.known.motion.positions, self._mesh)
-        return (framed("POLYDATA", "TumourNow", body, answer.stamp),)
+        body = encode_polydata(1e3 * answer.known.motion.positions, self._mesh)
+        return (pack_message("POLYDATA", "TumourNow", body, answer.stamp),)
 
     def status(self, answer: PoseResult, refused: str) -> bytes:
         """What is known."""
-        return framed("STATUS", "Sulcus", status(Code.OK, answer.known.words), answer.stamp)
+        return pack_message("STATUS", "Sulcus", encode_status(Code.OK, answer.known.words), answer.stamp)
 
     def placed(self, names: list[str], at: np.ndarray) -> SentPlaces:
         """No places are followed."""
@@ -94,7 +94,7 @@ def measured(points: int, rate: float, seconds: float) -> Latency:
         sender = threading.Thread(target=_send, args=(port, rate, count), daemon=True)
         sender.start()
         found = run_on_each(clients, _received, [(port, count)] * CLIENTS)
-    late = [[after - time_of(stamp) for stamp, after in each] for each in found]
+    late = [[after - to_time(stamp) for stamp, after in each] for each in found]
     milliseconds = 1e3 * np.concatenate([np.array(each) for each in late])
     answered = 100.0 * len(milliseconds) / (CLIENTS * (count - WARM_UP))
     p99 = float(np.percentile(milliseconds, 99.0))
@@ -136,9 +136,9 @@ def _send(port: int, rate: float, count: int) -> None:
         for number in range(count):
             time.sleep(max(0.0, begun + number / rate - time.perf_counter()))
             T[0, 3] = 1.0 + number
-            out.sendall(framed("TRANSFORM", NAME, transform(T), stamp_of(time.time())))
+            out.sendall(pack_message("TRANSFORM", NAME, transform(T), to_stamp(time.time())))
         time.sleep(0.5)
-        out.sendall(framed("TRANSFORM", NAME, transform(T), stamp_of(time.time() + 1e6)))
+        out.sendall(pack_message("TRANSFORM", NAME, transform(T), to_stamp(time.time() + 1e6)))
         time.sleep(0.5)
 
 
@@ -161,7 +161,7 @@ def _received(nothing: None, task: tuple[int, int]) -> list[tuple[int, float]]:
             here = time.time()
             if header.name != "TumourNow" or not header.stamp:
                 continue
-            if time_of(header.stamp) > here + 1e5:
+            if to_time(header.stamp) > here + 1e5:
                 return stamps[WARM_UP:]
             stamps.append((header.stamp, here))
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes.analysis.measurement import timed
+from scenes.analysis.measurement import time_work
 from scenes.script.scene import Scene
 from scenes.script.site import Site
 from scenes.script.tool import Probe
@@ -87,7 +87,7 @@ def frames_of(fem: Fem, loads: Sequence[Loads]) -> Iterator[Frame]:
     """Each frame in turn, from the last one's answer; the device is waited for at each reading."""
     last = None
     for number, load in enumerate(loads):
-        last, seconds = timed(fem.deform, load, start=last)
+        last, seconds = time_work(fem.deform, load, start=last)
         if number >= WARM_UP:
             yield Frame(load, replace(last, memory={}, warm={}), seconds)
 

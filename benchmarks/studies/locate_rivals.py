@@ -16,8 +16,8 @@ from sim.accuracy import REFERENCE
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.compile import compile_problem
 from sim.effects import Elasticity, Held
-from sim.geometry.closest_point import closest
-from sim.geometry.surface import areas
+from sim.geometry.closest_point import find_closest_points
+from sim.geometry.surface import compute_areas
 from sim.material import Material
 from sim.runtime.device import find_device
 from surrogate.locating.prior import MotionPrior
@@ -133,7 +133,7 @@ def springs(anatomy: Anatomy, skull: float = SKULL, point: float = POINT) -> Spr
     stiffness = compile_problem((tissue, Held()), anatomy, find_device("cpu", REFERENCE.precision)).rest_curvature()
     covered = anatomy.slide_normal.any(axis=1) | anatomy.held.any(axis=1)
     area = np.zeros(len(mesh.nodes))
-    np.add.at(area, mesh.surface, np.repeat(areas(mesh.nodes[mesh.surface])[:, None] / 3.0, 3, axis=1))
+    np.add.at(area, mesh.surface, np.repeat(compute_areas(mesh.nodes[mesh.surface])[:, None] / 3.0, 3, axis=1))
     spring = np.repeat(np.where(covered, skull * area, 0.0), 3)
     factor = splu(sp.csc_matrix(stiffness + sp.diags_array(spring)), "MMD_AT_PLUS_A", options={"SymmetricMode": True})
     cortex = np.unique(anatomy.open_surface)
@@ -150,7 +150,7 @@ def _on_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
     triangles, corners = anatomy.open_surface, anatomy.mesh.nodes[anatomy.open_surface]
     vertices = np.unique(triangles)
     weights = np.zeros((len(points), len(vertices)))
-    found = closest(points, corners)
+    found = find_closest_points(points, corners)
     weights[np.arange(len(points))[:, None], np.searchsorted(vertices, triangles[found.triangle])] = found.weights
     return weights
 

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.analysis.measurement import timed
+from scenes.analysis.measurement import time_work
 from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
-from sim.runtime.threads import one_thread
-from surrogate.locating.calibration import RADIUS_SQUARED, seen_patch
+from sim.runtime.threads import limit_to_one_thread
+from surrogate.locating.calibration import RADIUS_SQUARED, sample_seen_patch
 from surrogate.locating.evidence import smooth_root
 from surrogate.locating.locator import Locator
 from surrogate.locating.observation import Observation
-from surrogate.locating.prior import middle_of
+from surrogate.locating.prior import compute_middle
 
 from .locate_rivals import Rival, oracle
 from .locate_twins import Twin
@@ -120,7 +120,7 @@ def observed(body: Anatomy, motion: np.ndarray, sight: PointsSeen, seed: tuple[i
     Where the points lie is the same at every level of noise.
     """
     place = np.random.default_rng([*seed, sight.points, sight.cover])
-    evidence = seen_patch(body, motion, place, sight.points, 1e-2 * sight.cover)
+    evidence = sample_seen_patch(body, motion, place, sight.points, 1e-2 * sight.cover)
     rest, moved = evidence.at[::3], evidence.value.reshape(-1, 3)
     if sight.slip:
         moved = moved + sight.slip * _along(body, np.random.default_rng([*seed, sight.points, sight.cover, 3]))
@@ -248,7 +248,7 @@ def ours(locator: Locator, motion: np.ndarray, seen: Observation) -> Estimate:
         found = locator.locate(seen)
     except InputError:
         return estimate(np.zeros_like(true), true, None, None, refused=True)
-    off = found.centroid - middle_of(body, motion[None])[0]
+    off = found.centroid - compute_middle(body, motion[None])[0]
     square = float(off @ np.linalg.solve(found.centroid_covariance, off))
     doubts = {"doubted": found.slipped, "warned": found.is_registration_suspect}
     return estimate(found.at(body.tumour_nodes), true, square, found.seconds, **doubts)
@@ -256,8 +256,8 @@ def ours(locator: Locator, motion: np.ndarray, seen: Observation) -> Estimate:
 
 def _rivalling(body: Anatomy, twin: Twin, rival: Rival, seen: Observation) -> Estimate:
     assert seen.rest is not None
-    with one_thread():  # products are small
-        found, seconds = timed(rival, seen.rest, seen.now - seen.rest)
+    with limit_to_one_thread():  # products are small
+        found, seconds = time_work(rival, seen.rest, seen.now - seen.rest)
     return estimate(found, twin.motion[body.tumour_nodes], None, seconds)
 
 

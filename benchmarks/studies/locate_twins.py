@@ -10,7 +10,7 @@ import numpy as np
 
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL, Anatomy
-from sim.bodies.fluid_level import fluid_level
+from sim.bodies.fluid_level import compute_fluid_level
 from sim.bodies.open_cortex import open_cortex
 from sim.effects import Bonded, Effect, Elasticity, Gravity, Held, Pulsation, SkullContact, Slide, ToolForce, Wave
 from sim.elements import RECOMMENDED
@@ -20,7 +20,7 @@ from sim.geometry.locate import locate
 from sim.loads import Loads, Posture, Pushed
 from sim.material import MATERIALS, Ogden
 from surrogate.data.tool_loads import draw as drawn_loads
-from surrogate.model.kept_arrays import kept_arrays, kept_path
+from surrogate.model.kept_arrays import find_kept_path, keep_arrays
 
 CAUSES = ("tool", "drainage", "swelling", "drainage and tool")
 """What moves twins, one after the other: each takes part in a quarter of them, or in half."""
@@ -132,7 +132,7 @@ def loads_of(anatomy: Anatomy, draw: Draw) -> Loads:
     if "drainage" in draw.cause:
         down, left = open_cortex(anatomy).axis + draw.tilt, draw.left
         down /= np.linalg.norm(down)
-    level = fluid_level(anatomy.mesh.nodes, down, left)
+    level = compute_fluid_level(anatomy.mesh.nodes, down, left)
     # The wave has its crest after a second, and its trough a second before.
     time = float(np.sign(draw.swelling)) if draw.cause == "swelling" else 0.0
     return Loads((pushed, Posture(down[None], np.array([level]), np.ones(1))), np.array([time]))
@@ -196,7 +196,7 @@ def check_same(body: Anatomy, finer: Anatomy) -> None:
 
 def _kept(anatomy: Anatomy, draw: Draw, device: str, element: str, folder: Path | None) -> np.ndarray | None:
     """The motion of a twin's own mesh, from the folder if it is there, of the same draw."""
-    path = kept_path(folder, f"twin-{draw.number:04d}-", device, anatomy.digest, element, draw)
+    path = find_kept_path(folder, f"twin-{draw.number:04d}-", device, anatomy.digest, element, draw)
 
     def made() -> dict[str, np.ndarray]:
         found = solved(anatomy, draw, device, element)
@@ -207,5 +207,5 @@ def _kept(anatomy: Anatomy, draw: Draw, device: str, element: str, folder: Path 
         if (count, *rest) not in (anatomy.mesh.nodes.shape, (0, 3)):
             raise InputError(f"holds motions of {count} vertices: delete it, and it is made anew.")
 
-    motion = kept_arrays(path, "a twin", ["motion"], made, check)["motion"]
+    motion = keep_arrays(path, "a twin", ["motion"], made, check)["motion"]
     return motion if len(motion) else None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.analysis.measurement import timed
+from scenes.analysis.measurement import time_work
 from sim.accuracy import REFERENCE, STRAINED, Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Outcome
@@ -72,7 +72,7 @@ def records(trial: Trial, count: int, seed: int, done: Sequence[Record]) -> Iter
         for start in range(first // trial.batch * trial.batch, len(loads), trial.batch):
             index = np.arange(start, min(start + trial.batch, len(loads)))
             some = loads.rows(index)
-            answer, seconds = timed(fem.deform, some)
+            answer, seconds = time_work(fem.deform, some)
             again = np.full(len(index), np.nan)
             chosen = np.flatnonzero(index % CHECKED == 0)
             if len(chosen):

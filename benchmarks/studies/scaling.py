@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from scenes.analysis.loglog_chart import ChartPanel, Curve
-from scenes.analysis.measurement import timed, watched_card
-from scenes.report.finite_elements import template_mesh
+from scenes.analysis.measurement import time_work, watch_gpu_memory
+from scenes.report.finite_elements import build_template_mesh
 from sim.accuracy import TRAIN
 from sim.bodies.meshfile import read_anatomy
 from sim.effects import pushed_effects
@@ -22,7 +22,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN
 from sim.runtime.processes import LostError, map_apart
-from sim.strategy.memory_needed import foreseen
+from sim.strategy.memory_needed import estimate_needed
 from surrogate.data.tool_loads import draw
 
 # Batches are solved until so many loads, or so many seconds, are spent.
@@ -85,20 +85,20 @@ def measured(trial: Trial, size: int, batch: int) -> Row:
     InputError
         As `Fem`; a card on which they would not fit.
     """
-    anatomy = read_anatomy(template_mesh(trial.folder, size))
-    needed = foreseen(anatomy, trial.element, TRAIN, trial.device, batch, batch)
+    anatomy = read_anatomy(build_template_mesh(trial.folder, size))
+    needed = estimate_needed(anatomy, trial.element, TRAIN, trial.device, batch, batch)
     if needed is not None:
         print(f"{needed}.", file=sys.stderr)
         needed.demand()
-    with watched_card(trial.device) as card:
+    with watch_gpu_memory(trial.device) as card:
         effects = pushed_effects(anatomy, BRAIN)
-        fem, made = timed(Fem, anatomy, effects, TRAIN, trial.device, batch, trial.element)
+        fem, made = time_work(Fem, anatomy, effects, TRAIN, trial.device, batch, trial.element)
         loads = draw("palpation", anatomy, max(LOADS, batch) + 1, SEED)
         fem.deform(loads.rows(np.array([-1])).scaled(1e-3))  # kernels are compiled or loaded at their first launch
         seconds, outer, good = [], [], 0
         while sum(seconds) < PATIENCE and len(outer) + batch <= max(LOADS, batch):
             some = loads.rows(np.arange(len(outer), len(outer) + batch))
-            answer, spent = timed(fem.deform, some)
+            answer, spent = time_work(fem.deform, some)
             seconds.append(spent)
             outer += list(answer.iterations)
             good += sum(outcome.good for outcome in answer.outcome)
@@ -127,7 +127,7 @@ def rows(
             if (size, batch) in known:
                 continue
             said(f"{size} nodes, the mesh")
-            template_mesh(trial.folder, size)
+            build_template_mesh(trial.folder, size)
             said(f"{size} nodes, batch of {batch}")
             try:
                 yield from (row for _, row in map_apart(partial(measured, trial, size), [batch]))

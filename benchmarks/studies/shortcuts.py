@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes.analysis.measurement import timed
+from scenes.analysis.measurement import time_work
 from scenes.script.scene import find_scene
 from scenes.script.site import Site
 from sim.accuracy import LIVE, TRAIN, Accuracy
@@ -17,7 +17,7 @@ from sim.loads import Loads
 from sim.material import BRAIN
 from sim.strategy.plan import SolverStep
 from surrogate.data.tool_loads import draw
-from surrogate.data.tool_poses import draw_poses, tool_of
+from surrogate.data.tool_poses import choose_ball, draw_poses
 
 SEED = 4
 BATCH, BATCH_ON_CUDA, POSES = 32, 2048, 16
@@ -95,7 +95,7 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
     yield Work("L-BFGS before Newton", "a palpation load from rest", SolverStep.LBFGS, single, pushed)
     poses = draw_poses("palpation", anatomy, POSES * (runs + 1), SEED)
     together = [poses.rows(np.arange(first, first + POSES)) for first in range(0, len(poses), POSES)]
-    tool = (*pushed, ToolContact((tool_of("palpation"),)))
+    tool = (*pushed, ToolContact((choose_ball("palpation"),)))
     yield Work("contact solved apart", f"{POSES} poses of a ball together", SolverStep.CONTACT, together, tool)
     for scene, step, shortcut in (
         ("press", SolverStep.STRAINED, "a stiffness that knows strained tissue"),
@@ -104,7 +104,7 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
         ("press", SolverStep.FRAME, "frame as one captured graph"),
     ):
         played = find_scene(scene)
-        effects, first = played.effects_on(anatomy), len(played.times) // 3  # the tool has arrived
+        effects, first = played.get_effects_on(anatomy), len(played.times) // 3  # the tool has arrived
         frames = [
             played.loads(site, played.path(time), time) for time in played.times[first : first + runs + 1].tolist()
         ]
@@ -146,7 +146,7 @@ def _timed(fem: Fem, work: Work, warm: bool) -> Iterator[float]:
     """Seconds of each load."""
     last = None
     for loads in work.loads:
-        answer, seconds = timed(fem.deform, loads, last)
+        answer, seconds = time_work(fem.deform, loads, last)
         yield seconds
         if work.follows and all(outcome.good for outcome in answer.outcome):
             last = answer if warm else replace(answer, warm={})

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.analysis.measurement import timed
+from scenes.analysis.measurement import time_work
 from sim.accuracy import STRAINED
 from sim.anatomy import Anatomy
-from sim.deformation import Deformation, joined
+from sim.deformation import Deformation, join_deformations
 from sim.effects import Bonded, pushed_effects
 from sim.fem import Fem
 from sim.loads import Loads
@@ -87,9 +87,13 @@ def _answered(
     if skull in TORN:
         effects = [TORN[skull] if isinstance(one, Bonded) else one for one in pushed_effects(anatomy, tissue)]
         each = [loads.rows(np.array([row])) for row in range(len(loads))]
-        found = [timed(torn, anatomy, effects, load, STRAINED, device, tearing=tearing) for load in each]
+        found = [time_work(torn, anatomy, effects, load, STRAINED, device, tearing=tearing) for load in each]
         good = np.array([one.rested and one.answer.outcome[0].good for one, _ in found])
-        return joined([one.answer for one, _ in found]), good, float(np.mean([seconds for _, seconds in found]))
+        return (
+            join_deformations([one.answer for one, _ in found]),
+            good,
+            float(np.mean([seconds for _, seconds in found])),
+        )
     fem = Fem(anatomy, pushed_effects(anatomy, tissue, skull), STRAINED, device)
-    answer, seconds = timed(fem.deform, loads)
+    answer, seconds = time_work(fem.deform, loads)
     return answer, np.array([outcome.good for outcome in answer.outcome]), seconds / len(loads)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.analysis.measurement import timed
+from scenes.analysis.measurement import time_work
 from scenes.play.deformers import Theatre
 from scenes.play.player import Player
 from sim.accuracy import LIVE, TRAIN
@@ -32,7 +32,7 @@ class Row:
 
 def figure(name: str, unit: str, scale: float, runs: int, note: str, work: Callable[[int], object]) -> Row:
     """Run `work(i)` and report seconds x scale."""
-    seconds = [timed(work, run % runs)[1] for run in range(-WARM_UP, runs)][WARM_UP:]
+    seconds = [time_work(work, run % runs)[1] for run in range(-WARM_UP, runs)][WARM_UP:]
     return Row(name, scale * float(np.median(seconds)), scale * float(np.percentile(seconds, 95)), unit, runs, note)
 
 
@@ -54,11 +54,11 @@ def rows(
     loads = draw("palpation", theatre.anatomy, solves, seed=20)
     single = [loads.rows(np.array([row])) for row in range(len(loads))]
 
-    fem, seconds = timed(theatre.fem, scene, TRAIN, batch)
-    seconds += timed(fem.deform, single[0])[1]
+    fem, seconds = time_work(theatre.fem, scene, TRAIN, batch)
+    seconds += time_work(fem.deform, single[0])[1]
     made(fem)
     yield Row("FEM set-up", seconds, None, "s", 1, f"compile or load kernels, factorise; {size}")
-    answers, seconds = timed(fem.deform, loads)
+    answers, seconds = time_work(fem.deform, loads)
     each = 1e3 * seconds / len(loads)
     good = sum(outcome.good for outcome in answers.outcome)
     note = f"{good} of {len(loads)} converged to {TRAIN.tolerance:g}; palpation loads, batches of {batch}"

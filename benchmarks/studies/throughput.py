@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from scenes.analysis.measurement import timed
+from scenes.analysis.measurement import time_work
 from sim.accuracy import REFERENCE, STRAINED
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation
@@ -115,7 +115,7 @@ def drawn(anatomy: Anatomy, presets: Sequence[str], count: int, posed: bool = Fa
     out, by = {}, draw_poses if posed else draw
     for preset in presets:
         by(preset, anatomy, 1, SEED)  # the cortex is measured at the first draw
-        out[preset] = timed(by, preset, anatomy, count, SEED)
+        out[preset] = time_work(by, preset, anatomy, count, SEED)
     return out
 
 
@@ -163,7 +163,7 @@ def on_each(devices: Sequence[str], trial: Trial) -> Iterator[Asked]:
 def made(device: str, trial: Trial) -> Made:
     """A trial's finite elements on a device, in single precision."""
     find_device(device, STRAINED.precision)  # starts Warp, off the clock
-    return Made(*timed(replace(trial, device=device).fem, STRAINED))
+    return Made(*time_work(replace(trial, device=device).fem, STRAINED))
 
 
 def facts(made: Made, task: None) -> tuple[int, str, float]:

@@ -17,9 +17,9 @@ from scipy.stats import chi2, qmc
 
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.drawn import drawn
+from ar.tracking.drawn import render_targets
 from ar.tracking.pose import Pose, Tracker, Verdict
-from ar.tracking.targets import MARKER, TIP, tool_cube
+from ar.tracking.targets import MARKER, TIP, build_tool_cube
 
 # The camera of the published trials: pixels, focal length [pixel], how far its targets are [m], and a usual lens.
 WIDTH, HEIGHT, FOCAL, AWAY = 1280, 960, 1400.0, 0.4
@@ -82,8 +82,8 @@ def studied(count: int, seed: int = 0, progress: Callable[[int, int], object] = 
     """All protocols, of `count` pictures each."""
     plans = {
         "FMAC: all six freedoms": (spread(count, seed), _off),
-        "F2554: one point": (pivoted(count, seed, np.zeros(3)), _from_mean),
-        "F2554: between points": (pivoted(count, seed, None), between),
+        "F2554: one point": (calibrate_pivot(count, seed, np.zeros(3)), _from_mean),
+        "F2554: between points": (calibrate_pivot(count, seed, None), between),
     }
     rows, done, total = [], 0, count * len(plans)
     for name, (poses, measure) in plans.items():
@@ -92,11 +92,11 @@ def studied(count: int, seed: int = 0, progress: Callable[[int, int], object] = 
             shots.append(shot)
             done += 1
             progress(done, total)
-        rows.append(row_of(name, shots, measure))
+        rows.append(build_row(name, shots, measure))
     return rows
 
 
-def row_of(name: str, shots: list[Shot], measure: Callable[[list[Shot]], np.ndarray]) -> Row:
+def build_row(name: str, shots: list[Shot], measure: Callable[[list[Shot]], np.ndarray]) -> Row:
     """A protocol's row, whose errors (n,) [m] are measured on the certain ones of its pictures."""
     certain = [shot for shot in shots if shot.found is not None]
     fair = [shot for shot in shots if shot.markers >= SEEN]
@@ -156,7 +156,7 @@ def _numbers(count: int, seed: int) -> np.ndarray:
     return qmc.Halton(6, scramble=False).fast_forward(1 + seed * count).random(count)
 
 
-def pivoted(count: int, seed: int, point: np.ndarray | None) -> Iterator[np.ndarray]:
+def calibrate_pivot(count: int, seed: int, point: np.ndarray | None) -> Iterator[np.ndarray]:
     """Poses (4, 4) of the cube, the tip on a point (3,) [m] beside the middle of the volume, or on one of many."""
     for u in _numbers(count, seed):
         axis = _direction(u[0], u[1])
@@ -185,10 +185,10 @@ def _facing(turn: Rotation) -> np.ndarray:
 
 
 def _shots(poses: Iterable[np.ndarray], seed: int) -> Iterator[Shot]:
-    camera, cube, rng = trial_camera(), tool_cube(), np.random.default_rng(seed)
+    camera, cube, rng = trial_camera(), build_tool_cube(), np.random.default_rng(seed)
     tracker = Tracker(camera, (cube,))
     for T in poses:
-        sharp = drawn(np.full((HEIGHT, WIDTH), 120, np.uint8), camera, [(cube, T)])
+        sharp = render_targets(np.full((HEIGHT, WIDTH), 120, np.uint8), camera, [(cube, T)])
         blurred = gaussian_filter(sharp.astype(np.float32), BLUR)
         picture = np.clip(blurred + rng.normal(0.0, NOISE, blurred.shape), 0.0, 255.0).astype(np.uint8)
         first = tracker.track(picture)
@@ -204,7 +204,7 @@ def _shots(poses: Iterable[np.ndarray], seed: int) -> Iterator[Shot]:
 def _markers(camera: Camera, T: np.ndarray) -> float:
     """Side [pixel] of the markers on the face that is seen largest: the root of what a square covers."""
     sides = [0.0]
-    for face in tool_cube().faces:
+    for face in build_tool_cube().faces:
         pixels = camera.project(face.outline @ T[:3, :3].T + T[:3, 3])[0]
         (x, y), (x_next, y_next) = pixels.T, np.roll(pixels, -1, axis=0).T
         area = 0.5 * float(np.sum(x * y_next - x_next * y))  # negative where it is seen from behind

@@ -11,7 +11,7 @@ from surrogate.model.learned import Learned
 
 from ..play.deformers import Theatre
 from ..script.scene import Scene
-from .measurement import timed
+from .measurement import time_work
 
 # Frames that are timed, after one that is not.
 TIMED = 24
@@ -19,7 +19,7 @@ TIMED = 24
 PROMISED = 5e-5
 
 
-def offers(theatre: Theatre, scene: Scene) -> list[Offer]:
+def time_offers(theatre: Theatre, scene: Scene) -> list[Offer]:
     """One offer for each deformer that states an error, timed on moments of the scene, as they are played."""
     made = []
     times = scene.times[np.linspace(0, len(scene.times) - 1, TIMED + 1).astype(int)]
@@ -32,7 +32,7 @@ def offers(theatre: Theatre, scene: Scene) -> list[Offer]:
         if np.isnan(error_mm):
             continue
         for load in loads:
-            last, spent = timed(deformer.deform, load, start=None if forgets else last)
+            last, spent = time_work(deformer.deform, load, start=None if forgets else last)
             seconds.append(spent)
         made.append(Offer(name, error_mm, 1e3 * float(np.median(seconds[1:]))))
     return made

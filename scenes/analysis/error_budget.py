@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera
-from ar.tracking.pose import pose_of
+from ar.tracking.pose import find_pose
 from ar.tracking.registration import Registration
-from ar.tracking.targets import patient_reference
+from ar.tracking.targets import build_patient_reference
 from sim.errors import InputError
 from surrogate.locating.calibration import RADIUS_SQUARED
 
@@ -22,8 +22,8 @@ from ..script.priors import MESH, OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION
 from ..script.site import Site
 from ..script.uncertainty import LEVEL, SURROGATE
 from ..script.viewpoint import Viewpoint
-from .tracking_errors import CORNER, after_middle, changed, corners_in, seen_by_rows
-from .uncertainty import SurfaceMotions, off_by
+from .tracking_errors import CORNER, change_calibration, compute_row_delay, project_by_rows, project_corners
+from .uncertainty import SurfaceMotions, compute_error
 
 CALIBRATION, MARKERS, LATENCY, SHUTTER = "calibration", "markers", "latency x motion", "rolling shutter"
 PARAMETERS = "tissue, skull, tool's place"
@@ -107,7 +107,7 @@ class Filmed:
         scale[scale == 0.0] = 1.0  # exact inputs
         values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
         steps = np.random.default_rng(0).standard_normal((CALIBRATIONS, 9)) * np.sqrt(values.clip(0.0))
-        return tuple(changed(self.calibration, step) for step in scale * (steps @ vectors.T))
+        return tuple(change_calibration(self.calibration, step) for step in scale * (steps @ vectors.T))
 
     @cached_property
     def off(self) -> np.ndarray:
@@ -138,7 +138,7 @@ class OverlayErrors:
         return np.hypot(self.across, self.along)
 
 
-def errors_of(filmed: Filmed, contributors: Sequence[str], count: int, seed: int = 0) -> OverlayErrors:
+def compute_errors(filmed: Filmed, contributors: Sequence[str], count: int, seed: int = 0) -> OverlayErrors:
     """Sample the overlay error caused by the contributors, all others being exact.
 
     The same seed gives the same random numbers for any set of contributors.
@@ -156,7 +156,7 @@ def _samples(
     filmed: Filmed, contributors: frozenset[str], count: int, seed: int
 ) -> Iterator[tuple[Camera, Camera, np.ndarray, np.ndarray]]:
     """The true and the believed camera, the tumour's surface as it is, and as it is drawn (n, 3) [m]."""
-    target = patient_reference()
+    target = build_patient_reference()
     corners = sum(len(face.corners) for face in target.faces)
 
     def of(name: str, value: np.ndarray) -> np.ndarray:
@@ -178,12 +178,12 @@ def _samples(
         true, then = _cameras(filmed, time, late, readout, surface.mean(axis=0))
         believed = taken.camera(then.T_camera_world)
         if taken is not filmed.calibration or off.any() or readout:
-            found = corners_in(then, target, filmed.T_scan_patient, off)
+            found = project_corners(then, target, filmed.T_scan_patient, off)
             if readout:
                 at = partial(_camera_after, filmed, time - late)
-                found = seen_by_rows(found, at, readout, filmed.T_scan_patient)
+                found = project_by_rows(found, at, readout, filmed.T_scan_patient)
             known = then.T_camera_world @ filmed.T_scan_patient
-            _, pose = pose_of(believed, target, found, known)
+            _, pose = find_pose(believed, target, found, known)
             if pose is None:
                 raise InputError("the camera does not see the patient's reference: take a path that keeps it in sight.")
             believed = taken.camera(pose.T_camera_target @ np.linalg.inv(filmed.T_scan_patient))
@@ -203,7 +203,7 @@ def _cameras(filmed: Filmed, time: float, late: float, readout: float, middle: n
     then = _camera_after(filmed, time, -late) if late else true
     if readout:
         row = float(true.project(middle[None])[0][0, 1])
-        true = _camera_after(filmed, time, readout * after_middle(true, row))
+        true = _camera_after(filmed, time, readout * compute_row_delay(true, row))
     return true, then
 
 
@@ -269,7 +269,7 @@ class ErrorBudget:
         return max(self.alone, key=lambda name: float(np.quantile(getattr(self.alone[name], what), LEVEL)))
 
 
-def budgeted(
+def compute_budget(
     filmed: Filmed,
     count: int,
     seed: int = 0,
@@ -277,12 +277,12 @@ def budgeted(
     progress: Callable[[Sequence[str]], Iterable[str]] = iter,
 ) -> ErrorBudget:
     """Compute the budget from `count` samples; `twins`, other bodies, test its band with other random numbers."""
-    alone = {name: errors_of(filmed, [name], count, seed) for name in progress(CLINICAL)}
-    technical, clinical = (errors_of(filmed, names, count, seed) for names in (TECHNICAL, CLINICAL))
+    alone = {name: compute_errors(filmed, [name], count, seed) for name in progress(CLINICAL)}
+    technical, clinical = (compute_errors(filmed, names, count, seed) for names in (TECHNICAL, CLINICAL))
     budget = ErrorBudget(alone, technical, clinical)
     if twins is None:
         return budget
-    within = errors_of(twins, CLINICAL, count, seed + 1).worst <= budget.band
+    within = compute_errors(twins, CLINICAL, count, seed + 1).worst <= budget.band
     return replace(budget, held=_share(within, [_begun(twins, seed + 1, number)[2] for number in range(count)]))
 
 
@@ -299,16 +299,16 @@ def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | No
     return share, float(np.sqrt(np.square(excess).sum() * clusters / (clusters - 1))) / len(within)
 
 
-def moment_of(still: SurfaceMotions, answers: Sequence[tuple[np.ndarray, ...]], meshes: np.ndarray) -> int:
-    """The moment of a scene at which its bodies differ the most; `meshes` (b,) as of `off_by`."""
+def choose_moment(still: SurfaceMotions, answers: Sequence[tuple[np.ndarray, ...]], meshes: np.ndarray) -> int:
+    """The moment of a scene at which its bodies differ the most; `meshes` (b,) as of `compute_error`."""
     sizes = []
     for number, here in enumerate(still.fields):
-        off = off_by(np.stack([answer[number] for answer in answers]), here, meshes)
+        off = compute_error(np.stack([answer[number] for answer in answers]), here, meshes)
         sizes.append(float(np.linalg.norm(off, axis=2).max(axis=1).mean()))
     return int(np.argmax(sizes))
 
 
-def velocity_at(still: SurfaceMotions, number: int) -> np.ndarray:
+def compute_velocity(still: SurfaceMotions, number: int) -> np.ndarray:
     """Return the velocity (n, 3) [m/s] of the tumour's surface before a time; 0 if tissue was cut meanwhile."""
     before, here = still.fields[max(number - 1, 0)], still.fields[number]
     if number == 0 or before.shape != here.shape:

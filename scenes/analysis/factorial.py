@@ -17,7 +17,7 @@ from sim.loads import Loads, push, stacked
 from sim.material import BRAIN
 
 from .loglog_chart import ChartPanel, Curve
-from .sensitivity import BodyVariant, SensitivityStudy, moved_alike
+from .sensitivity import BodyVariant, SensitivityStudy, match_motion
 
 Levels = Mapping[str, Sequence[str | float]]
 LEVELS: Levels = {
@@ -46,7 +46,7 @@ class Cell:
     motion: float
 
 
-def cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> Iterator[Cell]:
+def solve_cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> Iterator[Cell]:
     """Solve every combination on template meshes of about `nodes` nodes; the tool presses at three places."""
     for opening, depth in product(levels["opening [mm]"], levels["depth [mm]"]):
         subject = template_subject(Tumour(cover=1e-3 * float(depth)))
@@ -56,7 +56,7 @@ def cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> I
         forces = stacked([push(place.point, FORCE * place.inward, FOOTPRINT) for place in places])
         study = SensitivityStudy(anatomy, forces, _body(DEFAULT), device=device)
         default = study.fem(study.body).deform(forces)
-        motions = moved_alike(anatomy, forces, default)
+        motions = match_motion(anatomy, forces, default)
         for combination in product(*(levels[name] for name in DEFAULT)):
             chosen = dict(zip(DEFAULT, combination, strict=True))
             fem = study.fem(_body(chosen))
@@ -76,7 +76,7 @@ def _motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
     return 1e3 * float(np.linalg.norm(answer.displacement, axis=2).mean())
 
 
-def shares(found: Sequence[Cell], what: str = "force") -> dict[str, float]:
+def compute_variance_shares(found: Sequence[Cell], what: str = "force") -> dict[str, float]:
     """Return the share of variance of the logarithmic motion explained by each factor, and by each pair beyond its two.
 
     The sums of squares of a balanced analysis of variance, by size; cells that did not converge are left out. What
@@ -98,7 +98,7 @@ def shares(found: Sequence[Cell], what: str = "force") -> dict[str, float]:
     return dict(sorted({**own, **pairs}.items(), key=lambda item: -item[1]))
 
 
-def panels(found: Sequence[Cell]) -> list[ChartPanel]:
+def build_panels(found: Sequence[Cell]) -> list[ChartPanel]:
     """The motion over the tumour's depth, a panel for each opening: skulls, and Poisson's ratios of the default one."""
     chosen = [{**DEFAULT, "nu": nu} for nu in _levels(found, "nu")]
     chosen += [{**DEFAULT, "skull": skull} for skull in _levels(found, "skull") if skull != DEFAULT["skull"]]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.runtime.optional_packages import needed_from
+from sim.runtime.optional_packages import require_extra
 
-with needed_from("report", "a chart needs"):
+with require_extra("report", "a chart needs"):
     from matplotlib.axes import Axes
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -63,7 +63,7 @@ class ChartPanel:
     y_range: tuple[float, float] | None = None
 
 
-def drawn(panels: Sequence[ChartPanel]) -> np.ndarray:
+def draw_panels(panels: Sequence[ChartPanel]) -> np.ndarray:
     """Panels of one height side by side, (height, sum of widths, 3) uint8.
 
     Raises

@@ -15,12 +15,12 @@ from typing import Any, ParamSpec, TypeVar
 
 import warp as wp
 
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.device import find_device
-from sim.runtime.versions import version_of
+from sim.runtime.versions import get_version
 
 
-def machine(device: str) -> str:
+def describe_machine(device: str) -> str:
     """Hardware, versions and date, in one line.
 
     Raises
@@ -34,7 +34,7 @@ def machine(device: str) -> str:
             names += [line.split(":")[1].strip() for line in file if line.startswith("model name")][:1]
     except OSError:
         names.append(platform.processor())
-    versions = ", ".join(f"{name} {version_of(name)}" for name in ("sulcus", "warp-lang", "torch", "numpy"))
+    versions = ", ".join(f"{name} {get_version(name)}" for name in ("sulcus", "warp-lang", "torch", "numpy"))
     return (
         f"{' / '.join(names)}, {os.cpu_count()} cores; Python {platform.python_version()}, {versions}; {date.today()}"
     )
@@ -43,13 +43,13 @@ def machine(device: str) -> str:
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write a line for each row, and a column for each name that one has, whole or not at all."""
     names = dict.fromkeys(name for row in rows for name in row)
-    with written_whole(path, ".csv") as partial, partial.open("w", newline="") as file:
+    with write_atomically(path, ".csv") as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(names))
         writer.writeheader()
         writer.writerows(rows)
 
 
-def peak_memory() -> float | None:
+def measure_peak_memory() -> float | None:
     """Return the peak resident size of this process [GiB], as Linux reports it."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
@@ -59,7 +59,7 @@ def peak_memory() -> float | None:
 
 
 @contextmanager
-def watched_card(device: str) -> Iterator[list[int]]:
+def watch_gpu_memory(device: str) -> Iterator[list[int]]:
     """The bytes of the card that are taken while the block runs, beyond those taken before; zero without a card."""
     where = wp.get_device(None if device == "auto" else device)
     taken = [0]
@@ -85,7 +85,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def timed(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> tuple[T, float]:
+def time_work(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> tuple[T, float]:
     """Return the result of `work` and its wall time [s]; the device is synchronised at both readings."""
     wp.synchronize()
     begun = time.perf_counter()

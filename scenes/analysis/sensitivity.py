@@ -10,14 +10,14 @@ import numpy as np
 from sim.accuracy import STRAINED, Accuracy
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.deformation import Deformation, guess
-from sim.discretisation.footprint import footprint_weights
+from sim.discretisation.footprint import compute_footprint_weights
 from sim.effects import SKULLS, Elasticity, ToolDisplacement, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import MAGNITUDE, Displaced, Loads, Pushed, stacked
 from sim.material import BRAIN, Material
 from surrogate.data.cortex_patch import Patch, open_patch
-from surrogate.data.tool_loads import across
+from surrogate.data.tool_loads import find_perpendiculars
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Variant:
     aim: Aim = Aim()
 
 
-def variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] = ()) -> list[Variant]:
+def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] = ()) -> list[Variant]:
     """The tool's uncertainty, the tissue's, the skull's, and other `elements`."""
     tissue = body.tissue
     young, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
@@ -86,7 +86,7 @@ def variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] = ()) 
     return [variant for variant in changed if variant.body != body or variant.aim != Aim()]
 
 
-def aimed(loads: Loads, aim: Aim, patch: Patch) -> Loads:
+def apply_aim(loads: Loads, aim: Aim, patch: Patch) -> Loads:
     """The loads of one tool as `aim` has them, one block for each way; points are shifted along the open cortex."""
     (cause,) = loads.causes
     if not isinstance(cause, Pushed | Displaced):
@@ -98,10 +98,10 @@ def aimed(loads: Loads, aim: Aim, patch: Patch) -> Loads:
         vectors = [(1.0 + share) * vector for share in (aim.share, -aim.share)]
     if aim.turn:
         length = np.linalg.norm(vector, axis=1, keepdims=True)
-        turned = [np.sin(aim.turn) * length * way for way in across(vector / length)]
+        turned = [np.sin(aim.turn) * length * way for way in find_perpendiculars(vector / length)]
         vectors = [np.cos(aim.turn) * vector + aside for aside in turned]
     if aim.shift:
-        first, second = across(patch.normal_near(cause.point))
+        first, second = find_perpendiculars(patch.find_normals(cause.point))
         points = [cause.point + aim.shift * way for way in (first, -first, second, -second)]
     return stacked(
         [Loads((replace(cause, **{name: one, "point": point}),), loads.time) for one in vectors for point in points]
@@ -162,7 +162,7 @@ class SensitivityStudy:
         return Fem(self.anatomy, effects, self.accuracy, self.device, element=body.element)
 
 
-def rows(study: SensitivityStudy, changed: Sequence[Variant]) -> Iterator[SensitivityRow]:
+def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Iterator[SensitivityRow]:
     """First the default, whose change is its whole motion; then each variant's change from it.
 
     Known motions are those of the default under its forces: the mean motion of each footprint. Every solve starts at
@@ -178,7 +178,7 @@ def rows(study: SensitivityStudy, changed: Sequence[Variant]) -> Iterator[Sensit
         raise InputError("the anatomy has no tumour whose motion could change: make one with `sulcus anatomy`.")
     body, fem = study.body, study.fem(study.body)
     pushed = fem.deform(study.loads)
-    known = moved_alike(study.anatomy, study.loads, pushed)
+    known = match_motion(study.anatomy, study.loads, pushed)
     defaults = ((study.loads, pushed), (known, fem.deform(known, guess(pushed.displacement))))
     rest = np.zeros((len(study.loads), len(nodes), 3))
     whole = [change(default.at(nodes), default.at(nodes), rest) for _, default in defaults]
@@ -188,7 +188,7 @@ def rows(study: SensitivityStudy, changed: Sequence[Variant]) -> Iterator[Sensit
             body, fem = variant.body, study.fem(variant.body)
         found = []
         for loads, default in defaults:
-            asked = aimed(loads, variant.aim, patch)
+            asked = apply_aim(loads, variant.aim, patch)
             start = np.tile(default.displacement, (len(asked) // len(loads), 1, 1))
             of_default = default.at(nodes)
             found.append(change(fem.deform(asked, guess(start), nodes), of_default, of_default.displacement))
@@ -223,7 +223,7 @@ def change(answer: Deformation, default: Deformation, origin: np.ndarray) -> Cha
     )
 
 
-def moved_alike(anatomy: Anatomy, loads: Loads, answer: Deformation) -> Loads:
+def match_motion(anatomy: Anatomy, loads: Loads, answer: Deformation) -> Loads:
     """Tools that move the tissue under them as far as `answer` says that the forces of `loads` do.
 
     The mean motion of each footprint, from the motion of the mesh's own vertices: on quadratic elements nearly.
@@ -232,6 +232,6 @@ def moved_alike(anatomy: Anatomy, loads: Loads, answer: Deformation) -> Loads:
     if cause is None:
         raise InputError("known motions are derived from forces: give `Pushed` loads alone.")
     mesh = anatomy.mesh
-    weight = footprint_weights(mesh.nodes, mesh.surface, cause.point, cause.footprint).toarray()
+    weight = compute_footprint_weights(mesh.nodes, mesh.surface, cause.point, cause.footprint).toarray()
     motion = np.einsum("bv,bvi->bi", weight, answer.displacement)
     return Loads((Displaced(cause.point, motion, cause.footprint),), loads.time)

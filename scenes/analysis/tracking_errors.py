@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.intrinsics import BoardView, covariance_of
-from ar.tracking.targets import DetectedCorners, Target, calibration_board, seen_from_front
+from ar.tracking.intrinsics import BoardView, compute_intrinsics_covariance
+from ar.tracking.targets import DetectedCorners, Target, build_calibration_board, is_seen_from_front
 
 CORNER = 0.1
 """Standard deviation of a corner per axis [pixel]: by default twice that of sharp images (`benchmarks track`)."""
@@ -20,12 +20,12 @@ CORNER = 0.1
 VIEWS, TILT, WIDE = 24, np.radians(35.0), (0.45, 0.8)
 
 
-def usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarray:
+def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarray:
     """The covariance (9, 9) of intrinsics, in the order of `ar.tracking.intrinsics.PARAMETERS`, of a good calibration.
 
     It has 24 views of the printed board, tilted by up to 35 degrees to all sides, near and far, all over the image.
     """
-    random, board = np.random.default_rng(seed), calibration_board().faces[0]
+    random, board = np.random.default_rng(seed), build_calibration_board().faces[0]
     points = board.corners - np.array([*(0.5 * board.size), 0.0])
     camera, views, poses = calibration.camera(np.eye(4)), [], []
     for number in range(VIEWS):
@@ -40,10 +40,10 @@ def usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarray:
         noisy = pixels + CORNER * random.standard_normal(pixels.shape)
         views.append(BoardView(str(number), points[inside], noisy[inside], 1.0))
         poses.append((turn, shift))
-    return covariance_of(calibration, views, poses)[0]
+    return compute_intrinsics_covariance(calibration, views, poses)[0]
 
 
-def changed(calibration: Calibration, step: np.ndarray) -> Calibration:
+def change_calibration(calibration: Calibration, step: np.ndarray) -> Calibration:
     """A calibration whose nine parameters differ by `step` (9,); further coefficients of its lens stay."""
     fx, fy, cx, cy = (np.array([*calibration.focal, *calibration.principal]) + step[:4]).tolist()
     coefficients = calibration.lens.coefficients.copy()
@@ -51,11 +51,11 @@ def changed(calibration: Calibration, step: np.ndarray) -> Calibration:
     return replace(calibration, focal=(fx, fy), principal=(cx, cy), lens=Lens(*coefficients.tolist()))
 
 
-def corners_in(camera: Camera, target: Target, T_world_target: np.ndarray, off: np.ndarray) -> DetectedCorners:
+def project_corners(camera: Camera, target: Target, T_world_target: np.ndarray, off: np.ndarray) -> DetectedCorners:
     """Project the corners of a target's visible faces, each with an error from a row of `off` (n, 2) [pixel]."""
     points, faces, T = [], [], camera.T_camera_world @ T_world_target
     for number, face in enumerate(target.faces):
-        if seen_from_front(T @ face.T_target_face):
+        if is_seen_from_front(T @ face.T_target_face):
             points.append(face.corners)
             faces += [number] * len(face.corners)
     at = np.concatenate([np.zeros((0, 3)), *points])
@@ -64,7 +64,7 @@ def corners_in(camera: Camera, target: Target, T_world_target: np.ndarray, off: 
     return DetectedCorners(at[inside], (pixels + off[: len(at)])[inside], np.array(faces, int)[inside])
 
 
-def seen_by_rows(
+def project_by_rows(
     seen: DetectedCorners, camera_at: Callable[[float], Camera], readout: float, T_world_target: np.ndarray
 ) -> DetectedCorners:
     """Project corners with a rolling shutter that reads the image rows within `readout` [s].
@@ -75,12 +75,12 @@ def seen_by_rows(
     middle = camera_at(0.0)
     still, _ = middle.project(at)
     moved = [
-        camera_at(readout * after_middle(middle, row)).project(place[None])[0][0]
+        camera_at(readout * compute_row_delay(middle, row)).project(place[None])[0][0]
         for place, row in zip(at, still[:, 1].tolist(), strict=True)
     ]
     return replace(seen, pixels=seen.pixels + np.reshape(moved, still.shape) - still)
 
 
-def after_middle(camera: Camera, row: float) -> float:
+def compute_row_delay(camera: Camera, row: float) -> float:
     """When a row [pixel] is read, after the middle one, as a share of the readout."""
     return (row + 0.5) / camera.height - 0.5

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ar.rendering.layer import vertex_normals
+from ar.rendering.layer import compute_vertex_normals
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import Deformation
@@ -35,8 +35,8 @@ from ..script.priors import (
     TOOL,
     ParameterPrior,
     PatientSample,
-    chosen,
-    rigid,
+    choose_name,
+    sample_rigid_errors,
 )  # fmt: skip
 from ..script.scene import Scene
 from ..script.tool_paths import Path, Touch
@@ -84,7 +84,7 @@ class SurfaceMotions:
     normals: tuple[np.ndarray, ...]
 
 
-def changed(scene: Scene, draw: PatientSample) -> Scene:
+def apply_sample(scene: Scene, draw: PatientSample) -> Scene:
     """The scene with another tissue, tumour, skull and place of the tool.
 
     Raises
@@ -92,14 +92,14 @@ def changed(scene: Scene, draw: PatientSample) -> Scene:
     InputError
         A tissue that is not described by Young's modulus and Poisson's ratio.
     """
-    tissue = tissue_of(scene)
+    tissue = get_tissue(scene)
 
     def drawn(one: Material, times: float = 1.0) -> Material:
         return replace(one, young=times * draw.stiffness * one.young, poisson=draw.poisson)
 
     regions = {label: drawn(one) for label, one in scene.elasticity.regions.items() if isinstance(one, Material)}
-    elasticity = Elasticity(drawn(tissue), {**regions, TUMOUR_LABEL: drawn(tumour_of(scene), draw.ratio)})
-    skull = SKULLS[chosen(draw.skull, skulls_of(scene))]
+    elasticity = Elasticity(drawn(tissue), {**regions, TUMOUR_LABEL: drawn(get_tumour_tissue(scene), draw.ratio)})
+    skull = SKULLS[choose_name(draw.skull, list_skulls(scene))]
 
     def other(effect: Effect) -> Effect:
         return elasticity if isinstance(effect, Elasticity) else skull if isinstance(effect, SKULL_EFFECTS) else effect
@@ -107,39 +107,39 @@ def changed(scene: Scene, draw: PatientSample) -> Scene:
     return replace(scene, effects=tuple(map(other, scene.effects)), path=_aside(scene.path, draw.tip))
 
 
-def skulls_of(scene: Scene) -> tuple[str, ...]:
+def list_skulls(scene: Scene) -> tuple[str, ...]:
     """List the possible skull models of a scene: if the brain may separate, fluid is in between and no bond remains."""
     lets_go = any(isinstance(effect, SkullContact) for effect in scene.effects)
     return tuple(name for name in SKULLS if not (lets_go and name == "bonded"))
 
 
-def skull_of(scene: Scene) -> str | None:
+def build_skull(scene: Scene) -> str | None:
     """Return the skull model of a scene; None if it is not simulated."""
     own = next((type(effect) for effect in scene.effects if isinstance(effect, SKULL_EFFECTS)), None)
     return next((name for name, skull in SKULLS.items() if type(skull) is own), None)
 
 
-def mesh_prior(scene: Scene, skull: str | None) -> ParameterPrior:
+def find_mesh_prior(scene: Scene, skull: str | None) -> ParameterPrior:
     """Return the prior of a scene's mesh error for a skull model."""
     if skull in (None, "bonded"):
         return OF_MESH
     return OF_MESH_SINKING if any(isinstance(effect, Gravity) for effect in scene.effects) else OF_MESH_SLIDING
 
 
-def mesh_errors(scene: Scene, draws: Sequence[PatientSample]) -> np.ndarray:
+def sample_mesh_errors(scene: Scene, draws: Sequence[PatientSample]) -> np.ndarray:
     """Sample the mesh error (draws,) of each draw, relative to its motion."""
-    return mesh_deviations(scene, draws) * np.array([draw.mesh for draw in draws])
+    return estimate_mesh_deviations(scene, draws) * np.array([draw.mesh for draw in draws])
 
 
-def mesh_deviations(scene: Scene, draws: Sequence[PatientSample]) -> np.ndarray:
+def estimate_mesh_deviations(scene: Scene, draws: Sequence[PatientSample]) -> np.ndarray:
     """Return the standard deviation (draws,) of each draw's mesh error, relative to its motion."""
-    if skull_of(scene) is None:
-        return np.full(len(draws), mesh_prior(scene, None).range[1])
-    skulls = skulls_of(scene)
-    return np.array([mesh_prior(scene, chosen(draw.skull, skulls)).range[1] for draw in draws])
+    if build_skull(scene) is None:
+        return np.full(len(draws), find_mesh_prior(scene, None).range[1])
+    skulls = list_skulls(scene)
+    return np.array([find_mesh_prior(scene, choose_name(draw.skull, skulls)).range[1] for draw in draws])
 
 
-def tissue_of(scene: Scene) -> Material:
+def get_tissue(scene: Scene) -> Material:
     """The brain's tissue in a scene; regions may have another.
 
     Raises
@@ -158,15 +158,15 @@ def tissue_of(scene: Scene) -> Material:
     return elasticity.default
 
 
-def tumour_of(scene: Scene) -> Material:
+def get_tumour_tissue(scene: Scene) -> Material:
     """The tumour's tissue in a scene, or the brain's where it has none of its own.
 
     Raises
     ------
     InputError
-        As `tissue_of`.
+        As `get_tissue`.
     """
-    brain, tumour = tissue_of(scene), scene.elasticity.regions.get(TUMOUR_LABEL)
+    brain, tumour = get_tissue(scene), scene.elasticity.regions.get(TUMOUR_LABEL)
     return tumour if isinstance(tumour, Material) else brain
 
 
@@ -180,12 +180,12 @@ def _aside(path: Path, tip: Sequence[float]) -> Path:
     return aside
 
 
-def moments(scene: Scene) -> tuple[float, ...]:
+def list_moments(scene: Scene) -> tuple[float, ...]:
     """The times [s] of a scene that are solved."""
     return tuple(np.linspace(0.0, scene.duration, MOMENTS).tolist())
 
 
-def nominal(theatre: Theatre, scene: Scene) -> SurfaceMotions:
+def get_nominal(theatre: Theatre, scene: Scene) -> SurfaceMotions:
     """Solve the scene as it is.
 
     Raises
@@ -195,17 +195,17 @@ def nominal(theatre: Theatre, scene: Scene) -> SurfaceMotions:
     """
     if not len(theatre.anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour to be uncertain of: make one with `sulcus anatomy`.")
-    answer, normals = solved(theatre, scene), []
+    answer, normals = solve_scene(theatre, scene), []
     if answer is None:
         raise InputError(f"of the scene {scene.name} itself no equilibrium was found.")
-    for time in moments(scene):
+    for time in list_moments(scene):
         loads = scene.loads(theatre.site, scene.path(time), time)
         tumour = Stage(scene, theatre.site).at(loads).tumour(theatre.anatomy.mesh.nodes)
-        normals.append(vertex_normals(tumour.vertices, tumour.triangles))
-    return SurfaceMotions(moments(scene), answer.motions, tuple(normals))
+        normals.append(compute_vertex_normals(tumour.vertices, tumour.triangles))
+    return SurfaceMotions(list_moments(scene), answer.motions, tuple(normals))
 
 
-def solved(theatre: Theatre, scene: Scene) -> Answer:
+def solve_scene(theatre: Theatre, scene: Scene) -> Answer:
     """The tumour's motions at each moment; None where some has no equilibrium.
 
     A moment that has none from the one before is gone to by way of times between.
@@ -220,7 +220,7 @@ def solved(theatre: Theatre, scene: Scene) -> Answer:
                 return None
         return start
 
-    for time in moments(scene):
+    for time in list_moments(scene):
         answer = gone_to([time], last)
         if answer is None and time > before:
             answer = gone_to(np.linspace(before, time, 1 + PARTS)[1:].tolist(), last)
@@ -235,36 +235,36 @@ def _surface(stage: Stage, answer: Deformation) -> np.ndarray:
     return answer.at(stage.tumour_vertices).displacement[0]
 
 
-def ensemble(theatre: Theatre, scene: Scene, draws: Sequence[PatientSample]) -> Iterator[Answer]:
+def solve_ensemble(theatre: Theatre, scene: Scene, draws: Sequence[PatientSample]) -> Iterator[Answer]:
     """The motions of every draw."""
     for draw in draws:
-        yield solved(theatre, changed(scene, draw))
+        yield solve_scene(theatre, apply_sample(scene, draw))
 
 
-def sound_of(
+def find_sound_draws(
     draws: Sequence[PatientSample], answers: Iterable[Answer]
 ) -> list[tuple[PatientSample, tuple[np.ndarray, ...]]]:
     """The draws that have an equilibrium at each moment, with their motions."""
     return [(draw, answer.motions) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
 
 
-def enough_of(
+def filter_sound_draws(
     scene: Scene, draws: Sequence[PatientSample], answers: Iterable[Answer]
 ) -> list[tuple[PatientSample, tuple[np.ndarray, ...]]]:
-    """Return the sound draws, as `sound_of`, of a scene with enough of them.
+    """Return the sound draws, as `find_sound_draws`, of a scene with enough of them.
 
     Raises
     ------
     InputError
         Too few draws have an equilibrium.
     """
-    sound = sound_of(draws, answers)
+    sound = find_sound_draws(draws, answers)
     if len(sound) < LEAST * len(draws):
         raise InputError(f"of {len(draws)} draws of the scene {scene.name} {len(sound)} have an equilibrium: too few.")
     return sound
 
 
-def uncertainty(
+def estimate_uncertainty(
     theatre: Theatre,
     scene: Scene,
     still: SurfaceMotions,
@@ -280,21 +280,21 @@ def uncertainty(
         Too few draws have an equilibrium.
     """
     answers = tuple(answers)
-    sound = enough_of(scene, draws, answers)
+    sound = filter_sound_draws(scene, draws, answers)
     folded = sum(answer is not None and answer.inverted > 0 for answer in answers)
-    kept, shifts = [draw for draw, _ in sound], rigid(SHIFTS, seed)
-    meshes = mesh_errors(scene, kept)
+    kept, shifts = [draw for draw, _ in sound], sample_rigid_errors(SHIFTS, seed)
+    meshes = sample_mesh_errors(scene, kept)
     rows = []
     for moment, (field, normals) in enumerate(zip(still.fields, still.normals, strict=True)):
         motion = np.stack([answer[moment] for _, answer in sound])
-        worst, middle = distances(off_by(motion, field, meshes), normals, *shifts)
+        worst, middle = compute_worst_distances(compute_error(motion, field, meshes), normals, *shifts)
         bounds = [float(np.quantile(one, LEVEL)) for one in (worst, middle)]
         moved = float(np.linalg.norm(field, axis=1).mean())
-        rows.append((*bounds, moved, parts(motion, field, kept, scene)))
+        rows.append((*bounds, moved, split_contributions(motion, field, kept, scene)))
     worst, middle, moved, by_name = zip(*rows, strict=True)
     return Uncertainty(
         scene=scene.name,
-        mark=mark_of(scene, theatre.site, theatre.element_of(scene)),
+        mark=mark_of(scene, theatre.site, theatre.choose_element(scene)),
         draws=len(draws),
         failed=len(draws) - len(sound),
         times=still.times,
@@ -303,16 +303,16 @@ def uncertainty(
         moved=moved,
         parts={name: tuple(row[name] for row in by_name) for name in by_name[0]},
         folded=folded,
-        numbers=sum(column.shape[1] for column in causes(kept, scene).values()),
+        numbers=sum(column.shape[1] for column in collect_contributor_values(kept, scene).values()),
     )
 
 
-def off_by(motion: np.ndarray, field: np.ndarray, meshes: np.ndarray) -> np.ndarray:
+def compute_error(motion: np.ndarray, field: np.ndarray, meshes: np.ndarray) -> np.ndarray:
     """Return the error of a scene's field (n, 3) [m] relative to motions (draws, n, 3) with mesh errors (draws,)."""
     return (1.0 + meshes)[:, None, None] * motion - field
 
 
-def distances(
+def compute_worst_distances(
     off: np.ndarray, normals: np.ndarray, shift: np.ndarray, wide: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return errors of the worst point and of the centre (draws, shifts) [m], for every draw with every rigid error.
@@ -326,39 +326,41 @@ def distances(
     return worst, middle
 
 
-def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[PatientSample], scene: Scene) -> dict[str, float]:
+def split_contributions(
+    motion: np.ndarray, field: np.ndarray, draws: Sequence[PatientSample], scene: Scene
+) -> dict[str, float]:
     """Return the error of each contributor alone [m]: root mean square over the draws, at the worst surface point of each.
 
     A linear fit of the draws (draws, n, 3) tells the causes apart; what it leaves is of several together.
     """
-    off, columns = motion - field, causes(draws, scene)
+    off, columns = motion - field, collect_contributor_values(draws, scene)
     design = np.concatenate(list(columns.values()), axis=1)
     slope = np.linalg.lstsq(design, off.reshape(len(off), -1), rcond=None)[0]
     found, first = {}, 0
     for name, column in columns.items():
         last = first + column.shape[1]
-        found[name] = size((column @ slope[first:last]).reshape(off.shape))
+        found[name] = compute_field_size((column @ slope[first:last]).reshape(off.shape))
         first = last
-    found[TOGETHER] = size(off - (design @ slope).reshape(off.shape))
-    found[MESH] = size(mesh_deviations(scene, draws)[:, None, None] * motion)
+    found[TOGETHER] = compute_field_size(off - (design @ slope).reshape(off.shape))
+    found[MESH] = compute_field_size(estimate_mesh_deviations(scene, draws)[:, None, None] * motion)
     found[REGISTRATION] = float(np.sqrt(3.0)) * OF_REGISTRATION.range[1]
     return found | {SEGMENTATION: OF_SEGMENTATION.range[1]}
 
 
-def causes(draws: Sequence[PatientSample], scene: Scene) -> dict[str, np.ndarray]:
+def collect_contributor_values(draws: Sequence[PatientSample], scene: Scene) -> dict[str, np.ndarray]:
     """Return, by contributor, the difference of each draw from the scene (draws, columns); zero without difference."""
-    poisson = tissue_of(scene).poisson
+    poisson = get_tissue(scene).poisson
     table = np.array([[np.log(one.stiffness), one.poisson - poisson, np.log(one.ratio), *one.tip] for one in draws])
     found = {STIFFNESS.name: table[:, :1], POISSON.name: table[:, 1:2], RATIO.name: table[:, 2:3]}
-    skull = skull_of(scene)
-    others = [name for name in skulls_of(scene) if name != skull]
-    names = [chosen(draw.skull, skulls_of(scene)) for draw in draws]
+    skull = build_skull(scene)
+    others = [name for name in list_skulls(scene) if name != skull]
+    names = [choose_name(draw.skull, list_skulls(scene)) for draw in draws]
     if skull is not None:
         found[SKULL] = np.array([[name == other for other in others] for name in names], float)
     return found if scene.tool is None else found | {TOOL: table[:, 3:]}
 
 
-def size(field: np.ndarray) -> float:
+def compute_field_size(field: np.ndarray) -> float:
     """Root mean square over draws of the largest length in each: vectors (draws, n, 3)."""
     return float(np.sqrt((field**2).sum(axis=2).max(axis=1).mean()))
 
@@ -378,19 +380,21 @@ def coverage(
     InputError
         Fewer than two of them have an equilibrium.
     """
-    sound = sound_of(draws, answers)
+    sound = find_sound_draws(draws, answers)
     if len(sound) < 2:
         raise InputError(
             f"{len(sound)} of {len(draws)} synthetic patients of the scene {scene.name} have an equilibrium: too few."
         )
-    meshes, inside = mesh_errors(scene, [draw for draw, _ in sound]), []
-    shift, wide = rigid(SHIFTS * len(sound), seed)  # a different one for each patient
+    meshes, inside = sample_mesh_errors(scene, [draw for draw, _ in sound]), []
+    shift, wide = sample_rigid_errors(SHIFTS * len(sound), seed)  # a different one for each patient
     each = list(zip(shift.reshape(len(sound), SHIFTS, 3), wide.reshape(len(sound), SHIFTS), strict=True))
     for moment in range(1, len(still.times)):
         motion = np.stack([answer[moment] for _, answer in sound])
-        off = off_by(motion, still.fields[moment], meshes)
+        off = compute_error(motion, still.fields[moment], meshes)
         normals = still.normals[moment]
-        worst = [distances(one[None], normals, *errors)[0][0] for one, errors in zip(off, each, strict=True)]
+        worst = [
+            compute_worst_distances(one[None], normals, *errors)[0][0] for one, errors in zip(off, each, strict=True)
+        ]
         inside.append(np.array(worst) <= stated.worst[moment])
     shares = np.mean(inside, axis=(0, 2))  # errors of one patient depend on each other
     deviation = float(shares.std(ddof=1) / np.sqrt(len(shares)))

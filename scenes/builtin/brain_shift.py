@@ -5,7 +5,7 @@ import numpy as np
 from sim.effects import Elasticity, Gravity, Held, SkullContact
 from sim.material import MATERIALS
 
-from ..script.head_posture import drained_then_turned
+from ..script.head_posture import build_drained_turn
 from ..script.scene import Scene
 
 # Minutes go by, and fluid leaves the tissue.
@@ -17,5 +17,5 @@ SCENE = Scene(
     duration=6.0,
     effects=(Elasticity(SLOW), Held(), SkullContact(), Gravity()),
     tool=None,
-    lying=drained_then_turned(drain=3.0, pause=0.5, turn=2.0, angle=np.radians(30.0), to=0.5),
+    lying=build_drained_turn(drain=3.0, pause=0.5, turn=2.0, angle=np.radians(30.0), to=0.5),
 )

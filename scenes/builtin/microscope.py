@@ -6,7 +6,7 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity, Gravity, Held, Slide, ToolForce
 from sim.material import Material
 
-from ..script.head_posture import drained
+from ..script.head_posture import build_drainage
 from ..script.scene import Bounds, Scene
 from ..script.sight import StereoSight
 from ..script.tool import Probe
@@ -33,7 +33,7 @@ SCENE = Scene(
     tool=Probe(radius=7e-3),
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity(), ToolForce()),
-    lying=drained(2.0, to=0.2),
+    lying=build_drainage(2.0, to=0.2),
     sight=StereoSight(),
     viewpoint=Viewpoint(distance=0.3, tilt=-0.4, fov=np.radians(9.0), width=800, height=600, eye="left", field=1.0),
     bounds=Bounds(overlap=0.7, error=3e-3, drawn=2.5, removed=0.5),

@@ -4,7 +4,7 @@ from sim.effects import Elasticity, Gravity, Held, SkullContact
 from sim.material import MATERIALS
 
 from ..script.debulking import Debulking
-from ..script.head_posture import drained
+from ..script.head_posture import build_drainage
 from ..script.scene import Scene
 
 # Minutes go by, and fluid leaves the tissue.
@@ -17,6 +17,6 @@ SCENE = Scene(
     duration=5.0,
     effects=(Elasticity(SLOW), Held(), SkullContact(), Gravity()),
     tool=None,
-    lying=drained(1.5, to=0.3),
+    lying=build_drainage(1.5, to=0.3),
     surgery=Debulking(times=(2.0, 2.7, 3.4, 4.1)),
 )

@@ -4,7 +4,7 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity, Gravity, Held, Slide
 from sim.material import Material
 
-from ..script.head_posture import drained
+from ..script.head_posture import build_drainage
 from ..script.scene import Bounds, Scene
 from ..script.sight import Sight
 from ..script.viewpoint import Viewpoint
@@ -19,7 +19,7 @@ SCENE = Scene(
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity()),
     tool=None,
-    lying=drained(3.0, to=0.2),
+    lying=build_drainage(3.0, to=0.2),
     sight=Sight(),
     viewpoint=Viewpoint(width=800, height=600),
     # # The truth's dashed outline is drawn with an error of up to 0.4 pixels at a live solution: in one frame that

@@ -11,30 +11,30 @@ from typing import Any
 
 import numpy as np
 
-from sim.anatomy import PART_LABELS, Anatomy, region_name
-from sim.bodies.dural_septa import SEPTA, walled
-from sim.bodies.head_masks import head_masks
-from sim.bodies.intensity import sidecar, write_intensity
-from sim.bodies.label_volume import masked_subject
-from sim.bodies.mesher import lost_pieces, lost_words, surface_errors
+from sim.anatomy import PART_LABELS, Anatomy, name_region
+from sim.bodies.dural_septa import SEPTA, find_held_vertices
+from sim.bodies.head_masks import read_head_masks
+from sim.bodies.intensity import to_intensity_path, write_intensity
+from sim.bodies.label_volume import build_masked_subject
+from sim.bodies.mesher import compute_surface_errors, describe_lost_pieces, find_lost_pieces
 from sim.bodies.meshfile import write_anatomy
-from sim.bodies.placement import side_of
+from sim.bodies.placement import describe_side
 from sim.bodies.subject import MeshPlan, Subject, SubjectPart, make_anatomy
 from sim.errors import InputError
-from sim.geometry.tetmesh import TetMesh, dihedral_angles
-from sim.runtime.timing import stage
+from sim.geometry.tetmesh import TetMesh, compute_dihedral_angles
+from sim.runtime.timing import time_stage
 
-from ..options.outputs import add_force, claimed, demand_no_strangers
-from ..options.placement_options import add_opening_arguments, opened, opened_over
+from ..options.outputs import add_force, check_no_foreign_files, check_output_path
+from ..options.placement_options import add_opening_arguments, describe_opening, place_craniotomy
 from ..options.shared_options import add_json
 from ..options.subject_options import (
     add_drawn_arguments,
     add_label_arguments,
-    demand_no_drawn,
-    drawn,
-    regions_asked,
-    source,
-    sources_of,
+    build_drawn_subject,
+    check_no_drawn_options,
+    describe_source,
+    parse_regions,
+    parse_sources,
 )
 
 # Lengths in millimetres, as on the command line.
@@ -89,21 +89,21 @@ def run(args: argparse.Namespace) -> int:
     """Make the anatomy, write it, and print what it is."""
     began = time.perf_counter()
     read = (args.labels, args.mask, args.tumour_in, args.t1)
-    claimed(args.out, ".vtu", args.force, read)
-    beside = sidecar(args.out)
-    claimed(beside, ".gz", args.force, read)
+    check_output_path(args.out, ".vtu", args.force, read)
+    beside = to_intensity_path(args.out)
+    check_output_path(beside, ".gz", args.force, read)
     chosen = {**DEFAULTS, **PRESETS[args.preset], **_given(args)}
     plan = MeshPlan(args.nodes, 1e-3 * chosen["craniotomy"], fine_opening=args.fine_opening)
-    with stage("labels" if args.labels else "head" if args.mask or args.head else "template"):
-        subject = opened(_subject(args, chosen), args)
+    with time_stage("labels" if args.labels else "head" if args.mask or args.head else "template"):
+        subject = place_craniotomy(_subject(args, chosen), args)
     for note in subject.notes:
-        print(f"{source(args)}: {note}", file=sys.stderr)
+        print(f"{describe_source(args)}: {note}", file=sys.stderr)
     print(f"sulcus anatomy: meshing with about {plan.nodes} nodes ...", file=sys.stderr)
-    with stage("mesh"):
+    with time_stage("mesh"):
         anatomy = make_anatomy(subject, plan)
-    for path in demand_no_strangers(args.out, anatomy.digest, args.force):
+    for path in check_no_foreign_files(args.out, anatomy.digest, args.force):
         print(f"{path}: was made with the anatomy that is replaced: simulate and train anew.", file=sys.stderr)
-    with stage("write the mesh"):
+    with time_stage("write the mesh"):
         intensity = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy], anatomy.mesh)
         write_anatomy(args.out, anatomy)
         if intensity is None:
@@ -111,21 +111,21 @@ def run(args: argparse.Namespace) -> int:
         else:
             write_intensity(beside, intensity)
     tumour = anatomy.mesh.tets[anatomy.in_tumour]
-    lost = lost_pieces(subject.pieces, anatomy.mesh.nodes, tumour)
+    lost = find_lost_pieces(subject.pieces, anatomy.mesh.nodes, tumour)
     if any(lost):
-        said = lost_words(subject.pieces, lost)
+        said = describe_lost_pieces(subject.pieces, lost)
         print(f"{args.out}: does not hold {said}: where they matter, ask for more nodes.", file=sys.stderr)
     figures = _figures(args, anatomy, subject, lost)
     missed = figures["tumour_volume_error_percent"]
     if abs(missed) > NOTED:
         print(
             f"{args.out}: holds {abs(missed):.1f} % {'less' if missed < 0.0 else 'more'} tumour than "
-            f"{source(args)}: where that matters, ask for more nodes.",
+            f"{describe_source(args)}: where that matters, ask for more nodes.",
             file=sys.stderr,
         )
     for part in subject.parts:
         if not anatomy.mesh.within(part.label).any():
-            said = f"has no {region_name(part.label)}, of which the labels mark {1e6 * part.volume:.2g} ml"
+            said = f"has no {name_region(part.label)}, of which the labels mark {1e6 * part.volume:.2g} ml"
             print(f"{args.out}: {said}: where it matters, ask for more nodes.", file=sys.stderr)
     files = {"mesh": str(args.out), "t1": None if intensity is None else str(beside)}
     summary = {**files, **figures, "seconds": round(time.perf_counter() - began, 2)}
@@ -145,17 +145,17 @@ def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
                 raise InputError(
                     f"--{option} belongs to a label volume: give --labels FILE.nii.gz too, or leave it out."
                 )
-        return drawn(args, chosen)
-    demand_no_drawn(args)
-    return masked_subject(head_masks(sources_of(args)), args.t1, regions=regions_asked(args))
+        return build_drawn_subject(args, chosen)
+    check_no_drawn_options(args)
+    return build_masked_subject(read_head_masks(parse_sources(args)), args.t1, regions=parse_regions(args))
 
 
 def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost: list[bool]) -> dict[str, Any]:
     mesh = anatomy.mesh
     volume = mesh.volumes[anatomy.in_tumour].sum()
-    error, weight = surface_errors(mesh.nodes, mesh.surface, subject.brain)
-    septa = [int((walled(mesh, one) & anatomy.held.all(axis=1)).sum()) for one in subject.septa]
-    regions = {region_name(part.label): (_volume(mesh, part), part) for part in subject.parts}
+    error, weight = compute_surface_errors(mesh.nodes, mesh.surface, subject.brain)
+    septa = [int((find_held_vertices(mesh, one) & anatomy.held.all(axis=1)).sum()) for one in subject.septa]
+    regions = {name_region(part.label): (_volume(mesh, part), part) for part in subject.parts}
     return {
         "nodes": len(mesh.nodes),
         "tets": len(mesh.tets),
@@ -164,7 +164,7 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost:
         "held_nodes": int(anatomy.held.any(axis=1).sum()),
         "septa_nodes": {septum.name: held for septum, held in zip(subject.septa, septa, strict=True)},
         "sliding_nodes": int(anatomy.slide_normal.any(axis=1).sum()),
-        "worst_dihedral_deg": round(float(dihedral_angles(mesh.nodes, mesh.tets).min()), 2),
+        "worst_dihedral_deg": round(float(compute_dihedral_angles(mesh.nodes, mesh.tets).min()), 2),
         "brain_ml": round(float(mesh.volumes.sum()) * 1e6, 2),
         "tumour_ml": round(float(volume) * 1e6, 4),
         "regions_ml": {name: round(1e6 * held, 3) for name, (held, _) in regions.items()},
@@ -175,7 +175,7 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost:
         "tumour_volume_error_percent": round(100.0 * float(volume / subject.tumour_volume - 1.0), 3),
         "surface_error_mean_mm": round(1e3 * float(np.average(error, weights=weight)), 3),
         "surface_error_p95_mm": round(1e3 * float(np.quantile(error, 0.95, weights=weight, method="inverted_cdf")), 3),
-        "opening": {"over": opened_over(args), **_place(subject, subject.site)},
+        "opening": {"over": describe_opening(args), **_place(subject, subject.site)},
         "tumour_pieces": [
             {"ml": round(1e6 * piece.volume, 3), "lost": gone, **_place(subject, piece.centre)}
             for piece, gone in zip(subject.pieces, lost, strict=True)
@@ -192,7 +192,7 @@ def _volume(mesh: TetMesh, part: SubjectPart) -> float:
 def _place(subject: Subject, place: np.ndarray) -> dict[str, Any]:
     """Describe the position of a point (3,) [m]: in mm, and in words."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
-    return {"at_mm": [round(1e3 * value, 1) for value in place.tolist()], "side": side_of(place, low, high)}
+    return {"at_mm": [round(1e3 * value, 1) for value in place.tolist()], "side": describe_side(place, low, high)}
 
 
 def _said(place: dict[str, Any]) -> str:

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
-from ..options.camera_options import add_camera, filmed_with_targets
-from ..options.shared_options import add_device, add_json, add_seed, json_line
-from ..options.theatre_options import add_bodies, scene_asked
+from ..options.camera_options import add_camera, film_with_targets
+from ..options.shared_options import add_device, add_json, add_seed, to_json_line
+from ..options.theatre_options import add_bodies, build_requested_scene
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 if TYPE_CHECKING:
@@ -100,16 +100,16 @@ def run(args: argparse.Namespace) -> int:
     InputError
         What cannot be read, numbers out of range, or a scene that cannot be solved.
     """
-    from ..analysis.error_budget import Filmed, budgeted, moment_of, velocity_at
-    from ..analysis.uncertainty import mesh_errors, nominal, parts
+    from ..analysis.error_budget import Filmed, choose_moment, compute_budget, compute_velocity
+    from ..analysis.uncertainty import get_nominal, sample_mesh_errors, split_contributions
     from ..play.deformers import open_theatre
     from ..play.stage import Stage
-    from ..tracked.filming import reference_beside
-    from ..tracked.registration_file import other_mesh, read_registration
+    from ..tracked.filming import place_reference
+    from ..tracked.registration_file import describe_other_mesh, read_registration
 
-    at_least("--draws", args.draws, FEWEST)
-    at_least("--samples", args.samples, FEWEST_SAMPLES)
-    at_least("--twins", args.twins, 0)
+    check_at_least("--draws", args.draws, FEWEST)
+    check_at_least("--samples", args.samples, FEWEST_SAMPLES)
+    check_at_least("--twins", args.twins, 0)
     for name, value in (
         ("--corner-px", args.corner_px),
         ("--latency-ms", args.latency_ms),
@@ -126,18 +126,18 @@ def run(args: argparse.Namespace) -> int:
     registration = None
     if args.registration is not None:
         registration = read_registration(args.registration)
-        other_mesh(registration, theatre.anatomy, args.registration)
-    still = nominal(theatre, scene)
+        describe_other_mesh(registration, theatre.anatomy, args.registration)
+    still = get_nominal(theatre, scene)
     bodies = _bodies(args, theatre, scene, args.draws, args.seed)
     draws = [draw for draw, _ in bodies]
-    number = moment_of(still, [answer for _, answer in bodies], mesh_errors(scene, draws))
+    number = choose_moment(still, [answer for _, answer in bodies], sample_mesh_errors(scene, draws))
     time = still.times[number]
     own_bodies, meshes, own_mesh = _at(scene, bodies, number)
     filmed = Filmed(
         site=site, viewpoint=scene.viewpoint, duration=scene.duration, covariance=known, time=time,
-        T_scan_patient=reference_beside(site, scene.viewpoint.camera(site)),
+        T_scan_patient=place_reference(site, scene.viewpoint.camera(site)),
         rest=Stage(scene, site).at(scene.loads(site, scene.path(time), time)).tumour_at_rest.vertices,
-        field=still.fields[number], normals=still.normals[number], velocity=velocity_at(still, number),
+        field=still.fields[number], normals=still.normals[number], velocity=compute_velocity(still, number),
         bodies=own_bodies, meshes=meshes, own_mesh=own_mesh, surrogate=_promised(theatre, scene, time),
         registration=registration, corner=args.corner_px, latency=1e-3 * args.latency_ms, clock=1e-3 * args.clock_ms,
     )  # fmt: skip
@@ -146,9 +146,9 @@ def run(args: argparse.Namespace) -> int:
         others, meshes, own_mesh = _at(scene, _bodies(args, theatre, scene, args.twins, args.seed + 1), number)
         twins = replace(filmed, bodies=others, meshes=meshes, own_mesh=own_mesh)
     bar = partial(tqdm, unit="part", desc="errors", leave=False, file=sys.stderr)
-    found = budgeted(filmed, args.samples, args.seed, twins, bar)
-    report = _flat(args, filmed, found, parts(filmed.bodies, filmed.field, draws, scene))
-    print(json_line(report) if args.json else "\n".join(_lines(report)))
+    found = compute_budget(filmed, args.samples, args.seed, twins, bar)
+    report = _flat(args, filmed, found, split_contributions(filmed.bodies, filmed.field, draws, scene))
+    print(to_json_line(report) if args.json else "\n".join(_lines(report)))
     return 0
 
 
@@ -160,15 +160,15 @@ def _seen(args: argparse.Namespace, theatre: Theatre) -> Scene:
     InputError
         A scene whose tumour is found by what is seen, or whose tissue is none that is drawn; a camera that zooms.
     """
-    from ..analysis.uncertainty import tissue_of
+    from ..analysis.uncertainty import get_tissue
 
-    scene = scene_asked(args, args.scene, theatre)
+    scene = build_requested_scene(args, args.scene, theatre)
     if scene.sight is not None:
         raise InputError(
             f"the scene {scene.name} finds its tumour by what is seen, and says its error: choose another."
         )
-    tissue_of(scene)
-    filmed = filmed_with_targets(args, scene)
+    get_tissue(scene)
+    filmed = film_with_targets(args, scene)
     calibration = filmed.viewpoint.calibration
     if args.readout_ms is None or calibration is None:
         return filmed
@@ -187,11 +187,11 @@ def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
     InputError
         A file that is missing, no such covariance, or of another camera.
     """
-    from ..analysis.tracking_errors import usual_covariance
+    from ..analysis.tracking_errors import sample_usual_covariance
 
     path = args.intrinsics
     if path is None:
-        return usual_covariance(calibration)
+        return sample_usual_covariance(calibration)
     if args.camera is None:
         raise InputError("--intrinsics belongs to a camera: give it by --camera.")
     wanted = "Give the K.json that `sulcus calibrate` wrote beside the camera."
@@ -213,21 +213,23 @@ def _bodies(args: argparse.Namespace, theatre: Theatre, scene: Scene, count: int
     InputError
         Too few have one.
     """
-    from ..analysis.uncertainty import enough_of, ensemble
-    from ..script.priors import drawn
+    from ..analysis.uncertainty import filter_sound_draws, solve_ensemble
+    from ..script.priors import sample_priors
 
-    draws = drawn(count, seed)
-    bar = tqdm(ensemble(theatre, scene, draws), total=count, unit="body", desc=scene.name, leave=False, file=sys.stderr)
-    return enough_of(scene, draws, bar)
+    draws = sample_priors(count, seed)
+    bar = tqdm(
+        solve_ensemble(theatre, scene, draws), total=count, unit="body", desc=scene.name, leave=False, file=sys.stderr
+    )
+    return filter_sound_draws(scene, draws, bar)
 
 
 def _at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the tumour's surface motion in each body at one time, and the errors of their meshes."""
-    from ..analysis.uncertainty import mesh_errors, mesh_prior, skull_of
+    from ..analysis.uncertainty import build_skull, find_mesh_prior, sample_mesh_errors
 
     draws = [draw for draw, _ in bodies]
-    own = mesh_prior(scene, skull_of(scene)).range[1] * np.array([draw.mesh for draw in draws])
-    return np.stack([answer[number] for _, answer in bodies]), mesh_errors(scene, draws), own
+    own = find_mesh_prior(scene, build_skull(scene)).range[1] * np.array([draw.mesh for draw in draws])
+    return np.stack([answer[number] for _, answer in bodies]), sample_mesh_errors(scene, draws), own
 
 
 def _promised(theatre: Theatre, scene: Scene, time: float) -> float:

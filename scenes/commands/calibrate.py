@@ -14,9 +14,9 @@ import numpy as np
 
 from sim.errors import InputError
 
-from ..options.camera_options import size
-from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_json, json_line
+from ..options.camera_options import parse_size
+from ..options.outputs import add_force, check_output_path
+from ..options.shared_options import add_json, to_json_line
 
 if TYPE_CHECKING:
     from ar.tracking.tracker_calibration import HandEye, Pivot
@@ -81,28 +81,31 @@ def run(args: argparse.Namespace) -> int:
 
 def _camera(args: argparse.Namespace) -> int:
     """Calibrate a camera from images of the board."""
-    from ar.tracking.intrinsics import calibrated, chosen
-    from ar.tracking.targets import calibration_board
+    from ar.tracking.intrinsics import calibrate_intrinsics, choose_views
+    from ar.tracking.targets import build_calibration_board
 
-    from ..tracked.board_pictures import seen_views
-    from ..tracked.calibration_file import SUFFIXES, intrinsics_header, write_calibration
+    from ..tracked.board_pictures import detect_board
+    from ..tracked.calibration_file import SUFFIXES, build_intrinsics_header, write_calibration
 
     if not args.out:
         raise InputError("give --out K.yaml for the camera.")
     suffix = Path(args.out).suffix
-    out = claimed(args.out, suffix if suffix in SUFFIXES else ".yaml", args.force, [args.pictures])
-    table = claimed(out.with_suffix(".json"), ".json", args.force, [args.pictures])
+    out = check_output_path(args.out, suffix if suffix in SUFFIXES else ".yaml", args.force, [args.pictures])
+    table = check_output_path(out.with_suffix(".json"), ".json", args.force, [args.pictures])
     size = None if args.size is None else _size(args.size)
-    board = calibration_board()
-    seen = seen_views(args.pictures, board, size)
+    board = build_calibration_board()
+    seen = detect_board(args.pictures, board, size)
     try:
-        found = calibrated(
-            chosen(seen.views, board.faces[0], MOST_VIEWS), seen.width, seen.height, f"sulcus calibrate: {out.stem}"
+        found = calibrate_intrinsics(
+            choose_views(seen.views, board.faces[0], MOST_VIEWS),
+            seen.width,
+            seen.height,
+            f"sulcus calibrate: {out.stem}",
         )
     except ValueError as error:
         raise InputError(f"{args.pictures}: {error}") from error
     report = {
-        **intrinsics_header(found.calibration, found.covariance),
+        **build_intrinsics_header(found.calibration, found.covariance),
         "rms_px": found.rms,
         "pictures": str(args.pictures),
         "looked_at": seen.looked_at,
@@ -114,7 +117,7 @@ def _camera(args: argparse.Namespace) -> int:
     write_calibration(out, found.calibration)
     _write_json(table, report)
     if args.json:
-        print(json_line(report))
+        print(to_json_line(report))
         return 0
     print(f"{seen.looked_at} pictures, the board in {len(seen.views)}, {len(found.used)} views used")
     if found.left_out:
@@ -131,16 +134,16 @@ def _camera(args: argparse.Namespace) -> int:
 
 
 def _write_json(path: Path, report: dict) -> None:
-    from sim.runtime.atomic_files import written_whole
+    from sim.runtime.atomic_files import write_atomically
 
-    with written_whole(path, ".json") as partial:
-        partial.write_text(json_line(report) + "\n", encoding="utf-8")
+    with write_atomically(path, ".json") as partial:
+        partial.write_text(to_json_line(report) + "\n", encoding="utf-8")
 
 
 def _size(text: str) -> tuple[int, int]:
     """Parse the width and height of an image, such as 1280x960."""
     try:
-        return size(text)
+        return parse_size(text)
     except argparse.ArgumentTypeError as error:
         message = f"--size {text!r} is no size: give width and height [pixel], such as 1280x960."
         raise InputError(message) from error
@@ -148,12 +151,12 @@ def _size(text: str) -> tuple[int, int]:
 
 def _tip(args: argparse.Namespace) -> int:
     """A tool's tip, from its poses while it pivots."""
-    from ar.tracking.tracker_calibration import pivoted
+    from ar.tracking.tracker_calibration import calibrate_pivot
 
     from ..tracked.pose_file import read_numbered_poses
 
     rows, _, poses = read_numbered_poses(args.pivot)
-    found = _fitted(pivoted, [args.pivot], [poses], rows)
+    found = _fitted(calibrate_pivot, [args.pivot], [poses], rows)
     deviations = 1e3 * np.sqrt(np.diag(found.covariance))
     if args.json:
         report = {
@@ -163,7 +166,7 @@ def _tip(args: argparse.Namespace) -> int:
             "rms_mm": 1e3 * found.rms,
             "tilt_degrees": float(np.degrees(found.tilt)),
         }
-        print(json_line(report))
+        print(to_json_line(report))
         return 0
     print(f"tip in the tool's frame: {_said(1e3 * found.tip, deviations[:3])} mm")
     print(f"it stood at {_said(1e3 * found.centre, deviations[3:])} mm")
@@ -179,7 +182,7 @@ def _said(values: np.ndarray, deviations: np.ndarray) -> str:
 
 def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray], rows: np.ndarray) -> Found:
     """Calibration by `fit` from poses of files; InputError if it fails, or if its residuals exceed its limits."""
-    from ar.tracking.rigid import reread
+    from ar.tracking.rigid import read_conventions
 
     names = " and ".join(map(str, files))
     try:
@@ -194,7 +197,7 @@ def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray
         return found
     worst = int(found.distances.argmax())
     hint = "Leave out wrong rows, and"
-    for forms in islice(product(*(reread(each).items() for each in poses)), 1, None):  # the first is as read
+    for forms in islice(product(*(read_conventions(each).items() for each in poses)), 1, None):  # the first is as read
         with suppress(ValueError):  # Poses of this form may turn too little.
             if not fit(*(form for _, form in forms)).misfit:
                 fitting = [f"{how} in {file}" for file, (how, _) in zip(files, forms, strict=True) if how]
@@ -208,7 +211,7 @@ def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray
 
 def _bodies(args: argparse.Namespace) -> int:
     """Estimate the transform between two bodies from poses of both."""
-    from ar.tracking.tracker_calibration import hand_eye
+    from ar.tracking.tracker_calibration import solve_hand_eye
 
     from ..tracked.pose_file import read_numbered_poses
 
@@ -216,7 +219,7 @@ def _bodies(args: argparse.Namespace) -> int:
     (rows, times, first), (_, again, second) = read_numbered_poses(one), read_numbered_poses(other)
     if len(times) != len(again) or np.abs(times - again).max(initial=0.0) > SAME_TIME:
         raise InputError(f"{one} and {other} have rows at different times: keep those that both have, in one order.")
-    found = _fitted(hand_eye, [one, other], [first, second], rows)
+    found = _fitted(solve_hand_eye, [one, other], [first, second], rows)
     if args.json:
         report = {
             "rotation": found.X[:3, :3].tolist(),
@@ -226,7 +229,7 @@ def _bodies(args: argparse.Namespace) -> int:
             "motions": found.motions,
             "spread_degrees": float(np.degrees(found.spread)),
         }
-        print(json_line(report))
+        print(to_json_line(report))
         return 0
     print("X, where x_A = X x_B [mm]:")
     for row in found.X[:3] * [1.0, 1.0, 1.0, 1e3]:

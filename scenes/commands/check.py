@@ -10,11 +10,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, TextIO
 
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 
-from ..options.camera_options import add_camera, filmed
+from ..options.camera_options import add_camera, apply_camera_options
 from ..options.shared_options import add_json, add_style
-from ..options.theatre_options import add_theatre, deformer_name, playable, scene_asked, theatre_asked
+from ..options.theatre_options import (
+    add_theatre,
+    build_requested_scene,
+    build_requested_theatre,
+    choose_deformer,
+    list_playable,
+)
 
 if TYPE_CHECKING:
     from ..play.checks import SceneFigures
@@ -45,20 +51,20 @@ def run(args: argparse.Namespace) -> int:
     """Check scene by scene. 1: a bound was not kept."""
     from tqdm import tqdm
 
-    from ..play.checks import measure, objections
-    from ..play.frame_text import error_lines
-    from ..play.reference import truth_of
+    from ..play.checks import list_objections, measure
+    from ..play.frame_text import format_errors
+    from ..play.reference import solve_reference_frames
     from ..script.scene import SCENES
 
-    at_least("--every", args.every, 1)
+    check_at_least("--every", args.every, 1)
     asked = args.scenes or [*SCENES, TRACKING]
     names = [name for name in asked if name != TRACKING]
-    theatre = theatre_asked(args, *names)
-    scenes = [filmed(args, scene_asked(args, name, theatre)) for name in names]
-    scenes = playable(args, theatre, scenes)
+    theatre = build_requested_theatre(args, *names)
+    scenes = [apply_camera_options(args, build_requested_scene(args, name, theatre)) for name in names]
+    scenes = list_playable(args, theatre, scenes)
     rows, table = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
-        name = deformer_name(args, theatre, scene)
+        name = choose_deformer(args, theatre, scene)
         player = replace(theatre.player(name, scene), style=args.style)
         print(f"{scene.name} by {theatre.described(name, scene)}", file=table)
         total = len(scene.times[:: args.every])
@@ -67,13 +73,13 @@ def run(args: argparse.Namespace) -> int:
             for frame in player.frames(args.every):
                 frames.append(frame)
                 bar.update()
-            truth = truth_of(theatre, scene, [frame.loads for frame in frames], bar.update)
+            truth = solve_reference_frames(theatre, scene, [frame.loads for frame in frames], bar.update)
         figures = measure(player, player.camera_at, frames, truth)
         broken = figures.broken(scene.bounds)
         played = {"scene": scene.name, "deformer": name, "solver": theatre.described(name, scene)}
         promised, error = _errors(frames)
         rows.append({**played, "frames": len(frames), **figures.row(), "broken": broken})
-        against = objections(frames)
+        against = list_objections(frames)
         rows[-1] |= {
             "model_error_mm": _mm(promised),
             "tumour_error_mm": _mm(error.bound),
@@ -89,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
             f"skull{_bond(figures.bond)}{_estimates(figures)}",
             file=table,
         )
-        for sentence in error_lines(promised, error, name != "fem"):
+        for sentence in format_errors(promised, error, name != "fem"):
             print(f"{'':11s} {sentence}", file=table)
         for sentence in (*broken, *against):
             print(f"{'':11s} {sentence}", file=table)
@@ -102,11 +108,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _tracking(args: argparse.Namespace, theatre: Theatre, table: TextIO) -> dict[str, object]:
     """Check the overlay on a synthetic video whose markers disappear and return."""
-    from ..tracked.drawn_film import drawn_film
-    from ..tracked.tracking_checks import measure_tracking, usual
+    from ..tracked.drawn_film import build_synthetic_video
+    from ..tracked.tracking_checks import build_default_pipeline, measure_tracking
 
-    film = drawn_film(theatre)
-    figures = measure_tracking(film, *usual(film, args.style))
+    film = build_synthetic_video(theatre)
+    figures = measure_tracking(film, *build_default_pipeline(film, args.style))
     broken = figures.broken()
     print(
         f"{TRACKING:11s} {'FAILS' if broken else 'passes'}  markers covered, pictures repeated, late and missing: "
@@ -121,10 +127,10 @@ def _tracking(args: argparse.Namespace, theatre: Theatre, table: TextIO) -> dict
 
 def _errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:
     """The largest of a scene's frames: what the model promises [m], and how far the tumour may be off."""
-    from ..play.frame_text import worst
+    from ..play.frame_text import find_worst
 
     promised = [frame.model_error for frame in frames if frame.model_error is not None]
-    return max(promised, default=None), worst([frame.tumour_error for frame in frames])
+    return max(promised, default=None), find_worst([frame.tumour_error for frame in frames])
 
 
 def _mm(metres: float | None) -> float | None:

@@ -9,10 +9,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from ..options.camera_options import add_camera, filmed
-from ..options.outputs import add_force, claimed
+from ..options.camera_options import add_camera, apply_camera_options
+from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_json, add_style
-from ..options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
+from ..options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,10 +32,10 @@ def run(args: argparse.Namespace) -> int:
 
     from ..episodes.episode import collect
 
-    out = claimed(args.out, ".h5", args.force, [args.anatomy, args.camera])
-    theatre = theatre_asked(args, args.scene)
-    scene = filmed(args, scene_asked(args, args.scene, theatre))
-    name = deformer_name(args, theatre, scene)
+    out = check_output_path(args.out, ".h5", args.force, [args.anatomy, args.camera])
+    theatre = build_requested_theatre(args, args.scene)
+    scene = apply_camera_options(args, build_requested_scene(args, args.scene, theatre))
+    name = choose_deformer(args, theatre, scene)
     player = replace(theatre.player(name, scene), style=args.style)
     total = len(scene.times)
     with tqdm(total=2 * total, unit="frame", desc="drawn", file=sys.stderr) as bar:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from sim.errors import InputError
-from sim.runtime.optional_packages import needed_from
+from sim.runtime.optional_packages import require_extra
 
-from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_json, json_line
+from ..options.outputs import add_force, check_output_path
+from ..options.shared_options import add_json, to_json_line
 
 FORMATS = ("lerobot", "robomimic", "folder", "xdmf", "card")
 
@@ -45,21 +45,21 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..episodes.reading.contents import read_contents
-    from ..episodes.reading.windows import episode_paths
+    from ..episodes.reading.windows import list_episode_paths
 
-    write = writer_of(args)
-    contents = [read_contents(path) for path in episode_paths(args.episodes)]
+    write = build_episode_writer(args)
+    contents = [read_contents(path) for path in list_episode_paths(args.episodes)]
     report = write(contents, progress=partial(tqdm, unit="episode", file=sys.stderr))
     said = f"{len(contents)} episodes written to {report['out']}"
     if args.to == "card":
         said = f"card of {len(contents)} episodes written to {report['out']}: {', '.join(report['files'])}"
     if report.get("points_only"):
         said += f"; the surfaces of {report['points_only']} are not known, so that they hold points alone"
-    print(json_line(report) if args.json else said)
+    print(to_json_line(report) if args.json else said)
     return 0
 
 
-def writer_of(args: argparse.Namespace) -> Callable[..., dict[str, Any]]:
+def build_episode_writer(args: argparse.Namespace) -> Callable[..., dict[str, Any]]:
     """Return the function that writes episodes in the requested format; its output path is free.
 
     Raises
@@ -80,12 +80,12 @@ def writer_of(args: argparse.Namespace) -> Callable[..., dict[str, Any]]:
     if args.to == "robomimic":
         from ..episodes.exports.robomimic import write_robomimic
 
-        out = claimed(args.out, ".hdf5", args.force, args.episodes)
+        out = check_output_path(args.out, ".hdf5", args.force, args.episodes)
         return partial(write_robomimic, path=out)
-    return partial(folder_writer(args.to), folder=args.out)
+    return partial(find_folder_writer(args.to), folder=args.out)
 
 
-def folder_writer(name: str) -> Callable[..., dict[str, Any]]:
+def find_folder_writer(name: str) -> Callable[..., dict[str, Any]]:
     """Return the function that writes a folder of this format.
 
     Raises
@@ -94,7 +94,7 @@ def folder_writer(name: str) -> Callable[..., dict[str, Any]]:
         LeRobot without the package that writes its tables.
     """
     if name == "lerobot":
-        with needed_from("data", "--to lerobot needs"):
+        with require_extra("data", "--to lerobot needs"):
             from ..episodes.exports.lerobot import write_lerobot
         return write_lerobot
     if name == "folder":

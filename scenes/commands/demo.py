@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
-from ..options.camera_options import add_camera, filmed
-from ..options.shared_options import add_address, add_style, addresses_of, say_addresses
-from ..options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
+from ..options.camera_options import add_camera, apply_camera_options
+from ..options.shared_options import add_address, add_style, list_addresses, print_addresses
+from ..options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
 
 if TYPE_CHECKING:
     from ..script.scene import Scene
@@ -52,20 +52,20 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{args.scene} is no scene. For a film or a camera of your own: {own}")
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
-    addresses_of(args)
+    list_addresses(args)
     find_device(args.device, LIVE.precision)
     # One thread for all kernels of the first image: each compilation reads Warp's headers first, for two seconds.
     kernels = ThreadPoolExecutor(1, "kernels")
     kernels.submit(load_kernels)
     from ar.page.guard import check_address
 
-    from .interrupt import until_ended
+    from .interrupt import run_until_ended
 
     try:
         check_address(args.host, args.port)
     except (OSError, ValueError) as error:
         raise InputError(f"no page on host {args.host}, port {args.port} ({error}): choose others.") from error
-    return until_ended(partial(play, args, kernels))
+    return run_until_ended(partial(play, args, kernels))
 
 
 def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitStack) -> int:
@@ -74,24 +74,24 @@ def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitSta
 
     from ..page.demo import Demo
 
-    theatre = theatre_asked(args, args.scene)
+    theatre = build_requested_theatre(args, args.scene)
 
     def asked(scene: str) -> Scene:
-        return filmed(args, scene_asked(args, scene, theatre))
+        return apply_camera_options(args, build_requested_scene(args, scene, theatre))
 
     scene = asked(args.scene)
-    name = deformer_name(args, theatre, scene)
+    name = choose_deformer(args, theatre, scene)
     anatomy = "the average of 152 healthy adults (ICBM 152)" if args.anatomy is None else args.anatomy.name
     try:
         demo = Demo(
             theatre, scene, name, args.host, args.port,
-            anatomy=anatomy, find=asked, style=args.style, origins=addresses_of(args),
+            anatomy=anatomy, find=asked, style=args.style, origins=list_addresses(args),
         )  # fmt: skip
     except UnguardedError as error:
         raise InputError(str(error)) from error
     closing.callback(demo.close)
     print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)
-    say_addresses(demo.browser)
+    print_addresses(demo.browser)
     print(f"{scene.name} by {theatre.described(name, scene)}")
     demo.busy.on("compiling; the next start finds it done")
     if name != "fem":

@@ -7,10 +7,10 @@ import json
 import sys
 from dataclasses import asdict
 
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 
 from ..options.shared_options import add_anatomy, add_device, add_json
-from ..options.theatre_options import add_trajectory, scene_asked
+from ..options.theatre_options import add_trajectory, build_requested_scene
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
 HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", "")
@@ -33,19 +33,19 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..play.deformers import open_theatre
-    from ..play.effect_ablation import rows
+    from ..play.effect_ablation import measure_effects
 
-    at_least("--every", args.every, 1)
+    check_at_least("--every", args.every, 1)
     theatre = open_theatre(args.anatomy, device=args.device, scenes=[args.scene])
-    scene = scene_asked(args, args.scene, theatre)
+    scene = build_requested_scene(args, args.scene, theatre)
     table = sys.stderr if args.json else sys.stdout
     who = theatre.described("fem", scene)
     print(f"{scene.name} by {who}: all effects together, then what each adds to the others\n", file=table)
     print(f"| {' | '.join(HEAD)} |\n|{'---|' * len(HEAD)}", file=table)
     found = []
-    count = 1 + len(scene.effects_on(theatre.anatomy))
+    count = 1 + len(scene.get_effects_on(theatre.anatomy))
     with tqdm(total=count, unit="effect", leave=False, file=sys.stderr) as bar:
-        for row in rows(theatre, scene, args.every):
+        for row in measure_effects(theatre, scene, args.every):
             found.append(row)
             figures = (row.milliseconds, row.held_mb, row.tumour_mm, row.cortex_mm)
             cells = ["" if figure is None else f"{figure:.2f}" for figure in figures]

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim.errors import InputError
-from sim.runtime.optional_packages import needed_from
+from sim.runtime.optional_packages import require_extra
 
-from ..options.outputs import claimed_folder
-from ..options.shared_options import add_json, add_seed, json_line
-from .interrupt import INTERRUPTED, terminated_as_interrupted
+from ..options.outputs import check_output_folder
+from ..options.shared_options import add_json, add_seed, to_json_line
+from .interrupt import INTERRUPTED, interrupt_on_termination
 
 if TYPE_CHECKING:
     from ..episodes.engine import ProgressListener, RunStatistics
@@ -85,7 +85,7 @@ def _plan(args: argparse.Namespace) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Make what is missing; 1 if an episode failed."""
-    out = claimed_folder(args.out, "episodes").absolute()
+    out = check_output_folder(args.out, "episodes").absolute()
     if args.slurm:
         return _print_script(args, out)
     from ..episodes.plan import load_plan
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     if args.estimate:
         return _print_estimate(args, plan, out)
     try:
-        with terminated_as_interrupted() as stop_if_asked:
+        with interrupt_on_termination() as stop_if_asked:
             return _made(args, plan, out, stop_if_asked)
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on in {out}", file=sys.stderr)
@@ -102,22 +102,24 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _made(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_if_asked: Callable[[], None]) -> int:
-    with needed_from("data", "sulcus episodes needs"):
-        from ..episodes.engine import make_all, still_missing
-    from ..episodes.make import body_of, make_body, make_episode
-    from ..episodes.run_folder import RunSettings, begin, finished, read_run, versions_here
+    with require_extra("data", "sulcus episodes needs"):
+        from ..episodes.engine import find_still_missing, make_all
+    from ..episodes.make import choose_body, make_body, make_episode
+    from ..episodes.run_folder import RunSettings, begin, get_versions, list_finished, read_run
     from ..episodes.tasks import RunWork
 
     before = read_run(out)
     device = before.device if before and args.device == "auto" else args.device
     with _workers(args, device) as workers:
-        run = RunSettings(plan.name, plan.digest, args.seed, workers.device, versions_here())
+        run = RunSettings(plan.name, plan.digest, args.seed, workers.device, get_versions())
         first_client = begin(out, run, plan.text, args.force)
-        found = finished(out)
-        there, missing = still_missing(out, found, range(args.first, args.first + args.count), first_client, args.again)
+        found = list_finished(out)
+        there, missing = find_still_missing(
+            out, found, range(args.first, args.first + args.count), first_client, args.again
+        )
         given = out, plan, args.seed
         work = RunWork(
-            partial(body_of, plan, args.seed),
+            partial(choose_body, plan, args.seed),
             partial(make_body, *given, device=workers.device),
             partial(make_episode, *given, device=workers.device),
         )
@@ -126,7 +128,7 @@ def _made(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_if_asked:
             tally = make_all(work, out, run, missing, workers, heard, there)
         seconds = time.perf_counter() - begun
         changed = tally != there
-        lacking = _card(out, finished(out) if changed else found, changed)
+        lacking = _card(out, list_finished(out) if changed else found, changed)
         _report(args, out, tally, seconds, workers.where, lacking is None and tally.made + tally.skipped > 0)
     if lacking is not None:
         print(lacking, file=sys.stderr)
@@ -146,17 +148,17 @@ def _card(out: Path, numbers: Set[int], changed: bool) -> str | None:
 def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Workers]:
     from dask.system import CPU_COUNT
 
-    from ..episodes.workers import own_workers, scheduled_workers
+    from ..episodes.workers import connect_workers, start_own_workers
 
     if args.scheduler:
-        return scheduled_workers(args.scheduler, device)
-    from sim.runtime.device import device_names, find_device
+        return connect_workers(args.scheduler, device)
+    from sim.runtime.device import find_device, parse_device_names
 
     if find_device(device, "float32").on_cuda:
-        cards = device_names("all")
+        cards = parse_device_names("all")
         count = args.workers or len(cards)
-        return own_workers([cards[number % len(cards)] for number in range(count)])
-    return own_workers(["cpu"] * (args.workers or CPU_COUNT))
+        return start_own_workers([cards[number % len(cards)] for number in range(count)])
+    return start_own_workers(["cpu"] * (args.workers or CPU_COUNT))
 
 
 @contextmanager
@@ -167,7 +169,7 @@ def _progress(
     from tqdm import tqdm
 
     from ..episodes.engine import BODY
-    from ..episodes.rates import written_rates
+    from ..episodes.rates import write_rates
     from ..episodes.tasks import TaskOutcome
 
     done, begun = there, time.perf_counter()
@@ -176,7 +178,7 @@ def _progress(
         "total": total, "initial": there.skipped + there.failed, "unit": "episode", "file": sys.stderr,
         "mininterval": pause, "maxinterval": pause, "smoothing": 0.05,
     }  # fmt: skip
-    with written_rates(out) as written, tqdm(**words) as bar:
+    with write_rates(out) as written, tqdm(**words) as bar:
 
         def heard(kind: str, outcome: TaskOutcome | None, workers: int) -> None:
             nonlocal done
@@ -198,10 +200,10 @@ def _progress(
 
 
 def _report(args: argparse.Namespace, out: Path, tally: RunStatistics, seconds: float, where: str, card: bool) -> None:
-    from ..episodes.bodies import models_of, said_of_weak, weak_as_json
-    from ..episodes.run_folder import failed, failure_of
+    from ..episodes.bodies import describe_weak, list_model_errors, to_weak_json
+    from ..episodes.run_folder import list_failed, read_failure
 
-    count, models = tally.failed + tally.lost, models_of(out)
+    count, models = tally.failed + tally.lost, list_model_errors(out)
     if args.json:
         said = {
             "out": str(out),
@@ -216,9 +218,9 @@ def _report(args: argparse.Namespace, out: Path, tally: RunStatistics, seconds: 
             "where": where,
             "card": card,
             "bodies_with_a_model": len(models),
-            "weak_bodies": weak_as_json(models),
+            "weak_bodies": to_weak_json(models),
         }
-        print(json_line(said))
+        print(to_json_line(said))
         return
     print(f"{out}: {tally.made + tally.skipped} of {args.count} episodes are there; {tally.made} were made now.")
     if tally.made:
@@ -226,20 +228,20 @@ def _report(args: argparse.Namespace, out: Path, tally: RunStatistics, seconds: 
             f"{tally.frames} frames, {tally.bytes / 1e6:.3g} MB in {seconds:.3g} s by {where}: "
             f"{tally.made / seconds:.3g} episodes and {tally.frames / seconds:.3g} frames a second."
         )
-    print("".join(f"{line}\n" for line in said_of_weak(models)), end="")
+    print("".join(f"{line}\n" for line in describe_weak(models)), end="")
     if count:
         print(
             f"{count} failed: {out / 'failed'} says why of each. {tally.lost} of them are tried again by the same "
             "command; with --again all are."
         )
-        number = min(failed(out).intersection(range(args.first, args.first + args.count)), default=0)
-        one = failure_of(out, number)
+        number = min(list_failed(out).intersection(range(args.first, args.first + args.count)), default=0)
+        one = read_failure(out, number)
         if one is not None:
             print(f"Episode {number}: {one.reason}")
 
 
 def _print_estimate(args: argparse.Namespace, plan: EpisodePlan, out: Path) -> int:
-    from ..episodes.estimate import estimated, lines
+    from ..episodes.estimate import compute_estimate, format_estimate
     from ..episodes.rates import read_rates
     from ..episodes.run_folder import read_run
 
@@ -247,18 +249,18 @@ def _print_estimate(args: argparse.Namespace, plan: EpisodePlan, out: Path) -> i
     if found is not None and found.digest != plan.digest:
         raise InputError(f"{out}: holds episodes of another plan, {found.plan}: choose another folder.")
     bodies = min(args.count, plan.contents.bodies.count)  # to draw a million would take minutes
-    estimate = estimated(read_rates(out), args.count, bodies)
+    estimate = compute_estimate(read_rates(out), args.count, bodies)
     if args.json:
         from dataclasses import asdict
 
-        print(json_line(asdict(estimate)))
+        print(to_json_line(asdict(estimate)))
     else:
-        print("\n".join(lines(estimate)))
+        print("\n".join(format_estimate(estimate)))
     return 0
 
 
 def _print_script(args: argparse.Namespace, out: Path) -> int:
-    from ..episodes.engine import sbatch_script
+    from ..episodes.engine import write_sbatch_script
 
     if args.device == "auto":
         raise InputError("--slurm needs to know what its machines have: give --device cpu, or --device cuda.")
@@ -266,5 +268,5 @@ def _print_script(args: argparse.Namespace, out: Path) -> int:
         raise InputError("--slurm gives each machine its workers: leave --workers and --scheduler out.")
     words = ["--count", args.count, "--seed", args.seed, "--first", args.first, "--out", out, "--device", args.device]
     command = [sys.executable, "-m", "scenes.cli", "episodes", _plan(args), *map(str, words)]
-    print(sbatch_script(command, args.slurm, args.device, f"sulcus-{Path(args.plan).stem}"), end="")
+    print(write_sbatch_script(command, args.slurm, args.device, f"sulcus-{Path(args.plan).stem}"), end="")
     return 0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sim.errors import InputError
 
-from ..options.outputs import add_force, claimed
+from ..options.outputs import add_force, check_output_path
 
 ENDING = ".model.npz"
 
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     from surrogate.model.store import load
     from surrogate.onnx_export.export import write_onnx
 
-    out = claimed(args.out, ".onnx", args.force)
+    out = check_output_path(args.out, ".onnx", args.force)
     if not args.model.is_file():
         raise InputError(f"{args.model}: no such file. Give a model of `sulcus train`.")
     mesh = args.anatomy

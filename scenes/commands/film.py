@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.errors import InputError
-from sim.runtime.atomic_files import REMEDY, why
+from sim.runtime.atomic_files import REMEDY, explain_error
 
-from ..options.camera_options import add_camera, filmed_with_targets
-from ..options.outputs import add_force, claimed, claimed_folder, claimed_frames
-from ..options.shared_options import add_json, add_seed, json_line
-from ..options.theatre_options import add_theatre, scene_asked, theatre_asked
+from ..options.camera_options import add_camera, film_with_targets
+from ..options.outputs import add_force, check_output_folder, check_output_frames, check_output_path
+from ..options.shared_options import add_json, add_seed, to_json_line
+from ..options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_seed(parser, "noise and of --registered")
     parser.add_argument(
-        "--trouble", type=trouble, action="append", default=[], metavar="KIND:FROM-TO",
+        "--trouble", type=parse_trouble, action="append", default=[], metavar="KIND:FROM-TO",
         help=f"disturbance between two times [s]: {', '.join(TROUBLES)}; repeatable",
     )  # fmt: skip
     parser.add_argument(
@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
-def trouble(text: str) -> tuple[str, float, float]:
+def parse_trouble(text: str) -> tuple[str, float, float]:
     """KIND:FROM-TO as a name and two times [s], for argparse."""
     found = re.fullmatch(r"(\w+):([\d.]+)-([\d.]+)", text)
     if found is None:
@@ -92,12 +92,12 @@ def run(args: argparse.Namespace) -> int:
         Input that cannot be read, output that cannot be written, numbers out of range.
     """
     from ..tracked.calibration_file import write_calibration, write_exactly_known
-    from ..tracked.filming import Taking, Trouble, mounted, registered, shots_of
+    from ..tracked.filming import Taking, Trouble, mount_targets, register_with_error, render_shots
     from ..tracked.registration_file import write_registration
     from ..tracked.tracked_tool import write_tool
     from ..tracked.truth import VideoGroundTruth, write_table, write_truth
 
-    at_least("--every", args.every, 1)
+    check_at_least("--every", args.every, 1)
     for name, value in (
         ("--blur", args.blur),
         ("--noise", args.noise),
@@ -107,22 +107,22 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"{name} {value:g}: give a number that is not below 0.")
     shift, turn = args.registered
     taking = Taking(args.blur, args.noise, tuple(Trouble(*each) for each in args.trouble), args.seed)
-    theatre = theatre_asked(args, args.scene)
+    theatre = build_requested_theatre(args, args.scene)
     scene = _scene(args, theatre)
-    if all("gap" in taking.happening(time) for time in scene.times[:: args.every].tolist()):
+    if all("gap" in taking.list_disturbances(time) for time in scene.times[:: args.every].tolist()):
         raise InputError("no picture would be taken: give --seconds and --trouble that leave some.")
     _demand_troubles(taking.troubles, scene.times[:: args.every])
     calibration = scene.viewpoint.calibration
     assert calibration is not None
-    folder = claimed_folder(args.out, "film and its truth")
-    paths = {name: claimed(folder / name, Path(name).suffix, args.force) for name in FILES}
+    folder = check_output_folder(args.out, "film and its truth")
+    paths = {name: check_output_path(folder / name, Path(name).suffix, args.force) for name in FILES}
     player = theatre.player(args.deformer or "fem", scene)
-    mounts = mounted(player)
+    mounts = mount_targets(player)
     shots: list[VideoFrame] = []
-    film = _write_film(args, shots_of(player, mounts, taking, args.every), shots, player)
+    film = _write_film(args, render_shots(player, mounts, taking, args.every), shots, player)
     write_calibration(paths["camera.yaml"], replace(calibration, name=f"sulcus film: {scene.name}"))
     write_exactly_known(paths["camera.json"], calibration)
-    write_registration(paths["registration.json"], registered(player.site, mounts, shift, turn, args.seed))
+    write_registration(paths["registration.json"], register_with_error(player.site, mounts, shift, turn, args.seed))
     write_tool(paths["tool.json"], mounts.tool)
     truth = VideoGroundTruth(
         player.site.anatomy.digest,
@@ -136,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
     moved = 1e3 * float(np.linalg.norm(truth.displacement, axis=2).mean(axis=1).max())
     report = {"scene": scene.name, "frames": len(shots), "film": str(film), "tumour_moves_mm": moved}
     said = f"{len(shots)} pictures of {scene.name}, in which the tumour moves by up to {moved:.2f} mm: {film}"
-    print(json_line(report) if args.json else said)
+    print(to_json_line(report) if args.json else said)
     return 0
 
 
@@ -152,7 +152,7 @@ def _demand_troubles(troubles: Sequence[Trouble], times: np.ndarray) -> None:
 
 def _scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
     """The scene as the camera sees it, and no longer than is asked for."""
-    scene = filmed_with_targets(args, scene_asked(args, args.scene, theatre))
+    scene = film_with_targets(args, build_requested_scene(args, args.scene, theatre))
     if args.readout is not None:
         view = scene.viewpoint
         assert view.calibration is not None
@@ -179,17 +179,17 @@ def _write_film(args: argparse.Namespace, taken: Iterator[VideoFrame], shots: li
     try:
         if not args.png:
             args.out.mkdir(parents=True, exist_ok=True)
-            film = claimed(args.out / "film.mp4", ".mp4", args.force)
+            film = check_output_path(args.out / "film.mp4", ".mp4", args.force)
             write_film(film, noted(), player.scene.frames_per_second / args.every)
             return film
-        frames = claimed_folder(args.out / "frames", "pictures")
-        for path in claimed_frames(frames, args.force):
+        frames = check_output_folder(args.out / "frames", "pictures")
+        for path in check_output_frames(frames, args.force):
             path.unlink()
         screen = Film(frames)
         for number, colour in enumerate(noted()):
             screen.show(number, colour)
         return frames
     except OSError as error:
-        raise InputError(f"{args.out}: the film cannot be written ({why(error)}). {REMEDY}") from error
+        raise InputError(f"{args.out}: the film cannot be written ({explain_error(error)}). {REMEDY}") from error
     except ValueError as error:
         raise InputError(str(error)) from error

@@ -13,11 +13,11 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.errors import InputError
 from sim.material import BRAIN
 
-from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_device, add_json, add_seed, json_line
-from ..options.tissue_options import add_region_argument, regions_of
-from .locate import rows_left_out
-from .locator import REGIONS, located_by
+from ..options.outputs import add_force, check_output_path
+from ..options.shared_options import add_device, add_json, add_seed, to_json_line
+from ..options.tissue_options import add_region_argument, assign_regions
+from .locate import describe_left_out
+from .locator import REGIONS, find_locator
 
 if TYPE_CHECKING:
     from surrogate.fitting.frame import Frame
@@ -65,18 +65,18 @@ def run(args: argparse.Namespace) -> int:
     from sim.runtime.device import find_device
     from surrogate.fitting.fit import fit_tissue
     from surrogate.fitting.frame import check_frames
-    from surrogate.fitting.tissue import save_tissue, tissue_path
-    from surrogate.fitting.weighing import unsupported
+    from surrogate.fitting.tissue import save_tissue, to_tissue_path
+    from surrogate.fitting.weighing import find_unsupported
 
-    out = claimed(args.out or tissue_path(args.anatomy), ".json", args.force, [args.anatomy, *args.frames])
+    out = check_output_path(args.out or to_tissue_path(args.anatomy), ".json", args.force, [args.anatomy, *args.frames])
     find_device(args.device, "float32")
     frames = _frames(args)
     anatomy = read_anatomy(args.anatomy)
     check_frames(anatomy, frames)  # bad frames need not wait for a locator
-    if TUMOUR_LABEL in regions_of(args.region, BRAIN, anatomy.mesh):
+    if TUMOUR_LABEL in assign_regions(args.region, BRAIN, anatomy.mesh):
         raise InputError("--region tumour: its stiffness is what `sulcus fit` finds. Give other regions alone.")
-    locator = located_by(args, anatomy, small=True)
-    left_out = unsupported(locator, frames)
+    locator = find_locator(args, anatomy, small=True)
+    left_out = find_unsupported(locator, frames)
     with tqdm(file=sys.stderr) as bar:
 
         def progress(stage: str, done: int, total: int) -> None:
@@ -88,10 +88,10 @@ def run(args: argparse.Namespace) -> int:
     save_tissue(out, tissue)
     shutil.rmtree(parts, ignore_errors=True)
     if args.json:
-        print(json_line({**_numbers(tissue, out), "outliers": [each.tolist() for each in left_out]}))
+        print(to_json_line({**_numbers(tissue, out), "outliers": [each.tolist() for each in left_out]}))
     else:
-        said = [f"Frame {n}: {rows_left_out(each)}" for n, each in enumerate(left_out, start=1) if len(each)]
-        print("\n".join([*said, *sentences(tissue, out)]))
+        said = [f"Frame {n}: {describe_left_out(each)}" for n, each in enumerate(left_out, start=1) if len(each)]
+        print("\n".join([*said, *format_fit(tissue, out)]))
     return 0
 
 
@@ -119,7 +119,7 @@ def _numbers(tissue: FittedTissue, out: Path) -> dict[str, object]:
     }
 
 
-def sentences(tissue: FittedTissue, out: Path) -> list[str]:
+def format_fit(tissue: FittedTissue, out: Path) -> list[str]:
     """Describe the fitted parameters, and those that are not determined."""
     low, middle, high = tissue.ratio
     lines = [
@@ -135,7 +135,7 @@ def sentences(tissue: FittedTissue, out: Path) -> list[str]:
     return [*lines, f"written: {out}"]
 
 
-def fitted_beside(path: Path | None, anatomy: Path, digest: str) -> FittedTissue | None:
+def find_fitted_tissue(path: Path | None, anatomy: Path, digest: str) -> FittedTissue | None:
     """Read the tissue from `path`, or from the file next to an anatomy; None if there is none.
 
     Raises
@@ -143,9 +143,9 @@ def fitted_beside(path: Path | None, anatomy: Path, digest: str) -> FittedTissue
     InputError
         As `load_tissue`; a requested file that is missing.
     """
-    from surrogate.fitting.tissue import load_tissue, tissue_path
+    from surrogate.fitting.tissue import load_tissue, to_tissue_path
 
     if path is not None and not path.is_file():
         raise InputError(f"{path}: no such file: make it by `sulcus fit`, or leave --tissue out.")
-    where = path or tissue_path(anatomy)
+    where = path or to_tissue_path(anatomy)
     return load_tissue(where, digest) if where.is_file() else None

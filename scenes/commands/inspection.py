@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL, region_name
+from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL, name_region
 from sim.bodies.dural_septa import SEPTA
 from sim.bodies.head_masks import NECROSIS, HeadMasks
 from sim.bodies.one_space import share_on
-from sim.bodies.placement import side_of
+from sim.bodies.placement import describe_side
 from sim.bodies.subject import Subject
 from sim.effects import Elasticity
 from sim.material import Tissue
 
-from ..options.tissue_options import stiffness_doubt
+from ..options.tissue_options import check_stiffness
 
 # [ml] Brains of adults, with their ventricles: beyond, a mask lacks a part or holds more than brain.
 SMALL, LARGE = 850.0, 2000.0
@@ -126,7 +126,7 @@ class Inspection:
         }
 
 
-def inspected(masks: HeadMasks, subject: Subject, regions: Mapping[int, Tissue]) -> Inspection:
+def inspect_subject(masks: HeadMasks, subject: Subject, regions: Mapping[int, Tissue]) -> Inspection:
     """Inspect `masks` and the `subject` in them, with tissues of regions by label."""
     affine = masks.affine
     edges, voxel = 1e3 * np.linalg.norm(affine[:3, :3], axis=0), 1e6 * abs(float(np.linalg.det(affine[:3, :3])))
@@ -135,22 +135,22 @@ def inspected(masks: HeadMasks, subject: Subject, regions: Mapping[int, Tissue])
     found = Inspection(
         brain=voxel * float(marked.sum()),
         tumour=1e6 * subject.tumour_volume,
-        pieces=tuple((1e6 * one.volume, side_of(one.centre, low, high)) for one in subject.pieces),
+        pieces=tuple((1e6 * one.volume, describe_side(one.centre, low, high)) for one in subject.pieces),
         parts={name: voxel * float(mask.sum()) for name, mask in masks.parts.items()},
         regions={
-            region_name(label): _tissue(label, regions)
+            name_region(label): _tissue(label, regions)
             for label in (TUMOUR_LABEL, *(part.label for part in subject.parts))
         },
         depth=1e3 * float(KDTree(subject.cortex).query(subject.interface)[0].min()),
         opening=tuple((1e3 * subject.site).tolist()),
-        place=side_of(subject.site, low, high),
+        place=describe_side(subject.site, low, high),
         distance=1e3 * float(np.linalg.norm(subject.interface - subject.site, axis=1).min()),
         voxel=tuple(edges.tolist()),
-        axes=axes_of(affine),
+        axes=describe_axes(affine),
         mirrored=bool(np.linalg.det(affine[:3, :3]) < 0.0),
         warnings=(),
     )
-    stiffness = (f"{region_name(label)}: {doubt}" for label, one in regions.items() if (doubt := stiffness_doubt(one)))
+    stiffness = (f"{name_region(label)}: {doubt}" for label, one in regions.items() if (doubt := check_stiffness(one)))
     return replace(found, warnings=(*subject.notes, *stiffness, *_warnings(found, subject)))
 
 
@@ -161,7 +161,7 @@ def _tissue(label: int, regions: Mapping[int, Tissue]) -> str:
     return f"as stiff as the {around}" if tissue is None else str(tissue)
 
 
-def axes_of(affine: np.ndarray) -> str:
+def describe_axes(affine: np.ndarray) -> str:
     """Three letters for where a volume's axes point, by its affine (4, 4) to RAS."""
     letters, taken = [], set()
     for column in affine[:3, :3].T / np.linalg.norm(affine[:3, :3], axis=0)[:, None]:

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from ar.page.slices import PLANES
 from sim.bodies.head_masks import HeadMasks
-from sim.bodies.signed_distance import gradient
+from sim.bodies.signed_distance import compute_gradient
 from sim.bodies.subject import Subject
 
 from .inspection import Inspection
@@ -88,7 +88,7 @@ class InspectionView:
         return found
 
 
-def sheet(found: Inspection, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
+def draw_inspection_sheet(found: Inspection, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
     """The sheet (H, W, 3) uint8; `opened` (n,) bool says which points of the subject's cortex are in the opening."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     centre = subject.pieces[0].centre
@@ -181,7 +181,7 @@ def _outside(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarr
     colour = np.tile(np.array(GROUND, float), (SIDE, SIDE, 1))
     there = seen >= 0
     places = subject.cortex[seen[there]]
-    normals = gradient(subject.brain, places, probe=cell)
+    normals = compute_gradient(subject.brain, places, probe=cell)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     light = np.clip(normals @ np.stack([right, -down, -inward], axis=1) @ LIGHT, 0.0, 1.0)
     base = np.where(opened[seen[there]][:, None], COLOURS["opening"], CORTEX)

@@ -30,7 +30,7 @@ class Ended(BaseException):
         self.code = CODES[signal.Signals(number)]
 
 
-def until_ended(work: Callable[[ExitStack], int]) -> int:
+def run_until_ended(work: Callable[[ExitStack], int]) -> int:
     """Return what `work` returns, once it has cleaned up; at a signal, clean up and leave the process at once.
 
     A thread of its own does the work: the main thread, which alone hears signals, is free to hear them while the work
@@ -50,7 +50,7 @@ def until_ended(work: Callable[[ExitStack], int]) -> int:
     try:
         for number in CODES:
             signal.signal(number, leave)
-        worker = threading.Thread(target=fulfil, args=(result, work, closing), name="work", daemon=True)
+        worker = threading.Thread(target=fulfil_work, args=(result, work, closing), name="work", daemon=True)
         worker.start()
         while worker.is_alive():
             worker.join(POLL)
@@ -70,7 +70,7 @@ def until_ended(work: Callable[[ExitStack], int]) -> int:
 
 
 @contextmanager
-def terminated_as_interrupted() -> Iterator[Callable[[], None]]:
+def interrupt_on_termination() -> Iterator[Callable[[], None]]:
     """Do at SIGTERM what Ctrl-C does: clean up, and end what was started.
 
     Python drops an error that a finaliser raises: a signal that comes while one runs is repeated after it. Long work
@@ -78,7 +78,7 @@ def terminated_as_interrupted() -> Iterator[Callable[[], None]]:
     """
     came, over = threading.Event(), threading.Event()
 
-    def hear(number: int, frame: FrameType | None) -> None:
+    def receive_input(number: int, frame: FrameType | None) -> None:
         came.set()
         if not _finalises(frame):
             raise KeyboardInterrupt
@@ -94,7 +94,7 @@ def terminated_as_interrupted() -> Iterator[Callable[[], None]]:
         yield stop_if_asked
         return
     main = threading.get_ident()
-    before = {number: signal.signal(number, hear) for number in CODES}
+    before = {number: signal.signal(number, receive_input) for number in CODES}
     try:
         yield stop_if_asked
     finally:
@@ -117,7 +117,7 @@ def leave(number: int, frame: FrameType | None) -> None:
     raise Ended(number)
 
 
-def fulfil(result: Future[int], work: Callable[[ExitStack], int], closing: ExitStack) -> None:
+def fulfil_work(result: Future[int], work: Callable[[ExitStack], int], closing: ExitStack) -> None:
     """Do the work, close, and note what came of it."""
     try:
         with closing:

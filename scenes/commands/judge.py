@@ -31,11 +31,11 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Loads at places that the models were trained on, or of another tissue or element.
     """
-    from sim.bodies.tip_distance import tip_gauge
+    from sim.bodies.tip_distance import build_tip_gauge
     from surrogate.data.dataset import read_dataset
-    from surrogate.data.tool_loads import refused_share, refused_words
-    from surrogate.evaluation.coverage import coverage, distance_coverage
-    from surrogate.evaluation.score import judged_force, score, table
+    from surrogate.data.tool_loads import compute_rejected_share, describe_rejected
+    from surrogate.evaluation.coverage import coverage, measure_distance_coverage
+    from surrogate.evaluation.score import compare_forces, format_scores, score
     from surrogate.model.store import load
 
     data = read_dataset(args.data)
@@ -58,16 +58,16 @@ def run(args: argparse.Namespace) -> int:
             )
     scores = [score(name, model, loads, truth, nodes) for name, model in models.items()]
     promised = {name: coverage(model, loads, truth) for name, model in models.items() if model.bounds is not None}
-    gauge = tip_gauge(data.anatomy)
+    gauge = build_tip_gauge(data.anatomy)
     distance = gauge.distances(loads, data.displacement(gauge.nodes)[data.good], gauge.nodes, data.tool)
     ranged = {
-        name: distance_coverage(model, loads, distance)
+        name: measure_distance_coverage(model, loads, distance)
         for name, model in models.items()
         if model.tip is not None and model.tip.bound is not None
     }
     reaction = data.reaction()
     forces = {
-        name: judged_force(model, loads, reaction[data.good, 0, :3])
+        name: compare_forces(model, loads, reaction[data.good, 0, :3])
         for name, model in models.items()
         if model.force is not None and reaction is not None
     }
@@ -77,11 +77,11 @@ def run(args: argparse.Namespace) -> int:
         covered, of_tip = ({name: asdict(found) for name, found in held.items()} for held in (promised, ranged))
         figures = {"scores": [asdict(row) for row in scores], "coverage": covered, "distance_coverage": of_tip}
         figures["force"] = {name: asdict(found) for name, found in forces.items()}
-        print(json.dumps({**figures, "motion_mm": motion, "nominal_refused": refused_share(preset)}))
+        print(json.dumps({**figures, "motion_mm": motion, "nominal_refused": compute_rejected_share(preset)}))
     else:
-        print(f"{len(loads)} loads, against the finite elements that answered them:\n{table(scores, motion)}")
-        if refused_words(preset):
-            print(refused_words(preset))
+        print(f"{len(loads)} loads, against the finite elements that answered them:\n{format_scores(scores, motion)}")
+        if describe_rejected(preset):
+            print(describe_rejected(preset))
         for name in models:
             for what, held in (("bounds", promised), ("bounds of the distance from tip to tumour", ranged)):
                 print(f"{name}: {what} held for {held[name]}" if name in held else f"{name}: states no {what}")
@@ -92,6 +92,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _physics(stated: Mapping[str, str]) -> dict[str, object]:
     """Return the properties that two bodies must share to be compared: tissue, with that of regions, and element."""
-    from surrogate.data.answer_rows import BRAIN, stated_tissue
+    from surrogate.data.answer_rows import BRAIN, read_tissue_statement
 
-    return {"tissue": stated_tissue(stated) if BRAIN in stated else None, "element": stated.get("element")}
+    return {"tissue": read_tissue_statement(stated) if BRAIN in stated else None, "element": stated.get("element")}

@@ -18,9 +18,15 @@ import numpy as np
 from sim.errors import InputError
 
 from ..options.shared_options import add_device
-from ..options.tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
-from ..tracked.tracked_scene import mover, tracked_scene
-from .interrupt import until_ended
+from ..options.tissue_options import (
+    AS_LEARNED,
+    add_element_argument,
+    add_skull_argument,
+    add_tissue_arguments,
+    apply_tissue_options,
+)
+from ..tracked.tracked_scene import build_mover, build_tracked_scene
+from .interrupt import run_until_ended
 
 if TYPE_CHECKING:
     from ..link.heard import TransformNames
@@ -120,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--tracking-mm {args.tracking_mm:g}: give millimetres, 0 to 100.")
     if not 0 <= args.port < 1 << 16:
         raise InputError(f"--port {args.port}: give a port from 0 to 65535.")
-    names = names_of(args)
+    names = parse_names(args)
     for option, name in zip(NAMES, (names.tool, names.reference, names.camera, names.registration), strict=True):
         if not (name.strip() and name.isascii() and name.isprintable()):
             raise InputError(f"{option} {name!r}: must be of printable ASCII characters.")
@@ -129,23 +135,23 @@ def run(args: argparse.Namespace) -> int:
     if args.host not in ("127.0.0.1", "localhost", "::1"):
         said = "OpenIGTLink asks for no password: whoever reaches this address may move the tumour that all see"
         print(f"sulcus link: {said}", file=sys.stderr)
-    source = None if args.client is None else address_of(args.client)
+    source = None if args.client is None else parse_address(args.client)
     if source is not None and source[1] == args.port and is_here(source[0], args.host):
         raise InputError(
             f"--client {args.client}: port {args.port} of this machine is the one that is served here. Give --port "
             f"another one, as --port {args.port % 65535 + 1}, or give --client the port of the other server."
         )
-    return until_ended(partial(_linked, args, source))
+    return run_until_ended(partial(_linked, args, source))
 
 
-def names_of(args: argparse.Namespace) -> TransformNames:
+def parse_names(args: argparse.Namespace) -> TransformNames:
     """Names of the transforms that are received."""
     from ..link.heard import TransformNames
 
     return TransformNames(args.tool_name, args.reference_name, args.camera_name, args.registration_name)
 
 
-def address_of(text: str) -> tuple[str, int]:
+def parse_address(text: str) -> tuple[str, int]:
     """Host and port of `HOST[:PORT]`, `[IPv6]:PORT` or an IPv6 address alone.
 
     Raises
@@ -195,17 +201,17 @@ def _is_own(family: int, address: tuple) -> bool:
 
 
 def _linked(args: argparse.Namespace, source: tuple[str, int] | None, closing: ExitStack) -> int:
-    from ..link.console import address_words
+    from ..link.console import format_address
 
     over = threading.Event()
 
     async def work() -> None:
-        session = opened(args)
+        session = open_link(args)
         closing.callback(over.wait, FAREWELL)
         closing.callback(session.end)
         ready = asyncio.get_running_loop().create_future()
         ready.add_done_callback(
-            lambda port: print(f"sulcus: serves {address_words(args.host, port.result())} (Ctrl-C ends)", flush=True)
+            lambda port: print(f"sulcus: serves {format_address(args.host, port.result())} (Ctrl-C ends)", flush=True)
         )
         await session.serve(args.host, args.port, args.seconds, ready, source)
 
@@ -218,7 +224,7 @@ def _linked(args: argparse.Namespace, source: tuple[str, int] | None, closing: E
     return 0
 
 
-def opened(args: argparse.Namespace) -> LinkSession:
+def open_link(args: argparse.Namespace) -> LinkSession:
     """The link that the arguments ask for; in an event loop.
 
     Raises
@@ -231,14 +237,14 @@ def opened(args: argparse.Namespace) -> LinkSession:
     from sim.runtime.device import find_device
 
     from ..link.answer import PoseResponder
-    from ..link.console import limited, printed
+    from ..link.console import limit_rate, print_safely
     from ..link.heard import ReceivedTransforms
     from ..link.outgoing import Outgoing
     from ..link.session import LinkSession, OverlayCamera
     from ..play.deformers import open_theatre
     from ..tracked.calibration_file import read_calibration
     from ..tracked.picture import Painter
-    from ..tracked.registration_file import other_mesh, read_registration
+    from ..tracked.registration_file import describe_other_mesh, read_registration
     from ..tracked.tool_motion import ToolMotion
     from ..tracked.tracked_tool import read_tool
 
@@ -249,15 +255,15 @@ def opened(args: argparse.Namespace) -> LinkSession:
     said = (
         f"a {args.registration_name} that is sent does not say whose registration it is"
         if registration is None
-        else other_mesh(registration, theatre.anatomy, str(args.registration))
+        else describe_other_mesh(registration, theatre.anatomy, str(args.registration))
     )
     if registration is None or registration.scanned is None:
         said += ". Every answer is doubtful: give --registration with a file of `sulcus register --anatomy`"
     if said:
         print(f"sulcus link: {said}", file=sys.stderr)
     tool = tool or _tool_of(theatre, args.anatomy)
-    scene = dressed(args, tracked_scene(args, tool.shape), theatre)
-    deformer, who = mover(args, theatre, scene, True)
+    scene = apply_tissue_options(args, build_tracked_scene(args, tool.shape), theatre)
+    deformer, who = build_mover(args, theatre, scene, True)
     stage, tracking = theatre.stage(scene), 1e-3 * args.tracking_mm
     eye = None
     if calibration is not None:
@@ -275,8 +281,10 @@ def opened(args: argparse.Namespace) -> LinkSession:
             f"{np.ceil(3.0 * seconds):.0f}, or a model of the tool's poses",
             file=sys.stderr,
         )
-    heard = ReceivedTransforms(names_of(args), args.stale)
-    return LinkSession(answering, Outgoing(stage, registration is not None), heard, eye, args.clients, limited(printed))
+    heard = ReceivedTransforms(parse_names(args), args.stale)
+    return LinkSession(
+        answering, Outgoing(stage, registration is not None), heard, eye, args.clients, limit_rate(print_safely)
+    )
 
 
 def _tool_of(theatre: Theatre, path: Path) -> TrackedTool:

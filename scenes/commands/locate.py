@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim.anatomy import region_name
-from sim.arguments import at_least
+from sim.anatomy import name_region
+from sim.arguments import check_at_least
 
-from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_device, add_json, add_seed, json_line
+from ..options.outputs import add_force, check_output_path
+from ..options.shared_options import add_device, add_json, add_seed, to_json_line
 from ..options.tissue_options import add_region_argument
-from .locator import REGIONS, located_by
+from .locator import REGIONS, find_locator
 
 if TYPE_CHECKING:
     from surrogate.locating.locator import Location
@@ -67,18 +67,18 @@ def run(args: argparse.Namespace) -> int:
     """Locate the tumour. 0: done; what fits no cause is bad input."""
     from sim.bodies.meshfile import read_anatomy, write_mesh
     from sim.runtime.device import find_device
-    from surrogate.locating.observation import placed
+    from surrogate.locating.observation import to_evidence
     from surrogate.locating.observed_files import read_observation
 
-    out = None if args.out is None else claimed(args.out, ".vtu", args.force, [args.anatomy])
-    at_least("--seed", args.seed, 0)
+    out = None if args.out is None else check_output_path(args.out, ".vtu", args.force, [args.anatomy])
+    check_at_least("--seed", args.seed, 0)
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
     observation = replace(
         read_observation(args.observed, args.tool), rigid=1e-3 * args.rigid, checked=args.registration_checked
     )
-    placed(anatomy, observation)  # reject points that cannot be placed before the locator is loaded
-    locator = located_by(args, anatomy, small=out is None)
+    to_evidence(anatomy, observation)  # reject points that cannot be placed before the locator is loaded
+    locator = find_locator(args, anatomy, small=out is None)
     found = locator.locate(observation)
     if out is not None:
         every = np.arange(len(anatomy.mesh.nodes))
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         }
         write_mesh(out, anatomy.mesh, fields, "RAS")
     if args.json:
-        print(json_line(_numbers(found, len(observation.now), locator.regions, out)))
+        print(to_json_line(_numbers(found, len(observation.now), locator.regions, out)))
     else:
         print(_sentences(found, out))
     return 0
@@ -114,7 +114,7 @@ def _numbers(found: Location, points: int, regions: tuple[Region, ...], out: Pat
         "slipped": found.slipped,
         "calibrated": found.calibrated,
         "warnings": _warnings(found),
-        "regions": {region_name(one.label): one.ratio for one in regions},
+        "regions": {name_region(one.label): one.ratio for one in regions},
         "milliseconds": 1e3 * found.seconds,
         "of": "the tumour, as far as the causes that were tried go; not of a model",
         "out": None if out is None else str(out),
@@ -140,11 +140,11 @@ def _warnings(found: Location) -> list[str]:
     if found.slipped:
         said.append("If it was checked, say so by --registration-checked.")
     if len(found.outliers):
-        said.append(rows_left_out(found.outliers))
+        said.append(describe_left_out(found.outliers))
     return said + [f"Left out, as the points do not support it: tip {number + 1}." for number in found.tips_left_out]
 
 
-def rows_left_out(numbers: np.ndarray) -> str:
+def describe_left_out(numbers: np.ndarray) -> str:
     """Describe which rows of a file were excluded, by the numbers (k,) of their points from 0."""
     rows = ", ".join(str(number + 2) for number in numbers[:20]) + (" ..." if len(numbers) > 20 else "")
     return f"Left out, off the open cortex or without support by other points: rows {rows} of the file."

@@ -10,13 +10,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.errors import InputError
 from sim.material import BRAIN
 
-from ..options.outputs import add_force, claimed
+from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_device, add_json, add_seed
-from ..options.tissue_options import AS_LEARNED, add_region_argument, regions_of
+from ..options.tissue_options import AS_LEARNED, add_region_argument, assign_regions
 
 if TYPE_CHECKING:
     from sim.anatomy import Anatomy
@@ -49,25 +49,25 @@ def run(args: argparse.Namespace) -> int:
     """Make the locator. 0: done."""
     from sim.bodies.meshfile import read_anatomy
     from sim.runtime.device import find_device
-    from surrogate.locating.locator_store import locator_path, save_locator
-    from surrogate.locating.regions import regions_words
+    from surrogate.locating.locator_store import save_locator, to_locator_path
+    from surrogate.locating.regions import describe_regions
 
-    path = claimed(args.out or locator_path(args.anatomy), ".npz", args.force, [args.anatomy])
-    at_least("--seed", args.seed, 0)
+    path = check_output_path(args.out or to_locator_path(args.anatomy), ".npz", args.force, [args.anatomy])
+    check_at_least("--seed", args.seed, 0)
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
-    locator = made(path, anatomy, args.seed, args.device, regions_known(args, anatomy))
+    locator = make_with_progress(path, anatomy, args.seed, args.device, list_regions_known(args, anatomy))
     save_locator(path, locator.small() if args.small else locator)
     forget_parts(path)
     size = path.stat().st_size
     written = {"out": str(path), "shapes": len(locator.prior.shape), "bytes": size, "whole": not args.small}
     written["regions"] = [asdict(one) for one in locator.regions]
-    beside = f"; knows {words}" if (words := regions_words(locator.regions)) else ""
+    beside = f"; knows {words}" if (words := describe_regions(locator.regions)) else ""
     print(json.dumps(written) if args.json else f"written: {path}, {size / 1e6:.1f} MB{beside}")
     return 0
 
 
-def made(path: Path, anatomy: Anatomy, seed: int, device: str, regions: tuple[Region, ...]) -> Locator:
+def make_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, regions: tuple[Region, ...]) -> Locator:
     """Make a locator, with a bar of progress; parts that an interrupted run left next to `path` are reused."""
     from tqdm import tqdm
 
@@ -84,7 +84,7 @@ def made(path: Path, anatomy: Anatomy, seed: int, device: str, regions: tuple[Re
         return make_locator(anatomy, seed, device, Causes(regions=regions), folder=_parts(path), progress=progress)
 
 
-def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) -> Locator:
+def find_locator(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) -> Locator:
     """Load the locator next to the anatomy, or make one; it covers every vertex, unless it may be `small`.
 
     Raises
@@ -92,15 +92,15 @@ def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) 
     InputError
         As `load_locator`; a small one; one of other regions than those requested.
     """
-    from surrogate.locating.locator_store import load_locator, locator_path, save_locator
-    from surrogate.locating.regions import regions_words
+    from surrogate.locating.locator_store import load_locator, save_locator, to_locator_path
+    from surrogate.locating.regions import describe_regions
 
-    path = args.locator or locator_path(args.anatomy)
+    path = args.locator or to_locator_path(args.anatomy)
     if path.is_file():
         locator = load_locator(path, anatomy)
-        if args.region and locator.regions != regions_known(args, anatomy):
+        if args.region and locator.regions != list_regions_known(args, anatomy):
             raise InputError(
-                f"{path}: knows other regions than --region says ({regions_words(locator.regions) or 'none'}). Leave "
+                f"{path}: knows other regions than --region says ({describe_regions(locator.regions) or 'none'}). Leave "
                 "--region out, or name another file by --locator: one that knows them is made there."
             )
         if locator.prior.nodes is not None and not small:
@@ -109,32 +109,32 @@ def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) 
                 "tumour alone, or name another file by --locator: a whole one is made there."
             )
         return locator
-    path = claimed(path, ".npz", args.force)
-    locator = made(path, anatomy, args.seed, args.device, regions_known(args, anatomy))
+    path = check_output_path(path, ".npz", args.force)
+    locator = make_with_progress(path, anatomy, args.seed, args.device, list_regions_known(args, anatomy))
     save_locator(path, locator)
     forget_parts(path)
     return locator
 
 
-def regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Region, ...]:
+def list_regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Region, ...]:
     """Return the regions of --region; without it, those with a tissue in the models next to the anatomy.
 
     Raises
     ------
     InputError
-        As `regions_of` and `known_regions`; a statement that is no tissue.
+        As `assign_regions` and `list_known_regions`; a statement that is no tissue.
     """
     from sim.effects import Elasticity
-    from surrogate.locating.regions import known_regions
-    from surrogate.model.store import learned_tissue
+    from surrogate.locating.regions import list_known_regions
+    from surrogate.model.store import read_learned_tissue
 
-    from ..play.deformers import model_path
+    from ..play.deformers import to_model_path
 
     if args.region:
-        return known_regions(Elasticity(BRAIN, regions_of(args.region, BRAIN, anatomy.mesh)))
-    models = model_path(Path(args.anatomy))
-    learned = learned_tissue(models, anatomy) if models.is_file() else None
-    return known_regions(learned) if learned is not None else ()
+        return list_known_regions(Elasticity(BRAIN, assign_regions(args.region, BRAIN, anatomy.mesh)))
+    models = to_model_path(Path(args.anatomy))
+    learned = read_learned_tissue(models, anatomy) if models.is_file() else None
+    return list_known_regions(learned) if learned is not None else ()
 
 
 def forget_parts(path: Path) -> None:

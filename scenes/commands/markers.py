@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from ..options.outputs import add_force, claimed
+from ..options.outputs import add_force, check_output_path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,20 +29,20 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Files of those names that `sulcus markers` did not write, or a folder that cannot be written to.
     """
-    from ar.tracking.pages import DPI, listed_targets, pdf_bytes, png_bytes, printed_pages
-    from sim.runtime.atomic_files import written_whole
+    from ar.tracking.pages import DPI, build_printed_pages, describe_targets, to_pdf, to_png
+    from sim.runtime.atomic_files import write_atomically
 
-    pages = printed_pages()
-    pictures = [claimed(args.out / f"{page.name}.png", ".png", args.force) for page in pages]
-    book = claimed(args.out / "markers.pdf", ".pdf", args.force)
-    table = claimed(args.out / "targets.json", ".json", args.force)
+    pages = build_printed_pages()
+    pictures = [check_output_path(args.out / f"{page.name}.png", ".png", args.force) for page in pages]
+    book = check_output_path(args.out / "markers.pdf", ".pdf", args.force)
+    table = check_output_path(args.out / "targets.json", ".json", args.force)
     contents = {
-        book: pdf_bytes(pages),
-        **{path: png_bytes(page) for path, page in zip(pictures, pages, strict=True)},
-        table: (json.dumps(listed_targets(), indent=1) + "\n").encode(),
+        book: to_pdf(pages),
+        **{path: to_png(page) for path, page in zip(pictures, pages, strict=True)},
+        table: (json.dumps(describe_targets(), indent=1) + "\n").encode(),
     }
     for path, content in contents.items():
-        with written_whole(path, path.suffix) as partial:
+        with write_atomically(path, path.suffix) as partial:
             partial.write_bytes(content)
     print(f"{book}: {len(pages)} pages of A4, also as PNG of {DPI:.0f} dpi; what is on them: {table}")
     print("Print at 100 %, then measure the rulers: each must be 100 mm long.")

@@ -15,23 +15,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import REMEDY, why
+from sim.runtime.atomic_files import REMEDY, explain_error
 
-from ..options.outputs import add_force, claimed
-from ..options.poses_options import add_poses, demand_poses, elsewhere_of
+from ..options.outputs import add_force, check_output_path
+from ..options.poses_options import add_poses, check_pose_options, open_external_tracker
 from ..options.shared_options import (
     add_address,
     add_device,
     add_json,
     add_style,
-    addresses_of,
-    json_line,
-    say_addresses,
+    list_addresses,
+    print_addresses,
+    to_json_line,
 )
 from ..options.theatre_options import add_bodies
-from ..options.tissue_options import AS_LEARNED, add_element_argument, add_skull_argument, add_tissue_arguments, dressed
-from ..tracked.tracked_scene import REST, mover, tracked_scene
-from .interrupt import until_ended
+from ..options.tissue_options import (
+    AS_LEARNED,
+    add_element_argument,
+    add_skull_argument,
+    add_tissue_arguments,
+    apply_tissue_options,
+)
+from ..tracked.tracked_scene import REST, build_mover, build_tracked_scene
+from .interrupt import run_until_ended
 
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
@@ -121,30 +127,32 @@ def run(args: argparse.Namespace) -> int:
         Files that cannot be read, written, or do not belong together; images of another size than the camera's.
     """
     from ..tracked.run import write_rows
-    from ..tracked.truth import off, read_truth, summary
+    from ..tracked.truth import compute_overlay_error, read_truth, summarise_errors
 
     camera = args.pictures.isdecimal() and not Path(args.pictures).exists()
     if not 0.0 < args.rate < np.inf:
         raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")
     if camera or args.page:
-        return until_ended(partial(_served, args, camera))
+        return run_until_ended(partial(_served, args, camera))
     inputs = [args.pictures, args.camera, args.registration, args.tool, args.anatomy, args.truth, args.covered]
     inputs += [*(args.poses or ()), args.hand_eye, args.camera_poses]
-    demand_poses(args)
+    check_pose_options(args)
     out = None if args.out is None else _film_path(args.out, args.force, inputs)
-    table = None if args.table is None else claimed(args.table, ".csv", args.force, inputs)
+    table = None if args.table is None else check_output_path(args.table, ".csv", args.force, inputs)
     parts = _parts(args, film=True)
     stage = parts.painter.stage
     truth = None
     if args.truth is not None:
         truth = read_truth(args.truth, stage.anatomy.digest, len(stage.tumour_vertices))
     shown = _played(args, parts, out)
-    errors = [None if truth is None else off(each.known, truth, parts.calibration, stage) for each in shown]
+    errors = [
+        None if truth is None else compute_overlay_error(each.known, truth, parts.calibration, stage) for each in shown
+    ]
     if table is not None:
         write_rows(table, shown, errors)
     report = _report(shown, parts.who)
     if truth is not None:
-        report["off"] = summary([each.known for each in shown], errors)
+        report["off"] = summarise_errors([each.known for each in shown], errors)
     return _ended(args, report, shown, out, table)
 
 
@@ -158,10 +166,10 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
     given = [name for name, value in (films | {"--live": args.live or None}).items() if value is not None]
     if given:
         raise InputError(f"{', '.join(given)}: for films without a page. Leave it out here.")
-    addresses_of(args)
+    list_addresses(args)
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
-    table = None if args.table is None else claimed(args.table, ".csv", args.force, [args.camera])
+    table = None if args.table is None else check_output_path(args.table, ".csv", args.force, [args.camera])
     try:
         check_address(HOST, args.port)
         parts = _parts(args, film=not camera)
@@ -176,15 +184,17 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
 
 
 def _camera_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
-    from ar.tracking.live_camera import camera_pictures, newest, opened
+    from ar.tracking.live_camera import open_camera, read_camera_images, read_newest
 
     from ..tracked.follower import GAP
 
-    again = partial(opened, int(args.pictures), parts.calibration.width, parts.calibration.height)
+    again = partial(open_camera, int(args.pictures), parts.calibration.width, parts.calibration.height)
     name, source = f"camera {args.pictures}", again()
     if not source.isOpened():
         raise InputError(f"{name} cannot be opened: plug it in, see that no other program has it, and give its number.")
-    return _page(args, parts, closing, name).watch(newest(camera_pictures(source, name, again), GAP), args.seconds)
+    return _page(args, parts, closing, name).watch(
+        read_newest(read_camera_images(source, name, again), GAP), args.seconds
+    )
 
 
 def _film_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
@@ -197,10 +207,10 @@ def _film_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> l
 def _page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name: str, frames: int = 0) -> OverlayPage:
     from ..tracked.page import OverlayPage
 
-    page = OverlayPage(parts.follower, parts.painter, name, parts.who, HOST, args.port, frames, addresses_of(args))
+    page = OverlayPage(parts.follower, parts.painter, name, parts.who, HOST, args.port, frames, list_addresses(args))
     closing.callback(page.close)
     print(f"sulcus: open {page.browser.address} (Ctrl-C ends); motion by {parts.who}", flush=True)
-    say_addresses(page.browser)
+    print_addresses(page.browser)
     return page
 
 
@@ -209,14 +219,14 @@ def _ended(
 ) -> int:
     """Print the summary of a run; return 1 if the tumour position is reliable in no frame."""
     report |= {"out": None if out is None else str(out), "table": None if table is None else str(table)}
-    print(json_line(report) if args.json else _words(report))
+    print(to_json_line(report) if args.json else _words(report))
     return 0 if any(each.known.relied for each in shown) else 1
 
 
 def _film_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path:
     if path.suffix not in FILMS:
         raise InputError(f"{path}: films are written as {', '.join(FILMS)}; give a name that ends so.")
-    return claimed(path, path.suffix, force, inputs)
+    return check_output_path(path, path.suffix, force, inputs)
 
 
 def _parts(args: argparse.Namespace, film: bool) -> Parts:
@@ -227,10 +237,10 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
 
     from ..play.deformers import open_theatre
     from ..tracked.calibration_file import read_calibration, read_intrinsic_covariance
-    from ..tracked.film_camera import demand_film
+    from ..tracked.film_camera import check_video
     from ..tracked.follower import Follower
     from ..tracked.picture import Painter
-    from ..tracked.registration_file import other_mesh, read_registration
+    from ..tracked.registration_file import describe_other_mesh, read_registration
     from ..tracked.tool_motion import ToolMotion
     from ..tracked.tracked_tool import read_tool
 
@@ -244,16 +254,16 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     if intrinsic is None:
         print(f"sulcus overlay: {UNSTATED.format(Path(args.camera).with_suffix('.json'))}", file=sys.stderr)
     if film:
-        demand_film(Path(args.pictures), args.rate, calibration, args.camera)
+        check_video(Path(args.pictures), args.rate, calibration, args.camera)
     tool = None if args.tool is None else read_tool(args.tool)
-    elsewhere = elsewhere_of(args, calibration)
+    elsewhere = open_external_tracker(args, calibration)
     theatre = open_theatre(args.anatomy, args.model, args.device)
-    said = other_mesh(registration, theatre.anatomy, args.registration)
+    said = describe_other_mesh(registration, theatre.anatomy, args.registration)
     if said:
         print(f"sulcus overlay: {said}", file=sys.stderr)
-    scene = dressed(args, tracked_scene(args, None if tool is None else tool.shape), theatre)
+    scene = apply_tissue_options(args, build_tracked_scene(args, None if tool is None else tool.shape), theatre)
     stage = theatre.stage(scene)
-    deformer, who = mover(args, theatre, scene, tool is not None)
+    deformer, who = build_mover(args, theatre, scene, tool is not None)
     motion = ToolMotion(stage, deformer)
     device = find_device(args.device, LIVE.precision).name
     load_kernels(device)
@@ -264,17 +274,17 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
 def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:
     """Draw all frames, into a video if requested; return them without their colours."""
     from ar.screen import write_film
-    from ar.tracking.pictures import film_of, rate_of
+    from ar.tracking.pictures import measure_rate, read_video
 
-    from ..tracked.run import overlaid, timed
+    from ..tracked.run import draw_overlay, read_timed
 
     shown: list[Shown] = []
 
     def pictures() -> Iterator[np.ndarray]:
-        masks = None if args.covered is None else film_of(args.covered, args.rate)
-        film = timed(film_of(Path(args.pictures), args.rate, colour=True), masks)
-        for each in overlaid(film, parts.follower, parts.painter, args.live):
-            shown.append(each.without_picture())
+        masks = None if args.covered is None else read_video(args.covered, args.rate)
+        film = read_timed(read_video(Path(args.pictures), args.rate, colour=True), masks)
+        for each in draw_overlay(film, parts.follower, parts.painter, args.live):
+            shown.append(each.drop_image())
             yield each.colour
 
     try:
@@ -282,17 +292,17 @@ def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Sh
             for _ in pictures():
                 pass
         else:
-            write_film(out, pictures(), rate_of(Path(args.pictures)) or args.rate)
+            write_film(out, pictures(), measure_rate(Path(args.pictures)) or args.rate)
     except ValueError as error:
         raise InputError(str(error)) from error
     except OSError as error:
-        raise InputError(f"{out}: cannot be written ({why(error)}). {REMEDY}") from error
+        raise InputError(f"{out}: cannot be written ({explain_error(error)}). {REMEDY}") from error
     return shown
 
 
 def _report(shown: list[Shown], who: str) -> dict[str, object]:
     """Summarise a run for JSON."""
-    from ..tracked.run import latencies
+    from ..tracked.run import summarise_latencies
 
     count = len(shown)
     states = Counter(each.known.state.value for each in shown)
@@ -302,7 +312,7 @@ def _report(shown: list[Shown], who: str) -> dict[str, object]:
         "reference_seen_percent": 100.0 * sum(each.known.seen == each.known.time for each in shown) / count,
         "tool_seen_percent": 100.0 * sum(each.known.T_scan_tool is not None for each in shown) / count,
         "states": dict(states.most_common()),
-        "latency": latencies(shown),
+        "latency": summarise_latencies(shown),
     }
 
 

@@ -12,24 +12,29 @@ from datetime import datetime
 from pathlib import Path
 
 from sim.anatomy import PART_LABELS, REGION_NAMES
-from sim.bodies.head_masks import head_masks
-from sim.bodies.label_volume import masked_subject
-from sim.bodies.subject import MeshPlan, opened_cortex
+from sim.bodies.head_masks import read_head_masks
+from sim.bodies.label_volume import build_masked_subject
+from sim.bodies.subject import MeshPlan, find_opened_cortex
 from sim.elements import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS, Tissue
-from sim.runtime.atomic_files import written_whole
-from sim.runtime.journal import opened as opened_journal
-from sim.runtime.partial_files import unfinished_path
-from sim.runtime.timing import listened
+from sim.runtime.atomic_files import write_atomically
+from sim.runtime.journal import open_journal as opened_journal
+from sim.runtime.partial_files import to_unfinished_path
+from sim.runtime.timing import listen_to_stages
 from surrogate.data.splits import APART, FEWEST
 from surrogate.data.tool_loads import PRESETS
 
-from ..options.outputs import add_force, claimed
-from ..options.placement_options import add_opening_arguments, opened, opening_words, trajectory_given
+from ..options.outputs import add_force, check_output_path
+from ..options.placement_options import (
+    add_opening_arguments,
+    get_trajectory_option,
+    place_craniotomy,
+    to_opening_options,
+)
 from ..options.shared_options import add_devices, add_json
-from ..options.subject_options import add_label_arguments, label_words, regions_asked, sources_of
-from ..options.tissue_options import OWN, add_element_argument, add_region_argument, regions_of
+from ..options.subject_options import add_label_arguments, label_words, parse_regions, parse_sources
+from ..options.tissue_options import OWN, add_element_argument, add_region_argument, assign_regions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,36 +86,36 @@ def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; the same command resumes an interrupted run."""
     # Report problems now, not after minutes of reading and meshing.
     plan = MeshPlan(args.nodes, 1e-3 * args.craniotomy, fine_opening=args.fine_opening)
-    regions = regions_of(args.region, replace(BRAIN, law=args.material))
+    regions = assign_regions(args.region, replace(BRAIN, law=args.material))
     strange = set(regions) - set(REGION_NAMES.values())
     if strange:
         raise InputError(f"--region {min(strange)}: a patient has no such region. Choose from {', '.join(OWN)}.")
     # A part of another stiffness must be a region.
     args.regions = (*args.regions, *(name for name, label in PART_LABELS.items() if label in regions))
-    note = unfinished_path(args.out)
+    note = to_unfinished_path(args.out)
     resumed = note.exists() and not args.force
-    claimed(args.out, ".vtu", args.force, _inputs(args), resumed or args.inspect)
+    check_output_path(args.out, ".vtu", args.force, _inputs(args), resumed or args.inspect)
     if args.inspect:
         return _inspect(args, plan, regions)
-    from sim.runtime.device import device_names
+    from sim.runtime.device import parse_device_names
     from surrogate.training.train import check_learners
 
     from ..cli import main
-    from ..play.deformers import model_path
-    from .train import asked_learners
+    from ..play.deformers import to_model_path
+    from .train import parse_learners
 
-    data, model = args.out.with_suffix(".h5"), model_path(args.out)
+    data, model = args.out.with_suffix(".h5"), to_model_path(args.out)
     for path, suffix in ((data, ".h5"), (model, ".npz")):
-        claimed(path, suffix, args.force, _inputs(args), resumed)
-    device_names(args.device)
-    check_learners(asked_learners(args.learners), of_poses=False, where=str(data))
+        check_output_path(path, suffix, args.force, _inputs(args), resumed)
+    parse_device_names(args.device)
+    check_learners(parse_learners(args.learners), of_poses=False, where=str(data))
     if args.count - args.count // APART < FEWEST + 1:
         raise InputError(f"--count {args.count} is too few to learn from and to leave {FEWEST} discs out: give more.")
     force = ["--force"] if args.force else []
     t1 = [] if args.t1 is None else ["--t1", str(args.t1)]
     steps = [
         ["anatomy", *label_words(args), *t1,
-         "--nodes", str(args.nodes), "--craniotomy", str(args.craniotomy), *opening_words(args),
+         "--nodes", str(args.nodes), "--craniotomy", str(args.craniotomy), *to_opening_options(args),
          "--out", str(args.out)],
         ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--preset", args.preset,
          "--device", args.device, "--material", args.material,
@@ -123,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
         note.unlink(missing_ok=True)
     changed = [path.stat().st_mtime for path in _inputs(args) if path.exists()]
     begun = {"anatomy": shlex.join(steps[0]), "inputs": f"of {datetime.fromtimestamp(max(changed, default=0))}"}
-    with listened() as seconds, opened_journal(note, begun) as journal:
+    with listen_to_stages() as seconds, opened_journal(note, begun) as journal:
         try:
             for step in steps:
                 if (step[0], 0) in journal:
@@ -156,17 +161,17 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
     """Print what would be made, and draw it."""
     from ar.screen import write_png
 
-    from .inspection import inspected
-    from .inspection_sheet import sheet
+    from .inspection import inspect_subject
+    from .inspection_sheet import draw_inspection_sheet
 
     began = time.perf_counter()
     picture = args.out.with_suffix(".inspect.png")
-    claimed(picture, ".png", True, _inputs(args))  # a preview, which is drawn until it looks right
-    masks = head_masks(sources_of(args))
-    subject = opened(masked_subject(masks, args.t1, regions=regions_asked(args)), args)
-    found = inspected(masks, subject, regions)
-    with written_whole(picture, ".png") as partial:
-        write_png(partial, sheet(found, masks, subject, opened_cortex(subject, plan.craniotomy)))
+    check_output_path(picture, ".png", True, _inputs(args))  # a preview, which is drawn until it looks right
+    masks = read_head_masks(parse_sources(args))
+    subject = place_craniotomy(build_masked_subject(masks, args.t1, regions=parse_regions(args)), args)
+    found = inspect_subject(masks, subject, regions)
+    with write_atomically(picture, ".png") as partial:
+        write_png(partial, draw_inspection_sheet(found, masks, subject, find_opened_cortex(subject, plan.craniotomy)))
     took = round(time.perf_counter() - began, 2)
     if args.json:
         print(json.dumps({**found.figures(), "picture": str(picture), "seconds": took}))
@@ -181,7 +186,7 @@ def _physics(args: argparse.Namespace) -> str:
     """The options with which a scene is played as these data are: tissue, element, and the planned trajectory."""
     tissue = "" if args.material == BRAIN.law else f" --material {args.material}"
     element = "" if args.element in (None, RECOMMENDED) else f" --element {args.element}"
-    trajectory = trajectory_given(args)
+    trajectory = get_trajectory_option(args)
     return tissue + element + ("" if trajectory is None else f" --trajectory {trajectory}")
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from sim.errors import InputError
 
-from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_json, json_line
+from ..options.outputs import add_force, check_output_path
+from ..options.shared_options import add_json, to_json_line
 
 if TYPE_CHECKING:
     from ar.tracking.registration import Nearest, PairResiduals, Registration
@@ -44,35 +44,35 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Files that cannot be read or written, a surface without anatomy, or points that determine no registration.
     """
-    from ar.tracking.registration import pair_residuals, refined, registered
+    from ar.tracking.registration import compute_pair_residuals, refined, register_points
     from sim import read_anatomy
     from surrogate.locating.observed_files import read_columns
 
-    from ..tracked.registration_file import as_stored, scanned_of, write_registration
+    from ..tracked.registration_file import as_stored, describe_scan, write_registration
 
     if args.surface is not None and args.anatomy is None:
         raise InputError("--surface is traced on an anatomy: give it by --anatomy.")
-    out = claimed(args.out, ".json", args.force, [args.pairs, args.surface])
+    out = check_output_path(args.out, ".json", args.force, [args.pairs, args.surface])
     columns = read_columns(args.pairs, {("x", "y", "z", "px", "py", "pz")})
     scan, patient = (1e-3 * np.column_stack([columns[name] for name in names]) for names in ("xyz", ("px", "py", "pz")))
     anatomy = None if args.anatomy is None else read_anatomy(args.anatomy)
     source = args.pairs if args.surface is None else f"{args.pairs}, {args.surface}"
     try:
         if args.surface is None or anatomy is None:
-            found = registered(scan, patient)
+            found = register_points(scan, patient)
         else:
             traced = read_columns(args.surface, {("px", "py", "pz")})
             seen = 1e-3 * np.column_stack([traced[name] for name in ("px", "py", "pz")])
             found = refined(scan, patient, seen, _nearest_on(anatomy))
-        fits = pair_residuals(scan, patient)
+        fits = compute_pair_residuals(scan, patient)
     except ValueError as error:
         raise InputError(f"{source}: {error}") from error
-    found = found if anatomy is None else replace(found, scanned=scanned_of(anatomy))
+    found = found if anatomy is None else replace(found, scanned=describe_scan(anatomy))
     write_registration(out, found)
     target = None if anatomy is None else _error_at_tumour(found, anatomy)
     if args.json:
         figures = {} if target is None else {"tumour_p95_mm": 1e3 * target[1], "along_mm": target[0].tolist()}
-        print(json_line({"out": str(out), **as_stored(found), **figures, **_stored(fits)}))
+        print(to_json_line({"out": str(out), **as_stored(found), **figures, **_stored(fits)}))
         return 0
     print("\n".join(_table(fits)))
     print(f"{found.pairs} pairs fit to {1e3 * found.rms:.2f} mm (rms); that is not the error at the tumour")
@@ -115,14 +115,14 @@ def _table(fits: PairResiduals) -> list[str]:
 
 def _nearest_on(anatomy: Anatomy) -> Nearest:
     """The nearest place on the surface of the brain, and its normal."""
-    from sim.geometry.closest_point import closest
+    from sim.geometry.closest_point import find_closest_points
 
     corners = anatomy.mesh.nodes[anatomy.mesh.surface]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
 
     def nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found = closest(points, corners)
+        found = find_closest_points(points, corners)
         return found.point, normals[found.triangle]
 
     return nearest
@@ -130,9 +130,9 @@ def _nearest_on(anatomy: Anatomy) -> Nearest:
 
 def _error_at_tumour(found: Registration, anatomy: Anatomy) -> tuple[np.ndarray, float]:
     """Deviations (3,) [mm] along the reference's axes at the tumour's middle, and the radius [m] that 95 % stay in."""
-    from surrogate.locating.locator import radius_of
+    from surrogate.locating.locator import compute_radius
 
     if not len(anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour: leave out --anatomy, or give one with a tumour.")
     _, covariance = found.point(anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0))
-    return 1e3 * np.sqrt(np.diag(covariance)), radius_of(covariance)
+    return 1e3 * np.sqrt(np.diag(covariance)), compute_radius(covariance)

@@ -9,14 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from ar.screen import Film, read_png, write_film
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.errors import InputError
-from sim.runtime.atomic_files import REMEDY, why
+from sim.runtime.atomic_files import REMEDY, explain_error
 
-from ..options.camera_options import add_camera, filmed
-from ..options.outputs import add_force, claimed, claimed_folder, claimed_frames
+from ..options.camera_options import add_camera, apply_camera_options
+from ..options.outputs import add_force, check_output_folder, check_output_frames, check_output_path
 from ..options.shared_options import add_json, add_style
-from ..options.theatre_options import add_theatre, deformer_name, scene_asked, theatre_asked
+from ..options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,33 +37,33 @@ def run(args: argparse.Namespace) -> int:
     """Render frame by frame; return 1 if a frame is unreliable."""
     from tqdm import tqdm
 
-    from ..play.scene_costs import labelled
+    from ..play.scene_costs import add_cost_label
 
-    at_least("--every", args.every, 1)
-    claimed_folder(args.out, "frames")
+    check_at_least("--every", args.every, 1)
+    check_output_folder(args.out, "frames")
     if args.film is not None:
         if args.film.suffix not in (".mp4", ".gif", ".webp"):
             raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
-        claimed(args.film, args.film.suffix, args.force, [args.camera])
-    theatre = theatre_asked(args, args.scene)
-    scene = filmed(args, scene_asked(args, args.scene, theatre))
-    name = deformer_name(args, theatre, scene)
+        check_output_path(args.film, args.film.suffix, args.force, [args.camera])
+    theatre = build_requested_theatre(args, args.scene)
+    scene = apply_camera_options(args, build_requested_scene(args, args.scene, theatre))
+    name = choose_deformer(args, theatre, scene)
     player = replace(theatre.player(name, scene), style=args.style)
-    others = claimed_frames(args.out, args.force)
+    others = check_output_frames(args.out, args.force)
     written, bad = [], 0
     try:
         for path in others:
             path.unlink()
         film = Film(args.out)
         for frame in tqdm(player.frames(every=args.every), total=len(scene.times[:: args.every]), file=sys.stderr):
-            film.show(frame.number, frame.shown if args.plain else labelled(frame, name))
+            film.show(frame.number, frame.shown if args.plain else add_cost_label(frame, name))
             written.append(args.out / f"frame_{frame.number:04d}.png")
             bad += not frame.deformation.outcome[0].good
         if args.film is not None:
             args.film.parent.mkdir(parents=True, exist_ok=True)
             write_film(args.film, (read_png(path) for path in written), scene.frames_per_second / args.every)
     except OSError as error:
-        raise InputError(f"{args.out}: the frames cannot be written ({why(error)}). {REMEDY}") from error
+        raise InputError(f"{args.out}: the frames cannot be written ({explain_error(error)}). {REMEDY}") from error
     film, who = None if args.film is None else str(args.film), theatre.described(name, scene)
     report = {"scene": scene.name, "deformer": name, "solver": who, "frames": len(written), "not_good": bad}
     report |= {"out": str(args.out), "film": film}

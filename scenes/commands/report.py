@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from sim.errors import InputError
 
-from ..options.outputs import add_force, claimed
+from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_devices, add_json
 from .interrupt import INTERRUPTED
 
@@ -73,18 +73,18 @@ def run(args: argparse.Namespace) -> int:
 
 def _measured(args: argparse.Namespace) -> list[Section]:
     """Measure the rows of each data set; rewrite the page after each."""
-    from sim.runtime.device import device_names
+    from sim.runtime.device import parse_device_names
 
-    from ..analysis.measurement import machine
-    from ..report.adaptation import debulked_study, simulate_debulked
+    from ..analysis.measurement import describe_machine
+    from ..report.adaptation import build_debulked_study, simulate_debulked
     from ..report.page import Section, write_report
     from ..report.reference import solve_beyond, solve_reference
-    from ..report.rows import every, learners, rows, star
+    from ..report.rows import list_all_combinations, list_learner_specs, list_one_factor_variants, measure_rows
     from ..report.study import ReportStudy
 
-    several = device_names(args.device)
+    several = parse_device_names(args.device)
     device = args.device if len(several) == 1 else several[0]
-    claimed(args.out / "index.html", ".html", args.force, resumed=(args.out / "rows").is_dir())
+    check_output_path(args.out / "index.html", ".html", args.force, resumed=(args.out / "rows").is_dir())
     count, loads, beyond = QUICK if args.quick else WHOLE
     if args.loads is not None and args.loads < 1:
         raise InputError(f"--loads {args.loads} plays nothing: give at least 1.")
@@ -99,7 +99,10 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     studies = [ReportStudy(path, args.out, device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
     sections = []
     for study in studies:
-        specs = (*(every(study) if args.full else star(study, not args.quick)), *learners())
+        specs = (
+            *(list_all_combinations(study) if args.full else list_one_factor_variants(study, not args.quick)),
+            *list_learner_specs(),
+        )
         after = 0 if args.quick else len(study.dataset.loads) + len(study.dataset.unit_good)
         total = len(study.played) + len(study.outside) + after + len(specs)
         found = []
@@ -109,12 +112,12 @@ def _measured(args: argparse.Namespace) -> list[Section]:
             _tabulate(study, bar)
             if not args.quick:
                 simulate_debulked(study, bar.update)
-                _tabulate(debulked_study(study), bar)
-            for row in rows(study, specs):
+                _tabulate(build_debulked_study(study), bar)
+            for row in measure_rows(study, specs):
                 found.append(row)
                 bar.update()
         sections.append(Section(study.data.stem, _about(study), tuple(found)))
-        write_report(args.out, machine(device), sections)
+        write_report(args.out, describe_machine(device), sections)
     return sections
 
 
@@ -139,10 +142,10 @@ def _simulated(path: Path, args: argparse.Namespace, count: int) -> None:
 
 
 def _about(study: ReportStudy) -> tuple[str, ...]:
-    from ..report.reference import reference_of
+    from ..report.reference import get_reference
     from ..report.study import KINDS
 
-    truth, said = reference_of(study), study.dataset.provenance
+    truth, said = get_reference(study), study.dataset.provenance
     mesh = "the same mesh with every edge halved" if study.fine else "the same mesh"
     good = int(truth.good.sum())
     return (

@@ -8,11 +8,11 @@ import sys
 from pathlib import Path
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import REMEDY, why
+from sim.runtime.atomic_files import REMEDY, explain_error
 
-from ..options.outputs import add_force, claimed, claimed_folder
+from ..options.outputs import add_force, check_output_folder, check_output_path
 from ..options.shared_options import add_anatomy, add_device, add_json
-from ..options.theatre_options import playable
+from ..options.theatre_options import list_playable
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,22 +34,22 @@ def run(args: argparse.Namespace) -> int:
     from ar.screen import write_png
 
     from ..play.deformers import open_theatre
-    from ..play.scene_costs import sheet, thumbnail
+    from ..play.scene_costs import render_thumbnail, tile_images
     from ..script.scene import SCENES, find_scene
 
     scenes = {scene.name: scene for scene in map(find_scene, args.scenes or SCENES)}
     if args.out is not None:
-        claimed_folder(args.out, "pictures")
+        check_output_folder(args.out, "pictures")
         for name in (*scenes, "sheet"):
-            claimed(args.out / f"{name}.png", ".png", args.force)
+            check_output_path(args.out / f"{name}.png", ".png", args.force)
     theatre = open_theatre(args.anatomy, device=args.device)
     lines = sys.stderr if args.json else sys.stdout
-    drawn = [] if args.out is None else [scene.name for scene in playable(args, theatre, list(scenes.values()))]
+    drawn = [] if args.out is None else [scene.name for scene in list_playable(args, theatre, list(scenes.values()))]
     rows, pictures = [], {}
     drawing = tqdm(total=len(scenes), unit="scene", leave=False, disable=args.out is None, file=sys.stderr)
     with drawing as bar:
         for name, scene in scenes.items():
-            names = [type(effect).__name__ for effect in scene.effects_on(theatre.anatomy)]
+            names = [type(effect).__name__ for effect in scene.get_effects_on(theatre.anatomy)]
             known = {"scene": name, "title": scene.title, "effects": names, "deformers": list(theatre.names(scene))}
             players = ", ".join(theatre.names(scene))
             known["solver"] = solver = theatre.described("fem", scene)
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
             bar.write(f"  can be played by: {players}\n  fem: {solver}", file=lines)
             if name in drawn:
                 usual = theatre.usual(scene)
-                found = thumbnail(theatre.player(usual, scene), usual)
+                found = render_thumbnail(theatre.player(usual, scene), usual)
                 pictures[name] = found.colour
                 known |= {"milliseconds": found.milliseconds, "moved_mm": found.moved_mm, "played_by": usual}
                 cost = f"{found.total:.0f} ms a frame by {usual}"
@@ -68,9 +68,11 @@ def run(args: argparse.Namespace) -> int:
         try:
             for name, picture in pictures.items():
                 write_png(args.out / f"{name}.png", picture)
-            write_png(args.out / "sheet.png", sheet(list(pictures.values())))
+            write_png(args.out / "sheet.png", tile_images(list(pictures.values())))
         except OSError as error:
-            raise InputError(f"{args.out}: the pictures cannot be written ({why(error)}). {REMEDY}") from error
+            raise InputError(
+                f"{args.out}: the pictures cannot be written ({explain_error(error)}). {REMEDY}"
+            ) from error
     if args.json:
         print(json.dumps({"scenes": rows, "out": None if args.out is None else str(args.out)}))
     return 0

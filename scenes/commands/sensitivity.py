@@ -16,8 +16,8 @@ from sim.elements import ELEMENTS
 from sim.errors import InputError
 from surrogate.data.tool_loads import PRESETS, draw
 
-from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_device, add_json, add_seed, json_line
+from ..options.outputs import add_force, check_output_path
+from ..options.shared_options import add_device, add_json, add_seed, to_json_line
 from ..options.theatre_options import add_bodies
 
 if TYPE_CHECKING:
@@ -76,12 +76,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
-    from ..analysis.measurement import machine, write_table
-    from ..analysis.sensitivity import BodyVariant, SensitivityStudy, rows, variants
+    from ..analysis.measurement import describe_machine, write_table
+    from ..analysis.sensitivity import BodyVariant, SensitivityStudy, list_variants, measure_variants
     from ..play.deformers import open_theatre
 
     if args.out:
-        claimed(args.out, ".csv", args.force)
+        check_output_path(args.out, ".csv", args.force)
     if args.factorial:
         return _factorial(args)
     theatre = open_theatre(args.anatomy, args.model, args.device)
@@ -91,8 +91,8 @@ def run(args: argparse.Namespace) -> int:
     loads = draw(args.preset, anatomy, args.count, args.seed)
     body = BodyVariant(element=args.element or ("smoothed" if anatomy.mesh.middles is None else "p2"))
     study = SensitivityStudy(anatomy, loads, body, device=args.device)
-    changed = variants(anatomy, body, args.beside)
-    where = machine(args.device)
+    changed = list_variants(anatomy, body, args.beside)
+    where = describe_machine(args.device)
     lines = sys.stderr if args.json else sys.stdout
     print(
         f"{where}\n\n{_opening(study, args.preset)}\n\n{_line(HEAD)}\n{_line(['-' * width for width in WIDTHS])}",
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     )
     found = []
     with tqdm(total=1 + len(changed), unit="row", file=sys.stderr) as bar:
-        for row in rows(study, changed):
+        for row in measure_variants(study, changed):
             found.append(row)
             what = (row.variant.what, row.variant.default, row.variant.now)
             bar.write(_line((*what, *_cells(row.force), *_cells(row.motion))), file=lines)
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
         stated = {"preset": args.preset, "loads": len(loads), "seed": args.seed, "default": asdict(body)}
         surrogate = _stated(model) if model else None
         whole = {"machine": where, **stated, "failed": failed, "surrogate": surrogate, "rows": table}
-        print(json_line(whole))
+        print(to_json_line(whole))
     else:
         print("\n".join([*_bound(model), NOTE, *_remarks(study, args.beside, model, failed)]))
     return 1 if failed else 0
@@ -126,23 +126,23 @@ def _factorial(args: argparse.Namespace) -> int:
 
     from ar.screen import write_png
 
-    from ..analysis.factorial import LEVELS, cells, panels, shares
-    from ..analysis.loglog_chart import drawn
+    from ..analysis.factorial import LEVELS, build_panels, compute_variance_shares, solve_cells
+    from ..analysis.loglog_chart import draw_panels
     from ..analysis.measurement import write_table
 
     if args.anatomy:
         raise InputError("--factorial makes its bodies of the template: leave --anatomy out.")
-    picture = args.out and claimed(args.out.with_suffix(".png"), ".png", args.force)
+    picture = args.out and check_output_path(args.out.with_suffix(".png"), ".png", args.force)
     total = prod(map(len, LEVELS.values()))
-    found = list(tqdm(cells(nodes=args.nodes, device=args.device), total=total, unit="cell", file=sys.stderr))
+    found = list(tqdm(solve_cells(nodes=args.nodes, device=args.device), total=total, unit="cell", file=sys.stderr))
     table = [{**cell.levels, "force_mm": cell.force, "motion_mm": cell.motion} for cell in found]
     failed = sum(not np.isfinite(value) for cell in found for value in (cell.force, cell.motion))
-    parts = {what: shares(found, what) for what in ("force", "motion")}
+    parts = {what: compute_variance_shares(found, what) for what in ("force", "motion")}
     if args.out:
         write_table(args.out, table)
-        write_png(picture, drawn(panels(found)))
+        write_png(picture, draw_panels(build_panels(found)))
     if args.json:
-        print(json_line({"failed": failed, "shares": parts, "rows": table}))
+        print(to_json_line({"failed": failed, "shares": parts, "rows": table}))
         return 1 if failed else 0
     print("Of the variance of the motion's logarithm, known force and known motion of the tool:")
     for name, share in parts["force"].items():

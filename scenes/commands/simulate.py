@@ -21,31 +21,31 @@ from sim.effects import Effect, NodalForce, ToolContact, ToolForce, pushed_effec
 from sim.errors import InputError
 from sim.loads import Loads
 from sim.material import Tissue
-from sim.runtime.device import device_names
+from sim.runtime.device import parse_device_names
 from sim.runtime.memory import MemoryBudget
-from sim.runtime.partial_files import unfinished_path
-from sim.runtime.timing import stage
-from sim.runtime.versions import version_of
+from sim.runtime.partial_files import to_unfinished_path
+from sim.runtime.timing import time_stage
+from sim.runtime.versions import get_version
 from sim.tools import Ball, BuiltIn, Capsule, Spatula
-from surrogate.data.answer_rows import stating
-from surrogate.data.crew import LazyFem, solving
+from surrogate.data.answer_rows import describe_tissue_source
+from surrogate.data.crew import LazyFem, open_solvers
 from surrogate.data.dataset import read_outcomes
-from surrogate.data.holding import HISTORY, drawn_times
+from surrogate.data.holding import HISTORY, sample_times
 from surrogate.data.simulate import SimulatedRows, simulate
-from surrogate.data.tool_loads import BEYOND_TISSUE, PRESETS, draw, refused_share, refused_words
-from surrogate.data.tool_poses import draw_poses, tool_of
+from surrogate.data.tool_loads import BEYOND_TISSUE, PRESETS, compute_rejected_share, describe_rejected, draw
+from surrogate.data.tool_poses import choose_ball, draw_poses
 
-from ..options.outputs import add_force, batch_begun, claimed, remove_data, stated
+from ..options.outputs import add_force, check_output_path, find_begun_batch, read_statements, remove_data
 from ..options.shared_options import add_devices, add_json, add_seed
 from ..options.tissue_options import (
     add_element_argument,
     add_skull_argument,
     add_tissue_arguments,
-    elasticity_of,
-    tissue_of,
+    get_tissue,
+    parse_elasticity,
 )
 from ..script.shipped_files import template_path
-from .interrupt import INTERRUPTED, terminated_as_interrupted
+from .interrupt import INTERRUPTED, interrupt_on_termination
 
 # Sizes [mm] of tools that press on a brain.
 SMALLEST_MM, LARGEST_MM = 0.1, 200.0
@@ -100,13 +100,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Returns 0: the file is complete, whether or not every case converged; it says which did."""
-    out = claimed(args.out, ".h5", args.force, resumed="anatomy" in stated(Path(args.out)))
-    with stage("draw"):
+    out = check_output_path(args.out, ".h5", args.force, resumed="anatomy" in read_statements(Path(args.out)))
+    with time_stage("draw"):
         anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
         if not len(anatomy.tumour_nodes):
             print(f"{args.anatomy}: has no tumour: `sulcus train` will reject the data.", file=sys.stderr)
-        elasticity = elasticity_of(args, anatomy.mesh)
-        tissue = tissue_of(args)
+        elasticity = parse_elasticity(args, anatomy.mesh)
+        tissue = get_tissue(args)
         tool, loads = _drawn(args, anatomy, tissue)
     precision = "float32" if args.tolerance >= 1e-4 else "float64"
     accuracy = Accuracy(args.tolerance, precision=precision, limit_strain=args.preset not in BEYOND_TISSUE)
@@ -114,16 +114,16 @@ def run(args: argparse.Namespace) -> int:
     if tool is not None:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
         effects = (*passive, ToolContact((tool,)))
-    devices = device_names(args.device)
-    batch = batch_begun(out) if args.batch is None else args.batch
+    devices = parse_device_names(args.device)
+    batch = find_begun_batch(out) if args.batch is None else args.batch
     with ExitStack() as closing:
-        stop_if_asked = closing.enter_context(terminated_as_interrupted())
-        with stage("set-up"):
+        stop_if_asked = closing.enter_context(interrupt_on_termination())
+        with time_stage("set-up"):
             wanted = LazyFem(anatomy, effects, accuracy, args.element, batch, len(loads))
-            solver = closing.enter_context(solving(wanted, devices, partial(print, file=sys.stderr)))
+            solver = closing.enter_context(open_solvers(wanted, devices, partial(print, file=sys.stderr)))
         provenance = {
             "effects": repr(effects),
-            **stating(elasticity),
+            **describe_tissue_source(elasticity),
             "element": solver.element,
             "accuracy": repr(accuracy),
             "device": devices[0].split(":")[0],
@@ -131,7 +131,7 @@ def run(args: argparse.Namespace) -> int:
             "seed": str(args.seed),
             **({} if tool is None else {"shape": repr(tool)}),
             **({"history": HISTORY} if tool is not None and tissue.prony else {}),
-            **{f"{name} version": version_of(name) for name in ("sulcus", "warp-lang", "numpy")},
+            **{f"{name} version": get_version(name) for name in ("sulcus", "warp-lang", "numpy")},
         }
         if args.force:
             remove_data(out, {**provenance, "anatomy": anatomy.digest})
@@ -146,7 +146,7 @@ def run(args: argparse.Namespace) -> int:
             solved = simulate(out, solver.deformer, loads, provenance, solver.batch, progress)
         except KeyboardInterrupt:
             bar.close()  # its line ends
-            print(f"stopped; the same command goes on from {unfinished_path(out)}", file=sys.stderr)
+            print(f"stopped; the same command goes on from {to_unfinished_path(out)}", file=sys.stderr)
             return INTERRUPTED
     _report(args, solver.description, len(loads), solved)
     return 0
@@ -159,9 +159,9 @@ def _drawn(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[
         if asked is not None:
             raise InputError("--ball, --capsule and --blade are moved by pose: give --poses too, or leave them out.")
         return None, draw(args.preset, anatomy, args.count, args.seed)
-    tool = tool_of(args.preset) if asked is None else asked
+    tool = choose_ball(args.preset) if asked is None else asked
     loads = draw_poses(args.preset, anatomy, args.count, args.seed, tool)
-    return tool, Loads(loads.causes, drawn_times(len(loads), args.seed)) if tissue.prony else loads
+    return tool, Loads(loads.causes, sample_times(len(loads), args.seed)) if tissue.prony else loads
 
 
 def _asked(args: argparse.Namespace) -> BuiltIn | None:
@@ -201,7 +201,7 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
             "outcome": counts,
             "seconds": {"unit responses": solved.unit_seconds, "loads": solved.load_seconds},
             "loads_per_second": rate,
-            "nominal_refused": 0.0 if args.poses else refused_share(args.preset),
+            "nominal_refused": 0.0 if args.poses else compute_rejected_share(args.preset),
         }
         print(json.dumps(said))
         return
@@ -216,8 +216,8 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
     print(f"Solved by {solver}.")
     if rate is not None:
         print(f"{rate:.4g} loads a second, from their footprints to the file.")
-    if not args.poses and refused_words(args.preset):
-        print(refused_words(args.preset))
+    if not args.poses and describe_rejected(args.preset):
+        print(describe_rejected(args.preset))
     if failed:
         print(
             f"{failed} answers are not reliable (their outcomes say why); they stay in the file and are not trained on."

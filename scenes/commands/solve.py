@@ -18,9 +18,9 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Cause, Loads, Nodal, Prescribed
 
-from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_device, add_json, json_line
-from ..options.tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, elasticity_of
+from ..options.outputs import add_force, check_output_path
+from ..options.shared_options import add_device, add_json, to_json_line
+from ..options.tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, parse_elasticity
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,11 +64,11 @@ def run(args: argparse.Namespace) -> int:
 
     Then the equilibrium under the largest share of the load that has one is written, or the last state where none has.
     """
-    out = claimed(args.out, ".vtu", args.force, [args.mesh])
+    out = check_output_path(args.out, ".vtu", args.force, [args.mesh])
     accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision, limit_strain=not args.any_strain)
     file = read_mesh(args.mesh, args.unit)
-    tissue = elasticity_of(args, file.mesh)
-    anatomy, loads, notes = problem_of(file, args.mesh, UNITS[args.unit])
+    tissue = parse_elasticity(args, file.mesh)
+    anatomy, loads, notes = read_problem(file, args.mesh, UNITS[args.unit])
     for note in (*file.notes, *notes):
         print(f"{args.mesh}: {note}", file=sys.stderr)
     clock = time.perf_counter()
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
         "notes": notes,
         "out": str(out),
     }
-    print(json_line({**report, "plan": plan} if plan else report))
+    print(to_json_line({**report, "plan": plan} if plan else report))
     return 0 if outcome.good else 1
 
 
@@ -141,7 +141,7 @@ def start_of(file: MeshFile, name: str, metre: float) -> Deformation | None:
     return guess(metre * _field(name, "start", file.point_data["start"], {(len(file.mesh.nodes), 3)})[None])
 
 
-def problem_of(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Loads, list[str]]:
+def read_problem(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Loads, list[str]]:
     """Constraints and loads from a file's point data, and what was changed. `metre`: the file's unit of length in m.
 
     Raises

@@ -11,8 +11,8 @@ import numpy as np
 
 from sim.errors import InputError
 
-from ..options.outputs import add_force, claimed
-from ..options.shared_options import add_json, json_line
+from ..options.outputs import add_force, check_output_path
+from ..options.shared_options import add_json, to_json_line
 
 # Tracked bodies, and coordinate systems of their poses.
 BODIES, FRAMES = ("tool", "patient", "board", "camera"), ("camera", "patient", "board")
@@ -56,29 +56,29 @@ def run(args: argparse.Namespace) -> int:
     from ar.tracking.targets import TIP
 
     from ..tracked.calibration_file import read_calibration
-    from ..tracked.elsewhere import followed
-    from ..tracked.film_camera import demand_film
+    from ..tracked.elsewhere import follow_body
+    from ..tracked.film_camera import check_video
     from ..tracked.pose_file import write_poses
 
     if not 0.0 < args.rate < np.inf:
         raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")
     if args.body == args.frame:
         raise InputError(f"the {args.body} is at rest in its own frame: choose --frame camera, or another --body.")
-    out = claimed(args.out, ".csv", args.force, [args.pictures, Path(args.camera)])
+    out = check_output_path(args.out, ".csv", args.force, [args.pictures, Path(args.camera)])
     tip = np.array([0.0, 0.0, -TIP]) if args.tip is None else 1e-3 * np.array(args.tip)
     if not np.isfinite(tip).all():
         raise InputError("--tip has a number that is not finite: give three numbers in millimetres.")
     calibration = read_calibration(args.camera)
-    demand_film(args.pictures, args.rate, calibration, args.camera)
+    check_video(args.pictures, args.rate, calibration, args.camera)
     begun = time.perf_counter()
-    rows = list(followed(args.pictures, calibration, args.body, args.frame, args.rate))
+    rows = list(follow_body(args.pictures, calibration, args.body, args.frame, args.rate))
     seconds = time.perf_counter() - begun
     write_poses(out, rows, tip)
     good = sum(row.pose is not None for row in rows)
     middle = 1e3 * float(np.median([row.seconds for row in rows]))
     if args.json:
         said = {verdict.name.lower(): count for verdict, count in Counter(row.verdict for row in rows).items()}
-        print(json_line({"out": str(out), "pictures": len(rows), "states": said, "ms": middle, "seconds": seconds}))
+        print(to_json_line({"out": str(out), "pictures": len(rows), "states": said, "ms": middle, "seconds": seconds}))
     else:
         print(f"{len(rows)} pictures of the {args.body}, {middle:.1f} ms each (median):")
         for (lacks, verdict), count in Counter((row.lacks, row.verdict) for row in rows).most_common():

@@ -12,20 +12,20 @@ import numpy as np
 from tqdm import tqdm
 
 from sim.errors import InputError
-from sim.runtime.device import device_names
-from sim.runtime.partial_files import unfinished_path
-from sim.runtime.timing import stage
+from sim.runtime.device import parse_device_names
+from sim.runtime.partial_files import to_unfinished_path
+from sim.runtime.timing import time_stage
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.splits import APART
-from surrogate.data.tool_loads import refused_share, refused_words
-from surrogate.evaluation.score import table, winner
-from surrogate.model.guarded import judged, off_by
+from surrogate.data.tool_loads import compute_rejected_share, describe_rejected
+from surrogate.evaluation.score import find_best, format_scores
+from surrogate.model.guarded import compute_error, describe_error
 from surrogate.model.learned import Learned
 from surrogate.model.store import save
 from surrogate.training.expansion import EXPANDED, Expansion
-from surrogate.training.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, learners_for, train
+from surrogate.training.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, list_learners, train
 
-from ..options.outputs import add_force, claimed
+from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_devices, add_json
 
 
@@ -46,15 +46,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Returns 0 when the models are written."""
-    out = claimed(args.out, ".npz", args.force)
-    device = device_names(args.device)[0]
+    out = check_output_path(args.out, ".npz", args.force)
+    device = parse_device_names(args.device)[0]
     if args.force:
-        unfinished_path(out).unlink(missing_ok=True)
-    asked = None if args.learners is None else asked_learners(args.learners)
-    with stage("read the data"):
+        to_unfinished_path(out).unlink(missing_ok=True)
+    asked = None if args.learners is None else parse_learners(args.learners)
+    with time_stage("read the data"):
         data = read_dataset(args.data)
-    learners = asked or list(learners_for(data))
-    for note in notes_on(data, learners):
+    learners = asked or list(list_learners(data))
+    for note in list_notes(data, learners):
         print(f"sulcus train: {note}", file=sys.stderr)
     # Without the time that is left: learners take seconds or minutes, whatever the first of them took.
     shown = "{l_bar}{bar}| {n_fmt}/{total_fmt} learners [{elapsed}{postfix}]"
@@ -63,12 +63,12 @@ def run(args: argparse.Namespace) -> int:
             data,
             device,
             lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"),
-            begun=unfinished_path(out),
+            begun=to_unfinished_path(out),
         )
         trained = train(data, learners, lambda learner: bar.update(), most=args.most, expansion=expansion)
-    with stage("save"):
+    with time_stage("save"):
         save(out, trained.models)
-        unfinished_path(out).unlink(missing_ok=True)
+        to_unfinished_path(out).unlink(missing_ok=True)
     failed = int(np.sum(~data.good))
     preset = "" if data.tool is not None else data.provenance.get("preset", "")
     show = _for_machines if args.json else _for_people
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def asked_learners(words: str) -> list[str]:
+def parse_learners(words: str) -> list[str]:
     """The names in `--learners`, of which none is empty."""
     names = [name.strip() for name in words.split(",")]
     if not all(names):
@@ -84,7 +84,7 @@ def asked_learners(words: str) -> list[str]:
     return names
 
 
-def notes_on(data: Dataset, learners: Sequence[str]) -> list[str]:
+def list_notes(data: Dataset, learners: Sequence[str]) -> list[str]:
     """List notes on slow parts and on results that need more loads, in sentences."""
     notes, good = [], int(data.good.sum())
     expanded = [name for name in learners if name in EXPANDED]
@@ -104,16 +104,16 @@ def notes_on(data: Dataset, learners: Sequence[str]) -> list[str]:
 
 def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
     notes = [f"{failed} cases that did not converge were left aside."] if failed else []
-    notes += [words for words in [refused_words(preset)] if words]
+    notes += [words for words in [describe_rejected(preset)] if words]
     bounds = ", ".join(f"{name} {1e3 * model.bound:.3f}" for name, model in trained.models.items())
     return "\n".join(
         [
             *notes,
             trained.split.summary(),
             "error at the tumour's vertices on the held-out loads, against the finite elements on the same mesh:",
-            table(trained.scores, 1e3 * trained.motion),
+            format_scores(trained.scores, 1e3 * trained.motion),
             f"worst vertex of 95 in 100 held-out loads within [mm]: {bounds}; scenes play that of the least",
-            *(f"on those discs {name} is {judged(model)}" for name, model in trained.models.items()),
+            *(f"on those discs {name} is {describe_error(model)}" for name, model in trained.models.items()),
             *(f"on those discs bounds of {name} held for {found}" for name, found in trained.left_out.items()),
             *(
                 f"on those discs, bounds of the distance from tip to tumour by {name} held for {found}"
@@ -135,7 +135,7 @@ def _calibration(trained: Trained) -> str:
 
 def _stated(model: Learned) -> dict[str, object]:
     """Describe the model's own reported errors, next to its score."""
-    known = off_by(model)
+    known = compute_error(model)
     discs = None if known.left_out is None else asdict(known.left_out)
     return {"bound_mm": 1e3 * known.bound, "discs": discs, "weak": known.weak}
 
@@ -146,7 +146,7 @@ def _for_machines(trained: Trained, out: str, failed: int, preset: str) -> str:
         {
             "out": out,
             "scores": [{**asdict(row), **_stated(trained.models[row.name])} for row in trained.scores],
-            "winner": winner(trained.scores).name,
+            "winner": find_best(trained.scores).name,
             "motion_mm": 1e3 * trained.motion,
             "discs": len(split.centres),
             "disc_radius_mm": 1e3 * split.radius,
@@ -158,6 +158,6 @@ def _for_machines(trained: Trained, out: str, failed: int, preset: str) -> str:
             "distance_left_out": {name: asdict(found) for name, found in trained.distance_left_out.items()},
             "force": {name: asdict(found) for name, found in trained.force.items()},
             "not_converged": failed,
-            "nominal_refused": refused_share(preset),
+            "nominal_refused": compute_rejected_share(preset),
         }
     )

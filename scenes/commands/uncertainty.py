@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 
-from ..options.outputs import claimed
-from ..options.shared_options import add_device, add_json, add_seed, json_line
-from ..options.theatre_options import add_bodies, scene_asked
+from ..options.outputs import check_output_path
+from ..options.shared_options import add_device, add_json, add_seed, to_json_line
+from ..options.theatre_options import add_bodies, build_requested_scene
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
-from .fit import fitted_beside
+from .fit import find_fitted_tissue
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
@@ -66,50 +66,58 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve an ensemble of each scene, and keep what it says."""
-    from ..analysis.uncertainty import coverage, ensemble, nominal, skulls_of, tissue_of, tumour_of, uncertainty
+    from ..analysis.uncertainty import (
+        coverage,
+        estimate_uncertainty,
+        get_nominal,
+        get_tissue,
+        get_tumour_tissue,
+        list_skulls,
+        solve_ensemble,
+    )
     from ..play.deformers import open_theatre
-    from ..script.priors import drawn, drawn_from
+    from ..script.priors import sample_from_fit, sample_priors
     from ..script.scene import SCENES
     from ..script.shipped_files import template_path
-    from ..script.uncertainty import read_uncertainties, uncertainty_path, write_uncertainties
+    from ..script.uncertainty import read_uncertainties, to_uncertainty_path, write_uncertainties
 
-    at_least("--draws", args.draws, FEWEST)
-    at_least("--twins", args.twins, 2 if args.twins else 0)
+    check_at_least("--draws", args.draws, FEWEST)
+    check_at_least("--twins", args.twins, 2 if args.twins else 0)
     names = args.scenes or SCENES
     theatre = open_theatre(args.anatomy, args.model, args.device, names)
-    scenes = [scene_asked(args, name, theatre) for name in names]
-    out = args.out or uncertainty_path(args.anatomy or template_path())
+    scenes = [build_requested_scene(args, name, theatre) for name in names]
+    out = args.out or to_uncertainty_path(args.anatomy or template_path())
     # Before hours are spent: tissue must be one that is drawn. A file that is there is read, and scenes are added.
     for scene in scenes:
-        tissue_of(scene)
-    claimed(out, ".json", resumed=True)
+        get_tissue(scene)
+    check_output_path(out, ".json", resumed=True)
     read_uncertainties(out)
-    fitted = fitted_beside(args.tissue, args.anatomy or template_path(), theatre.anatomy.digest)
+    fitted = find_fitted_tissue(args.tissue, args.anatomy or template_path(), theatre.anatomy.digest)
 
     def draws_of(scene: Scene, count: int, seed: int) -> list[PatientSample]:
         if fitted is None:
-            return drawn(count, seed)
-        young = tissue_of(scene).young
-        return drawn_from(fitted, young, skulls_of(scene), count, seed, tumour_of(scene).young / young)
+            return sample_priors(count, seed)
+        young = get_tissue(scene).young
+        return sample_from_fit(fitted, young, list_skulls(scene), count, seed, get_tumour_tissue(scene).young / young)
 
     rows, lines = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
         bar = partial(tqdm, unit="body", desc=scene.name, leave=False, file=sys.stderr)
         draws, twins = (draws_of(scene, *each) for each in ((args.draws, args.seed), (args.twins, args.seed + 1)))
-        still = nominal(theatre, scene)
-        found = uncertainty(
-            theatre, scene, still, draws, bar(ensemble(theatre, scene, draws), total=len(draws)), args.seed
+        still = get_nominal(theatre, scene)
+        found = estimate_uncertainty(
+            theatre, scene, still, draws, bar(solve_ensemble(theatre, scene, draws), total=len(draws)), args.seed
         )
         found = replace(found, frames=0 if fitted is None else fitted.frames)
         if twins:
             write_uncertainties(out, [found])
-            tried = bar(ensemble(theatre, scene, twins), total=len(twins))
+            tried = bar(solve_ensemble(theatre, scene, twins), total=len(twins))
             found = coverage(scene, still, found, twins, tried, args.seed + 1)
         write_uncertainties(out, [found])
         rows.append(_flat(theatre, scene, found))
         print("\n".join(_lines(rows[-1])), file=lines, flush=True)
     if args.json:
-        print(json_line({"seed": args.seed, "out": str(out), "scenes": rows}))
+        print(to_json_line({"seed": args.seed, "out": str(out), "scenes": rows}))
     else:
         print(f"{NOTE}\nWritten to {out}.")
     return 0
@@ -117,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _flat(theatre: Theatre, scene: Scene, found: Uncertainty) -> dict[str, Any]:
     """Figures of a scene, at the moment when the tumour may be farthest off [mm]."""
-    from ..play.frame_text import error_lines
+    from ..play.frame_text import format_errors
 
     model = theatre.models.get(theatre.best(scene))
     promised = None if model is None or not np.isfinite(model.bound) else float(model.bound)
@@ -126,7 +134,7 @@ def _flat(theatre: Theatre, scene: Scene, found: Uncertainty) -> dict[str, Any]:
     parts = {name: 1e3 * values[moment] for name, values in found.parts.items()}
     ranked = dict(sorted(parts.items(), key=lambda part: -part[1]))
     return {
-        "scene": scene.name, "said": error_lines(promised, error, model is not None), "time_s": found.times[moment],
+        "scene": scene.name, "said": format_errors(promised, error, model is not None), "time_s": found.times[moment],
         "model_mm": None if promised is None else 1e3 * promised, "tumour_mm": 1e3 * (error.bound or 0.0),
         "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment],
         "largest_part": None if found.few else error.largest,

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..options.shared_options import add_device, add_json, json_line
+from ..options.shared_options import add_device, add_json, to_json_line
 
 if TYPE_CHECKING:
     from ..episodes.reading.validation import Report
@@ -39,48 +39,48 @@ def run(args: argparse.Namespace) -> int:
 
     from sim.errors import InputError
 
-    from ..episodes.bodies import models_of, said_of_weak, weak_as_json
-    from ..episodes.reading.again import validated
-    from ..episodes.reading.windows import episode_paths
+    from ..episodes.bodies import describe_weak, list_model_errors, to_weak_json
+    from ..episodes.reading.again import validate_files
+    from ..episodes.reading.windows import list_episode_paths
 
     if args.workers < 1:
         raise InputError(f"--workers {args.workers}: at least one process must look.")
     if args.solve < 0:
         raise InputError(f"--solve {args.solve}: give a number of frames, or leave it away.")
-    paths = episode_paths(args.episodes)
+    paths = list_episode_paths(args.episodes)
     with tqdm(total=len(paths), unit="episode", file=sys.stderr) as bar:
         found = {}
-        for report in validated(paths, min(args.workers, len(paths))):
+        for report in validate_files(paths, min(args.workers, len(paths))):
             found[report.path] = report
             bar.update()
     reports = [found[path] for path in dict.fromkeys(paths)]
-    reports += [one for place in args.episodes if place.is_dir() for one in lost_from(place)]
+    reports += [one for place in args.episodes if place.is_dir() for one in list_lost_episodes(place)]
     if args.solve:
-        from ..episodes.reading.again import solved_again
+        from ..episodes.reading.again import solve_again
 
         bar = tqdm(reports, unit="episode", desc="solved again", file=sys.stderr)
-        reports = [one if one.problems else solved_again(one, args.solve, args.device) for one in bar]
+        reports = [one if one.problems else solve_again(one, args.solve, args.device) for one in bar]
     broken = [report for report in reports if report.problems]
-    trained = {place: models_of(place) for place in args.episodes if place.is_dir()}
+    trained = {place: list_model_errors(place) for place in args.episodes if place.is_dir()}
     if args.json:
         files = [as_json(one) for one in reports]
-        weak = {str(place): weak_as_json(models) for place, models in trained.items()}
-        print(json_line({"episodes": len(reports), "broken": len(broken), "files": files, "weak_bodies": weak}))
+        weak = {str(place): to_weak_json(models) for place, models in trained.items()}
+        print(to_json_line({"episodes": len(reports), "broken": len(broken), "files": files, "weak_bodies": weak}))
     else:
-        said = lines(reports, broken)
+        said = format_reports(reports, broken)
         for place, models in trained.items():
-            said += [line if line.startswith("-") else f"{place}: {line}" for line in said_of_weak(models)]
+            said += [line if line.startswith("-") else f"{place}: {line}" for line in describe_weak(models)]
         print("\n".join(said))
     return 1 if broken else 0
 
 
-def lost_from(folder: Path) -> list[Report]:
+def list_lost_episodes(folder: Path) -> list[Report]:
     """Episodes that a folder's card names and that are not there."""
-    from ..episodes.exports.card import TABLE, listed_files
+    from ..episodes.exports.card import TABLE, list_card_files
     from ..episodes.reading.validation import Report
 
     words = f"is gone; {TABLE} names it. Make it anew, or write the card anew: `sulcus convert FOLDER --to card`."
-    return [Report(folder / name, [words]) for name in listed_files(folder) if not (folder / name).is_file()]
+    return [Report(folder / name, [words]) for name in list_card_files(folder) if not (folder / name).is_file()]
 
 
 def as_json(report: Report) -> dict[str, object]:
@@ -88,7 +88,7 @@ def as_json(report: Report) -> dict[str, object]:
     return {**asdict(report), "path": str(report.path)}
 
 
-def lines(reports: list[Report], broken: list[Report]) -> list[str]:
+def format_reports(reports: list[Report], broken: list[Report]) -> list[str]:
     """Format the faults of each file, the files that could not be checked, and statistics of all complete ones."""
     said = [f"{report.path}: {problem}" for report in broken for problem in report.problems]
     said = [

@@ -12,10 +12,10 @@ import numpy as np
 
 from sim.errors import InputError
 
-from ..options.shared_options import add_device, add_json, json_line
+from ..options.shared_options import add_device, add_json, to_json_line
 from ..options.subject_options import add_axes
-from ..options.theatre_options import add_trajectory, scene_asked
-from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
+from ..options.theatre_options import add_trajectory, build_requested_scene
+from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, apply_tissue_options
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
@@ -85,37 +85,37 @@ def run(args: argparse.Namespace) -> int:
     """Solve, write and report; return 1 if the solution did not converge or the field folds (all is written nevertheless)."""
     from tqdm import tqdm
 
-    from sim.runtime.atomic_files import written_folder
+    from sim.runtime.atomic_files import write_folder_atomically
 
     from ..play.deformers import open_theatre
-    from ..script.scene import demand_scene
+    from ..script.scene import check_scene_exists
     from ..script.shipped_files import template_path
     from ..warp.export import WarpSettings, write_warp
     from ..warp.images import read_picture
-    from ..warp.places import steps_of
+    from ..warp.places import count_steps
 
-    demand_options(args)
+    check_warp_options(args)
     if args.scene is not None:
-        demand_scene(args.scene)
-    with written_folder(args.out) as place:
+        check_scene_exists(args.scene)
+    with write_folder_atomically(args.out) as place:
         theatre = open_theatre(args.anatomy, None, args.device)
-        scene = None if args.located else scene_of(args, theatre)
+        scene = None if args.located else build_scene(args, theatre)
         pictures = [
             read_picture(path, theatre.anatomy, path in args.labels, args.axes) for path in (*args.image, *args.labels)
         ]
         for picture in pictures:
             for warning in picture.warnings:
                 print(f"{picture.path}: {warning}", file=sys.stderr)
-        moment, sequence = moments(args, theatre, scene)
+        moment, sequence = select_moments(args, theatre, scene)
         source = (args.anatomy or template_path()).name
         spacing = None if args.spacing is None else 1e-3 * args.spacing
-        total = steps_of(spacing) + 2 + len(pictures) + bool(sequence)
+        total = count_steps(spacing) + 2 + len(pictures) + bool(sequence)
         with tqdm(total=total, unit="part", desc="fields, files", file=sys.stderr) as bar:
             asked = WarpSettings(spacing, args.interpolation, source, bar.update)
             report = write_warp(place, moment, pictures, asked, sequence)
     for warning in report["warnings"]:
         print(f"sulcus warp: {warning}", file=sys.stderr)
-    print(json_line({**report, "out": str(args.out)}) if args.json else sentences(report, args.out))
+    print(to_json_line({**report, "out": str(args.out)}) if args.json else format_warp(report, args.out))
     wrong = "" if report["converged"] else "the answer did not converge"
     if report["fields_fold"]:
         wrong = "space folds, see README.txt"
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
     return 1 if wrong else 0
 
 
-def demand_options(args: argparse.Namespace) -> None:
+def check_warp_options(args: argparse.Namespace) -> None:
     """Reject options that conflict or are out of range.
 
     Raises
@@ -132,7 +132,7 @@ def demand_options(args: argparse.Namespace) -> None:
     InputError
         One that is missing, is no use, or has such a value; two images whose names would be one.
     """
-    from ..warp.images import warped_name
+    from ..warp.images import to_warped_name
     from ..warp.places import COARSEST, FINEST
 
     if args.spacing is not None and not 1e3 * FINEST <= args.spacing <= 1e3 * COARSEST:
@@ -143,13 +143,13 @@ def demand_options(args: argparse.Namespace) -> None:
         raise InputError("--trajectory is of a --scene: a --load has its own place. Leave one of them out.")
     if args.scene is not None and args.frame is None:
         raise InputError("--frame: say which moment of the scene, by its number; `sulcus demo` shows them.")
-    names = [warped_name(path) for path in (*args.image, *args.labels)]
+    names = [to_warped_name(path) for path in (*args.image, *args.labels)]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two images would both become {name}. Rename one, or warp them one after the other.")
 
 
-def scene_of(args: argparse.Namespace, theatre: Theatre) -> Scene:
+def build_scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
     """The scene that is asked for; a load is one whose tool pushes all the time.
 
     Raises
@@ -158,8 +158,8 @@ def scene_of(args: argparse.Namespace, theatre: Theatre) -> Scene:
         A scene or a frame that there is not; a force that is no push, or too hard; a place that is not on the cortex.
     """
     if args.load is not None:
-        return dressed(args, replace(pushing(theatre, args.load), name="load"), theatre)
-    scene = scene_asked(args, args.scene, theatre)
+        return apply_tissue_options(args, replace(build_pushing_scene(theatre, args.load), name="load"), theatre)
+    scene = build_requested_scene(args, args.scene, theatre)
     last = len(scene.times) - 1
     if not 0 <= args.frame <= last:
         raise InputError(f"--frame {args.frame}: {scene.name} has the frames 0 to {last}.")
@@ -168,13 +168,13 @@ def scene_of(args: argparse.Namespace, theatre: Theatre) -> Scene:
     return scene
 
 
-def pushing(theatre: Theatre, asked: tuple[float, float, float, float]) -> Scene:
+def build_pushing_scene(theatre: Theatre, asked: tuple[float, float, float, float]) -> Scene:
     """Return the scene of a round tool that pushes on the open cortex at X, Y, Z [mm, RAS] with a force [N].
 
     Raises
     ------
     InputError
-        As `scene_of`.
+        As `build_scene`.
     """
     from ..script.scene import find_scene
     from ..script.tool_paths import Touch
@@ -196,7 +196,7 @@ def pushing(theatre: Theatre, asked: tuple[float, float, float, float]) -> Scene
     return replace(find_scene("press"), path=lambda time: touch, duration=1.0, frames_per_second=1.0)
 
 
-def moments(
+def select_moments(
     args: argparse.Namespace, theatre: Theatre, scene: Scene | None
 ) -> tuple[DeformedAnatomy, list[tuple[float, DeformedAnatomy]]]:
     """The moment that is asked for, and those of a sequence with their times [s]; None as scene: of a file.
@@ -222,7 +222,7 @@ def moments(
     return found[wanted], [(float(scene.times[number]), found[number]) for number in many]
 
 
-def sentences(report: dict, out: Path) -> str:
+def format_warp(report: dict, out: Path) -> str:
     """Format the summary of a warp."""
     error, bound = report["grid_error_mm"], report["bound_mm"]
     lines = [

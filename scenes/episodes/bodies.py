@@ -11,32 +11,32 @@ from typing import Any
 
 from sim.accuracy import TRAIN
 from sim.anatomy import PART_LABELS, REGION_NAMES, Anatomy
-from sim.bodies.intensity import Intensity, read_intensity, sidecar, write_intensity
+from sim.bodies.intensity import Intensity, read_intensity, to_intensity_path, write_intensity
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
-from sim.discretisation.space import recommended
+from sim.discretisation.space import recommend_element
 from sim.effects import SKULLS, Effect, Elasticity, Held, NodalForce, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import Material
-from surrogate.data.answer_rows import stating
+from surrogate.data.answer_rows import describe_tissue_source
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import OF_ITS_MAKING, simulate
 from surrogate.data.tool_loads import draw as draw_loads
-from surrogate.model.applicability import refusal
+from surrogate.model.applicability import find_rejection
 from surrogate.model.learned import Learned
 from surrogate.model.left_out import HeldOutError
-from surrogate.model.store import load, save, stated_errors
+from surrogate.model.store import load, read_reported_errors, save
 from surrogate.training.expansion import Expansion
 from surrogate.training.train import train
 
-from ..play.deformers import Theatre, model_path, open_theatre
+from ..play.deformers import Theatre, open_theatre, to_model_path
 from ..script.shipped_files import template_path
-from .draws import drawn, random_of
-from .half_made import DATA, TABLE, forget, gone_on
-from .plan import NO_LEARNER, Bodies, EpisodePlan, digest_beside, fields_of, ratio_of
-from .run_folder import BODIES, versions_here
+from .draws import build_generator, sample_value
+from .half_made import DATA, TABLE, check_resumed, forget
+from .plan import NO_LEARNER, Bodies, EpisodePlan, compute_anatomy_digest, list_fields, to_ratio_key
+from .run_folder import BODIES, get_versions
 
 # Maximum number of sampled tumours: one may leave the brain, or its craniotomy have too few nodes.
 TRIES = 6
@@ -61,7 +61,7 @@ class EpisodeBody:
     @property
     def tissue(self) -> Elasticity:
         """Tissue of the body."""
-        return tissue_of(self.drawn)
+        return get_tissue(self.drawn)
 
     def effects(self, *more: Effect, lets_go: bool = False) -> tuple[Effect, ...]:
         """Return the effects: constraints, skull and others; with `lets_go`, the skull separates whatever was sampled."""
@@ -75,11 +75,11 @@ class EpisodeBody:
         InputError
             As `open_theatre`.
         """
-        shipped = self.drawn["bodies.anatomies"] == "template" and not model_path(self.anatomy).is_file()
-        return open_theatre(self.anatomy, model_path(template_path()) if shipped else None, device)
+        shipped = self.drawn["bodies.anatomies"] == "template" and not to_model_path(self.anatomy).is_file()
+        return open_theatre(self.anatomy, to_model_path(template_path()) if shipped else None, device)
 
 
-def tissue_of(values: Mapping[str, Any]) -> Elasticity:
+def get_tissue(values: Mapping[str, Any]) -> Elasticity:
     """The tissue of drawn values."""
     law, young, poisson = (values[f"bodies.tissue.{name}"] for name in ("law", "young_pa", "poisson"))
     ratio = {name: values.get(_ratio(name), 1.0) for name in ("tumour", *PART_LABELS)}
@@ -92,7 +92,7 @@ def tissue_of(values: Mapping[str, Any]) -> Elasticity:
 
 def _ratio(region: str) -> str:
     """Under which name a region's stiffness is drawn."""
-    return f"bodies.tissue.{ratio_of(region)}"
+    return f"bodies.tissue.{to_ratio_key(region)}"
 
 
 def _of_regions_in(values: Mapping[str, Any], anatomy: Anatomy) -> dict[str, Any]:
@@ -101,15 +101,15 @@ def _of_regions_in(values: Mapping[str, Any], anatomy: Anatomy) -> dict[str, Any
     return {name: value for name, value in values.items() if name not in absent}
 
 
-def drawn_body(bodies: Bodies, seed: int, number: int, attempt: int = 0) -> dict[str, Any]:
+def sample_body(bodies: Bodies, seed: int, number: int, attempt: int = 0) -> dict[str, Any]:
     """Sample the values of a body by name; another `attempt` samples another tumour."""
     found: dict[str, Any] = {}
     for table, values, again in (
         ("bodies", bodies, 0), ("bodies.tissue", bodies.tissue, 0), ("bodies.tumour", bodies.tumour, attempt),
     ):  # fmt: skip
-        for name, value, *_ in fields_of(values):
-            found[f"{table}.{name}"] = drawn(value, random_of(seed, number, f"{table}.{name}/{again}"))
-    found["bodies.tumour.seed"] = int(random_of(seed, number, f"bodies.tumour.seed/{attempt}").integers(2**31))
+        for name, value, *_ in list_fields(values):
+            found[f"{table}.{name}"] = sample_value(value, build_generator(seed, number, f"{table}.{name}/{again}"))
+    found["bodies.tumour.seed"] = int(build_generator(seed, number, f"bodies.tumour.seed/{attempt}").integers(2**31))
     return found
 
 
@@ -136,7 +136,7 @@ def write_body(
     body = EpisodeBody(folder, values)
     write_anatomy(body.anatomy, anatomy)
     if scan is not None:
-        write_intensity(sidecar(body.anatomy), scan)
+        write_intensity(to_intensity_path(body.anatomy), scan)
     before = False
     if bodies.learner.name != NO_LEARNER and not _shipped(body, anatomy):
         before = _train(body, anatomy, plan, seed, number, device, others)
@@ -162,19 +162,19 @@ def read_body(folder: Path) -> EpisodeBody:
 def _anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy, Intensity | None, dict[str, Any]]:
     """An anatomy, its scan, and what was drawn."""
     bodies = plan.contents.bodies
-    values = drawn_body(bodies, seed, number)
+    values = sample_body(bodies, seed, number)
     kind = str(values["bodies.anatomies"])
     if kind != "drawn":
         path = template_path() if kind == "template" else plan.folder / kind
-        scan = sidecar(path)
-        if kind in plan.own and digest_beside(plan, kind) != plan.own[kind]:
+        scan = to_intensity_path(path)
+        if kind in plan.own and compute_anatomy_digest(plan, kind) != plan.own[kind]:
             raise InputError(f"{path}: has changed since the plan was read. Begin another folder with it.")
         known = {name: value for name, value in values.items() if not name.startswith("bodies.tumour.")}
         anatomy = read_anatomy(path)
         return anatomy, read_intensity(scan) if scan.is_file() else None, _of_regions_in(known, anatomy)
     refused: list[str] = []
     for attempt in range(TRIES):
-        values = drawn_body(bodies, seed, number, attempt)
+        values = sample_body(bodies, seed, number, attempt)
         about = {name: values[f"bodies.tumour.{name}"] for name in ("shape", "site", "seed")}
         radius, cover, opening = (1e-3 * values[f"bodies.tumour.{each}_mm"] for each in ("radius", "cover", "opening"))
         try:
@@ -192,9 +192,9 @@ def _shipped(body: EpisodeBody, anatomy: Anatomy) -> bool:
     """Return True if the shipped model applies to this body."""
     if body.drawn["bodies.anatomies"] != "template":
         return False
-    models = load(model_path(template_path()), anatomy)
+    models = load(to_model_path(template_path()), anatomy)
     effects = pushed_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"])
-    return any(refusal(model, effects, recommended(anatomy.mesh)) is None for model in models.values())
+    return any(find_rejection(model, effects, recommend_element(anatomy.mesh)) is None for model in models.values())
 
 
 def _train(
@@ -204,20 +204,20 @@ def _train(
     learner = plan.contents.bodies.learner
     effects = (*pushed_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"]), NodalForce())
     fem = Fem(anatomy, effects, TRAIN, device, 64)
-    first = int(random_of(seed, number, "bodies.learner").integers(2**31))
+    first = int(build_generator(seed, number, "bodies.learner").integers(2**31))
     stated = {
-        "effects": repr(effects), **stating(body.tissue), "element": fem.space.element, "accuracy": repr(TRAIN),
+        "effects": repr(effects), **describe_tissue_source(body.tissue), "element": fem.space.element, "accuracy": repr(TRAIN),
         "preset": PRESET, "seed": str(first),
     }  # fmt: skip
     data = body.folder / DATA
-    all_stated = {**stated, **versions_here(), "anatomy": anatomy.digest, "loads": str(learner.loads)}
-    before = gone_on(data, all_stated, others)
+    all_stated = {**stated, **get_versions(), "anatomy": anatomy.digest, "loads": str(learner.loads)}
+    before = check_resumed(data, all_stated, others)
     simulate(data, fem, draw_loads(PRESET, anatomy, learner.loads, first), stated)
     known = read_dataset(data)
     batch = TOGETHER if fem.problem.device.on_cuda else None
     expansion = Expansion(known, device, kept=data.with_suffix(TABLE), batch=batch)
     trained = train(known, [learner.name], expansion=expansion)
-    save(model_path(body.anatomy), {name: _undated(model) for name, model in trained.models.items()})
+    save(to_model_path(body.anatomy), {name: _undated(model) for name, model in trained.models.items()})
     forget(data)
     return before
 
@@ -231,23 +231,25 @@ MOST_SAID = 10
 """Bodies that are named one by one."""
 
 
-def models_of(folder: Path) -> dict[int, HeldOutError]:
+def list_model_errors(folder: Path) -> dict[int, HeldOutError]:
     """Read the reported errors of the models of a folder's bodies, by number; bodies without a model are excluded."""
     found = {}
     for path in sorted((folder / BODIES).glob("[0-9]*")):
         with suppress(InputError, ValueError):  # bodies without a readable model play nothing
-            found[int(path.name)] = min(stated_errors(model_path(path / ANATOMY)).values(), key=lambda one: one.bound)
+            found[int(path.name)] = min(
+                read_reported_errors(to_model_path(path / ANATOMY)).values(), key=lambda one: one.bound
+            )
     return found
 
 
-def weak_of(models: Mapping[int, HeldOutError]) -> dict[int, HeldOutError]:
+def find_weak(models: Mapping[int, HeldOutError]) -> dict[int, HeldOutError]:
     """Those that are weak, the worst first."""
     return dict(sorted(((number, one) for number, one in models.items() if one.weak), key=lambda each: -each[1].bound))
 
 
-def said_of_weak(models: Mapping[int, HeldOutError]) -> list[str]:
+def describe_weak(models: Mapping[int, HeldOutError]) -> list[str]:
     """Describe the weak models and their errors, in sentences; empty if there is none."""
-    weak = weak_of(models)
+    weak = find_weak(models)
     if not weak:
         return []
     return [
@@ -258,7 +260,7 @@ def said_of_weak(models: Mapping[int, HeldOutError]) -> list[str]:
     ]
 
 
-def weak_as_json(models: Mapping[int, HeldOutError]) -> list[dict[str, float | int | None]]:
+def to_weak_json(models: Mapping[int, HeldOutError]) -> list[dict[str, float | int | None]]:
     """The weak ones as numbers."""
     return [
         {
@@ -266,5 +268,5 @@ def weak_as_json(models: Mapping[int, HeldOutError]) -> list[dict[str, float | i
             "bound_mm": 1e3 * one.bound,
             "mean_share_of_motion": None if one.left_out is None else one.left_out.mean,
         }
-        for number, one in weak_of(models).items()
+        for number, one in find_weak(models).items()
     ]

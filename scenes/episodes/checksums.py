@@ -13,7 +13,7 @@ LISTED = "arrays"
 """The file's attribute that names the data sets it was written with."""
 
 
-def digest_of(data: h5py.Dataset) -> str:
+def compute_digest(data: h5py.Dataset) -> str:
     """Hexadecimal digits of a data set's kind, shape and content."""
     found = sha256(f"{data.shape} {data.dtype.str if data.dtype.kind != 'O' else 'objects'}".encode())
     values = np.asarray(data[()])
@@ -26,17 +26,17 @@ def digest_of(data: h5py.Dataset) -> str:
     return found.hexdigest()
 
 
-def datasets_of(file: h5py.File) -> list[h5py.Dataset]:
+def list_datasets(file: h5py.File) -> list[h5py.Dataset]:
     """All data sets of a file, in the order of their names."""
     found: dict[str, h5py.Dataset] = {}
     file.visititems(lambda name, item: found.update({name: item}) if isinstance(item, h5py.Dataset) else None)
     return [found[name] for name in sorted(found)]
 
 
-def digest_of_file(file: h5py.File) -> str:
+def compute_file_digest(file: h5py.File) -> str:
     """Return the hexadecimal digest of all attributes and of the data sets' recorded checksums."""
     found = sha256()
-    for item in (file, *datasets_of(file)):
+    for item in (file, *list_datasets(file)):
         for name in sorted(item.attrs):
             if item is file and name == SUM:
                 continue
@@ -46,20 +46,22 @@ def digest_of_file(file: h5py.File) -> str:
     return found.hexdigest()
 
 
-def seal(file: h5py.File) -> None:
+def write_checksums(file: h5py.File) -> None:
     """State the names of all data sets, the checksum of each, and that of the file."""
-    for data in datasets_of(file):
-        data.attrs[SUM] = digest_of(data)
+    for data in list_datasets(file):
+        data.attrs[SUM] = compute_digest(data)
     file.attrs[LISTED] = " ".join(_names_of(file))
-    file.attrs[SUM] = digest_of_file(file)
+    file.attrs[SUM] = compute_file_digest(file)
 
 
-def broken(file: h5py.File) -> list[str]:
+def find_broken(file: h5py.File) -> list[str]:
     """List the differences from the recorded checksums; empty for a file without checksums."""
     if SUM not in file.attrs:
         return []
     found = [
-        f"{data.name}: is not as it was written" for data in datasets_of(file) if data.attrs.get(SUM) != digest_of(data)
+        f"{data.name}: is not as it was written"
+        for data in list_datasets(file)
+        if data.attrs.get(SUM) != compute_digest(data)
     ]
     if LISTED in file.attrs:
         there, written = _names_of(file), str(file.attrs[LISTED]).split()
@@ -67,11 +69,11 @@ def broken(file: h5py.File) -> list[str]:
         gone += [f"{name}: was not there when the file was written" for name in there if name not in written]
         if gone:
             return [*gone, *(words for words in found if words.partition(": ")[0] in written)]
-    if file.attrs[SUM] != digest_of_file(file):
+    if file.attrs[SUM] != compute_file_digest(file):
         arrays = "" if LISTED in file.attrs else ", or an array is gone: the file does not name those it had"
         found.append(f"attributes are not as they were written{arrays}")
     return found
 
 
 def _names_of(file: h5py.File) -> list[str]:
-    return [str(data.name) for data in datasets_of(file)]
+    return [str(data.name) for data in list_datasets(file)]

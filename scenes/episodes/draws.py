@@ -50,7 +50,7 @@ class ValueLimits:
         return f"{self.low:,g} to {self.high:,g}" + (f" {self.unit}" if self.unit != "1" else "")
 
 
-def random_of(seed: int, number: int, name: str) -> np.random.Generator:
+def build_generator(seed: int, number: int, name: str) -> np.random.Generator:
     """Random numbers for one name of one episode: no other name, and no other episode, changes them."""
     return np.random.default_rng([seed, number, crc32(name.encode())])
 
@@ -64,7 +64,7 @@ def spread_of(value: object) -> Distribution:
     return Distribution(choice=list(value) if isinstance(value, list) else [value])  # type: ignore[list-item]
 
 
-def drawn(value: object, random: np.random.Generator) -> float | str | bool:
+def sample_value(value: object, random: np.random.Generator) -> float | str | bool:
     """One value of a plan's `Number` or `Word`."""
     spread = spread_of(value)
     if spread.uniform is not None:

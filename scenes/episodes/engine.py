@@ -19,9 +19,9 @@ from distributed.scheduler import KilledWorker
 
 from sim.errors import InputError
 
-from .run_folder import Failure, RunSettings, episode_name, failed, failures, mark_failed, unmark
-from .tasks import Made, RunWork, TaskOutcome, attempted
-from .workers import MOST_DEATHS, Workers, scheduler_ended
+from .run_folder import Failure, RunSettings, list_failed, list_failures, mark_failed, to_episode_name, unmark
+from .tasks import Made, RunWork, TaskOutcome, try_task
+from .workers import MOST_DEATHS, Workers, describe_scheduler_end
 
 RETRIES = 3
 """Number of retries of a task that raises an error."""
@@ -64,7 +64,7 @@ class RunStatistics:
         return replace(self, made=self.made + 1, frames=frames, bytes=size)
 
 
-def still_missing(
+def find_still_missing(
     folder: Path, found: Set[int], numbers: range, first_client: bool, again: bool = False
 ) -> tuple[RunStatistics, list[int]]:
     """Count episodes that exist or have failed permanently, and list the missing ones in their order of execution.
@@ -80,7 +80,7 @@ def still_missing(
         Whether to try those again that failed for good.
     """
     there = found & set(numbers)
-    gone = set() if again else {number for number, one in failures(folder).items() if not one.lost}
+    gone = set() if again else {number for number, one in list_failures(folder).items() if not one.lost}
     gone = gone.intersection(numbers) - there
     missing = [number for number in numbers if number not in there and number not in gone]
     if not first_client:
@@ -112,12 +112,12 @@ def make_all(
     ended: SimpleQueue[Future] = SimpleQueue()
     busy: dict[str, tuple[str, int, Future]] = {}
     bodies: dict[int, Future] = {}
-    failed_before, token = failed(folder), uuid4().hex
+    failed_before, token = list_failed(folder), uuid4().hex
     tally, count, counted = before, workers.count(), monotonic()
 
     def hand_out(kind: str, number: int, make: Callable[[int], Made], *needed: Future) -> Future:
         future = workers.client.submit(
-            attempted, make, number, folder, run, *needed,
+            try_task, make, number, folder, run, *needed,
             key=f"{kind}-{number}-{token}", retries=RETRIES, resources=workers.needs,
         )  # fmt: skip
         busy[str(future.key)] = kind, number, future
@@ -139,7 +139,7 @@ def make_all(
 
     def missing() -> Iterator[int]:
         for number in numbers:
-            if (folder / episode_name(number)).exists():  # another client made it meanwhile
+            if (folder / to_episode_name(number)).exists():  # another client made it meanwhile
                 note(EPISODE, TaskOutcome(number, skipped=True))
             else:
                 yield number
@@ -190,7 +190,7 @@ def _outcomes(
         except TimeoutError:
             future.add_done_callback(ended.put)
         except CancelledError as error:  # state of all futures when the scheduler is gone
-            raise scheduler_ended(workers.where) from error
+            raise describe_scheduler_end(workers.where) from error
         else:
             yield future, outcome
 
@@ -201,7 +201,7 @@ def _reason(error: object) -> str:
     return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
 
 
-def sbatch_script(command: Sequence[str], machines: int, device: str, name: str) -> str:
+def write_sbatch_script(command: Sequence[str], machines: int, device: str, name: str) -> str:
     """Return a script for `sbatch`: an array of jobs that work in one folder without communication.
 
     A job that ends early is queued again and continues. No port is opened between machines.

@@ -20,24 +20,24 @@ import h5py
 import numpy as np
 
 from ar.optics.camera import Camera
-from ar.overlay.outlines import silhouette
+from ar.overlay.outlines import compute_silhouette
 from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Posture, Pushed, Resected, Retracted, Touching
 from sim.resected_fem import OperatedFem
-from sim.runtime.atomic_files import demand_space, written_stream
-from sim.runtime.versions import version_of
-from surrogate.data.answer_rows import stating
-from surrogate.model.guarded import model_of
+from sim.runtime.atomic_files import check_disk_space, write_stream_atomically
+from sim.runtime.versions import get_version
+from surrogate.data.answer_rows import describe_tissue_source
+from surrogate.model.guarded import find_model
 from surrogate.model.learned import Learned
 
 from ..play.deformers import Theatre
 from ..play.player import STAGES, Frame, Player
-from ..play.reference import TOGETHER, truth_of
+from ..play.reference import TOGETHER, solve_reference_frames
 from ..play.stage import NAMES, Stage
-from .checksums import seal
-from .png import png
+from .checksums import write_checksums
+from .png import encode_png
 
 FORMAT = "sulcus episode 2"
 DEPTH_SCALE = 1e-5
@@ -159,36 +159,38 @@ def collect(
         A file that cannot be written, or a disk with less space than it needs.
     """
     total = len(player.scene.times)
-    demand_space(path, int(total * PIXEL_BYTES * player.camera.width * player.camera.height))
+    check_disk_space(path, int(total * PIXEL_BYTES * player.camera.width * player.camera.height))
     right = replace(player.stage) if player.scene.viewpoint.eye == "left" else None
-    with written_stream(path, ".h5", sweep=False) as stream, h5py.File(stream, "w") as file:
+    with write_stream_atomically(path, ".h5", sweep=False) as stream, h5py.File(stream, "w") as file:
         pictures = file.create_group("pictures")
         stores: dict[str, h5py.Dataset] = {}
         rows, loads = [], []  # a frame itself holds seven megabytes
         for frame in progress(player.frames(together=1 if recording.dated else TOGETHER)):
-            for name, code in encoded(frame, player, recording, right).items():
+            for name, code in encode_frame(frame, player, recording, right).items():
                 if name not in stores:
                     stores[name] = pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
                 stores[name][frame.number] = code
             if stream.failure is not None:  # no frame after it would be kept
                 raise stream.failure
-            rows.append(motion(frame, player, recording.dated))
+            rows.append(collect_numbers_of_frame(frame, player, recording.dated))
             loads.append(frame.loads)
         every = recording.solved_every
         numbers = np.arange(0, total, every or 1)
         asked = [loads[k] for k in numbers]
-        truth = None if every is None else truth_of(theatre, player.scene, asked, solved, recording.fem)
+        truth = None if every is None else solve_reference_frames(theatre, player.scene, asked, solved, recording.fem)
         outcomes = write_motion(file, player, rows, numbers, truth, recording)
         describe(file, theatre, player, deformer, recording)
-        seal(file)
+        write_checksums(file)
     return {"out": str(path), "scene": player.scene.name, "deformer": deformer, "frames": total, "fem": outcomes}
 
 
-def encoded(frame: Frame, player: Player, recording: EpisodeRecording, right: Stage | None) -> dict[str, np.ndarray]:
+def encode_frame(
+    frame: Frame, player: Player, recording: EpisodeRecording, right: Stage | None
+) -> dict[str, np.ndarray]:
     """Encode the frame's images, by name; `right` renders the right eye, if there is one."""
     picture = frame.picture
     tumour = player.stage.at(frame.loads).tumour(player.believed(frame))
-    mask = silhouette(frame.camera, tumour.vertices, tumour.triangles, player.stage.device)
+    mask = compute_silhouette(frame.camera, tumour.vertices, tumour.triangles, player.stage.device)
     depth = np.minimum(np.rint(picture.depth / DEPTH_SCALE), np.iinfo(np.uint16).max).astype(np.uint16)
     found = {"colour": _jpeg(recording.grain(2 * frame.number, picture.colour))}
     if recording.overlay:
@@ -197,9 +199,9 @@ def encoded(frame: Frame, player: Player, recording: EpisodeRecording, right: St
         seen = right.at(frame.loads).picture(_right(player, frame), player.positions(frame.deformation), frame.pose)
         found["colour_right"] = _jpeg(recording.grain(2 * frame.number + 1, seen.colour))
     return found | {
-        "depth": png(depth),
-        "segmentation": png(picture.segmentation),
-        "tumour_mask": png(mask.astype(np.uint8)),
+        "depth": encode_png(depth),
+        "segmentation": encode_png(picture.segmentation),
+        "tumour_mask": encode_png(mask.astype(np.uint8)),
     }
 
 
@@ -213,58 +215,58 @@ def _right(player: Player, frame: Frame) -> Camera:
     return replace(player.scene.viewpoint, eye="right").camera(player.site, frame.time)
 
 
-def motion(frame: Frame, player: Player, dated: bool = True) -> dict[str, np.ndarray | float | str]:
+def collect_numbers_of_frame(frame: Frame, player: Player, dated: bool = True) -> dict[str, np.ndarray | float | str]:
     """Return all values except images, by name; with computing times if `dated`."""
-    nodes, cortex = player.site.anatomy.tumour_nodes, cortex_of(player)
+    nodes, cortex = player.site.anatomy.tumour_nodes, find_cortex_vertices(player)
     right = player.scene.viewpoint.eye == "left"
     return {
         "time": frame.time,
         "T_camera_world": frame.camera.T_camera_world,
         **({} if player.scene.viewpoint.path is None else {"K_of_frame": frame.camera.K}),
-        **({} if frame.pose is None or frame.tip is None else held(frame, frame.pose, frame.tip)),
-        **caused(frame.loads),
-        **(felt(frame.deformation) if player.scene.posed else {}),
+        **({} if frame.pose is None or frame.tip is None else collect_tool(frame, frame.pose, frame.tip)),
+        **collect_causes(frame.loads),
+        **(collect_reactions(frame.deformation) if player.scene.posed else {}),
         "tumour_predicted": player.believed(frame)[nodes],
         "cortex_predicted": player.positions(frame.deformation)[cortex],
         **({"T_camera_world_right": _right(player, frame).T_camera_world} if right else {}),
         "tumour_left": ~player.stage.at(frame.loads).anatomy.orphaned[nodes],
         "outcome_predicted": frame.deformation.outcome[0].name,
         "bound": frame.deformation.bound[:, 0],
-        "model_error": number(frame.model_error),
-        "tumour_error": number(frame.tumour_error.bound),
-        "tumour_error_unobserved": number(frame.tumour_error.prior),
+        "model_error": to_number(frame.model_error),
+        "tumour_error": to_number(frame.tumour_error.bound),
+        "tumour_error_unobserved": to_number(frame.tumour_error.prior),
         **({"seconds": np.array([frame.seconds[stage] for stage in STAGES])} if dated else {}),
     }
 
 
-def cortex_of(player: Player) -> np.ndarray:
+def find_cortex_vertices(player: Player) -> np.ndarray:
     """Mesh vertices (c,) of the open cortex."""
     return np.unique(player.site.anatomy.open_surface)
 
 
-def held(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, np.ndarray | float]:
+def collect_tool(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, np.ndarray | float]:
     """Return the tool's pose and the printed distance to the tumour; NaN if none is printed."""
     return {
         "T_world_tool": pose,
         "tip": tip,
-        "distance": number(frame.distance),
-        "distance_error": number(frame.distance_error),
+        "distance": to_number(frame.distance),
+        "distance_error": to_number(frame.distance_error),
     }
 
 
-def felt(answer: Deformation) -> dict[str, np.ndarray]:
+def collect_reactions(answer: Deformation) -> dict[str, np.ndarray]:
     """Return the force of a pose-controlled tool, if the deformation model provides it."""
     if not answer.reaction.shape[1]:
         return {}
     return {"reaction_predicted": answer.reaction[0], "reaction_bound": answer.reaction_bound[:, 0]}
 
 
-def number(value: float | None) -> float:
+def to_number(value: float | None) -> float:
     """NaN in place of None."""
     return np.nan if value is None else value
 
 
-def caused(loads: Loads) -> dict[str, np.ndarray]:
+def collect_causes(loads: Loads) -> dict[str, np.ndarray]:
     """Return the values of each cause of one load case, by name."""
     found: dict[str, np.ndarray] = {}
     for cause in loads.causes:
@@ -294,7 +296,7 @@ def write_motion(
 
     `truth` has one row for each frame in `numbers` (F,); None: the rows themselves are the finite elements'.
     """
-    nodes, cortex = player.site.anatomy.tumour_nodes, cortex_of(player)
+    nodes, cortex = player.site.anatomy.tumour_nodes, find_cortex_vertices(player)
     rest = player.site.anatomy.mesh.nodes
     columns: dict[str, Sequence | np.ndarray] = {
         name: [row[name] for row in rows] for name in rows[0] if all(name in row for row in rows)
@@ -323,7 +325,7 @@ def write_motion(
 
 def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, recording: EpisodeRecording) -> None:
     """Units, frames and provenance as attributes."""
-    scene, camera, model = player.scene, player.camera, model_of(player.deformer)
+    scene, camera, model = player.scene, player.camera, find_model(player.deformer)
     file.create_dataset("K", data=camera.K)
     if camera.lens is not None:
         file.create_dataset("distortion", data=camera.lens.coefficients)
@@ -339,15 +341,15 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, r
             "format": FORMAT,
             "scene": scene.name,
             "deformer": deformer,
-            "effects": repr(scene.effects_on(player.site.anatomy)),
+            "effects": repr(scene.get_effects_on(player.site.anatomy)),
             "finite_elements": theatre.described("fem", scene),
             "answered_by": theatre.described(deformer, scene),
-            "element": theatre.element_of(scene),
+            "element": theatre.choose_element(scene),
             "tissue": "none",
-            **stating(scene.elasticity),
+            **describe_tissue_source(scene.elasticity),
             "tool": repr(scene.tool),
             "footprint_m": np.nan if scene.tool is None else scene.tool.radius,
-            "model_digest": "none" if model is None else digest_of_model(model),
+            "model_digest": "none" if model is None else compute_model_digest(model),
             **({"date": datetime.now(UTC).isoformat(timespec="seconds")} if recording.dated else {}),
             "anatomy": player.site.anatomy.digest,
             "world_frame": "RAS [m]",
@@ -356,7 +358,7 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, r
             "height": camera.height,
             "depth_scale_m": DEPTH_SCALE,
             "segmentation": ", ".join(f"{label} {name}" for label, name in NAMES.items()) + ", 0 nothing",
-            "sulcus_version": version_of("sulcus"),
+            "sulcus_version": get_version("sulcus"),
             "solved_every": recording.solved_every or 1,
             **recording.stated,
         }
@@ -364,7 +366,7 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, r
 
 
 @lru_cache(maxsize=4)
-def digest_of_model(model: Learned) -> str:
+def compute_model_digest(model: Learned) -> str:
     """Sixteen hexadecimal digits of what a model's parts hold and of what it says of its training."""
     found = sha256(repr(sorted(model.training.items())).encode())
     for part in model.parts:

@@ -58,7 +58,7 @@ class RunEstimate:
     opening: Amount
     apart: bool
 
-    def lasts(self, processes: int) -> Amount:
+    def estimate_duration(self, processes: int) -> Amount:
         """Return the duration [s] with a number of processes."""
         each = self.episodes / processes
         further = self.bodies * -np.expm1(-each / self.bodies) - 1.0  # bodies that the episodes of one process use
@@ -66,7 +66,7 @@ class RunEstimate:
         return _added([Amount(part.mean * by, part.error * by) for part, by in parts if np.isfinite(part.mean)])
 
 
-def estimated(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEstimate:
+def compute_estimate(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEstimate:
     """Estimate the cost of a number of episodes on a number of bodies from measured ones.
 
     Raises
@@ -125,7 +125,7 @@ def _added(amounts: Sequence[Amount]) -> Amount:
     return Amount(sum(one.mean for one in amounts), float(np.hypot.reduce([one.error for one in amounts])))
 
 
-def lines(estimate: RunEstimate) -> list[str]:
+def format_estimate(estimate: RunEstimate) -> list[str]:
     """A table of it."""
     found = estimate
     rows = [
@@ -134,7 +134,10 @@ def lines(estimate: RunEstimate) -> list[str]:
         ("work of one process", _time(found.seconds)),
         ("start of a process", _time(found.start)),
         ("its first on a body", _time(found.opening)),
-        *((f"time of {count} process{'es' * (count > 1)}", _time(found.lasts(count))) for count in PROCESSES),
+        *(
+            (f"time of {count} process{'es' * (count > 1)}", _time(found.estimate_duration(count)))
+            for count in PROCESSES
+        ),
         ("processes for one day", f"{int(np.ceil(found.seconds.mean / DAY))}"),
     ]
     width = max(len(name) for name, _ in rows)

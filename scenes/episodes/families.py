@@ -12,9 +12,9 @@ import numpy as np
 from sim.effects import Effect, Gravity, Retraction, ToolContact, ToolForce
 
 from ..builtin.retract import RELAXING
-from ..script.camera_paths import wandering
+from ..script.camera_paths import sample_wandering
 from ..script.debulking import Debulking
-from ..script.head_posture import Lie, drained_then_turned, supine
+from ..script.head_posture import Lie, build_drained_turn, get_supine_pose
 from ..script.tool import Blade, Instrument, Probe
 from ..script.tool_paths import Path, Touch, draw, idle, lay, palpate, press, slide, smooth
 from .draws import Number, ValueLimits
@@ -139,7 +139,7 @@ class Scenario:
     path: Path = idle
     tool: Instrument | None = None
     effects: tuple[Effect, ...] = (ToolForce(),)
-    lying: Lie = supine
+    lying: Lie = get_supine_pose
     surgery: Debulking | None = None
     relaxes: bool = False
     lets_go: bool = False
@@ -149,7 +149,7 @@ class Scenario:
 class ScenarioInputs:
     """Inputs of a scenario: sampled values, random numbers, duration [s], reach [m].
 
-    `reach` is the largest distance of a tool of a radius [m] from the centre of the open cortex.
+    `sample_reach_scenario` is the largest distance of a tool of a radius [m] from the centre of the open cortex.
     """
 
     values: Mapping[str, Any]
@@ -169,7 +169,7 @@ class ScenarioInputs:
         return Probe(radius=1e-3 * self.values["radius_mm"])
 
 
-def pressed(chance: ScenarioInputs) -> Scenario:
+def sample_press_scenario(chance: ScenarioInputs) -> Scenario:
     """The act of `Press`."""
     probe = chance.probe
     at = chance.place(probe.radius)
@@ -183,7 +183,7 @@ def pressed(chance: ScenarioInputs) -> Scenario:
     return Scenario(path, probe)
 
 
-def slid(chance: ScenarioInputs) -> Scenario:
+def sample_slide_scenario(chance: ScenarioInputs) -> Scenario:
     """The act of `SlideMotion`."""
     probe = chance.probe
     start, end = chance.place(probe.radius), chance.place(probe.radius)
@@ -191,7 +191,7 @@ def slid(chance: ScenarioInputs) -> Scenario:
     return Scenario(slide(chance.values["force_n"], start, end, chance.seconds - 2.0 * rise, rise), probe)
 
 
-def drawn_aside(chance: ScenarioInputs) -> Scenario:
+def sample_draw_scenario(chance: ScenarioInputs) -> Scenario:
     """The act of `DrawMotion`."""
     probe, rise = chance.probe, 0.25 * chance.seconds
     tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(probe.radius)
@@ -205,7 +205,7 @@ def drawn_aside(chance: ScenarioInputs) -> Scenario:
     return Scenario(path, probe)
 
 
-def reach(chance: ScenarioInputs) -> Scenario:
+def sample_reach_scenario(chance: ScenarioInputs) -> Scenario:
     """The act of `Reach`."""
     probe, count = chance.probe, round(chance.values["places"])
     places = np.array([chance.place(probe.radius) for _ in range(count)])
@@ -230,14 +230,14 @@ def walk(chance: ScenarioInputs) -> Scenario:
     far, force = 0.5 * chance.values["spread"] * chance.reach(probe.radius), chance.values["force_n"]
 
     def path(time: float) -> Touch:
-        way = wandering(seed, time)
+        way = sample_wandering(seed, time)
         begun = smooth(time / (0.15 * chance.seconds))
         return Touch(float(far * way[0]), float(far * way[1]), force * begun * float(np.clip(0.6 + 0.2 * way[2], 0, 1)))
 
     return Scenario(path, probe)
 
 
-def palpated(chance: ScenarioInputs) -> Scenario:
+def sample_palpate_scenario(chance: ScenarioInputs) -> Scenario:
     """The act of `Palpate`."""
     probe, rise = chance.probe, 0.2 * chance.seconds
     start, end = chance.place(probe.radius), chance.place(probe.radius)
@@ -245,7 +245,7 @@ def palpated(chance: ScenarioInputs) -> Scenario:
     return Scenario(way, probe, (ToolContact((probe.shape,)),))
 
 
-def retracted(chance: ScenarioInputs) -> Scenario:
+def sample_retract_scenario(chance: ScenarioInputs) -> Scenario:
     """The act of `Retract`."""
     blade = Blade()
     tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(blade.radius)
@@ -253,33 +253,33 @@ def retracted(chance: ScenarioInputs) -> Scenario:
     return Scenario(way, blade, (Retraction(blade.shape),), relaxes=True)
 
 
-def drained(chance: ScenarioInputs) -> Scenario:
+def sample_drain_scenario(chance: ScenarioInputs) -> Scenario:
     """The act of `Drain`."""
     turn, fluid = float(np.radians(chance.values["turn_deg"])), chance.values["fluid"]
-    lie = drained_then_turned(0.5 * chance.seconds, 0.1 * chance.seconds, 0.3 * chance.seconds, turn, fluid)
+    lie = build_drained_turn(0.5 * chance.seconds, 0.1 * chance.seconds, 0.3 * chance.seconds, turn, fluid)
     return Scenario(effects=(Gravity(),), lying=lie, lets_go=True)
 
 
-def debulked(chance: ScenarioInputs) -> Scenario:
+def debulk_tumour(chance: ScenarioInputs) -> Scenario:
     """The act of `Debulk`."""
     count, fluid = round(chance.values["steps"]), chance.values["fluid"]
-    lie = drained_then_turned(0.3 * chance.seconds, 0.0, 1.0, 0.0, fluid)
+    lie = build_drained_turn(0.3 * chance.seconds, 0.0, 1.0, 0.0, fluid)
     times = tuple((chance.seconds * np.linspace(0.4, 0.9, count)).tolist())
     return Scenario(effects=(Gravity(),), lying=lie, surgery=Debulking(times), lets_go=True)
 
 
 FAMILIES: dict[str, Callable[[ScenarioInputs], Scenario]] = {
-    "press": pressed, "slide": slid, "draw": drawn_aside, "reach": reach, "walk": walk, "palpate": palpated,
-    "retract": retracted, "drain": drained, "debulk": debulked,
+    "press": sample_press_scenario, "slide": sample_slide_scenario, "draw": sample_draw_scenario, "reach": sample_reach_scenario, "walk": walk, "palpate": sample_palpate_scenario,
+    "retract": sample_retract_scenario, "drain": sample_drain_scenario, "debulk": debulk_tumour,
 }  # fmt: skip
 """Scenario of each family of `FamilyMotions`."""
 
 
-def trembling(path: Path, seed: int, place: float, force: float) -> Path:
+def add_tremor(path: Path, seed: int, place: float, force: float) -> Path:
     """A path with a hand's tremor and drift: standard deviations of place [m] and force [N]; none in the air."""
 
     def trembles(time: float) -> Touch:
-        touch, way = path(time), wandering(seed, time)
+        touch, way = path(time), sample_wandering(seed, time)
         pushed = max(0.0, touch.force + force * float(way[2])) if touch.force > 0.0 else touch.force
         return replace(touch, x=touch.x + place * float(way[0]), y=touch.y + place * float(way[1]), force=pushed)
 

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from sim.runtime.atomic_files import written_whole
-from sim.runtime.partial_files import unfinished_path
+from sim.runtime.atomic_files import write_atomically
+from sim.runtime.partial_files import to_unfinished_path
 
 DATA = "training.h5"
 """The loads that a body's model is trained on, until it is trained."""
@@ -21,7 +21,7 @@ NOTE, TABLE = ".json", ".series.npz"
 """Endings of companion files: the loads; and the series table, if the learner has one."""
 
 
-def gone_on(data: Path, stated: Mapping[str, str], others: Sequence[Path]) -> bool:
+def check_resumed(data: Path, stated: Mapping[str, str], others: Sequence[Path]) -> bool:
     """Resume a data set and its table from the most complete copy; return True if there is one.
 
     Copies are searched in its own folder and in `others`.
@@ -39,16 +39,16 @@ def gone_on(data: Path, stated: Mapping[str, str], others: Sequence[Path]) -> bo
     said = json.dumps(dict(stated), sort_keys=True)
     if not _is_of(data, said):
         forget(data)
-        with written_whole(data.with_suffix(NOTE), NOTE, sweep=False) as partial:
+        with write_atomically(data.with_suffix(NOTE), NOTE, sweep=False) as partial:
             partial.write_text(said, encoding="utf-8")
     alike = [data, *(each for other in others if _is_of(each := other / data.name, said))]
     *_, (whole, size, best) = sorted(max(_kept(each), default=(False, 0, each)) for each in alike)
     if size:
-        _copy(best, data if whole else unfinished_path(data))
+        _copy(best, data if whole else to_unfinished_path(data))
     for table in (each.with_suffix(TABLE) for each in alike):
         if table.exists() and not data.with_suffix(TABLE).exists():
             _copy(table, data.with_suffix(TABLE))
-    return begun(data.parent)
+    return is_begun(data.parent)
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -57,18 +57,18 @@ def _copy(source: Path, target: Path) -> None:
     with (
         suppress(FileNotFoundError),  # from a process that has finished with it
         source.open("rb") as file,
-        written_whole(target, target.suffix, sweep=False) as partial,
+        write_atomically(target, target.suffix, sweep=False) as partial,
         partial.open("wb") as copy,
     ):
         shutil.copyfileobj(file, copy)
 
 
-def begun(folder: Path) -> bool:
+def is_begun(folder: Path) -> bool:
     """Return True if a folder contains solved loads of a body."""
     return any(path.exists() for path in _files(folder / DATA)[1:])
 
 
-def emptied(folder: Path) -> None:
+def empty_folder(folder: Path) -> None:
     """Make a folder, or empty it of all but what was solved for a body."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in set(folder.iterdir()) - set(_files(folder / DATA)):
@@ -83,7 +83,7 @@ def forget(data: Path) -> None:
 
 def _files(data: Path) -> tuple[Path, ...]:
     """Return the paths of the description of the loads, the solved part, the complete data set, and the table."""
-    return data.with_suffix(NOTE), unfinished_path(data), data, data.with_suffix(TABLE)
+    return data.with_suffix(NOTE), to_unfinished_path(data), data, data.with_suffix(TABLE)
 
 
 def _is_of(data: Path, said: str) -> bool:
@@ -94,6 +94,6 @@ def _is_of(data: Path, said: str) -> bool:
 
 def _kept(data: Path) -> Iterator[tuple[bool, int, Path]]:
     """Return whether a file is the complete data set, its size, and its name."""
-    for path in (data, unfinished_path(data)):
+    for path in (data, to_unfinished_path(data)):
         with suppress(OSError):
             yield path == data, path.stat().st_size, path

@@ -17,25 +17,25 @@ from scipy.special import ndtri
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.resected_fem import OperatedFem
-from sim.runtime.atomic_files import written_folder
-from sim.runtime.partial_files import partial_path, partials_of
+from sim.runtime.atomic_files import write_folder_atomically
+from sim.runtime.partial_files import list_partials, to_partial_path
 
 from ..play.deformers import Theatre
-from ..play.reference import following
+from ..play.reference import build_reference_fem
 from ..script.scene import Scene
 from .bodies import ABOUT, EpisodeBody, read_body, write_body
-from .draws import random_of
+from .draws import build_generator
 from .episode import EpisodeRecording, collect
-from .half_made import begun, emptied
+from .half_made import empty_folder, is_begun
 from .plan import NO_LEARNER, EpisodePlan
-from .run_folder import BODIES, episode_name
-from .scripted import drawn_body_of, drawn_episode, scene_of
+from .run_folder import BODIES, to_episode_name
+from .scripted import build_scene, sample_body_number, sample_episode
 from .tasks import Made
 
 QUANTILES = ndtri((np.arange(256) + 0.5) / 256)
 
 
-def noisy(colour: np.ndarray, deviation: float, random: np.random.Generator) -> np.ndarray:
+def add_noise(colour: np.ndarray, deviation: float, random: np.random.Generator) -> np.ndarray:
     """Return an image (H, W, 3) uint8 with Gaussian noise [grey levels], independent of pixel and colour.
 
     The noise has 256 values, each as probable: quantiles of the normal law. They are quicker to draw by far, and fit
@@ -49,7 +49,7 @@ def noisy(colour: np.ndarray, deviation: float, random: np.random.Generator) -> 
     return np.clip(total, 0, 255, out=total).astype(np.uint8)
 
 
-def jittered(poses: np.ndarray, metres: float, radians: float, random: np.random.Generator) -> np.ndarray:
+def add_jitter(poses: np.ndarray, metres: float, radians: float, random: np.random.Generator) -> np.ndarray:
     """Poses (n, 4, 4) as a tracker has them: each apart is off along and about its own axes by such deviations."""
     off = np.tile(np.eye(4), (len(poses), 1, 1))
     off[:, :3, 3] = metres * random.standard_normal((len(poses), 3))
@@ -57,18 +57,20 @@ def jittered(poses: np.ndarray, metres: float, radians: float, random: np.random
     return poses @ off
 
 
-def sensed(columns: Mapping[str, Any], noise: Mapping[str, float], seed: int, number: int) -> dict[str, np.ndarray]:
+def sense_columns(
+    columns: Mapping[str, Any], noise: Mapping[str, float], seed: int, number: int
+) -> dict[str, np.ndarray]:
     """Return the measured columns of an episode: `force_read`, and both tracked poses."""
     found: dict[str, np.ndarray] = {}
     if "force" in columns:
         force = np.asarray(columns["force"])
-        random = random_of(seed, number, "noise.force")
+        random = build_generator(seed, number, "noise.force")
         found["force_read"] = force + noise["force_n"] * random.standard_normal(force.shape)
     for name, whose in (("T_world_tool", "tool"), ("T_camera_world", "camera")):
         if name in columns:
-            random = random_of(seed, number, f"noise.{whose}")
+            random = build_generator(seed, number, f"noise.{whose}")
             shift, turn = 1e-3 * noise[f"{whose}_mm"], float(np.radians(noise[f"{whose}_deg"]))
-            found[f"{name}_tracked"] = jittered(np.asarray(columns[name]), shift, turn, random)
+            found[f"{name}_tracked"] = add_jitter(np.asarray(columns[name]), shift, turn, random)
     return found
 
 
@@ -78,19 +80,19 @@ PASSING = OSError, MemoryError
 """The fault of the disk, or of others on the same card: another try may have more luck."""
 
 
-def episode_path(folder: Path, number: int) -> Path:
+def to_episode_path(folder: Path, number: int) -> Path:
     """The file of an episode."""
-    return folder / episode_name(number)
+    return folder / to_episode_name(number)
 
 
-def body_path(folder: Path, number: int) -> Path:
+def to_body_path(folder: Path, number: int) -> Path:
     """The folder of a body."""
     return folder / BODIES / f"{number:04d}"
 
 
-def body_of(plan: EpisodePlan, seed: int, number: int) -> int:
+def choose_body(plan: EpisodePlan, seed: int, number: int) -> int:
     """Return the number of the body of an episode."""
-    return drawn_body_of(plan.contents, seed, number)
+    return sample_body_number(plan.contents, seed, number)
 
 
 def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: str = "auto") -> Made:
@@ -99,21 +101,21 @@ def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: s
     It is made under another name, so that a folder of its name is whole. A second
     process discards its own copy: both are equal. Loads that were solved before are not solved again.
     """
-    path = body_path(folder, number)
+    path = to_body_path(folder, number)
     if (path / ABOUT).is_file():
         return Made(path, skipped=True)
     if path.exists() and not (path / ABOUT).is_file():  # asked again, as another may have made it meanwhile
         return Made(path, failed=f"{path}: is no whole body. Remove it, and give the same command with --again.")
     resumed = False
     try:
-        with written_folder(path, kept=begun) as partial:
-            emptied(partial)
-            resumed = write_body(partial, plan, seed, number, device, partials_of(path))
+        with write_folder_atomically(path, kept=is_begun) as partial:
+            empty_folder(partial)
+            resumed = write_body(partial, plan, seed, number, device, list_partials(path))
     except InputError as error:
         whole = (path / ABOUT).is_file()  # another process was faster
         if not whole and isinstance(error.__cause__, PASSING):
             raise
-        rmtree(partial_path(path), ignore_errors=True)
+        rmtree(to_partial_path(path), ignore_errors=True)
         if not whole:
             return Made(path, failed=str(error))
     size = sum(file.stat().st_size for file in path.iterdir())
@@ -125,11 +127,11 @@ def make_episode(folder: Path, plan: EpisodePlan, seed: int, number: int, device
 
     Loads without equilibrium fail no episode: their frames say so in `outcome_predicted` and `outcome_fem`.
     """
-    path = episode_path(folder, number)
+    path = to_episode_path(folder, number)
     if path.is_file():
         return Made(path, skipped=True)
     try:
-        report = _collected(path, plan, seed, number, body_path(folder, body_of(plan, seed, number)), device)
+        report = _collected(path, plan, seed, number, to_body_path(folder, choose_body(plan, seed, number)), device)
     except InputError as error:
         if isinstance(error.__cause__, PASSING):
             raise
@@ -147,16 +149,16 @@ class Opened:
 
     def fem(self, scene: Scene) -> Fem | OperatedFem:
         """Those of a scene; the last few are kept, for to make them takes as long as some frames."""
-        asked = repr(scene.effects_on(self.theatre.anatomy))
+        asked = repr(scene.get_effects_on(self.theatre.anatomy))
         if asked not in self.made:
             if len(self.made) >= KEPT:
                 self.made.clear()
-            self.made[asked] = following(self.theatre, scene)
+            self.made[asked] = build_reference_fem(self.theatre, scene)
         return self.made[asked]
 
 
 @lru_cache(maxsize=KEPT)
-def opened_body(place: Path, device: str) -> Opened:
+def open_body(place: Path, device: str) -> Opened:
     """A body that was made, read once for many episodes; InputError as `read_body`."""
     body = read_body(place)
     return Opened(body, body.theatre(device))
@@ -165,19 +167,19 @@ def opened_body(place: Path, device: str) -> Opened:
 def _collected(path: Path, plan: EpisodePlan, seed: int, number: int, place: Path, device: str) -> Mapping[str, Any]:
     """Play an episode and write its file."""
     contents = plan.contents
-    opened, asked = opened_body(place, device), drawn_episode(contents, seed, number)
+    opened, asked = open_body(place, device), sample_episode(contents, seed, number)
     body, theatre = opened.body, opened.theatre
-    scene = scene_of(plan, body, theatre.site, asked, seed, number)
+    scene = build_scene(plan, body, theatre.site, asked, seed, number)
     name = "fem" if contents.bodies.learner.name == NO_LEARNER else theatre.best(scene)
     player = replace(theatre.player(name, scene), composed=contents.overlay)
     noise = asked.group("noise")
 
     def grain(picture: int, colour: np.ndarray) -> np.ndarray:
-        return noisy(colour, noise["grey_levels"], random_of(seed, number, f"noise.picture/{picture}"))
+        return add_noise(colour, noise["grey_levels"], build_generator(seed, number, f"noise.picture/{picture}"))
 
     recording = EpisodeRecording(
         None if name == "fem" else contents.solved_every, contents.overlay, False, grain,
-        lambda columns: sensed(columns, noise, seed, number),
+        lambda columns: sense_columns(columns, noise, seed, number),
         {
             "plan": plan.text, "plan_name": plan.name, "plan_digest": plan.digest, "seed": seed, "episode": number,
             "family": asked.family, "body": asked.body,

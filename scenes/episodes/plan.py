@@ -13,7 +13,7 @@ from typing import Annotated, get_args, get_origin, get_type_hints
 import msgspec
 
 from sim.anatomy import PART_LABELS
-from sim.bodies.intensity import sidecar
+from sim.bodies.intensity import to_intensity_path
 from sim.bodies.template import SITES
 from sim.effects import SKULLS
 from sim.errors import InputError
@@ -40,7 +40,7 @@ FIXED = "fixed"
 """The path of a camera that stays."""
 
 
-def said_plainly(error: str) -> str:
+def format_msgspec_error(error: str) -> str:
     """An error of msgspec as a sentence that begins with the key in question; what else it says stays as it is."""
     words, _, place = error.partition(" - at `$.")
     table = place.rstrip("`")
@@ -196,7 +196,7 @@ class EpisodePlan:
         return sha256("".join((self.text, *self.own.values())).encode()).hexdigest()[:16]
 
 
-def shipped() -> list[str]:
+def list_shipped() -> list[str]:
     """Names of the plans that ship."""
     return sorted(path.stem for path in SHIPPED.glob("*.toml"))
 
@@ -213,17 +213,17 @@ def load_plan(name: str) -> EpisodePlan:
     path = Path(name) if name.endswith(".toml") else SHIPPED / f"{name}.toml"
     if not os.path.isfile(path):  # which accepts any name
         raise InputError(
-            f"no plan is called {name!r}: choose {', '.join(shipped())}, or name a file of your own, .toml."
+            f"no plan is called {name!r}: choose {', '.join(list_shipped())}, or name a file of your own, .toml."
         )
     with read_as(path, "a plan", "A plan is text in UTF-8."):
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"is longer than a plan may be, {MOST_BYTES:,} bytes. Leave out what is no plan.")
         text = path.read_text(encoding="utf-8-sig")
     plan = plan_from(text, path.stem, path.parent)
-    return replace(plan, own={each: digest_beside(plan, each) for each in _own_anatomies(plan.contents)})
+    return replace(plan, own={each: compute_anatomy_digest(plan, each) for each in _own_anatomies(plan.contents)})
 
 
-def digest_beside(plan: EpisodePlan, anatomy: str) -> str:
+def compute_anatomy_digest(plan: EpisodePlan, anatomy: str) -> str:
     """Sixteen hexadecimal digits of an own anatomy's file and of its scan, as they are now.
 
     Raises
@@ -233,7 +233,7 @@ def digest_beside(plan: EpisodePlan, anatomy: str) -> str:
     """
     found, path = sha256(), plan.folder / anatomy
     with read_as(path, "an anatomy", "Put it beside the plan."):
-        for file in (path, *filter(Path.is_file, [sidecar(path)])):
+        for file in (path, *filter(Path.is_file, [to_intensity_path(path)])):
             found.update(sha256(file.read_bytes()).digest())
     return found.hexdigest()[:16]
 
@@ -249,7 +249,7 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
     try:
         contents = msgspec.toml.decode(text, type=PlanContents)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        said = said_plainly(str(error))
+        said = format_msgspec_error(str(error))
         raise InputError(f"the plan {name}: {said} docs/datasets_make.md says what a plan holds.") from error
     plan = EpisodePlan(name, text, contents, folder)
     try:
@@ -259,7 +259,7 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
     return plan
 
 
-def fields_of(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | None, tuple[str, ...]]]:
+def list_fields(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | None, tuple[str, ...]]]:
     """List every field that may be sampled: name, value, limits of a number, and known words."""
     found = []
     for name, (kind, about) in _kinds_of(type(table)).items():
@@ -269,7 +269,7 @@ def fields_of(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | No
     return found
 
 
-def fixed_of(table: msgspec.Struct) -> list[tuple[str, float, ValueLimits]]:
+def list_fixed(table: msgspec.Struct) -> list[tuple[str, float, ValueLimits]]:
     """List every fixed number: name, value and limits; one entry for each number of a pair."""
     found = []
     for name, (kind, about) in _kinds_of(type(table)).items():
@@ -285,7 +285,7 @@ def _kinds_of(table: type[msgspec.Struct]) -> dict[str, tuple[object, ValueLimit
     return {name: get_args(kind)[:2] if get_origin(kind) is Annotated else (kind, None) for name, kind in hints.items()}
 
 
-def tables_of(contents: PlanContents) -> dict[str, msgspec.Struct]:
+def list_tables(contents: PlanContents) -> dict[str, msgspec.Struct]:
     """The tables of a plan by name: those whose fields are drawn for each episode, and those of bodies."""
     bodies, motion = contents.bodies, {f"motion.{name}": each for name, each in contents.motion.named.items()}
     of_bodies = {f"bodies.{name}": getattr(bodies, name) for name in ("tumour", "tissue", "learner")}
@@ -294,10 +294,10 @@ def tables_of(contents: PlanContents) -> dict[str, msgspec.Struct]:
 
 
 def _check(contents: PlanContents) -> None:
-    for table, values in tables_of(contents).items():
-        for name, value, limits, words in fields_of(values):
+    for table, values in list_tables(contents).items():
+        for name, value, limits, words in list_fields(values):
             check_spread(value, f"{table}.{name}".lstrip("."), limits, words)
-        for name, value, limits in fixed_of(values):
+        for name, value, limits in list_fixed(values):
             if not limits.low <= value <= limits.high:
                 raise InputError(f"{f'{table}.{name}'.lstrip('.')}: {value} is outside {limits}.")
     if contents.bodies.learner.name != NO_LEARNER:
@@ -309,7 +309,7 @@ def _check(contents: PlanContents) -> None:
             'bodies.tumour: only drawn anatomies have such a tumour. Say anatomies = "drawn", or leave it out.'
         )
     for name in PART_LABELS:
-        key = ratio_of(name)
+        key = to_ratio_key(name)
         if getattr(contents.bodies.tissue, key) != 1.0 and not _own_anatomies(contents):
             raise InputError(
                 f"bodies.tissue.{key}: only an own anatomy may have {name}. Name one in bodies.anatomies, or leave "
@@ -323,7 +323,7 @@ def _check(contents: PlanContents) -> None:
             raise InputError(f"bodies.anatomies: {each!r} leaves the plan's folder: put the file beside the plan.")
 
 
-def ratio_of(region: str) -> str:
+def to_ratio_key(region: str) -> str:
     """The key of a region's stiffness in `bodies.tissue`, by the region's name."""
     return f"{region}_ratio"
 

@@ -6,9 +6,9 @@ import struct
 
 import numpy as np
 
-from sim.runtime.optional_packages import needed_from
+from sim.runtime.optional_packages import require_extra
 
-with needed_from("data", "writing an episode needs"):
+with require_extra("data", "writing an episode needs"):
     from isal import isal_zlib
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -17,7 +17,7 @@ GREY, SUB = 0, 1
 LEVEL = 1
 
 
-def png(picture: np.ndarray) -> np.ndarray:
+def encode_png(picture: np.ndarray) -> np.ndarray:
     """Encode a grey image (H, W) uint8 or uint16 as the bytes (n,) uint8 of a PNG file.
 
     ISO/IEC 15948: one IDAT chunk, and the filter Sub in all rows. The same image gives the same bytes.

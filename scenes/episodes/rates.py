@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import why
+from sim.runtime.atomic_files import explain_error
 
 from .run_folder import RATES
 from .tasks import TaskOutcome
@@ -35,7 +35,7 @@ class Rate:
 
 
 @contextmanager
-def written_rates(folder: Path) -> Iterator[Callable[[str, TaskOutcome], None]]:
+def write_rates(folder: Path) -> Iterator[Callable[[str, TaskOutcome], None]]:
     """Yield a function that records each completed task, unless it was resumed, in a file of this process.
 
     Raises
@@ -48,7 +48,9 @@ def written_rates(folder: Path) -> Iterator[Callable[[str, TaskOutcome], None]]:
     try:
         file = path.open("a", buffering=1)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({why(error)}). Choose another folder for --out.") from error
+        raise InputError(
+            f"{path}: cannot be written ({explain_error(error)}). Choose another folder for --out."
+        ) from error
     with file:
         file.write(COLUMNS + "\n")
 

@@ -16,9 +16,9 @@ from functools import cache
 from pathlib import Path
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import why, written_whole
+from sim.runtime.atomic_files import explain_error, write_atomically
 from sim.runtime.partial_files import remove_left_overs
-from sim.runtime.versions import version_of
+from sim.runtime.versions import get_version
 
 FORMAT = "sulcus run 1"
 PLAN, RUN, FAILED, BODIES, RATES = "plan.toml", "run.json", "failed", "bodies", "rates"
@@ -59,12 +59,12 @@ class Failure:
 
 
 @cache
-def versions_here() -> Mapping[str, str]:
+def get_versions() -> Mapping[str, str]:
     """The versions of this process's packages."""
-    return {name: version_of(name) for name in PARTS}
+    return {name: get_version(name) for name in PARTS}
 
 
-def episode_name(number: int) -> str:
+def to_episode_name(number: int) -> str:
     """The name of an episode's file."""
     return f"episode_{number:06d}.h5"
 
@@ -97,14 +97,14 @@ def begin(folder: Path, run: RunSettings, text: str, force: bool = False) -> boo
     if found is None or found.versions != run.versions:
         _write_json(folder / RUN, {"format": FORMAT, **asdict(run)})
     if not (folder / PLAN).exists():
-        with written_whole(folder / PLAN, ".toml") as partial:
+        with write_atomically(folder / PLAN, ".toml") as partial:
             partial.write_text(text)
     try:  # the first of simultaneous clients wins
         (folder / RATES).mkdir()
     except FileExistsError:
         return False
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written to ({why(error)}). Choose another folder.") from error
+        raise InputError(f"{folder}: cannot be written to ({explain_error(error)}). Choose another folder.") from error
     return True
 
 
@@ -125,27 +125,27 @@ def read_run(folder: Path) -> RunSettings | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({why(error)}). Choose another folder.") from error
+        raise InputError(f"{path}: cannot be read ({explain_error(error)}). Choose another folder.") from error
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise InputError(f"{path}: is not what `sulcus episodes` writes. Choose another folder.") from error
 
 
-def finished(folder: Path) -> set[int]:
+def list_finished(folder: Path) -> set[int]:
     """Numbers of the episodes that are there."""
     return {number for number, ending in _numbered(folder) if ending == ".h5"}
 
 
-def failures(folder: Path) -> dict[int, Failure]:
+def list_failures(folder: Path) -> dict[int, Failure]:
     """The episodes that could not be made, by number."""
-    return {number: one for number in failed(folder) if (one := failure_of(folder, number)) is not None}
+    return {number: one for number in list_failed(folder) if (one := read_failure(folder, number)) is not None}
 
 
-def failed(folder: Path) -> set[int]:
+def list_failed(folder: Path) -> set[int]:
     """Numbers of the episodes that could not be made; no file is read."""
     return {number for number, _ in _numbered(folder / FAILED)}
 
 
-def failure_of(folder: Path, number: int) -> Failure | None:
+def read_failure(folder: Path, number: int) -> Failure | None:
     """Read the reason why an episode failed; None if it exists by now, or if the reason cannot be read."""
     with suppress(OSError, ValueError, TypeError):  # another client is removing it
         return Failure(**json.loads(_failed_path(folder, number).read_text()))
@@ -163,7 +163,7 @@ def unmark(folder: Path, number: int) -> None:
 
 
 def _failed_path(folder: Path, number: int) -> Path:
-    return (folder / FAILED / episode_name(number)).with_suffix(".json")
+    return (folder / FAILED / to_episode_name(number)).with_suffix(".json")
 
 
 def _numbered(folder: Path) -> Iterator[tuple[int, str]]:
@@ -176,7 +176,7 @@ def _numbered(folder: Path) -> Iterator[tuple[int, str]]:
 
 
 def _write_json(path: Path, value: Mapping) -> None:
-    with written_whole(path, ".json") as partial:
+    with write_atomically(path, ".json") as partial:
         partial.write_text(json.dumps(value) + "\n")
 
 
@@ -205,14 +205,14 @@ def _demand_same(folder: Path, found: RunSettings, run: RunSettings, force: bool
             f"{folder}: holds episodes that were made on {found.device}, whose last digits differ. Give --device "
             f"{found.device}, or choose another folder."
         )
-    other = unlike(found.versions, run.versions)
+    other = describe_versions(found.versions, run.versions)
     if other and not force:
         raise InputError(
             f"{folder}: was begun with {other}: episodes may differ. Choose another folder, or give --force to go on."
         )
 
 
-def unlike(others: Mapping[str, str], ours: Mapping[str, str]) -> str:
+def describe_versions(others: Mapping[str, str], ours: Mapping[str, str]) -> str:
     """The packages of other versions in words; none if all are alike."""
     names = [name for name in sorted({*others, *ours}) if others.get(name) != ours.get(name)]
     return ", ".join(f"{name} {others.get(name, 'none')} and not {ours.get(name, 'none')}" for name in names)

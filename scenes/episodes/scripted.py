@@ -18,9 +18,9 @@ from ..script.scene import Scene
 from ..script.site import Site
 from ..script.viewpoint import Appearance, Cottonoid, Viewpoint
 from .bodies import EpisodeBody
-from .draws import drawn, random_of
-from .families import FAMILIES, PRONY, ScenarioInputs, trembling
-from .plan import FIXED, EpisodePlan, PlanContents, fields_of, tables_of
+from .draws import build_generator, sample_value
+from .families import FAMILIES, PRONY, ScenarioInputs, add_tremor
+from .plan import FIXED, EpisodePlan, PlanContents, list_fields, list_tables
 
 # Deviation of a cortex's red, green and blue from ours is the tint times one of these.
 TINTS = np.array([0.3, 1.0, 1.0])
@@ -52,27 +52,29 @@ class EpisodeSample:
         return {name.removeprefix(head): value for name, value in self.values.items() if name.startswith(head)}
 
 
-def drawn_body_of(contents: PlanContents, seed: int, number: int) -> int:
+def sample_body_number(contents: PlanContents, seed: int, number: int) -> int:
     """The number of the body that an episode is played on."""
-    return int(random_of(seed, number, "body").integers(contents.bodies.count))
+    return int(build_generator(seed, number, "body").integers(contents.bodies.count))
 
 
-def drawn_episode(contents: PlanContents, seed: int, number: int) -> EpisodeSample:
+def sample_episode(contents: PlanContents, seed: int, number: int) -> EpisodeSample:
     """Sample the values of an episode from the seed and its number alone, each by its own name."""
     named = contents.motion.named
     weights = np.array([motion.weight for motion in named.values()])
-    family = list(named)[int(random_of(seed, number, "family").choice(len(named), p=weights / weights.sum()))]
+    family = list(named)[int(build_generator(seed, number, "family").choice(len(named), p=weights / weights.sum()))]
     values: dict[str, Any] = {}
-    for table, struct in tables_of(contents).items():
+    for table, struct in list_tables(contents).items():
         if table.startswith("bodies") or (table.startswith("motion") and table != f"motion.{family}"):
             continue
-        for name, value, *_ in fields_of(struct):
+        for name, value, *_ in list_fields(struct):
             full = f"{table}.{name}".lstrip(".")
-            values[full] = drawn(value, random_of(seed, number, full))
-    return EpisodeSample(drawn_body_of(contents, seed, number), family, values)
+            values[full] = sample_value(value, build_generator(seed, number, full))
+    return EpisodeSample(sample_body_number(contents, seed, number), family, values)
 
 
-def scene_of(plan: EpisodePlan, body: EpisodeBody, site: Site, asked: EpisodeSample, seed: int, number: int) -> Scene:
+def build_scene(
+    plan: EpisodePlan, body: EpisodeBody, site: Site, asked: EpisodeSample, seed: int, number: int
+) -> Scene:
     """Build the scene of an episode on a body.
 
     Raises
@@ -82,17 +84,17 @@ def scene_of(plan: EpisodePlan, body: EpisodeBody, site: Site, asked: EpisodeSam
     """
     contents, seconds = plan.contents, asked.values["seconds"]
     chance = ScenarioInputs(
-        asked.group(f"motion.{asked.family}"), random_of(seed, number, "motion"), seconds, site.reach
+        asked.group(f"motion.{asked.family}"), build_generator(seed, number, "motion"), seconds, site.reach
     )
     act = FAMILIES[asked.family](chance)
     hand = asked.group("hand")
     path = act.path
     if act.tool is not None and (hand["tremor_mm"] > 0.0 or hand["tremor_n"] > 0.0):
-        first = int(random_of(seed, number, "hand").integers(2**31))
-        path = trembling(path, first, 1e-3 * hand["tremor_mm"], hand["tremor_n"])
+        first = int(build_generator(seed, number, "hand").integers(2**31))
+        path = add_tremor(path, first, 1e-3 * hand["tremor_mm"], hand["tremor_n"])
     effects = body.effects(*act.effects, lets_go=act.lets_go)
     if act.relaxes:
-        effects = tuple(relaxing(each) if isinstance(each, Elasticity) else each for each in effects)
+        effects = tuple(make_relaxing(each) if isinstance(each, Elasticity) else each for each in effects)
     title = f"{FAMILIES[asked.family].__doc__ or ''} Episode {number} of the plan {plan.name}, seed {seed}."
     return Scene(
         asked.family, title, path, seconds, effects, act.tool, act.lying, act.surgery,
@@ -101,7 +103,7 @@ def scene_of(plan: EpisodePlan, body: EpisodeBody, site: Site, asked: EpisodeSam
     )  # fmt: skip
 
 
-def relaxing(tissue: Elasticity) -> Elasticity:
+def make_relaxing(tissue: Elasticity) -> Elasticity:
     """The same tissues, relaxing."""
 
     def relaxed(each: object) -> Any:
@@ -113,7 +115,7 @@ def relaxing(tissue: Elasticity) -> Elasticity:
 
 def _viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int, number: int) -> Viewpoint:
     """The camera of an episode."""
-    random = random_of(seed, number, "look.camera")
+    random = build_generator(seed, number, "look.camera")
     width, height = contents.size
     path = None if look["path"] == FIXED else PATHS[look["path"]](int(random.integers(2**31)))
     view = Viewpoint(
@@ -136,7 +138,7 @@ def _viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int, numbe
 
 def _look(look: Mapping[str, Any], site: Site, seed: int, number: int) -> Appearance:
     """Light, colour and covers of an episode."""
-    random = random_of(seed, number, "look.covers")
+    random = build_generator(seed, number, "look.covers")
     vessels = int(random.integers(2**31)) if random.random() < look["vessels"] else None
     tint = 1.0 - look["tint"] * TINTS * random.random(3)
     finger = float(random.uniform(0.0, 2.0 * np.pi)) if random.random() < look["glove"] else None

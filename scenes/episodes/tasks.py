@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import ClassVar
 
 from sim.errors import InputError
-from sim.runtime.threads import one_thread
+from sim.runtime.threads import limit_to_one_thread
 
-from .run_folder import RunSettings, read_run, unlike, versions_here
+from .run_folder import RunSettings, describe_versions, get_versions, read_run
 
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 """Errors that every other episode would meet too."""
@@ -106,7 +106,7 @@ class _Process:
     spoilt = False
 
 
-def attempted(
+def try_task(
     make: Callable[[int], Made], number: int, folder: Path, run: RunSettings, body: TaskOutcome | None = None
 ) -> TaskOutcome:
     """Make the one of a number, by a worker that sees the run's folder and has its versions.
@@ -126,7 +126,7 @@ def attempted(
         return TaskOutcome(number, failed=body.failed and f"its body {body.number}: {body.failed}", halt=body.halt)
     begun = time.perf_counter()
     try:
-        with one_thread():
+        with limit_to_one_thread():
             made = make(number)
     except Exception as error:
         if _is_full(error):
@@ -146,7 +146,7 @@ def attempted(
 def _unfit(folder: Path, run: RunSettings) -> str:
     """Return the reason why this worker cannot take part in the run; empty if it can."""
     here = platform.node()
-    other = unlike(versions_here(), run.versions)
+    other = describe_versions(get_versions(), run.versions)
     if other:
         return f"the worker on {here} has {other}. Install the same there."
     found = read_run(folder)

@@ -20,7 +20,7 @@ from dask import config
 from distributed import Client, Scheduler, Security, SpecCluster, Worker
 
 from sim.errors import InputError
-from sim.runtime.processes import card_variables, start_process
+from sim.runtime.processes import start_process, to_gpu_variables
 
 HERE = "127.0.0.1"
 """Address of our own scheduler and workers: not reachable from outside this machine."""
@@ -47,7 +47,7 @@ class _Started:
 
 
 @contextmanager
-def started_processes(
+def start_processes(
     address: str, security: Security, devices: Sequence[str], starts: int
 ) -> Iterator[Callable[[], None]]:
     """Start workers of the scheduler at an address, one for each device, killed at the end; yield a restart function.
@@ -84,7 +84,7 @@ def started_processes(
             _close(one)
 
 
-def quiet_dask() -> None:
+def silence_dask() -> None:
     """Silence Dask's own notes: relevant ones are reported in our messages."""
     for name in ("distributed", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -92,7 +92,7 @@ def quiet_dask() -> None:
 
 def _start(address: str, security: Security, device: str, times: int) -> _Started:
     ours, theirs = Pipe(duplex=False)
-    card = card_variables(device)
+    card = to_gpu_variables(device)
     resources = {CARD: 1.0} if card else None
     process = start_process(_serve, address, security, resources, theirs, name="worker", variables={**ALONE, **card})
     theirs.close()
@@ -112,7 +112,7 @@ def _close(one: _Started) -> None:
 
 
 def _serve(address: str, security: Security, resources: dict[str, float] | None, connected: Any) -> None:
-    quiet_dask()
+    silence_dask()
     # A profile holds on to what a task has closed, and what is served by HTTP asks for no keys.
     with config.set({"distributed.worker.profile.enabled": False, "distributed.worker.http.routes": []}):
         asyncio.run(_work(address, security, resources, connected))
@@ -162,16 +162,16 @@ class Workers:
         """
         self.tend()
         if self.client.status != "running":
-            raise scheduler_ended(self.where)
+            raise describe_scheduler_end(self.where)
         try:
             known = self.client.scheduler_info(n_workers=-1)["workers"].values()
         except (OSError, TimeoutError) as error:
-            raise scheduler_ended(self.where) from error
+            raise describe_scheduler_end(self.where) from error
         return sum(self.needs is None or CARD in one["resources"] for one in known)
 
 
 @contextmanager
-def own_workers(
+def start_own_workers(
     devices: Sequence[str], settings: Mapping[str, object] | None = None, starts: int = 10
 ) -> Iterator[Workers]:
     """Processes of this machine, one for each name in `devices`, each with the card that its name has.
@@ -191,7 +191,7 @@ def own_workers(
     """
     device = devices[0].split(":")[0]
     with _environment(), config.set({**SETTINGS, **(settings or {})}):
-        quiet_dask()
+        silence_dask()
         security = Security.temporary()
         options = {"host": HERE, "port": 0, "protocol": "tls://", "security": security}
         options |= {"dashboard": False, "dashboard_address": f"{HERE}:0"}
@@ -199,13 +199,13 @@ def own_workers(
         with (
             closing(SpecCluster({}, scheduler, security=security, name=f"sulcus-{os.getpid()}")) as cluster,
             Client(cluster, set_as_default=False) as client,
-            started_processes(cluster.scheduler_address, security, devices, starts) as tend,
+            start_processes(cluster.scheduler_address, security, devices, starts) as tend,
         ):
             yield Workers(client, device, f"{len(devices)} process{'es' * (len(devices) > 1)} on {device}", tend)
 
 
 @contextmanager
-def scheduled_workers(address: str, device: str, patience: float = PATIENCE) -> Iterator[Workers]:
+def connect_workers(address: str, device: str, patience: float = PATIENCE) -> Iterator[Workers]:
     """The workers of a running scheduler, who may come and go.
 
     Parameters
@@ -220,7 +220,7 @@ def scheduled_workers(address: str, device: str, patience: float = PATIENCE) -> 
     InputError
         A scheduler that does not answer.
     """
-    quiet_dask()
+    silence_dask()
     try:
         client = Client(address, set_as_default=False, timeout=patience)
     except (OSError, ValueError, TimeoutError) as error:
@@ -246,6 +246,6 @@ def _environment() -> Iterator[None]:
         os.environ.update(before)
 
 
-def scheduler_ended(where: str) -> InputError:
+def describe_scheduler_end(where: str) -> InputError:
     """Return the error of a lost scheduler."""
     return InputError(f"{where}: their scheduler ended. What is finished stays; the same command goes on.")

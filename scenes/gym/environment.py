@@ -13,14 +13,14 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sim.arguments import at_least
+from sim.arguments import check_at_least
 from sim.errors import InputError
 
 from .episode import Episode, EpisodeStep
-from .observation import KINDS, space_of, twists
+from .observation import KINDS, build_action_space, build_space
 from .pictures import ObservationCamera
 from .registration import NAMESPACE, STEPS
-from .setting import TaskSetting, checked, open_setting
+from .setting import TaskSetting, check_arguments, open_setting
 from .tasks import SECONDS, find_task
 from .touched import TissueRequest
 
@@ -29,7 +29,7 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(
 """Render modes, as Gymnasium requires."""
 
 
-def opened(
+def open_environment_setting(
     task: str, observation: str, render_mode: str | None, given: Mapping[str, Any], together: bool | None = None
 ) -> TaskSetting:
     """Open the setting of environments; anatomy, physics, device, size and model are `given` as to `open_setting`.
@@ -43,7 +43,7 @@ def opened(
         raise InputError(f"observation is {observation!r:.80}: choose one of {', '.join(KINDS)}.")
     if render_mode is not None and render_mode not in RENDERED:
         raise InputError(f"render_mode is {render_mode!r:.80}: choose {', '.join(RENDERED)}, or None.")
-    return open_setting(find_task(task), *checked(given), together)
+    return open_setting(find_task(task), *check_arguments(given), together)
 
 
 class Operation(gymnasium.Env):
@@ -63,7 +63,7 @@ class Operation(gymnasium.Env):
     Raises
     ------
     InputError
-        As `opened`.
+        As `open_environment_setting`.
     """
 
     metadata = METADATA
@@ -80,10 +80,10 @@ class Operation(gymnasium.Env):
         model: str | Path | None = None,
     ):
         given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size, "model": model}
-        self.setting = opened(task, observation, render_mode, given)
+        self.setting = open_environment_setting(task, observation, render_mode, given)
         self.observation, self.render_mode = observation, render_mode
-        self.observation_space = space_of(observation, size)
-        self.action_space = twists()
+        self.observation_space = build_space(observation, size)
+        self.action_space = build_action_space()
         self.episode, self.pictures = Episode(self.setting), ObservationCamera(self.setting)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -168,13 +168,13 @@ class Operations(VectorEnv):
         model: str | Path | None = None,
         together: bool | None = None,
     ):
-        self.num_envs = at_least("num_envs", num_envs, 1)
-        self.steps = at_least("max_episode_steps", max_episode_steps, 1)
+        self.num_envs = check_at_least("num_envs", num_envs, 1)
+        self.steps = check_at_least("max_episode_steps", max_episode_steps, 1)
         given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size, "model": model}
-        self.setting = opened(task, observation, render_mode, given, together)
+        self.setting = open_environment_setting(task, observation, render_mode, given, together)
         self.observation, self.render_mode = observation, render_mode
-        self.single_observation_space = space_of(observation, size)
-        self.single_action_space = twists()
+        self.single_observation_space = build_space(observation, size)
+        self.single_action_space = build_action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.episodes = [Episode(self.setting) for _ in range(num_envs)]
@@ -251,7 +251,7 @@ class Operations(VectorEnv):
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
 
 
-def many(task: str, count: int, processes: bool = False, **given: Any) -> VectorEnv:
+def make_many(task: str, count: int, processes: bool = False, **given: Any) -> VectorEnv:
     """Make `count` environments of a task, as `gymnasium.make_vec` does.
 
     Parameters

@@ -9,13 +9,13 @@ import numpy as np
 
 from sim.errors import InputError
 
-from ..script.camera_paths import wandering
+from ..script.camera_paths import sample_wandering
 from ..script.tool_paths import smooth
-from .observation import FELT, SEEN, TRACKED, states
+from .observation import FELT, SEEN, TRACKED, compute_states
 from .pictures import Seen
 from .setting import TaskSetting
 from .tasks import OVER, SECONDS, Goal
-from .tool_motion import RobotTool, frame_of, laid, lever_of, moved, trembling
+from .tool_motion import RobotTool, add_tremor, build_tool_frame, compute_lever, lay_tool, move_tool
 from .touched import TissueRequest, Touched
 
 STEP, OVER_LIMIT, DONE, ENDED = 0.01, 0.5, 10.0, -10.0
@@ -57,7 +57,7 @@ class EpisodeScore:
         return SHARE * self.cut - min(self.away, FAR) / NEAR - min(self.off, 1.0)
 
 
-def earned(before: EpisodeScore, now: EpisodeScore, success: bool, ended: bool) -> float:
+def compute_reward(before: EpisodeScore, now: EpisodeScore, success: bool, ended: bool) -> float:
     """The reward of a step from one state to the next; `ended`: at a limit, without success."""
     reward = now.potential - before.potential - STEP
     if now.load > 1.0:
@@ -94,7 +94,7 @@ def draw(setting: TaskSetting, random: np.random.Generator) -> ResetSample:
     x, y = x + aside * np.cos(2.0 * np.pi * angle), y + aside * np.sin(2.0 * np.pi * angle)
     under = site.contact(float(x), float(y), tool.radius).point
     tip = under - (ABOVE[0] + high * (ABOVE[1] - ABOVE[0])) * site.axis
-    return ResetSample(goal, laid(site, tool, tip), int(random.integers(2**31)), TREMOR * float(size))
+    return ResetSample(goal, lay_tool(site, tool, tip), int(random.integers(2**31)), TREMOR * float(size))
 
 
 class Episode:
@@ -108,7 +108,7 @@ class Episode:
 
     def __init__(self, setting: TaskSetting):
         self.setting = setting
-        self.frame = frame_of(setting.site)
+        self.frame = build_tool_frame(setting.site)
         self.drawn: ResetSample | None = None
         self.over = True
 
@@ -135,14 +135,14 @@ class Episode:
             raise InputError(f"the action {np.array2string(twist, threshold=12)} is none: give six finite numbers.")
         task = self.setting.task
         twist = np.clip(twist, -1.0, 1.0) * np.repeat([task.step, task.turn], 3)
-        self.hand = moved(self.hand, self.setting.site, task.tool, twist, task.tilt, task.deepest)
+        self.hand = move_tool(self.hand, self.setting.site, task.tool, twist, task.tilt, task.deepest)
         self.step += 1
         return self._asked(self.drawn)
 
     def _asked(self, drawn: ResetSample) -> TissueRequest:
         task = self.setting.task
-        offset = drawn.tremor * self.frame @ wandering(drawn.seed, SECONDS * self.step)[:3]
-        self.actual = trembling(self.hand, offset)
+        offset = drawn.tremor * self.frame @ sample_wandering(drawn.seed, SECONDS * self.step)[:3]
+        self.actual = add_tremor(self.hand, offset)
         fluid = 1.0 - (1.0 - drawn.goal.fluid) * smooth(self.step / DRAINS)
         return TissueRequest(self.actual.pose(task.tool), self.touched, fluid, self.done)
 
@@ -178,7 +178,7 @@ class Episode:
             success = self.cut >= goal.amount
             judged = self._judge(touched, target)
         ended = judged.load > OVER or not touched.good
-        reward = 0.0 if self.judged is None else earned(self.judged, judged, success, ended)
+        reward = 0.0 if self.judged is None else compute_reward(self.judged, judged, success, ended)
         self.violations += int(judged.load > 1.0)
         self.touched, self.judged, self.over = touched, judged, success or ended
         return EpisodeStep(self._states(touched), reward, success or ended, self._truth(touched, target, success))
@@ -207,7 +207,7 @@ class Episode:
         load = max(size / task.force, touched.pressure / task.pressure)
         if task.cuts:
             return EpisodeScore(float(np.linalg.norm(self.actual.place - target)), 0.0, self.cut, load)
-        tip = self.actual.place + lever_of(task.tool) * axis
+        tip = self.actual.place + compute_lever(task.tool) * axis
         along = float((target - tip) @ axis)
         aside = float(np.linalg.norm(target - tip - along * axis))
         away = float(np.hypot(aside, max(along, 0.0) if size == 0.0 else 0.0))
@@ -228,12 +228,12 @@ class Episode:
         task, goal = self.setting.task, self.drawn.goal
         cortex = touched.motion[np.searchsorted(touched.nodes, self.setting.cortex)].mean(axis=0)
         noise = self.random.standard_normal((3, 3))
-        tracked = trembling(self.actual, TRACKED * noise[0])
+        tracked = add_tremor(self.actual, TRACKED * noise[0])
         sensed = np.stack([touched.force, cortex]) + np.array([[FELT], [SEEN]]) * noise[1:]
         done = self.cut / goal.amount if task.cuts else self.held / task.held
         time = SECONDS * self.step
         planned = replace(goal, place=self._planned())
-        return states(task, planned, tracked, sensed, time, done, self.frame, self.setting.site.origin)
+        return compute_states(task, planned, tracked, sensed, time, done, self.frame, self.setting.site.origin)
 
     def _truth(self, touched: Touched, target: np.ndarray, success: bool) -> dict[str, Any]:
         """Return ground truth that no robot has (see the docs). Arrays are new in each step."""

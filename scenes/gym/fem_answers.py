@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sim.contact_pressure import pressure
-from sim.deformation import Deformation, joined
+from sim.deformation import Deformation, join_deformations
 from sim.fem import Fem
-from sim.geometry.closest_point import closest
-from sim.geometry.surface import vertex_normals
+from sim.geometry.closest_point import find_closest_points
+from sim.geometry.surface import compute_vertex_normals
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Resected, Touching
 from sim.resected_fem import OperatedFem
@@ -73,7 +73,7 @@ class PosedElements:
 
 
 def _stacked(starts: Sequence[Deformation]) -> Deformation:
-    return starts[0] if len(starts) == 1 else joined(starts)
+    return starts[0] if len(starts) == 1 else join_deformations(starts)
 
 
 # Solved fluid levels, relative to its height; solutions in between are interpolated.
@@ -145,7 +145,7 @@ class CutElements:
         healthy, nodes = self._healthy(done), self.site.anatomy.mesh.nodes
         radius = self.ball.radius
         middle = pose[:3, 3] + radius * pose[:3, 2]
-        near = closest(middle[None], (nodes + motion)[healthy.triangles])
+        near = find_closest_points(middle[None], (nodes + motion)[healthy.triangles])
         corners = healthy.triangles[near.triangle[0]]
         outward = near.weights[0] @ healthy.normals[corners]
         outward /= np.linalg.norm(outward)
@@ -168,4 +168,4 @@ class CutElements:
         middle = left.nodes[surface].mean(axis=1)
         around = np.concatenate([way, left.nodes[tumour]])
         near = np.linalg.norm(middle[:, None] - around, axis=2).min(axis=1) < AROUND
-        return HealthySurface(surface[near], vertex_normals(left.nodes, surface))
+        return HealthySurface(surface[near], compute_vertex_normals(left.nodes, surface))

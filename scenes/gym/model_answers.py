@@ -9,13 +9,13 @@ from functools import cached_property
 import numpy as np
 
 from sim.errors import InputError
-from sim.geometry.closest_point import closest
+from sim.geometry.closest_point import find_closest_points
 from sim.loads import Loads, Pushed, Touching
 from sim.material import Tissue
 from sim.tools import Ball
 from surrogate.data.cortex_patch import Patch, open_patch
-from surrogate.data.indentation import indented
-from surrogate.model.guarded import tool_pressure
+from surrogate.data.indentation import to_indentation
+from surrogate.model.guarded import compute_tool_pressure
 from surrogate.model.learned import Learned
 
 from ..script.site import Site
@@ -106,7 +106,7 @@ class PressedModel:
 
     def _answered(self, poses: np.ndarray) -> list[Touched]:
         """Predict tools at poses (B, 4, 4) together."""
-        near = indented(Loads((Touching(poses[:, None]),)), Ball(self.ball.radius), self._patch)
+        near = to_indentation(Loads((Touching(poses[:, None]),)), Ball(self.ball.radius), self._patch)
         depth = np.linalg.norm(near.force, axis=1)
         inward = np.divide(near.force, depth[:, None], out=np.zeros_like(near.force), where=depth[:, None] > 0.0)
         answers = [Touched(np.zeros((len(self.model.nodes), 3)), self.model.nodes, np.zeros(3), 0.0) for _ in poses]
@@ -134,7 +134,7 @@ class PressedModel:
     def _forces(self, point: np.ndarray, inward: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find forces (k,) [N] at points (k, 3) by the secant method, and whether each brings a ball to its depth (k,) [m]."""
         patch, rows = self._patch, np.arange(len(depth))
-        place = closest(point, patch.points[patch.triangles])
+        place = find_closest_points(point, patch.points[patch.triangles])
         corners, most = patch.triangles[place.triangle], STRONGEST * self.model.envelope.force[1]
 
         def off(size: np.ndarray) -> np.ndarray:
@@ -160,7 +160,7 @@ class PressedModel:
 class PosedModel:
     """Prediction of motion, force and bound by a model of tool poses; a blade continues from its last state.
 
-    The pressure under a ball is that of Hertz under its force; under a blade it is the highest of `tool_pressure`.
+    The pressure under a ball is that of Hertz under its force; under a blade it is the highest of `compute_tool_pressure`.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ class PosedModel:
             return replace(rest, good=False, error=float("inf"))
         force = answer.reaction[0, 0, :3]
         if self.ball is None:
-            highest = float(tool_pressure(self.model, loads, answer).max())
+            highest = float(compute_tool_pressure(self.model, loads, answer).max())
         else:
             highest = self.ball.pressure(float(np.linalg.norm(force)))
         error = float(answer.bound[0, 0])

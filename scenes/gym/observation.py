@@ -24,12 +24,12 @@ FARTHEST = 2.0
 """Upper limit of depths in images [m]."""
 
 
-def twists() -> spaces.Box:
+def build_action_space() -> spaces.Box:
     """The space of actions: twists (6,) of a tool."""
     return spaces.Box(-1.0, 1.0, (6,), np.float32)
 
 
-def space_of(kind: str, size: tuple[int, int]) -> spaces.Space:
+def build_space(kind: str, size: tuple[int, int]) -> spaces.Space:
     """Return the observation space of one of `KINDS`, with images of a width and height [pixel]."""
     states = spaces.Box(-BOUND, BOUND, (COUNT,), np.float32)
     if kind == "states":
@@ -44,7 +44,7 @@ def space_of(kind: str, size: tuple[int, int]) -> spaces.Space:
     )
 
 
-def states(
+def compute_states(
     task: GymTask, goal: Goal, hand: RobotTool, sensed: np.ndarray, time: float, done: float, frame: np.ndarray,
     origin: np.ndarray,
 ) -> np.ndarray:  # fmt: skip

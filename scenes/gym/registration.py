@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sim.runtime.optional_packages import needed_from
+from sim.runtime.optional_packages import require_extra
 
 NAMESPACE = "sulcus"
 NAMES = ("Palpate", "Retract", "Debulk")
@@ -18,7 +18,7 @@ def register_environments() -> None:
     InputError
         Gymnasium is not installed.
     """
-    with needed_from("gym", "these environments need"):
+    with require_extra("gym", "these environments need"):
         from gymnasium.envs.registration import register, registry
     for name in NAMES:
         known = f"{NAMESPACE}/{name}-v0"

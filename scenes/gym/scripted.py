@@ -16,7 +16,7 @@ STIFFNESS = 60.0
 FOLLOWS, CREEPS = 1.0, 2.0
 
 
-def scripted(task: str, states: np.ndarray) -> np.ndarray:
+def compute_scripted_actions(task: str, states: np.ndarray) -> np.ndarray:
     """Actions (..., 6) float32 for states (..., 24) of a task by name.
 
     Raises

@@ -20,13 +20,13 @@ from sim.loads import Loads, Resected
 from sim.material import Tissue
 from sim.runtime.device import find_device
 from sim.skulls import Bonded
-from surrogate.model.guarded import knows_pressure
+from surrogate.model.guarded import has_tool_pressure
 
 from ..play.deformers import Theatre, open_theatre
-from ..play.learned_regions import learned_regions
+from ..play.learned_regions import find_learned_regions
 from ..play.stage import Stage
 from ..script.scene import Scene
-from ..script.shipped_files import spatula_model_path
+from ..script.shipped_files import get_spatula_model_path
 from ..script.site import Site
 from ..script.tool import Blade, Probe
 from .fem_answers import CutElements, PosedElements
@@ -95,7 +95,7 @@ class TaskSetting:
         if surgery is None:
             return ()
         mesh = self.site.anatomy.mesh
-        return tuple(mesh.tets[list(step)].ravel() for step in surgery.resection(self.site.anatomy).steps[1:])
+        return tuple(mesh.tets[list(step)].ravel() for step in surgery.build_resection(self.site.anatomy).steps[1:])
 
     def near(self, place: np.ndarray) -> np.ndarray:
         """Vertices (n,) of the open cortex within `PATCH` of a place (3,) [m], or the nearest one."""
@@ -157,7 +157,7 @@ def open_setting(
     if not theatre.anatomy.in_tumour.any():
         raise InputError(f"{anatomy}: has no tumour, which these tasks aim at: mesh one with region {TUMOUR_LABEL}.")
     scene, tool = task.scene(size), task.tool
-    scene = scene.with_regions(learned_regions(scene.elasticity, theatre.learned_tissue))
+    scene = scene.replace_regions(find_learned_regions(scene.elasticity, theatre.learned_tissue))
     card = find_device(device, LIVE.precision).name != "cpu"
     at_once = card if together is None else together
     ball = Hertz(tool.radius, _touched(task, scene, theatre.site)) if isinstance(tool, Probe) else None
@@ -200,11 +200,15 @@ def _refusals(task: GymTask, scene: Scene, theatre: Theatre) -> dict[str, str | 
         return dict.fromkeys(theatre.models, "tissue is cut away, which no model learned")
     ball = isinstance(task.tool, Probe)
     pushes = replace(scene, effects=(scene.elasticity, Held(), Bonded(), ToolForce()))
-    moved, pushed = theatre.refusals(scene), theatre.refusals(pushes) if ball else {}
+    moved, pushed = theatre.list_rejections(scene), theatre.list_rejections(pushes) if ball else {}
     found = {}
     for name, each in theatre.models.items():
         found[name] = pushed.get(name, moved[name]) if each.tool is None else moved[name]
-        if found[name] is None and each.tool is not None and (each.force is None or not (ball or knows_pressure(each))):
+        if (
+            found[name] is None
+            and each.tool is not None
+            and (each.force is None or not (ball or has_tool_pressure(each)))
+        ):
             found[name] = f"it does not know its tool's {'force' if each.force is None else 'pressure'}"
     return found
 
@@ -237,10 +241,10 @@ def _theatre(anatomy: str, model: str | None, device: str) -> Theatre:
 
 
 def _shipped(task: GymTask) -> str | None:
-    return str(spatula_model_path()) if isinstance(task.tool, Blade) else None
+    return str(get_spatula_model_path()) if isinstance(task.tool, Blade) else None
 
 
-def checked(given: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int], str | None]:
+def check_arguments(given: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int], str | None]:
     """Arguments `anatomy`, `physics`, `device`, `size` and `model` as `open_setting` takes them.
 
     Raises

@@ -33,35 +33,37 @@ class RobotTool:
         """T_world_tool (4, 4)."""
         T = np.eye(4)
         T[:3, :3] = self.turned
-        T[:3, 3] = self.place - lever_of(tool) * self.turned[:, 2]
+        T[:3, 3] = self.place - compute_lever(tool) * self.turned[:, 2]
         return T
 
 
-def lever_of(tool: Instrument) -> float:
+def compute_lever(tool: Instrument) -> float:
     """Return the distance of the pivot point up the tool's shaft [m]."""
     return tool.radius if isinstance(tool, Probe) else 0.0
 
 
-def frame_of(site: Site) -> np.ndarray:
+def build_tool_frame(site: Site) -> np.ndarray:
     """The frame of twists and observations, as columns (3, 3): the open cortex's right, up, and outwards."""
     return np.column_stack([site.right, site.up, -site.axis])
 
 
-def laid(site: Site, tool: Instrument, tip: np.ndarray) -> RobotTool:
+def lay_tool(site: Site, tool: Instrument, tip: np.ndarray) -> RobotTool:
     """A tool in its first posture, its lowest point at `tip` (3,) [m]."""
     turned = tool.pose(tip, site.axis, site.right)[:3, :3]
-    return RobotTool(tip - lever_of(tool) * site.axis, turned)
+    return RobotTool(tip - compute_lever(tool) * site.axis, turned)
 
 
-def moved(hand: RobotTool, site: Site, tool: Instrument, twist: np.ndarray, tilt: float, deepest: float) -> RobotTool:
-    """A tool after a twist (6,) [m, rad], in the frame of `frame_of`, about its own point.
+def move_tool(
+    hand: RobotTool, site: Site, tool: Instrument, twist: np.ndarray, tilt: float, deepest: float
+) -> RobotTool:
+    """A tool after a twist (6,) [m, rad], in the frame of `build_tool_frame`, about its own point.
 
     The bone stops it at the opening's edge. It goes no deeper than `deepest` [m] below the open cortex's middle. It
     leans by no more than `tilt` [rad] from its first posture: a turn beyond that is left out.
     """
-    frame = frame_of(site)
+    frame = build_tool_frame(site)
     place = site.within(hand.place + frame @ twist[:3], tool.radius)
-    along = float((place - site.origin) @ site.axis) + lever_of(tool)
+    along = float((place - site.origin) @ site.axis) + compute_lever(tool)
     place = place + (np.clip(along, -HIGHEST, deepest) - along) * site.axis
     turned = Rotation.from_rotvec(frame @ twist[3:]).as_matrix() @ hand.turned
     first = tool.pose(site.origin, site.axis, site.right)[:3, 2]
@@ -70,6 +72,6 @@ def moved(hand: RobotTool, site: Site, tool: Instrument, twist: np.ndarray, tilt
     return RobotTool(place, np.asarray(turned))
 
 
-def trembling(hand: RobotTool, offset: np.ndarray) -> RobotTool:
+def add_tremor(hand: RobotTool, offset: np.ndarray) -> RobotTool:
     """Return the pose shifted by (3,) [m]."""
     return replace(hand, place=hand.place + offset)

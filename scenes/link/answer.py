@@ -15,12 +15,20 @@ from ar.tracking.pose_stream import LONGEST, PoseStream
 from ar.tracking.registration import Registration
 
 from ..script.uncertainty import LEVEL
-from ..tracked.follower import LIMIT, UNCHECKED, UNKNOWN, TrackingResult, TumourState, tip_covariance, wide_words
+from ..tracked.follower import (
+    LIMIT,
+    UNCHECKED,
+    UNKNOWN,
+    TrackingResult,
+    TumourState,
+    compute_tip_covariance,
+    describe_wide_band,
+)
 from ..tracked.picture import Painter
-from ..tracked.plausible import misplaced_tool
+from ..tracked.plausible import describe_misplaced_tool
 from ..tracked.tool_motion import ToolMotion
 from ..tracked.tracked_tool import TrackedTool
-from .frame import stamp_of, time_of
+from .frame import to_stamp, to_time
 from .heard import ReceivedTransforms, Sent
 
 # # Minimum number of poses to estimate the camera's acceleration between them.
@@ -39,7 +47,9 @@ class CameraPlacement:
     moved: float
 
 
-def placed_at(course: Sequence[Sent], now: float, stamp: int, place: np.ndarray, stale: float) -> CameraPlacement | str:
+def place_camera(
+    course: Sequence[Sent], now: float, stamp: int, place: np.ndarray, stale: float
+) -> CameraPlacement | str:
     """Interpolate a camera's pose at an image's time stamp, from its poses, the newest last; or return a reason.
 
     Between two poses, and just after the newest, it is interpolated as by `PoseStream.at`. The error is the camera's
@@ -49,8 +59,8 @@ def placed_at(course: Sequence[Sent], now: float, stamp: int, place: np.ndarray,
     """
     body = course[-1]
     stamped = bool(stamp and all(sent.stamp for sent in course))
-    times = np.array([time_of(sent.stamp) if stamped else sent.arrived for sent in course])
-    time = time_of(stamp) if stamped else now
+    times = np.array([to_time(sent.stamp) if stamped else sent.arrived for sent in course])
+    time = to_time(stamp) if stamped else now
     poses = np.stack([sent.T for sent in course])
     if stamped and len(course) >= EVEN and np.ptp(times[-EVEN:]) <= LONGEST * EVEN:
         between = PoseStream(times, poses, np.zeros((len(course), 6, 6))).at(time)
@@ -130,13 +140,13 @@ class PoseResponder:
         body = heard.beside(heard.names.tool, now)
         if isinstance(body, str):
             return self._nothing(body, moment, before)
-        stamp = body.stamp or stamp_of(moment)
+        stamp = body.stamp or to_stamp(moment)
         beside = Pose(body.T, np.diag(np.repeat([self.tracking**2, 0.0], 3)), 0.0, 0)
         pose = np.linalg.inv(registration.T_patient_scan) @ body.T @ self.tool.T_cube_tool
-        spread = tip_covariance(registration, self.tool, beside)
+        spread = compute_tip_covariance(registration, self.tool, beside)
         motion = self.motion.under(pose, spread, None if before is None else before.motion)
         known = TrackingResult(
-            time_of(stamp), TumourState.GOOD if motion.moved > 0.0 else TumourState.REST, "", NOT_SEEN, motion, None, pose, spread
+            to_time(stamp), TumourState.GOOD if motion.moved > 0.0 else TumourState.REST, "", NOT_SEEN, motion, None, pose, spread
         )  # fmt: skip
         known = replace(known, seen=known.time, felt=moment, **self._doubts(known, before))
         if known.state is TumourState.UNKNOWN:
@@ -164,7 +174,7 @@ class PoseResponder:
         if isinstance(registration, str) or isinstance(body, str):
             return registration if isinstance(registration, str) else str(body)
         middle = registration.T_patient_scan @ np.append(self.motion.stage.tumour_at_rest.vertices.mean(axis=0), 1.0)
-        placed = placed_at(heard.course(name), now, stamp, middle[:3], heard.stale)
+        placed = place_camera(heard.course(name), now, stamp, middle[:3], heard.stale)
         if isinstance(placed, str):
             return placed.format(name=name)
         return CameraView(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.moved)
@@ -182,7 +192,7 @@ class PoseResponder:
         """Return state, text and `near` of an unreliable result; only `near` of a reliable one."""
         near = before is not None and before.near
         assert known.T_scan_tool is not None
-        doubt, near = misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, THEIRS)
+        doubt, near = describe_misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, THEIRS)
         doubt = doubt or known.motion.doubt
         if doubt:
             return {"state": TumourState.UNSURE, "words": doubt, "near": near}
@@ -199,7 +209,7 @@ class PoseResponder:
         registered = float(np.sqrt(chi2.ppf(LEVEL, 3) * max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
         parts = {"registration": registered, "tool": known.motion.tool, "model": known.motion.model}
         band = float(np.hypot(registered, known.motion.error))
-        return bounded(known, band, parts)
+        return add_bound(known, band, parts)
 
     def _nothing(self, why: str, moment: float, before: TrackingResult | None) -> PoseResult:
         """Nothing is known now, and why."""
@@ -208,18 +218,18 @@ class PoseResponder:
         state = TumourState.NO_TOOL if felt is None else TumourState.STALE
         motion = self.motion.rest if before is None else before.motion
         return PoseResult(
-            stamp_of(moment), TrackingResult(moment, state, why, NOT_SEEN, motion, felt=felt, near=near)
+            to_stamp(moment), TrackingResult(moment, state, why, NOT_SEEN, motion, felt=felt, near=near)
         )  # fmt: skip
 
 
-def bounded(known: TrackingResult, band: float, parts: dict[str, float]) -> TrackingResult:
+def add_bound(known: TrackingResult, band: float, parts: dict[str, float]) -> TrackingResult:
     """Add a bound [m] on the position, and its parts, to a result; beyond 5 mm it is unreliable."""
     if band <= LIMIT:
         return replace(known, band=band, parts=parts)
-    return replace(known, state=TumourState.UNSURE, words=wide_words(band), band=None, parts={})
+    return replace(known, state=TumourState.UNSURE, words=describe_wide_band(band), band=None, parts={})
 
 
-def late(answer: PoseResult, age: float, stale: float) -> PoseResult:
+def add_lateness(answer: PoseResult, age: float, stale: float) -> PoseResult:
     """Return the result for a pose of the given age [s]: stale if older than `stale`."""
     if age <= stale or not (answer.known.relied or answer.known.state is TumourState.UNSURE):
         return answer

@@ -9,8 +9,17 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import count
 
-from .frame import HEADER, WRONG_CHECKSUM, BadMessageError, Header, content_of, framed, metadata_of, read_header
-from .messages import Code, status
+from .frame import (
+    HEADER,
+    WRONG_CHECKSUM,
+    BadMessageError,
+    Header,
+    pack_message,
+    read_content,
+    read_header,
+    read_metadata,
+)
+from .messages import Code, encode_status
 
 REFUSED = "SulcusRefused"
 """The device name of each STATUS that is sent to one client."""
@@ -101,7 +110,7 @@ class Clients:
         self._count(why, text)
         client = self._clients.get(number)
         if client is not None and not client.asks:
-            client.offer(REFUSED, (framed("STATUS", REFUSED, status(code, text), 0),))
+            client.offer(REFUSED, (pack_message("STATUS", REFUSED, encode_status(code, text), 0),))
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve one connection until it ends."""
@@ -115,7 +124,7 @@ class Clients:
             return
         self._count("too many clients")
         text = f"{self._most} clients are connected, and no more are taken: end one of them"
-        writer.write(framed("STATUS", REFUSED, status(Code.BUSY, text), 0))
+        writer.write(pack_message("STATUS", REFUSED, encode_status(Code.BUSY, text), 0))
         await _close(writer)
 
     async def close(self) -> None:
@@ -218,8 +227,8 @@ class Clients:
             return
         body = await reader.readexactly(header.size)
         try:
-            content = content_of(header, body)
-            self._receive(client.number, replace(header, metadata=metadata_of(header, body)), content)
+            content = read_content(header, body)
+            self._receive(client.number, replace(header, metadata=read_metadata(header, body)), content)
         except BadMessageError as error:
             code = Code.CHECKSUM if str(error) == WRONG_CHECKSUM else Code.CONFIGURATION
             # # The text after a colon differs from message to message.
@@ -234,7 +243,7 @@ class Clients:
         elif client.asks:
             found = _found(self._newest, header.kind.removeprefix("GET_"), header.name)
             text = f"there is no {header.kind.removeprefix('GET_')} yet"
-            none = framed("STATUS", REFUSED, status(Code.NOT_FOUND, text), 0)
+            none = pack_message("STATUS", REFUSED, encode_status(Code.NOT_FOUND, text), 0)
             client.waiting.clear()
             client.offer("asked", (found or none,))
         else:

@@ -12,14 +12,14 @@ MOST, WHILE = 10, 5.0
 PREFIX = "sulcus link: "
 
 
-def printed(line: str) -> None:
+def print_safely(line: str) -> None:
     """Print a line to standard error, without control characters; ignored if standard error is closed."""
     plain = "".join(each if each.isprintable() else "?" for each in line)
     with suppress(OSError):
         print(f"{PREFIX}{plain}", file=sys.stderr, flush=True)
 
 
-def limited(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Callable[[str], None]:
+def limit_rate(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Callable[[str], None]:
     """A function that writes lines, no more than 10 in 5 s; the next one says how many were left out."""
     begun, count, left_out = -WHILE, 0, 0
 
@@ -37,6 +37,6 @@ def limited(write: Callable[[str], None], clock: Callable[[], float] = time.mono
     return note
 
 
-def address_words(host: str, port: int) -> str:
+def format_address(host: str, port: int) -> str:
     """HOST:PORT, as people write it: an IPv6 address stands in brackets."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

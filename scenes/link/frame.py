@@ -6,9 +6,9 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from sim.runtime.optional_packages import needed_from
+from sim.runtime.optional_packages import require_extra
 
-with needed_from("slicer", "OpenIGTLink's checksums need"):
+with require_extra("slicer", "OpenIGTLink's checksums need"):
     from fastcrc import crc64
 
 HEADER = struct.Struct(">H12s20sQQQ")
@@ -72,7 +72,7 @@ def read_header(raw: bytes) -> Header:
     return Header(version, words[0].decode().strip(), words[1].decode().strip(), stamp, size, checksum)
 
 
-def content_of(header: Header, body: bytes) -> bytes:
+def read_content(header: Header, body: bytes) -> bytes:
     """Extract the content between extended header and metadata, after the checksum test; of version 1 the whole body.
 
     Raises
@@ -93,7 +93,7 @@ def content_of(header: Header, body: bytes) -> bytes:
     return body[start:end]
 
 
-def metadata_of(header: Header, body: bytes) -> dict[str, str]:
+def read_metadata(header: Header, body: bytes) -> dict[str, str]:
     """Metadata of a message whose content was read, by key; those of version 1 have none.
 
     Raises
@@ -118,17 +118,17 @@ def metadata_of(header: Header, body: bytes) -> dict[str, str]:
     return found
 
 
-def framed(kind: str, name: str, body: bytes, stamp: int) -> bytes:
+def pack_message(kind: str, name: str, body: bytes, stamp: int) -> bytes:
     """A whole message of version 1, which every client reads; a name longer than 20 bytes is cut."""
     text = name.encode("ascii", "replace")[:NAME_BYTES]
     return HEADER.pack(1, kind.encode(), text, stamp, len(body), crc64.ecma_182(body)) + body
 
 
-def stamp_of(time: float) -> int:
+def to_stamp(time: float) -> int:
     """The time stamp of a moment [s since 1970]."""
     return int(time * TICKS)
 
 
-def time_of(stamp: int) -> float:
+def to_time(stamp: int) -> float:
     """The moment of a time stamp [s since 1970]."""
     return stamp / TICKS

@@ -39,7 +39,7 @@ class TransformNames:
         """Every one, by the bytes of it that a message carries."""
         return {name[:NAME_BYTES].strip(): name for name in (self.tool, self.reference, self.camera, self.registration)}
 
-    def by_tracker(self, name: str) -> bool:
+    def is_tracker_transform(self, name: str) -> bool:
         """Return True if a body's transform is in the tracker's frame."""
         tracker = self.reference.rpartition("To")[2]
         return "To" in self.reference and name.rpartition("To")[2] == tracker
@@ -74,7 +74,7 @@ class ReceivedTransforms:
     sent: Mapping[str, Sent] = field(default_factory=dict)
     earlier: Mapping[str, tuple[Sent, ...]] = field(default_factory=dict)
 
-    def hearing(self, name: str, matrix: np.ndarray, stamp: int, now: float, sender: int) -> ReceivedTransforms:
+    def add_transform(self, name: str, matrix: np.ndarray, stamp: int, now: float, sender: int) -> ReceivedTransforms:
         """With a transform (4, 4) [mm] of one client.
 
         Raises
@@ -85,7 +85,7 @@ class ReceivedTransforms:
         """
         if not matrix[:3, :3].any():
             raise BadMessageError("zeros, which trackers send of what they do not see")
-        T = rigid(matrix)
+        T = to_rigid(matrix)
         if name != self.names.registration and np.array_equal(matrix, np.eye(4)):
             raise BadMessageError("the identity, which trackers send of what they do not see")
         last = self.sent.get(name)
@@ -102,7 +102,7 @@ class ReceivedTransforms:
 
     def beside(self, name: str, now: float) -> Sent | str:
         """Return a body relative to the patient's reference, with its own time stamp; or why it is unknown."""
-        needed = (name, self.names.reference) if self.names.by_tracker(name) else (name,)
+        needed = (name, self.names.reference) if self.names.is_tracker_transform(name) else (name,)
         for each in needed:
             sent = self.sent.get(each)
             if sent is None:
@@ -118,7 +118,7 @@ class ReceivedTransforms:
         return tuple(self._in_reference(name, sent) for sent in every if sent.sender == newest.sender)
 
     def _in_reference(self, name: str, body: Sent) -> Sent:
-        if not self.names.by_tracker(name):
+        if not self.names.is_tracker_transform(name):
             return body
         reference = self.sent[self.names.reference]
         arrived = min(body.arrived, reference.arrived)
@@ -138,7 +138,7 @@ def check_status(metadata: Mapping[str, str]) -> None:
             raise BadMessageError(f"not seen by its tracker: {key} {value[:20]}")
 
 
-def rigid(matrix: np.ndarray) -> np.ndarray:
+def to_rigid(matrix: np.ndarray) -> np.ndarray:
     """The rigid motion (4, 4) [m] of a matrix (4, 4) [mm], rid of single precision's rounding.
 
     Raises

@@ -62,7 +62,7 @@ NOTHING = SentMesh(0, b"")
 """A surface that is not known."""
 
 
-def polydata(points: np.ndarray, mesh: SentMesh) -> bytes:
+def encode_polydata(points: np.ndarray, mesh: SentMesh) -> bytes:
     """POLYDATA: points (n, 3) [mm] and the triangles between them."""
     head = struct.pack(">10I", len(points), 0, 0, 0, 0, mesh.count, len(mesh.cells), 0, 0, 0)
     return head + np.ascontiguousarray(points, FLOATS).tobytes() + mesh.cells
@@ -108,7 +108,7 @@ def _floats(content: bytes, count: int) -> np.ndarray:
     return np.frombuffer(content, FLOATS).astype(float)
 
 
-def points(names: list[str], places: np.ndarray) -> bytes:
+def encode_points(names: list[str], places: np.ndarray) -> bytes:
     """POINT: places (n, 3) [mm], with a name each."""
     rows = zip(names, places.tolist(), strict=True)
     return b"".join(
@@ -134,7 +134,7 @@ def read_points(content: bytes) -> tuple[list[str], np.ndarray]:
     return [row[0].split(b"\0", 1)[0].decode("ascii", "replace") for row in rows], places
 
 
-def image(colour: np.ndarray) -> bytes:
+def encode_image(colour: np.ndarray) -> bytes:
     """Encode an image (H, W, 3) uint8 as IMAGE, with pixels of 1 mm around the origin."""
     height, width, channels = colour.shape
     size = width, height, 1
@@ -163,13 +163,13 @@ def read_image(content: bytes) -> np.ndarray:
     return np.ascontiguousarray(np.broadcast_to(pixels, (height, width, 3)) if channels == 1 else pixels[..., :3])
 
 
-def string(text: str) -> bytes:
+def encode_string(text: str) -> bytes:
     """STRING: a text of ASCII characters."""
     raw = text.encode("ascii", "replace")[:LONGEST_TEXT]
     return struct.pack(">HH", ASCII, len(raw)) + raw
 
 
-def status(code: Code, text: str) -> bytes:
+def encode_status(code: Code, text: str) -> bytes:
     """STATUS: a code, its name, and a sentence."""
     name = "" if code is Code.OK else code.name
     return STATUS.pack(code, 0, name.encode()) + text.encode("ascii", "replace") + b"\0"

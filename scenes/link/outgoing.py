@@ -8,15 +8,15 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ar.overlay.hud import bound_words, millimetres
-from sim.geometry.closest_point import closest
+from ar.overlay.hud import bound_words, format_millimetres
+from sim.geometry.closest_point import find_closest_points
 from sim.geometry.locate import Located, locate
 
 from ..play.stage import Stage
 from ..tracked.follower import TrackingResult, TumourState
 from .answer import PoseResult
-from .frame import BadMessageError, framed
-from .messages import NOTHING, Code, SentMesh, points, polydata, status, string, transform
+from .frame import BadMessageError, pack_message
+from .messages import NOTHING, Code, SentMesh, encode_points, encode_polydata, encode_status, encode_string, transform
 
 # A place that is asked for belongs to tumour or open cortex where the scan has it no farther from them [m].
 BESIDE = 2e-3
@@ -74,27 +74,27 @@ class Outgoing:
         """The tumour as the scan has it."""
         _, vertices, mesh = self._surfaces[0]
         at = self.stage.anatomy.mesh.nodes[vertices]
-        return framed("POLYDATA", "TumourInScan", polydata(1e3 * at, mesh), stamp)
+        return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * at, mesh), stamp)
 
     def messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """Build all messages of a result, with its stamp: unknown surfaces are sent without points."""
         known, stamp = answer.known, answer.stamp
-        none = polydata(np.empty((0, 3)), NOTHING)
+        none = encode_polydata(np.empty((0, 3)), NOTHING)
         out = []
         for name, vertices, mesh in self._surfaces:
             here = _follows(known, vertices)
-            body = polydata(1e3 * known.motion.positions[vertices], mesh) if here else none
+            body = encode_polydata(1e3 * known.motion.positions[vertices], mesh) if here else none
             for word, shown in (("Now", known.relied), ("Doubtful", known.state is TumourState.UNSURE)):
-                out.append(framed("POLYDATA", f"{name}{word}", body if shown else none, stamp))
+                out.append(pack_message("POLYDATA", f"{name}{word}", body if shown else none, stamp))
         if known.relied:
             rest, now = (each[self.stage.tumour_vertices] for each in (self._rest, known.motion.positions))
-            out.append(framed("TRANSFORM", "TumourToRas", transform(rigid_fit(1e3 * rest, 1e3 * now)), stamp))
-        out.append(framed("STRING", "TipToTumour", string(self._distance_words(answer)), stamp))
-        out.append(framed("STRING", "TumourMotion", string(self._motion_words(known)), stamp))
+            out.append(pack_message("TRANSFORM", "TumourToRas", transform(fit_rigid(1e3 * rest, 1e3 * now)), stamp))
+        out.append(pack_message("STRING", "TipToTumour", encode_string(self._distance_words(answer)), stamp))
+        out.append(pack_message("STRING", "TumourMotion", encode_string(self._motion_words(known)), stamp))
         if places is not None:
             body = self._points(known, places)
             for word, shown in (("Now", known.relied), ("Doubtful", known.state is TumourState.UNSURE)):
-                out.append(framed("POINT", f"Points{word}", body if shown else b"", stamp))
+                out.append(pack_message("POINT", f"Points{word}", body if shown else b"", stamp))
         return tuple(out)
 
     def status(self, answer: PoseResult, refused: str) -> bytes:
@@ -102,7 +102,7 @@ class Outgoing:
         known = answer.known
         code = Code.OK if known.relied else Code.NOT_READY
         words = known.words or f"the tumour is known, {known.state.value}"
-        return framed("STATUS", "Sulcus", status(code, f"{words}{refused}"), answer.stamp)
+        return pack_message("STATUS", "Sulcus", encode_status(code, f"{words}{refused}"), answer.stamp)
 
     def placed(self, names: list[str], at: np.ndarray) -> SentPlaces:
         """Attach points of the scan (n, 3) [m]: to the tumour's volume if inside, else to the nearest surface.
@@ -116,7 +116,7 @@ class Outgoing:
             raise BadMessageError(f"no place, or more than are followed: 1 to {MOST_PLACES}")
         anatomy = self.stage.anatomy
         triangles = np.concatenate([anatomy.tumour_surface, anatomy.open_surface])
-        found = closest(at, self._rest[triangles])
+        found = find_closest_points(at, self._rest[triangles])
         away = np.linalg.norm(found.point - at, axis=1)
         corners = triangles[found.triangle]
         vertices = np.concatenate([corners, corners[:, :1]], axis=1)
@@ -147,7 +147,7 @@ class Outgoing:
         at = 1e3 * (places.rest + np.einsum("nk,nkd->nd", places.weights, moved))
         nodes = () if known.motion.answer is None else known.motion.answer.nodes
         here = np.flatnonzero((np.isin(places.vertices, nodes) | (places.weights <= 0.0)).all(axis=1))
-        return points([places.names[row] for row in here], at[here])
+        return encode_points([places.names[row] for row in here], at[here])
 
     def _distance_words(self, answer: PoseResult) -> str:
         """The distance from tip to tumour with its error and what that is of; or why it is not known."""
@@ -155,13 +155,13 @@ class Outgoing:
         if gauge is None:
             return f"not known: {known.words}"
         inside = "inside the tumour, its edge " if gauge.inside else ""
-        return f"{inside}{millimetres(gauge.distance, gauge.error)} (95 %; {self._of}){_but(known)}"
+        return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._of}){_but(known)}"
 
     def _motion_words(self, known: TrackingResult) -> str:
         """Describe the tumour's displacement, with its error and sources; or why it is unknown."""
         if known.band is None:
             return f"not known: {known.words}"
-        moved = millimetres(known.motion.moved, known.motion.error)
+        moved = format_millimetres(known.motion.moved, known.motion.error)
         return f"moved {moved}, placed within {bound_words(known.band, 1)} (95 %; {self._of}){_but(known)}"
 
     @property
@@ -189,7 +189,7 @@ def _follows(known: TrackingResult, vertices: np.ndarray) -> bool:
     return answer is not None and bool(np.isin(vertices, answer.nodes).all())
 
 
-def rigid_fit(rest: np.ndarray, now: np.ndarray) -> np.ndarray:
+def fit_rigid(rest: np.ndarray, now: np.ndarray) -> np.ndarray:
     """The rigid motion (4, 4) that takes points (n, 3) nearest to where they are now (n, 3), in their unit."""
     middle, there = rest.mean(axis=0), now.mean(axis=0)
     T = np.eye(4)

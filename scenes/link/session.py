@@ -15,14 +15,24 @@ import numpy as np
 
 from ar.optics.calibration import Calibration
 
-from ..tracked.follower import TrackingResult, TumourState, across
+from ..tracked.follower import TrackingResult, TumourState, compute_radius_across
 from ..tracked.picture import Painter
-from .answer import CameraView, PoseResult, bounded, late
+from .answer import CameraView, PoseResult, add_bound, add_lateness
 from .clients import Clients
-from .console import address_words
-from .frame import BadMessageError, Header, framed, stamp_of
+from .console import format_address
+from .frame import BadMessageError, Header, pack_message, to_stamp
 from .heard import ReceivedTransforms, check_status
-from .messages import IMAGE, POINT, Code, image, read_image, read_points, read_position, read_transform, status
+from .messages import (
+    IMAGE,
+    POINT,
+    Code,
+    encode_image,
+    encode_status,
+    read_image,
+    read_points,
+    read_position,
+    read_transform,
+)
 from .outgoing import MOST_PLACES, STRANGE, SentPlaces
 
 # # Intervals [s]: check of missing input, unchanged STATUS, new attempt to connect to a server.
@@ -92,9 +102,9 @@ class OverlayCamera:
         T = seen.T_camera_scan
         if known.band is not None:
             middle = known.motion.positions[self.painter.stage.tumour_vertices].mean(axis=0)
-            placed = across(self.tracking**2 * np.eye(3), T[:3, :3] @ middle + T[:3, 3])
+            placed = compute_radius_across(self.tracking**2 * np.eye(3), T[:3, :3] @ middle + T[:3, 3])
             parts = {**known.parts, "camera": placed, "time": seen.moved}
-            known = bounded(known, float(np.linalg.norm([known.band, placed, seen.moved])), parts)
+            known = add_bound(known, float(np.linalg.norm([known.band, placed, seen.moved])), parts)
         return self.painter.paint(colour, replace(known, camera=self.calibration.camera(T))).colour
 
 
@@ -168,7 +178,7 @@ class LinkSession:
                 each.cancel()
 
     async def _connected(self, host: str, port: int) -> None:
-        reached, at = True, f"the server {address_words(host, port)}"
+        reached, at = True, f"the server {format_address(host, port)}"
         while True:
             try:
                 streams = await asyncio.open_connection(host, port, limit=AHEAD)
@@ -196,7 +206,9 @@ class LinkSession:
             done, _ = await asyncio.wait((*tasks, ended), timeout=limit, return_when=asyncio.FIRST_COMPLETED)
             for task in (*tasks, ended):
                 task.cancel()
-            over = framed("STATUS", "Sulcus", status(Code.SHUTDOWN, "the server ends"), stamp_of(clock.time()))
+            over = pack_message(
+                "STATUS", "Sulcus", encode_status(Code.SHUTDOWN, "the server ends"), to_stamp(clock.time())
+            )
             self.clients.publish("status", (over,))
             await self.clients.close()
             for task in done:
@@ -236,7 +248,7 @@ class LinkSession:
         """Return the last solution, or the reason why none holds at a time [s]; the solver is not called."""
         if isinstance(self._heard.beside(self._heard.names.tool, now), str):
             return self._answers.answer(self._heard, now, clock.time(), self._shown.known)
-        answer, waited = late(self._solved, now - self._arrived, self._heard.stale), now - self._begun
+        answer, waited = add_lateness(self._solved, now - self._arrived, self._heard.stale), now - self._begun
         if answer is self._solved and answer.known.state in (TumourState.NO_TOOL, TumourState.STALE) and waited > BEAT:
             return replace(answer, known=replace(answer.known, words=f"no solution yet, computing for {waited:.0f} s"))
         return answer
@@ -273,7 +285,7 @@ class LinkSession:
             (colour, stamp), heard = self._picture, self._heard
             camera = self._answers.camera(heard, self._loop.time(), stamp)
             drawn = await self._loop.run_in_executor(thread, eye.painted, colour, self._shown.known, camera)
-            self.clients.publish("picture", (framed("IMAGE", "Overlay", image(drawn), stamp),))
+            self.clients.publish("picture", (pack_message("IMAGE", "Overlay", encode_image(drawn), stamp),))
 
     def _longest(self, kind: str) -> int:
         """Return the maximum size [bytes] of a wanted message of a type; 0: not wanted."""
@@ -314,7 +326,7 @@ class LinkSession:
             return
         check_status(header.metadata)
         matrix = (read_transform if header.kind == "TRANSFORM" else read_position)(content)
-        self._heard = self._heard.hearing(name, matrix, header.stamp, self._loop.time(), number)
+        self._heard = self._heard.add_transform(name, matrix, header.stamp, self._loop.time(), number)
         if name in (names.tool, names.registration):
             self._posed.set()
 

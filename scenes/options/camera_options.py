@@ -24,14 +24,17 @@ def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None
         "--camera", type=Path, metavar="FILE.yaml", help="calibration of a camera, of OpenCV or ROS (default: ideal)"
     )
     group.add_argument(
-        "--size", type=size, metavar="WxH", help="scale the calibration of --camera to images of this size [pixel]"
+        "--size",
+        type=parse_size,
+        metavar="WxH",
+        help="scale the calibration of --camera to images of this size [pixel]",
     )
     group.add_argument("--path", choices=PATHS, default=path, help=f"camera motion (default: {path or 'none'})")
     group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held (default: %(default)s)")
     group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")
 
 
-def size(text: str) -> tuple[int, int]:
+def parse_size(text: str) -> tuple[int, int]:
     """WxH as two numbers, for argparse."""
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     if found is None:
@@ -39,7 +42,7 @@ def size(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def filmed(args: argparse.Namespace, scene: Scene) -> Scene:
+def apply_camera_options(args: argparse.Namespace, scene: Scene) -> Scene:
     """The scene as the camera of `add_camera`'s options sees it, where there are any.
 
     Raises
@@ -55,7 +58,7 @@ def filmed(args: argparse.Namespace, scene: Scene) -> Scene:
         calibration = read_calibration(args.camera)
         if args.size is not None:
             try:
-                calibration = calibration.sized(*args.size, scale=True)
+                calibration = calibration.resize_calibration(*args.size, scale=True)
             except ValueError as error:
                 raise InputError(f"{args.camera}: {error}") from error
         view = view.calibrated(calibration)
@@ -68,17 +71,17 @@ def filmed(args: argparse.Namespace, scene: Scene) -> Scene:
     return scene if view is scene.viewpoint else replace(scene, viewpoint=view)
 
 
-def filmed_with_targets(args: argparse.Namespace, scene: Scene) -> Scene:
+def film_with_targets(args: argparse.Namespace, scene: Scene) -> Scene:
     """Return the scene with a tracked camera that sees the craniotomy, the reference and the tool's cube.
 
     Raises
     ------
     InputError
-        As `filmed`; a camera that zooms.
+        As `apply_camera_options`; a camera that zooms.
     """
     from ..tracked.filming import VIEW, from_where_it_sees_all
 
     if args.path == "microscope":
         raise InputError("--path microscope zooms, and a tracked camera has one calibration: choose another path.")
-    scene = filmed(args, replace(scene, viewpoint=VIEW))
+    scene = apply_camera_options(args, replace(scene, viewpoint=VIEW))
     return replace(scene, viewpoint=from_where_it_sees_all(scene.viewpoint))

@@ -13,9 +13,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import check_output, empty_parents_removed
+from sim.runtime.atomic_files import check_output, remove_empty_parents
 from sim.runtime.journal import run_of
-from sim.runtime.partial_files import unfinished_path
+from sim.runtime.partial_files import to_unfinished_path
 
 FRAME = re.compile(r"frame_\d{4,}\.png")
 
@@ -25,7 +25,7 @@ def add_force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace files that are there")
 
 
-def claimed(
+def check_output_path(
     path: str | Path,
     suffix: str,
     force: bool = False,
@@ -41,7 +41,7 @@ def claimed(
     InputError
         As `check_output`; a file that the command reads; without `force`, a file that is there.
     """
-    with empty_parents_removed(Path(path)):
+    with remove_empty_parents(Path(path)):
         path = check_output(path, suffix)
     if not path.exists():
         return path
@@ -52,7 +52,7 @@ def claimed(
     return path
 
 
-def claimed_folder(folder: Path, what: str) -> Path:
+def check_output_folder(folder: Path, what: str) -> Path:
     """Check that images can be written into a folder; return it and leave nothing behind. `what` is their plural name.
 
     Raises
@@ -63,14 +63,14 @@ def claimed_folder(folder: Path, what: str) -> Path:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file, but the {what} need a folder. Choose another name.")
     try:
-        with empty_parents_removed(folder / "any.png"):
+        with remove_empty_parents(folder / "any.png"):
             check_output(folder / "any.png", ".png")
     except InputError as error:
         raise InputError(f"{folder}: the {what} cannot be written there. Choose another folder.") from error
     return folder
 
 
-def claimed_frames(folder: Path, force: bool) -> list[Path]:
+def check_output_frames(folder: Path, force: bool) -> list[Path]:
     """Frames that are in a folder, which `force` allows to remove; other files are left alone.
 
     Raises
@@ -90,7 +90,7 @@ def claimed_frames(folder: Path, force: bool) -> list[Path]:
 KEPT = ("anatomy", "effects", "tissue", "element", "accuracy", "preset", "seed", "shape")
 
 
-def stated(path: Path) -> dict[str, str]:
+def read_statements(path: Path) -> dict[str, str]:
     """Read the attributes of a data set, an unfinished one, or a model file as texts; empty if unreadable."""
     import h5py
 
@@ -108,24 +108,24 @@ def stated(path: Path) -> dict[str, str]:
         return {}
 
 
-def strangers(mesh: Path, digest: str) -> list[Path]:
+def find_foreign_files(mesh: Path, digest: str) -> list[Path]:
     """List data and models next to a mesh file that were made with an anatomy of another `digest`."""
-    from ..play.deformers import model_path  # takes seconds, and is not needed for simulation alone
+    from ..play.deformers import to_model_path  # takes seconds, and is not needed for simulation alone
 
     data = mesh.with_suffix(".h5")
-    beside = (data, unfinished_path(data), model_path(mesh))
-    return [path for path in beside if path.is_file() and stated(path).get("anatomy", digest) != digest]
+    beside = (data, to_unfinished_path(data), to_model_path(mesh))
+    return [path for path in beside if path.is_file() and read_statements(path).get("anatomy", digest) != digest]
 
 
-def demand_no_strangers(mesh: Path, digest: str, force: bool) -> list[Path]:
-    """Those `strangers`, which `force` accepts.
+def check_no_foreign_files(mesh: Path, digest: str, force: bool) -> list[Path]:
+    """Those `find_foreign_files`, which `force` accepts.
 
     Raises
     ------
     InputError
         Without `force`, where there is one.
     """
-    found = strangers(mesh, digest)
+    found = find_foreign_files(mesh, digest)
     if found and not force:
         raise InputError(
             f"{mesh}: would be another anatomy than the one that {' and '.join(path.name for path in found)} beside it "
@@ -136,16 +136,16 @@ def demand_no_strangers(mesh: Path, digest: str, force: bool) -> list[Path]:
 
 def remove_data(path: Path, wanted: Mapping[str, str]) -> None:
     """Remove a data set, and an unfinished one of its name, that cannot go on as what is `wanted`; keep others."""
-    for each in (path, unfinished_path(path)):
-        found = stated(each)
+    for each in (path, to_unfinished_path(path)):
+        found = read_statements(each)
         if any(found.get(name) != wanted.get(name) for name in KEPT):
             each.unlink(missing_ok=True)
 
 
-def batch_begun(path: Path) -> int | None:
+def find_begun_batch(path: Path) -> int | None:
     """Return the batch size of an existing or unfinished data set, which it keeps; None if unreadable."""
-    for each in (path, unfinished_path(path)):
-        found = stated(each).get("batch", "")
+    for each in (path, to_unfinished_path(path)):
+        found = read_statements(each).get("batch", "")
         if found.isdigit():
             return int(found)
     return None

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.bodies.markups import Markup, read_markup
-from sim.bodies.placement import opening_at, opening_over, opening_within
+from sim.bodies.placement import find_opening_at, find_opening_over, find_opening_within
 from sim.bodies.subject import Subject
 from sim.errors import InputError
 
@@ -27,7 +27,7 @@ def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
         "tumour). A file of 3D Slicer may hold a point, a trajectory as a line, or an outline as a closed curve",
     )  # fmt: skip
     place.add_argument(
-        "--opening-over", type=piece_point_or_file, metavar="PIECE|X,Y,Z|FILE.mrk.json",
+        "--opening-over", type=parse_opening, metavar="PIECE|X,Y,Z|FILE.mrk.json",
         help="open the skull over a piece of the tumour, by its number (1, the default, is the largest), or over a "
         "point inside the brain [mm, RAS]. A file of 3D Slicer may hold the point, or a trajectory that ends there",
     )  # fmt: skip
@@ -51,12 +51,12 @@ def point_or_file(text: str) -> Point | Path:
     return Path(text) if text.lower().endswith((".json", ".fcsv")) else point(text)
 
 
-def piece_point_or_file(text: str) -> int | Point | Path:
+def parse_opening(text: str) -> int | Point | Path:
     """A piece's number, X,Y,Z or a file of markups, for argparse."""
     return int(text) if text.isdecimal() else point_or_file(text)
 
 
-def opening_words(args: argparse.Namespace) -> list[str]:
+def to_opening_options(args: argparse.Namespace) -> list[str]:
     """The options as words for another command."""
     given = {"--opening-at": args.opening_at, "--opening-over": args.opening_over}
     texts = {
@@ -67,13 +67,13 @@ def opening_words(args: argparse.Namespace) -> list[str]:
     return [f"{name}={text}" for name, text in texts.items()] + ["--fine-opening"] * args.fine_opening
 
 
-def trajectory_given(args: argparse.Namespace) -> Path | None:
+def get_trajectory_option(args: argparse.Namespace) -> Path | None:
     """The file of the trajectory that the options name, if they name one."""
     given = args.opening_over if args.opening_at is None else args.opening_at
     return given if isinstance(given, Path) and read_markup(given).kind == "Line" else None
 
 
-def opened_over(args: argparse.Namespace) -> str:
+def describe_opening(args: argparse.Namespace) -> str:
     """Describe the target of the craniotomy."""
     given = args.opening_over if args.opening_at is None else args.opening_at
     if isinstance(given, Path):
@@ -81,7 +81,7 @@ def opened_over(args: argparse.Namespace) -> str:
     return "the point given" if isinstance(given, tuple) else f"piece {given or 1}"
 
 
-def opened(subject: Subject, args: argparse.Namespace) -> Subject:
+def place_craniotomy(subject: Subject, args: argparse.Namespace) -> Subject:
     """Return the subject with the craniotomy placed by the options.
 
     Raises
@@ -93,7 +93,7 @@ def opened(subject: Subject, args: argparse.Namespace) -> Subject:
     if isinstance(args.opening_at, Path):
         return _marked(subject, read_markup(args.opening_at))
     if args.opening_at is not None:
-        return replace(subject, site=opening_at(subject.cortex, 1e-3 * np.array(args.opening_at)))
+        return replace(subject, site=find_opening_at(subject.cortex, 1e-3 * np.array(args.opening_at)))
     over, pieces = args.opening_over, subject.pieces
     if over is None:
         return subject
@@ -108,7 +108,7 @@ def opened(subject: Subject, args: argparse.Namespace) -> Subject:
         place = max(markup.points, key=lambda end: _depth(subject, end))
     else:
         place = 1e-3 * np.array(over)
-    return replace(subject, site=opening_over(subject.cortex, place, _depth(subject, place)))
+    return replace(subject, site=find_opening_over(subject.cortex, place, _depth(subject, place)))
 
 
 def _depth(subject: Subject, place: np.ndarray) -> float:
@@ -123,12 +123,12 @@ def _marked(subject: Subject, markup: Markup) -> Subject:
     _demand_kind(markup, "--opening-at", Fiducial=1, Line=2, ClosedCurve=None)
     if markup.kind == "ClosedCurve":
         outline = markup.curve()
-        return replace(subject, outline=outline, site=opening_within(subject.cortex, outline))
+        return replace(subject, outline=outline, site=find_opening_within(subject.cortex, outline))
     ends = sorted(markup.points, key=lambda end: _depth(subject, end))
     along = ends[0] + np.linspace(0.0, 1.0, ON_LINE)[:, None] * (ends[-1] - ends[0])
     inside = np.flatnonzero(subject.brain(along) < 0.0)
     entry = along[inside[0]] if len(inside) else ends[-1]
-    return replace(subject, site=opening_at(subject.cortex, entry))
+    return replace(subject, site=find_opening_at(subject.cortex, entry))
 
 
 def _demand_kind(markup: Markup, option: str, **kinds: int | None) -> None:

@@ -43,7 +43,7 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def demand_poses(args: argparse.Namespace) -> None:
+def check_pose_options(args: argparse.Namespace) -> None:
     """Reject options that conflict, before anything is read.
 
     Raises
@@ -74,7 +74,7 @@ def _clock(words: list[str]) -> tuple[float, float]:
     return offset, error
 
 
-def elsewhere_of(args: argparse.Namespace, calibration: Calibration) -> ExternalTracker | None:
+def open_external_tracker(args: argparse.Namespace, calibration: Calibration) -> ExternalTracker | None:
     """The other tracker's poses; None where none are asked for.
 
     Raises
@@ -100,11 +100,11 @@ def elsewhere_of(args: argparse.Namespace, calibration: Calibration) -> External
 
 def _say_apart(args: argparse.Namespace, elsewhere: ExternalTracker) -> None:
     """Report the times of poses and images, if the video begins outside the poses."""
-    from ar.tracking.pictures import film_of
+    from ar.tracking.pictures import read_video
 
-    from ..tracked.run import timed
+    from ..tracked.run import read_timed
 
-    first = next(timed(film_of(Path(args.pictures), args.rate))).picture.time
+    first = next(read_timed(read_video(Path(args.pictures), args.rate))).picture.time
     outside = elsewhere.outside(first)
     if not outside:
         return
@@ -119,17 +119,17 @@ def _say_apart(args: argparse.Namespace, elsewhere: ExternalTracker) -> None:
 
 def _clock_of(args: argparse.Namespace, calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:
     """Return the given clock offset, or the one estimated from the video's own markers."""
-    from ar.tracking.pictures import film_of
+    from ar.tracking.pictures import read_video
     from ar.tracking.pose_stream import Clock
 
-    from ..tracked.elsewhere import clock_of_film
-    from ..tracked.run import timed
+    from ..tracked.elsewhere import estimate_video_clock
+    from ..tracked.run import read_timed
 
     if args.clock != [AUTO]:
         return Clock(*_clock(args.clock))
     try:
-        film = (each.picture for each in timed(film_of(Path(args.pictures), args.rate)))
-        found = clock_of_film(film, calibration, tool, patient)
+        film = (each.picture for each in read_timed(read_video(Path(args.pictures), args.rate)))
+        found = estimate_video_clock(film, calibration, tool, patient)
     except ValueError as error:
         raise InputError(f"--clock {AUTO}: {error}") from error
     said = f"the tracker's clock is {found.offset:.4f} s ahead of the pictures', +- {found.error:.4f} s"

@@ -51,7 +51,7 @@ def add_json(parser: argparse.ArgumentParser, meaning: str = "print one JSON lin
     parser.add_argument("--json", action="store_true", help=meaning)
 
 
-def json_line(value: Any) -> str:
+def to_json_line(value: Any) -> str:
     """One line of JSON: null stands for numbers that are not finite, which JSON does not have."""
     return json.dumps(_finite(value), allow_nan=False)
 
@@ -83,7 +83,7 @@ def add_address(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def addresses_of(args: argparse.Namespace) -> tuple[str, ...]:
+def list_addresses(args: argparse.Namespace) -> tuple[str, ...]:
     """Addresses as browsers write them.
 
     Raises
@@ -99,7 +99,7 @@ def addresses_of(args: argparse.Namespace) -> tuple[str, ...]:
         raise InputError(f"--address {error}") from error
 
 
-def say_addresses(browser: Browser) -> None:
+def print_addresses(browser: Browser) -> None:
     """Print where else the page is, if a token is needed there."""
     for address in browser.addresses:
         print(f"sulcus: behind the proxy or the forwarded port, open {address}", flush=True)

@@ -9,12 +9,12 @@ from typing import Any
 
 from sim.anatomy import PART_LABELS
 from sim.bodies.conventions import CONVENTIONS
-from sim.bodies.dural_septa import SEPTA, drawn_falx
+from sim.bodies.dural_septa import SEPTA, synthesise_falx
 from sim.bodies.head_masks import Sources
-from sim.bodies.healthy_heads import fsaverage_head, masked_head
+from sim.bodies.healthy_heads import build_masked_head, read_fsaverage_head
 from sim.bodies.label_map import Label
 from sim.bodies.subject import Subject
-from sim.bodies.template import SITES, Head, Tumour, drawn_subject, template_subject
+from sim.bodies.template import SITES, Head, Tumour, build_synthetic_subject, template_subject
 from sim.errors import InputError
 
 from .placement_options import point
@@ -23,10 +23,10 @@ from .placement_options import point
 def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None:
     """Declare --brain, --tumour, --mask, --tumour-in, and by these `names` the convention that labels follow."""
     parser.add_argument(
-        "--brain", type=labels, metavar="1,2", help="labels that are brain, by number or by a segment's name"
+        "--brain", type=parse_labels, metavar="1,2", help="labels that are brain, by number or by a segment's name"
     )
     parser.add_argument(
-        "--tumour", type=labels, metavar="3,4", help="labels that are tumour, by number or by a segment's name"
+        "--tumour", type=parse_labels, metavar="3,4", help="labels that are tumour, by number or by a segment's name"
     )
     said = ". ".join(f"{name}: {one.source}" for name, one in CONVENTIONS.items())
     parser.add_argument(
@@ -46,12 +46,12 @@ def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None
     for name, number in PART_LABELS.items():
         counts = "tumour" if name == "necrosis" else "brain"
         parser.add_argument(
-            f"--{name}", type=labels, metavar="LABELS",
+            f"--{name}", type=parse_labels, metavar="LABELS",
             help=f"labels that are {name}: they count as {counts}, and become region {number} for its own stiffness",
         )  # fmt: skip
     for name in SEPTA:
         parser.add_argument(
-            f"--{name}", type=labels, metavar="LABELS",
+            f"--{name}", type=parse_labels, metavar="LABELS",
             help=f"labels that are {name}, a sheet of dura: they count as brain, and what lies at them does not move. "
             "No convention marks it",
         )  # fmt: skip
@@ -69,7 +69,7 @@ def add_axes(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
 
 
-def labels(text: str) -> tuple[Label, ...]:
+def parse_labels(text: str) -> tuple[Label, ...]:
     """Numbers and names with commas between them, for argparse."""
     found = tuple(int(part) if part.strip().isdecimal() else part.strip() for part in text.split(","))
     if "" in found:
@@ -77,7 +77,7 @@ def labels(text: str) -> tuple[Label, ...]:
     return found
 
 
-def sources_of(args: argparse.Namespace) -> Sources:
+def parse_sources(args: argparse.Namespace) -> Sources:
     """The files and labels that the options name."""
     return Sources(
         args.labels,
@@ -91,7 +91,7 @@ def sources_of(args: argparse.Namespace) -> Sources:
     )
 
 
-def regions_asked(args: argparse.Namespace) -> tuple[str, ...]:
+def parse_regions(args: argparse.Namespace) -> tuple[str, ...]:
     """The parts of brain and tumour that become regions of their own."""
     return tuple(dict.fromkeys((*(name for name in _parts(args) if name in PART_LABELS), *args.regions)))
 
@@ -158,19 +158,19 @@ def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
     drawn.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random lobed shape (default 0)")
 
 
-def source(args: argparse.Namespace) -> str:
+def describe_source(args: argparse.Namespace) -> str:
     """Describe the source of the brain."""
     return str(args.labels or args.mask or (args.head if args.head == "fsaverage" else "the template"))
 
 
-def demand_no_drawn(args: argparse.Namespace) -> None:
+def check_no_drawn_options(args: argparse.Namespace) -> None:
     """Reject options of a synthetic tumour together with a label map, by an `InputError`."""
     for name in PLACED:
         if getattr(args, name) is not None:
             raise InputError(f"--{name.replace('_', '-')} draws in a healthy head: leave it out with --labels.")
 
 
-def drawn(args: argparse.Namespace, chosen: dict[str, Any]) -> Subject:
+def build_drawn_subject(args: argparse.Namespace, chosen: dict[str, Any]) -> Subject:
     """Return the synthetic subject of the options; `chosen` has lengths [mm], shape and site after presets and defaults.
 
     Raises
@@ -191,14 +191,14 @@ def drawn(args: argparse.Namespace, chosen: dict[str, Any]) -> Subject:
     subject = _in_head(Tumour(*lengths, chosen["tumour_shape"], chosen["site"], args.seed, middle), args)
     if args.falx_depth is None:
         return subject
-    return replace(subject, septa=(drawn_falx(subject.cortex, 1e-3 * args.falx_depth),))
+    return replace(subject, septa=(synthesise_falx(subject.cortex, 1e-3 * args.falx_depth),))
 
 
 def _in_head(tumour: Tumour, args: argparse.Namespace) -> Subject:
     volume = None if args.brain_ml is None else 1e-6 * args.brain_ml
     if args.mask is not None:
-        return drawn_subject(tumour, masked_head(args.mask, args.t1, volume))
+        return build_synthetic_subject(tumour, build_masked_head(args.mask, args.t1, volume))
     head = Head() if volume is None else Head(volume)
     if args.head == "fsaverage":
-        return drawn_subject(tumour, fsaverage_head(head.volume), head)
+        return build_synthetic_subject(tumour, read_fsaverage_head(head.volume), head)
     return template_subject(tumour, head)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from sim.errors import InputError
 
 from .shared_options import add_anatomy, add_device
-from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, dressed
+from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, apply_tissue_options
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
@@ -73,7 +73,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     add_device(parser, "finite elements")
 
 
-def theatre_asked(args: argparse.Namespace, *scenes: str) -> Theatre:
+def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> Theatre:
     """The theatre that `add_theatre`'s arguments ask for, to play scenes of these names there.
 
     Raises
@@ -91,17 +91,17 @@ def theatre_asked(args: argparse.Namespace, *scenes: str) -> Theatre:
     return replace(theatre, limit=1e-3 * args.guard_mm)
 
 
-def scene_asked(args: argparse.Namespace, name: str, theatre: Theatre) -> Scene:
+def build_requested_scene(args: argparse.Namespace, name: str, theatre: Theatre) -> Scene:
     """A scene by name, of the tissue and on the element that `add_theatre`'s arguments ask for, if they ask for any.
 
     Raises
     ------
     InputError
-        As `find_scene`, `dressed`, `read_markup` and `approach_of`.
+        As `find_scene`, `apply_tissue_options`, `read_markup` and `approach_of`.
     """
     from ..script.scene import find_scene
 
-    scene = dressed(args, find_scene(name), theatre)
+    scene = apply_tissue_options(args, find_scene(name), theatre)
     return scene if args.trajectory is None else _approached(args, scene, theatre.site)
 
 
@@ -122,9 +122,9 @@ def _approached(args: argparse.Namespace, scene: Scene, site: Site) -> Scene:
     return replace(scene, path=approach.followed(scene.path), tool=approach.held(scene.tool))
 
 
-def playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]) -> list[Scene]:
+def list_playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]) -> list[Scene]:
     """Return the named scenes; by default all that the anatomy has a locator for, with a notice about the others."""
-    left = [] if args.scenes else [scene for scene in scenes if theatre.lacks_locator(scene)]
+    left = [] if args.scenes else [scene for scene in scenes if theatre.is_without_locator(scene)]
     if left:
         names = ", ".join(scene.name for scene in left)
         said = f"no {names}: this anatomy has no locator, which `sulcus locator` makes"
@@ -132,7 +132,7 @@ def playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]
     return [scene for scene in scenes if scene not in left]
 
 
-def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> str:
+def choose_deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> str:
     """Return the requested deformation model; one that a budget selected is reported, with the reason.
 
     Raises
@@ -146,22 +146,22 @@ def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> s
             from ..play.deformers import TRUTH
 
             none = "none lies beside this anatomy; `sulcus train` makes them" if scene.sight is None else TRUTH
-            why = next(iter(theatre.refusals(scene).values()), none)
+            why = next(iter(theatre.list_rejections(scene).values()), none)
             print(f"{args.program}: finite elements play {scene.name}, no learned model: {why}", file=sys.stderr)
         best = theatre.best(scene)
         if args.deformer is None and best in theatre.models:
-            from surrogate.model.guarded import judged, off_by
+            from surrogate.model.guarded import compute_error, describe_error
 
             model = theatre.models[best]
-            if off_by(model).weak:
-                print(f"{args.program}: on left-out cortex {best} is {judged(model)}", file=sys.stderr)
+            if compute_error(model).weak:
+                print(f"{args.program}: on left-out cortex {best} is {describe_error(model)}", file=sys.stderr)
         return args.deformer or theatre.usual(scene)
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
     from surrogate.evaluation.choose import choose
 
-    from ..analysis.budget import offers
+    from ..analysis.budget import time_offers
 
-    choice = choose(offers(theatre, scene), *budget)
+    choice = choose(time_offers(theatre, scene), *budget)
     print(f"{args.program}: {choice.reason}", file=sys.stderr)
     return choice.offer.name

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from sim.anatomy import PART_LABELS, REGION_NAMES, missing_region, region_name
+from sim.anatomy import PART_LABELS, REGION_NAMES, describe_missing_region, name_region
 from sim.effects import SKULLS, Elasticity
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
@@ -110,7 +110,7 @@ def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMEND
     )
 
 
-def tissue_of(args: argparse.Namespace) -> Tissue:
+def get_tissue(args: argparse.Namespace) -> Tissue:
     """The tissue asked for.
 
     Raises
@@ -160,23 +160,23 @@ def _elastic(args: argparse.Namespace) -> Material | Ogden:
     )
 
 
-def elasticity_of(args: argparse.Namespace, mesh: TetMesh) -> Elasticity:
+def parse_elasticity(args: argparse.Namespace, mesh: TetMesh) -> Elasticity:
     """The tissue asked for, of a mesh and its regions.
 
     Raises
     ------
     InputError
-        As `tissue_of` and `regions_of`.
+        As `get_tissue` and `assign_regions`.
     """
-    tissue = tissue_of(args)
-    return Elasticity(tissue, regions_of(args.region, tissue, mesh))
+    tissue = get_tissue(args)
+    return Elasticity(tissue, assign_regions(args.region, tissue, mesh))
 
 
-def tissue_asked(args: argparse.Namespace) -> Tissue | None:
+def parse_optional_tissue(args: argparse.Namespace) -> Tissue | None:
     """The tissue asked for, or None where no option of it is given."""
     constants = (args.young, args.poisson, args.ogden, args.bulk, args.prony)
     given = args.material != "default" or any(value is not None for value in constants)
-    return tissue_of(args) if given else None
+    return get_tissue(args) if given else None
 
 
 def refuse(given: Mapping[str, object], material: str, owner: str) -> None:
@@ -188,30 +188,30 @@ def refuse(given: Mapping[str, object], material: str, owner: str) -> None:
             )
 
 
-def dressed(args: argparse.Namespace, scene: Scene, theatre: Theatre) -> Scene:
+def apply_tissue_options(args: argparse.Namespace, scene: Scene, theatre: Theatre) -> Scene:
     """Return a scene with the requested tissue and element.
 
-    Regions that no --region names are those of the scene, or of `learned_regions`; the latter are reported.
+    Regions that no --region names are those of the scene, or of `find_learned_regions`; the latter are reported.
 
     Raises
     ------
     InputError
-        As `tissue_of`, `regions_of` and `Scene.made_of`.
+        As `get_tissue`, `assign_regions` and `Scene.made_of`.
     """
-    from ..play.learned_regions import learned_regions
+    from ..play.learned_regions import find_learned_regions
 
-    made = scene.made_of(tissue_asked(args), args.element)
+    made = scene.made_of(parse_optional_tissue(args), args.element)
     here = made.elasticity
-    own = regions_of(args.region, here.default or BRAIN, theatre.anatomy.mesh)
-    kept = learned_regions(here, theatre.learned_tissue, own)
+    own = assign_regions(args.region, here.default or BRAIN, theatre.anatomy.mesh)
+    kept = find_learned_regions(here, theatre.learned_tissue, own)
     if own and kept:
         print(
             f"{scene.name} keeps, as the models beside the anatomy have it: {Elasticity(None, kept)}", file=sys.stderr
         )
-    return made.with_regions(dict(sorted({**own, **kept}.items())))
+    return made.replace_regions(dict(sorted({**own, **kept}.items())))
 
 
-def regions_of(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | None = None) -> dict[int, Tissue]:
+def assign_regions(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | None = None) -> dict[int, Tissue]:
     """Tissues by region label, of the law of `tissue`.
 
     Raises
@@ -224,15 +224,15 @@ def regions_of(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | None = None
     for label in labels:
         if labels.count(label) > 1:
             raise InputError(f"--region {label} is given twice: give each region once.")
-        if mesh is not None and (missing := missing_region(mesh, label)):
-            marks = f" `sulcus patient --{name}` marks it." if (name := region_name(label)) in PART_LABELS else ""
+        if mesh is not None and (missing := describe_missing_region(mesh, label)):
+            marks = f" `sulcus patient --{name}` marks it." if (name := name_region(label)) in PART_LABELS else ""
             raise InputError(f"--region {label}: {missing}{marks}")
     for text, (_, one) in zip(texts, pairs, strict=True):
         _warn(f"--region {text}", one)
     return dict(sorted(pairs))
 
 
-def stiffness_doubt(tissue: Tissue) -> str:
+def check_stiffness(tissue: Tissue) -> str:
     """Return the reason why a tissue's small-strain stiffness is implausible, as a predicate; empty if plausible."""
     mu, lame = tissue.lame
     young, (least, most) = mu * (3.0 * lame + 2.0 * mu) / (lame + mu), DOUBTED
@@ -249,12 +249,12 @@ def stiffness_doubt(tissue: Tissue) -> str:
 
 
 def _warn(option: str, tissue: Tissue) -> None:
-    doubt = stiffness_doubt(tissue)
+    doubt = check_stiffness(tissue)
     if doubt:
         warnings.warn(f"{option}: {doubt}", stacklevel=1)
 
 
-def region_label(text: str) -> int:
+def parse_region_label(text: str) -> int:
     """A region's label, by its number or its name.
 
     Raises
@@ -278,12 +278,12 @@ def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
         label, constants = text.split(":")
         if ogden:
             *terms, bulk = constants.split(";")
-            return region_label(label), Ogden(parse_terms(terms), float(bulk), tissue.prony)
+            return parse_region_label(label), Ogden(parse_terms(terms), float(bulk), tissue.prony)
         if not isinstance(tissue, Material):
             raise InputError(f"tissue of the law {tissue.law} has no Young's modulus.")
         young, *poisson = map(float, constants.split(","))
         (ratio,) = poisson or (tissue.poisson,)
-        return region_label(label), replace(tissue, young=young, poisson=ratio)
+        return parse_region_label(label), replace(tissue, young=young, poisson=ratio)
     except InputError as error:
         raise InputError(f"--region {text}: {error}") from error
     except ValueError as error:

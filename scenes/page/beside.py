@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ar.page.history import Line, Sample
-from ar.page.slices import Cut, sliced
+from ar.page.slices import Cut, draw_slices
 from ar.rendering.layer import Layer
 from sim.deformation import Deformation
 from sim.loads import Loads, Pushed
@@ -24,7 +24,7 @@ SET = Line("force", "N", "#ffa94d", "as it is set")
 MOVED = Line("tumour moved", "mm", "#4cf28c", "band: error of the tumour (95 %); dotted: not known")
 
 
-def lines_of(scene: Scene) -> tuple[Line, ...]:
+def list_lines(scene: Scene) -> tuple[Line, ...]:
     """Return the plotted quantities of a scene: without a tool, the displacement of the tumour."""
     if scene.tool is None:
         return (MOVED,)
@@ -32,17 +32,17 @@ def lines_of(scene: Scene) -> tuple[Line, ...]:
 
 
 def sample_of(frame: Frame, scene: Scene, now: float) -> Sample:
-    """Build the readings, with errors, of a frame that is shown at a time [s], in the order of `lines_of`."""
+    """Build the readings, with errors, of a frame that is shown at a time [s], in the order of `list_lines`."""
     if scene.tool is None:
         known = frame.estimate.location if frame.estimate is not None else None
         error = frame.tumour_error.bound if known is None else known.p95
         return Sample(now, (1e3 * frame.moved,), (_scaled(error, 1e3),))
-    force, force_error = force_of(frame.loads, frame.deformation)
+    force, force_error = fit_force_model(frame.loads, frame.deformation)
     distance = _scaled(frame.distance, 1e3), _scaled(frame.distance_error, 1e3)
     return Sample(now, (distance[0], force), (distance[1], force_error))
 
 
-def force_of(loads: Loads, answer: Deformation) -> tuple[float | None, float | None]:
+def fit_force_model(loads: Loads, answer: Deformation) -> tuple[float | None, float | None]:
     """Return the tool force and its error [N]: a prescribed force has none; None: not known."""
     pushed = loads.every(Pushed)
     if pushed:
@@ -54,7 +54,7 @@ def force_of(loads: Loads, answer: Deformation) -> tuple[float | None, float | N
     return float(np.linalg.norm(answer.reaction[0, -1, :3])), bound if known else None
 
 
-def slices_of(frame: Frame, player: Player, through: str) -> np.ndarray:
+def render_slices(frame: Frame, player: Player, through: str) -> np.ndarray:
     """Three slices (h, 3 h, 3) uint8 through the tumour's middle, or through the tool's tip where there is one."""
     stage, positions = player.stage.at(frame.loads), player.believed(frame)
     others, tool = [], player.scene.tool
@@ -65,14 +65,14 @@ def slices_of(frame: Frame, player: Player, through: str) -> np.ndarray:
         others.append(replace(stage.truth(player.positions(frame.deformation)), name="truth"))
     now, before = stage.tumour(positions), stage.tumour_at_rest
     cut = Cut(now, before, frame.tumour_error.bound, bool(frame.doubt), others, frame.tip)
-    return sliced_where(player.stage, cut, through)
+    return draw_slices_through(player.stage, cut, through)
 
 
-def sliced_where(stage: Stage, cut: Cut, through: str) -> np.ndarray:
+def draw_slices_through(stage: Stage, cut: Cut, through: str) -> np.ndarray:
     """Three slices (h, 3 h, 3) uint8 of a stage's scan through one of the places above; of no tip, the middle's."""
     shape = cut.now if len(cut.now.vertices) else stage.tumour_at_rest
     middle = 0.5 * (shape.vertices.min(axis=0) + shape.vertices.max(axis=0))
-    return sliced(stage.scan, cut.tip if through == TIP and cut.tip is not None else middle, cut)
+    return draw_slices(stage.scan, cut.tip if through == TIP and cut.tip is not None else middle, cut)
 
 
 def _scaled(value: float | None, by: float) -> float | None:

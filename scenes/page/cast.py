@@ -10,7 +10,7 @@ from dataclasses import replace
 from sim.deformation import Deformation, Deformer
 
 from ..play.deformers import GUARDED, Theatre
-from ..play.effect_ablation import without
+from ..play.effect_ablation import remove_effect
 from ..play.player import Player
 from ..play.replay import ReplaySession
 from ..play.stage import Stage
@@ -54,8 +54,8 @@ class SceneSolvers:
         """The stage of the scene without some effects, of the tissue that it has with them."""
         if off not in self.stages:
             scene = self.stages[ALL].scene
-            for effect in scene.effects_on(self.theatre.anatomy):
-                scene = without(scene, effect) if type(effect).__name__ in off else scene
+            for effect in scene.get_effects_on(self.theatre.anatomy):
+                scene = remove_effect(scene, effect) if type(effect).__name__ in off else scene
             self.stages[off] = replace(self.stages[ALL], scene=scene)
         return self.stages[off]
 
@@ -152,8 +152,8 @@ class SceneSolvers:
             self.seeking[0].drop()
             self.seeking = None
 
-    def dismiss(self) -> list[FemWorker]:
+    def stop_soon(self) -> list[FemWorker]:
         """Stop the finite elements, without waiting for the steps in hand; returns those that have one."""
         for solver in self.solvers.values():
-            solver.dismiss()
+            solver.stop_soon()
         return [solver for solver in self.solvers.values() if solver.thread.is_alive()]

@@ -8,16 +8,16 @@ from html import escape
 
 import numpy as np
 
-from ar.overlay.hud import millimetres
+from ar.overlay.hud import format_millimetres
 from ar.overlay.styles import Style
 from sim.deformation import Deformation
 from sim.loads import Pushed
-from surrogate.evaluation.choose import unbeaten
+from surrogate.evaluation.choose import find_pareto_front
 
-from ..play.frame_text import doubt_of
+from ..play.frame_text import describe_outcome
 from ..play.player import Frame, Player
-from ..play.tip_reading import measured
-from ..script.tool_paths import lifted
+from ..play.tip_reading import measure_tip_distance
+from ..script.tool_paths import compute_lift
 from .referee import FemResult
 
 OWN, TRUTH = "this is the result of the FEM solver", "the truth is the result of the FEM solver"
@@ -40,7 +40,7 @@ class Comparison:
     distance: float | None = None
 
 
-def judge(truth: FemResult, player: Player, own: bool, shown: Deformation | None = None) -> Comparison:
+def compare_with_fem(truth: FemResult, player: Player, own: bool, shown: Deformation | None = None) -> Comparison:
     """Compare a deformer with an FEM solution, for the same loads.
 
     `shown` is the deformer's solution of these loads, if it depends on previous ones.
@@ -54,13 +54,15 @@ def judge(truth: FemResult, player: Player, own: bool, shown: Deformation | None
     motion = float(np.linalg.norm(right, axis=1).mean())
     off = (None, None) if error is None else (float(error.mean()), float(error.max()))
     pushed = truth.loads.every(Pushed)
-    lift = lifted(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
-    gauge = measured(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
+    lift = compute_lift(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
+    gauge = measure_tip_distance(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
     distance = None if gauge is None else gauge.distance
-    return Comparison(truth.number, truth.seconds, doubt_of(truth.deformation.outcome[0]), motion, *off, distance)
+    return Comparison(
+        truth.number, truth.seconds, describe_outcome(truth.deformation.outcome[0]), motion, *off, distance
+    )
 
 
-def verdict_words(judged: Comparison | None, stale: bool, waits: str, own: str = OWN) -> str:
+def format_comparison(judged: Comparison | None, stale: bool, waits: str, own: str = OWN) -> str:
     """Format the comparison; that of a previous load is greyed and marked, with the state of the FEM solver.
 
     `own` is the text for a solution by FEM itself.
@@ -70,7 +72,7 @@ def verdict_words(judged: Comparison | None, stale: bool, waits: str, own: str =
     said = own
     if judged.mean is not None and judged.largest is not None:
         said = f"error against FEM: mean {1e3 * judged.mean:.3f}, largest {1e3 * judged.largest:.3f} mm"
-    tip = "" if judged.distance is None else f"tip to tumour {millimetres(judged.distance)}, "
+    tip = "" if judged.distance is None else f"tip to tumour {format_millimetres(judged.distance)}, "
     tail = f"{tip}tumour moved {1e3 * judged.motion:.2f} mm by FEM, without the error of the tumour"
     tail += f" (frame {judged.number}, FEM {1e3 * judged.seconds:.0f} ms"
     tail += f", {judged.doubt})" if judged.doubt else ")"
@@ -79,7 +81,7 @@ def verdict_words(judged: Comparison | None, stale: bool, waits: str, own: str =
     return f"<p>{said}; {tail}</p>"
 
 
-def changed(truth: FemResult, player: Player, shown: Deformation, off: Sequence[str]) -> str:
+def describe_change(truth: FemResult, player: Player, shown: Deformation, off: Sequence[str]) -> str:
     """Describe the tumour's distance from its position under all effects, for a solution without some."""
     nodes = player.stage.at(truth.loads).anatomy.tumour_nodes
     apart = truth.deformation.at(nodes).displacement[0] - shown.at(nodes).displacement[0]
@@ -153,7 +155,7 @@ class AccuracyTimeTable:
         known = {name: loads for name, loads in known.items() if loads}
         common = set.intersection(*map(set, known.values())) if len(known) > 1 else set()
         places = {name: self._place(name, common or loads) for name, loads in known.items()}
-        best = unbeaten(places) if common else None
+        best = find_pareto_front(places) if common else None
         return [
             ComparisonRow(name, *place, len(common or known[name]), None if best is None else name in best)
             for name, place in sorted(places.items(), key=lambda item: item[1])

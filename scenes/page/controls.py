@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ar.overlay.hud import bearings
+from ar.overlay.hud import name_bearings
 from ar.overlay.styles import STYLES, Style
 from ar.page.elements import STYLE
 from ar.page.parts import Dropdown, Fold, Note, Slider, Toggle
@@ -19,7 +19,7 @@ from ..script.site import Site
 from ..script.tool_paths import AIR, Touch
 from .beside import TIP, TUMOUR_MIDDLE
 from .requests import HAND, SCRIPT, Requests
-from .text import effect_words
+from .text import describe_effect
 
 MOST_FORCE, MOST_DEPTH, MOST_TILT = 0.4, 8.0, 40.0
 """Ends of the sliders [N], [mm], [deg]."""
@@ -38,7 +38,7 @@ ASKED = (
 HANDS = "A slider takes the tool in your hand; 'script' gives it back."
 
 
-def controls(
+def build_controls(
     scene: Scene,
     site: Site,
     names: tuple[str, ...],
@@ -56,10 +56,10 @@ def controls(
         wish.set(path="" if name == cameras[0] else name)
 
     switches = tuple(
-        Toggle(effect, True, partial(wish.switch, effect), effect_words(effect), "switch this effect on or off")
-        for effect in switched(scene, site)
+        Toggle(effect, True, partial(wish.switch, effect), describe_effect(effect), "switch this effect on or off")
+        for effect in list_switchable_effects(scene, site)
     )
-    slices = through(wish.through, lambda name: wish.set(through=name))
+    slices = build_slice_control(wish.through, lambda name: wish.set(through=name))
     scenes = SCENES if scene.name in SCENES else (scene.name, *SCENES)
     return [
         Dropdown("scene", scenes, scene.name, lambda name: wish.set(scene=name), hint="what happens to the brain"),
@@ -71,16 +71,16 @@ def controls(
             "model",
             "fem: finite elements, solved each time; the others: models that were trained on them",
         ),
-        overlays(wish.style, lambda style: wish.set(style=style)),
+        add_overlay_controls(wish.style, lambda style: wish.set(style=style)),
         Dropdown("camera", cameras, wish.path or cameras[0], film, hint="how the camera moves"),
-        *([] if scene.tool is None else [*hand(scene, site, wish, give, take), slices]),
+        *([] if scene.tool is None else [*build_tool_controls(scene, site, wish, give, take), slices]),
         *([Fold("physics effects (on/off)", switches)] if switches else []),
         Note(PLAN),
         Note(OWN_FILM, ASKED),
     ]
 
 
-def overlays(now: Style, choose: Callable[[Style], None]) -> Dropdown:
+def add_overlay_controls(now: Style, choose: Callable[[Style], None]) -> Dropdown:
     """Build the choice of overlay styles."""
     styles: dict[str, Style] = {words: style for style, words in STYLES.items()}
     return Dropdown(
@@ -88,33 +88,33 @@ def overlays(now: Style, choose: Callable[[Style], None]) -> Dropdown:
     )
 
 
-def through(now: str, choose: Callable[[str], None]) -> Dropdown:
+def build_slice_control(now: str, choose: Callable[[str], None]) -> Dropdown:
     """Build the choice of slice positions."""
     places = TUMOUR_MIDDLE, TIP
     hint = "position of the scan slices (tab slices)"
     return Dropdown("slices", places, now or places[0], choose, hint=hint)
 
 
-def switched(scene: Scene, site: Site) -> list[str]:
+def list_switchable_effects(scene: Scene, site: Site) -> list[str]:
     """Effects that a scene can be without: all but those that make it a body at rest."""
-    kinds = (type(effect) for effect in scene.effects_on(site.anatomy))
+    kinds = (type(effect) for effect in scene.get_effects_on(site.anatomy))
     return [kind.__name__ for kind in kinds if kind not in (Elasticity, Held, Bonded, Slide)]
 
 
-def clocked(scene: Scene, site: Site) -> bool:
+def is_animated(scene: Scene, site: Site) -> bool:
     """Return True if the scene evolves without tool input."""
-    effects = scene.effects_on(site.anatomy)
+    effects = scene.get_effects_on(site.anatomy)
     relaxing = remember(effect for effect in effects if isinstance(effect, Elasticity))
     return relaxing or any(isinstance(effect, Gravity | Inertia | Pulsation | Resection) for effect in effects)
 
 
-def hand(
+def build_tool_controls(
     scene: Scene, site: Site, wish: Requests, give: Callable[[str], None], take: Callable[..., None]
 ) -> list[Slider | Dropdown]:
     """Build the controls of the tool: who holds it, and its position within the opening, in patient directions."""
     assert scene.tool is not None
     room = max(0.5, np.floor(2e3 * (site.clearance - scene.tool.radius)) / 2.0)
-    sides = bearings(scene.viewpoint.camera(site).T_camera_world[:3, :3])
+    sides = name_bearings(scene.viewpoint.camera(site).T_camera_world[:3, :3])
     stops = "limited by the edge of the craniotomy"
     against = "direction of the push: tilt from the surface normal"
     ways = (("right", "x", sides["right"]), ("up", "y", sides["top"]))
@@ -132,10 +132,15 @@ def hand(
         )
         for way, _, side in ways
     )  # fmt: skip
-    return [Dropdown("tool", (SCRIPT, HAND), SCRIPT, give, hint=HANDS), strength(scene, wish, take), *places, *tilts]
+    return [
+        Dropdown("tool", (SCRIPT, HAND), SCRIPT, give, hint=HANDS),
+        build_strength_slider(scene, wish, take),
+        *places,
+        *tilts,
+    ]
 
 
-def slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
+def to_slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
     """Values of the tool's sliders at a touch, by their labels."""
     strong = {"depth [mm]": 1e3 * touch.depth} if scene.posed else {"force [N]": touch.force}
     places = {"place right [mm]": 1e3 * touch.x, "place up [mm]": 1e3 * touch.y}
@@ -143,7 +148,7 @@ def slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
     return {label: round(float(value), 2) for label, value in (strong | places | tilts).items()}
 
 
-def strength(scene: Scene, wish: Requests, take: Callable[..., None]) -> Slider:
+def build_strength_slider(scene: Scene, wish: Requests, take: Callable[..., None]) -> Slider:
     """Build the slider of the force, or of the depth of a posed tool."""
     touch = wish.touch
     if scene.posed:

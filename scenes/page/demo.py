@@ -16,7 +16,7 @@ from ar.page.history import History
 from ar.page.parts import Playback
 from sim.errors import InputError
 from sim.loads import Loads
-from surrogate.data.dataset import digest_of_loads
+from surrogate.data.dataset import compute_loads_digest
 
 from ..play.deformers import AtRest, Theatre
 from ..play.player import Frame, Player
@@ -24,22 +24,22 @@ from ..play.stage import Stage
 from ..play.waiting_notice import Busy
 from ..script.scene import Scene, find_scene
 from ..script.tool_paths import Touch
-from .beside import lines_of, sample_of, slices_of
+from .beside import list_lines, render_slices, sample_of
 from .cast import SceneSolvers
-from .comparison import OWN, TRUTH, AccuracyTimeTable, PageState, changed, judge, verdict_words
-from .controls import PLAN, clocked, controls, slider_values
+from .comparison import OWN, TRUTH, AccuracyTimeTable, PageState, compare_with_fem, describe_change, format_comparison
+from .controls import PLAN, build_controls, is_animated, to_slider_values
 from .referee import FemResult, FemWorker
-from .requests import HAND, SCRIPT, Requests, holding
-from .text import effect_words, pending_words, plan_words, report, words, work_words
+from .requests import HAND, SCRIPT, Requests, describe_holder
+from .text import describe_effect, describe_work, format_caption, format_pending, plan_words, report
 from .view import (
     FEM_COLOUR,
     STALE_COLOUR,
-    bodies_of,
+    build_page_bodies,
+    choose_viewpoint,
+    list_orientation_labels,
     move_bodies,
     move_wire,
-    pictured,
-    signs_of,
-    viewpoint_of,
+    render_page_image,
 )
 
 WAITS = "The finite elements are working on this load."
@@ -72,12 +72,12 @@ class Demo:
         parts = self._parts(deformer)
         self.browser = Browser(
             parts[0],
-            viewpoint_of(site),
+            choose_viewpoint(site),
             *parts[1:],
             host=host,
             port=port,
             size=size,
-            signs=signs_of(site),
+            signs=list_orientation_labels(site),
             origins=origins,
         )
         self.busy = Busy(lambda line: self.browser.status(escape(line)))
@@ -139,7 +139,7 @@ class Demo:
     def _tell(self) -> None:
         """Tell each visitor who has the tool, and who leads."""
         tool, holder, here = self.stage.scene.tool, self.wish.holder, self.browser.here
-        self.browser.tell(lambda visitor: "" if tool is None else holding(visitor, holder, here))
+        self.browser.tell(lambda visitor: "" if tool is None else describe_holder(visitor, holder, here))
 
     def close(self) -> None:
         """Stop the page and the finite elements."""
@@ -161,10 +161,10 @@ class Demo:
     def _cast(self, scene: Scene, deformer: str) -> None:
         """Have a deformer play a scene."""
         self.cast, self.tally = SceneSolvers(self.theatre, scene, deformer, self.turn), AccuracyTimeTable()
-        self.history = History(lines_of(scene))
+        self.history = History(list_lines(scene))
         # The frame that is shown.
         self.reached: int | None = None
-        self.wish = Requests(deformer, scene.path(0.0), scene.name, clocked=clocked(scene, self.theatre.site))
+        self.wish = Requests(deformer, scene.path(0.0), scene.name, clocked=is_animated(scene, self.theatre.site))
 
     def _change(self, name: str) -> None:
         """Play another scene; where this body has none of that name, stay, and say why."""
@@ -185,7 +185,7 @@ class Demo:
         finally:
             self.busy.off()
         self.browser.fill(*parts)
-        self.dismissed = [solver for solver in self.dismissed if solver.thread.is_alive()] + old[0].dismiss()
+        self.dismissed = [solver for solver in self.dismissed if solver.thread.is_alive()] + old[0].stop_soon()
 
     def answer(self, now: PageState) -> int:
         """Bring the page nearer to what is wished; returns how many frames were drawn, 0 or 1."""
@@ -210,7 +210,7 @@ class Demo:
         number, name, touch, off = self.asked
         question, scene = (number, touch), self.stage.scene
         if name != "fem" and not off:  # no model was trained without
-            self.busy.on(work_words(scene, name, *question))
+            self.busy.on(describe_work(scene, name, *question))
             return self.cast.predicted(name, question)
         found = self.cast.solved(off, question, now.shown, 0.0)
         if found is not None:
@@ -222,7 +222,7 @@ class Demo:
         elif now.goal == self.asked and now.frame is not None:
             self.busy.on(f"on the way to frame {number}: frame {now.frame.number} is solved")
         else:
-            self.busy.on(work_words(scene, "fem", *question))
+            self.busy.on(describe_work(scene, "fem", *question))
         return self.cast.solved(off, question, now.shown, 1.0 / scene.frames_per_second)
 
     def _rest(self, now: PageState) -> None:
@@ -232,7 +232,7 @@ class Demo:
         player = Player(stage, AtRest(stage.site.anatomy), self.wish.style)
         frame = player.draw(number, float(self.stage.scene.times[number]), touch or player.touch(number))
         move_bodies(self.browser, frame, player)
-        self.browser.show(number, pictured(frame), RESTS)
+        self.browser.show(number, render_page_image(frame), RESTS)
         self._beside(frame, player)
         now.rests = True
 
@@ -245,7 +245,7 @@ class Demo:
         hand = touch or player.touch(found.number)
         self.reached, now.goal, now.asked = found.number, self.asked, (found.number, name, touch, off)
         now.look, now.shown, now.own = look, found, None
-        now.load = digest_of_loads(self._whole(found.number, touch) if off else found.loads)
+        now.load = compute_loads_digest(self._whole(found.number, touch) if off else found.loads)
         now.frame = frame = player.drawn(found.number, hand, found.loads, found.deformation, found.seconds)
         self.history.add(sample_of(frame, self.stage.scene, clock.monotonic()))
         if found.number == number:
@@ -256,7 +256,7 @@ class Demo:
             self.referee.ask(number, touch)
         if not off:
             self.tally.took(name, now.load, found.deformation.cost.total)
-        now.picture = pictured(frame)
+        now.picture = render_page_image(frame)
         move_bodies(self.browser, frame, player)
         self._beside(frame, player)
         if touch is None:
@@ -265,7 +265,7 @@ class Demo:
     def _show_touch(self, touch: Touch, wanted: Callable[[], bool]) -> None:
         """Set the tool's sliders to a touch, so that a hand that takes the tool starts there."""
         if self.stage.scene.tool is not None:
-            for label, value in slider_values(self.stage.scene, touch).items():
+            for label, value in to_slider_values(self.stage.scene, touch).items():
                 self.browser.put(label, value, wanted)
 
     def _restyle(self, now: PageState) -> None:
@@ -274,7 +274,7 @@ class Demo:
         frame, now.look = now.frame, self.wish.look
         player, seconds = self._seen(now.asked, now.look), frame.seconds["deform"]
         now.frame = player.drawn(frame.number, frame.touch, frame.loads, frame.deformation, seconds)
-        now.picture = pictured(now.frame)
+        now.picture = render_page_image(now.frame)
         self._beside(now.frame, player)
 
     def _seen(self, asked: tuple, look: tuple[Style, str, str]) -> Player:
@@ -286,7 +286,7 @@ class Demo:
     def _beside(self, frame: Frame, player: Player) -> None:
         """Show slices of a frame, and what was read lately, when there is time for it."""
         through, history = self.wish.through, self.history
-        self.browser.show_beside(lambda: (slices_of(frame, player, through), history.chart()))
+        self.browser.show_beside(lambda: (render_slices(frame, player, through), history.chart()))
 
     def _check(self, now: PageState) -> None:
         """Show what the finite elements say of what is shown, and whether it is of the same load."""
@@ -294,7 +294,7 @@ class Demo:
         _, name, _, off = now.asked
         name = "fem" if off else name
         truth = now.own or self.referee.truth
-        fresh = truth is not None and digest_of_loads(truth.loads) == now.load
+        fresh = truth is not None and compute_loads_digest(truth.loads) == now.load
         if truth is not None and (truth is not now.truth or now.by != (name, off)):
             whole = self.cast.player(name)
             move_wire(self.browser, self.stage, truth, whole)
@@ -302,24 +302,24 @@ class Demo:
                 now.judged = None
             elif not off:
                 shown = now.frame.deformation if whole.follows else None
-                now.judged = judge(truth, whole, name == "fem", shown)
+                now.judged = compare_with_fem(truth, whole, name == "fem", shown)
                 if now.judged.mean is not None:
-                    self.tally.missed(name, digest_of_loads(truth.loads), now.judged.mean)
+                    self.tally.missed(name, compute_loads_digest(truth.loads), now.judged.mean)
             now.truth, now.by = truth, (name, off)
         if now.stale is not (not fresh):
             now.stale = not fresh
             self.browser.tint("finite elements", FEM_COLOUR if fresh else STALE_COLOUR)
-        gone = [effect_words(effect) for effect in sorted(off)]
+        gone = [describe_effect(effect) for effect in sorted(off)]
         if self.referee.failure is not None:
             what = "this" if self.referee.thread.is_alive() else "any more"
             why = escape(str(self.referee.failure))
             verdict = f'<p class="warn">error: the finite elements do not solve {what} ({why})</p>'
         elif off and truth is not None:
             shown, whole = now.frame.deformation, self.cast.player(name)
-            verdict = changed(truth, whole, shown, gone) if fresh else verdict_words(None, True, WAITS)
+            verdict = describe_change(truth, whole, shown, gone) if fresh else format_comparison(None, True, WAITS)
         else:
             own = OWN if now.frame.estimate is None else TRUTH
-            verdict = verdict_words(now.judged if truth is not None else None, not fresh, WAITS, own)
+            verdict = format_comparison(now.judged if truth is not None else None, not fresh, WAITS, own)
         plan = self.cast.solver(off).plan or self.referee.plan
         if plan != now.plan:
             now.plan = plan
@@ -327,7 +327,7 @@ class Demo:
         scene = self.stage.scene
         said = report(now.frame, self.stage, name, verdict, self.tally.rows, len(scene.times), gone)
         if now.asked != self.asked and self.busy.noticed:
-            said = pending_words(now.frame.number, self.asked[0], len(scene.times)) + said
+            said = format_pending(now.frame.number, self.asked[0], len(scene.times)) + said
         assert now.picture is not None
         self.browser.show(now.frame.number, now.picture, said, self.asked[0])
 
@@ -341,8 +341,14 @@ class Demo:
         scene, site = self.stage.scene, self.stage.site
         wish, names = self.wish, self.theatre.names(scene)
         playback = Playback(len(scene.times), self._play, lambda number: self._give(SCRIPT, number=number))
-        given = controls(scene, site, names, wish, self._give, self._take)
-        return bodies_of(self.stage), playback, given, f"sulcus: {scene.name}", words(self.theatre, scene, self.anatomy)
+        given = build_controls(scene, site, names, wish, self._give, self._take)
+        return (
+            build_page_bodies(self.stage),
+            playback,
+            given,
+            f"sulcus: {scene.name}",
+            format_caption(self.theatre, scene, self.anatomy),
+        )
 
     def _play(self, plays: bool) -> None:
         """Handle the play button: in a static scene the script takes the tool. A pause stops on the way."""

@@ -84,7 +84,7 @@ class FemWorker:
         with self.wake:
             return self.wake.wait_for(found, seconds)
 
-    def dismiss(self) -> None:
+    def stop_soon(self) -> None:
         """Ask for no more after the solve in hand, and do not wait for it."""
         with self.wake:
             self.closed.set()
@@ -92,7 +92,7 @@ class FemWorker:
 
     def close(self) -> None:
         """Stop after the solve in hand."""
-        self.dismiss()
+        self.stop_soon()
         self.thread.join()
 
     def _serve(self, theatre: Theatre, scene: Scene) -> None:

@@ -78,7 +78,7 @@ class Requests:
                 self.number = (number + 1) % frames
 
 
-def holding(visitor: int, holder: int | None, here: Collection[int]) -> str:
+def describe_holder(visitor: int, holder: int | None, here: Collection[int]) -> str:
     """Return the line that a visitor reads.
 
     Parameters

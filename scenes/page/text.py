@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 
 from ar.overlay import hud
-from sim.anatomy import region_name
+from sim.anatomy import name_region
 from sim.deformation import Deformation, Outcome
 from sim.material import Material, Tissue
 
@@ -46,25 +46,25 @@ EFFECTS = {
 """Names of a scene's effects for users."""
 
 
-def effect_words(name: str) -> str:
+def describe_effect(name: str) -> str:
     """Return the name of an effect class for users."""
     return EFFECTS.get(name, name)
 
 
-def words(theatre: Theatre, scene: Scene, anatomy: str) -> str:
+def format_caption(theatre: Theatre, scene: Scene, anatomy: str) -> str:
     """Describe the image: visible parts, meaning of the lines, and anatomy."""
     title = " ".join(scene.title.split())
     seen = SEEN if scene.sight is None else ESTIMATED
     return (
-        f"<p>{seen} <b>{RESEARCH}</b></p><p>Scene: {escape(title)}</p>{legend(scene)}"
-        f'<p class="dim">{escape(about(theatre, scene, anatomy))}</p>'
+        f"<p>{seen} <b>{RESEARCH}</b></p><p>Scene: {escape(title)}</p>{format_page_legend(scene)}"
+        f'<p class="dim">{escape(describe_scene(theatre, scene, anatomy))}</p>'
     )
 
 
-def legend(scene: Scene) -> str:
+def format_page_legend(scene: Scene) -> str:
     """Build the legend of the lines, each with a sample."""
     scan = ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan")
-    now, true, ellipsoid = (stroked(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
+    now, true, ellipsoid = (to_stroke(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
     under = (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone")
     keys = [
         (f'{now} stroke-width="3"', "tumour now (predicted)"),
@@ -83,10 +83,10 @@ def legend(scene: Scene) -> str:
         ]
     if scene.tool is not None:
         keys.append(('stroke="#fff" stroke-width="1.5"', "tip to tumour, in mm"))
-    return keyed(keys)
+    return format_legend(keys)
 
 
-def keyed(keys: Sequence[tuple[str, str]]) -> str:
+def format_legend(keys: Sequence[tuple[str, str]]) -> str:
     """A legend: each line's attributes as SVG has them, and what it means."""
     lines = (
         f'<span><svg width="26" height="8"><line x1="1" y1="4" x2="25" y2="4" {line}/></svg>{text}</span>'
@@ -95,35 +95,35 @@ def keyed(keys: Sequence[tuple[str, str]]) -> str:
     return f'<div class="legend">{"".join(lines)}</div>'
 
 
-def stroked(colour: Sequence[float]) -> str:
+def to_stroke(colour: Sequence[float]) -> str:
     """A colour, sRGB in [0, 1], as a line has it in HTML."""
     return 'stroke="#' + "".join(f"{round(255.0 * share):02x}" for share in colour) + '"'
 
 
-def about(theatre: Theatre, scene: Scene, anatomy: str) -> str:
+def describe_scene(theatre: Theatre, scene: Scene, anatomy: str) -> str:
     """Describe the anatomy, the side, and the tissue of the FEM model."""
     mesh = theatre.anatomy.mesh
     return (
-        f"Brain: {anatomy}, opened {side(theatre.site)}; {len(mesh.nodes)} mesh points. Finite elements: "
-        f"{fem_words(theatre, scene)}."
+        f"Brain: {anatomy}, opened {describe_side_of_brain(theatre.site)}; {len(mesh.nodes)} mesh points. Finite elements: "
+        f"{describe_fem(theatre, scene)}."
     )
 
 
-def side(site: Site) -> str:
+def describe_side_of_brain(site: Site) -> str:
     """Describe the side of the opening, relative to the middle of the brain's width."""
     nodes = site.anatomy.mesh.nodes[:, 0]
     off = float(site.origin[0] - 0.5 * (nodes.min() + nodes.max()))
     return "near the midline" if abs(off) < MIDLINE else f"on the patient's {'right' if off > 0.0 else 'left'}"
 
 
-def fem_words(theatre: Theatre, scene: Scene) -> str:
+def describe_fem(theatre: Theatre, scene: Scene) -> str:
     """Element and tissue that the theatre's finite elements have in a scene."""
-    element, elasticity = theatre.element_of(scene), scene.elasticity
-    own = (f"; the {region_name(label)} of {tissue_words(one)}" for label, one in elasticity.regions.items())
-    return f"{ELEMENTS.get(element, element)}, {tissue_words(elasticity.default)}{''.join(own)}"
+    element, elasticity = theatre.choose_element(scene), scene.elasticity
+    own = (f"; the {name_region(label)} of {describe_tissue(one)}" for label, one in elasticity.regions.items())
+    return f"{ELEMENTS.get(element, element)}, {describe_tissue(elasticity.default)}{''.join(own)}"
 
 
-def tissue_words(tissue: Tissue | None) -> str:
+def describe_tissue(tissue: Tissue | None) -> str:
     """A tissue's law and constants."""
     if tissue is None:
         return "a tissue for each region"
@@ -136,22 +136,22 @@ def tissue_words(tissue: Tissue | None) -> str:
     )
 
 
-def deformer_words(name: str) -> str:
+def describe_deformer(name: str) -> str:
     """Describe a deformer."""
     if name == GUARDED:
         return "best trained model; finite elements if its error bound is too large"
     return "finite elements" if name == "fem" else f"trained model {name}"
 
 
-def work_words(scene: Scene, name: str, number: int, touch: Touch | None) -> str:
+def describe_work(scene: Scene, name: str, number: int, touch: Touch | None) -> str:
     """Describe the running solve: a frame of the script, or the manual touch."""
     if touch is None:
-        return f"solving frame {number} ({deformer_words(name)})"
+        return f"solving frame {number} ({describe_deformer(name)})"
     how = f"{1e3 * touch.depth:.1f} mm deep" if scene.posed else f"{touch.force:.2f} N"
-    return f"computing the deformation for the manual tool, {how} ({deformer_words(name)})"
+    return f"computing the deformation for the manual tool, {how} ({describe_deformer(name)})"
 
 
-def pending_words(shown: int, asked: int, frames: int) -> str:
+def format_pending(shown: int, asked: int, frames: int) -> str:
     """Describe an image that does not show the requested frame yet."""
     way = f" on the way to frame {asked}, this is frame {shown} of {frames - 1}" if shown != asked else ""
     return f'<p class="stale">Result pending:{way or " it is being computed"}.</p>'
@@ -162,10 +162,10 @@ def plan_words(lines: Sequence[str]) -> str:
     return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>" if lines else ""
 
 
-def trust(answer: Deformation, name: str) -> str:
+def format_trust(answer: Deformation, name: str) -> str:
     """Describe the source of a solution and its error; as a warning with the reason, if it is unreliable."""
     outcome = answer.outcome[0]
-    who = f"<b>{escape(_guarded_words(outcome) if name == GUARDED else deformer_words(name))}</b>"
+    who = f"<b>{escape(_guarded_words(outcome) if name == GUARDED else describe_deformer(name))}</b>"
     if outcome is Outcome.EXTRAPOLATED:
         return (
             f'<p>{who}</p><p class="warn">Do not rely on this result: the load lies outside the range that the model '
@@ -191,7 +191,7 @@ def _guarded_words(outcome: Outcome) -> str:
     return "trained model (guarded)" if by_model else "finite elements, as the error bound of the model is too large"
 
 
-def tumour_trust(error: TumourError) -> str:
+def format_tumour_trust(error: TumourError) -> str:
     """Describe the error of the tumour position relative to the patient, which includes more than the model."""
     if error.bound is None:
         return (
@@ -222,16 +222,16 @@ def report(
     left = stage.at(frame.loads).left
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
     if frame.estimate is not None or not is_undeformed(frame.deformation):
-        facts += [moved_words(frame)]
+        facts += [format_motion(frame)]
     if frame.distance_error is not None and frame.distance_error < np.inf:
         facts += [
             f"tip to tumour within {hud.bound_words(frame.distance_error, 1)} of the model's finite elements (95 %)"
         ]
     off = None if frame.doubt else frame.tumour_error.bound
-    parts = [] if frame.distance is None else [tip_words(frame.distance, off, frame.inside)]
-    number, *found = [""] if frame.estimate is None else estimated(frame.estimate)
+    parts = [] if frame.distance is None else [format_tip_distance(frame.distance, off, frame.inside)]
+    number, *found = [""] if frame.estimate is None else compute_estimate(frame.estimate)
     # A narrow window shows the first lines alone: both errors are among them.
-    parts += [number, trust(frame.deformation, name), tumour_trust(frame.tumour_error), *found]
+    parts += [number, format_trust(frame.deformation, name), format_tumour_trust(frame.tumour_error), *found]
     parts.append(f"<p>{escape('; '.join(facts))}</p>")
     if without:
         parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
@@ -239,10 +239,10 @@ def report(
         parts.append(f"<p>{len(left.loose)} loose elements were removed with the resection.</p>")
     spent = {"deform": "deformation", "render": "rendering", "overlay": "overlay"}
     took = ", ".join(f"{spent.get(stage, stage)} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
-    return "".join([*parts, verdict, table(rows), f'<p class="dim">milliseconds: {took}</p>'])
+    return "".join([*parts, verdict, format_cost_table(rows), f'<p class="dim">milliseconds: {took}</p>'])
 
 
-def moved_words(frame: Frame) -> str:
+def format_motion(frame: Frame) -> str:
     """Describe the tumour's displacement with its errors: of the model, and of the tumour in the patient."""
     said = f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' by the estimate'}"
     if frame.moved_error is not None:
@@ -254,15 +254,15 @@ def moved_words(frame: Frame) -> str:
     return f"{said} ({off})"
 
 
-def estimated(found: TumourEstimate) -> list[str]:
+def compute_estimate(found: TumourEstimate) -> list[str]:
     """Describe an estimate, its error and its input; or the reason of its rejection."""
-    truth = f"truly {unbroken(found.truly)}"
+    truth = f"truly {format_unbroken(found.truly)}"
     if found.location is None:
         return [
             f'<p class="number">tumour position unknown ({truth})</p>',
             f'<p class="warn">Observation rejected: {escape(found.refusal)}</p>',
         ]
-    moved = unbroken(found.moved, found.location.p95)
+    moved = format_unbroken(found.moved, found.location.p95)
     held = "inside" if found.held else "outside of"
     guess = f" {found.location.doubt}" if found.location.doubt else ""
     still = "" if found.noticed else " No significant motion detected."
@@ -273,25 +273,25 @@ def estimated(found: TumourEstimate) -> list[str]:
     ]
 
 
-def tip_words(distance: float, error: float | None, inside: bool) -> str:
+def format_tip_distance(distance: float, error: float | None, inside: bool) -> str:
     """The page's first line: from the tip to the tumour's surface, with its error [m], as HTML; None: not known."""
     what = "tip inside the tumour, its edge" if inside else "tip to tumour"
-    return f'<p class="number">{what} {unbroken(distance, error)}</p>'
+    return f'<p class="number">{what} {format_unbroken(distance, error)}</p>'
 
 
-def unbroken(length: float, error: float | None = None) -> str:
+def format_unbroken(length: float, error: float | None = None) -> str:
     """A length and its error [m] in millimetres, whose unit no new line parts from them."""
-    said = hud.millimetres(length, error).replace("+-", "\N{PLUS-MINUS SIGN}")
+    said = hud.format_millimetres(length, error).replace("+-", "\N{PLUS-MINUS SIGN}")
     return said.replace(" ", "&nbsp;")
 
 
-def table(rows: Sequence[ComparisonRow]) -> str:
+def format_cost_table(rows: Sequence[ComparisonRow]) -> str:
     """Build the table of time and error of the deformers shown; ranked only if all have the same loads."""
     if not rows:
         return ""
     ranked = rows[0].best is not None
     what = (
-        f"Medians over the same {counted(rows[0].loads)}; bold: no other is both faster and more accurate."
+        f"Medians over the same {format_load_count(rows[0].loads)}; bold: no other is both faster and more accurate."
         if ranked
         else "Medians up to now."
     )
@@ -299,7 +299,7 @@ def table(rows: Sequence[ComparisonRow]) -> str:
         what = "Medians over different loads: not comparable."
     lines = (
         f"<tr{' class=best' if row.best else ''}><td>{escape(row.name)}</td>"
-        f"<td>{row.milliseconds:.1f} ms</td><td>error {_off(row.millimetres)} mm</td><td>{counted(row.loads)}</td></tr>"
+        f"<td>{row.milliseconds:.1f} ms</td><td>error {_off(row.millimetres)} mm</td><td>{format_load_count(row.loads)}</td></tr>"
         for row in rows
     )
     return f'<p class="dim">{what}</p><table>{"".join(lines)}</table>'
@@ -310,6 +310,6 @@ def _off(millimetres: float) -> str:
     return f"{millimetres:.3f}" if millimetres >= 1e-3 else "under 0.001"
 
 
-def counted(loads: int) -> str:
+def format_load_count(loads: int) -> str:
     """Format the number of loads."""
     return f"{loads} load{'' if loads == 1 else 's'}"

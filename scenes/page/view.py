@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ar.overlay.hud import marked
+from ar.overlay.hud import draw_orientation_labels
 from ar.page.browser import Browser
 from ar.page.parts import SceneSurface, SceneViewpoint, Sign
 
@@ -23,11 +23,11 @@ SMALL = 1e-4
 BESIDE = 12e-3
 
 
-def bodies_of(stage: Stage) -> list[SceneSurface]:
+def build_page_bodies(stage: Stage) -> list[SceneSurface]:
     """Brain, open cortex, tumour, the finite elements' tumour, an estimate's ellipsoid and the tool, at rest."""
     tool, site, tumour = stage.scene.tool, stage.site, stage.tumour(stage.site.anatomy.mesh.nodes)
     wire = SceneSurface("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True)
-    bodies = [*brain_of(stage), wire]
+    bodies = [*build_brain(stage), wire]
     if stage.observer is not None:
         middle = tumour.vertices.mean(axis=0)
         bodies.append(SceneSurface("ellipsoid", middle + SMALL * BALL, BALL_FACES, ELLIPSOID_COLOUR, wireframe=True))
@@ -38,7 +38,7 @@ def bodies_of(stage: Stage) -> list[SceneSurface]:
     return bodies
 
 
-def brain_of(stage: Stage) -> list[SceneSurface]:
+def build_brain(stage: Stage) -> list[SceneSurface]:
     """Brain, open cortex and tumour, at rest."""
     positions = stage.site.anatomy.mesh.nodes
     brain, cortex, tumour = stage.brain, stage.cortex(positions), stage.tumour(positions)
@@ -49,7 +49,7 @@ def brain_of(stage: Stage) -> list[SceneSurface]:
     ]
 
 
-def signs_of(site: Site) -> list[Sign]:
+def list_orientation_labels(site: Site) -> list[Sign]:
     """The patient's sides round the brain."""
     nodes = site.anatomy.mesh.nodes
     middle, half = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + BESIDE
@@ -57,7 +57,7 @@ def signs_of(site: Site) -> list[Sign]:
     return [Sign(word, middle + way) for (plus, minus), arm in ways for word, way in ((plus, arm), (minus, -arm))]
 
 
-def viewpoint_of(site: Site) -> SceneViewpoint:
+def choose_viewpoint(site: Site) -> SceneViewpoint:
     """Obliquely onto the open cortex."""
     eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
     return SceneViewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))
@@ -82,6 +82,6 @@ def move_wire(browser: Browser, stage: Stage, truth: FemResult, player: Player) 
     browser.move("finite elements", seen.vertices, seen.triangles)
 
 
-def pictured(frame: Frame) -> np.ndarray:
+def render_page_image(frame: Frame) -> np.ndarray:
     """Return a frame's image (H, W, 3) uint8 with the orientation letters."""
-    return marked(frame.shown, frame.camera.T_camera_world[:3, :3], frame.taken)
+    return draw_orientation_labels(frame.shown, frame.camera.T_camera_world[:3, :3], frame.taken)

@@ -8,13 +8,20 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from ar.optics.camera import Camera, project_cv2
-from ar.overlay.outlines import iou, silhouette
+from ar.overlay.outlines import compute_iou, compute_silhouette
 from ar.rendering.layer import Layer
 from sim.deformation import Deformation
-from surrogate.locating.prior import middle_of
+from surrogate.locating.prior import compute_middle
 
 from ..script.scene import Bounds
-from .picture_checks import beside_tip, drawn_off, honest, printed, silhouette_of, truth_off
+from .picture_checks import (
+    has_distance_at_tip,
+    has_printed_numbers,
+    is_hidden_part_marked,
+    measure_outline_error,
+    measure_truth_error,
+    render_silhouette,
+)
 from .player import Frame, Player
 
 # # Share of its largest motion below which the tumour counts as still.
@@ -130,8 +137,8 @@ def measure(
         motion_mm=1e3 * float(max(moved)),
         pixels=max(pixels),
         drawn=max(drawn),
-        printed=all(good and printed(player, frame) for good, frame in zip(finite, frames, strict=True)),
-        labelled=all(good and beside_tip(player, frame) for good, frame in zip(finite, frames, strict=True)),
+        printed=all(good and has_printed_numbers(player, frame) for good, frame in zip(finite, frames, strict=True)),
+        labelled=all(good and has_distance_at_tip(player, frame) for good, frame in zip(finite, frames, strict=True)),
         honest=all(honestly),
         finite=all(finite),
         answered=not doubts,
@@ -154,12 +161,12 @@ def _covered(player: Player, frames: Sequence[Frame], truth: Deformation) -> flo
     anatomy, held = player.site.anatomy, []
     for row, frame in enumerate(frames):
         ellipsoid = None if frame.estimate is None else frame.estimate.ellipsoid()
-        middle = middle_of(anatomy, player.positions(truth, row)[None])[0]
-        held.append(ellipsoid is not None and within(ellipsoid, middle))
+        middle = compute_middle(anatomy, player.positions(truth, row)[None])[0]
+        held.append(ellipsoid is not None and is_within_surface(ellipsoid, middle))
     return float(np.mean(held))
 
 
-def within(closed: Layer, point: np.ndarray) -> bool:
+def is_within_surface(closed: Layer, point: np.ndarray) -> bool:
     """Return True if a closed convex surface, with triangles oriented outwards, contains a point (3,) [m]."""
     a, b, c = np.moveaxis(closed.vertices[closed.triangles], 1, 0)
     return bool((np.einsum("fi,fi->f", np.cross(b - a, c - a), point - a) <= 0.0).all())
@@ -185,7 +192,7 @@ def _doubts(frames: Sequence[Frame], truth: Deformation) -> list[str]:
     return found
 
 
-def objections(frames: Sequence[Frame]) -> list[str]:
+def list_objections(frames: Sequence[Frame]) -> list[str]:
     """List warnings about the estimates of a scene with an observation model, or about its frames.
 
     Number of frames that the locator rejects or doubts, with the first reason. A tumour that is still in most frames:
@@ -222,16 +229,16 @@ def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row:
     believed = player.believed(frame)
     shown = stage.tumour(believed)
     true = stage.tumour(player.positions(truth, row))
-    drawn = silhouette(frame.camera, shown.vertices, shown.triangles)
-    overlap = iou(drawn, silhouette(camera, true.vertices, true.triangles))
+    drawn = compute_silhouette(frame.camera, shown.vertices, shown.triangles)
+    overlap = compute_iou(drawn, compute_silhouette(camera, true.vertices, true.triangles))
     nodes = stage.anatomy.tumour_nodes
     off = (believed - player.positions(truth, row))[nodes]
     ours = frame.camera.project(shown.vertices)[0]
     pixels = np.linalg.norm(ours - project_cv2(camera, shown.vertices), axis=1).max()
     mean = float(np.linalg.norm(off, axis=1).mean())
-    mask = silhouette_of(camera, true if frame.estimate is None else shown)
-    drawn = drawn_off(frame, mask)
+    mask = render_silhouette(camera, true if frame.estimate is None else shown)
+    drawn = measure_outline_error(frame, mask)
     if frame.estimate is not None:  # both are in the image
-        drawn = max(drawn, truth_off(frame, silhouette_of(camera, true)))
+        drawn = max(drawn, measure_truth_error(frame, render_silhouette(camera, true)))
     # Not a number: behind the camera.
-    return overlap, mean, np.inf if np.isnan(pixels) else float(pixels), drawn, honest(frame, mask)
+    return overlap, mean, np.inf if np.isnan(pixels) else float(pixels), drawn, is_hidden_part_marked(frame, mask)

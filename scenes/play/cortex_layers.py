@@ -12,10 +12,10 @@ from scipy.spatial import KDTree
 
 from ar.rendering.layer import Layer, Solid
 from sim.bodies.intensity import Intensity
-from sim.geometry.surface import unit
+from sim.geometry.surface import normalise_vectors
 
 from ..script.site import Site
-from ..script.tool import capsule
+from ..script.tool import build_capsule
 from ..script.viewpoint import Cottonoid
 
 # Voxels across and along the axis of the opening [m]; how far they go beyond it, above its middle and below it [m].
@@ -31,7 +31,7 @@ DARK, MOTTLE, MOTTLED = 0.75, 0.12, 0.35e-3
 
 
 @lru_cache(maxsize=2)
-def with_vessels(
+def add_vessels(
     intensity: Intensity | None, site: Site, seed: int, dark: tuple[float, float, float], relief: float
 ) -> Solid:
     """The scan round an opening as a solid texture with vessels upon it, which the seed draws.
@@ -46,15 +46,15 @@ def with_vessels(
     T[:3, 3] = site.origin + across[0] * (site.right + site.up) + along[0] * site.axis
     scan = np.ones((len(across), len(across), len(along)), np.float32)
     if intensity is not None:
-        grey, inside = intensity.windowed(site.anatomy.mesh), np.linalg.inv(intensity.affine) @ T
+        grey, inside = intensity.apply_window(site.anatomy.mesh), np.linalg.inv(intensity.affine) @ T
         scan = affine_transform(grey, inside, output_shape=scan.shape, order=1, mode="nearest")
-    light = 1.0 - taken(across, np.random.default_rng([seed, 1])).astype(np.float32)
+    light = 1.0 - compute_vessel_absorption(across, np.random.default_rng([seed, 1])).astype(np.float32)
     return Solid(scan * light[:, :, None], np.linalg.inv(T), dark, relief, height=scan)
 
 
-def taken(across: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def compute_vessel_absorption(across: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Share of the light that vessels take, (n, n), at places `across` (n,) [m] from the middle, both ways."""
-    points, widths = paths(float(np.abs(across).max()), random)
+    points, widths = sample_vessel_paths(float(np.abs(across).max()), random)
     here = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1)
     away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * WIDEST)
     width = np.append(widths, WIDEST)[nearest]
@@ -63,7 +63,7 @@ def taken(across: np.ndarray, random: np.random.Generator) -> np.ndarray:
     return np.clip(vessels + (1.0 - vessels) * MOTTLE * mottle / mottle.std(), 0.0, 0.95)
 
 
-def paths(half: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def sample_vessel_paths(half: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points (k, 2) [m] of vessels that come in at the border of a square, wander and branch; their widths (k,) [m]."""
     angles = 2.0 * np.pi * (np.arange(TRUNKS) + random.uniform(0.0, 0.7, TRUNKS)) / TRUNKS
     rim = half * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -107,7 +107,7 @@ class Squares:
         return Layer("cotton", COTTON, carried + self.lift, self.triangles, COTTON_COLOUR, gloss=0.1)
 
 
-def squares(site: Site, cottonoids: Sequence[Cottonoid]) -> Squares:
+def build_squares(site: Site, cottonoids: Sequence[Cottonoid]) -> Squares:
     """Lay squares of cotton on an open cortex."""
     steps = np.linspace(-0.5, 0.5, PLACES)
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -126,12 +126,12 @@ def squares(site: Site, cottonoids: Sequence[Cottonoid]) -> Squares:
     )  # fmt: skip
 
 
-def finger(site: Site, angle: float) -> Layer:
+def build_finger(site: Site, angle: float) -> Layer:
     """A gloved finger that stands still over the edge of the opening, from a direction in the tangent plane [rad]."""
     out = np.cos(angle) * site.right + np.sin(angle) * site.up
     tip = site.origin + (site.clearance - OVER) * out - HIGH * site.axis
-    way = unit((out - 0.35 * site.axis)[None])[0]
-    side = unit(np.cross(way, site.axis)[None])[0]
-    vertices, triangles = capsule(FINGER, LENGTH)
+    way = normalise_vectors((out - 0.35 * site.axis)[None])[0]
+    side = normalise_vectors(np.cross(way, site.axis)[None])[0]
+    vertices, triangles = build_capsule(FINGER, LENGTH)
     turned = vertices @ np.stack([side, np.cross(way, side), way])
     return Layer("glove", GLOVE, turned + tip, triangles, GLOVE_COLOUR, gloss=0.3, still=True)

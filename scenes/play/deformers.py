@@ -10,32 +10,32 @@ from pathlib import Path
 import numpy as np
 
 from sim.accuracy import LIVE, Accuracy
-from sim.anatomy import Anatomy, region_words
-from sim.bodies.intensity import Intensity, read_intensity, sidecar
+from sim.anatomy import Anatomy, describe_region
+from sim.bodies.intensity import Intensity, read_intensity, to_intensity_path
 from sim.bodies.meshfile import read_anatomy
 from sim.deformation import Deformation, Deformer, guess
-from sim.discretisation.space import recommended
+from sim.discretisation.space import recommend_element
 from sim.effects import Elasticity
 from sim.errors import InputError
-from sim.fem import Fem, solver_named
+from sim.fem import Fem, describe_solver
 from sim.loads import Loads
 from sim.resected_fem import OperatedFem, finite_elements
 from sim.runtime.device import find_device
-from surrogate.data.answer_rows import first_stated
+from surrogate.data.answer_rows import find_first_tissue
 from surrogate.locating.locator import Locator
-from surrogate.locating.locator_store import load_locator, locator_path
-from surrogate.locating.regions import differing
-from surrogate.model.applicability import refusal
-from surrogate.model.guarded import Guarded, off_by
+from surrogate.locating.locator_store import load_locator, to_locator_path
+from surrogate.locating.regions import find_differing_regions
+from surrogate.model.applicability import find_rejection
+from surrogate.model.guarded import Guarded, compute_error
 from surrogate.model.learned import Learned
 from surrogate.model.left_out import LIMIT
 from surrogate.model.store import load
 
-from ..script.scene import Scene, demand_scene
+from ..script.scene import Scene, check_scene_exists
 from ..script.shipped_files import template_path
 from ..script.sight import Sight, StereoSight
 from ..script.site import Site, site_of
-from ..script.uncertainty import Uncertainty, mark_of, read_uncertainties, uncertainty_path
+from ..script.uncertainty import Uncertainty, mark_of, read_uncertainties, to_uncertainty_path
 from .observer import Observer
 from .player import Player
 from .stage import Stage
@@ -94,9 +94,9 @@ class Theatre:
         InputError
             A model gives an invalid tissue.
         """
-        return first_stated(model.training for model in self.models.values())
+        return find_first_tissue(model.training for model in self.models.values())
 
-    def lacks_locator(self, scene: Scene) -> bool:
+    def is_without_locator(self, scene: Scene) -> bool:
         """Return True if a scene has an observation model and this anatomy has no locator file."""
         return scene.sight is not None and (self.locator_file is None or not self.locator_file.is_file())
 
@@ -109,10 +109,10 @@ class Theatre:
             A scene with a sight, on an anatomy without a locator, or with one that knows regions otherwise.
         """
         device = find_device(self.device, LIVE.precision).name
-        if scene.sight is not None and (unlike := differing(scene.elasticity, self.locator.regions)):
+        if scene.sight is not None and (unlike := find_differing_regions(scene.elasticity, self.locator.regions)):
             raise InputError(
                 f"{scene.name}: the locator at {self.locator_file} has another stiffness of "
-                f"{' and '.join(map(region_words, unlike))} than the scene. Compute it again: `sulcus locator "
+                f"{' and '.join(map(describe_region, unlike))} than the scene. Compute it again: `sulcus locator "
                 "ANATOMY.vtu`, with the same --region."
             )
         stage = Stage(scene, self.site, self.intensity, device=device)
@@ -124,7 +124,7 @@ class Theatre:
             case StereoSight():
                 return replace(stage, observer=StereoObserver(stage, self.locator, scene.sight))
 
-    def refusals(self, scene: Scene) -> dict[str, str | None]:
+    def list_rejections(self, scene: Scene) -> dict[str, str | None]:
         """Find the reason why each trained model does not support a scene, by name; None if it does.
 
         A model supports only the effects, the tissue and the element that it was trained on. None is the reference with
@@ -133,12 +133,12 @@ class Theatre:
         """
         if scene.sight is not None:
             return dict.fromkeys(self.models, TRUTH)
-        effects, element = scene.effects_on(self.anatomy), self.element_of(scene)
-        return {name: refusal(model, effects, element) for name, model in self.models.items()}
+        effects, element = scene.get_effects_on(self.anatomy), self.choose_element(scene)
+        return {name: find_rejection(model, effects, element) for name, model in self.models.items()}
 
     def knowing(self, scene: Scene) -> dict[str, Learned]:
         """Select the trained models that support a scene, by name."""
-        return {name: self.models[name] for name, why in self.refusals(scene).items() if why is None}
+        return {name: self.models[name] for name, why in self.list_rejections(scene).items() if why is None}
 
     def names(self, scene: Scene) -> tuple[str, ...]:
         """List all deformers available for a scene: trained models that support it, the best one guarded, FEM."""
@@ -163,7 +163,7 @@ class Theatre:
         A model of tissue that relaxes is used without guard, with its bound: see `_guardable`.
         """
         name = self.best(scene)
-        return GUARDED if self._guardable(scene) and off_by(self.models[name]).weak else name
+        return GUARDED if self._guardable(scene) and compute_error(self.models[name]).weak else name
 
     def _guardable(self, scene: Scene) -> bool:
         """Return True if FEM can serve as fallback of the best model.
@@ -175,7 +175,7 @@ class Theatre:
 
     def described(self, name: str, scene: Scene) -> str:
         """A deformer by name, in words: what solves, or what it learned from."""
-        solver = solver_named(self.element_of(scene), scene.effects)
+        solver = describe_solver(self.choose_element(scene), scene.effects)
         if name == GUARDED:
             model, limit = self.models[self.best(scene)], 1e3 * self.limit_of(scene)
             return f"{model.source}; where its error may exceed {limit:g} mm, {solver}"
@@ -183,12 +183,12 @@ class Theatre:
 
     def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | OperatedFem:
         """Finite elements for a scene's effects, tissue and element; `live` as `Fem` has it."""
-        effects, element = scene.effects_on(self.anatomy), self.element_of(scene)
+        effects, element = scene.get_effects_on(self.anatomy), self.choose_element(scene)
         return finite_elements(self.anatomy, effects, accuracy, self.device, batch, element, live)
 
-    def element_of(self, scene: Scene) -> str:
+    def choose_element(self, scene: Scene) -> str:
         """The element of a scene, or the one that is recommended for the mesh."""
-        return scene.element or recommended(self.anatomy.mesh)
+        return scene.element or recommend_element(self.anatomy.mesh)
 
     def deformer(self, name: str, scene: Scene) -> Deformer:
         """A deformer by name; finite elements are made for the scene's accuracy.
@@ -210,7 +210,7 @@ class Theatre:
             model, limit = self.models[self.best(scene)], self.limit_of(scene)
             return Guarded(model, self.fem(scene, scene.accuracy, live=True), limit)
         if name == GUARDED and self.models:
-            why = next(iter(self.refusals(scene).values()))
+            why = next(iter(self.list_rejections(scene).values()))
             raise InputError(
                 f"no model that {GUARDED} could ask knows the scene {scene.name}: {why}. Choose {allowed}."
             )
@@ -218,7 +218,7 @@ class Theatre:
             raise InputError(
                 f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the trained ones."
             )
-        why = self.refusals(scene)[name]
+        why = self.list_rejections(scene)[name]
         if why is not None:
             raise InputError(f"{name} does not know the scene {scene.name}: {why}. Choose one of {allowed}.")
         return self.models[name]
@@ -236,7 +236,7 @@ class Theatre:
     def uncertainty(self, scene: Scene) -> Uncertainty | None:
         """Return the expected error of the tumour position in a scene; None without an ensemble of exactly it."""
         found = self.uncertainties.get(scene.name)
-        return found if found and found.mark == mark_of(scene, self.site, self.element_of(scene)) else None
+        return found if found and found.mark == mark_of(scene, self.site, self.choose_element(scene)) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +256,7 @@ def plan_of(deformer: Deformer) -> tuple[str, ...]:
     return deformer.plan.explain() if isinstance(deformer, Fem) else ()
 
 
-def model_path(anatomy: Path) -> Path:
+def to_model_path(anatomy: Path) -> Path:
     """Return the default path of an anatomy's models: MESH.model.npz next to MESH.vtu."""
     return anatomy.with_suffix(".model.npz")
 
@@ -271,18 +271,18 @@ def open_theatre(
     Raises
     ------
     InputError
-        As `demand_scene`, before anything is read. Files that are missing, unreadable, or do not belong together; a
+        As `check_scene_exists`, before anything is read. Files that are missing, unreadable, or do not belong together; a
         device that is not there.
     """
     for name in scenes:
-        demand_scene(name)
+        check_scene_exists(name)
     # # Trained models alone would not detect this, and the FEM fallback would fail too late.
     find_device(device, LIVE.precision)
     path = template_path() if anatomy is None else Path(anatomy)
     body = read_anatomy(path)
-    scan = sidecar(path)
-    learnt = model_path(path) if model is None else Path(model)
+    scan = to_intensity_path(path)
+    learnt = to_model_path(path) if model is None else Path(model)
     models = load(learnt, body) if model is not None or learnt.is_file() else {}
     intensity = read_intensity(scan) if scan.is_file() else None
-    uncertainties = read_uncertainties(uncertainty_path(path))
-    return Theatre(body, intensity, models, device, locator_path(path), uncertainties)
+    uncertainties = read_uncertainties(to_uncertainty_path(path))
+    return Theatre(body, intensity, models, device, to_locator_path(path), uncertainties)

@@ -53,14 +53,14 @@ class AblationRow:
     refused: str = ""
 
 
-def without(scene: Scene, effect: Effect) -> Scene:
+def remove_effect(scene: Scene, effect: Effect) -> Scene:
     """The scene without one of its effects."""
     if effect not in scene.effects:  # it depends on the body
         return replace(scene, surgery=None)
     return replace(scene, effects=tuple(other for other in scene.effects if other != effect))
 
 
-def rows(theatre: Theatre, scene: Scene, every: int) -> Iterator[AblationRow]:
+def measure_effects(theatre: Theatre, scene: Scene, every: int) -> Iterator[AblationRow]:
     """Yield the row of the scene, then of each effect, with the scene's own tissue; solve each `every`-th frame.
 
     Raises
@@ -71,13 +71,13 @@ def rows(theatre: Theatre, scene: Scene, every: int) -> Iterator[AblationRow]:
     whole = run(theatre, scene, every)
     nowhere = replace(whole, displacement=np.zeros_like(whole.displacement), milliseconds=0.0, held=0)
     yield _row(theatre, ALL, whole, nowhere)
-    for effect in scene.effects_on(theatre.anatomy):
+    for effect in scene.get_effects_on(theatre.anatomy):
         name = type(effect).__name__
         if isinstance(effect, Elasticity):
             yield AblationRow(name, refused="nothing else resists deformation")
             continue
         try:
-            less = run(theatre, without(scene, effect), every)
+            less = run(theatre, remove_effect(scene, effect), every)
         except InputError as error:
             yield AblationRow(name, refused=str(error))
             continue
@@ -92,13 +92,13 @@ def run(theatre: Theatre, scene: Scene, every: int) -> AblationRun:
     InputError
         A body without fixed nodes, or a frame without a good solution.
     """
-    before = device_arrays()  # freed meanwhile or not, they are not the scene's
+    before = list_device_arrays()  # freed meanwhile or not, they are not the scene's
     fem = theatre.fem(scene, scene.accuracy, live=True)
     times = scene.times[::every].tolist()
     found, seconds = _solved(fem, scene, theatre.site, times)
     wp.synchronize()
     known = {id(array) for array in before}
-    held = sum(array.capacity for array in device_arrays() if id(array) not in known)
+    held = sum(array.capacity for array in list_device_arrays() if id(array) not in known)
     return AblationRun(np.stack(found), 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :])), held)
 
 
@@ -117,7 +117,7 @@ def _solved(fem: Deformer, scene: Scene, site: Site, times: list[float]) -> tupl
     return found, seconds
 
 
-def device_arrays() -> list[wp.array]:
+def list_device_arrays() -> list[wp.array]:
     """All Warp arrays that live and own their memory."""
     gc.collect()
     return [thing for thing in gc.get_objects() if type(thing) is wp.array and thing.deleter is not None]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ar.overlay.hud import bound_words, rounded_up
+from ar.overlay.hud import bound_words, round_up
 from sim.deformation import Deformation, Outcome
 from sim.loads import Cause, Loads, Posture, Pushed, Resected, Retracted, Touching
 
@@ -32,12 +32,12 @@ DOUBTS = {
 }
 
 
-def doubt_of(outcome: Outcome) -> str:
+def describe_outcome(outcome: Outcome) -> str:
     """Return the reason why a solution is unreliable, in a few words for the image; empty if it is reliable."""
     return "" if outcome.good else DOUBTS.get(outcome, "not solved to the end: do not rely on it")
 
 
-def acting(loads: Loads, answer: Deformation, nodes: np.ndarray) -> str:
+def format_acting(loads: Loads, answer: Deformation, nodes: np.ndarray) -> str:
     """Describe the active loads of the first load case, and the measured tool force, as one line; empty without loads.
 
     `nodes` (V, 3) [m] are the undeformed vertices of the brain: the fluid level is given as a share of its height.
@@ -57,7 +57,7 @@ def _words(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str:
         case Touching() | Retracted() if answer.reaction.shape[1]:  # some trained models do not predict it
             bound = float(answer.reaction_bound[0, 0])
             known = answer.outcome[0].good and np.isfinite(bound)
-            within = f" within {rounded_up(bound, 2):.2f} N (model)" if known else ""
+            within = f" within {round_up(bound, 2):.2f} N (model)" if known else ""
             return f"tool force {np.linalg.norm(answer.reaction[0, -1, :3]):.2f} N{within}"
         case _:
             return ""
@@ -80,7 +80,7 @@ def _fluid(cause: Posture, nodes: np.ndarray) -> str:
     return f"fluid up to {100.0 * share:.0f} % of the brain's height"
 
 
-def shortened(source: str) -> str:
+def shorten_source(source: str) -> str:
     """Shorten `Deformation.source`: regions with a tissue of their own are given by name only."""
     return OWN_TISSUES.sub(lambda found: f"; own tissue: {', '.join(OWN.findall(found[0]))}", source)
 
@@ -88,7 +88,7 @@ def shortened(source: str) -> str:
 NOT_KNOWN_WORDS = "error of the tumour: not known"
 
 
-def error_lines(
+def format_errors(
     promised: float | None, error: TumourError, trained: bool, doubt: str = "", brief: bool = False
 ) -> list[str]:
     """Build the lines for an image: error of the model, and error of the tumour position.
@@ -105,10 +105,10 @@ def error_lines(
         True for the short form, for a small image.
     """
     modelled = error.observed is None and not doubt
-    return [*([model_words(promised, trained, brief)] if modelled else []), tumour_words(error, brief)]
+    return [*([format_model_error(promised, trained, brief)] if modelled else []), format_tumour_error(error, brief)]
 
 
-def model_words(promised: float | None, trained: bool, brief: bool = False) -> str:
+def format_model_error(promised: float | None, trained: bool, brief: bool = False) -> str:
     """Describe the error of the model relative to its FEM."""
     if not trained:
         return "model: FEM itself" if brief else "model: finite elements themselves"
@@ -118,7 +118,7 @@ def model_words(promised: float | None, trained: bool, brief: bool = False) -> s
     return within if brief else f"{within} of its finite elements (95 %)"
 
 
-def tumour_words(error: TumourError, brief: bool = False) -> str:
+def format_tumour_error(error: TumourError, brief: bool = False) -> str:
     """Describe the error of the drawn tumour position relative to the patient."""
     if error.bound is None:
         return "tumour: not known" if brief else NOT_KNOWN_WORDS
@@ -135,7 +135,7 @@ def tumour_words(error: TumourError, brief: bool = False) -> str:
     return said if error.prior is None else f"{said}; without observation {bound_words(error.prior, 1)}{guess}"
 
 
-def worst(errors: Sequence[TumourError]) -> TumourError:
+def find_worst(errors: Sequence[TumourError]) -> TumourError:
     """The largest of several frames' errors; not known where one is not."""
     known = [error for error in errors if error.bound is not None]
     if len(known) < len(errors) or not known:

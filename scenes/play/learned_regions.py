@@ -9,7 +9,7 @@ from sim.effects import Elasticity
 from sim.material import Material, Ogden, Tissue
 
 
-def learned_regions(
+def find_learned_regions(
     here: Elasticity, learned: Elasticity | None, named: Collection[int] = frozenset()
 ) -> dict[int, Tissue]:
     """Tissues by label of the regions that a scene, whose tissue is `here`, leaves to the models.

@@ -12,20 +12,20 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from ar.overlay.hud import millimetres
+from ar.overlay.hud import format_millimetres
 from ar.rendering.layer import Layer
 from sim.anatomy import Anatomy
 from sim.errors import InputError
-from sim.geometry.closest_point import closest
+from sim.geometry.closest_point import find_closest_points
 from surrogate.locating.calibration import RADIUS_SQUARED
 from surrogate.locating.evidence import smooth_root
 from surrogate.locating.locator import Location, Locator
 from surrogate.locating.observation import Observation
-from surrogate.locating.prior import middle_of
+from surrogate.locating.prior import compute_middle
 
 from ..script.sight import Sight, StereoSight
 from ..script.site import HOLE, Site
-from ..script.tool import sphere
+from ..script.tool import build_sphere
 
 # A tool so near to the cortex touches it; it hides points that are so near to it [m].
 TOUCHES, HIDES = 1e-3, 4e-3
@@ -34,7 +34,7 @@ CORNERS = 32
 ELLIPSOID_COLOUR = (0.21, 0.30, 0.90)
 ELLIPSOID = 5
 """Segmentation id of the ellipsoid's layer, which no image contains."""
-BALL, BALL_FACES = sphere()
+BALL, BALL_FACES = build_sphere()
 NOTHING = Observation(np.zeros((0, 3)))
 """Empty observation."""
 
@@ -115,7 +115,9 @@ class TumourEstimate:
             return ""
         still = "" if self.noticed else "no significant motion detected; "
         guess = "" if self.location.calibrated else "a guess; "
-        return f"{still}{guess}truth moved {millimetres(self.truly)}; estimate error {millimetres(self.off)}"
+        return (
+            f"{still}{guess}truth moved {format_millimetres(self.truly)}; estimate error {format_millimetres(self.off)}"
+        )
 
     @property
     def source(self) -> str:
@@ -167,7 +169,9 @@ class Observer:
         `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is observed.
         """
         begun = clock.perf_counter()
-        return estimated(self.site.anatomy, self.locator, lambda: self.seen(number, positions, tool), positions, begun)
+        return compute_estimate(
+            self.site.anatomy, self.locator, lambda: self.seen(number, positions, tool), positions, begun
+        )
 
     def seen(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Observation:
         """Sample the observation of a frame; arguments as of `estimate`."""
@@ -177,7 +181,7 @@ class Observer:
         shown, tips = np.ones(len(now), bool), np.zeros((0, 3))
         if tool is not None:
             shown = KDTree(tool).query(now)[0] > HIDES
-            tips = touched(self.site.anatomy, positions, tool)
+            tips = find_touched(self.site.anatomy, positions, tool)
             tips = self._as_a_whole(tips + sight.white * random.standard_normal(tips.shape))
         sigma = np.full(shown.sum(), np.hypot(sight.white, sight.smooth))
         return Observation(self._as_a_whole(now + off)[shown], self._at(self._rest)[shown], sigma, tips)
@@ -214,7 +218,7 @@ class Observer:
 
     @cached_property
     def _rigid(self) -> RigidError:
-        return rigid_error(self.sight, 2)
+        return sample_rigid_error(self.sight, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,22 +233,22 @@ class RigidError:
         return middle + Rotation.from_rotvec(self.turn).apply(points - middle) + self.shift
 
 
-def rigid_error(sight: Sight | StereoSight, number: int) -> RigidError:
+def sample_rigid_error(sight: Sight | StereoSight, number: int) -> RigidError:
     """One of the rigid errors of a sight, by number."""
     turn, shift = np.random.default_rng([sight.seed, 0, number]).standard_normal((2, 3))
     return RigidError(sight.turn * turn / np.linalg.norm(turn), sight.shift * shift / np.linalg.norm(shift))
 
 
-def touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> np.ndarray:
+def find_touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> np.ndarray:
     """The place of the cortex (1, 3) [m] that a tool with corners (t, 3) [m] touches; (0, 3) where it is in the air."""
     triangles = anatomy.open_surface
     near = tool[np.argsort(KDTree(positions[np.unique(triangles)]).query(tool)[0])[:CORNERS]]
-    place = closest(near, positions[triangles]).point
+    place = find_closest_points(near, positions[triangles]).point
     away = np.linalg.norm(place - near, axis=1)
     return place[[away.argmin()]] if away.min() < TOUCHES else NOTHING.now
 
 
-def estimated(
+def compute_estimate(
     anatomy: Anatomy, locator: Locator, see: Callable[[], Observation], positions: np.ndarray, begun: float
 ) -> TumourEstimate:
     """Locate the tumour from an observation, and compare with the truth at `positions` (V, 3) [m]; rejections are kept.
@@ -258,5 +262,5 @@ def estimated(
     except InputError as error:
         refusal = str(error)
     seconds, rest = clock.perf_counter() - begun, anatomy.mesh.nodes
-    middle, true = middle_of(anatomy, np.stack([rest, positions - rest]))
+    middle, true = compute_middle(anatomy, np.stack([rest, positions - rest]))
     return TumourEstimate(anatomy, observation, location, refusal, middle, true, seconds)

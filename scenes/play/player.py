@@ -10,34 +10,34 @@ from functools import cached_property
 import numpy as np
 
 from ar.optics.camera import Camera
-from ar.overlay.composite import Overlaid, composite, draw_points, head_lines
+from ar.overlay.composite import Overlaid, composite, draw_points, format_head_lines
 from ar.overlay.gauge import Gauge
-from ar.overlay.hud import NARROW, folded, lay
+from ar.overlay.hud import NARROW, lay, wrap_line
 from ar.overlay.legend import LegendNames
 from ar.overlay.marks import Cover, Marks, Trace, Words
 from ar.overlay.styles import Style
 from ar.rendering.layer import Layer
-from ar.rendering.real_picture import vignetted
+from ar.rendering.real_picture import add_vignette
 from ar.rendering.renderer import Picture
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
-from sim.geometry.ball_at_rest import resting_tip
-from sim.geometry.closest_point import closest
-from sim.geometry.surface import encloses
+from sim.geometry.ball_at_rest import find_resting_tip
+from sim.geometry.closest_point import find_closest_points
+from sim.geometry.surface import is_enclosing
 from sim.loads import Loads, stacked
-from surrogate.model.guarded import answering
+from surrogate.model.guarded import find_first_model
 from surrogate.model.learned import Learned
 
 from ..script.scene import Scene
 from ..script.site import Site
 from ..script.tool import Instrument, Probe
-from ..script.tool_paths import Touch, lifted
+from ..script.tool_paths import Touch, compute_lift
 from ..script.uncertainty import NOT_KNOWN, TumourError, Uncertainty
 from .cortex_layers import COTTON, GLOVE
-from .frame_text import acting, doubt_of, error_lines
+from .frame_text import describe_outcome, format_acting, format_errors
 from .observer import TumourEstimate
 from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, TOOL, Stage
-from .tip_reading import reading
+from .tip_reading import read_tip_distance
 
 REFUSED = "observation rejected, and the scan is shown: do not rely on it"
 # Strokes and gaps of the outlines of the truth and of the ellipsoid [pixel].
@@ -183,7 +183,7 @@ class Player:
     def remembers(self) -> bool:
         """True if a solution depends on the previous one."""
         solved = not isinstance(self.deformer, Learned)
-        return self.follows or (solved and remember(self.scene.effects_on(self.site.anatomy)))
+        return self.follows or (solved and remember(self.scene.get_effects_on(self.site.anatomy)))
 
     @cached_property
     def follows(self) -> bool:
@@ -219,32 +219,34 @@ class Player:
         stage, camera = self.stage.at(loads), self.camera_at(float(loads.times[0]))
         picture = stage.picture(camera, positions, None if held is None else held.pose)
         field = self.scene.viewpoint.field
-        picture = picture if field is None else vignetted(picture, field)
+        picture = picture if field is None else add_vignette(picture, field)
         corners = stage.corners(None if held is None else held.pose)
         estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
         # # The observer's rendering time is not part of the estimate.
         seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds
         tumour, rest = stage.tumour(_believed(positions, estimate)), stage.tumour_at_rest
-        doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.beyond > BLOCKED else "")
+        doubt = describe_outcome(deformation.outcome[0]) or (
+            IN_BONE if held is not None and held.beyond > BLOCKED else ""
+        )
         doubt = doubt or (REFUSED if estimate is not None and estimate.location is None else "")
         gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
         promised = None if doubt else self._promised(deformation)
         error = NOT_KNOWN if doubt else self._tumour_error(touch, loads, promised or 0.0, estimate)
         shown = None if gauge is None else replace(gauge, error=error.bound)
-        traces = () if estimate is None else traces_of(estimate, stage.truth(positions))
+        traces = () if estimate is None else list_traces(estimate, stage.truth(positions))
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
         motion = float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean())
         if estimate is None and error.moved is not None and not is_undeformed(deformation):
             moved = motion, error.moved
         band = 0.0 if estimate is not None else error.bound or 0.0
-        trained = answering(self.deformer, deformation) is not None
-        lines = error_lines(promised, error, trained, doubt, camera.width < FEW)
-        head = head_lines(lines, picture.segmentation == TOOL)
+        trained = find_first_model(self.deformer, deformation) is not None
+        lines = format_errors(promised, error, trained, doubt, camera.width < FEW)
+        head = format_head_lines(lines, picture.segmentation == TOOL)
         remarks = self.scene.stopped(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
         if self.composed:
             marks = Marks(band, shown, rest, traces)
-            words = Words(doubt, head, names_of(estimate), moved, error.bound)
+            words = Words(doubt, head, get_legend_names(estimate), moved, error.bound)
             over = composite(picture, camera, tumour, self.style, Cover(COVERS, OPENING), marks, words)
             if estimate is not None and self.style != "none":
                 draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
@@ -261,19 +263,23 @@ class Player:
             distance=None if gauge is None else gauge.distance, distance_error=None if gauge is None else gauge.error,
             inside=gauge is not None and gauge.inside, moved=how_far, moved_error=moved_error,
             model_error=promised, tumour_error=error, doubt=doubt,
-            acts=acting(loads, deformation, self.site.anatomy.mesh.nodes), head=tuple(head), remark=remark,
+            acts=format_acting(loads, deformation, self.site.anatomy.mesh.nodes), head=tuple(head), remark=remark,
             seconds=took, estimate=estimate,
         )  # fmt: skip
 
     def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
         """Measure from the tip to the tumour, with the error bound of the deformer, if known."""
-        gauge = gauged(held.tip, tumour)
-        read = None if held.beyond > CARRIED else reading(self.deformer, loads, answer, self.scene.tool, gauge.distance)
+        gauge = measure_gauge(held.tip, tumour)
+        read = (
+            None
+            if held.beyond > CARRIED
+            else read_tip_distance(self.deformer, loads, answer, self.scene.tool, gauge.distance)
+        )
         return gauge if read is None else replace(gauge, read=read.distance, error=read.bound)
 
     def _promised(self, answer: Deformation) -> float | None:
         """Return a model's guaranteed error relative to FEM [m], of this load if available; None if unknown."""
-        model = answering(self.deformer, answer)
+        model = find_first_model(self.deformer, answer)
         if model is None:
             return None
         of_load = float(answer.bound[0, 0])
@@ -339,8 +345,8 @@ class Player:
         beyond = float(np.linalg.norm(inside - carried))
         tip = through = inside if beyond > CARRIED else carried
         if isinstance(tool, Probe):
-            tip = resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
-        tip = tip - lifted(touch.force) * inward
+            tip = find_resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
+        tip = tip - compute_lift(touch.force) * inward
         pose = tool.pose(tip, inward, self.site.right)
         return HeldTool(tip, pose, beyond)
 
@@ -354,7 +360,7 @@ def _believed(positions: np.ndarray, estimate: TumourEstimate | None) -> np.ndar
     return positions if estimate is None else estimate.carried(positions)
 
 
-def traces_of(estimate: TumourEstimate, truth: Layer) -> tuple[Trace, ...]:
+def list_traces(estimate: TumourEstimate, truth: Layer) -> tuple[Trace, ...]:
     """Build the traces of an estimate: its ellipsoid, and the true tumour surface with its centroid."""
     ellipsoid, true = estimate.ellipsoid(), Trace(truth, TRUE_STROKES, estimate.middle + estimate.true)
     if ellipsoid is None:
@@ -362,21 +368,21 @@ def traces_of(estimate: TumourEstimate, truth: Layer) -> tuple[Trace, ...]:
     return Trace(ellipsoid, ELLIPSOID_STROKES, estimate.middle + estimate.motion), true
 
 
-def names_of(estimate: TumourEstimate | None) -> LegendNames:
+def get_legend_names(estimate: TumourEstimate | None) -> LegendNames:
     """Return the names of the lines of an image; a rejected estimate has no ellipsoid."""
     if estimate is None:
         return PREDICTED_LINES
     return ESTIMATED_LINES if estimate.location is not None else replace(ESTIMATED_LINES, traces=("truth",))
 
 
-def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
+def measure_gauge(tip: np.ndarray, hidden: Layer) -> Gauge:
     """From a tip (3,) [m] to the nearest point of a hidden surface, and whether it is inside."""
     corners = hidden.vertices[hidden.triangles]
-    return Gauge(tip, closest(tip[None], corners).point[0], inside=encloses(corners, tip))
+    return Gauge(tip, find_closest_points(tip[None], corners).point[0], inside=is_enclosing(corners, tip))
 
 
 def annotate(over: Overlaid, number: int, remark: str) -> None:
     """Write a remark at the bottom of a composite image and a frame's number, in place."""
     height, width = over.taken.shape
-    lay(over.colour, over.taken, folded(remark, NARROW * width), (0, height))
+    lay(over.colour, over.taken, wrap_line(remark, NARROW * width), (0, height))
     lay(over.colour, over.taken, [f"frame {number}"], (width, height))

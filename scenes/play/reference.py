@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from sim.accuracy import TRAIN
-from sim.deformation import Deformation, Deformer, joined
+from sim.deformation import Deformation, Deformer, join_deformations
 from sim.fem import Fem
 from sim.loads import Loads, stacked
 from sim.resected_fem import OperatedFem
@@ -19,7 +19,7 @@ from .deformers import Theatre
 TOGETHER = 16
 
 
-def following(theatre: Theatre, scene: Scene) -> Fem | OperatedFem:
+def build_reference_fem(theatre: Theatre, scene: Scene) -> Fem | OperatedFem:
     """Finite elements for the truth of many scenes alike: on a card of frames together, else frame after frame.
 
     A frame that starts from the last one takes a quarter of the time of one that is solved apart.
@@ -29,7 +29,7 @@ def following(theatre: Theatre, scene: Scene) -> Fem | OperatedFem:
     return theatre.fem(scene, TRAIN, 1, live=True)
 
 
-def past_matters(fem: Deformer) -> bool:
+def is_history_dependent(fem: Deformer) -> bool:
     """Return True if FEM must solve a frame after the previous ones.
 
     Not needed if only forces act on an elastic intact body. A deformer that is not FEM needs no history.
@@ -37,7 +37,7 @@ def past_matters(fem: Deformer) -> bool:
     return isinstance(fem, OperatedFem) or (isinstance(fem, Fem) and not fem.problem.plain)
 
 
-def truth_of(
+def solve_reference_frames(
     theatre: Theatre,
     scene: Scene,
     loads: Sequence[Loads],
@@ -47,14 +47,14 @@ def truth_of(
     """One row per frame's loads, every vertex, at training accuracy; one after the other where the past matters.
 
     `progress` hears how many more frames are solved, whenever some are. `fem` are finite elements that are at hand, as
-    `following` makes them.
+    `build_reference_fem` makes them.
     """
     fem = fem or theatre.fem(scene, TRAIN, TOGETHER)
-    apart = not past_matters(fem) and not (isinstance(fem, Fem) and fem.batch == 1)
+    apart = not is_history_dependent(fem) and not (isinstance(fem, Fem) and fem.batch == 1)
     size = TOGETHER if apart else 1
     answers: list[Deformation] = []
     for first in range(0, len(loads), size):
         some = stacked(loads[first : first + size])
         answers.append(fem.deform(some, start=None if apart or not answers else answers[-1]))
         progress(len(some))
-    return joined([replace(answer, memory={}, warm={}) for answer in answers])
+    return join_deformations([replace(answer, memory={}, warm={}) for answer in answers])

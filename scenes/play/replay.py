@@ -97,7 +97,7 @@ class ReplaySession:
 
     def __init__(self, player: Player) -> None:
         self.player = player
-        course, scene = course_of(player), player.scene
+        course, scene = plan_replay_order(player), player.scene
         self._reel: FrameCache[Deformation] | None = None
         if course is not None:
             self._reel = FrameCache(
@@ -118,12 +118,12 @@ class ReplaySession:
         return number, self._last
 
 
-def course_of(player: Player) -> ReplayOrder | None:
+def plan_replay_order(player: Player) -> ReplayOrder | None:
     """Return the order in which frames of a script are computed; None if all are independent."""
     scene = player.scene
     if player.remembers:
         return IN_ORDER
-    if not any(isinstance(effect, SkullContact) for effect in scene.effects_on(player.site.anatomy)):
+    if not any(isinstance(effect, SkullContact) for effect in scene.get_effects_on(player.site.anatomy)):
         return None
     # # Only displacements of such a state are stored, a third of a megabyte each.
     return ReplayOrder(max(1, round(LEAP * scene.frames_per_second)), back=True, kept=64)

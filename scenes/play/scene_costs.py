@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ar.overlay.hud import HEAD, ROW, bound_words, panel
-from ar.screen import shrunk
+from ar.overlay.hud import HEAD, ROW, bound_words, draw_text_panel
+from ar.screen import shrink_image
 
-from .frame_text import shortened
+from .frame_text import shorten_source
 from .player import Frame, Player
 from .stage import DRAPE, TOOL
 
@@ -24,7 +24,7 @@ LINES = "green estimate, pink truth, blue 95 % of its middle"
 def label_lines(frame: Frame, name: str) -> list[str]:
     """Build the panel's lines for a frame of a deformer, most important first."""
     answer, found = frame.deformation, frame.estimate
-    source, spent = shortened(answer.source or name), frame.seconds.items()
+    source, spent = shorten_source(answer.source or name), frame.seconds.items()
     doubt = [] if answer.outcome[0].good else [answer.outcome[0].value]
     moment = f"t {frame.time:.2f} s{', ' if frame.acts else ''}{frame.acts}"
     rest = [*doubt, moment, "ms: " + ", ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in spent)]
@@ -41,13 +41,13 @@ def _within(length: float, error: float | None) -> str:
     return f"{1e3 * length:.2f} {'mm' if error is None else f'+- {bound_words(error, 1)}'}"
 
 
-def labelled(frame: Frame, name: str) -> np.ndarray:
+def add_cost_label(frame: Frame, name: str) -> np.ndarray:
     """Draw a panel on the shown image (H, W, 3): deformer, loads, and milliseconds by stage; also of an estimate."""
     seen = frame.picture.segmentation
     # It hides cortex where it must, but no tool, no line and no word.
     hides = (frame.taken > 0) | (seen != DRAPE), (frame.taken > 0) | (seen == TOOL)
     sights = [each.view(np.uint8) for each in hides]
-    return panel(frame.shown, label_lines(frame, name), below=HEAD + ROW * len(frame.head), sights=sights)
+    return draw_text_panel(frame.shown, label_lines(frame, name), below=HEAD + ROW * len(frame.head), sights=sights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,15 +64,17 @@ class Thumbnail:
         return sum(self.milliseconds.values())
 
 
-def thumbnail(player: Player, name: str) -> Thumbnail:
+def render_thumbnail(player: Player, name: str) -> Thumbnail:
     """The frame of a deformer `name` in which the tumour has moved most, of those after the last cut, small."""
     every = max(1, (len(player.scene.times) - 1) // (DRAWN - 1))
     frames = list(player.frames(every))
     best = max(frames, key=lambda frame: (_cuts(player, frame), frame.moved))
-    said = labelled(best, name)
+    said = add_cost_label(best, name)
     taken = best.taken | (said != best.shown).any(axis=2).view(np.uint8)
-    picture = panel(said, [player.scene.name], "top right", 0.9, sights=[taken])
-    return Thumbnail(shrunk(picture, *SIZE), _medians(frames[1:] or frames), 1e3 * max(frame.moved for frame in frames))
+    picture = draw_text_panel(said, [player.scene.name], "top right", 0.9, sights=[taken])
+    return Thumbnail(
+        shrink_image(picture, *SIZE), _medians(frames[1:] or frames), 1e3 * max(frame.moved for frame in frames)
+    )
 
 
 def _cuts(player: Player, frame: Frame) -> int:
@@ -84,7 +86,7 @@ def _medians(frames: list[Frame]) -> dict[str, float]:
     return {stage: 1e3 * float(np.median([frame.seconds[stage] for frame in frames])) for stage in frames[0].seconds}
 
 
-def sheet(pictures: list[np.ndarray], columns: int = 3) -> np.ndarray:
+def tile_images(pictures: list[np.ndarray], columns: int = 3) -> np.ndarray:
     """Arrange images (H, W, 3) uint8 of one size in rows of a sheet; empty cells are dark."""
     blank = np.full_like(pictures[0], 12)
     whole = [*pictures, *[blank] * (-len(pictures) % columns)]

@@ -11,18 +11,18 @@ from scipy.spatial.transform import Rotation
 from ar.optics.camera import Camera
 from ar.overlay.legend import LegendNames
 from ar.overlay.styles import Opening
-from ar.rendering.layer import Layer, Solid, vertex_normals
+from ar.rendering.layer import Layer, Solid, compute_vertex_normals
 from ar.rendering.renderer import Lamp, Picture, Renderer, lamp_beside
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity
-from sim.discretisation.resected_body import RemainingBody, bodies
+from sim.discretisation.resected_body import RemainingBody, list_remaining_bodies
 from sim.effects import SkullContact
 from sim.loads import Loads, Resected
 
 from ..script.scene import Scene
 from ..script.sight import StereoSight
 from ..script.site import HOLE, Site
-from .cortex_layers import COTTON, GLOVE, Squares, finger, squares, with_vessels
+from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, build_squares
 from .observer import Sees
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
@@ -99,7 +99,9 @@ class Stage:
     def _after(self) -> tuple[Stage, ...]:
         """The stage after 0, 1, ... steps."""
         whole = self.site.anatomy
-        return tuple(replace(self, left=left) for left in bodies(whole, self.scene.effects_on(whole)))
+        return tuple(
+            replace(self, left=left) for left in list_remaining_bodies(whole, self.scene.get_effects_on(whole))
+        )
 
     @cached_property
     def nodes(self) -> np.ndarray:
@@ -173,11 +175,11 @@ class Stage:
 
     @cached_property
     def _squares(self) -> Squares:
-        return squares(self.site, self.scene.look.cottonoids)
+        return build_squares(self.site, self.scene.look.cottonoids)
 
     @cached_property
     def _finger(self) -> Layer:
-        return finger(self.site, self.scene.look.finger or 0.0)
+        return build_finger(self.site, self.scene.look.finger or 0.0)
 
     @cached_property
     def _renderers(self) -> dict[int, Renderer]:
@@ -222,7 +224,7 @@ class Stage:
         vertices, triangles = np.unique(surface, return_inverse=True)
         at = self.anatomy.mesh.nodes[vertices]
         colour = np.array(CORTEX_COLOUR) * self.scene.look.tint
-        return Cortex(vertices, triangles, at - READ_BELOW * vertex_normals(at, triangles), self.scan, colour)
+        return Cortex(vertices, triangles, at - READ_BELOW * compute_vertex_normals(at, triangles), self.scan, colour)
 
     @cached_property
     def scan(self) -> Solid | None:
@@ -231,22 +233,22 @@ class Stage:
         if isinstance(sight, StereoSight) and sight.vessels:
             seed = sight.seed
         if seed is not None:
-            return with_vessels(self.intensity, self.site, seed, DARK, RELIEF)
+            return add_vessels(self.intensity, self.site, seed, DARK, RELIEF)
         if self.intensity is None:
             return None
-        values = self.intensity.windowed(self.site.anatomy.mesh)
+        values = self.intensity.apply_window(self.site.anatomy.mesh)
         return Solid(values, np.linalg.inv(self.intensity.affine), DARK, RELIEF)
 
     @cached_property
     def _drape(self) -> Layer:
         """The surface lifted off the brain, with a round hole over the open cortex, and a wall round the hole."""
         mesh, site = self.site.anatomy.mesh, self.site
-        normals = vertex_normals(mesh.nodes, mesh.surface)
+        normals = compute_vertex_normals(mesh.nodes, mesh.surface)
         lifted = mesh.nodes + DRAPE_HEIGHT * normals
         # # Distance of a node outside the hole: across the axis on the near side, everywhere on the far side.
         far = (mesh.nodes - site.origin) @ site.axis > 2.0 * site.radius
         outside = np.where(far, site.radius, site.across(mesh.nodes) - HOLE * site.clearance)
-        points, triangles, rim = clipped(lifted, mesh.surface, outside)
+        points, triangles, rim = clip_surface(lifted, mesh.surface, outside)
         # The wall has its own vertices: normals shared with the drape would round its edge off.
         low = points[rim] + (DRAPE_HEIGHT + DRAPE_DEPTH) * site.axis
         corner = len(points) + np.arange(4 * len(rim)).reshape(-1, 4)  # two upper, two lower, of every edge
@@ -255,7 +257,9 @@ class Stage:
         return Layer("drape", DRAPE, points, np.concatenate([triangles, wall]), DRAPE_COLOUR, gloss=0.05, still=True)
 
 
-def clipped(points: np.ndarray, triangles: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def clip_surface(
+    points: np.ndarray, triangles: np.ndarray, value: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The part of a surface where a linear field is positive: points (n, 3), triangles (m, 3), cut edges (k, 2).
 
     points (V, 3), triangles (F, 3), value (V,). Triangles that the zero line crosses are cut along it.

@@ -12,9 +12,9 @@ from surrogate.locating.locator import Locator
 from surrogate.locating.observation import Observation
 
 from ..script.sight import StereoSight
-from .observer import NOTHING, RigidError, TumourEstimate, estimated, rigid_error, touched
+from .observer import NOTHING, RigidError, TumourEstimate, compute_estimate, find_touched, sample_rigid_error
 from .stage import Stage
-from .stereo_update import First, StereoPair, cloud_of, first_of, points_of
+from .stereo_update import First, StereoPair, observe_first, observe_point_cloud, observe_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +31,10 @@ class StereoObserver:
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
         """Estimate the tumour in a frame; arguments as of `Observer.estimate`. Rendering time is not counted."""
         shot, anatomy = self.shot(number, positions, tool), self.stage.site.anatomy
-        tips = NOTHING.now if tool is None else touched(anatomy, positions, tool)
+        tips = NOTHING.now if tool is None else find_touched(anatomy, positions, tool)
         _ = self._first_shot  # to draw it takes long
         begun = clock.perf_counter()
-        return estimated(anatomy, self.locator, lambda: self.seen(shot, tips), positions, begun)
+        return compute_estimate(anatomy, self.locator, lambda: self.seen(shot, tips), positions, begun)
 
     def seen(self, shot: StereoPair, tips: np.ndarray) -> Observation:
         """Extract the observation from a stereo pair, with contact points of a tool, `tips` (k, 3) [m].
@@ -42,12 +42,12 @@ class StereoObserver:
         Raises
         ------
         InputError
-            As `points_of`, or `cloud_of` without correspondences; as `first_of`.
+            As `observe_points`, or `observe_point_cloud` without correspondences; as `observe_first`.
         """
         site, sight = self.stage.site, self.sight
         if not sight.named:
-            return cloud_of(site, shot, sight.points, self._tracked(0), tips)
-        return points_of(site, self.first, shot, self._tracked(1), tips)
+            return observe_point_cloud(site, shot, sight.points, self._tracked(0), tips)
+        return observe_points(site, self.first, shot, self._tracked(1), tips)
 
     def shot(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> StereoPair:
         """Render both eyes' images of a frame, for positions (V, 3) [m] and a tool's corners (t, 3) [m].
@@ -71,9 +71,9 @@ class StereoObserver:
         Raises
         ------
         InputError
-            As `first_of`.
+            As `observe_first`.
         """
-        return first_of(self.stage.site, self._first_shot, self.sight.points, self._tracked(0))
+        return observe_first(self.stage.site, self._first_shot, self.sight.points, self._tracked(0))
 
     @cached_property
     def _first_shot(self) -> StereoPair:
@@ -92,7 +92,7 @@ class StereoObserver:
         return np.clip(np.rint(lit), 0.0, 255.0).astype(np.uint8)
 
     def _tracked(self, number: int) -> TrackedMicroscope:
-        return TrackedMicroscope(rigid_error(self.sight, 2 + number), self.stage.site.origin)
+        return TrackedMicroscope(sample_rigid_error(self.sight, 2 + number), self.stage.site.origin)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,11 @@ from typing import cast
 import numpy as np
 
 from ar.optics.camera import Camera
-from ar.overlay.outlines import silhouette
-from ar.stereo.disparity import Cloud, StereoView, cloud, followed, supported, viewed
-from ar.stereo.rectified import rectified
+from ar.overlay.outlines import compute_silhouette
+from ar.stereo.disparity import Cloud, StereoView, compute_stereo_view, find_supported, follow_pixels, triangulate_cloud
+from ar.stereo.rectified import rectify
 from sim.errors import InputError
-from sim.geometry.closest_point import closest
+from sim.geometry.closest_point import find_closest_points
 from surrogate.locating.evidence import SIGMA, WHITE
 from surrogate.locating.observation import Observation
 
@@ -65,11 +65,11 @@ class StereoPair:
         InputError
             Eyes that are swapped, or one that sees nothing.
         """
-        masks = None if self.tool is None else tuple(silhouette(camera, *self.tool) for camera in self.cameras)
+        masks = None if self.tool is None else tuple(compute_silhouette(camera, *self.tool) for camera in self.cameras)
         target = cast(tuple[float, float, float], tuple(site.origin.tolist()))
         try:
-            geometry = rectified(*self.cameras, target, WIDE * site.radius, FINENESS)
-            return viewed(geometry, *self.pictures, cast(tuple[np.ndarray, np.ndarray] | None, masks))
+            geometry = rectify(*self.cameras, target, WIDE * site.radius, FINENESS)
+            return compute_stereo_view(geometry, *self.pictures, cast(tuple[np.ndarray, np.ndarray] | None, masks))
         except ValueError as error:
             raise InputError(str(error)) from error
 
@@ -96,7 +96,7 @@ class First:
     still: np.ndarray
 
 
-def first_of(site: Site, shot: StereoPair, count: int, rigid: Rigid) -> First:
+def observe_first(site: Site, shot: StereoPair, count: int, rigid: Rigid) -> First:
     """Match the first pair, of an undeformed brain: `count` points, each at the nearest point of the scan.
 
     Raises
@@ -105,22 +105,22 @@ def first_of(site: Site, shot: StereoPair, count: int, rigid: Rigid) -> First:
         As `StereoPair.seen`; too few points; points off the scan's cortex.
     """
     view = shot.seen(site)
-    pixels = grid(site, view, count)
-    found = seen_points(site, view, pixels)
+    pixels = build_pixel_grid(site, view, count)
+    found = triangulate_seen_points(site, view, pixels)
     points = rigid(found.points)
-    rest, off = on_cortex(site, points)
+    rest, off = find_on_cortex(site, points)
     if len(off) and np.median(off) > MISPLACED:
         raise InputError(
             f"the first image pair shows a cortex {1e3 * np.median(off):.1f} mm from the scan's: check that eyes "
             "are not swapped, or calibrate them again."
         )
-    good = supported(rest, points - rest)
+    good = find_supported(rest, points - rest)
     demand(int(good.sum()), len(pixels))
-    around, still = surroundings(site, view)
+    around, still = find_surroundings(site, view)
     return First(view, pixels[found.which[good]], rest[good], len(pixels), around, rigid(still))
 
 
-def points_of(site: Site, first: First, shot: StereoPair, rigid: Rigid, tips: np.ndarray) -> Observation:
+def observe_points(site: Site, first: First, shot: StereoPair, rigid: Rigid, tips: np.ndarray) -> Observation:
     """Points of the first pair, where a later one shows them; `tips` (k, 3) [m], where a tool touches.
 
     Raises
@@ -129,11 +129,11 @@ def points_of(site: Site, first: First, shot: StereoPair, rigid: Rigid, tips: np
         As `StereoPair.seen`; too few points; surroundings that seem to move; motions larger than are searched for.
     """
     view = shot.seen(site)
-    demand_still(first, view, rigid)
-    which, there = followed(first.view, view, first.pixels)
-    found = seen_points(site, view, there)
+    check_no_motion(first, view, rigid)
+    which, there = follow_pixels(first.view, view, first.pixels)
+    found = triangulate_seen_points(site, view, there)
     now, rest = rigid(found.points), first.rest[which[found.which]]
-    good = supported(rest, now - rest)
+    good = find_supported(rest, now - rest)
     demand(int(good.sum()), first.asked, MOVED_FAR)
     motion = float(np.median(np.linalg.norm(now - rest, axis=1)))
     if motion > FARTHEST:
@@ -141,22 +141,22 @@ def points_of(site: Site, first: First, shot: StereoPair, rigid: Rigid, tips: np
             f"half of the points seem to have moved by {1e3 * motion:.0f} mm, farther than they are searched for: "
             "check that eyes are not swapped, or begin with a new scan."
         )
-    return Observation(now[good], rest[good], stated(found.sigma[good]), rigid(tips))
+    return Observation(now[good], rest[good], compute_deviations(found.sigma[good]), rigid(tips))
 
 
-def cloud_of(site: Site, shot: StereoPair, count: int, rigid: Rigid, tips: np.ndarray) -> Observation:
-    """Return `count` cortex points without correspondences, from one pair; arguments and errors as of `points_of`."""
+def observe_point_cloud(site: Site, shot: StereoPair, count: int, rigid: Rigid, tips: np.ndarray) -> Observation:
+    """Return `count` cortex points without correspondences, from one pair; arguments and errors as of `observe_points`."""
     view = shot.seen(site)
-    pixels = grid(site, view, count)
-    found = seen_points(site, view, pixels)
+    pixels = build_pixel_grid(site, view, count)
+    found = triangulate_seen_points(site, view, pixels)
     points = rigid(found.points)
-    rest, _ = on_cortex(site, points)
-    good = supported(rest, points - rest)
+    rest, _ = find_on_cortex(site, points)
+    good = find_supported(rest, points - rest)
     demand(int(good.sum()), len(pixels))
-    return Observation(points[good], None, stated(found.sigma[good]), rigid(tips))
+    return Observation(points[good], None, compute_deviations(found.sigma[good]), rigid(tips))
 
 
-def grid(site: Site, view: StereoView, count: int) -> np.ndarray:
+def build_pixel_grid(site: Site, view: StereoView, count: int) -> np.ndarray:
     """Build a regular grid of about `count` pixels (n, 2) of the left window, over the drape's hole."""
     reach = HOLE * site.clearance - OFF_DRAPE
     step = reach * np.sqrt(np.pi / count)
@@ -167,7 +167,7 @@ def grid(site: Site, view: StereoView, count: int) -> np.ndarray:
     return view.geometry.place(places)[0]
 
 
-def seen_points(site: Site, view: StereoView, pixels: np.ndarray) -> Cloud:
+def triangulate_seen_points(site: Site, view: StereoView, pixels: np.ndarray) -> Cloud:
     """Select the pixels (n, 2) with a depth inside the drape's hole.
 
     Raises
@@ -176,28 +176,28 @@ def seen_points(site: Site, view: StereoView, pixels: np.ndarray) -> Cloud:
         Epipolar rows of the two eyes do not match.
     """
     try:
-        found = cloud(view, pixels)
+        found = triangulate_cloud(view, pixels)
     except ValueError as error:
         raise InputError(str(error)) from error
     inside = site.across(found.points) < HOLE * site.clearance - OFF_DRAPE
     return Cloud(found.which[inside], found.points[inside], found.sigma[inside])
 
 
-def surroundings(site: Site, view: StereoView) -> tuple[np.ndarray, np.ndarray]:
+def find_surroundings(site: Site, view: StereoView) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (m, 2) of the left window that show what lies round the opening, and where that is (m, 3) [m]."""
     ticks = np.linspace(0.0, view.geometry.size - 1.0, 40)
     pixels = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-    found = cloud(view, pixels)
+    found = triangulate_cloud(view, pixels)
     outside = np.flatnonzero(site.across(found.points) > HOLE * site.clearance)
     some = outside[np.linspace(0, len(outside) - 1, min(AROUND, len(outside))).astype(int)]
     return pixels[found.which[some]], found.points[some]
 
 
-def demand_still(first: First, view: StereoView, rigid: Rigid) -> None:
+def check_no_motion(first: First, view: StereoView, rigid: Rigid) -> None:
     """Raise InputError where what lies round the opening seems to have moved since the first pair."""
-    which, there = followed(first.view, view, first.around)
+    which, there = follow_pixels(first.view, view, first.around)
     try:
-        found = cloud(view, there)
+        found = triangulate_cloud(view, there)
     except ValueError as error:
         raise InputError(str(error)) from error
     if len(found.which) < ENOUGH:
@@ -211,16 +211,16 @@ def demand_still(first: First, view: StereoView, rigid: Rigid) -> None:
         )
 
 
-def on_cortex(site: Site, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_on_cortex(site: Site, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The places of the scan's cortex nearest to points (n, 3) [m], and how far they are (n,) [m]."""
     if not len(points):
         return points, np.zeros(0)
     anatomy = site.anatomy
-    place = closest(points, anatomy.mesh.nodes[anatomy.open_surface]).point
+    place = find_closest_points(points, anatomy.mesh.nodes[anatomy.open_surface]).point
     return place, np.linalg.norm(points - place, axis=1)
 
 
-def stated(sigma: np.ndarray) -> np.ndarray:
+def compute_deviations(sigma: np.ndarray) -> np.ndarray:
     """Deviations (n,) [m] of errors that differ from point to point, as a locator takes them: with smooth ones."""
     return sigma * (SIGMA / WHITE)
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ar.overlay.hud import millimetres
+from ar.overlay.hud import format_millimetres
 from sim.anatomy import Anatomy
-from sim.bodies.tip_distance import tip_gauge
+from sim.bodies.tip_distance import build_tip_gauge
 from sim.deformation import Deformation, Deformer
 from sim.loads import Loads, Pushed, Touching
-from surrogate.model.guarded import answering
+from surrogate.model.guarded import find_first_model
 
 from ..script.tool import Instrument, Probe
 
@@ -32,10 +32,10 @@ class TipDistance:
     bound: float | None
 
     def __str__(self) -> str:
-        return millimetres(self.distance, self.bound)
+        return format_millimetres(self.distance, self.bound)
 
 
-def reading(
+def read_tip_distance(
     deformer: Deformer, loads: Loads, answer: Deformation, tool: Instrument | None, apart: float
 ) -> TipDistance | None:
     """Read the distance in the first load case of a solution; None unless a single ball pushes or is moved.
@@ -49,7 +49,7 @@ def reading(
     """
     if _ball(loads, tool) is None:
         return None
-    model = answering(deformer, answer)
+    model = find_first_model(deformer, answer)
     if model is None:
         return TipDistance(apart, None)
     found = model.distance(loads, answer, np.array([apart]))
@@ -58,7 +58,7 @@ def reading(
     return TipDistance(float(found.value[0]), promised if kept else None)
 
 
-def measured(
+def measure_tip_distance(
     anatomy: Anatomy, loads: Loads, answer: Deformation, tool: Instrument | None, lift: float
 ) -> TipDistance | None:
     """Measure the distance in a solution of any deformer, without error bound.
@@ -78,7 +78,7 @@ def measured(
     ball = _ball(loads, tool)
     if ball is None:
         return None
-    found = tip_gauge(anatomy).distances(loads, answer.displacement, answer.nodes, ball.shape, lift)
+    found = build_tip_gauge(anatomy).distances(loads, answer.displacement, answer.nodes, ball.shape, lift)
     return TipDistance(float(found[0]), None)
 
 

@@ -14,16 +14,16 @@ from sim.anatomy import Anatomy
 from sim.effects import NodalForce, pushed_effects
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
-from sim.runtime.partial_files import unfinished_path
+from sim.runtime.partial_files import to_unfinished_path
 from surrogate.data.simulate import simulate
 
-from .study import ReportStudy, note_seconds, noted_seconds
+from .study import ReportStudy, note_seconds, read_noted_seconds
 
 # Removed share of the tumour's volume.
 SHARE = 0.2
 
 
-def debulked(anatomy: Anatomy) -> Anatomy:
+def debulk_tumour(anatomy: Anatomy) -> Anatomy:
     """The body without a fifth of its tumour, from the middle outwards; what no tetrahedron is left at is gone too."""
     mesh = anatomy.mesh
     tumour = np.flatnonzero(anatomy.in_tumour)
@@ -38,7 +38,7 @@ def debulked(anatomy: Anatomy) -> Anatomy:
     return Anatomy(body, anatomy.held[used], anatomy.slide_normal[used], anatomy.craniotomy[used])
 
 
-def debulked_study(study: ReportStudy) -> ReportStudy:
+def build_debulked_study(study: ReportStudy) -> ReportStudy:
     """The same study of the debulked body, once `simulate_debulked` has made its data."""
     return replace(study, data=_path(study))
 
@@ -49,9 +49,9 @@ def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> 
     if path.exists():
         progress(len(study.dataset.loads) + len(study.dataset.unit_good))
         return
-    whole = not unfinished_path(path).exists()
-    body, data = debulked(study.anatomy), study.dataset
-    effects = (*pushed_effects(body, study.tissue_on(body)), NodalForce())
+    whole = not to_unfinished_path(path).exists()
+    body, data = debulk_tumour(study.anatomy), study.dataset
+    effects = (*pushed_effects(body, study.get_tissue_on(body)), NodalForce())
     begun = clock.perf_counter()
     fem = Fem(body, effects, TRAIN, study.device, None, study.element)
     reported = [0]
@@ -65,9 +65,9 @@ def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> 
         note_seconds(path, clock.perf_counter() - begun)
 
 
-def simulating_seconds(study: ReportStudy) -> float | None:
+def read_simulation_seconds(study: ReportStudy) -> float | None:
     """Read the seconds of `simulate_debulked`; None if it was not run, or not in one run."""
-    return noted_seconds(_path(study))
+    return read_noted_seconds(_path(study))
 
 
 def _path(study: ReportStudy) -> Path:

@@ -13,7 +13,7 @@ from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.refine import refined
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
-from sim.discretisation.footprint import nearest_on
+from sim.discretisation.footprint import find_nearest_on
 from sim.effects import Elasticity, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
@@ -21,9 +21,9 @@ from sim.geometry.locate import locate
 from sim.loads import Loads, Pushed
 from sim.material import Material, Tissue
 
-from ..analysis.measurement import timed
-from .adaptation import debulked
-from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, ReportRow, against_reference, of_times
+from ..analysis.measurement import time_work
+from .adaptation import debulk_tumour
+from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, ReportRow, compare_with_reference, summarise_times
 from .study import ReportStudy
 
 OWN, HALVED = "own", "halved"
@@ -61,14 +61,14 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, n
     InputError
         Input that `Fem` rejects; a law that the data's tissue has no constants for.
     """
-    body, own = body_of(study, spec.mesh), study.anatomy
-    fem, set_up = timed(_fem, study, spec, body)
-    loads = study.played if spec.mesh == OWN else onto(body, study.played)
+    body, own = find_body(study, spec.mesh), study.anatomy
+    fem, set_up = time_work(_fem, study, spec, body)
+    loads = study.played if spec.mesh == OWN else move_pushes_onto(body, study.played)
     located = locate(body.mesh, own.mesh.nodes[own.tumour_nodes])
     fem.deform(loads.rows(np.array([0])))  # kernels are compiled or loaded at their first launch
     fields, good, seconds = [], [], []
     for row in range(len(loads)):
-        answer, spent = timed(fem.deform, loads.rows(np.array([row])))
+        answer, spent = time_work(fem.deform, loads.rows(np.array([row])))
         seconds.append(spent)
         fields.append(located.read(answer.displacement)[0])
         good.append(answer.outcome[0].good)
@@ -76,47 +76,47 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, n
     row = ReportRow(
         spec.name,
         "finite elements",
-        against=against(study, spec),
-        reference=against_reference(study, field, np.array(good), own.tumour_nodes),
+        against=describe_difference(study, spec),
+        reference=compare_with_reference(study, field, np.array(good), own.tumour_nodes),
         failed=good.count(False),
         set_up=set_up,
         plan=fem.plan.explain(),
         adapt=_adapt(study, spec, loads.rows(np.array([0]))),
-        **of_times(seconds),
+        **summarise_times(seconds),
     )
     return row, field
 
 
 def _adapt(study: ReportStudy, spec: FemVariant, load: Loads) -> float:
     """Return the seconds from the debulked body to its first solution, with compiled kernels."""
-    body = debulked(body_of(study, spec.mesh))
-    return timed(lambda: _fem(study, spec, body).deform(load))[1]
+    body = debulk_tumour(find_body(study, spec.mesh))
+    return time_work(lambda: _fem(study, spec, body).deform(load))[1]
 
 
 def _fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:
     """Set up for single loads."""
-    effects = pushed_effects(body, tissue_of(study.tissue_on(body), spec.law))
+    effects = pushed_effects(body, get_tissue(study.get_tissue_on(body), spec.law))
     return Fem(body, effects, spec.accuracy, study.device, None, spec.element or study.element, live=True)
 
 
-def against(study: ReportStudy, spec: FemVariant) -> str:
+def describe_difference(study: ReportStudy, spec: FemVariant) -> str:
     """Describe the kind of difference from the reference."""
-    if tissue_of(study.tissue, spec.law) != study.tissue:
+    if get_tissue(study.tissue, spec.law) != study.tissue:
         return DIFFERENCE
     same = (spec.element or study.element) == "p2" and spec.mesh == (HALVED if study.fine else OWN)
     return TOLERANCE_ALONE if same else ERROR
 
 
-def body_of(study: ReportStudy, mesh: str) -> Anatomy:
+def find_body(study: ReportStudy, mesh: str) -> Anatomy:
     """The body on a mesh by name; meshes of the template are made once and kept."""
     if mesh == OWN:
         return study.anatomy
     if mesh == HALVED:
         return refined(study.anatomy)
-    return read_anatomy(template_mesh(study.folder / "meshes", int(mesh)))
+    return read_anatomy(build_template_mesh(study.folder / "meshes", int(mesh)))
 
 
-def template_mesh(folder: Path, size: int) -> Path:
+def build_template_mesh(folder: Path, size: int) -> Path:
     """The template's brain of about `size` nodes; made if it is not there."""
     path = folder / f"template_{size}.vtu"
     if not path.exists():
@@ -124,12 +124,12 @@ def template_mesh(folder: Path, size: int) -> Path:
     return path
 
 
-def law_of(tissue: Elasticity) -> str | None:
+def get_law_name(tissue: Elasticity) -> str | None:
     """The name of the brain's law."""
     return None if tissue.default is None else tissue.default.law
 
 
-def tissue_of(tissue: Elasticity, law: str | None) -> Elasticity:
+def get_tissue(tissue: Elasticity, law: str | None) -> Elasticity:
     """The tissue, in all regions, with another law of the same constants.
 
     Raises
@@ -149,8 +149,10 @@ def tissue_of(tissue: Elasticity, law: str | None) -> Elasticity:
     return Elasticity(obeying(tissue.default), {label: obeying(one) for label, one in tissue.regions.items()})
 
 
-def onto(body: Anatomy, loads: Loads) -> Loads:
+def move_pushes_onto(body: Anatomy, loads: Loads) -> Loads:
     """The same pushes at the nearest points of another mesh's open cortex."""
     (pushed,) = loads.every(Pushed)
     corners = body.mesh.nodes[body.open_surface]
-    return Loads((replace(pushed, point=np.array([nearest_on(corners, point) for point in pushed.point])),), loads.time)
+    return Loads(
+        (replace(pushed, point=np.array([find_nearest_on(corners, point) for point in pushed.point])),), loads.time
+    )

@@ -10,14 +10,14 @@ from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
 from surrogate.data.splits import DiscSplit, leave_sectors_out
 from surrogate.evaluation.coverage import TENTHS, coverage
-from surrogate.evaluation.score import SolveCounts, bare_microseconds, single_seconds
+from surrogate.evaluation.score import SolveCounts, time_model_alone, time_single_loads
 from surrogate.training.train import train
 
-from ..analysis.measurement import timed
-from .adaptation import debulked_study, simulating_seconds
-from .reference import beyond_of
-from .row import ErrorFigures, ReportRow, against_reference, figures_between, of_times
-from .study import ReportStudy, series_seconds
+from ..analysis.measurement import time_work
+from .adaptation import build_debulked_study, read_simulation_seconds
+from .reference import get_solutions_beyond
+from .row import ErrorFigures, ReportRow, compare_with_reference, compute_figures, summarise_times
+from .study import ReportStudy, measure_series_seconds
 
 FEWEST_LOADS = 64
 
@@ -45,15 +45,15 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, n
         return _held(model, study.converged.rows(rows), truth[rows], nodes)
 
     discs, sectors = study.discs, leave_sectors_out(study.pushed, study.patch)
-    (model, solves), learning = timed(_trained, study, spec, discs)
+    (model, solves), learning = time_work(_trained, study, spec, discs)
     order = np.flatnonzero(discs.train)
     curve = []
-    for count in counts(len(order)):
+    for count in list_counts(len(order)):
         left_aside = np.isin(np.arange(len(discs.disc)), order[count:])
         fewer = replace(discs, disc=np.where(left_aside, -2, discs.disc))
         curve.append((count, judged(_trained(study, spec, fewer)[0], discs)[0]))
     of_discs, of_sectors = judged(model, discs), judged(_trained(study, spec, sectors)[0], sectors)
-    beyond = beyond_of(study)
+    beyond = get_solutions_beyond(study)
     outside = study.outside.rows(np.flatnonzero(beyond.good))
     sets = {
         "discs": of_discs,
@@ -61,14 +61,14 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, n
         "beyond": _held(model, outside, beyond.displacement[beyond.good], nodes),
     }
     field = model.deform(study.played, at=nodes).displacement
-    covered = coverage_of(study, spec, outside, beyond.displacement[beyond.good])
+    covered = compute_coverage_beyond(study, spec, outside, beyond.displacement[beyond.good])
     adapt, adapted = _adapted(study, spec)
     held_out = study.converged.rows(np.flatnonzero(discs.test))
-    bare = bare_microseconds(model, held_out)
+    bare = time_model_alone(model, held_out)
     row = ReportRow(
         spec.name,
         "learnt",
-        reference=against_reference(study, field, np.ones(len(field), bool), nodes),
+        reference=compare_with_reference(study, field, np.ones(len(field), bool), nodes),
         own_fem={name: figures for name, (figures, _) in sets.items() if figures is not None},
         flagged={name: share for name, (_, share) in sets.items()},
         covered=covered,
@@ -82,17 +82,19 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, n
         adapt=adapt,
         adapted=adapted,
         curve=tuple((count, each) for count, each in [*curve, (len(order), of_discs[0])] if each is not None),
-        **of_times(single_seconds(model, held_out, nodes, study.timed)),
+        **summarise_times(time_single_loads(model, held_out, nodes, study.timed)),
     )
     return row, field
 
 
-def counts(most: int) -> list[int]:
+def list_counts(most: int) -> list[int]:
     """64, 128, 256, ... below `most`."""
     return [FEWEST_LOADS << k for k in range(20) if FEWEST_LOADS << k < most]
 
 
-def coverage_of(study: ReportStudy, spec: LearnerSpec, outside: Loads, truth: np.ndarray) -> dict[str, float]:
+def compute_coverage_beyond(
+    study: ReportStudy, spec: LearnerSpec, outside: Loads, truth: np.ndarray
+) -> dict[str, float]:
     """Return the coverage of the 95 % bounds outside their guarantee; `truth` (B, n, 3) [m] of the loads `outside`."""
     trained = train(study.dataset, [spec.name], expansion=study.expansion)
     model, found = trained.models[spec.name], trained.left_out.get(spec.name)
@@ -104,13 +106,13 @@ def coverage_of(study: ReportStudy, spec: LearnerSpec, outside: Loads, truth: np
 
 def _adapted(study: ReportStudy, spec: LearnerSpec) -> tuple[float | None, ErrorFigures | None]:
     """Seconds of simulating and learning the debulked body, and figures there; nothing where it was not simulated."""
-    seconds = simulating_seconds(study)
+    seconds = read_simulation_seconds(study)
     if seconds is None:
         return None, None
-    after = debulked_study(study)
-    (model, _), learning = timed(_trained, after, spec, after.discs)
+    after = build_debulked_study(study)
+    (model, _), learning = time_work(_trained, after, spec, after.discs)
     rows = np.flatnonzero(after.discs.test)
-    seconds += learning + series_seconds(after, spec.name)
+    seconds += learning + measure_series_seconds(after, spec.name)
     return seconds, _held(model, after.converged.rows(rows), after.answers[rows], after.anatomy.tumour_nodes)[0]
 
 
@@ -126,4 +128,4 @@ def _held(model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -
     """Figures against `truth` (B, k, 3) [m], and the share of the loads that the model calls extrapolated."""
     answer = model.deform(loads, at=nodes)
     flagged = [outcome is Outcome.EXTRAPOLATED for outcome in answer.outcome]
-    return figures_between(answer.displacement, truth, loads), float(np.mean(flagged)) if flagged else 0.0
+    return compute_figures(answer.displacement, truth, loads), float(np.mean(flagged)) if flagged else 0.0

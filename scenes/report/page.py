@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from ar.screen import write_png
-from sim.runtime.atomic_files import written_whole
-from surrogate.evaluation.choose import unbeaten
+from sim.runtime.atomic_files import write_atomically
+from surrogate.evaluation.choose import find_pareto_front
 from surrogate.model.left_out import FEWEST_FOR_P999
 
-from ..analysis.loglog_chart import ChartPanel, Curve, Dot, drawn
+from ..analysis.loglog_chart import ChartPanel, Curve, Dot, draw_panels
 from ..analysis.measurement import write_table
 from .row import ERROR, TOLERANCE_ALONE, ErrorFigures, ReportRow
 
@@ -27,15 +27,15 @@ TIME = "milliseconds a load, one at a time"
 Place = tuple[float, float]
 
 
-def front(rows: Sequence[ReportRow]) -> frozenset[str]:
+def find_front(rows: Sequence[ReportRow]) -> frozenset[str]:
     """Names of the rows that no other equals or beats in both milliseconds and mean distance from the reference.
 
     Only errors count: another law is none, and the reference's own elements have none of their mesh.
     """
-    return unbeaten(_places((row, row.reference) for row in rows if row.against == ERROR))
+    return find_pareto_front(_places((row, row.reference) for row in rows if row.against == ERROR))
 
 
-def against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
+def plot_error_against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
     """Error against time, (H, W, 3) uint8; the rows off the front pale. None without rows.
 
     What shows its tolerance alone would stand far below all others, and is left out.
@@ -43,26 +43,26 @@ def against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
     places = _places((row, row.reference) for row in rows if row.against != TOLERANCE_ALONE)
     group = {row.name: row.family if row.against == ERROR else DIFFERENT for row in rows}
     title = "Error against time: full colour where no other row is both faster and nearer"
-    return _scatter(title, "mean distance from the reference at the tumour [mm]", places, group, front(rows))
+    return _scatter(title, "mean distance from the reference at the tumour [mm]", places, group, find_front(rows))
 
 
-def learners_against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
+def plot_learners_against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
     """Plot the learning error against time, (H, W, 3) uint8; None without learners."""
     places = _places((row, row.own_fem.get("discs")) for row in rows)
     title = "What learning lost, against time: distance from its own finite elements, left-out discs"
     group = {row.name: row.family for row in rows}
     return _scatter(
-        title, "mean distance from its own finite elements at the tumour [mm]", places, group, unbeaten(places)
+        title, "mean distance from its own finite elements at the tumour [mm]", places, group, find_pareto_front(places)
     )
 
 
-def against_solves(rows: Sequence[ReportRow]) -> np.ndarray | None:
+def plot_error_against_solves(rows: Sequence[ReportRow]) -> np.ndarray | None:
     """Error against the number of training loads, (H, W, 3) uint8; None without learners."""
     curves = tuple(
         Curve(row.name, tuple((float(count), each.mm.mean) for count, each in row.curve)) for row in rows if row.curve
     )
     y = "mean distance from its own finite elements on left-out discs [mm]"
-    return drawn([ChartPanel("Error against solves", "training loads", y, curves, size=SIZE)]) if curves else None
+    return draw_panels([ChartPanel("Error against solves", "training loads", y, curves, size=SIZE)]) if curves else None
 
 
 def _places(found: Iterable[tuple[ReportRow, ErrorFigures | None]]) -> dict[str, Place]:
@@ -78,10 +78,10 @@ def _scatter(
     title: str, y: str, places: Mapping[str, Place], group: Mapping[str, str], best: frozenset[str]
 ) -> np.ndarray | None:
     dots = tuple(Dot(name, group[name], *place, pale=name not in best) for name, place in places.items())
-    return drawn([ChartPanel(title, TIME, y, dots=dots, size=SIZE)]) if dots else None
+    return draw_panels([ChartPanel(title, TIME, y, dots=dots, size=SIZE)]) if dots else None
 
 
-PLOTS = {"time": against_time, "learners": learners_against_time, "solves": against_solves}
+PLOTS = {"time": plot_error_against_time, "learners": plot_learners_against_time, "solves": plot_error_against_solves}
 SETS = {
     "discs": "whole discs of cortex left out",
     "sectors": "whole sectors of direction left out",
@@ -146,10 +146,10 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
                 plots.append(folder / f"{section.name}-{kind}.png")
         write_table(folder / f"{section.name}.csv", [dict(_flat(asdict(row))) for row in section.rows])
         bodies.append(_section(section, folder, plots))
-    with written_whole(folder / "report.json", ".json") as partial:
+    with write_atomically(folder / "report.json", ".json") as partial:
         partial.write_text(json.dumps({"machine": machine, "sections": [asdict(section) for section in sections]}))
     notes = "".join(f"<p>{escape(note)}</p>" for note in NOTES)
-    with written_whole(folder / "index.html", ".html") as partial:
+    with write_atomically(folder / "index.html", ".html") as partial:
         partial.write_text(
             f'<!doctype html><html lang="en"><meta charset="utf-8"><title>What accuracy costs in time</title>'
             f"<style>{STYLE}</style><h1>What accuracy costs in time</h1>{''.join(bodies)}<h2>How to read this</h2>"
@@ -190,7 +190,7 @@ def _plans(rows: Sequence[ReportRow]) -> str:
 
 
 def _against_reference(section: Section) -> str:
-    best = front(section.rows)
+    best = find_front(section.rows)
     heads = (
         "row", "distance", "loads", *SPREAD_HEADS, "median ms", "p99", "model in NumPy ms", "set-up s", "memory GiB",
         "card", "solves", "in discs", "minutes", "adapting s",

@@ -8,11 +8,11 @@ import numpy as np
 
 from ar.optics.camera import look_at
 from ar.overlay.composite import DASHED, composite
-from ar.overlay.hud import panel
+from ar.overlay.hud import draw_text_panel
 from ar.overlay.marks import Cover
-from ar.overlay.outlines import dash, outlines, silhouette
-from sim.bodies.intensity import read_intensity, sidecar
-from sim.geometry.ball_at_rest import resting_tip
+from ar.overlay.outlines import compute_silhouette, draw_dashes, find_outlines
+from sim.bodies.intensity import read_intensity, to_intensity_path
+from sim.geometry.ball_at_rest import find_resting_tip
 from sim.loads import Pushed
 
 from ..play.stage import TOOL, Stage
@@ -21,7 +21,7 @@ from ..script.shipped_files import template_path
 from ..script.site import Site, site_of
 from ..script.tool import Probe
 from ..script.viewpoint import Viewpoint
-from .reference import reference_of
+from .reference import get_reference
 from .study import ReportStudy
 
 # So narrow that a pixel is a tenth of a millimetre.
@@ -29,12 +29,12 @@ VIEW = Viewpoint(fov=np.radians(9.0), width=400, height=300)
 YELLOW = (255, 215, 50)
 
 
-def worst_picture(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
+def render_worst(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
     """Render the test load with the largest error, (H, W, 3) uint8.
 
     answer (n, k, 3) [m]: a row's displacements of the tumour's vertices.
     """
-    truth, anatomy = reference_of(study), study.anatomy
+    truth, anatomy = get_reference(study), study.anatomy
     tumour = np.isin(study.drawn, anatomy.tumour_nodes)
     distance = np.linalg.norm(answer - truth.displacement[:, tumour], axis=2).max(axis=1) * truth.good
     worst = int(distance.argmax())
@@ -44,27 +44,29 @@ def worst_picture(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
     predicted[anatomy.tumour_nodes] = anatomy.mesh.nodes[anatomy.tumour_nodes] + answer[worst]
     (pushed,) = study.played.every(Pushed)
     site = site_of(anatomy)
-    scan = read_intensity(sidecar(template_path())) if study.of_template else None
+    scan = read_intensity(to_intensity_path(template_path())) if study.of_template else None
     middle = there[anatomy.tumour_nodes].mean(axis=0)
     camera = look_at(VIEW.camera(site).centre, middle, site.up, VIEW.fov, VIEW.width, VIEW.height)
     radius = float(pushed.footprint[worst])
-    tip = rested(site, pushed.point[worst], there, radius)
+    tip = find_rested_tip(site, pushed.point[worst], there, radius)
     tool = Probe(radius)
     stage = Stage(replace(find_scene("press"), viewpoint=VIEW, tool=tool), site, scan)
     picture = stage.picture(camera, there, tool.pose(tip, site.axis, site.right))
     shown = composite(picture, camera, stage.tumour(predicted), style="window", cover=Cover((TOOL,))).colour
     reference = stage.tumour(there)
-    dash(shown, outlines(silhouette(camera, reference.vertices, reference.triangles)), YELLOW, DASHED, 1)
+    draw_dashes(
+        shown, find_outlines(compute_silhouette(camera, reference.vertices, reference.triangles)), YELLOW, DASHED, 1
+    )
     force = float(np.linalg.norm(pushed.force[worst]))
     lines = [f"{force:.2f} N on {1e3 * radius:.1f} mm", f"off by up to {1e3 * distance[worst]:.3f} mm"]
-    return panel(shown, lines)
+    return draw_text_panel(shown, lines)
 
 
-def rested(site: Site, point: np.ndarray, positions: np.ndarray, radius: float) -> np.ndarray:
+def find_rested_tip(site: Site, point: np.ndarray, positions: np.ndarray, radius: float) -> np.ndarray:
     """Return the tip (3,) [m] of a ball that pushes at a point: it touches the deformed cortex, and pierces it nowhere.
 
     point (3,): at rest [m]; positions (V, 3): of all mesh vertices now [m]; radius of the ball [m].
     """
     place = point - site.origin
     carried = site.contact(float(place @ site.right), float(place @ site.up), radius).carried(positions)
-    return resting_tip(positions, site.anatomy.open_surface, carried, site.axis, radius)
+    return find_resting_tip(positions, site.anatomy.open_surface, carried, site.axis, radius)

@@ -14,7 +14,7 @@ from sim.effects import pushed_effects
 from sim.fem import Fem
 from sim.geometry.locate import Located, locate
 from sim.loads import Loads
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as
 from surrogate.model.kept_arrays import REMADE
 from surrogate.model.npz_archive import Archive
@@ -42,7 +42,7 @@ def solve_reference(study: ReportStudy, progress: Callable[[int], object], accur
 
     def made() -> tuple[Fem, Located]:
         body = refined(study.anatomy) if study.fine else study.anatomy
-        fem = Fem(body, pushed_effects(body, study.tissue_on(body)), accuracy, study.device, None, "p2")
+        fem = Fem(body, pushed_effects(body, study.get_tissue_on(body)), accuracy, study.device, None, "p2")
         return fem, locate(body.mesh, study.anatomy.mesh.nodes[study.drawn])
 
     _solve(study, "reference", study.played, made, progress)
@@ -53,18 +53,18 @@ def solve_beyond(study: ReportStudy, progress: Callable[[int], object]) -> None:
 
     def made() -> tuple[Fem, Located]:
         body = study.anatomy
-        fem = Fem(body, pushed_effects(body, study.tissue_on(body)), TRAIN, study.device, None, study.element)
+        fem = Fem(body, pushed_effects(body, study.get_tissue_on(body)), TRAIN, study.device, None, study.element)
         return fem, locate(body.mesh, body.mesh.nodes[body.tumour_nodes])
 
     _solve(study, "beyond", study.outside, made, progress)
 
 
-def reference_of(study: ReportStudy) -> ReferenceSolutions:
+def get_reference(study: ReportStudy) -> ReferenceSolutions:
     """Read the solutions of `solve_reference`."""
     return _read(study, "reference", len(study.played))
 
 
-def beyond_of(study: ReportStudy) -> ReferenceSolutions:
+def get_solutions_beyond(study: ReportStudy) -> ReferenceSolutions:
     """Read the solutions of `solve_beyond`."""
     return _read(study, "beyond", len(study.outside))
 
@@ -84,7 +84,7 @@ def _solve(
     for rows in np.array_split(missing, -(-len(missing) // min(fem.batch, TOGETHER))):
         answer = fem.deform(loads.rows(rows))
         for row, field, outcome in zip(rows, located.read(answer.displacement), answer.outcome, strict=True):
-            with written_whole(_path(study, kind, row), ".npz") as partial:
+            with write_atomically(_path(study, kind, row), ".npz") as partial:
                 np.savez(partial, displacement=field, good=outcome.good, seconds=answer.cost.total / len(rows))
         progress(len(rows))
 

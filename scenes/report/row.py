@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from sim.loads import Loads, Pushed
-from surrogate.data.encode import directions
+from surrogate.data.encode import split_forces
 from surrogate.evaluation.score import spread
 
-from .reference import reference_of
+from .reference import get_reference
 from .study import ReportStudy
 
 # Kind of difference from the reference: same law, another law, or the reference's own elements.
@@ -57,7 +57,7 @@ class ErrorFigures:
     tenths: tuple[Tenth, ...]
 
 
-def figures_of(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> ErrorFigures | None:
+def compute_distance_figures(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> ErrorFigures | None:
     """Figures of distances (B, n) [m] from `truth` (B, n, 3) [m] under forces (B,) [N]; None of no load.
 
     A load's motion is the mean displacement of its n vertices in `truth`.
@@ -82,23 +82,23 @@ def figures_of(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> Er
     )
 
 
-def figures_between(answer: np.ndarray, truth: np.ndarray, loads: Loads) -> ErrorFigures | None:
+def compute_figures(answer: np.ndarray, truth: np.ndarray, loads: Loads) -> ErrorFigures | None:
     """Figures of `answer` (B, n, 3) [m] against `truth` (B, n, 3) [m] under pushes."""
     (pushed,) = loads.every(Pushed)
-    return figures_of(np.linalg.norm(answer - truth, axis=2), truth, directions(pushed)[0])
+    return compute_distance_figures(np.linalg.norm(answer - truth, axis=2), truth, split_forces(pushed)[0])
 
 
-def against_reference(
+def compare_with_reference(
     study: ReportStudy, answer: np.ndarray, good: np.ndarray, nodes: np.ndarray
 ) -> ErrorFigures | None:
     """Compute the errors of solutions (n, k, 3) [m] at vertices (k,) of the test loads where both are `good` (n,)."""
-    truth = reference_of(study)
+    truth = get_reference(study)
     rows = np.flatnonzero(good & truth.good)
     known = np.isin(study.drawn, nodes)
-    return figures_between(answer[rows], truth.displacement[rows][:, known], study.played.rows(rows))
+    return compute_figures(answer[rows], truth.displacement[rows][:, known], study.played.rows(rows))
 
 
-def of_times(seconds: Sequence[float]) -> dict[str, Any]:
+def summarise_times(seconds: Sequence[float]) -> dict[str, Any]:
     """Summarise the wall times of single loads [s]."""
     ms = 1e3 * np.array(seconds)
     p99 = float(np.percentile(ms, 99.0)) if len(ms) >= FEWEST_FOR_P99 else None

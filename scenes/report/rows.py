@@ -20,16 +20,16 @@ import numpy as np
 
 from sim.accuracy import FLOOR, Precision
 from sim.errors import InputError
-from sim.geometry.tetmesh import digest_of
+from sim.geometry.tetmesh import compute_digest
 from sim.material import LAWS
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.device import find_device
 from sim.runtime.processes import LostError, process_pool, run_on_each
-from sim.runtime.threads import one_thread
+from sim.runtime.threads import limit_to_one_thread
 from surrogate.training.train import LEARNERS
 
-from ..analysis.measurement import peak_memory, watched_card
-from .finite_elements import HALVED, OWN, STANDARD, FemVariant, law_of, measure_elements
+from ..analysis.measurement import measure_peak_memory, watch_gpu_memory
+from .finite_elements import HALVED, OWN, STANDARD, FemVariant, get_law_name, measure_elements
 from .learner import LearnerSpec, measure_learner
 from .row import ReportRow
 from .study import ReportStudy
@@ -38,7 +38,7 @@ Spec = FemVariant | LearnerSpec
 FAMILY = {FemVariant: "finite elements", LearnerSpec: "learnt"}
 
 
-def ready(device: str, study: ReportStudy) -> ReportStudy:
+def prepare_rows(device: str, study: ReportStudy) -> ReportStudy:
     """Import all that rows need, and start Warp without its notes; on a card also PyTorch, and what draws."""
     find_device("auto", "float32")
     if study.on_card:
@@ -47,31 +47,31 @@ def ready(device: str, study: ReportStudy) -> ReportStudy:
     return study
 
 
-def measured(study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
+def measure_row(study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
     """Measure the row of a deformation model, and render its worst case; `ReportRow.state` gives the reason for a missing one."""
     try:
         if isinstance(spec, FemVariant):
-            with watched_card(study.device) as taken:
+            with watch_gpu_memory(study.device) as taken:
                 row, field = measure_elements(study, spec)
             row = replace(row, card=max(taken) / 2**30 or None)
         else:
             row, field = _on_one_core(study, spec)
     except InputError as error:
         return ReportRow(spec.name, FAMILY[type(spec)], state=str(error))
-    row = replace(row, memory=peak_memory())
+    row = replace(row, memory=measure_peak_memory())
     # The time for images does not belong to the row.
     from ar.screen import write_png
 
-    from .picture import worst_picture
+    from .picture import render_worst
 
     picture.parent.mkdir(parents=True, exist_ok=True)
-    write_png(picture, worst_picture(study, field))
+    write_png(picture, render_worst(study, field))
     return replace(row, picture=picture.name)
 
 
 def _on_one_core(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, np.ndarray]:
     """Products this small take longer on several, and say less."""
-    with one_thread():
+    with limit_to_one_thread():
         return measure_learner(study, spec)
 
 
@@ -83,7 +83,7 @@ Run = Callable[[ReportStudy, Spec, Path], ReportRow]
 CORES = 4
 
 
-def star(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
+def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
     """The data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`."""
     meshes = {} if not remesh else MESHES if study.of_template else {"halved edges": HALVED}
     return (
@@ -92,11 +92,11 @@ def star(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
         *(FemVariant(f"FEM {name}", mesh=mesh) for name, mesh in meshes.items()),
         *(FemVariant(f"FEM {_power(size)}", tolerance=size) for size in TOLERANCES if size != STANDARD),
         FemVariant("FEM float64", precision="float64"),
-        *(FemVariant(f"FEM {law} law", law=law) for law in LAWS if law != law_of(study.tissue)),
+        *(FemVariant(f"FEM {law} law", law=law) for law in LAWS if law != get_law_name(study.tissue)),
     )
 
 
-def every(study: ReportStudy) -> tuple[FemVariant, ...]:
+def list_all_combinations(study: ReportStudy) -> tuple[FemVariant, ...]:
     """All of the star's laws, elements, meshes, tolerances and precisions with each other."""
     meshes = {OWN: OWN, **(MESHES if study.of_template else {"halved edges": HALVED})}
     precisions: tuple[Precision, ...] = ("float32", "float64")
@@ -109,26 +109,28 @@ def every(study: ReportStudy) -> tuple[FemVariant, ...]:
     )
 
 
-def learners() -> tuple[LearnerSpec, ...]:
+def list_learner_specs() -> tuple[LearnerSpec, ...]:
     """One for each learner of `surrogate`."""
     return tuple(LearnerSpec(name) for name in LEARNERS)
 
 
-def apart(turn: AbstractContextManager[object], study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
+def measure_in_process(
+    turn: AbstractContextManager[object], study: ReportStudy, spec: Spec, picture: Path
+) -> ReportRow:
     """Measured in a process of its own, which starts at once and measures in its `turn`."""
     try:
         # Data that the study has already read stay here.
-        with process_pool(["cpu"], ready, replace(study)) as children, turn:
+        with process_pool(["cpu"], prepare_rows, replace(study)) as children, turn:
             return run_on_each(children, _measure, [(spec, picture)])[0]
     except LostError:
         return ReportRow(spec.name, FAMILY[type(spec)], state="its process was ended, for want of memory most likely")
 
 
 def _measure(study: ReportStudy, task: tuple[Spec, Path]) -> ReportRow:
-    return measured(study, *task)
+    return measure_row(study, *task)
 
 
-def rows(
+def measure_rows(
     study: ReportStudy,
     specs: Sequence[Spec],
     run: Run | None = None,
@@ -147,7 +149,7 @@ def rows(
     stopped, groups = Event(), []
     for kind, alike in groupby(specs, type):
         together = 1 if kind is FemVariant else max(1, cores // CORES - beside)
-        measuring = run or partial(apart, BoundedSemaphore(together))
+        measuring = run or partial(measure_in_process, BoundedSemaphore(together))
         ahead = together if cores >= CORES else 0
         groups.append(_ahead(partial(_row, study, measuring), list(alike), ahead))
     if not beside or len(groups) < 2:
@@ -187,7 +189,7 @@ def _row(study: ReportStudy, run: Run, spec: Spec) -> ReportRow:
     if kept is None:
         kept = run(study, spec, study.folder / "pictures" / f"{stem}.png")
         if kept.state == "measured":
-            with written_whole(path, ".json") as unfinished:
+            with write_atomically(path, ".json") as unfinished:
                 unfinished.write_text(json.dumps({"digest": digest, "row": asdict(kept)}))
     return kept
 
@@ -199,7 +201,7 @@ def _power(tolerance: float) -> str:
 
 def _digest(study: ReportStudy, spec: Spec) -> str:
     stated = f"{study.digest} {study.timed} {study.device} {type(spec).__name__} {sorted(asdict(spec).items())}"
-    return digest_of(np.frombuffer(stated.encode(), np.uint8))
+    return compute_digest(np.frombuffer(stated.encode(), np.uint8))
 
 
 FORMER_NAMES = {"teacher": "own_fem", "taught": "loads"}

@@ -15,15 +15,15 @@ from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy
 from sim.effects import Elasticity
 from sim.errors import InputError
-from sim.geometry.tetmesh import digest_of
+from sim.geometry.tetmesh import compute_digest
 from sim.loads import Loads, Pushed
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.device import find_device
-from sim.runtime.versions import version_of
-from surrogate.data.answer_rows import BRAIN, stated_tissue
+from sim.runtime.versions import get_version
+from surrogate.data.answer_rows import BRAIN, read_tissue_statement
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
-from surrogate.data.encode import directions
+from surrogate.data.encode import split_forces
 from surrogate.data.splits import DiscSplit, leave_discs_out
 from surrogate.training.expansion import EXPANDED, Expansion
 
@@ -86,9 +86,9 @@ class ReportStudy:
     def tissue(self) -> Elasticity:
         """The tissue that the data was made with, and that of regions."""
         stated = self.dataset.provenance
-        return stated_tissue(stated) if BRAIN in stated else Elasticity()
+        return read_tissue_statement(stated) if BRAIN in stated else Elasticity()
 
-    def tissue_on(self, body: Anatomy) -> Elasticity:
+    def get_tissue_on(self, body: Anatomy) -> Elasticity:
         """The same for a body that may lack some of the regions."""
         return self.tissue.on(np.unique(body.mesh.region).tolist())
 
@@ -140,7 +140,7 @@ class ReportStudy:
     def played(self) -> Loads:
         """Loads of the left-out discs, spread evenly over their forces."""
         rows = np.flatnonzero(self.discs.test)
-        rows = rows[np.argsort(directions(self.pushed)[0][rows], kind="stable")]
+        rows = rows[np.argsort(split_forces(self.pushed)[0][rows], kind="stable")]
         chosen = np.unique(np.linspace(0, len(rows) - 1, min(self.loads, len(rows))).round().astype(int))
         return self.converged.rows(rows[chosen])
 
@@ -150,15 +150,15 @@ class ReportStudy:
         pushed = self.converged.rows(np.flatnonzero(self.discs.test)).of(Pushed)
         training = self.converged.rows(np.flatnonzero(self.discs.train)).of(Pushed)
         assert pushed is not None and training is not None
-        return loads_beyond(self.patch, training, pushed, self.beyond)
+        return draw_loads_beyond(self.patch, training, pushed, self.beyond)
 
     @cached_property
     def digest(self) -> str:
         """Hash of all inputs of the solutions."""
         data = self.dataset
         on = "cuda" if self.on_card else "cpu"
-        stated = repr((sorted(data.provenance.items()), self.loads, self.beyond, self.fine, on, version_of("sulcus")))
-        return digest_of(np.frombuffer(stated.encode(), np.uint8), data.good, *vars(self.pushed).values())
+        stated = repr((sorted(data.provenance.items()), self.loads, self.beyond, self.fine, on, get_version("sulcus")))
+        return compute_digest(np.frombuffer(stated.encode(), np.uint8), data.good, *vars(self.pushed).values())
 
 
 # Times the greatest force; degrees more than the greatest angle; of the radius, how near to the rim a centre comes.
@@ -166,16 +166,16 @@ STRONGER, MORE_OBLIQUE, NEARER = (1.2, 1.6), (5.0, 15.0), (0.5, 0.9)
 KINDS = ("stronger", "more oblique", "nearer to the rim")
 
 
-def loads_beyond(patch: Patch, training: Pushed, like: Pushed, count: int) -> Loads:
+def draw_loads_beyond(patch: Patch, training: Pushed, like: Pushed, count: int) -> Loads:
     """`count` loads, every third of one of `KINDS`, otherwise as those of `like` are; always the same ones."""
     random = np.random.default_rng(0)
     rows = random.integers(len(like.point), size=count)
     kind = np.arange(count) % len(KINDS)
-    size, direction = directions(replace(like, force=like.force[rows]))
+    size, direction = split_forces(replace(like, force=like.force[rows]))
     point, footprint = like.point[rows], like.footprint[rows]
-    size = np.where(kind == 0, directions(training)[0].max() * random.uniform(*STRONGER, count), size)
+    size = np.where(kind == 0, split_forces(training)[0].max() * random.uniform(*STRONGER, count), size)
     oblique = _tilted(
-        direction, patch.normal_near(point), _angle(patch, training), random.uniform(*MORE_OBLIQUE, count)
+        direction, patch.find_normals(point), _angle(patch, training), random.uniform(*MORE_OBLIQUE, count)
     )
     direction = np.where((kind == 1)[:, None], oblique, direction)
     point = np.where((kind == 2)[:, None], _near_rim(patch, footprint, random), point)
@@ -184,7 +184,7 @@ def loads_beyond(patch: Patch, training: Pushed, like: Pushed, count: int) -> Lo
 
 def _angle(patch: Patch, pushed: Pushed) -> float:
     """Greatest angle between force and inward normal [rad]."""
-    cosine = np.einsum("bi,bi->b", directions(pushed)[1], patch.normal_near(pushed.point))
+    cosine = np.einsum("bi,bi->b", split_forces(pushed)[1], patch.find_normals(pushed.point))
     return float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
 
 
@@ -201,18 +201,18 @@ def _tilted(direction: np.ndarray, normal: np.ndarray, angle: float, more: np.nd
 def _near_rim(patch: Patch, footprint: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Points (B, 3) [m] whose footprints (B,) [m] hang over the rim by a tenth to half of their radius."""
     points = patch.place(random.random((4096, 3)))[0]
-    ratio = patch.rim_distance(points)[None] / footprint[:, None]
+    ratio = patch.compute_edge_distance(points)[None] / footprint[:, None]
     wanted = random.uniform(*NEARER, len(footprint))[:, None]
     return points[np.abs(ratio - wanted).argmin(axis=1)]
 
 
 def note_seconds(made: Path, seconds: float) -> None:
     """Keep the seconds that a file took to make, in a JSON file of its name."""
-    with written_whole(_beside(made), ".json") as partial:
+    with write_atomically(_beside(made), ".json") as partial:
         partial.write_text(json.dumps({"seconds": seconds}))
 
 
-def noted_seconds(made: Path) -> float | None:
+def read_noted_seconds(made: Path) -> float | None:
     """Read the stored value; None if missing or incomplete."""
     try:
         return float(json.loads(_beside(made).read_text())["seconds"])
@@ -230,6 +230,6 @@ def tabulate_series(study: ReportStudy, progress: Callable[[int, int], object]) 
         replace(study.expansion, progress=progress).tabulated  # noqa: B018 (asking makes it)
 
 
-def series_seconds(study: ReportStudy, learner: str) -> float:
+def measure_series_seconds(study: ReportStudy, learner: str) -> float:
     """Return the seconds spent on the table, if this learner uses it."""
     return study.expansion.tabulated.seconds if learner in EXPANDED else 0.0

@@ -57,12 +57,12 @@ class HandHeld:
 
     def __call__(self, camera: Camera, target: np.ndarray, time: float) -> Camera:
         """The camera at a time [s]."""
-        way = wandering(self.seed, time)
+        way = sample_wandering(self.seed, time)
         lifted = np.array([0.0, self.breath * np.sin(2.0 * np.pi * BREATH * time), 0.0])
         turn = self.turn * way[3:]
         moved = camera.moved(self.shift * way[:3] + lifted)
         angle = float(np.linalg.norm(turn))
-        return moved.perturbed(np.degrees(angle), tuple(turn)) if angle > 0.0 else moved
+        return moved.perturb(np.degrees(angle), tuple(turn)) if angle > 0.0 else moved
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,9 @@ class Orbit:
     def __call__(self, camera: Camera, target: np.ndarray, time: float) -> Camera:
         """The camera at a time [s]."""
         degrees = np.degrees(self.reach * np.sin(2.0 * np.pi * time / self.period))
-        to_target = camera.in_frame(np.asarray(target))
+        to_target = camera.to_camera_frame(np.asarray(target))
         # About the target in place of the camera's own centre.
-        return camera.moved(to_target).perturbed(degrees).moved(-to_target)
+        return camera.moved(to_target).perturb(degrees).moved(-to_target)
 
 
 @dataclass(frozen=True)
@@ -140,13 +140,13 @@ class Microscope:
             share = float(share * share * (3.0 - 2.0 * share))
             distance += share * (setting.distance - distance)
             zoom *= (setting.zoom / zoom) ** share
-        first = float(camera.in_frame(np.asarray(target))[2])
+        first = float(camera.to_camera_frame(np.asarray(target))[2])
         moved = camera.moved(np.array([0.0, 0.0, first - distance * first]))
-        return moved.refocused(self.focal_length, first, distance * first).zoomed(zoom)
+        return moved.refocus(self.focal_length, first, distance * first).zoomed(zoom)
 
 
 @lru_cache(maxsize=16)
-def waves(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sample_waves(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frequencies [Hz], phases [rad] and amplitudes of a hand's motion, each (6, n), for 3 shifts and 3 turns."""
     random = np.random.default_rng(seed)
     bands = [random.uniform(*band, (6, WAVES)) for band in (SLOW, TREMOR)]
@@ -154,9 +154,9 @@ def waves(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.hstack(bands), random.uniform(0.0, 2.0 * np.pi, (6, 2 * WAVES)), np.hstack(sizes)
 
 
-def wandering(seed: int, time: float) -> np.ndarray:
+def sample_wandering(seed: int, time: float) -> np.ndarray:
     """Six numbers (6,) that wander with time [s] about 0, with a standard deviation of 1."""
-    frequencies, phases, sizes = waves(seed)
+    frequencies, phases, sizes = sample_waves(seed)
     return (sizes * np.sin(2.0 * np.pi * frequencies * time + phases)).sum(axis=1)
 
 

@@ -32,7 +32,7 @@ class Debulking:
         """Count the steps done at a time [s]."""
         return int(np.searchsorted(self.times, time, side="right"))
 
-    def resection(self, anatomy: Anatomy) -> Resection:
+    def build_resection(self, anatomy: Anatomy) -> Resection:
         """Select the tetrahedra of each step.
 
         Raises

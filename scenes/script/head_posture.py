@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.bodies.fluid_level import fluid_level
+from sim.bodies.fluid_level import compute_fluid_level
 from sim.loads import Posture
 
 from .tool_paths import smooth
@@ -33,29 +33,29 @@ class Lying:
     def posture(self, nodes: np.ndarray) -> Posture:
         """One load case for a body of these nodes (V, 3) [m]."""
         down = np.array(self.direction) / np.linalg.norm(self.direction)
-        return Posture(down[None], np.array([fluid_level(nodes, down, self.fluid)]), np.ones(1))
+        return Posture(down[None], np.array([compute_fluid_level(nodes, down, self.fluid)]), np.ones(1))
 
 
 Lie = Callable[[float], Lying]
 """Time [s] -> Lying."""
 
 
-def supine(time: float) -> Lying:
+def get_supine_pose(time: float) -> Lying:
     """Return the pose of the scan, at any time [s]: supine, under fluid."""
     return Lying()
 
 
-def drained(seconds: float, to: float = 0.0) -> Lie:
+def build_drainage(seconds: float, to: float = 0.0) -> Lie:
     """Return a supine pose whose fluid falls to a share of its height within `seconds`."""
     return lambda time: Lying(fluid=1.0 - (1.0 - to) * smooth(time / seconds))
 
 
-def drained_then_turned(drain: float, pause: float, turn: float, angle: float, to: float = 0.0) -> Lie:
+def build_drained_turn(drain: float, pause: float, turn: float, angle: float, to: float = 0.0) -> Lie:
     """On the back while the fluid falls to a share within `drain` [s]; `pause` [s]; then a turn by `angle` [rad].
 
     A positive angle brings the left side down; the turn takes `turn` [s].
     """
-    falling = drained(drain, to)
+    falling = build_drainage(drain, to)
 
     def lie(time: float) -> Lying:
         turned = angle * smooth((time - drain - pause) / turn)

@@ -135,7 +135,7 @@ class PatientSample:
     mesh: float
 
 
-def drawn(count: int, seed: int = 0) -> list[PatientSample]:
+def sample_priors(count: int, seed: int = 0) -> list[PatientSample]:
     """Draw `count` samples that cover each prior evenly (a Latin hypercube: McKay, Beckman, Conover 1979)."""
     random = np.random.default_rng(seed)
 
@@ -148,10 +148,10 @@ def drawn(count: int, seed: int = 0) -> list[PatientSample]:
     return [PatientSample(young, nu, ratio, skull, tuple(tip), mesh) for young, nu, ratio, skull, *tip, mesh in rows]
 
 
-def drawn_from(
+def sample_from_fit(
     tissue: FittedTissue, young: float, skulls: Sequence[str], count: int, seed: int = 0, ratio: float = 1.0
 ) -> list[PatientSample]:
-    """Draw `count` samples whose tissue and skull are from a fit; all else as in `drawn`.
+    """Draw `count` samples whose tissue and skull are from a fit; all else as in `sample_priors`.
 
     `young` [Pa] is the scene's own modulus, `ratio` its tumour's relative stiffness, and `skulls` the skulls that it
     may have. Parameters that were not fitted keep their prior.
@@ -169,7 +169,7 @@ def drawn_from(
     names, poisson, ratios = tissue.drawn(count, seed, tuple(skulls))
     random, made = np.random.default_rng([seed, 3]), []
     moduli = random.choice(tissue.young, count) if len(tissue.young) else None
-    for number, one in enumerate(drawn(count, seed)):
+    for number, one in enumerate(sample_priors(count, seed)):
         stiffness = one.stiffness if moduli is None else float(moduli[number]) / young
         skull = (list(skulls).index(names[number]) + 0.5) / len(skulls)
         own = {"poisson": float(poisson[number]), "ratio": float(ratios[number]) / ratio}
@@ -177,13 +177,13 @@ def drawn_from(
     return made
 
 
-def rigid(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def sample_rigid_errors(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Errors of registration (count, 3) and of segmentation (count,) [m]."""
     random = np.random.default_rng([seed, 1])
     shift = OF_REGISTRATION.range[1] * random.standard_normal((count, 3))
     return shift, OF_SEGMENTATION.range[1] * random.standard_normal(count)
 
 
-def chosen(share: float, names: Sequence[str]) -> str:
+def choose_name(share: float, names: Sequence[str]) -> str:
     """The name that a share in [0, 1) chooses, each as probable."""
     return names[min(int(share * len(names)), len(names) - 1)]

@@ -30,10 +30,10 @@ from sim.effects import (
 from sim.errors import InputError
 from sim.loads import Cause, Loads, Pushed, Resected, Retracted, Touching
 from sim.material import Material, Tissue
-from sim.runtime.user_script import error_text, run_script
+from sim.runtime.user_script import format_script_error, run_script
 
 from .debulking import Debulking
-from .head_posture import Lie, supine
+from .head_posture import Lie, get_supine_pose
 from .sight import Sight, StereoSight
 from .site import Site
 from .tool import Instrument, Probe
@@ -110,7 +110,7 @@ class Scene:
     duration: float = 4.0
     effects: tuple[Effect, ...] = (Elasticity(), Held(), Bonded(), ToolForce())
     tool: Instrument | None = PALPATION
-    lying: Lie = supine
+    lying: Lie = get_supine_pose
     surgery: Debulking | None = None
     sight: Sight | StereoSight | None = None
     viewpoint: Viewpoint = USUAL
@@ -161,7 +161,7 @@ class Scene:
         """Tissue of the scene; without laws if there is none."""
         return next((effect for effect in self.effects if isinstance(effect, Elasticity)), Elasticity(None))
 
-    def with_regions(self, regions: Mapping[int, Tissue]) -> Scene:
+    def replace_regions(self, regions: Mapping[int, Tissue]) -> Scene:
         """The scene with tissues of some regions by label, in place of those that it has of them."""
 
         def made(effect: Effect) -> Effect:
@@ -175,7 +175,7 @@ class Scene:
         """Time of every frame (n,) [s]."""
         return np.arange(round(self.duration * self.frames_per_second) + 1) / self.frames_per_second
 
-    def effects_on(self, anatomy: Anatomy) -> tuple[Effect, ...]:
+    def get_effects_on(self, anatomy: Anatomy) -> tuple[Effect, ...]:
         """Its effects, with those that depend on the body: from a skull that is held no brain comes off."""
         gone = () if anatomy.slide_normal.any() else (SkullContact,)
         kept = tuple(effect for effect in self.effects if not isinstance(effect, gone))
@@ -214,7 +214,7 @@ class Scene:
 
     def loads(self, site: Site, touch: Touch, time: float) -> Loads:
         """Build one load case: the cause of every effect that has one; without causes, only time advances."""
-        causes = (self._cause(effect, site, touch, time) for effect in self.effects_on(site.anatomy))
+        causes = (self._cause(effect, site, touch, time) for effect in self.get_effects_on(site.anatomy))
         return Loads(tuple(cause for cause in causes if cause is not None), np.array([time]))
 
     def _cause(self, effect: Effect, site: Site, touch: Touch, time: float) -> Cause | None:
@@ -244,7 +244,7 @@ class Scene:
 @lru_cache(8)
 def _resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
     """Each frame asks for it."""
-    return surgery.resection(anatomy)
+    return surgery.build_resection(anatomy)
 
 
 SCENES = (
@@ -265,13 +265,13 @@ def find_scene(name: str) -> Scene:
         There is no scene of that name. Or the file is missing, does not run or has no SCENE. Or the scene's path gives
         no Touch, or its tissue fails `sim.check_tissue`.
     """
-    demand_scene(name)
+    check_scene_exists(name)
     if name.endswith(".py"):
         return _own_scene(name)
     return importlib.import_module(f"scenes.builtin.{name}").SCENE
 
 
-def demand_scene(name: str) -> None:
+def check_scene_exists(name: str) -> None:
     """Raise InputError where no scene is called so and it is no file of a user's. Nothing is run or read."""
     if name not in SCENES and not name.endswith(".py"):
         raise InputError(
@@ -291,7 +291,7 @@ def _own_scene(path: str) -> Scene:
         try:
             touch = found.path(time)
         except Exception as error:
-            raise InputError(error_text(FilePath(path).absolute(), error)) from error
+            raise InputError(format_script_error(FilePath(path).absolute(), error)) from error
         if not isinstance(touch, Touch):
             what = type(touch).__name__
             raise InputError(f"{path}: at {time:g} s its path gives a {what}. Make it a scenes.Touch.")

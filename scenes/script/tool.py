@@ -9,32 +9,32 @@ from typing import Protocol
 import numpy as np
 import trimesh
 
-from sim.tools import Ball, BuiltIn, Spatula, Tool, core_of
+from sim.tools import Ball, BuiltIn, Spatula, Tool, get_core
 
 # Radius of the shaft of a tool of which no more is known [m].
 SHAFT = 1.8e-3
 
 
-def sphere(subdivisions: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def build_sphere(subdivisions: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """A sphere of radius 1: vertices (n, 3), and triangles (m, 3), which point outwards."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     return np.asarray(ball.vertices), np.asarray(ball.faces)
 
 
-def capsule(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
+def build_capsule(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
     """A rod with round ends, from the origin along +z: vertices (n, 3) [m], and triangles (m, 3)."""
     rod = trimesh.creation.capsule(length, radius, count=(20, 20))
     rod.apply_translation([0.0, 0.0, -float(rod.bounds[0, 2])])
     return np.asarray(rod.vertices), np.asarray(rod.faces)
 
 
-def shafted(shape: BuiltIn, top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def add_shaft(shape: BuiltIn, top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A tool of which the shape alone is known, on a straight shaft to `top` (3,) [m].
 
     Vertices (n, 3) [m] in the tool's own frame, and triangles (m, 3).
     """
-    core = core_of(shape)
-    ball = core.radius * sphere(3)[0]
+    core = get_core(shape)
+    ball = core.radius * build_sphere(3)[0]
     head = trimesh.convex.convex_hull((core.corners[:, None] + ball).reshape(-1, 3))
     shaft = trimesh.creation.cylinder(SHAFT, segment=[core.centre, top], sections=24)
     both = head + shaft
@@ -154,7 +154,7 @@ class Blade:
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
         """Surface in the tool's own frame [m]: the blade's face downwards through the origin, the arm along +z."""
-        core = core_of(self.shape)
+        core = get_core(self.shape)
         ball = trimesh.creation.icosphere(subdivisions=2, radius=self.edge).vertices
         corners = core.centre + core.half * np.array([[x, y, 0.0] for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
         blade = trimesh.convex.convex_hull((corners[:, None] + ball).reshape(-1, 3))

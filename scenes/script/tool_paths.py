@@ -43,7 +43,7 @@ AIR = 4e-3
 FAINT = 2e-3
 
 
-def lifted(force: float) -> float:
+def compute_lift(force: float) -> float:
     """Return the height [m] above the tissue at which a tool that pushes with a force [N] is drawn: `AIR` when idle."""
     return AIR * max(0.0, 1.0 - force / FAINT)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as
 
 from .priors import OF_REGISTRATION, PRIORS, REGISTRATION, SEGMENTATION
@@ -161,7 +161,7 @@ def _numbers(scene: Scene, time: float) -> list[float]:
     return [touch.x, touch.y, touch.force, *touch.tilt, touch.depth, *lying.direction, lying.fluid]
 
 
-def uncertainty_path(anatomy: Path) -> Path:
+def to_uncertainty_path(anatomy: Path) -> Path:
     """Return the path of an anatomy's uncertainties: MESH.uncertainty.json next to MESH.vtu."""
     return anatomy.with_suffix(SUFFIX)
 
@@ -206,7 +206,7 @@ def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:
     scenes = read_uncertainties(path) | {one.scene: one for one in found}
     rows = {name: asdict(scenes[name]) for name in sorted(scenes)}
     stored = {"format": FORMAT, "unit": "m", "level": LEVEL, "scenes": rows}
-    with written_whole(path, ".json") as unfinished:
+    with write_atomically(path, ".json") as unfinished:
         unfinished.write_text(json.dumps(_rounded(stored), indent=1) + "\n")
 
 

@@ -115,7 +115,7 @@ class Viewpoint:
             raise InputError(f"a round field has the radius {self.field}: give a number above 0, or None.")
         if self.calibration is not None:
             try:
-                self.calibration.sized(self.width, self.height)
+                self.calibration.resize_calibration(self.width, self.height)
             except ValueError as error:
                 raise InputError(str(error)) from error
 
@@ -138,7 +138,7 @@ class Viewpoint:
             found = self.path(found, target, time)
         if self.eye is None:
             return found
-        left, right = stereo_pair(found, working_distance=float(found.in_frame(target)[2]))
+        left, right = stereo_pair(found, working_distance=float(found.to_camera_frame(target)[2]))
         return left if self.eye == "left" else right
 
 

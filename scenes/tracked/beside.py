@@ -8,7 +8,7 @@ from ar.overlay.gauge import Gauge
 from ar.page.history import Line, Sample
 from ar.page.slices import Cut
 
-from ..page.beside import sliced_where
+from ..page.beside import draw_slices_through
 from .follower import TrackingResult
 from .picture import Painter
 
@@ -16,13 +16,13 @@ DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of tip and motion
 WITHIN = Line("error of the overlay", "mm", "#4cf28c", "across the view (95 %), without tissue and segmentation")
 
 
-def lines_of(tooled: bool) -> tuple[Line, ...]:
+def list_lines(tooled: bool) -> tuple[Line, ...]:
     """Return the plotted quantities of each image."""
     return (DISTANCE, WITHIN) if tooled else (WITHIN,)
 
 
 def sample_of(known: TrackingResult, gauge: Gauge | None, tooled: bool, now: float) -> Sample:
-    """Build the readings of an image that is shown at a time [s], in the order of `lines_of`."""
+    """Build the readings of an image that is shown at a time [s], in the order of `list_lines`."""
     within = 1e3 * known.band if known.relied and known.band is not None else None
     if not tooled:
         return Sample(now, (within,), (0.0,))
@@ -31,7 +31,7 @@ def sample_of(known: TrackingResult, gauge: Gauge | None, tooled: bool, now: flo
     return Sample(now, (distance, within), (error, 0.0))
 
 
-def slices_of(known: TrackingResult, painter: Painter, through: str) -> np.ndarray:
+def render_slices(known: TrackingResult, painter: Painter, through: str) -> np.ndarray:
     """Three slices (h, 3 h, 3) uint8 of the scan, through one of the places of `scenes.page.beside`.
 
     Their band is the error of the motion, for tracking and registration do not move the tumour in the scan.
@@ -41,4 +41,6 @@ def slices_of(known: TrackingResult, painter: Painter, through: str) -> np.ndarr
     others = [] if tool is None else [tool]
     error = known.motion.error if known.relied and known.motion.known else None
     now = stage.tumour(known.motion.positions)
-    return sliced_where(stage, Cut(now, stage.tumour_at_rest, error, not known.relied, others, tip, "motion"), through)
+    return draw_slices_through(
+        stage, Cut(now, stage.tumour_at_rest, error, not known.relied, others, tip, "motion"), through
+    )

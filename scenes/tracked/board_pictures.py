@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ar.tracking.intrinsics import BoardView, find_board
-from ar.tracking.pictures import GIVE, pictures_of
+from ar.tracking.pictures import GIVE, read_images
 from ar.tracking.targets import Detector, Target
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
@@ -32,7 +32,7 @@ class BoardDetections:
     looked_at: int
 
 
-def seen_views(path: Path, board: Target, size: tuple[int, int] | None = None) -> BoardDetections:
+def detect_board(path: Path, board: Target, size: tuple[int, int] | None = None) -> BoardDetections:
     """Detect the board in each image of a folder or a video; `size` is the required width and height.
 
     Raises
@@ -43,7 +43,7 @@ def seen_views(path: Path, board: Target, size: tuple[int, int] | None = None) -
     views, count, first, detector = [], 0, "", Detector([board])
     with read_as(path, "images of a board", GIVE):
         try:
-            for picture in pictures_of(path):
+            for picture in read_images(path):
                 count += 1
                 found = (picture.grey.shape[1], picture.grey.shape[0])
                 if size is not None and found != size:

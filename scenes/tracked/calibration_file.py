@@ -8,15 +8,15 @@ from typing import Literal
 
 import numpy as np
 
-from ar.optics.calibration import LONGEST_TEXT, WANTED, Calibration, opencv_text, parsed, ros_text
+from ar.optics.calibration import LONGEST_TEXT, WANTED, Calibration, parse_calibration, to_opencv_text, to_ros_text
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
-from sim.runtime.outside_files import path_of, read_as
+from sim.runtime.atomic_files import write_atomically
+from sim.runtime.outside_files import read_as, to_path
 
 SUFFIXES = (".yaml", ".yml")
 INTRINSICS = "sulcus intrinsics"
 """Format of the covariance file of a calibration."""
-FORMATS = {"opencv": opencv_text, "ros": ros_text}
+FORMATS = {"opencv": to_opencv_text, "ros": to_ros_text}
 GIVE_HAND_EYE = "Give what `sulcus calibrate --hand-eye A.csv B.csv --json` prints, B being the camera."
 LARGEST_HAND_EYE, RIGID = 1 << 16, 1e-4
 
@@ -29,16 +29,16 @@ def read_calibration(path: str | Path) -> Calibration:
     Raises
     ------
     InputError
-        No such file, one that is too large or of another kind, or what `ar.optics.calibration.parsed` refuses.
+        No such file, one that is too large or of another kind, or what `ar.optics.calibration.parse_calibration` refuses.
     """
-    path = path_of(path)
+    path = to_path(path)
     with read_as(path, "a camera's calibration", WANTED):
         if path.exists() and not path.is_file():
             raise InputError(f"is no file. {WANTED}")
         with path.open("rb") as file:
             text = file.read(4 * LONGEST_TEXT + 1).decode("utf-8-sig")
         try:
-            return parsed(text)
+            return parse_calibration(text)
         except ValueError as error:
             raise InputError(str(error)) from error
 
@@ -51,7 +51,7 @@ def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
     InputError
         A file of that name and kind with an invalid covariance.
     """
-    beside = path_of(path).with_suffix(".json")
+    beside = to_path(path).with_suffix(".json")
     if not beside.is_file() or beside.stat().st_size > LONGEST_TEXT:
         return None
     with read_as(beside, "a covariance of `sulcus calibrate`", "Remove it, or calibrate the camera again."):
@@ -64,16 +64,16 @@ def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
         return 0.5 * (covariance + covariance.T)
 
 
-def intrinsics_header(calibration: Calibration, covariance: np.ndarray) -> dict[str, object]:
+def build_intrinsics_header(calibration: Calibration, covariance: np.ndarray) -> dict[str, object]:
     """Build the K.json of a calibration: its values (9,) and their covariance (9, 9), 0 where they are exact."""
-    from ar.tracking.intrinsics import PARAMETERS, values_of
+    from ar.tracking.intrinsics import PARAMETERS, to_values
 
     return {
         "format": f"{INTRINSICS} 1",
         "image_width": calibration.width,
         "image_height": calibration.height,
         "parameters": PARAMETERS,
-        "values": values_of(calibration).tolist(),
+        "values": to_values(calibration).tolist(),
         "standard_deviations": np.sqrt(np.diag(covariance)).tolist(),
         "covariance": covariance.tolist(),
     }
@@ -87,8 +87,8 @@ def write_exactly_known(path: str | Path, calibration: Calibration) -> None:
     InputError
         A file that cannot be written.
     """
-    with written_whole(path_of(path), ".json") as partial:
-        partial.write_text(json.dumps(intrinsics_header(calibration, np.zeros((9, 9)))) + "\n", encoding="utf-8")
+    with write_atomically(to_path(path), ".json") as partial:
+        partial.write_text(json.dumps(build_intrinsics_header(calibration, np.zeros((9, 9)))) + "\n", encoding="utf-8")
 
 
 def write_calibration(path: str | Path, calibration: Calibration, form: Literal["opencv", "ros"] = "opencv") -> None:
@@ -99,12 +99,12 @@ def write_calibration(path: str | Path, calibration: Calibration, form: Literal[
     InputError
         An unknown form, a name of another ending, or a file that cannot be written.
     """
-    path = path_of(path)
+    path = to_path(path)
     if form not in FORMATS:
         raise InputError(f"calibrations are written as {' or '.join(FORMATS)}, not as {form!r}: choose one.")
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: calibrations are written as {' or '.join(SUFFIXES)}; give a name that ends so.")
-    with written_whole(path, path.suffix) as partial:
+    with write_atomically(path, path.suffix) as partial:
         partial.write_text(FORMATS[form](calibration), encoding="utf-8")
 
 
@@ -120,7 +120,7 @@ def read_hand_eye(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """
     from ar.tracking.rigid import is_rigid
 
-    path = path_of(path)
+    path = to_path(path)
     with read_as(path, "a hand-eye calibration", GIVE_HAND_EYE):
         with path.open("rb") as file:
             stored = json.loads(file.read(LARGEST_HAND_EYE))

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ar.optics.calibration import Calibration
-from ar.tracking.pictures import Named, in_colour
+from ar.tracking.pictures import Named, to_named_image
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Deformer
 from sim.loads import Loads, Touching
-from surrogate.model.learned import predicted
+from surrogate.model.learned import build_prediction
 
 from ..play.deformers import Theatre
 from ..play.player import Player
@@ -20,11 +20,21 @@ from ..play.stage import Stage
 from ..script.camera_paths import HandHeld
 from ..script.scene import find_scene
 from ..script.site import Site
-from .filming import USUAL, VIEW, Mounted, Taking, Trouble, VideoFrame, from_where_it_sees_all, mounted, shots_of
+from .filming import (
+    USUAL,
+    VIEW,
+    Mounted,
+    Taking,
+    Trouble,
+    VideoFrame,
+    from_where_it_sees_all,
+    mount_targets,
+    render_shots,
+)
 
 SCENE = "palpate"
 """Scene of the video."""
-CAMERA = USUAL.sized(800, 600, scale=True)
+CAMERA = USUAL.resize_calibration(800, 600, scale=True)
 """Camera of the video: fewer pixels than usual, so that it takes seconds."""
 # # Frame rate [1/s], length [s], and start time in the scene [s]: the ball makes contact at 0.4 s.
 RATE, LENGTH, BEGIN = 10.0, 1.7, 0.5
@@ -53,7 +63,7 @@ class Dent:
             share = np.exp(-np.square(nodes - place).sum(axis=1) / (2.0 * ROUND**2))
             moved.append(depth * share[:, None] * self.site.axis)
         exact = np.zeros((2, len(loads)))
-        found = predicted(
+        found = build_prediction(
             np.stack(moved), np.arange(len(nodes)), loads, [False] * len(loads), clock.perf_counter(), exact, ""
         )
         return found if at is None else found.at(at)
@@ -82,10 +92,10 @@ class DrawnFilm:
 
     def picture(self, shot: VideoFrame) -> Named:
         """Return an image as a video gives it."""
-        return in_colour(f"{shot.time:.1f} s", shot.colour, shot.time)
+        return to_named_image(f"{shot.time:.1f} s", shot.colour, shot.time)
 
 
-def drawn_film(theatre: Theatre) -> DrawnFilm:
+def build_synthetic_video(theatre: Theatre) -> DrawnFilm:
     """Render the video of a theatre's anatomy.
 
     Raises
@@ -102,5 +112,5 @@ def drawn_film(theatre: Theatre) -> DrawnFilm:
     stage = theatre.stage(scene)
     deformer = Dent(theatre.anatomy, stage.site)
     player = Player(stage, deformer)
-    mounts, taking = mounted(player), Taking(troubles=TROUBLES)
-    return DrawnFilm(stage, mounts, CAMERA, deformer, tuple(shots_of(player, mounts, taking)), taking)
+    mounts, taking = mount_targets(player), Taking(troubles=TROUBLES)
+    return DrawnFilm(stage, mounts, CAMERA, deformer, tuple(render_shots(player, mounts, taking)), taking)

@@ -11,11 +11,11 @@ import numpy as np
 
 from ar.optics.calibration import Calibration
 from ar.tracking.drawn import read_stamp
-from ar.tracking.pictures import GIVE, Named, film_of
+from ar.tracking.pictures import GIVE, Named, read_video
 from ar.tracking.pose import Pose, TrackedTargets, Tracker, Verdict
-from ar.tracking.pose_stream import Clock, PoseStream, clock_by_motion
-from ar.tracking.rigid import cross_matrices, turn_vectors
-from ar.tracking.targets import all_targets, patient_reference, tool_cube
+from ar.tracking.pose_stream import Clock, PoseStream, estimate_clock_by_motion
+from ar.tracking.rigid import build_cross_matrices, turn_vectors
+from ar.tracking.targets import build_patient_reference, build_tool_cube, list_targets
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
@@ -28,7 +28,7 @@ AT_REST = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
 FAR = 1.0
 
 
-def rows_of(film: Iterable[Named], calibration: Calibration, body: str, frame: str) -> Iterator[TrackedRow]:
+def select_rows(film: Iterable[Named], calibration: Calibration, body: str, frame: str) -> Iterator[TrackedRow]:
     """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `frame` of a visible one of them.
 
     Raises
@@ -36,7 +36,7 @@ def rows_of(film: Iterable[Named], calibration: Calibration, body: str, frame: s
     ValueError
         Images of another size than the camera was calibrated at.
     """
-    targets = {each.name: each for each in all_targets()}
+    targets = {each.name: each for each in list_targets()}
     wanted = [each for each in (body, frame) if each != "camera"]
     tracker = Tracker(calibration.camera(np.eye(4)), tuple(targets[name] for name in wanted))
     state: TrackedTargets | None = None
@@ -49,7 +49,7 @@ def rows_of(film: Iterable[Named], calibration: Calibration, body: str, frame: s
         yield TrackedRow(picture.time, verdict, pose, time.perf_counter() - begun, lacks)
 
 
-def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: float) -> Iterator[TrackedRow]:
+def follow_body(path: Path, calibration: Calibration, body: str, frame: str, rate: float) -> Iterator[TrackedRow]:
     """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `frame` of a visible one of them.
 
     Times are the stamps in the images, or else those of the video.
@@ -62,7 +62,7 @@ def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: 
     count = 0
     with read_as(path, "a video", GIVE):
         try:
-            for row in rows_of(map(_at_its_time, film_of(path, rate)), calibration, body, frame):
+            for row in select_rows(map(_at_its_time, read_video(path, rate)), calibration, body, frame):
                 count += 1
                 yield row
         except ValueError as error:
@@ -144,12 +144,12 @@ class ExternalTracker:
         only
         the tool's poses can be compared.
         """
-        reference, tool = (seen.get(target().name) for target in (patient_reference, tool_cube))
+        reference, tool = (seen.get(target().name) for target in (build_patient_reference, build_tool_cube))
         if self.eye is None:
             body, other = self.beside(time), self.swapped.beside(time)
             if tool is None or reference is None or body is None:
                 return before
-            return before.seen(tool_cube().name, tool.seen_from(reference), body, other)
+            return before.seen(build_tool_cube().name, tool.seen_from(reference), body, other)
         body, other = self.reference(time), self.swapped.reference(time)
         for each, target, a, b in (("patient", reference, body, other), ("tool", tool, other, body)):
             before = before if target is None or a is None else before.seen(each, target, a, b)
@@ -164,7 +164,7 @@ class ExternalTracker:
     def outside(self, time: float) -> str:
         """Describe the body whose poses are all far from the image of a time [s], and by how much; empty: none."""
         for name, stream in self.streams.items():
-            at = stream.in_its_day(time + self.clock.offset)
+            at = stream.to_stream_day(time + self.clock.offset)
             first, last = stream.times[[0, -1]].tolist()
             if at < first - FAR:
                 return f"the {name}'s poses begin {first - at:.1f} s after this image"
@@ -204,21 +204,23 @@ class ExternalTracker:
         beside = patient.seen_from(body)
         T_camera_body = np.linalg.inv(self.eye.T_body_camera)
         arm = beside.T_camera_target[:3, 3] - self.eye.T_body_camera[:3, 3]
-        slope = np.block([[-np.eye(3), cross_matrices(arm)], [np.zeros((3, 3)), -np.eye(3)]])
+        slope = np.block([[-np.eye(3), build_cross_matrices(arm)], [np.zeros((3, 3)), -np.eye(3)]])
         whole = beside.covariance + slope @ self.eye.covariance @ slope.T
         turned = np.kron(np.eye(2), T_camera_body[:3, :3])
         return Pose(T_camera_body @ beside.T_camera_target, turned @ whole @ turned.T, 0.0, 0)
 
 
-def clock_of_film(film: Iterable[Named], calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:
+def estimate_video_clock(
+    film: Iterable[Named], calibration: Calibration, tool: PoseStream, patient: PoseStream
+) -> Clock:
     """Estimate the clock offset between the tracker and a video that shows the printed cube and reference.
 
     Raises
     ------
     ValueError
-        As `clock_by_motion` and `rows_of`.
+        As `estimate_clock_by_motion` and `select_rows`.
     """
-    film_rows = rows_of(film, calibration, tool_cube().name, patient_reference().name)
+    film_rows = select_rows(film, calibration, build_tool_cube().name, build_patient_reference().name)
     seen = [(row.time, row.pose) for row in film_rows if row.pose is not None]
     times, places = [time for time, _ in seen], [pose.T_camera_target[:3, 3] for _, pose in seen]
     both = [
@@ -229,4 +231,6 @@ def clock_of_film(film: Iterable[Named], calibration: Calibration, tool: PoseStr
     others = [pose.T_camera_target[:3, 3] for _, pose in both]
     if not both:
         raise ValueError("tool and reference have poses at no common time: record both at once.")
-    return clock_by_motion(np.array(times), np.array(places), np.array([time for time, _ in both]), np.array(others))
+    return estimate_clock_by_motion(
+        np.array(times), np.array(places), np.array([time for time, _ in both]), np.array(others)
+    )

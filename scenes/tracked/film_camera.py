@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from ar.optics.calibration import Calibration
-from ar.tracking.focal_fit import focal_fit
-from ar.tracking.pictures import GIVE, film_of
-from ar.tracking.pose import demand_picture
-from ar.tracking.targets import Detector, all_targets
+from ar.tracking.focal_fit import fit_focal_length
+from ar.tracking.pictures import GIVE, read_video
+from ar.tracking.pose import check_image_size
+from ar.tracking.targets import Detector, list_targets
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
@@ -19,7 +19,7 @@ from sim.runtime.outside_files import read_as
 LOOKED, EACH = 120, 10
 
 
-def demand_film(film: Path, rate: float, calibration: Calibration, camera: str) -> None:
+def check_video(film: Path, rate: float, calibration: Calibration, camera: str) -> None:
     """Reject an invalid video, or one of another camera, by its first images, before any long computation.
 
     Without markers the focal length is not checked.
@@ -37,19 +37,19 @@ def demand_film(film: Path, rate: float, calibration: Calibration, camera: str) 
         A missing or unreadable video, images of another size than the camera's, and focal lengths with a significant
         error of more than 5 %.
     """
-    targets = {target.name: target for target in all_targets()}
+    targets = {target.name: target for target in list_targets()}
     detector, seen, count = Detector(tuple(targets.values())), [], 0
     with read_as(film, "a video", GIVE):
         try:
-            for picture in islice(film_of(film, rate), 0, LOOKED, EACH):
-                demand_picture(picture.grey, calibration.width, calibration.height)
+            for picture in islice(read_video(film, rate), 0, LOOKED, EACH):
+                check_image_size(picture.grey, calibration.width, calibration.height)
                 seen += [(targets[name], corners) for name, corners in detector.seen(picture.grey).items()]
                 count += 1
         except ValueError as error:
             raise InputError(str(error)) from error
     if not count:
         raise InputError(f"{film}: holds no image. {GIVE}")
-    fit = focal_fit(calibration.camera(np.eye(4)), seen)
+    fit = fit_focal_length(calibration.camera(np.eye(4)), seen)
     if fit is not None and fit.differs:
         way = "longer" if fit.factor > 1.0 else "shorter"
         raise InputError(

@@ -11,14 +11,14 @@ from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from ar.optics.calibration import Calibration
-from ar.optics.camera import Camera, row_bands, time_of_point
+from ar.optics.camera import Camera, find_row_time, split_row_bands
 from ar.optics.lens import Lens
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Renderer
-from ar.tracking.drawn import drawn, stamped
+from ar.tracking.drawn import render_targets, stamp_time
 from ar.tracking.registration import Registration
-from ar.tracking.rigid import moved_about
-from ar.tracking.targets import Target, patient_reference, tool_cube, window_round
+from ar.tracking.rigid import move_about
+from ar.tracking.targets import Target, build_patient_reference, build_tool_cube, find_window
 from sim.errors import InputError
 from sim.tools import BuiltIn
 
@@ -26,7 +26,7 @@ from ..play.player import Player
 from ..play.stage import TOOL, TOOL_COLOUR
 from ..script.site import Site
 from ..script.viewpoint import Viewpoint
-from .registration_file import scanned_of
+from .registration_file import describe_scan
 from .tracked_tool import TrackedTool
 
 USUAL = Calibration((1400.0, 1400.0), (620.0, 540.0), 1280, 960, Lens(-0.1, 0.02, 5e-4, -3e-4), "sulcus film")
@@ -56,13 +56,13 @@ def from_where_it_sees_all(view: Viewpoint) -> Viewpoint:
     return replace(view, distance=longer * VIEW.distance)
 
 
-def reference_beside(site: Site, camera: Camera) -> np.ndarray:
+def place_reference(site: Site, camera: Camera) -> np.ndarray:
     """Return T_scan_patient (4, 4) of the reference near a site, facing `camera`."""
     right, up, outwards = BESIDE
     middle = site.origin + right * site.right + up * site.up - outwards * site.axis
     T = np.eye(4)
     T[:3, :3] = camera.T_camera_world[:3, :3].T @ Rotation.from_euler("xy", TURNED, degrees=True).as_matrix()
-    T[:3, 3] = middle - T[:3, :3] @ [*(0.5 * patient_reference().faces[0].size), 0.0]
+    T[:3, 3] = middle - T[:3, :3] @ [*(0.5 * build_patient_reference().faces[0].size), 0.0]
     return T
 
 
@@ -96,7 +96,7 @@ class Taking:
     troubles: tuple[Trouble, ...] = ()
     seed: int = 0
 
-    def happening(self, time: float) -> set[str]:
+    def list_disturbances(self, time: float) -> set[str]:
         """Return the disturbances at a time [s]."""
         return {each.kind for each in self.troubles if each.since <= time < each.until}
 
@@ -132,7 +132,7 @@ class Mounted:
     T_scan_patient: np.ndarray
 
 
-def mounted(player: Player) -> Mounted:
+def mount_targets(player: Player) -> Mounted:
     """Mount a cube on the scene's tool and a reference near the opening, both facing the initial camera.
 
     Raises
@@ -153,10 +153,10 @@ def mounted(player: Player) -> Mounted:
     towards = pose[:3, :3].T @ (camera.centre - pose[:3, :3] @ T_tool_cube[:3, 3] - pose[:3, 3])
     turn = np.arctan2(towards[1], towards[0]) - 0.25 * np.pi  # the edge between the cube's sides comes to the front
     T_tool_cube[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
-    return Mounted(TrackedTool(shape, np.linalg.inv(T_tool_cube)), reference_beside(site, camera))
+    return Mounted(TrackedTool(shape, np.linalg.inv(T_tool_cube)), place_reference(site, camera))
 
 
-def registered(site: Site, mounts: Mounted, shift: float, turn: float, seed: int) -> Registration:
+def register_with_error(site: Site, mounts: Mounted, shift: float, turn: float, seed: int) -> Registration:
     """Draw the reference's registration to the scan, with one random error of the given standard deviations.
 
     `shift` [mm] and `turn` [degree] are its standard deviations along and about each axis, about the opening's centre.
@@ -164,11 +164,11 @@ def registered(site: Site, mounts: Mounted, shift: float, turn: float, seed: int
     deviations = np.repeat([1e-3 * shift, np.radians(turn)], 3)
     error = deviations * np.random.default_rng([seed, 1]).standard_normal(6)
     centre = site.origin
-    T = moved_about(np.linalg.inv(mounts.T_scan_patient), centre, error)
-    return Registration(T, np.diag(deviations**2), centre, 0.0, 0, scanned=scanned_of(site.anatomy))
+    T = move_about(np.linalg.inv(mounts.T_scan_patient), centre, error)
+    return Registration(T, np.diag(deviations**2), centre, 0.0, 0, scanned=describe_scan(site.anatomy))
 
 
-def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) -> Iterator[VideoFrame]:
+def render_shots(player: Player, mounts: Mounted, taking: Taking, every: int = 1) -> Iterator[VideoFrame]:
     """Render the images of a scene, one in `every` frames; the deformer's solutions are the ground truth.
 
     With a rolling shutter, each row is rendered from its own camera pose; tool and tissue are those of the image's
@@ -183,7 +183,7 @@ def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) ->
     for number in range(0, len(player.scene.times), every):
         time, touch = float(player.scene.times[number]), player.touch(number)
         last = player.answer(player.loads(number, touch), last)
-        wrong = taking.happening(time)
+        wrong = taking.list_disturbances(time)
         if "gap" in wrong:
             continue
         positions = player.positions(last)
@@ -192,8 +192,8 @@ def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) ->
         layers = [*stage.layers(positions, None), held]
         renderer = renderer or Renderer(layers, stage.lamp, stage.device)
         targets = [
-            (tool_cube(), pose @ np.linalg.inv(mounts.tool.T_cube_tool)),
-            (patient_reference(), mounts.T_scan_patient),
+            (build_tool_cube(), pose @ np.linalg.inv(mounts.tool.T_cube_tool)),
+            (build_patient_reference(), mounts.T_scan_patient),
         ]
         view = partial(_seen, renderer, [layer.vertices for layer in layers if not layer.still], targets, wrong)
         camera_at = partial(_later, player, time)
@@ -202,11 +202,13 @@ def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) ->
         shown = (
             view(player.camera_at(time))
             if readout == 0.0
-            else np.concatenate([view(camera) for _, camera in row_bands(camera_at, readout, places)])
+            else np.concatenate([view(camera) for _, camera in split_row_bands(camera_at, readout, places)])
         )
-        camera = camera_at(time_of_point(camera_at, readout, places[0]))
+        camera = camera_at(find_row_time(camera_at, readout, places[0]))
         moved = tumour - rest[stage.tumour_vertices]
-        yield VideoFrame(time, stamped(_taken(shown, taking, wrong, number), time), camera.T_camera_world, pose, moved)
+        yield VideoFrame(
+            time, stamp_time(_taken(shown, taking, wrong, number), time), camera.T_camera_world, pose, moved
+        )
 
 
 def _later(player: Player, time: float, after: float) -> Camera:
@@ -223,7 +225,7 @@ def _seen(
 ) -> np.ndarray:
     """Render a camera's image (H, W, 3) uint8 with targets T_scan_target (4, 4), some of them covered by a hand."""
     sharp = renderer.picture(camera, moving).colour
-    shown = drawn(sharp, camera, [each for each in targets if NAMES[each[0].name] not in wrong])
+    shown = render_targets(sharp, camera, [each for each in targets if NAMES[each[0].name] not in wrong])
     for target, T in targets:
         if NAMES[target.name] in wrong:
             shown = _covered(shown, camera, target, T)
@@ -238,7 +240,7 @@ def _covered(colour: np.ndarray, camera: Camera, target: Target, T_scan_target: 
     """Draw a hand in front of a target."""
     T = camera.T_camera_world @ T_scan_target
     outline = target.outline
-    where = window_round(replace(camera, T_camera_world=np.eye(4)), outline @ T[:3, :3].T + T[:3, 3], 0.1, 0.0)
+    where = find_window(replace(camera, T_camera_world=np.eye(4)), outline @ T[:3, :3].T + T[:3, 3], 0.1, 0.0)
     out = colour.copy()
     if where is not None:
         out[where] = HAND

@@ -12,15 +12,15 @@ from scipy.stats import chi2
 
 from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera
-from ar.tracking.intrinsics import calibration_error
+from ar.tracking.intrinsics import compute_calibration_error
 from ar.tracking.pose import Pose, TrackedTargets, Tracker
 from ar.tracking.registration import Registration
-from ar.tracking.targets import patient_reference, tool_cube
+from ar.tracking.targets import build_patient_reference, build_tool_cube
 
 from ..script.uncertainty import DEVIATIONS, LEVEL
 from .agreement import Agreement
 from .elsewhere import ExternalTracker
-from .plausible import implausible, misplaced_tool
+from .plausible import describe_implausible, describe_misplaced_tool
 from .tool_motion import BrainMotion, ToolMotion
 from .tracked_tool import TrackedTool
 
@@ -41,7 +41,7 @@ SKEW, LEVER = 0.5, 2.0
 CALMS = 0.1
 UNCHECKED = "not checked whose registration this is: make one by `sulcus register --anatomy`"
 NO_PACE = "a rolling shutter, and how the camera moves is not known yet: do not rely on it"
-TOOL, PATIENT = tool_cube().name, patient_reference().name
+TOOL, PATIENT = build_tool_cube().name, build_patient_reference().name
 
 
 class TumourState(Enum):
@@ -143,7 +143,7 @@ class Follower:
     @cached_property
     def tracker(self) -> Tracker:
         """Tracker of the required targets."""
-        wanted = (patient_reference(),) if self.tool is None else (patient_reference(), tool_cube())
+        wanted = (build_patient_reference(),) if self.tool is None else (build_patient_reference(), build_tool_cube())
         return Tracker(self.calibration.camera(np.eye(4)), wanted)
 
     def step(self, grey: np.ndarray, time: float, before: TrackingResult | None = None) -> TrackingResult:
@@ -204,15 +204,15 @@ class Follower:
             why = f"no image for {apart:.1f} s" if apart > 0.0 else "the camera repeats an image"
             return replace(known, state=TumourState.STALE, words=f"stale, {why}: do not rely on it")
         if known.state in (TumourState.GOOD, TumourState.REST) and band > LIMIT:
-            return replace(known, state=TumourState.UNSURE, words=wide_words(band))
+            return replace(known, state=TumourState.UNSURE, words=describe_wide_band(band))
         return known
 
     def _implausible(self, camera: Camera, tool: np.ndarray | None, before: TrackingResult | None) -> tuple[str, bool]:
         """Describe why the registration is implausible for this patient; and return the updated `near`."""
         stage, near = self.motion.stage, before is not None and before.near
         theirs = "is this its registration?" if self.elsewhere is None else "are these its poses and registration?"
-        misplaced, near = ("", near) if tool is None else misplaced_tool(self.tool, tool, stage, near, theirs)
-        doubt = implausible(self.registration, stage, camera) or misplaced
+        misplaced, near = ("", near) if tool is None else describe_misplaced_tool(self.tool, tool, stage, near, theirs)
+        doubt = describe_implausible(self.registration, stage, camera) or misplaced
         return doubt, near
 
     def _without_reference(self, tracked: TrackedTargets, time: float, before: TrackingResult | None) -> TrackingResult:
@@ -257,7 +257,9 @@ class Follower:
             return TrackingResult(time, TumourState.NO_TOOL, words, tracked, last, felt=felt)
         into = np.linalg.inv(self.registration.T_patient_scan)
         pose = into @ beside.T_camera_target @ self.tool.T_cube_tool
-        spread = tip_covariance(self.registration, self.tool, beside) + (LEVER * shutter / DEVIATIONS) ** 2 * np.eye(3)
+        spread = compute_tip_covariance(self.registration, self.tool, beside) + (
+            LEVER * shutter / DEVIATIONS
+        ) ** 2 * np.eye(3)
         motion = self.motion.under(pose, spread, last)
         moved = TumourState.GOOD if motion.moved > 0.0 else TumourState.REST
         state = TumourState.UNSURE if motion.doubt else moved if motion.known else TumourState.UNKNOWN
@@ -290,26 +292,28 @@ class Follower:
         registered = turned @ beside @ turned.T
         camera = None
         if self.intrinsic is not None and (self.elsewhere is None or self.elsewhere.eye is None):
-            corners = patient_reference().faces[0].corners
-            camera = calibration_error(self.tracker.camera, reference.T_camera_target, corners, place, self.intrinsic)
+            corners = build_patient_reference().faces[0].corners
+            camera = compute_calibration_error(
+                self.tracker.camera, reference.T_camera_target, corners, place, self.intrinsic
+            )
         seen = tracked + registered + (0.0 if camera is None else camera)
         parts = {
-            "tracking": across(tracked, at),
-            **({} if camera is None else {"camera": across(camera, at)}),
-            "registration": across(registered, at),
+            "tracking": compute_radius_across(tracked, at),
+            **({} if camera is None else {"camera": compute_radius_across(camera, at)}),
+            "registration": compute_radius_across(registered, at),
             "tool": motion.tool,
             "model": motion.model,
             **({"shutter": shutter} if self.calibration.readout > 0.0 else {}),
         }
-        return float(np.linalg.norm([across(seen, at), motion.error, shutter])), parts
+        return float(np.linalg.norm([compute_radius_across(seen, at), motion.error, shutter])), parts
 
 
-def wide_words(band: float) -> str:
+def describe_wide_band(band: float) -> str:
     """Describe an error `band` [m] that is too large for a reliable position."""
     return f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
 
 
-def tip_covariance(registration: Registration, tool: TrackedTool, beside: Pose) -> np.ndarray:
+def compute_tip_covariance(registration: Registration, tool: TrackedTool, beside: Pose) -> np.ndarray:
     """Compute a tool tip's covariance (3, 3) [m^2] in the scan: by pose, tool calibration and registration."""
     T = registration.T_patient_scan
     arm, tracked = beside.point(tool.T_cube_tool[:3, 3])
@@ -319,7 +323,7 @@ def tip_covariance(registration: Registration, tool: TrackedTool, beside: Pose) 
     return T[:3, :3].T @ whole @ T[:3, :3]
 
 
-def across(covariance: np.ndarray, sight: np.ndarray) -> float:
+def compute_radius_across(covariance: np.ndarray, sight: np.ndarray) -> float:
     """The radius [m] that holds 95 % of an error of covariance (3, 3) [m^2] across a line of sight along (3,)."""
     ray = sight / np.linalg.norm(sight)
     plane = np.eye(3) - np.outer(ray, ray)

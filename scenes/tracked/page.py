@@ -19,16 +19,16 @@ from ar.page.history import History
 from ar.page.parts import Playback, SceneSurface
 from ar.tracking.pictures import Named
 
-from ..page.controls import overlays, through
-from ..page.view import STALE_COLOUR, brain_of, signs_of, viewpoint_of
+from ..page.controls import add_overlay_controls, build_slice_control
+from ..page.view import STALE_COLOUR, build_brain, choose_viewpoint, list_orientation_labels
 from ..play.stage import TOOL_COLOUR, TUMOUR_COLOUR
 from ..play.waiting_notice import Busy
-from .beside import lines_of, sample_of, slices_of
+from .beside import list_lines, render_slices, sample_of
 from .follower import GAP, SLOWEST, Follower, TrackingResult, TumourState
 from .picture import IN_GREY, Painter
-from .run import Shown, Timed, overlaid_one
+from .run import Shown, Timed, overlay_one
 from .seekable_film import SeekableFilm
-from .words import about, report
+from .words import describe_overlay, report
 
 # # Brightness factor of an outdated image; time for which the page stays after a failure [s].
 FADED, STAYS = 0.35, 2.0
@@ -88,26 +88,26 @@ class OverlayPage:
     def __post_init__(self) -> None:
         """Open the page; errors as of `ar.page.browser.Browser`."""
         stage, tool, calibration = self.painter.stage, self.painter.tool, self.follower.calibration
-        self.style, self.history = self.painter.style, History(lines_of(self.tooled))
-        bodies = brain_of(stage)
+        self.style, self.history = self.painter.style, History(list_lines(self.tooled))
+        bodies = build_brain(stage)
         if tool is not None:
             # # Empty until the tool is seen.
             away = np.tile(stage.site.origin, (len(tool.bare[0]), 1))
             bodies.append(SceneSurface("tool", away, tool.bare[1], TOOL_COLOUR))
         self.browser = Browser(
             bodies,
-            viewpoint_of(stage.site),
+            choose_viewpoint(stage.site),
             Playback(self.frames, lambda playing: setattr(self, "plays", playing), self.sought.append),
             [
-                overlays(self.style, lambda style: setattr(self, "style", style)),
-                through(self.through, lambda name: setattr(self, "through", name)),
+                add_overlay_controls(self.style, lambda style: setattr(self, "style", style)),
+                build_slice_control(self.through, lambda name: setattr(self, "through", name)),
             ],
             title=f"sulcus: {self.name}",
-            words=about(self.name, self.who, self.tooled),
+            words=describe_overlay(self.name, self.who, self.tooled),
             host=self.host,
             port=self.port,
             size=(calibration.width, calibration.height),
-            signs=signs_of(stage.site),
+            signs=list_orientation_labels(stage.site),
             origins=self.origins,
         )
         self.busy = Busy(lambda line: self.browser.status(escape(line)))
@@ -152,7 +152,7 @@ class OverlayPage:
                         self.sought.append(film.count - 1)
                     continue
                 before = known if wanted == self.number + 1 else None
-                one = overlaid_one(taken, None, before, self.follower, self._painter())
+                one = overlay_one(taken, None, before, self.follower, self._painter())
                 self.busy.off()
                 apart = 0.0 if before is None else taken.picture.time - before.time
                 due = now + min(max(apart, 0.0), SLOWEST)
@@ -193,7 +193,7 @@ class OverlayPage:
                 elif picture is None:
                     self._silent(now - came)
                 else:
-                    one = overlaid_one(Timed(picture, False), 0.0, known, self.follower, self._painter())
+                    one = overlay_one(Timed(picture, False), 0.0, known, self.follower, self._painter())
                     known, came = one.known, now
                     self.browser.status("")
                     self._show(Timed(picture, False), one, 0, f"live from {self.name}")
@@ -225,7 +225,7 @@ class OverlayPage:
         """Show an image with its report, and record its readings."""
         before = self.number
         self.taken, self.newest, self.number, self.place = taken, one, number, place
-        self.shown.append(one.without_mesh())
+        self.shown.append(one.drop_mesh())
         now = clock.monotonic()
         if number not in (before, before + 1):
             self.history.break_off(now)
@@ -252,7 +252,7 @@ class OverlayPage:
             self.browser.move("tool", tool.vertices)
         if self.tooled:
             self._tint("tool", STALE_COLOUR if grey or tool is None else TOOL_COLOUR)
-        self.browser.show_beside(lambda: (slices_of(known, painter, look), self.history.chart()))
+        self.browser.show_beside(lambda: (render_slices(known, painter, look), self.history.chart()))
 
     def _tint(self, name: str, colour: tuple[float, float, float]) -> None:
         if self.tints.get(name) != colour:

@@ -10,14 +10,14 @@ import numpy as np
 from ar.optics.camera import Camera
 from ar.overlay.composite import HEAD_WIDTHS, Overlaid, composite, write_doubt, write_head
 from ar.overlay.gauge import Gauge
-from ar.overlay.hud import bound_words, folded
+from ar.overlay.hud import bound_words, wrap_line
 from ar.overlay.marks import BEFORE, DOTTED, Cover, Marks, Words
-from ar.overlay.outlines import box_around, dash, ink_of, joined, outlines, silhouette
+from ar.overlay.outlines import compute_ink, compute_silhouette, draw_dashes, find_outlines, find_pixel_box, join_boxes
 from ar.overlay.styles import NOTICED, Opening, Style
 from ar.rendering.layer import Layer
-from ar.rendering.real_picture import real_picture
+from ar.rendering.real_picture import build_real_image
 
-from ..play.player import gauged
+from ..play.player import measure_gauge
 from ..play.stage import CORTEX, PREDICTED_LINES, TOOL, TOOL_COLOUR, Stage
 from ..script.uncertainty import DEVIATIONS
 from .follower import TrackingResult, TumourState
@@ -65,24 +65,24 @@ class Painter:
         before = self.stage.tumour_at_rest if known.motion.known and known.motion.moved > 0.0 else None
         doubt = "" if known.relied else known.words
         band = 0.0 if known.band is None else known.band
-        box = box_around(camera, tumour.vertices)
+        box = find_pixel_box(camera, tumour.vertices)
         if gauge is not None:
-            box = joined(box, box_around(camera, np.stack([gauge.tip, gauge.nearest])))
+            box = join_boxes(box, find_pixel_box(camera, np.stack([gauge.tip, gauge.nearest])))
         layers = [] if box is None else self._layers(known)
         whole = slice(0, camera.height), slice(0, camera.width)
-        picture = real_picture(colour, camera, layers, box or whole, self.device)
-        lines = [*head_lines(known), *self._hidden_words(camera, tumour, covered)]
-        head = [part for line in lines for part in folded(line, HEAD_WIDTHS[0] * camera.width)]
+        picture = build_real_image(colour, camera, layers, box or whole, self.device)
+        lines = [*format_head_lines(known), *self._hidden_words(camera, tumour, covered)]
+        head = [part for line in lines for part in wrap_line(line, HEAD_WIDTHS[0] * camera.width)]
         cover = Cover((TOOL,), SEEN_THROUGH, covered)
         words = Words(doubt, head, PREDICTED_LINES, (known.motion.moved, known.motion.error), known.band)
         return composite(picture, camera, tumour, self.style, cover, Marks(band, gauge, before), words)
 
     def _hidden_words(self, camera: Camera, tumour: Layer, covered: np.ndarray | None) -> Sequence[str]:
         """Describe the foreground's share of the tumour in the image, if it is noticeable."""
-        box = box_around(camera, tumour.vertices)
+        box = find_pixel_box(camera, tumour.vertices)
         if covered is None or box is None or self.style == "none":
             return ()
-        mask = silhouette(camera.cropped(*box), tumour.vertices, tumour.triangles)
+        mask = compute_silhouette(camera.crop_to(*box), tumour.vertices, tumour.triangles)
         hidden = np.count_nonzero(mask & covered[box])
         share = hidden / max(np.count_nonzero(mask), 1)
         return (f"{share:.0%} of the tumour is behind what lies in front",) if share >= NOTICED else ()
@@ -103,7 +103,7 @@ class Painter:
         """From the tool's tip to the tumour, with the error of both; None where one is not known."""
         if known.T_scan_tool is None or known.tip_covariance is None or known.band is None:
             return None
-        gauge = gauged(known.T_scan_tool[:3, 3], tumour)
+        gauge = measure_gauge(known.T_scan_tool[:3, 3], tumour)
         along = (gauge.nearest - gauge.tip) / max(gauge.distance, np.finfo(float).tiny)
         spread = DEVIATIONS * float(np.sqrt(along @ known.tip_covariance @ along))
         return Gauge(gauge.tip, gauge.nearest, error=float(np.hypot(spread, known.motion.error)))
@@ -120,14 +120,14 @@ class Painter:
         return over
 
     def _dot(self, over: Overlaid, camera: Camera, tumour: Layer) -> None:
-        box = box_around(camera, tumour.vertices)
+        box = find_pixel_box(camera, tumour.vertices)
         if box is None:
             return
-        mask = silhouette(camera.cropped(*box), tumour.vertices, tumour.triangles)
-        dash(over.colour[box], outlines(mask), ink_of(BEFORE), DOTTED)
+        mask = compute_silhouette(camera.crop_to(*box), tumour.vertices, tumour.triangles)
+        draw_dashes(over.colour[box], find_outlines(mask), compute_ink(BEFORE), DOTTED)
 
 
-def head_lines(known: TrackingResult) -> Sequence[str]:
+def format_head_lines(known: TrackingResult) -> Sequence[str]:
     """Describe the tumour position and its error, for the top of the image."""
     if known.band is None:
         return ()

@@ -6,8 +6,8 @@ import numpy as np
 
 from ar.optics.camera import Camera
 from ar.tracking.registration import Registration
-from ar.tracking.targets import patient_reference
-from sim.geometry.surface import encloses
+from ar.tracking.targets import build_patient_reference
+from sim.geometry.surface import is_enclosing
 
 from ..play.stage import Stage
 from .tracked_tool import TrackedTool
@@ -19,14 +19,14 @@ REACH, NEAR, DEEP = 0.3, 0.2, 0.03
 FAR = 1.0
 
 
-def implausible(registration: Registration, stage: Stage, camera: Camera) -> str:
+def describe_implausible(registration: Registration, stage: Stage, camera: Camera) -> str:
     """Say what is wrong with where a registration has the opening, as a camera sees it; empty: nothing."""
     opening = stage.site.origin
-    middle = 0.5 * np.array([*patient_reference().faces[0].size, 0.0])
+    middle = 0.5 * np.array([*build_patient_reference().faces[0].size, 0.0])
     away = float(np.linalg.norm(registration.point(opening)[0] - middle))
     if away > REACH:
         return f"the registration has the opening {1e3 * away:.0f} mm from the reference: is it another patient's?"
-    if camera.in_frame(opening[None])[0, 2] <= 0.0:
+    if camera.to_camera_frame(opening[None])[0, 2] <= 0.0:
         return "the registration has the opening behind the camera: is it another patient's?"
     return ""
 
@@ -37,19 +37,19 @@ def from_head(tip: np.ndarray, stage: Stage) -> float:
     return float(np.linalg.norm(tip - np.clip(tip, nodes.min(axis=0), nodes.max(axis=0))))
 
 
-def buried(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stage) -> str:
+def describe_penetration(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stage) -> str:
     """Say that a tool at a pose (4, 4) [m] is where none can be, with its tip or its markers deep inside; empty: no."""
     mesh = stage.anatomy.mesh
     corners = mesh.nodes[mesh.surface]
     for what, place in (("tip", np.zeros(3)), ("markers", np.linalg.inv(tool.T_cube_tool)[:3, 3])):
         point = T_scan_tool[:3, :3] @ place + T_scan_tool[:3, 3]
         depth = float(np.linalg.norm(corners.reshape(-1, 3) - point, axis=1).min())
-        if depth > DEEP and encloses(corners, point):
+        if depth > DEEP and is_enclosing(corners, point):
             return f"the tool's {what} would be {1e3 * depth:.0f} mm deep in the brain"
     return ""
 
 
-def misplaced_tool(
+def describe_misplaced_tool(
     tool: TrackedTool | None, T_scan_tool: np.ndarray, stage: Stage, near: bool, theirs: str
 ) -> tuple[str, bool]:
     """Say why a tool's pose (4, 4) [m] can be none on this patient, if so; and whether the tool has been near the head.
@@ -63,5 +63,5 @@ def misplaced_tool(
         return f"{never}: {theirs}", near
     if away > FAR:
         return f"the tool is {away:.1f} m from the head, which is not plausible: {theirs}", near
-    deep = "" if tool is None else buried(tool, T_scan_tool, stage)
+    deep = "" if tool is None else describe_penetration(tool, T_scan_tool, stage)
     return f"{deep}: {theirs}" if deep else "", near

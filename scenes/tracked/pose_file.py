@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ar.tracking.pose import Pose, Verdict
-from ar.tracking.pose_stream import PoseStream, stream_of
+from ar.tracking.pose_stream import PoseStream, build_pose_stream
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from surrogate.locating.observed_files import read_columns
 
 TIME, PLACE, TURN = "time_s", ("x_mm", "y_mm", "z_mm"), ("qx", "qy", "qz", "qw")
@@ -78,7 +78,7 @@ def read_stream(path: str | Path) -> PoseStream:
     if not _are_covariances(covariances[kept]):
         raise InputError(f"{path}: has a covariance that is none: mend it, or leave its columns out.")
     try:
-        return stream_of(times[kept], poses[kept], covariances[kept])
+        return build_pose_stream(times[kept], poses[kept], covariances[kept])
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -174,7 +174,7 @@ def write_poses(path: Path, rows: Iterable[TrackedRow], tip: np.ndarray) -> None
     `tip` (3,) [m] is the position of the tool's tip in its own frame. The covariance is of x, y, z [mm] and a small
     rotation about the body's origin in the axes of the frame [rad]: the upper triangle, row by row.
     """
-    with written_whole(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
+    with write_atomically(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow((TIME, "state", *PLACE, *TURN, *TIP, TIP_DEVIATION, *COVARIANCE, *LAST))
         for row in rows:

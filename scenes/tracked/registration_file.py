@@ -11,9 +11,9 @@ from ar.tracking.registration import Registration, Scanned
 from ar.tracking.rigid import is_rigid
 from sim.anatomy import Anatomy
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.file_limits import FARTHEST
-from sim.runtime.outside_files import path_of, read_as
+from sim.runtime.outside_files import read_as, to_path
 
 FORMAT = "sulcus registration 1"
 WANTED = "Make one by `sulcus register`."
@@ -37,7 +37,7 @@ def read_registration(path: str | Path) -> Registration:
     InputError
         No such file, another format, a transform that is not rigid, or a covariance that is none.
     """
-    path = path_of(path)
+    path = to_path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file. {WANTED}")
     with read_as(path, "a registration", WANTED):
@@ -69,7 +69,7 @@ def _scanned(stored: dict) -> Scanned:
     return Scanned(str(stored["anatomy"]), bounds, target)
 
 
-def scanned_of(anatomy: Anatomy) -> Scanned:
+def describe_scan(anatomy: Anatomy) -> Scanned:
     """Return the scan data of an anatomy for its registration; without a tumour the box's corners give the centre."""
     nodes = anatomy.mesh.nodes
     bounds = np.stack([nodes.min(axis=0), nodes.max(axis=0)])
@@ -77,7 +77,7 @@ def scanned_of(anatomy: Anatomy) -> Scanned:
     return Scanned(anatomy.digest, bounds, tumour.mean(axis=0))
 
 
-def other_mesh(registration: Registration, anatomy: Anatomy, path: str | Path) -> str:
+def describe_other_mesh(registration: Registration, anatomy: Anatomy, path: str | Path) -> str:
     """Say that a registration in a file was made for another mesh of the same scan, or that it does not say for which.
 
     Empty where it was made for this one.
@@ -87,7 +87,7 @@ def other_mesh(registration: Registration, anatomy: Anatomy, path: str | Path) -
     InputError
         One that was made for another body: its bounds or its tumour lie more than 5 mm from the anatomy's.
     """
-    made, here = registration.scanned, scanned_of(anatomy)
+    made, here = registration.scanned, describe_scan(anatomy)
     if made is None:
         return (
             f"{path} does not say of which anatomy it is: whether it is this patient's is not checked. "
@@ -145,5 +145,5 @@ def write_registration(path: str | Path, registration: Registration) -> None:
     InputError
         A file that cannot be written, or a name of another ending.
     """
-    with written_whole(path_of(path), ".json") as partial:
+    with write_atomically(to_path(path), ".json") as partial:
         partial.write_text(json.dumps(as_stored(registration), indent=1) + "\n", encoding="utf-8")

@@ -14,7 +14,7 @@ import numpy as np
 from ar.tracking.drawn import read_stamp
 from ar.tracking.pictures import Named
 from ar.tracking.pose_stream import DAY
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 
 from .follower import Follower, TrackingResult, TumourState
 from .picture import Painter
@@ -60,14 +60,14 @@ class Shown:
     latency: float | None = None
     stamped: bool = False
 
-    def without_picture(self) -> Shown:
+    def drop_image(self) -> Shown:
         """The same without its colours, which take memory."""
         return replace(self, colour=np.empty((0, 0, 3), np.uint8))
 
-    def without_mesh(self) -> Shown:
+    def drop_mesh(self) -> Shown:
         """The same without where the brain is, and without its colours."""
         motion = replace(self.known.motion, positions=np.empty((0, 3)), answer=None)
-        return replace(self.without_picture(), known=replace(self.known, motion=motion))
+        return replace(self.drop_image(), known=replace(self.known, motion=motion))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class Timed:
     covered: np.ndarray | None = None
 
 
-def timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> Iterator[Timed]:
+def read_timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> Iterator[Timed]:
     """Yield images with their time stamps, and with their masks: all that is not black is foreground.
 
     A 24-hour clock is continued at midnight.
@@ -115,7 +115,7 @@ def _mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
     return mask.grey >= (1 if mask.name.lower().endswith(".png") else FAINT)
 
 
-def paced(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
+def pace_images(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
     """Yield images like a live camera: the newest taken at the time of the request, and the moment [s] of its time 0.
 
     Images that arrive between requests are lost.
@@ -133,7 +133,7 @@ def paced(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
         waiting = newer
 
 
-def overlaid(film: Iterator[Timed], follower: Follower, painter: Painter, live: bool = False) -> Iterator[Shown]:
+def draw_overlay(film: Iterator[Timed], follower: Follower, painter: Painter, live: bool = False) -> Iterator[Shown]:
     """Yield every image with its overlay; `live`: in real time, so that late images are skipped and old ones marked.
 
     Raises
@@ -142,13 +142,13 @@ def overlaid(film: Iterator[Timed], follower: Follower, painter: Painter, live: 
         As `Follower.step`, and of the video.
     """
     known: TrackingResult | None = None
-    for taken, begun in paced(film) if live else ((each, None) for each in film):
-        shown = overlaid_one(taken, begun, known, follower, painter)
+    for taken, begun in pace_images(film) if live else ((each, None) for each in film):
+        shown = overlay_one(taken, begun, known, follower, painter)
         known = shown.known
         yield shown
 
 
-def overlaid_one(
+def overlay_one(
     taken: Timed, begun: float | None, before: TrackingResult | None, follower: Follower, painter: Painter
 ) -> Shown:
     """Compute one image with its overlay, from the result `before`.
@@ -163,7 +163,7 @@ def overlaid_one(
     arrived, picture = clock.perf_counter(), taken.picture
     assert picture.colour is not None
     known = follower.step(picture.grey, picture.time, before)
-    drawn = known if begun is None else aged(known, clock.perf_counter() - begun - picture.time)
+    drawn = known if begun is None else to_aged(known, clock.perf_counter() - begun - picture.time)
     colour = painter.paint(picture.colour, drawn, taken.covered).colour
     ready = clock.perf_counter()
     latency = None if begun is None else ready - begun - picture.time
@@ -171,14 +171,14 @@ def overlaid_one(
     return Shown(drawn, colour, ready - arrived, middle, latency, taken.stamped)
 
 
-def aged(known: TrackingResult, age: float) -> TrackingResult:
+def to_aged(known: TrackingResult, age: float) -> TrackingResult:
     """Return the result of an image of the given age [s]: it is stale beyond `OLD`."""
     if age <= OLD or not known.relied:
         return known
     return replace(known, state=TumourState.STALE, words=f"stale, the image is {age:.1f} s old: do not rely on it")
 
 
-def latencies(shown: list[Shown]) -> dict[str, object]:
+def summarise_latencies(shown: list[Shown]) -> dict[str, object]:
     """Compute median, 95th percentile and histogram [ms] of the latency of live images, or else of processing times."""
     live = [each.latency for each in shown if each.latency is not None]
     milliseconds = 1e3 * np.array(live or [each.seconds for each in shown])
@@ -200,7 +200,7 @@ def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[OverlayError
     sight.
     Four columns compare with the ground truth, if that is given; the last one names the space.
     """
-    with written_whole(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
+    with write_atomically(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(COLUMNS)
         table.writerows(_row(each, error) for each, error in zip(shown, errors, strict=True))

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ar.tracking.pictures import film_of, length_of
+from ar.tracking.pictures import count_frames, read_video
 
-from .run import Timed, timed
+from .run import Timed, read_timed
 
 
 @dataclass(eq=False)
@@ -18,7 +18,7 @@ class SeekableFilm:
     Parameters
     ----------
     path
-        Path, with errors, as of `ar.tracking.pictures.film_of`.
+        Path, with errors, as of `ar.tracking.pictures.read_video`.
     rate
         Frame rate of a folder [1/s].
     count
@@ -33,11 +33,11 @@ class SeekableFilm:
 
     def __post_init__(self) -> None:
         """Open it."""
-        self.count = length_of(self.path)
+        self.count = count_frames(self.path)
         self.film = self._from(0)
 
     def _from(self, number: int) -> Iterator[Timed]:
-        return timed(film_of(self.path, self.rate, colour=True, first=number))
+        return read_timed(read_video(self.path, self.rate, colour=True, first=number))
 
     def at(self, number: int) -> Timed | None:
         """Return an image by its number; None if the video ends before it, which `count` then gives."""

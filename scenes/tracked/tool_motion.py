@@ -9,10 +9,10 @@ import numpy as np
 from sim.deformation import Deformation, Deformer
 from sim.errors import InputError
 from sim.loads import Loads, Touching
-from surrogate.model.guarded import answering
+from surrogate.model.guarded import find_first_model
 from surrogate.model.learned import Learned
 
-from ..play.frame_text import doubt_of
+from ..play.frame_text import describe_outcome
 from ..play.stage import Stage
 from ..script.uncertainty import DEVIATIONS
 
@@ -85,9 +85,9 @@ class ToolMotion:
             return BrainMotion(self.rest.positions, doubt=REFUSED)
         vertices, rest = self.stage.tumour_vertices, self.rest.positions
         moved, beyond = (each.at(vertices).displacement[0] for each in (answer, further))
-        positions, doubt = rest.copy(), doubt_of(answer.outcome[0])
+        positions, doubt = rest.copy(), describe_outcome(answer.outcome[0])
         positions[answer.nodes] += answer.displacement[0]
-        model = answering(self.deformer, answer)
+        model = find_first_model(self.deformer, answer)
         bound = 0.0 if model is None else float(answer.bound[0, 0])
         if model is not None and not np.isfinite(bound):
             bound, doubt = (model.bound, doubt) if np.isfinite(model.bound) else (0.0, doubt or UNBOUND)

@@ -19,7 +19,7 @@ REST = "rest"
 """The deformer that lets the brain stay as in the scan."""
 
 
-def tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
+def build_tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
     """Build the scene of the brain: the tool, moved by pose, and the skull."""
     from sim.effects import SKULLS, Elasticity, Held, ToolContact
 
@@ -30,7 +30,7 @@ def tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
     return Scene(args.command, "A tracked tool.", effects=effects)
 
 
-def mover(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool) -> tuple[Deformer | None, str]:
+def build_mover(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool) -> tuple[Deformer | None, str]:
     """Select the deformer of the brain under a tracked tool, if there is one, with its description.
 
     Raises
@@ -45,7 +45,7 @@ def mover(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool
         return None, still
     name = args.deformer
     if name is None and not theatre.knowing(scene):
-        refused = next(iter(theatre.refusals(scene).values()), "there is none")
+        refused = next(iter(theatre.list_rejections(scene).values()), "there is none")
         said = f"no model says how the brain moves: {refused}. Give --deformer fem, or a model of the tool's poses"
         print(f"{args.program}: {said}", file=sys.stderr)
         name = REST

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from ar.tracking.rigid import is_rigid
-from ar.tracking.targets import TIP, tool_cube
+from ar.tracking.targets import TIP, build_tool_cube
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
-from sim.runtime.outside_files import path_of, read_as
-from sim.tools import BuiltIn, tool_from_text
+from sim.runtime.atomic_files import write_atomically
+from sim.runtime.outside_files import read_as, to_path
+from sim.tools import BuiltIn, parse_tool
 
-from ..script.tool import shafted
+from ..script.tool import add_shaft
 
 FORMAT = "sulcus tool 1"
 WANTED = "Give a tool of `sulcus film`, or one with format, shape, T_cube_tool and tip_covariance_mm2."
@@ -26,7 +26,7 @@ LONGEST = 100_000
 SQUARE, FARTHEST = 1e-3, 1.0
 
 
-def nominal() -> np.ndarray:
+def get_nominal() -> np.ndarray:
     """T_cube_tool (4, 4) of a cube whose axes are the tool's, the tip below its middle."""
     T = np.eye(4)
     T[2, 3] = -TIP
@@ -48,13 +48,13 @@ class TrackedTool:
     """
 
     shape: BuiltIn
-    T_cube_tool: np.ndarray = field(default_factory=nominal)
+    T_cube_tool: np.ndarray = field(default_factory=get_nominal)
     tip_covariance: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
 
     @cached_property
     def bare(self) -> tuple[np.ndarray, np.ndarray]:
         """Surface without the cube, which would occlude: vertices (n, 3) [m], triangles (m, 3)."""
-        return shafted(self.shape, np.linalg.inv(self.T_cube_tool)[:3, 3])
+        return add_shaft(self.shape, np.linalg.inv(self.T_cube_tool)[:3, 3])
 
     @cached_property
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
@@ -75,7 +75,7 @@ class TrackedTool:
 
 def _cube() -> tuple[np.ndarray, np.ndarray]:
     """The printed cube as a box in its own frame: corners (8, 3) [m], and triangles (12, 3)."""
-    half = float(max(abs(face.T_target_face[:3, 3]).max() for face in tool_cube().faces))
+    half = float(max(abs(face.T_target_face[:3, 3]).max() for face in build_tool_cube().faces))
     signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = [corner for a, b, c, d in quads for corner in ((a, b, c), (a, c, d))]
@@ -90,7 +90,7 @@ def read_tool(path: str | Path) -> TrackedTool:
     InputError
         A file that is missing or no such tool; a shape that is none, or a transform that is not rigid.
     """
-    path = path_of(path)
+    path = to_path(path)
     with read_as(path, "a tracked tool", WANTED):
         with path.open("rb") as file:
             stored = json.loads(file.read(LONGEST))
@@ -101,7 +101,7 @@ def read_tool(path: str | Path) -> TrackedTool:
         _demand_rigid(T)
         if covariance.shape != (3, 3) or not np.isfinite(covariance).all() or _least(covariance) < -1e-9:
             raise InputError(f"tip_covariance_mm2 is no covariance (3, 3). {WANTED}")
-        return TrackedTool(tool_from_text(str(stored["shape"])), T, 1e-6 * covariance)
+        return TrackedTool(parse_tool(str(stored["shape"])), T, 1e-6 * covariance)
 
 
 def _least(matrix: np.ndarray) -> float:
@@ -126,5 +126,5 @@ def write_tool(path: Path, tool: TrackedTool) -> None:
         "T_cube_tool": T.tolist(),
         "tip_covariance_mm2": (1e6 * tool.tip_covariance).tolist(),
     }
-    with written_whole(path, ".json") as partial:
+    with write_atomically(path, ".json") as partial:
         partial.write_text(json.dumps(stored, indent=1) + "\n", encoding="utf-8")

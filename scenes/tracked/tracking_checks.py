@@ -8,18 +8,18 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from ar.overlay.composite import HIDDEN, WARNING, doubt_lines
+from ar.overlay.composite import HIDDEN, WARNING, format_warning
 from ar.overlay.hud import FINE, WHITE
-from ar.overlay.outlines import ink_of, of_ink, outline_gap, silhouette, stands
+from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_text, measure_outline_gap
 from ar.overlay.styles import Style
 
 from ..play.picture_checks import SOFT
 from ..play.stage import TUMOUR_COLOUR
 from .drawn_film import DrawnFilm
-from .filming import VideoFrame, registered
+from .filming import VideoFrame, register_with_error
 from .follower import Follower, TrackingResult
 from .picture import Painter
-from .run import OLD, Timed, overlaid_one
+from .run import OLD, Timed, overlay_one
 from .tool_motion import ToolMotion
 
 # # Lost targets are searched in every third image, and then found. Maximum error of a drawn outline [pixel].
@@ -82,11 +82,11 @@ class Event:
     words: str = ""
 
 
-def events_of(film: DrawnFilm) -> Iterator[Event]:
+def replay_events(film: DrawnFilm) -> Iterator[Event]:
     """Yield the images of a video in order: one is repeated, one is delayed, and one comes after a gap."""
     before = 0.0
     for shot in film.shots:
-        covered = film.taking.happening(shot.time)
+        covered = film.taking.list_disturbances(shot.time)
         words = next((WORDS[kind] for kind in WORDS if kind in covered), "")
         if shot.time - before > OLD:
             words = STALE
@@ -97,10 +97,10 @@ def events_of(film: DrawnFilm) -> Iterator[Event]:
         before = shot.time
 
 
-def usual(film: DrawnFilm, style: Style = "window") -> tuple[Follower, Painter]:
+def build_default_pipeline(film: DrawnFilm, style: Style = "window") -> tuple[Follower, Painter]:
     """Build the default follower and painter for a video, with exact registration."""
     mounts, stage = film.mounts, film.stage
-    exact = registered(stage.site, mounts, 0.0, 0.0, 0)
+    exact = register_with_error(stage.site, mounts, 0.0, 0.0, 0)
     follower = Follower(film.calibration, exact, mounts.tool, ToolMotion(stage, film.deformer))
     return follower, Painter(stage, mounts.tool, style, stage.device)
 
@@ -109,12 +109,12 @@ def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> T
     """Track a video, draw the results, and detect in the images what they show."""
     known: TrackingResult | None = None
     confident, unsaid, waits, worst, waiting, count = 0, 0, [0], 0.0, True, 0
-    for event in events_of(film):
+    for event in replay_events(film):
         count += 1
         begun = clock.perf_counter() - event.shot.time - event.late if event.late else None
-        shown = overlaid_one(Timed(film.picture(event.shot), True), begun, known, follower, painter)
+        shown = overlay_one(Timed(film.picture(event.shot), True), begun, known, follower, painter)
         known = shown.known
-        drawn = bool(np.count_nonzero(of_ink(shown.colour, ink_of(TUMOUR_COLOUR))) >= NO_LINE)
+        drawn = bool(np.count_nonzero(find_ink(shown.colour, compute_ink(TUMOUR_COLOUR))) >= NO_LINE)
         if event.words:
             confident += drawn
             unsaid += not _says(shown.colour, known.words, event.words)
@@ -131,14 +131,14 @@ def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> T
 
 def _says(colour: np.ndarray, words: str, wanted: str) -> bool:
     """Return True if text that begins as wanted is found in an image."""
-    lines = doubt_lines(words, colour.shape[1])
-    return words.startswith(wanted) and all(stands(colour, line, FINE, ink_of(WARNING)) for line in lines)
+    lines = format_warning(words, colour.shape[1])
+    return words.startswith(wanted) and all(has_text(colour, line, FINE, compute_ink(WARNING)) for line in lines)
 
 
 def _off(film: DrawnFilm, shot: VideoFrame, colour: np.ndarray) -> float:
     """Compute the distance between the outline in an image and the true one [pixel]."""
     camera, rest = film.calibration.camera(shot.T_camera_scan), film.stage.tumour_at_rest
-    mask = silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
-    tool = silhouette(camera, *film.mounts.tool.at(shot.T_scan_tool))
-    words = of_ink(colour, WHITE, 0)
-    return outline_gap(colour, ink_of(TUMOUR_COLOUR), mask, tool | words, gap=HIDDEN[1] + SOFT)
+    mask = compute_silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
+    tool = compute_silhouette(camera, *film.mounts.tool.at(shot.T_scan_tool))
+    words = find_ink(colour, WHITE, 0)
+    return measure_outline_gap(colour, compute_ink(TUMOUR_COLOUR), mask, tool | words, gap=HIDDEN[1] + SOFT)

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from ar.optics.calibration import Calibration
-from ar.overlay.outlines import iou, silhouette
+from ar.overlay.outlines import compute_iou, compute_silhouette
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.file_limits import LARGEST_FILM
-from sim.runtime.outside_files import path_of, read_as
+from sim.runtime.outside_files import read_as, to_path
 from surrogate.model.npz_archive import Archive
 
 from ..play.stage import Stage
@@ -60,7 +60,7 @@ class VideoGroundTruth:
 
 def write_truth(path: Path, truth: VideoGroundTruth) -> None:
     """Write a truth as .npz; it appears whole or not at all."""
-    with written_whole(path, ".npz") as partial, partial.open("wb") as file:
+    with write_atomically(path, ".npz") as partial, partial.open("wb") as file:
         np.savez_compressed(
             file,
             header=np.array(json.dumps({"format": FORMAT, "anatomy": truth.anatomy, "spaces": SPACES})),
@@ -81,7 +81,7 @@ def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LAR
     InputError
         A file that is missing or no such truth, or of another body.
     """
-    path = path_of(path)
+    path = to_path(path)
     with read_as(path, "the ground truth of a video", WANTED), path.open("rb") as raw:
         archive = Archive(raw, WANTED, largest)
         header = json.loads(archive.text("header"))
@@ -106,7 +106,7 @@ def write_table(path: Path, truth: VideoGroundTruth, rest: np.ndarray) -> None:
     Poses are rows of 12 numbers, of the matrix from the scan to the camera, and from the tool to the scan [mm].
     """
     names = [f"{what}_{row}{column}" for what in COLUMNS for row in range(3) for column in range(4)]
-    with written_whole(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
+    with write_atomically(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(("time_s", "tumour_x_mm", "tumour_y_mm", "tumour_z_mm", "moved_mm", *names, "space"))
         for number, time in enumerate(truth.times):
@@ -138,7 +138,9 @@ class OverlayError:
     held: bool
 
 
-def off(known: TrackingResult, truth: VideoGroundTruth, calibration: Calibration, stage: Stage) -> OverlayError | None:
+def compute_overlay_error(
+    known: TrackingResult, truth: VideoGroundTruth, calibration: Calibration, stage: Stage
+) -> OverlayError | None:
     """Compute the error of a tracking result; None if no position is drawn, or without ground truth at its time."""
     row = truth.at(known.time)
     if row is None or known.camera is None:
@@ -146,13 +148,13 @@ def off(known: TrackingResult, truth: VideoGroundTruth, calibration: Calibration
     camera, triangles = calibration.camera(truth.T_camera_scan[row]), stage.tumour_at_rest.triangles
     true = stage.tumour_at_rest.vertices + truth.displacement[row]
     here = known.motion.positions[stage.tumour_vertices]
-    masks = silhouette(camera, true, triangles), silhouette(known.camera, here, triangles)
-    seen, apart = camera.in_frame(true), known.camera.in_frame(here) - camera.in_frame(true)
+    masks = compute_silhouette(camera, true, triangles), compute_silhouette(known.camera, here, triangles)
+    seen, apart = camera.to_camera_frame(true), known.camera.to_camera_frame(here) - camera.to_camera_frame(true)
     across = _across(apart, seen)
     middle = float(_across(apart.mean(axis=0)[None], seen.mean(axis=0)[None])[0])
     return OverlayError(
         _between(*masks),
-        iou(*masks),
+        compute_iou(*masks),
         middle,
         float(across.max()),
         known.band is not None and across.max() <= known.band,
@@ -174,7 +176,7 @@ def _between(true: np.ndarray, drawn: np.ndarray) -> float:
     return float(max(there[edges[1]].mean(), back[edges[0]].mean()))
 
 
-def summary(known: Sequence[TrackingResult], errors: Sequence[OverlayError | None]) -> dict[str, object]:
+def summarise_errors(known: Sequence[TrackingResult], errors: Sequence[OverlayError | None]) -> dict[str, object]:
     """Compute medians and 95th percentiles over images whose tumour is drawn as known; number of wrong ones."""
     relied = [(each, error) for each, error in zip(known, errors, strict=True) if each.relied and error is not None]
     if not relied:

@@ -8,7 +8,7 @@ from ar.overlay.composite import DOUBTFUL
 from ar.overlay.gauge import Gauge
 from ar.overlay.hud import bound_words
 
-from ..page.text import RESEARCH, keyed, stroked, tip_words, unbroken
+from ..page.text import RESEARCH, format_legend, format_tip_distance, format_unbroken, to_stroke
 from ..play.stage import TUMOUR_COLOUR
 from .follower import TrackingResult, TumourState
 from .run import Shown
@@ -20,9 +20,9 @@ DRAWN = {
 }
 
 
-def about(name: str, who: str, tooled: bool) -> str:
+def describe_overlay(name: str, who: str, tooled: bool) -> str:
     """Describe the image: its source, the meaning of the lines, and the deformation model."""
-    now, doubt = stroked(TUMOUR_COLOUR), stroked(DOUBTFUL)
+    now, doubt = to_stroke(TUMOUR_COLOUR), to_stroke(DOUBTFUL)
     keys = [
         (f'{now} stroke-width="3"', "tumour now"),
         (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone"),
@@ -36,7 +36,7 @@ def about(name: str, who: str, tooled: bool) -> str:
         "tool are tracked in each image."
     )
     return (
-        f"<p>{seen} <b>{RESEARCH}</b></p>{keyed(keys)}<p>Motion of the brain by {escape(who)}.</p>"
+        f"<p>{seen} <b>{RESEARCH}</b></p>{format_legend(keys)}<p>Motion of the brain by {escape(who)}.</p>"
         '<p class="dim">A scene in its place: <code>sulcus demo</code>.</p>'
     )
 
@@ -47,7 +47,7 @@ def report(shown: Shown, gauge: Gauge | None, tooled: bool, place: str) -> str:
     `place` names the image.
     """
     known = shown.known
-    parts = [distance_words(gauge, known.relied)] if tooled else []
+    parts = [format_distance(gauge, known.relied)] if tooled else []
     doubt = f'<p class="warn">{escape(known.words)}</p>'
     parts.append(f"<p><b>{DRAWN[known.state]}</b></p>" if known.relied else doubt)
     parts += [overlay_error(known), PATIENT_ERROR]
@@ -55,18 +55,20 @@ def report(shown: Shown, gauge: Gauge | None, tooled: bool, place: str) -> str:
     tool = "seen" if known.T_scan_tool is not None else "not seen" if placed else "not placed without the reference"
     facts = [place, f"reference {'seen' if placed else 'not seen'}", *([f"tool {tool}"] if tooled else [])]
     if known.motion.known and known.relied:
-        facts.append(f"tumour moved {unbroken(known.motion.moved, known.motion.error)} (error of model and tool)")
+        facts.append(
+            f"tumour moved {format_unbroken(known.motion.moved, known.motion.error)} (error of model and tool)"
+        )
     took = f"looked at and drawn in {1e3 * shown.seconds:.0f} ms"
     if shown.latency is not None:
         took += f"; shown {1e3 * shown.latency:.0f} ms after it was taken"
     return "".join([*parts, f"<p>{'; '.join(facts)}</p>", f'<p class="dim">{took}</p>'])
 
 
-def distance_words(gauge: Gauge | None, relied: bool) -> str:
+def format_distance(gauge: Gauge | None, relied: bool) -> str:
     """The distance from tip to tumour with its error, where there is one that may be relied on."""
     if gauge is None:
         return '<p class="number">tip to tumour: not known</p>'
-    return tip_words(gauge.distance, gauge.error if relied else None, gauge.inside)
+    return format_tip_distance(gauge.distance, gauge.error if relied else None, gauge.inside)
 
 
 def overlay_error(known: TrackingResult) -> str:

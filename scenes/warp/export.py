@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from sim.errors import InputError
-from sim.fields.warp_fields import WarpFields, faded, faint_of, forward_on, warp_grid
+from sim.fields.warp_fields import WarpFields, compute_faint_threshold, forward_on, remove_faint, warp_grid
 
 from .images import PatientImage, Warped, write_field_nifti, write_warped
-from .landmarks import CENTROID, Landmark, centroid_now
+from .landmarks import CENTROID, Landmark, compute_centroid
 from .markups import write_markups
-from .meshes import mesh_of, write_glb, write_stl, write_vtp
+from .meshes import build_surface_mesh, write_glb, write_stl, write_vtp
 from .moment import DeformedAnatomy
 from .nrrd_files import write_field_nrrd, write_field_sequence, write_segmentation
-from .places import ENOUGH, Folded, SamplePlaces, fields_of, folds_of, places_of
-from .readme import page
+from .places import ENOUGH, Folded, SamplePlaces, find_folds, list_fields, list_places
+from .readme import write_readme
 
 LOOKS = {
     "brain": (0.86, 0.72, 0.66, 0.35),
@@ -40,7 +40,7 @@ SEQUENCE_SPACING, MOST_NUMBERS = 3e-3, 400_000_000
 
 @dataclass(frozen=True)
 class WarpSettings:
-    """Settings of fields and images: spacing of the fields [m] (None: as `fields_of`), and interpolation of images.
+    """Settings of fields and images: spacing of the fields [m] (None: as `list_fields`), and interpolation of images.
 
     `source` is the name of the anatomy's file; `step` receives the number of newly finished parts.
     """
@@ -58,17 +58,17 @@ def write_warp(
     asked: WarpSettings,
     sequence: Sequence[tuple[float, DeformedAnatomy]],
 ) -> dict[str, Any]:
-    """Write a moment into the folder that `written_folder` yields, and moments of a `sequence` with their times [s].
+    """Write a moment into the folder that `write_folder_atomically` yields, and moments of a `sequence` with their times [s].
 
     Returns the figures.
 
     Raises
     ------
     InputError
-        As `fields_of`; a sequence that is too long.
+        As `list_fields`; a sequence that is too long.
     """
     begun = process_time()
-    fields = fields_of(moment, asked.spacing, asked.step)
+    fields = list_fields(moment, asked.spacing, asked.step)
     seconds = process_time() - begun
     write_field_nifti(place / "field_resampling.nii.gz", fields.grid, fields.backward)
     write_field_nrrd(place / "field_modeling.nrrd", fields.grid, fields.forward, "modeling")
@@ -81,16 +81,16 @@ def write_warp(
         warped.append(write_warped(place, picture, fields, asked.order))
         asked.step(1)
     _write_surfaces(place, moment)
-    places = places_of(moment)
+    places = list_places(moment)
     _write_points(place, moment, places.marks)
     asked.step(1)
-    report = figures(moment, fields, places, warped, len(sequence))
+    report = collect_figures(moment, fields, places, warped, len(sequence))
     report["fields_cpu_s"] = round(seconds, 1)
     report["anatomy"] = {"file": asked.source, "digest": moment.anatomy.digest}
-    (place / "README.txt").write_text(page(report, warped))
+    (place / "README.txt").write_text(write_readme(report, warped))
     files = sorted(path.name for path in place.iterdir())
     sums = {name: _sha256(place / name) for name in files}
-    report = {"format": "sulcus warp 1", "files": files, "spaces": spaces(files), "sha256": sums, **report}
+    report = {"format": "sulcus warp 1", "files": files, "spaces": describe_spaces(files), "sha256": sums, **report}
     (place / "warp.json").write_text(json.dumps(report, indent=1) + "\n")
     return report
 
@@ -108,7 +108,9 @@ def _write_surfaces(place: Path, moment: DeformedAnatomy) -> None:
     }
     nodes = moment.anatomy.mesh.nodes
     meshes = [
-        mesh_of(name, which, nodes, moment.displacement, LOOKS[name]) for name, which in triangles.items() if len(which)
+        build_surface_mesh(name, which, nodes, moment.displacement, LOOKS[name])
+        for name, which in triangles.items()
+        if len(which)
     ]
     for mesh in meshes:
         write_vtp(place / f"{mesh.name}.vtp", mesh)
@@ -117,7 +119,7 @@ def _write_surfaces(place: Path, moment: DeformedAnatomy) -> None:
 
 
 def _write_points(place: Path, moment: DeformedAnatomy, marks: Sequence[Landmark]) -> None:
-    points = named_points(moment, marks)
+    points = name_points(moment, marks)
     if points:
         write_markups(place / "landmarks.mrk.json", "Fiducial", points)
     gap = moment.gap()
@@ -128,19 +130,19 @@ def _write_points(place: Path, moment: DeformedAnatomy, marks: Sequence[Landmark
         write_segmentation(place / "tumour.seg.nrrd", moment.now, tumour, moment.bound)
 
 
-def named_points(moment: DeformedAnatomy, marks: Sequence[Landmark]) -> dict[str, np.ndarray]:
+def name_points(moment: DeformedAnatomy, marks: Sequence[Landmark]) -> dict[str, np.ndarray]:
     """Points (3,) [m] by name: of tissue in the scan and now, the tumour's centroid now, and the tool's tip."""
     points = {}
     for one in marks:
         points |= {f"{one.name}, in the scan": one.rest, f"{one.name}, now": one.now}
-    centroid = centroid_now(moment.left, moment.displacement)
+    centroid = compute_centroid(moment.left, moment.displacement)
     others = {CENTROID: centroid, "tip": moment.tip}
     return points | {name: point for name, point in others.items() if point is not None}
 
 
 def _write_sequence(path: Path, sequence: Sequence[tuple[float, DeformedAnatomy]]) -> None:
     anatomy = sequence[0][1].anatomy
-    moved = np.stack([faded(moment.displacement) for _, moment in sequence])
+    moved = np.stack([remove_faint(moment.displacement) for _, moment in sequence])
     grid = warp_grid(anatomy, moved, SEQUENCE_SPACING)
     if 3 * np.prod(grid.shape) * len(sequence) > MOST_NUMBERS:
         raise InputError(f"--sequence: {len(sequence)} moments are too many. Give a larger step.")
@@ -149,7 +151,7 @@ def _write_sequence(path: Path, sequence: Sequence[tuple[float, DeformedAnatomy]
     write_field_sequence(path, grid, fields, [time for time, _ in sequence])
 
 
-def spaces(files: Sequence[str]) -> dict[str, str]:
+def describe_spaces(files: Sequence[str]) -> dict[str, str]:
     """In which space each file's coordinates are; `cause` is of those in `warp.json`."""
     known = {"field_resampling.nii.gz": "RAS, mm", "deformed.glb": "left, head, front, m"}
     endings = {".nii.gz": "that of the image", ".txt": ""}
@@ -157,7 +159,7 @@ def spaces(files: Sequence[str]) -> dict[str, str]:
     return {"cause": "RAS, mm", **{name: space for name, space in found.items() if space}}
 
 
-def figures(
+def collect_figures(
     moment: DeformedAnatomy, fields: WarpFields, places: SamplePlaces, warped: Sequence[Warped], frames: int
 ) -> dict[str, Any]:
     """Collect the report of a warp: millimetres, shares, counts of voxels, and warnings."""
@@ -165,7 +167,7 @@ def figures(
     moving = np.linalg.norm(places.moved, axis=1) > MOVED
     gap, largest = moment.gap(), 1e3 * float(np.linalg.norm(moment.displacement, axis=1).max())
     of_tumour = _errors(error[places.tumour])
-    folds = folds_of(moment, fields)
+    folds = find_folds(moment, fields)
     return {
         "moved_by": moment.cause.words,
         "cause": dict(moment.cause.record),
@@ -177,7 +179,7 @@ def figures(
         "spacing_mm": round(1e3 * fields.grid.spacing, 6),
         "nodes": list(fields.grid.shape),
         "reach_mm": 1e3 * fields.reach,
-        "faint_mm": 1e3 * faint_of(moment.displacement),
+        "faint_mm": 1e3 * compute_faint_threshold(moment.displacement),
         "least_jacobian": dict(zip(("modeling", "resampling", "tetrahedra"), fields.least, strict=True)),
         "grid_error_mm": {
             "median": float(np.median(error)),

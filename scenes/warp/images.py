@@ -11,7 +11,7 @@ from nibabel.arrayproxy import ArrayProxy
 from scipy import ndimage
 
 from sim.anatomy import Anatomy
-from sim.bodies.label_map import are_whole
+from sim.bodies.label_map import has_whole_numbers
 from sim.bodies.nifti import load_nifti
 from sim.bodies.volume import READERS, Volume, read_volume
 from sim.bodies.voxels import LPS, Voxels
@@ -44,13 +44,13 @@ STILL = 1e-8
 TOGETHER = 8
 
 
-def shown(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float:
+def measure_shown_share(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float:
     """The share by volume of a brain that lies within voxels (I, J, K), whose affine leads to metres (RAS)."""
     _, inside = _voxels(affine, shape, _middles(anatomy))
     return float(np.average(inside, weights=anatomy.mesh.volumes))
 
 
-def doubts(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy: Anatomy) -> list[str]:
+def list_warnings(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy: Anatomy) -> list[str]:
     """List warnings, as predicates, about an image (I, J, K) that shows a part of a brain."""
     found, middles, volumes = [], _middles(anatomy), anatomy.mesh.volumes
     index, inside = _voxels(affine, values.shape, middles)
@@ -157,15 +157,15 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> 
     volume = read_volume(path, Voxels(axes=axes), finite=False)
     image = _as_nifti(path, volume)
     values = volume.values
-    if labels and not are_whole(values):
+    if labels and not has_whole_numbers(values):
         raise InputError(f"{path}: holds values that are not whole, so it is no label map. Give it by --image.")
-    if shown(volume.affine, values.shape, anatomy) == 0.0:
+    if measure_shown_share(volume.affine, values.shape, anatomy) == 0.0:
         low, high = (1e3 * end for end in (anatomy.mesh.nodes.min(axis=0), anatomy.mesh.nodes.max(axis=0)))
         raise InputError(
             f"{path}: shows none of this brain, which reaches from {_mm(low)} to {_mm(high)} mm (RAS). Give an image "
             "in the space of the labels that the anatomy was made from, or register it to them first."
         )
-    warnings = [*volume.notes, *doubts(values, volume.affine, labels, anatomy)]
+    warnings = [*volume.notes, *list_warnings(values, volume.affine, labels, anatomy)]
     return PatientImage(path, image, volume, labels, tuple(warnings))
 
 
@@ -182,7 +182,7 @@ def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
     return made
 
 
-def warped_name(path: Path) -> str:
+def to_warped_name(path: Path) -> str:
     """The name of a warped image: that of its file, with `_deformed`."""
     ending = next((end for end in SUFFIXES if path.name.lower().endswith(end)), "")
     return f"{path.name[: len(path.name) - len(ending)]}_deformed.nii.gz"
@@ -199,14 +199,14 @@ def write_warped(folder: Path, picture: PatientImage, fields: WarpFields, order:
     if isinstance(proxy, ArrayProxy):
         proxy, slope, shift = proxy.get_unscaled(), float(proxy.slope), float(proxy.inter)
     stored = np.asanyarray(proxy).reshape(shape)
-    values, counts = warped_values(stored, picture.volume.affine, fields, 0 if picture.labels else ORDERS[order])
+    values, counts = warp_values(stored, picture.volume.affine, fields, 0 if picture.labels else ORDERS[order])
     blank = 0.0 if shift == 0.0 else -shift / slope
     if blank:
         values[counts.blank] = np.rint(blank) if values.dtype.kind in "iu" else blank
     out = nibabel.Nifti1Image(values.reshape(image.shape), None, image.header)
     if (slope, shift) != (1.0, 0.0):
         out.header.set_slope_inter(slope, shift)
-    name = warped_name(picture.path)
+    name = to_warped_name(picture.path)
     nibabel.save(out, folder / name)
     return Warped(name, counts.moved, counts.outside, counts.gone)
 
@@ -221,7 +221,7 @@ class Counts:
     blank: np.ndarray
 
 
-def warped_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, order: int) -> tuple[np.ndarray, Counts]:
+def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, order: int) -> tuple[np.ndarray, Counts]:
     """Values (I, J, K), whose affine leads to metres (RAS), as the fields move them, of the same type.
 
     Voxels that do not move keep their value exactly.

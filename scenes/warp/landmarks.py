@@ -8,10 +8,10 @@ import numpy as np
 
 from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
-from sim.geometry.closest_point import closest
+from sim.geometry.closest_point import find_closest_points
 from sim.geometry.locate import locate
-from sim.geometry.tetmesh import signed_volumes
-from surrogate.locating.prior import tumour_share
+from sim.geometry.tetmesh import compute_signed_volumes
+from surrogate.locating.prior import compute_tumour_share
 
 TUMOUR, NEAREST, CORTEX = "tumour", "tumour, nearest to its centroid", "open cortex"
 CENTROID = "centroid of the tumour now"
@@ -36,20 +36,20 @@ class Landmark:
     now: np.ndarray
 
 
-def landmarks_of(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, ...]:
+def list_landmarks(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, ...]:
     """Points of tissue of the tumour and of the open cortex, where a body has them, as (V, 3) [m] displaces them.
 
     They move linearly in their tetrahedron or triangle, as the fields do.
     """
     mesh, found = body.mesh, []
     if body.in_tumour.any():
-        point = tumour_share(body) @ mesh.nodes
+        point = compute_tumour_share(body) @ mesh.nodes
         at = locate(mesh, point[None])
         if np.linalg.norm(at.read(mesh.nodes[None])[0, 0] - point) < ROUNDING:
             found.append(Landmark(TUMOUR, point, point + at.read(displacement[None])[0, 0]))
         else:
             triangles = body.tumour_surface
-            (rest,), (triangle,), (weights,) = closest(point[None], mesh.nodes[triangles])
+            (rest,), (triangle,), (weights,) = find_closest_points(point[None], mesh.nodes[triangles])
             found.append(Landmark(NEAREST, rest, rest + weights @ displacement[triangles[triangle]]))
     if len(body.open_surface):
         cortex = open_cortex(body)
@@ -58,10 +58,10 @@ def landmarks_of(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, ...
     return tuple(found)
 
 
-def centroid_now(body: Anatomy, displacement: np.ndarray) -> np.ndarray | None:
+def compute_centroid(body: Anatomy, displacement: np.ndarray) -> np.ndarray | None:
     """The centroid (3,) [m] of the tumour's volume as it is now; None without a tumour."""
     tumour = body.mesh.tets[body.in_tumour]
     if not len(tumour):
         return None
     now = body.mesh.nodes + displacement
-    return np.average(now[tumour].mean(axis=1), axis=0, weights=signed_volumes(now, tumour))
+    return np.average(now[tumour].mean(axis=1), axis=0, weights=compute_signed_volumes(now, tumour))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.geometry.surface import vertex_normals
+from sim.geometry.surface import compute_vertex_normals
 
 from .nrrd_files import LPS
 
@@ -34,7 +34,7 @@ class NamedSurface:
     colour: tuple[float, float, float, float]
 
 
-def mesh_of(
+def build_surface_mesh(
     name: str, triangles: np.ndarray, nodes: np.ndarray, moved: np.ndarray, colour: tuple[float, float, float, float]
 ) -> NamedSurface:
     """The surface of some triangles of a body's nodes (V, 3) [m], moved by (V, 3) [m], without other vertices."""
@@ -97,7 +97,7 @@ def write_glb(path: Path, meshes: Sequence[NamedSurface]) -> None:
     data, views, accessors, parts = b"", [], [], []
     for mesh in meshes:
         place = (mesh.vertices @ TO_GLTF.T).astype("<f4")
-        normals = vertex_normals(place.astype(np.float64), mesh.triangles).astype("<f4")
+        normals = compute_vertex_normals(place.astype(np.float64), mesh.triangles).astype("<f4")
         for values, target in ((place, VERTICES), (normals, VERTICES), (mesh.triangles.astype("<u4"), INDICES)):
             views.append({"buffer": 0, "byteOffset": len(data), "byteLength": values.nbytes, "target": target})
             view = {"bufferView": len(views) - 1}

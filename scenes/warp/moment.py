@@ -15,15 +15,15 @@ from sim.bodies.meshfile import read_mesh
 from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.geometry.closest_point import closest
-from sim.geometry.surface import encloses
+from sim.geometry.closest_point import find_closest_points
+from sim.geometry.surface import is_enclosing
 from sim.loads import Loads, Pushed
 from sim.resected_fem import OperatedFem
 from surrogate.locating.calibration import RADIUS_SQUARED
 
 from ..play.deformers import AtRest, Theatre
 from ..play.player import Player
-from ..play.reference import past_matters, truth_of
+from ..play.reference import is_history_dependent, solve_reference_frames
 from ..play.stage import Stage
 from ..script.scene import Scene
 
@@ -45,7 +45,7 @@ class Cause:
         return replace(self, words=f"{self.words}, by {solver}")
 
 
-def scene_cause(scene: Scene, number: int) -> Cause:
+def play_scene_cause(scene: Scene, number: int) -> Cause:
     """A moment of a scene, by the number of its frame."""
     time = float(scene.times[number])
     record = {"kind": "scene", "scene": scene.name, "frame": number, "time_s": time}
@@ -71,7 +71,7 @@ def load_cause(loads: Loads) -> Cause:
     return Cause(words, record)
 
 
-def file_cause(path: Path) -> Cause:
+def read_file_cause(path: Path) -> Cause:
     """A displacement that a file holds."""
     return Cause(f"displacement of {path.name}", {"kind": "file", "file": path.name})
 
@@ -120,8 +120,8 @@ class DeformedAnatomy:
         if self.tip is None or not len(triangles):
             return None
         corners = self.now[triangles]
-        point = closest(self.tip[None], corners).point[0]
-        return point, 0.0 if encloses(corners, self.tip) else float(np.linalg.norm(point - self.tip))
+        point = find_closest_points(self.tip[None], corners).point[0]
+        return point, 0.0 if is_enclosing(corners, self.tip) else float(np.linalg.norm(point - self.tip))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +137,10 @@ class Played:
     ) -> list[DeformedAnatomy]:
         """The moments of some frames, in rising order."""
         fem = self.theatre.fem(self.scene, TRAIN, 1, live=True)
-        needed = range(frames[-1] + 1) if past_matters(fem) else frames
-        answers = truth_of(self.theatre, self.scene, [self._loads(number) for number in needed], progress, fem)
+        needed = range(frames[-1] + 1) if is_history_dependent(fem) else frames
+        answers = solve_reference_frames(
+            self.theatre, self.scene, [self._loads(number) for number in needed], progress, fem
+        )
         rows = {number: row for row, number in enumerate(needed)}
         return [self._moment(number, answers.rows(np.array([rows[number]])), fem) for number in frames]
 
@@ -157,7 +159,7 @@ class Played:
         known = self.theatre.uncertainty(scene)
         bound = None if known is None else known.at(time).prior
         loads = self._loads(number)
-        cause = load_cause(loads) if self.load else scene_cause(scene, number)
+        cause = load_cause(loads) if self.load else play_scene_cause(scene, number)
         said = {} if bound is None else {"bound_words": ENSEMBLE}
         left = stage.at(loads).anatomy
         return DeformedAnatomy(
@@ -184,7 +186,7 @@ def read_moment(path: Path, anatomy: Anatomy) -> DeformedAnatomy:
     same = file.mesh.nodes.shape == mesh.nodes.shape and np.array_equal(file.mesh.tets, mesh.tets)
     if not same or np.abs(file.mesh.nodes - mesh.nodes).max() > SAME:
         raise InputError(f"{path}: is of another mesh than the anatomy. Give the anatomy that it was made with.")
-    cause = file_cause(path)
+    cause = read_file_cause(path)
     if "covariance" not in file.point_data:
         return DeformedAnatomy(cause, anatomy, anatomy, np.asarray(moved, np.float64))
     xx, yy, zz, xy, yz, xz = np.asarray(file.point_data["covariance"])[np.unique(anatomy.tumour_surface)].T

@@ -10,8 +10,8 @@ import numpy as np
 from scipy import ndimage
 
 from sim.bodies.voxels import LPS
-from sim.fields.grid import Grid, grid_around
-from sim.fields.in_tetrahedra import in_tetrahedra
+from sim.fields.grid import Grid, build_grid_around
+from sim.fields.in_tetrahedra import interpolate_in_tetrahedra
 
 TYPES = {"f4": "float", "u1": "unsigned char"}
 # Lowest compression level: more hardly reduces floats.
@@ -104,8 +104,8 @@ def write_segmentation(path: Path, nodes: np.ndarray, tets: np.ndarray, bound: f
 
     The shell is all outside the tumour that is no farther from it: of its surface's place, not of its size.
     """
-    grid = grid_around(nodes[np.unique(tets)], VOXEL, (bound or 0.0) + MARGIN)
-    inside = in_tetrahedra(grid, nodes, tets, np.zeros_like(nodes))[1]
+    grid = build_grid_around(nodes[np.unique(tets)], VOXEL, (bound or 0.0) + MARGIN)
+    inside = interpolate_in_tetrahedra(grid, nodes, tets, np.zeros_like(nodes))[1]
     labels = np.where(inside, TUMOUR, 0).astype(np.uint8)
     names = {TUMOUR: "tumour"}
     if bound is not None:

@@ -12,9 +12,9 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, warp_fields, warp_grid
-from sim.geometry.tetmesh import signed_volumes
+from sim.geometry.tetmesh import compute_signed_volumes
 
-from .landmarks import Landmark, landmarks_of
+from .landmarks import Landmark, list_landmarks
 from .moment import DeformedAnatomy
 
 # Weights of corners at the places between vertices: of a tetrahedron, of a triangle. No field is fitted there.
@@ -58,10 +58,10 @@ class SamplePlaces:
         return np.maximum(np.linalg.norm(forward, axis=1), np.linalg.norm(backward, axis=1))
 
 
-def places_of(moment: DeformedAnatomy) -> SamplePlaces:
+def list_places(moment: DeformedAnatomy) -> SamplePlaces:
     """Vertices of what is left of a body, four places in each tetrahedron, three on each open triangle, landmarks."""
     body, mesh = moment.left, moment.left.mesh
-    used, marks = np.unique(mesh.tets), landmarks_of(body, moment.displacement)
+    used, marks = np.unique(mesh.tets), list_landmarks(body, moment.displacement)
     within, on = len(WITHIN) * len(mesh.tets), len(ON) * len(body.open_surface)
     part = np.repeat(np.arange(4), [len(used), within, on, len(marks)])
 
@@ -90,38 +90,38 @@ class Folded:
     off: float
 
 
-def folds_of(moment: DeformedAnatomy, fields: WarpFields) -> tuple[Folded, ...]:
+def find_folds(moment: DeformedAnatomy, fields: WarpFields) -> tuple[Folded, ...]:
     """Find places where FEM folds, largest first."""
     mesh = moment.left.mesh
-    bad = mesh.tets[signed_volumes(mesh.nodes + moment.displacement, mesh.tets) <= 0.0]
+    bad = mesh.tets[compute_signed_volumes(mesh.nodes + moment.displacement, mesh.tets) <= 0.0]
     if not len(bad):
         return ()
     count = len(bad)
     sides = np.repeat(np.arange(count), 4), count + bad.ravel()
     graph = coo_matrix((np.ones(4 * count), sides), (count + len(mesh.nodes),) * 2)
     groups = connected_components(graph, directed=False)[1][:count]
-    errors = places_of(moment).errors(fields)
+    errors = list_places(moment).errors(fields)
     off = np.zeros(len(mesh.nodes))
     used = np.unique(mesh.tets)
     off[used] = errors[: len(used)]
     found = []
     for group in np.unique(groups):
         tets = bad[groups == group]
-        volumes = signed_volumes(mesh.nodes, tets)
+        volumes = compute_signed_volumes(mesh.nodes, tets)
         middle = np.average(mesh.nodes[tets].mean(axis=1), axis=0, weights=volumes)
         found.append(Folded(len(tets), tuple(middle.tolist()), float(volumes.sum()), float(off[tets].max())))
     return tuple(sorted(found, key=lambda fold: -fold.volume))
 
 
-def steps_of(spacing: float | None) -> int:
-    """Return the number of steps of `fields_of`: two fields for each tried spacing."""
+def count_steps(spacing: float | None) -> int:
+    """Return the number of steps of `list_fields`: two fields for each tried spacing."""
     return 2 * (1 + (TIMES if spacing is None else 0))
 
 
-def fields_of(moment: DeformedAnatomy, spacing: float | None, step: Callable[[int], object]) -> WarpFields:
+def list_fields(moment: DeformedAnatomy, spacing: float | None, step: Callable[[int], object]) -> WarpFields:
     """Compute the fields of a moment at a spacing [m]; None: 1 mm, or finer until tumour and landmarks are accurate.
 
-    `step` receives the number of newly finished steps of `steps_of`.
+    `step` receives the number of newly finished steps of `count_steps`.
 
     Raises
     ------
@@ -133,18 +133,18 @@ def fields_of(moment: DeformedAnatomy, spacing: float | None, step: Callable[[in
             f"--spacing {1e3 * spacing:g}: the fields would have {nodes / 1e6:.0f} million nodes, and "
             f"{MOST_ASKED / 1e6:.0f} million are the most. Give a larger one."
         )
-    left = steps_of(spacing) - 2
+    left = count_steps(spacing) - 2
     fields = _fields(moment, spacing or FIRST, step)
-    while left and (finer := finer_spacing(moment, fields)) is not None:
+    while left and (finer := find_finer_spacing(moment, fields)) is not None:
         fields, left = _fields(moment, finer, step), left - 2
     step(left)
     return fields
 
 
-def finer_spacing(moment: DeformedAnatomy, fields: WarpFields) -> float | None:
+def find_finer_spacing(moment: DeformedAnatomy, fields: WarpFields) -> float | None:
     """A spacing [m] at which both are exact enough, or as near as size allows; None where no finer one helps."""
     now = fields.grid.spacing
-    places = places_of(moment)
+    places = list_places(moment)
     worst = float(places.errors(fields)[places.tumour | places.landmarks].max(initial=0.0))
     if worst <= ENOUGH:
         return None

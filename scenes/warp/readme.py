@@ -54,7 +54,7 @@ These are errors of the grid. How far the tumour may be off: {bound}
 """
 
 
-def page(report: dict, images: Sequence[Warped]) -> str:
+def write_readme(report: dict, images: Sequence[Warped]) -> str:
     """The text of README.txt from the figures of a warp."""
     sequence = (
         "field_sequence.seq.nrrd  the same of many moments, which Slicer plays.\n" if report["sequence_frames"] else ""

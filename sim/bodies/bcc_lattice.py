@@ -35,7 +35,7 @@ class Lattice:
     centre: np.ndarray
 
 
-def graded_lattice(low: np.ndarray, high: np.ndarray, coarsest: float, levels: int, size: Sizing) -> Lattice:
+def build_graded_lattice(low: np.ndarray, high: np.ndarray, coarsest: float, levels: int, size: Sizing) -> Lattice:
     """The lattice over the box from `low` (3,) to `high` (3,) [m].
 
     Cells of edge `coarsest` [m] are halved up to `levels` times where they are larger than `size` asks for.

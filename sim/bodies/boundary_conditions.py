@@ -9,14 +9,14 @@ import numpy as np
 
 from ..anatomy import Anatomy
 from ..errors import InputError
-from ..geometry.geodesic import distances
-from ..geometry.surface import vertex_normals
+from ..geometry.geodesic import compute_geodesic_distances
+from ..geometry.surface import compute_vertex_normals
 from ..geometry.tetmesh import TetMesh
-from .dural_septa import Septum, walled
-from .placement import Placement, within_outline
+from .dural_septa import Septum, find_held_vertices
+from .placement import Placement, find_within_outline
 
 
-def bounded(
+def add_boundary_conditions(
     mesh: TetMesh,
     site: np.ndarray,
     craniotomy: float,
@@ -48,20 +48,20 @@ def bounded(
     stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= settings.stem * height
     said = f"a craniotomy of {craniotomy * 1e3:g} mm" if outline is None else "the outlined opening"
     if outline is None:
-        opened = distances(mesh.nodes, surface, site, 0.5 * craniotomy) <= 0.5 * craniotomy
+        opened = compute_geodesic_distances(mesh.nodes, surface, site, 0.5 * craniotomy) <= 0.5 * craniotomy
     else:
-        opened = np.isin(np.arange(len(mesh.nodes)), outer) & within_outline(mesh.nodes, outline)
+        opened = np.isin(np.arange(len(mesh.nodes)), outer) & find_within_outline(mesh.nodes, outline)
     opened &= ~stem
     if opened.sum() < settings.fewest_open:
         raise InputError(
             f"{said} holds {opened.sum()} mesh nodes, and {settings.fewest_open} are "
             "needed: ask for a larger one, or for more nodes."
         )
-    held = reduce(np.logical_or, (walled(mesh, septum) & ~opened for septum in septa), stem)
+    held = reduce(np.logical_or, (find_held_vertices(mesh, septum) & ~opened for septum in septa), stem)
     rest = np.zeros(len(mesh.nodes), bool)
     rest[outer] = True
     rest &= ~held & ~opened
     if not rest.any():
         raise InputError(f"{said} leaves no skull: ask for a smaller one.")
-    normals = np.where(rest[:, None], vertex_normals(mesh.nodes, surface), 0.0)
+    normals = np.where(rest[:, None], compute_vertex_normals(mesh.nodes, surface), 0.0)
     return Anatomy(mesh, np.repeat(held[:, None], 3, axis=1), normals, opened)

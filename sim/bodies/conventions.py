@@ -164,7 +164,7 @@ CONVENTIONS = {
 """By their names. FSL FIRST, and SynthSeg, have the numbers of FreeSurfer."""
 
 
-def demand_fits(
+def check_labels_fit(
     path: object,
     convention: Convention,
     present: Collection[int],

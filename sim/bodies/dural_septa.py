@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 
 from ..errors import InputError
-from ..geometry.tetmesh import EDGES, TetMesh, row_keys
+from ..geometry.tetmesh import EDGES, TetMesh, compute_row_keys
 
 SEPTA = ("falx", "tentorium")
 """Their names."""
@@ -33,7 +33,7 @@ class Septum:
     reach: float
 
 
-def drawn_falx(cortex: np.ndarray, depth: float) -> Septum:
+def synthesise_falx(cortex: np.ndarray, depth: float) -> Septum:
     """A falx in the midline of a head that has none, from points (n, 3) [m, RAS] of its surface.
 
     It hangs from the convexity by a `depth` [m], the same everywhere, and ends at half of the head's height. A real
@@ -59,13 +59,13 @@ def drawn_falx(cortex: np.ndarray, depth: float) -> Septum:
     return Septum("falx", np.column_stack([np.full(len(sheet), middle[0]), sheet]), np.sqrt(0.5) * SPACING)
 
 
-def walled(mesh: TetMesh, septum: Septum) -> np.ndarray:
+def find_held_vertices(mesh: TetMesh, septum: Septum) -> np.ndarray:
     """Which vertices (V,) bool a sheet holds: of each edge that meets it, the end that is nearer to where it does.
 
     Of every tetrahedron through which the sheet goes, each edge that it cuts has then an end that does not move.
     """
     ends = np.sort(mesh.tets[:, EDGES].reshape(-1, 2))
-    _, first = np.unique(row_keys(ends), return_index=True)
+    _, first = np.unique(compute_row_keys(ends), return_index=True)
     ends = ends[first]
     tree, corners = KDTree(septum.points), mesh.nodes[ends]
     length = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)

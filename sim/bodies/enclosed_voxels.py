@@ -10,7 +10,7 @@ ASIDE = np.array([3.37e-5, 7.13e-5])
 """Voxels by which rays miss the lattice, so that none meets an edge of triangles which lie on it."""
 
 
-def enclosed(points: np.ndarray, triangles: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
+def fill_enclosed(points: np.ndarray, triangles: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
     """Voxels (I, J, K) bool of an `edge` [m] whose middle lies inside a surface, and their affine (4, 4) to metres.
 
     The surface has vertices (n, 3) [m] and triangles (m, 3), which may be turned either way. A middle is inside if

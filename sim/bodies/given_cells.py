@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from ..anatomy import REGION_NAMES, region_words
+from ..anatomy import REGION_NAMES, describe_region
 from ..errors import InputError
 from ..geometry.tetmesh import FACES, TetMesh
 
@@ -29,7 +29,7 @@ SPELT = {"tumor": "tumour", "edema": "oedema", "ventricle": "ventricles", **{nam
 """Names of regions in other spellings."""
 
 
-def demand_tetrahedra(raw: Any, read: set[str]) -> None:
+def check_cell_types(raw: Any, read: set[str]) -> None:
     """Reject a mesh with volume cells of other types than those that are `read`.
 
     Raises
@@ -43,7 +43,7 @@ def demand_tetrahedra(raw: Any, read: set[str]) -> None:
         raise InputError(f"a part of its volume is {counts}: all of it must be tetrahedra. Split or mesh it so.")
 
 
-def merged(
+def merge_nodes(
     points: np.ndarray, table: np.ndarray, data: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], int]:
     """Points (V, 3), cells (T, n) and point data with one node in place of each group that coincides; how many went.
@@ -70,7 +70,7 @@ def merged(
     return points[left], (np.cumsum(left) - 1)[first[table]], {k: v[left] for k, v in data.items()}, int((~left).sum())
 
 
-def demand_one_body(points: np.ndarray, tets: np.ndarray) -> None:
+def check_one_body(points: np.ndarray, tets: np.ndarray) -> None:
     """Reject tetrahedra (T, 4) of positive orientation that are listed twice, or that overlap.
 
     Raises
@@ -93,7 +93,7 @@ def demand_one_body(points: np.ndarray, tets: np.ndarray) -> None:
         )
 
 
-def pieces_note(mesh: TetMesh) -> tuple[str, ...]:
+def note_pieces(mesh: TetMesh) -> tuple[str, ...]:
     """A note on a mesh in pieces that share no node; none where it is one."""
     links = mesh.tets[:, [0, 0, 0]].ravel(), mesh.tets[:, 1:].ravel()
     graph = coo_array((np.ones(len(links[0])), links), shape=(len(mesh.nodes),) * 2)
@@ -126,7 +126,7 @@ def _inside_others(points: np.ndarray, tets: np.ndarray) -> int:
     return len(np.unique(probe[(least > INSIDE) & (probe != which)]))
 
 
-def regions_of(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
+def assign_regions(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Region (T,) of each tetrahedron in some blocks of cells, and a note where it is not cell data `region`.
 
     Without such data it is the one array of whole numbers that varies, or the sets of cells.
@@ -211,6 +211,6 @@ def _named(
         region = np.array([number[old] for old in known], np.int32)[np.searchsorted([*known], region)]
         names = {number[old]: names.get(old, f"group {old}") for old in known}
     parts = (
-        region_words(one) + (f" from {names[one]}" if names.get(one) else "") for one in np.unique(region).tolist()
+        describe_region(one) + (f" from {names[one]}" if names.get(one) else "") for one in np.unique(region).tolist()
     )
     return region, (f"regions are those of {said}: {', '.join(parts)}",)

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from .conventions import CONVENTIONS, Convention, demand_fits
-from .label_contacts import against, contacts_of, contradiction
-from .label_map import Label, LabelMap, Mask, listed, on_border, read_labels, widened
-from .one_space import in_one_space
-from .placement import side_of
+from .conventions import CONVENTIONS, Convention, check_labels_fit
+from .label_contacts import build_contradiction_check, count_label_contacts, find_contradiction
+from .label_map import Label, LabelMap, Mask, count_on_border, format_labels, read_labels, widen_grid
+from .one_space import has_one_space
+from .placement import describe_side
 from .volume import read_volume
 from .voxels import OF_BRAINS, VoxelGrid, Voxels
 
@@ -102,7 +102,7 @@ class HeadMasks:
     voxels: Voxels = OF_BRAINS
 
 
-def head_masks(sources: Sources) -> HeadMasks:
+def read_head_masks(sources: Sources) -> HeadMasks:
     """Read what is brain and what tumour, on the label map's grid, widened so far that it holds the other files.
 
     Raises
@@ -129,10 +129,10 @@ def head_masks(sources: Sources) -> HeadMasks:
     either = False
     if others:
         ours = {name: Mask(Path(sources.labels), mask, whole.affine) for name, mask in marked.items()}
-        either = in_one_space((ours | others)["brain"], (ours | others)["tumour"])
+        either = has_one_space((ours | others)["brain"], (ours | others)["tumour"])
     shape, affine = whole.layers.shape[:3], whole.affine
     for other in others.values():
-        lacking, affine = widened(shape, affine, other)
+        lacking, affine = widen_grid(shape, affine, other)
         marked = {name: np.pad(mask, lacking) for name, mask in marked.items()}
         shape = tuple((np.array(shape) + lacking.sum(axis=1)).tolist())
     marked |= {name: other.onto(shape, affine) for name, other in others.items()}
@@ -148,12 +148,12 @@ def head_masks(sources: Sources) -> HeadMasks:
     marked, affine = _cropped(marked, affine)
     return HeadMasks(
         name=" and ".join(str(path) for path in (sources.labels, sources.mask, sources.tumour_in) if path),
-        meant=f"the mask {sources.mask}" if sources.mask else f"the labels {listed(brain)}",
+        meant=f"the mask {sources.mask}" if sources.mask else f"the labels {format_labels(brain)}",
         brain=marked.pop("brain"),
         tumour=marked.pop("tumour"),
         affine=affine,
         notes=notes,
-        cut=on_border(others["brain"].marked if sources.mask else whole.mask(brain)),
+        cut=count_on_border(others["brain"].marked if sources.mask else whole.mask(brain)),
         parts=marked,
         grids=(
             VoxelGrid(Path(sources.labels), whole.layers.shape[:3], whole.affine),
@@ -168,7 +168,7 @@ def _unnamed(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
     names = {(one.layer, one.value): one.name for one in whole.segments}
     found = {(layer, value) for layer, present in enumerate(whole.present) for value in present}
     left = [names.get(place, place[1]) for place in sorted(found - set(whole.places(named)))]
-    return (f"neither brain nor tumour: what is labelled {listed(left)}",) if left else ()
+    return (f"neither brain nor tumour: what is labelled {format_labels(left)}",) if left else ()
 
 
 def _doubtful(whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tuple[Label, ...]]) -> tuple[str, ...]:
@@ -178,7 +178,7 @@ def _doubtful(whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tupl
     own = {name: tuple(value for _, value in whole.places(labels)) for name, labels in parts.items()}
     core, necrosis = tuple(value for _, value in whole.places(tumour)), own.get(NECROSIS, ())
     meant = Convention("own", "", tumour=core + necrosis, necrosis=necrosis, oedema=own.get("oedema", ()))
-    found = contradiction(contacts_of(whole), meant)
+    found = find_contradiction(count_label_contacts(whole), meant)
     return (f"{found.reason}: see that the labels mean this",) if found else ()
 
 
@@ -188,7 +188,7 @@ def _side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
     centre = affine[:3, :3] @ np.argwhere(marked["tumour"]).mean(axis=0) + affine[:3, 3]
     return (
         f"{path}: has a grid of its own, and would fit with x and y negated, too. See that it is right that the tumour "
-        f"lies {side_of(centre, low, high)}"
+        f"lies {describe_side(centre, low, high)}"
     )
 
 
@@ -209,7 +209,7 @@ def _cavity(whole: LabelMap, convention: Convention | None, named: Mapping[str, 
         return ()
     ml = 1e6 * int(whole.mask(fluid).sum()) * abs(float(np.linalg.det(whole.affine[:3, :3])))
     return (
-        f"{ml:.2g} ml are a cavity, label {listed(fluid)}: where the mask holds it, it becomes brain. For a region "
+        f"{ml:.2g} ml are a cavity, label {format_labels(fluid)}: where the mask holds it, it becomes brain. For a region "
         f"with a stiffness of its own add --ventricles {','.join(map(str, fluid))}",
     )
 
@@ -236,8 +236,8 @@ def _meant(
         given = brain + parts + (() if sources.tumour_in else tumour + necrosis)
         named = {value for _, value in whole.places(given)}
         checked = convention.deepest or (convention.tumour and not sources.tumour and not sources.parts)
-        doubts = (against(whole, convention),) if checked else ()
-        demand_fits(sources.labels, convention, whole.labels, named, *doubts)
+        doubts = (build_contradiction_check(whole, convention),) if checked else ()
+        check_labels_fit(sources.labels, convention, whole.labels, named, *doubts)
         _demand_sides(whole, convention)
         if not brain and not sources.mask:
             brain = _there(convention.brain, whole)
@@ -272,7 +272,7 @@ def _others(sources: Sources, tumour: Sequence[Label]) -> dict[str, Mask]:
         second, necrosis = read_labels(sources.tumour_in, sources.voxels), sources.parts.get(NECROSIS, ())
         whole = second.mask((*tumour, *necrosis) if tumour else ())
         several = not tumour and len(second.labels) > 1
-        said = listed(sorted(second.labels))
+        said = format_labels(sorted(second.labels))
         all_of = f"its labels {said} are all taken for tumour: name those of the core by --tumour"
         notes = (*second.notes, all_of) if several else second.notes
         others["tumour"] = Mask(Path(sources.tumour_in), whole, second.affine, notes)
@@ -323,7 +323,7 @@ def _demand_one_meaning(whole: LabelMap, named: Mapping[str, tuple[str, Sequence
         both = [label for label, place in zip(others, whole.places(others), strict=True) if place in places]
         if both:
             raise InputError(
-                f"{whole.path}: label {listed(both)} is named by {option} and by {other}: give it to one of them."
+                f"{whole.path}: label {format_labels(both)} is named by {option} and by {other}: give it to one of them."
             )
 
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from ..errors import InputError
 from ..runtime.optional_packages import install_hint
-from .enclosed_voxels import enclosed
+from .enclosed_voxels import fill_enclosed
 from .fif import read_surface
 from .head_masks import HeadMasks
 from .intensity import Intensity, read_intensity
-from .label_map import on_border
-from .label_volume import whole_brain
-from .template import MIDDLE, HealthyHead, scaled, size_of
+from .label_map import count_on_border
+from .label_volume import fill_brain
+from .template import MIDDLE, HealthyHead, measure_size, scale_affine
 from .volume import read_volume
 
 SEEN_FROM = (1e-3 * MIDDLE[0], 1e-3 * MIDDLE[1], 1e-3 * MIDDLE[2])
@@ -27,7 +27,7 @@ VOXEL = 1e-3
 REMEDY = install_hint("heads")
 
 
-def masked_head(mask: Path, t1: Path | None = None, volume: float | None = None) -> HealthyHead:
+def build_masked_head(mask: Path, t1: Path | None = None, volume: float | None = None) -> HealthyHead:
     """The head whose brain is what is not 0 in a volume, scaled about its centroid to a `volume` [m^3] if one is given.
 
     `t1` is a volume of intensities in the same space, and is scaled with it.
@@ -35,20 +35,20 @@ def masked_head(mask: Path, t1: Path | None = None, volume: float | None = None)
     Raises
     ------
     InputError
-        What `read_volume`, `read_intensity` and `whole_brain` refuse, and a volume in which all is 0.
+        What `read_volume`, `read_intensity` and `fill_brain` refuse, and a volume in which all is 0.
     """
     read = read_volume(mask)
     brain = read.values != 0
     if not brain.any():
         raise InputError(f"{mask}: has no voxel other than 0: give a mask of the brain.")
     notes = list(read.notes)
-    masks = HeadMasks(str(mask), "its voxels", brain, np.zeros_like(brain), read.affine, cut=on_border(brain))
-    solid = whole_brain(masks, notes)
+    masks = HeadMasks(str(mask), "its voxels", brain, np.zeros_like(brain), read.affine, cut=count_on_border(brain))
+    solid = fill_brain(masks, notes)
     healthy = HealthyHead(solid, read.affine, t1 and read_intensity(t1), SEEN_FROM, tuple(notes))
     return healthy if volume is None else _scaled(healthy, volume)
 
 
-def fsaverage_head(volume: float) -> HealthyHead:
+def read_fsaverage_head(volume: float) -> HealthyHead:
     """The head of fsaverage, scaled to a `volume` [m^3]: all that its inner skull encloses counts as brain.
 
     The surface of this body is the skull: no fluid lies between them, and no sulci are in it.
@@ -61,7 +61,7 @@ def fsaverage_head(volume: float) -> HealthyHead:
     path = _skull_path()
     points, triangles = read_surface(path)
     try:
-        mask, affine = enclosed(points, triangles, VOXEL)
+        mask, affine = fill_enclosed(points, triangles, VOXEL)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return _scaled(HealthyHead(mask, affine, middle=SEEN_FROM), volume)
@@ -78,9 +78,9 @@ def _skull_path() -> Path:
 
 
 def _scaled(healthy: HealthyHead, volume: float) -> HealthyHead:
-    centre, own = size_of(healthy.mask, healthy.affine)
+    centre, own = measure_size(healthy.mask, healthy.affine)
     factor = (volume / own) ** (1.0 / 3.0)
     grey = healthy.intensity
     if grey is not None:
-        grey = Intensity(grey.values, scaled(grey.affine, centre, factor, centre))
-    return replace(healthy, affine=scaled(healthy.affine, centre, factor, centre), intensity=grey)
+        grey = Intensity(grey.values, scale_affine(grey.affine, centre, factor, centre))
+    return replace(healthy, affine=scale_affine(healthy.affine, centre, factor, centre), intensity=grey)

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from ..errors import InputError
 from ..geometry.tetmesh import TetMesh
-from ..runtime.atomic_files import written_whole
+from ..runtime.atomic_files import write_atomically
 from .volume import read_volume
 from .voxels import OF_BRAINS, Voxels
 
@@ -78,9 +78,9 @@ class Intensity:
         affine = self.affine.copy()
         affine[:3, 3] += self.affine[:3, :3] @ low
         part = Intensity(self.values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))], affine)
-        return Intensity(np.rint(255.0 * part.windowed(mesh, KEPT)).astype(np.uint8), affine)
+        return Intensity(np.rint(255.0 * part.apply_window(mesh, KEPT)).astype(np.uint8), affine)
 
-    def windowed(self, mesh: TetMesh, window: Window = Window()) -> np.ndarray:
+    def apply_window(self, mesh: TetMesh, window: Window = Window()) -> np.ndarray:
         """The values (I, J, K) float32 in 0 .. 1 by a window on the brain, a mesh in the same frame.
 
         What is no number, or far too bright for tissue, becomes the brain's median.
@@ -110,7 +110,7 @@ class Intensity:
         return np.clip(grey, 0.0, 1.0).astype(np.float32)
 
 
-def sidecar(mesh: str | Path) -> Path:
+def to_intensity_path(mesh: str | Path) -> Path:
     """Where the intensities of a mesh file lie: MESH.t1.nii.gz beside MESH.vtu."""
     return Path(mesh).with_suffix(".t1.nii.gz")
 
@@ -129,7 +129,7 @@ def write_intensity(path: str | Path, intensity: Intensity) -> None:
     image = nibabel.Nifti1Image(intensity.values, affine)
     image.header.set_xyzt_units("mm")
     image.header["descrip"] = b"sulcus: intensities beside a mesh"
-    with written_whole(path, ".gz") as partial:
+    with write_atomically(path, ".gz") as partial:
         nibabel.save(image, partial)
 
 

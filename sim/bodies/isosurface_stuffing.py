@@ -82,7 +82,7 @@ class Pieces:
         return Pieces(self.nodes[used], self.kind[used], tets, self.inside[keep], self.surface[used])
 
 
-def whole(lattice: Lattice) -> Pieces:
+def build_whole(lattice: Lattice) -> Pieces:
     """A lattice that nothing has cut yet."""
     kind = np.where(lattice.centre, CENTRE, CORNER)
     everywhere = np.ones(len(lattice.tets), bool)

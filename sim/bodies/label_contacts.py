@@ -40,7 +40,7 @@ class Contacts:
         return float(self.voxels[np.isin(self.labels, list(of))].sum() / self.voxels[self.labels != 0].sum())
 
 
-def contacts_of(whole: LabelMap) -> Contacts:
+def count_label_contacts(whole: LabelMap) -> Contacts:
     """Contacts of the labels in the first layer; faces on the border of the volume do not count."""
     layer, affine = whole.layers[..., 0], whole.affine[:3, :3]
     (box,) = ndimage.find_objects((layer != 0).astype(np.uint8))
@@ -64,7 +64,7 @@ class Contradiction:
     certain: bool = True
 
 
-def contradiction(contacts: Contacts, convention: Convention) -> Contradiction | None:
+def find_contradiction(contacts: Contacts, convention: Convention) -> Contradiction | None:
     """Compare a convention with the anatomy: necrosis lies inside enhancing tumour, oedema and cortex outside.
 
     Necrosis or oedema may be missing, or reach the surface of the brain. The rim of a tumour may be open.
@@ -96,18 +96,18 @@ def contradiction(contacts: Contacts, convention: Convention) -> Contradiction |
     return None
 
 
-def against(whole: LabelMap, chosen: Convention) -> Callable[[Convention], str]:
+def build_contradiction_check(whole: LabelMap, chosen: Convention) -> Callable[[Convention], str]:
     """Function that says why the anatomy contradicts a convention; empty where it does not.
 
     What rare tumours show, too, is held against the `chosen` convention only where another one fits.
     """
     if whole.layers.shape[-1] > 1:
         return lambda _: ""
-    contacts = contacts_of(whole)
+    contacts = count_label_contacts(whole)
     rivals = [one for one in CONVENTIONS.values() if one is not chosen and one.fits(whole.labels)]
 
     def reason(one: Convention) -> str:
-        found = contradiction(contacts, one)
+        found = find_contradiction(contacts, one)
         if found is None or not (found.certain or one is not chosen or any(map(shown, rivals))):
             return ""
         return found.reason

@@ -84,7 +84,9 @@ class LabelMap:
         found = [self._place(label) for label in labels]
         missing = [label for label, at in zip(labels, found, strict=True) if not at]
         if missing or 0 in labels:
-            wrong = f"has no label {listed(missing)}" if missing and missing != [0] else "has label 0 as background"
+            wrong = (
+                f"has no label {format_labels(missing)}" if missing and missing != [0] else "has label 0 as background"
+            )
             raise InputError(f"{self.path}: {wrong}. Choose from {self._choice()}.")
         for label, at in zip(labels, found, strict=True):
             if len(at) > 1:
@@ -112,8 +114,8 @@ class LabelMap:
 
     def _choice(self) -> str:
         if self.segments:
-            return listed([one.name for one in self.segments if one.value in self.present[one.layer]])
-        return listed(sorted(self.labels))
+            return format_labels([one.name for one in self.segments if one.value in self.present[one.layer]])
+        return format_labels(sorted(self.labels))
 
 
 def read_labels(path: str | Path, voxels: Voxels = OF_BRAINS) -> LabelMap:
@@ -128,7 +130,7 @@ def read_labels(path: str | Path, voxels: Voxels = OF_BRAINS) -> LabelMap:
     values, notes = volume.values, volume.notes
     if values.dtype.kind == "f":
         whole = np.rint(values)
-        if not are_whole(values) or np.abs(whole).max() > 2**31 - 1:
+        if not has_whole_numbers(values) or np.abs(whole).max() > 2**31 - 1:
             raise InputError(f"{path}: holds fractions, so it is no label volume. Give whole-number labels.")
         if not np.array_equal(values, whole):
             notes = (*notes, f"its labels are rounded by up to {np.abs(values - whole).max():.1g}")
@@ -139,12 +141,12 @@ def read_labels(path: str | Path, voxels: Voxels = OF_BRAINS) -> LabelMap:
     return LabelMap(Path(path), layers, volume.affine, notes, volume.segments)
 
 
-def are_whole(values: np.ndarray) -> bool:
+def has_whole_numbers(values: np.ndarray) -> bool:
     """Return True if all values are whole numbers but for round-off of a scale."""
     return bool((np.abs(values - np.rint(values)) <= ROUND_OFF).all())
 
 
-def listed(labels: Sequence[Label]) -> str:
+def format_labels(labels: Sequence[Label]) -> str:
     """The first twenty, and how many there are."""
     shown = ", ".join(map(str, labels[:20]))
     return f"{shown}, ... ({len(labels)} in all)" if len(labels) > 20 else shown
@@ -197,7 +199,7 @@ class Mask:
         return found.view(bool)
 
 
-def widened(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple[np.ndarray, np.ndarray]:
+def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple[np.ndarray, np.ndarray]:
     """How many voxels (3, 2) a grid lacks at both ends of its axes to hold `other`, and its affine (4, 4) with them.
 
     A grid of its own is held with a voxel round it.
@@ -228,6 +230,6 @@ def _alike(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> bool:
     return shape == other.marked.shape and np.allclose(affine, other.affine, rtol=0.0, atol=1e-9)
 
 
-def on_border(mask: np.ndarray) -> int:
+def count_on_border(mask: np.ndarray) -> int:
     """How many marked voxels (I, J, K) lie on the volume's border."""
     return int(mask.sum() - mask[1:-1, 1:-1, 1:-1].sum())

@@ -12,15 +12,15 @@ from scipy import ndimage
 
 from ..anatomy import NECROSIS_LABEL, PART_LABELS
 from ..errors import InputError
-from ..runtime.outside_files import path_of
+from ..runtime.outside_files import to_path
 from .dural_septa import SEPTA, Septum
-from .head_masks import HeadMasks, Sources, head_masks
+from .head_masks import HeadMasks, Sources, read_head_masks
 from .intensity import read_intensity
-from .label_map import Label, Mask, on_border
-from .one_space import demand_scan_of
-from .placement import Piece, site_over
+from .label_map import Label, Mask, count_on_border
+from .one_space import check_scan_space
+from .placement import Piece, find_reachable_site
 from .signed_distance import Blur, mask_field
-from .subject import Subject, SubjectPart, rim
+from .subject import Subject, SubjectPart, find_rim
 from .voxels import VoxelGrid
 
 
@@ -62,12 +62,12 @@ def volume_subject(
     Raises
     ------
     InputError
-        What `head_masks` and `masked_subject` refuse.
+        What `read_head_masks` and `build_masked_subject` refuse.
     """
-    return masked_subject(head_masks(Sources(path_of(path), tuple(brain), tuple(tumour))), t1, settings)
+    return build_masked_subject(read_head_masks(Sources(to_path(path), tuple(brain), tuple(tumour))), t1, settings)
 
 
-def masked_subject(
+def build_masked_subject(
     masks: HeadMasks,
     t1: str | Path | None = None,
     settings: Labelling = Labelling(),
@@ -93,13 +93,13 @@ def masked_subject(
             raise InputError(f"{masks.name}: marks no {name}, so it is no region. Choose from {known}{own}.")
     intensity = None if t1 is None else read_intensity(t1, masks.voxels)
     if t1 is not None and intensity is not None:
-        scan = VoxelGrid(path_of(t1), intensity.values.shape, intensity.affine)
-        demand_scan_of(Mask(Path(masks.name), masks.brain, masks.affine), scan, masks.grids)
+        scan = VoxelGrid(to_path(t1), intensity.values.shape, intensity.affine)
+        check_scan_space(Mask(Path(masks.name), masks.brain, masks.affine), scan, masks.grids)
     affine, voxel = masks.affine, abs(float(np.linalg.det(masks.affine[:3, :3])))
     notes = list(masks.notes)
-    solid = whole_brain(masks, notes, settings)
+    solid = fill_brain(masks, notes, settings)
     inside = _inside(masks.name, solid, masks.tumour, voxel, notes, settings)
-    cortex, interface = rim(solid, affine), rim(inside, affine)
+    cortex, interface = find_rim(solid, affine), find_rim(inside, affine)
     pieces = _pieces(inside, affine)
     return Subject(
         brain=mask_field(solid, affine, settings.blur),
@@ -107,7 +107,7 @@ def masked_subject(
         cortex=cortex,
         interface=interface,
         tumour_volume=float(inside.sum() * voxel),
-        site=site_over(cortex, pieces[0].centre),
+        site=find_reachable_site(cortex, pieces[0].centre),
         intensity=intensity,
         notes=tuple(notes),
         pieces=pieces,
@@ -137,7 +137,7 @@ def _parts(
     return tuple(reversed(parts))
 
 
-def whole_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelling()) -> np.ndarray:
+def fill_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelling()) -> np.ndarray:
     """The voxels (I, J, K) bool of a head's brain and tumour in one piece without holes; what is changed is noted.
 
     Raises
@@ -153,7 +153,7 @@ def whole_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labell
             f"{masks.name}: {masks.meant} make a brain of {solid.sum() * voxel * 1e6:.3g} ml; expected "
             f"{smallest * 1e6:g} to {largest * 1e6:g} ml. Check the labels and the voxel size."
         )
-    edge = max(on_border(solid), masks.cut)
+    edge = max(count_on_border(solid), masks.cut)
     if edge:
         notes.append(
             f"{edge} voxels of the brain lie on the volume's border: where it is cut there is no cortex, so see that "
@@ -234,6 +234,6 @@ def _pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[Piece, ...]:
     pieces = []
     for number in range(1, count + 1):
         one = component == number
-        surface = rim(one, affine)
+        surface = find_rim(one, affine)
         pieces.append(Piece(float(one.sum() * voxel), surface.mean(axis=0), surface))
     return tuple(sorted(pieces, key=lambda piece: -piece.volume))

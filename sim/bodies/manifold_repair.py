@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array, csgraph
 
-from ..geometry.tetmesh import FACES, row_keys
+from ..geometry.tetmesh import FACES, compute_row_keys
 
 
-def largest_piece(tets: np.ndarray) -> np.ndarray:
+def find_largest_piece(tets: np.ndarray) -> np.ndarray:
     """Which tetrahedra (T,) belong to the largest piece whose tetrahedra hang together by faces."""
-    _, number, count = np.unique(row_keys(tets[:, FACES].reshape(-1, 3)), return_inverse=True, return_counts=True)
+    _, number, count = np.unique(
+        compute_row_keys(tets[:, FACES].reshape(-1, 3)), return_inverse=True, return_counts=True
+    )
     owner = np.repeat(np.arange(len(tets)), 4)
     order = np.argsort(number, kind="stable")
     pairs = owner[order[np.flatnonzero(count[number[order]] == 2)]].reshape(-1, 2)
@@ -27,7 +29,7 @@ def clean(tets: np.ndarray) -> np.ndarray:
     """
     keep = np.ones(len(tets), bool)
     while True:
-        keep[keep] = largest_piece(tets[keep])
+        keep[keep] = find_largest_piece(tets[keep])
         offending = _pinching(tets[keep])
         if len(offending) == 0:
             return keep
@@ -37,7 +39,7 @@ def clean(tets: np.ndarray) -> np.ndarray:
 def _pinching(tets: np.ndarray) -> np.ndarray:
     """Numbers of the tetrahedra behind every surface fan but the largest at its node."""
     faces = tets[:, FACES].reshape(-1, 3)
-    _, first, count = np.unique(row_keys(faces), return_index=True, return_counts=True)
+    _, first, count = np.unique(compute_row_keys(faces), return_index=True, return_counts=True)
     outer = np.sort(first[count == 1])
     surface, behind = faces[outer], outer // 4
     # One graph node for each corner of a triangle; corners at one mesh node join across a surface edge, if just two do.
@@ -46,7 +48,7 @@ def _pinching(tets: np.ndarray) -> np.ndarray:
     ends = surface.ravel()[sides]
     turned = ends[:, 0] > ends[:, 1]
     sides[turned] = sides[turned][:, ::-1]
-    _, edge, shared = np.unique(row_keys(ends), return_inverse=True, return_counts=True)
+    _, edge, shared = np.unique(compute_row_keys(ends), return_inverse=True, return_counts=True)
     order = np.argsort(edge, kind="stable")
     pairs = sides[order[shared[edge[order]] == 2]].reshape(-1, 2, 2)
     joined = np.concatenate([pairs[:, :, 0], pairs[:, :, 1]])
@@ -60,14 +62,14 @@ def _pinching(tets: np.ndarray) -> np.ndarray:
     return np.unique(behind[lesser[fan.reshape(-1, 3)].any(axis=1)])
 
 
-def ears(tets: np.ndarray, unwanted: np.ndarray) -> np.ndarray:
+def find_removable_tetrahedra(tets: np.ndarray, unwanted: np.ndarray) -> np.ndarray:
     """Which of the tetrahedra marked `unwanted` (T,) can go and leave the surface a 2-manifold.
 
     A tetrahedron with three faces on the surface can, and one with two if the edge between the other two faces lies
     within; of neighbours only one goes.
     """
     faces = tets[:, FACES].reshape(-1, 3)
-    _, number, count = np.unique(row_keys(faces), return_inverse=True, return_counts=True)
+    _, number, count = np.unique(compute_row_keys(faces), return_inverse=True, return_counts=True)
     outer = (count[number] == 1).reshape(-1, 4)
     width = int(tets.max()) + 1
     edges = np.sort(faces[outer.ravel()][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 
 from ..errors import InputError
 from ..runtime.file_limits import FARTHEST
-from ..runtime.outside_files import path_of, read_as
+from ..runtime.outside_files import read_as, to_path
 
 SIGNS = {"LPS": (-1.0, -1.0, 1.0), "RAS": (1.0, 1.0, 1.0)}
 """What coordinates become in RAS. Slicer writes LPS, and means it where a file does not say."""
@@ -60,7 +60,7 @@ def read_markup(path: str | Path) -> Markup:
         A file that is none, or that has several markups. Another unit than mm, another system than LPS or RAS. No
         point that is placed, or coordinates that are no numbers.
     """
-    path = path_of(path)
+    path = to_path(path)
     with read_as(path, "markups of 3D Slicer", REMEDY):
         if path.stat().st_size > LARGEST:
             raise InputError(f"{path}: is too large for markups. {REMEDY}")

@@ -6,7 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from ..errors import InputError
-from ..runtime.file_limits import INFLATION, MeshBytes, too_large
+from ..runtime.file_limits import INFLATION, MeshBytes, build_too_large_error
 
 # Of meshio's formats those whose readers end where a file is cut short (of .mdpa, .tec and .node they never do), and
 # whose files say how much they hold (of .gz they do not).
@@ -16,7 +16,7 @@ ENDINGS = (
 )
 
 
-def demand_own(path: Path, limits: MeshBytes) -> None:
+def check_mesh_references(path: Path, limits: MeshBytes) -> None:
     """Refuse other formats than `ENDINGS`, numbers that lie outside the file or its folder, HDF5 beyond the limits.
 
     Raises
@@ -32,12 +32,12 @@ def demand_own(path: Path, limits: MeshBytes) -> None:
         raise InputError(f"no mesh is read from {given}: give a tetrahedral mesh as {', '.join(ENDINGS)}.")
     if suffix in (".xdmf", ".xmf"):
         for other in _named(path):
-            demand_stored(other, limits)
+            check_hdf5_storage(other, limits)
     elif h5py.is_hdf5(path):
-        demand_stored(path, limits)
+        check_hdf5_storage(path, limits)
 
 
-def demand_stored(path: Path, limits: MeshBytes) -> None:
+def check_hdf5_storage(path: Path, limits: MeshBytes) -> None:
     """Refuse HDF5 that refers to other files, or whose arrays take more bytes than may be or than were stored.
 
     Raises
@@ -69,7 +69,7 @@ def demand_stored(path: Path, limits: MeshBytes) -> None:
                     raise InputError(f"`{here}` of {path.name} declares more than it holds. Write the file anew.")
                 left -= found.nbytes
                 if left < 0:
-                    raise too_large(most)
+                    raise build_too_large_error(most)
 
     with h5py.File(path, "r") as file:
         look(file, "")

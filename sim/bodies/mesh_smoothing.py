@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.surface import areas
+from ..geometry.surface import compute_areas
 from ..geometry.tetmesh import EDGES, FACES
-from .signed_distance import Field, onto_level
+from .signed_distance import Field, project_onto_level
 
 Projection = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Points (n, 3) [m] wished for and their nodes (n,) -> the nearest points (n, 3) where those nodes may lie."""
@@ -48,7 +48,7 @@ class Smoothing:
         return float(np.sin(np.radians(self.good_angle)))
 
 
-def smallest_sines(corners: np.ndarray) -> np.ndarray:
+def compute_smallest_sines(corners: np.ndarray) -> np.ndarray:
     """The smallest sine (...,) of a dihedral angle in each tetrahedron of `corners` (..., 4, 3); negative if inverted.
 
     Small for angles near 0 and near 180 degrees alike (Klingner & Shewchuk 2007).
@@ -62,7 +62,7 @@ def smallest_sines(corners: np.ndarray) -> np.ndarray:
     return (six_volumes[..., None] * lengths / product).min(axis=-1)
 
 
-def fitted(
+def fit_nodes(
     nodes: np.ndarray,
     triangles: np.ndarray,
     field: Field,
@@ -88,29 +88,29 @@ def fitted(
     most = settings.largest_shift
     level = np.clip(total[on] / weight[on], -most, most)
     nodes = nodes.copy()
-    nodes[on] = onto_level(field, nodes[on], level)
+    nodes[on] = project_onto_level(field, nodes[on], level)
     if volume is not None:
         moving = movable[triangles].mean(axis=1)  # a triangle sweeps in proportion to its corners that move
         for _ in range(2):
             _, area = _middles_and_areas(nodes, triangles)
-            missing = (volume - enclosed_volume(nodes, triangles)) / (area @ moving)
+            missing = (volume - compute_enclosed_volume(nodes, triangles)) / (area @ moving)
             level = np.clip(level + missing, -most, most)
-            nodes[on] = onto_level(field, nodes[on], level)
+            nodes[on] = project_onto_level(field, nodes[on], level)
     return nodes
 
 
-def unfolded(nodes: np.ndarray, moved: np.ndarray, tets: np.ndarray) -> np.ndarray:
+def prevent_folds(nodes: np.ndarray, moved: np.ndarray, tets: np.ndarray) -> np.ndarray:
     """Nodes (V, 3) [m] as `moved` (V, 3), but where that turns a tetrahedron inside out: there they stay."""
     kept = moved.copy()
     while True:
-        folded = np.unique(tets[smallest_sines(kept[tets]) <= 0.0])
+        folded = np.unique(tets[compute_smallest_sines(kept[tets]) <= 0.0])
         astray = folded[(kept[folded] != nodes[folded]).any(axis=1)]
         if len(astray) == 0:
             return kept
         kept[astray] = nodes[astray]
 
 
-def enclosed_volume(nodes: np.ndarray, triangles: np.ndarray) -> float:
+def compute_enclosed_volume(nodes: np.ndarray, triangles: np.ndarray) -> float:
     """Volume [m^3] inside a closed surface of triangles (S, 3), outwards."""
     a, b, c = (nodes[triangles[:, k]] for k in range(3))
     return float(np.einsum("ti,ti->", a, np.cross(b, c))) / 6.0
@@ -118,10 +118,12 @@ def enclosed_volume(nodes: np.ndarray, triangles: np.ndarray) -> float:
 
 def _middles_and_areas(nodes: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     corners = nodes[triangles]
-    return corners.mean(axis=1), areas(corners)
+    return corners.mean(axis=1), compute_areas(corners)
 
 
-def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection, settings: Smoothing = Smoothing()) -> np.ndarray:
+def improve_mesh(
+    nodes: np.ndarray, tets: np.ndarray, project: Projection, settings: Smoothing = Smoothing()
+) -> np.ndarray:
     """Nodes (V, 3) [m] moved until every dihedral angle is good, or no bad one can be raised further.
 
     In each round a set of nodes of bad tetrahedra, no two in one tetrahedron, tries 26 steps each. Each node takes the
@@ -131,7 +133,7 @@ def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection, settings:
     order = np.argsort(tets, axis=None, kind="stable")
     incident, begin = order // 4, np.searchsorted(tets.ravel()[order], np.arange(len(nodes) + 1))
     step = np.full(len(nodes), settings.largest_step)
-    sines = smallest_sines(nodes[tets])
+    sines = compute_smallest_sines(nodes[tets])
     for _ in range(settings.rounds):
         movers = _independent(tets, sines, step, settings)
         if len(movers) == 0:
@@ -150,7 +152,7 @@ def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection, settings:
         astray = np.linalg.norm(placed - trials, axis=2) > (step[movers] * length)[:, None]
         trials = np.where(astray[..., None], nodes[movers, None], placed)
         tried = np.where(own[:, None, :, None], trials[row][:, :, None], corners[:, None])
-        badness = np.add.reduceat(_badness(smallest_sines(tried), good), first)
+        badness = np.add.reduceat(_badness(compute_smallest_sines(tried), good), first)
         best = badness.argmin(axis=1)
         better = badness.min(axis=1) < 0.99 * np.add.reduceat(_badness(sines[near], good), first)
 
@@ -158,7 +160,7 @@ def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection, settings:
         moved = movers[better]
         nodes[moved] = trials[better, best[better]]
         touched = near[better[row]]
-        sines[touched] = smallest_sines(nodes[tets[touched]])
+        sines[touched] = compute_smallest_sines(nodes[tets[touched]])
         around = np.unique(tets[touched])
         step[around] = np.maximum(step[around], 3.0 * settings.smallest_step)
     return nodes

@@ -10,14 +10,14 @@ from scipy.spatial import KDTree
 
 from ..anatomy import BRAIN_LABEL, TUMOUR_LABEL
 from ..errors import InputError
-from ..geometry.surface import areas
-from ..geometry.tetmesh import SLIVER_DEGREES, TetMesh, faces_once
-from .bcc_lattice import graded_lattice
-from .isosurface_stuffing import IsosurfaceStuffingOptions, Pieces, cut, whole
-from .manifold_repair import clean, ears
-from .mesh_smoothing import Projection, Smoothing, fitted, improved, smallest_sines, unfolded
+from ..geometry.surface import compute_areas
+from ..geometry.tetmesh import SLIVER_DEGREES, TetMesh, find_single_faces
+from .bcc_lattice import build_graded_lattice
+from .isosurface_stuffing import IsosurfaceStuffingOptions, Pieces, build_whole, cut
+from .manifold_repair import clean, find_removable_tetrahedra
+from .mesh_smoothing import Projection, Smoothing, compute_smallest_sines, fit_nodes, improve_mesh, prevent_folds
 from .placement import Piece
-from .signed_distance import Field, onto_level
+from .signed_distance import Field, project_onto_level
 
 INTRICATE = "the surfaces are too intricate", "smooth the labels"
 """Why a mesh does not show a solid, and what helps beside more nodes."""
@@ -101,7 +101,7 @@ class Solids:
     pieces: Sequence[Piece] = ()
 
 
-def mesh_solids(solids: Solids, count: int, settings: Meshing = Meshing()) -> TetMesh:
+def build_mesh(solids: Solids, count: int, settings: Meshing = Meshing()) -> TetMesh:
     """The mesh of `solids` with `count` nodes, to within 10 % and mostly 3 % by default.
 
     Raises
@@ -113,10 +113,12 @@ def mesh_solids(solids: Solids, count: int, settings: Meshing = Meshing()) -> Te
     mesh = _meshed(solids, count, settings)
     if isinstance(mesh, TetMesh):
         return mesh
-    raise too_few(count, mesh, settings.more, lambda number: _would_do(solids, number, settings))
+    raise build_too_few_error(count, mesh, settings.more, lambda number: _would_do(solids, number, settings))
 
 
-def too_few(count: int, why: tuple[str, str], more: Sequence[float], would_do: Callable[[int], bool]) -> InputError:
+def build_too_few_error(
+    count: int, why: tuple[str, str], more: Sequence[float], would_do: Callable[[int], bool]
+) -> InputError:
     """What is said where `count` nodes do not show a solid: the first of `more` times as many that `would_do`."""
     reason, remedy = why
     numbers = (int(round(count * times, -2)) for times in more)
@@ -124,7 +126,7 @@ def too_few(count: int, why: tuple[str, str], more: Sequence[float], would_do: C
     return InputError(f"{reason} for {count} nodes: {'' if enough is None else f'ask for {enough}, or '}{remedy}.")
 
 
-def lost_pieces(
+def find_lost_pieces(
     pieces: Sequence[Piece], nodes: np.ndarray, tets: np.ndarray, settings: Meshing = Meshing()
 ) -> list[bool]:
     """Which pieces of a tumour its tetrahedra (T, 4) do not show: each is of the piece whose surface is nearest."""
@@ -137,7 +139,7 @@ def lost_pieces(
     return [bool(one < settings.shown * piece.volume) for one, piece in zip(shown, pieces, strict=True)]
 
 
-def lost_words(pieces: Sequence[Piece], lost: Sequence[bool]) -> str:
+def describe_lost_pieces(pieces: Sequence[Piece], lost: Sequence[bool]) -> str:
     """How many pieces are lost, and their volume in all."""
     volume = sum(piece.volume for piece, gone in zip(pieces, lost, strict=True) if gone)
     return f"{sum(lost)} of the tumour's {len(pieces)} pieces, {1e6 * volume:.2g} ml in all"
@@ -151,7 +153,7 @@ def _would_do(solids: Solids, count: int, settings: Meshing) -> bool:
 
 
 def _meshed(solids: Solids, count: int, settings: Meshing) -> TetMesh | tuple[str, str]:
-    """The mesh with `count` nodes, or what is amiss with it and what helps. Raises as `mesh_solids`."""
+    """The mesh with `count` nodes, or what is amiss with it and what helps. Raises as `build_mesh`."""
     volume = float(np.prod(solids.high - solids.low))
     edge, best = (volume / count) ** (1.0 / 3.0), None
     for _ in range(settings.trials):
@@ -181,14 +183,14 @@ def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
     def size(points: np.ndarray) -> np.ndarray:
         return settings.rounding * np.min([least + growth * tree.query(points)[0] for tree, least in wanted], axis=0)
 
-    lattice = graded_lattice(solids.low - edge, solids.high + edge, edge, levels, size)
-    body = cut(whole(lattice), solids.brain, settings=settings.stuffing)
+    lattice = build_graded_lattice(solids.low - edge, solids.high + edge, edge, levels, size)
+    body = cut(build_whole(lattice), solids.brain, settings=settings.stuffing)
     if not body.inside.any():
         raise InputError(TOO_COARSE)
     body = body.kept(body.inside)
     body = body.kept(clean(body.tets))
     surface = np.zeros(len(body.nodes), bool)
-    surface[faces_once(body.tets)] = True
+    surface[find_single_faces(body.tets)] = True
     return cut(body, solids.tumour, surface, settings.stuffing)
 
 
@@ -196,14 +198,14 @@ def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | tu
     """The pieces fitted and improved, in a second try without what folds them; else as `_meshed`."""
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
-    lost = lost_pieces(solids.pieces, pieces.nodes, pieces.tets[pieces.inside], settings)
+    lost = find_lost_pieces(solids.pieces, pieces.nodes, pieces.tets[pieces.inside], settings)
     gone = sum(piece.volume for piece, one in zip(solids.pieces, lost, strict=True) if one)
     if gone > settings.largest_error * solids.tumour_volume:
         be = "is" if sum(lost) == 1 else "are"
-        return f"{lost_words(solids.pieces, lost)}, {be} too small", "leave what is small out of the labels"
+        return f"{describe_lost_pieces(solids.pieces, lost)}, {be} too small", "leave what is small out of the labels"
     for fold in (True, False):
         found = _improved(solids, _fitted(solids, pieces, solids.tumour_volume - gone, settings, fold), settings)
-        if smallest_sines(found.nodes[found.tets]).min() >= np.sin(np.radians(SLIVER_DEGREES)):
+        if compute_smallest_sines(found.nodes[found.tets]).min() >= np.sin(np.radians(SLIVER_DEGREES)):
             mesh = TetMesh(found.nodes, found.tets, np.where(found.inside, TUMOUR_LABEL, BRAIN_LABEL))
             volume = mesh.volumes[found.inside].sum()
             return mesh if abs(volume / solids.tumour_volume - 1.0) <= settings.largest_error else INTRICATE
@@ -216,28 +218,28 @@ def _fitted(solids: Solids, pieces: Pieces, volume: float, settings: Meshing, fo
     Unless it may `fold`, they stay where a piece would be inside out.
     """
     (surface, _), smoothing = _surfaces(pieces), settings.smoothing
-    outer, inner = faces_once(pieces.tets), faces_once(pieces.tets[pieces.inside])
-    nodes = fitted(pieces.nodes, outer, solids.brain, surface, settings=smoothing)
-    nodes = nodes if fold else unfolded(pieces.nodes, nodes, pieces.tets)
-    moved = fitted(nodes, inner, solids.tumour, ~surface, volume, smoothing)
-    return replace(pieces, nodes=moved if fold else unfolded(nodes, moved, pieces.tets))
+    outer, inner = find_single_faces(pieces.tets), find_single_faces(pieces.tets[pieces.inside])
+    nodes = fit_nodes(pieces.nodes, outer, solids.brain, surface, settings=smoothing)
+    nodes = nodes if fold else prevent_folds(pieces.nodes, nodes, pieces.tets)
+    moved = fit_nodes(nodes, inner, solids.tumour, ~surface, volume, smoothing)
+    return replace(pieces, nodes=moved if fold else prevent_folds(nodes, moved, pieces.tets))
 
 
 def _improved(solids: Solids, pieces: Pieces, settings: Meshing) -> Pieces:
     """What is flat on the surfaces trimmed, the bad angles improved."""
     for slack in settings.slacks:
-        bad = smallest_sines(pieces.nodes[pieces.tets]) < settings.smoothing.good_sine
-        pieces = pieces.kept(~ears(pieces.tets, bad))
+        bad = compute_smallest_sines(pieces.nodes[pieces.tets]) < settings.smoothing.good_sine
+        pieces = pieces.kept(~find_removable_tetrahedra(pieces.tets, bad))
         projection = _projection(solids, pieces, slack)
-        pieces = replace(pieces, nodes=improved(pieces.nodes, pieces.tets, projection, settings.smoothing))
+        pieces = replace(pieces, nodes=improve_mesh(pieces.nodes, pieces.tets, projection, settings.smoothing))
     return pieces
 
 
 def _surfaces(pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
     """Which nodes (V,) lie on the outer surface, and which on the tumour's surface."""
     marks = np.zeros((2, len(pieces.nodes)), bool)
-    marks[0, faces_once(pieces.tets)] = True
-    marks[1, faces_once(pieces.tets[pieces.inside])] = True
+    marks[0, find_single_faces(pieces.tets)] = True
+    marks[1, find_single_faces(pieces.tets[pieces.inside])] = True
     return marks[0], marks[1]
 
 
@@ -252,16 +254,18 @@ def _projection(solids: Solids, pieces: Pieces, slack: float) -> Projection:
         for solid, level, on in ((solids.tumour, levels[1], interface), (solids.brain, levels[0], surface)):
             rows = on[of]
             aim = level[of[rows]]
-            placed[rows] = onto_level(solid, placed[rows], np.clip(solid(placed[rows]), aim - slack, aim + slack))
+            placed[rows] = project_onto_level(
+                solid, placed[rows], np.clip(solid(placed[rows]), aim - slack, aim + slack)
+            )
         return placed
 
     return project
 
 
-def surface_errors(nodes: np.ndarray, triangles: np.ndarray, field: Field) -> tuple[np.ndarray, np.ndarray]:
+def compute_surface_errors(nodes: np.ndarray, triangles: np.ndarray, field: Field) -> tuple[np.ndarray, np.ndarray]:
     """Distances (15 S,) [m] from points spread over triangles (S, 3) to a field's surface, and their shares of area."""
     spread = np.array([(i, j, 12 - i - j) for i in range(1, 12, 2) for j in range(1, 12 - i, 2)]) / 12.0
     corners = nodes[triangles]
-    area = areas(corners)
+    area = compute_areas(corners)
     points = np.einsum("pk,tki->tpi", spread, corners).reshape(-1, 3)
     return np.abs(field(points)), np.repeat(area / area.sum() / len(spread), len(spread))

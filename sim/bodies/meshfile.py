@@ -16,15 +16,15 @@ import numpy as np
 
 from ..anatomy import Anatomy
 from ..errors import InputError
-from ..geometry.tetmesh import MeshWarning, TetMesh, oriented
-from ..runtime.atomic_files import written_whole
-from ..runtime.file_limits import MESH_BYTES, MeshBytes, at_most
-from ..runtime.outside_files import path_of, read_as
+from ..geometry.tetmesh import MeshWarning, TetMesh, orient_tetrahedra
+from ..runtime.atomic_files import write_atomically
+from ..runtime.file_limits import MESH_BYTES, MeshBytes, limit_memory
+from ..runtime.outside_files import read_as, to_path
 from .abaqus import AbaqusMesh, read_abaqus
-from .given_cells import demand_one_body, demand_tetrahedra, merged, pieces_note, regions_of
+from .given_cells import assign_regions, check_cell_types, check_one_body, merge_nodes, note_pieces
 from .markups import SIGNS
-from .mesh_references import demand_own
-from .vtu_size import demand_small
+from .mesh_references import check_mesh_references
+from .vtu_size import check_vtu_size
 
 if TYPE_CHECKING:
     import meshio
@@ -48,7 +48,7 @@ REASONS = {
     ),
     r"\$NOD": "it is of MSH 1, of which no mesh is read: save it as MSH 4.1.",
     r"np\.float": "it has `np.float64(...)` in place of numbers, as meshio writes ASCII: save it as binary.",
-    r" string$": "it has an array of text (`string`): save it without, as arrays of numbers alone are read.",
+    r" string$": "it has an array of text (`encode_string`): save it without, as arrays of numbers alone are read.",
 }
 """Messages by a pattern in meshio's reason, or in a line that meshio cannot read."""
 UNREAD = re.compile(rb"^\$ParametricNodes|^\$NOD\b|np\.float|^\S+ \d+ \d+ string$")
@@ -79,17 +79,17 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
         A file that is missing or unreadable, without tetrahedra, with both kinds or with other volume cells, or with
         data that does not fit. Tetrahedra that are listed twice, or overlap. A title with a space that is not known.
     """
-    path = path_of(path)
+    path = to_path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file. Give a tetrahedral mesh, such as .vtu or .msh.")
     if unit not in UNITS:
         raise InputError(f"no unit is called {unit!r}: choose one of {', '.join(UNITS)}.")
     with read_as(path, "a mesh", REMEDY):
         most = limits.of(path.stat().st_size)
-        counted = path.suffix.lower() == ".vtu" and demand_small(path, most)
-        with warnings.catch_warnings(), nullcontext() if counted else at_most(limits.largest):
+        counted = path.suffix.lower() == ".vtu" and check_vtu_size(path, most)
+        with warnings.catch_warnings(), nullcontext() if counted else limit_memory(limits.largest):
             warnings.simplefilter("ignore")  # meshio warns of arrays that it skips
-            demand_own(path, limits)
+            check_mesh_references(path, limits)
             raw = read_abaqus(path) if path.suffix.lower() == ".inp" else _by_meshio(path)
     with read_as(path, "a mesh", REMEDY):
         return _taken(path, raw, UNITS[unit])
@@ -135,29 +135,29 @@ def _taken(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
         raise InputError(
             f"{path}: holds {' and '.join(sorted(found))}, which do not conform: mesh it with one of them."
         )
-    demand_tetrahedra(raw, found)
+    check_cell_types(raw, found)
     blocks = [number for number, block in enumerate(raw.cells) if block.type in found]
     notes = []
     dropped = sorted({f"{len(block.data)} {block.type}" for block in raw.cells if block.type not in found})
     if dropped:
         notes.append(f"dropped cells that are not tetrahedra: {', '.join(dropped)}")
-    region, said = regions_of(raw, blocks)
-    table, turned = oriented(raw.points, np.concatenate([raw.cells[number].data for number in blocks]))
+    region, said = assign_regions(raw, blocks)
+    table, turned = orient_tetrahedra(raw.points, np.concatenate([raw.cells[number].data for number in blocks]))
     data, places = {name: np.asarray(field) for name, field in raw.point_data.items()}, np.asarray(raw.points, float)
     if _space_of(path) == "LPS":  # half a turn about z, which keeps orientations
         places = places * SIGNS["LPS"]
         vectors = {name for name, field in data.items() if field.shape[1:] == (3,) and field.dtype.kind in "if"}
         data.update({name: data[name] * SIGNS["LPS"] for name in vectors})
         notes.append("turned x and y of points and vectors from LPS, which its title states, to RAS")
-    points, table, data, gone = merged(places, table, data)
+    points, table, data, gone = merge_nodes(places, table, data)
     if gone:
         notes.append(f"merged {gone} nodes with others at the same place: results are numbered without them")
     tets, middles = np.split(table, [4], axis=1)
     mesh = TetMesh(points * metre, tets, region, middles if middles.size else None)
-    demand_one_body(points, tets)
+    check_one_body(points, tets)
     if turned:
         notes.append(f"turned {turned} tetrahedra of negative orientation")
-    return MeshFile(mesh, data, (*notes, *said, *pieces_note(mesh)))
+    return MeshFile(mesh, data, (*notes, *said, *note_pieces(mesh)))
 
 
 def _space_of(path: Path) -> str:
@@ -186,7 +186,7 @@ def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndar
     """
     import meshio
 
-    with written_whole(path, ".vtu") as partial:
+    with write_atomically(path, ".vtu") as partial:
         meshio.Mesh(
             mesh.nodes,
             [(CELLS[mesh.table.shape[1]], mesh.table)],

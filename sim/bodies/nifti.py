@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..runtime.file_limits import MOST_VOXELS
-from .voxels import PIECE, REMEDY, SURPLUS, Volume, Voxels, held, opened
+from .voxels import PIECE, REMEDY, SURPLUS, Volume, Voxels, open_volume, unpack_file
 
 if TYPE_CHECKING:
     from nibabel.fileholders import FileHolder
@@ -32,7 +32,7 @@ def read_nifti(path: Path, voxels: Voxels) -> Volume:
         own exceptions of a damaged one.
     """
     image = load_nifti(path)
-    with opened(path) as file:
+    with open_volume(path) as file:
         header = type(image.header).from_fileobj(file, check=False)  # the image's own has forgotten slope and size
     slope, shift = float(header["scl_slope"]), float(header["scl_inter"])
     _demand_few(path, image.shape)
@@ -64,7 +64,7 @@ def load_nifti(path: Path) -> Nifti1Image:
     from nibabel.imageglobals import LoggingOutputSuppressor
     from nibabel.spatialimages import HeaderDataError
 
-    with opened(path) as file:
+    with open_volume(path) as file:
         start = file.read(540)  # a header of NIfTI-2
     two = start[4:8] in (b"n+2\0", b"ni2\0")
     if not two and 348 not in (int.from_bytes(start[:4], "little"), int.from_bytes(start[:4], "big")):
@@ -92,7 +92,7 @@ def load_nifti(path: Path) -> Nifti1Image:
 def _holder(path: Path) -> FileHolder:
     from nibabel.fileholders import FileHolder
 
-    given = held(path)
+    given = unpack_file(path)
     return FileHolder(given) if isinstance(given, str) else FileHolder(fileobj=given)
 
 
@@ -113,7 +113,7 @@ def read_mgh(path: Path, voxels: Voxels) -> Volume:
     _demand_few(path, shape)
     needed = header.get_data_offset() + math.prod(shape) * header.get_data_bytespervox()
     _demand_held(path, needed)
-    with opened(path) as file:
+    with open_volume(path) as file:
         flag = file.read(30)[28:]  # nibabel's own header has an orientation always
     if flag != b"\x00\x01":
         raise InputError(
@@ -139,7 +139,7 @@ def _demand_few(path: Path, shape: tuple[int, ...]) -> None:
 def _demand_held(path: Path, needed: int) -> None:
     """Refuse a file that has fewer bytes than it declares: no memory is taken before."""
     held = 0
-    with opened(path) as file:
+    with open_volume(path) as file:
         while piece := file.read(PIECE):  # to its end, where gzip has its checksum
             held += len(piece)
             if held > needed + SURPLUS:

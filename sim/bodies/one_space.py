@@ -17,7 +17,7 @@ SAMPLED = 500
 ONE_OF_BOTH = "one of the two states LPS as RAS. Export that one anew."
 
 
-def in_one_space(brain: Mask, tumour: Mask) -> bool:
+def has_one_space(brain: Mask, tumour: Mask) -> bool:
     """Whether a brain and a tumour of grids of their own would fit as well if x and y of one were negated.
 
     Raises
@@ -25,7 +25,7 @@ def in_one_space(brain: Mask, tumour: Mask) -> bool:
     InputError
         A tumour beside the brain, and LPS that is stated as RAS as far as it shows.
     """
-    demand_not_negated(brain.grid, tumour.grid)
+    check_not_negated(brain.grid, tumour.grid)
     boxes = [mask.box for mask in (brain, tumour)]
     apart = (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any()
     points = _places(tumour.grid, _thinned(np.argwhere(tumour.marked)))
@@ -44,7 +44,7 @@ def in_one_space(brain: Mask, tumour: Mask) -> bool:
     return turned > EXPLAINED and not _same(brain.grid, tumour.grid)
 
 
-def demand_scan_of(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -> None:
+def check_scan_space(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -> None:
     """Refuse a scan in LPS that is stated as RAS, as far as it shows; `grids` are of the files that mark the `brain`.
 
     Raises
@@ -53,7 +53,7 @@ def demand_scan_of(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -> 
         A grid that is one of those with x and y negated, or a scan that would hold the brain if they were.
     """
     for grid in grids:
-        demand_not_negated(grid, scan)
+        check_not_negated(grid, scan)
     points = _thinned(brain.outline)
     within, turned = (share_on(scan.shape, scan.affine, points * signs) for signs in (np.ones(3), LPS))
     if within < AMISS and turned > EXPLAINED:
@@ -63,7 +63,7 @@ def demand_scan_of(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -> 
         )
 
 
-def demand_not_negated(one: VoxelGrid, other: VoxelGrid) -> None:
+def check_not_negated(one: VoxelGrid, other: VoxelGrid) -> None:
     """Refuse two grids of which one is the other with x and y negated.
 
     Raises

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from ..anatomy import Anatomy
-from ..arguments import numbers
+from ..arguments import check_numbers_array
 from ..errors import InputError
-from ..geometry.closest_point import closest
-from ..geometry.surface import areas, unit, vertex_normals
+from ..geometry.closest_point import find_closest_points
+from ..geometry.surface import compute_areas, compute_vertex_normals, normalise_vectors
 
 # A place so near to the rim [m] lies on it.
 ON_RIM = 1e-9
@@ -71,17 +71,17 @@ class OpenCortex:
     @cached_property
     def radius(self) -> float:
         """Radius of the circle of its area [m]."""
-        return float(np.sqrt(areas(self.corners).sum() / np.pi))
+        return float(np.sqrt(compute_areas(self.corners).sum() / np.pi))
 
     @cached_property
     def clearance(self) -> float:
         """Radius of the largest circle round the origin, across the axis, that it fills [m]."""
-        rim = rim_of(self.anatomy.mesh.nodes, self.anatomy.open_surface) - self.origin
-        return float(distances_to(rim - (rim @ self.axis)[..., None] * self.axis, np.zeros((1, 3)))[0])
+        rim = find_opening_edge(self.anatomy.mesh.nodes, self.anatomy.open_surface) - self.origin
+        return float(compute_distances(rim - (rim @ self.axis)[..., None] * self.axis, np.zeros((1, 3)))[0])
 
     @cached_property
     def _inward(self) -> np.ndarray:
-        return -vertex_normals(self.anatomy.mesh.nodes, self.anatomy.open_surface)
+        return -compute_vertex_normals(self.anatomy.mesh.nodes, self.anatomy.open_surface)
 
     def across(self, points: np.ndarray) -> np.ndarray:
         """Distance (n,) [m] of points (n, 3) from the line through the origin along the axis."""
@@ -90,9 +90,9 @@ class OpenCortex:
 
     def nearest(self, point: np.ndarray) -> Place:
         """The place that is nearest to a point (3,) [m]."""
-        at, triangle, weights = (found[0] for found in closest(point[None], self.corners))
+        at, triangle, weights = (found[0] for found in find_closest_points(point[None], self.corners))
         vertices = self.anatomy.open_surface[triangle]
-        return Place(at, unit((weights @ self._inward[vertices])[None])[0], vertices, weights)
+        return Place(at, normalise_vectors((weights @ self._inward[vertices])[None])[0], vertices, weights)
 
     def place(self, right_mm: float = 0.0, up_mm: float = 0.0) -> Place:
         """The place so many millimetres to the right of the middle, and up, in the tangent plane.
@@ -103,12 +103,12 @@ class OpenCortex:
             What is no number, or not one; a place outside the open cortex.
         """
         for name, value in (("right_mm", right_mm), ("up_mm", up_mm)):
-            given = numbers(name, value)
+            given = check_numbers_array(name, value)
             if given.shape != ():
                 raise InputError(f"{name} has shape {given.shape}: give one number, in millimetres.")
         found = self.nearest(self.origin + 1e-3 * (right_mm * self.right + up_mm * self.up))
-        rim = rim_of(self.anatomy.mesh.nodes, self.anatomy.open_surface)
-        if not distances_to(rim, found.point[None])[0] > ON_RIM:
+        rim = find_opening_edge(self.anatomy.mesh.nodes, self.anatomy.open_surface)
+        if not compute_distances(rim, found.point[None])[0] > ON_RIM:
             raise InputError(
                 f"the place {right_mm:g} mm right, {up_mm:g} mm up lies outside the open cortex: stay within "
                 f"{1e3 * self.clearance:.3g} mm of its middle, or open the skull wider with --craniotomy."
@@ -137,17 +137,17 @@ def open_cortex(anatomy: Anatomy) -> OpenCortex:
     reference = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
     right = np.cross(axis, reference)
     right /= np.linalg.norm(right)
-    return OpenCortex(anatomy, closest(middle[None], corners).point[0], axis, right, np.cross(right, axis))
+    return OpenCortex(anatomy, find_closest_points(middle[None], corners).point[0], axis, right, np.cross(right, axis))
 
 
-def rim_of(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def find_opening_edge(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Edges (E, 2, 3) [m] that belong to one only of triangles (S, 3) of points (V, 3) [m]."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, count = np.unique(edges, axis=0, return_counts=True)
     return points[edges[count == 1]]
 
 
-def distances_to(edges: np.ndarray, points: np.ndarray) -> np.ndarray:
+def compute_distances(edges: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Distances (B,) [m] from `points` (B, 3) to the nearest of `edges` (E, 2, 3)."""
     start, along = edges[:, 0], edges[:, 1] - edges[:, 0]
     offset = points[:, None] - start

@@ -57,7 +57,7 @@ class Piece:
     surface: np.ndarray
 
 
-def side_of(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings: Placement = Placement()) -> str:
+def describe_side(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings: Placement = Placement()) -> str:
     """Words for a place (3,) [m] in a brain's box `low` to `high` (3,), RAS: "left anterior superior" and the like.
 
     Left and right are stated but for a midline strip; of the other axes, the outer thirds.
@@ -73,13 +73,13 @@ def side_of(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings: Plac
     return " ".join(words)
 
 
-def site_over(cortex: np.ndarray, centre: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
+def find_reachable_site(cortex: np.ndarray, centre: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
     """The point (3,) [m] of `cortex` (n, 3) nearest to `centre` (3,) that can be reached through the skull."""
     floor = min(cortex[:, 2].min() + settings.base * np.ptp(cortex[:, 2]), centre[2])
     return _nearest_outer(cortex[cortex[:, 2] >= floor], centre, cortex, settings)
 
 
-def opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
+def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
     """The reachable point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) at the surface.
 
     Raises
@@ -98,7 +98,9 @@ def opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement = Plac
     return _not_over_stem(cortex, site, settings)
 
 
-def opening_over(cortex: np.ndarray, point: np.ndarray, depth: float, settings: Placement = Placement()) -> np.ndarray:
+def find_opening_over(
+    cortex: np.ndarray, point: np.ndarray, depth: float, settings: Placement = Placement()
+) -> np.ndarray:
     """The reachable point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) `depth` [m] below the brain's surface.
 
     Raises
@@ -112,16 +114,16 @@ def opening_over(cortex: np.ndarray, point: np.ndarray, depth: float, settings: 
             f"the point {_mm(point)} mm lies {-depth * 1e3:.0f} mm outside the brain: give a point inside. "
             f"{_box(cortex)}"
         )
-    return _not_over_stem(cortex, site_over(cortex, point, settings), settings)
+    return _not_over_stem(cortex, find_reachable_site(cortex, point, settings), settings)
 
 
-def opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
+def find_opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
     """The reachable point (3,) [m] of `cortex` (n, 3) that is nearest to the middle of an opening's outline (m, 3).
 
     Raises
     ------
     InputError
-        As `opening_at`; an outline that does not lie at the surface.
+        As `find_opening_at`; an outline that does not lie at the surface.
     """
     apart = float(KDTree(cortex).query(outline)[0].max())
     if apart > settings.near:
@@ -129,11 +131,11 @@ def opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Placement 
             f"the opening's outline lies up to {apart * 1e3:.0f} mm from the cortex; {settings.near * 1e3:g} mm is "
             f"the most. {_box(cortex)} See that its coordinates are those of the labels."
         )
-    inside = cortex[within_outline(cortex, outline)]
-    return opening_at(cortex, inside.mean(axis=0) if len(inside) else outline.mean(axis=0), settings)
+    inside = cortex[find_within_outline(cortex, outline)]
+    return find_opening_at(cortex, inside.mean(axis=0) if len(inside) else outline.mean(axis=0), settings)
 
 
-def within_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
+def find_within_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
     """(n,) bool: which points (n, 3) lie within a closed curve (m, 3), seen across the plane that fits it best.
 
     Points farther from that plane than the curve is wide are not meant: they lie on the head's other side.

@@ -10,8 +10,8 @@ from scipy.spatial import KDTree
 from ..anatomy import Anatomy
 from ..discretisation.space import discretise
 from ..errors import InputError
-from ..geometry.surface import edge_lengths
-from ..geometry.tetmesh import QUADRATIC_EDGES, TetMesh, oriented
+from ..geometry.surface import compute_edge_lengths
+from ..geometry.tetmesh import QUADRATIC_EDGES, TetMesh, orient_tetrahedra
 
 # Nodes of a quadratic tetrahedron: four children keep a corner each; the octahedron between them is cut along one of
 # its three diagonals, round which its other four nodes stand in this order.
@@ -69,7 +69,7 @@ def refined(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
     opening = space.surface[anatomy.craniotomy[mesh.surface].all(axis=1)]
     halved = np.ones(space.count, bool)
     if near_opening:
-        reach = edge_lengths(nodes[anatomy.open_surface]).mean()
+        reach = compute_edge_lengths(nodes[anatomy.open_surface]).mean()
         halved[count:] = KDTree(nodes[np.unique(opening)]).query(nodes[count:])[0] <= reach
     halved = _conforming(table, halved)
     tets, parent = _children(nodes, table, halved[table[:, 4:]])
@@ -78,7 +78,7 @@ def refined(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
     craniotomy[opening] = True
     craniotomy[:count] = anatomy.craniotomy
     free = ~held.any(axis=1) & (normal == 0.0).all(axis=1)
-    tets, _ = oriented(nodes, tets)
+    tets, _ = orient_tetrahedra(nodes, tets)
     number = np.cumsum(halved) - 1
     fine = TetMesh(nodes[halved], number[tets], mesh.region[parent])
     return Anatomy(fine, held[halved], normal[halved], (craniotomy & free)[halved])

@@ -54,7 +54,7 @@ def mask_field(mask: np.ndarray, affine: np.ndarray, blur: Blur = Blur()) -> Lev
     The mask is blurred and the blur of a plane, P = Phi(-d / sigma), is solved for the distance d.
     Where voxels are oblong the mean of the three blurs stands for sigma, so that distances are right to a factor.
     """
-    mask, affine = cropped(mask, affine, blur.margin)
+    mask, affine = crop_to(mask, affine, blur.margin)
     sigma = blur.voxels * abs(np.linalg.det(affine[:3, :3])) ** (1.0 / 3.0)
     share = ndimage.gaussian_filter(mask.astype(np.float32), blur.voxels, mode="nearest")
     limit = special.ndtr(-blur.reach)
@@ -62,7 +62,7 @@ def mask_field(mask: np.ndarray, affine: np.ndarray, blur: Blur = Blur()) -> Lev
     return LevelSet(distance.astype(np.float32), np.linalg.inv(affine))
 
 
-def cropped(mask: np.ndarray, affine: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
+def crop_to(mask: np.ndarray, affine: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
     """The part of a mask within `margin` voxels of what is marked, padded with zeros, and its affine (4, 4)."""
     (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(mask.astype(np.uint8)))
     low = np.array([part.start for part in box]) - margin
@@ -71,7 +71,7 @@ def cropped(mask: np.ndarray, affine: np.ndarray, margin: int) -> tuple[np.ndarr
     return np.pad(mask[box], margin), shifted
 
 
-def gradient(field: Field, points: np.ndarray, probe: float = 2e-4) -> np.ndarray:
+def compute_gradient(field: Field, points: np.ndarray, probe: float = 2e-4) -> np.ndarray:
     """Gradient (n, 3) of a field at points (n, 3) [m], by differences `probe` [m] to both sides.
 
     The default is below a voxel and above round-off.
@@ -80,14 +80,14 @@ def gradient(field: Field, points: np.ndarray, probe: float = 2e-4) -> np.ndarra
     return np.stack([field(points + step) - field(points - step) for step in steps], axis=1) / (2.0 * probe)
 
 
-def onto_level(field: Field, points: np.ndarray, level: np.ndarray, flat: float = 0.1) -> np.ndarray:
+def project_onto_level(field: Field, points: np.ndarray, level: np.ndarray, flat: float = 0.1) -> np.ndarray:
     """Points (n, 3) [m] moved along the gradient to where the field has the value `level` (n,): two Newton steps.
 
     A distance has slope 1. Slopes below `flat` lie between two surfaces or far from any, and their direction is noise:
     the flatter the field, the shorter the step.
     """
     for _ in range(2):
-        slope = gradient(field, points)
+        slope = compute_gradient(field, points)
         square = np.einsum("ni,ni->n", slope, slope)
         excess = (field(points) - level) / np.maximum(square, flat**2)
         points = points - excess[:, None] * slope

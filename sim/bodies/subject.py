@@ -12,11 +12,11 @@ from scipy import ndimage
 from ..anatomy import BRAIN_LABEL, NECROSIS_LABEL, TUMOUR_LABEL, Anatomy
 from ..errors import InputError
 from ..geometry.tetmesh import TetMesh
-from .boundary_conditions import bounded
+from .boundary_conditions import add_boundary_conditions
 from .dural_septa import Septum
 from .intensity import Intensity
-from .mesher import Meshing, Solids, mesh_solids
-from .placement import Piece, Placement, within_outline
+from .mesher import Meshing, Solids, build_mesh
+from .placement import Piece, Placement, find_within_outline
 from .refine import refined
 from .signed_distance import Field
 
@@ -125,15 +125,15 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
     Raises
     ------
     InputError
-        What `mesh_solids` and `bounded` refuse.
+        What `build_mesh` and `add_boundary_conditions` refuse.
     """
-    opening = subject.cortex[opened_cortex(subject, plan.craniotomy)]
+    opening = subject.cortex[find_opened_cortex(subject, plan.craniotomy)]
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     solids = Solids(
         subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening, subject.pieces
     )
-    mesh = _with_parts(mesh_solids(solids, plan.nodes, plan.meshing), subject)
-    made = bounded(mesh, subject.site, plan.craniotomy, plan.placement, subject.outline, subject.septa)
+    mesh = _with_parts(build_mesh(solids, plan.nodes, plan.meshing), subject)
+    made = add_boundary_conditions(mesh, subject.site, plan.craniotomy, plan.placement, subject.outline, subject.septa)
     return refined(made, near_opening=True) if plan.fine_opening else made
 
 
@@ -154,17 +154,17 @@ def _with_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
     return TetMesh(mesh.nodes, mesh.tets, region) if subject.parts else mesh
 
 
-def opened_cortex(subject: Subject, craniotomy: float) -> np.ndarray:
+def find_opened_cortex(subject: Subject, craniotomy: float) -> np.ndarray:
     """(n,) bool: which points of a subject's cortex lie under its outlined opening, or one of such a diameter [m].
 
     Distances are straight here. The mesh is opened by those along its surface, which are a little longer.
     """
     if subject.outline is not None:
-        return within_outline(subject.cortex, subject.outline)
+        return find_within_outline(subject.cortex, subject.outline)
     return np.linalg.norm(subject.cortex - subject.site, axis=1) <= 0.5 * craniotomy
 
 
-def rim(mask: np.ndarray, affine: np.ndarray) -> np.ndarray:
+def find_rim(mask: np.ndarray, affine: np.ndarray) -> np.ndarray:
     """Centres (n, 3) [m] of the voxels of `mask` (I, J, K) that touch its outside."""
     padded = np.pad(mask, 1)
     index = np.argwhere(padded & ~cast(np.ndarray, ndimage.binary_erosion(padded))) - 1

@@ -10,11 +10,11 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import InputError
-from ..runtime.optional_packages import needed_from
+from ..runtime.optional_packages import require_extra
 from .intensity import Intensity
-from .placement import Piece, site_over
+from .placement import Piece, find_reachable_site
 from .signed_distance import Field, mask_field
-from .subject import Subject, rim
+from .subject import Subject, find_rim
 
 MIDDLE = (0.0, -17.4, 5.4)
 """[mm] Middle of the template's box, from which the sites are seen."""
@@ -188,10 +188,10 @@ def template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
     InputError
         A tumour that would reach out of the brain.
     """
-    return drawn_subject(tumour, _scaled_template(head), head)
+    return build_synthetic_subject(tumour, _scaled_template(head), head)
 
 
-def drawn_subject(tumour: Tumour, healthy: HealthyHead, head: Head = Head()) -> Subject:
+def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: Head = Head()) -> Subject:
     """A healthy head with a tumour drawn in it. Of `head`, volume and threshold do not count here.
 
     Raises
@@ -199,7 +199,7 @@ def drawn_subject(tumour: Tumour, healthy: HealthyHead, head: Head = Head()) -> 
     InputError
         A tumour that would reach out of the brain.
     """
-    brain, cortex = mask_field(healthy.mask, healthy.affine), rim(healthy.mask, healthy.affine)
+    brain, cortex = mask_field(healthy.mask, healthy.affine), find_rim(healthy.mask, healthy.affine)
     if tumour.middle is None:
         site, inward = _site(brain, cortex, healthy.middle, tumour.site, head.smooth)
         shape = _round(
@@ -207,7 +207,7 @@ def drawn_subject(tumour: Tumour, healthy: HealthyHead, head: Head = Head()) -> 
         )
     else:
         shape = _round(tumour, lambda unit, scale: np.array(tumour.middle))
-        site = site_over(cortex, shape.middle)
+        site = find_reachable_site(cortex, shape.middle)
     interface = shape.middle + _sphere(400) * shape.radius(_sphere(400))[:, None]
     if (brain(interface) > -head.clearance).any():
         raise InputError(
@@ -219,7 +219,7 @@ def drawn_subject(tumour: Tumour, healthy: HealthyHead, head: Head = Head()) -> 
     return Subject(brain, shape, cortex, interface, volume, site, healthy.intensity, notes=healthy.notes, pieces=pieces)
 
 
-def scaled(affine: np.ndarray, centre: np.ndarray, factor: float, place: np.ndarray) -> np.ndarray:
+def scale_affine(affine: np.ndarray, centre: np.ndarray, factor: float, place: np.ndarray) -> np.ndarray:
     """An affine (4, 4) whose space is scaled by a factor about a `centre` (3,) that comes to lie at `place` (3,)."""
     moved = affine.copy()
     moved[:3, 3] -= centre
@@ -228,14 +228,14 @@ def scaled(affine: np.ndarray, centre: np.ndarray, factor: float, place: np.ndar
     return moved
 
 
-def size_of(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, float]:
+def measure_size(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, float]:
     """Centroid (3,) and volume of the voxels `mask` (I, J, K), in the units of their affine (4, 4)."""
     centre = affine[:3, :3] @ np.argwhere(mask).mean(axis=0) + affine[:3, 3]
     return centre, float(mask.sum() * abs(np.linalg.det(affine[:3, :3])))
 
 
 def _scaled_template(head: Head) -> HealthyHead:
-    with needed_from("heads", "an anatomy of the average brain needs"):
+    with require_extra("heads", "an anatomy of the average brain needs"):
         from nilearn.datasets import load_mni152_template  # takes seconds
 
     image = load_mni152_template(resolution=1)
@@ -243,8 +243,8 @@ def _scaled_template(head: Head) -> HealthyHead:
     component, _ = cast(tuple[np.ndarray, int], ndimage.label(grey > head.threshold * grey.max()))
     mask = cast(np.ndarray, ndimage.binary_fill_holes(component == np.bincount(component.ravel())[1:].argmax() + 1))
     affine = np.array(image.affine, np.float64)
-    centre, volume = size_of(mask, affine)
-    affine = scaled(affine, centre, (head.volume / volume) ** (1.0 / 3.0), 1e-3 * centre)
+    centre, volume = measure_size(mask, affine)
+    affine = scale_affine(affine, centre, (head.volume / volume) ** (1.0 / 3.0), 1e-3 * centre)
     return HealthyHead(mask, affine, Intensity(grey, affine))
 
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from ..anatomy import Anatomy
 from ..errors import InputError
-from ..geometry.ball_at_rest import resting_tips
-from ..geometry.closest_point import closest
+from ..geometry.ball_at_rest import find_resting_tips
+from ..geometry.closest_point import find_closest_points
 from ..loads import Loads, Pushed, Touching
-from ..tools import BuiltIn, foremost
+from ..tools import BuiltIn, find_foremost_points
 from .open_cortex import OpenCortex, open_cortex
 
 
@@ -100,7 +100,7 @@ class TipGauge:
         for first in range(0, len(loads), self.together):
             some = slice(first, first + self.together)
             tumour = self.anatomy.mesh.nodes[self._tumour[0]] + displacement[some][:, at]
-            near = closest(tips[some], tumour[:, self._tumour[1]]).point
+            near = find_closest_points(tips[some], tumour[:, self._tumour[1]]).point
             found[some] = np.linalg.norm(near - tips[some], axis=1)
         return found
 
@@ -110,7 +110,7 @@ class TipGauge:
         """Of the tool (B, 3) [m]; `row` (m,) of the open cortex's vertices in `displacement`."""
         axis, touching = self.cortex.axis, loads.of(Touching)
         if touching is not None and tool is not None:
-            return foremost(tool, touching.pose[:, 0], axis)
+            return find_foremost_points(tool, touching.pose[:, 0], axis)
         pushed = loads.of(Pushed)
         if pushed is None:
             raise InputError("there is no tip where no tool pushes, and no known tool is moved.")
@@ -118,15 +118,15 @@ class TipGauge:
         rest, tips = self.anatomy.mesh.nodes[nodes], np.empty((len(loads), 3))
         for first in range(0, len(loads), self.together):
             some = slice(first, first + self.together)
-            _, triangle, weights = closest(pushed.point[some], rest[triangles])
+            _, triangle, weights = find_closest_points(pushed.point[some], rest[triangles])
             surface = rest + displacement[some][:, row]
             corners = surface[np.arange(len(surface))[:, None], triangles[triangle]]
             through = np.einsum("bc,bci->bi", weights, corners)
-            tips[some] = resting_tips(surface, triangles, through, axis, pushed.footprint[some])
+            tips[some] = find_resting_tips(surface, triangles, through, axis, pushed.footprint[some])
         return tips - lift * axis
 
 
 @lru_cache(8)
-def tip_gauge(anatomy: Anatomy) -> TipGauge:
+def build_tip_gauge(anatomy: Anatomy) -> TipGauge:
     """The gauge of an anatomy; every frame asks for it."""
     return TipGauge(anatomy)

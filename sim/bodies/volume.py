@@ -6,10 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import InputError
-from ..runtime.outside_files import path_of, read_as
+from ..runtime.outside_files import read_as, to_path
 from .nifti import read_mgh, read_nifti
 from .nrrd import read_nrrd
-from .voxels import OF_BRAINS, REMEDY, Volume, Voxels, checked
+from .voxels import OF_BRAINS, REMEDY, Volume, Voxels, check_volume
 
 READERS = {
     ".nii": ("NIfTI", read_nifti),
@@ -34,7 +34,7 @@ def read_volume(path: str | Path, voxels: Voxels = OF_BRAINS, finite: bool = Tru
         slice, colours or complex numbers. Values or a slope that are not finite. A space that is not stated, an affine
         that is singular. Voxels that are too coarse or too fine, or too many of them.
     """
-    path = path_of(path)
+    path = to_path(path)
     if not path.is_file():
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {REMEDY}")
     ending = next((one for one in READERS if path.name.lower().endswith(one)), None)
@@ -45,4 +45,4 @@ def read_volume(path: str | Path, voxels: Voxels = OF_BRAINS, finite: bool = Tru
         volume = read(path, voxels)
         if kind != "NIfTI":  # whose reader uses `axes` where a file states none
             volume = replace(volume, notes=(*volume.notes, *voxels.ignored_axes))
-        return checked(path, volume, voxels, finite, layered)
+        return check_volume(path, volume, voxels, finite, layered)

@@ -93,7 +93,7 @@ class VoxelGrid:
     affine: np.ndarray
 
 
-def opened(path: Path) -> Any:
+def open_volume(path: Path) -> Any:
     """A file opened at its first byte, unpacked as its content says, whatever it is called.
 
     Raises
@@ -104,12 +104,12 @@ def opened(path: Path) -> Any:
     return _opener(path)(path, "rb")
 
 
-def held(path: Path) -> str | BytesIO:
+def unpack_file(path: Path) -> str | BytesIO:
     """What nibabel opens a file by: its name where that says how the content is packed, else its unpacked bytes."""
     named = gzip.open if path.name.lower().endswith(("gz", "mgz")) else open
     if _opener(path) is named:
         return str(path)
-    with opened(path) as file:
+    with open_volume(path) as file:
         return BytesIO(file.read(MOST_UNPACKED))
 
 
@@ -122,7 +122,7 @@ def _opener(path: Path) -> Callable[..., Any]:
     return next((opener for magic, opener in packers.items() if start.startswith(magic)), open)
 
 
-def checked(path: Path, volume: Volume, voxels: Voxels, finite: bool, layered: bool) -> Volume:
+def check_volume(path: Path, volume: Volume, voxels: Voxels, finite: bool, layered: bool) -> Volume:
     """The volume without axes of one voxel beyond the third, if it is one of numbers with a place.
 
     `layered` lets several layers of a segmentation pass, as (I, J, K, L).

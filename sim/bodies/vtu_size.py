@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..errors import InputError
-from ..runtime.file_limits import too_large
+from ..runtime.file_limits import build_too_large_error
 
 # What meshio takes for the start of raw bytes.
 RAW = re.compile(rb'<AppendedData[^>]+">')
@@ -25,7 +25,7 @@ OPENERS = {"vtkZLibDataCompressor": zlib.decompressobj, "vtkLZMADataCompressor":
 WORDS = {"UInt32": "u4", "UInt64": "u8"}
 
 
-def demand_small(path: Path, most: int) -> bool:
+def check_vtu_size(path: Path, most: int) -> bool:
     """Refuse a file whose packed arrays inflate to more than `most` bytes in all, or to more than they declare.
 
     False of a file whose arrays it cannot count, or not as surely as meshio reads them: no XML, raw, or not packed.
@@ -70,7 +70,7 @@ def demand_small(path: Path, most: int) -> bool:
             declared, blocks = _packed(inside, word)
             left -= declared
             if left < 0:
-                raise too_large(most)
+                raise build_too_large_error(most)
             for block in blocks:
                 declared -= _inflated(opener, block, declared)
                 if declared < 0:

@@ -9,12 +9,12 @@ from scipy.spatial import KDTree
 from ..anatomy import Anatomy
 from ..discretisation.space import Discretisation
 from ..effects import Bonded
-from ..geometry.surface import areas
+from ..geometry.surface import compute_areas
 from ..runtime.device import Device, forward_kernel
 
 
 @cache
-def kernel_of(device: Device) -> wp.Kernel:
+def build_kernel(device: Device) -> wp.Kernel:
     """The kernel of a device's scalar type, over (patch, column)."""
     scalar = device.scalar
 
@@ -62,7 +62,7 @@ class Bond:
         corners = space.mesh.surface
         wall = (covered | anatomy.held.all(axis=1))[corners].all(axis=1) & covered[corners].any(axis=1)
         triangles = space.surface[wall]
-        share = np.repeat(areas(space.nodes[triangles[:, :3]])[:, None] / 3.0, 3, axis=1)
+        share = np.repeat(compute_areas(space.nodes[triangles[:, :3]])[:, None] / 3.0, 3, axis=1)
         # Of a quadratic triangle's area the corners' shape functions have none.
         area = np.bincount(triangles[:, -3:].ravel(), share.ravel(), space.count)
         nodes = np.unique(triangles)
@@ -92,5 +92,5 @@ class Bond:
         """The largest share of each column (B,), on the device; all of them (n, B) into `share`, where it is given."""
         most = wp.zeros(force.shape[1], dtype=wp.float64, device=self._device.name)
         inputs = [force, *self._arrays, wp.float64(self._effect.tension), wp.float64(self._effect.shear)]
-        self._device.launch(kernel_of(self._device), (len(self.nodes), force.shape[1]), inputs, [share, most])
+        self._device.launch(build_kernel(self._device), (len(self.nodes), force.shape[1]), inputs, [share, most])
         return most

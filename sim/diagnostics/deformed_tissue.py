@@ -49,6 +49,6 @@ class Diagnostics:
         """
         good = np.array([one.good and self._limit_strain for one in outcome], bool)
         out = outcome.copy()
-        out[good & self._stretch.exceeds(strained)] = Outcome.OVERSTRAINED
+        out[good & self._stretch.is_beyond_range(strained)] = Outcome.OVERSTRAINED
         out[good & (inverted > 0)] = Outcome.INVERTED
         return out

@@ -7,9 +7,9 @@ import warp as wp
 from scipy.spatial import KDTree
 
 from ..anatomy import Anatomy
-from ..discretisation.element import quadratic_shapes
+from ..discretisation.element import compute_quadratic_shapes
 from ..discretisation.space import Discretisation
-from ..geometry.surface import areas
+from ..geometry.surface import compute_areas
 from ..runtime.device import Device, forward_kernel
 
 # Points (6, 3), barycentric, and weights (6,) on a triangle: exact to degree 4 (Dunavant 1985, Table I).
@@ -18,7 +18,7 @@ POINTS = np.array([np.roll([1.0 - 2.0 * x, x, x], turn) for x in (_A, _B) for tu
 WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 
-def facet_vectors(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def integrate_facet_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """The integrals (S, n, 3) [m^2] of N_i n over outward triangles (S, n): n = 3 or, quadratic and perhaps curved, 6.
 
     With N_i the shape function of node i (nodes (N, 3) [m]) and n the outward normal. The sum of products with the
@@ -29,7 +29,7 @@ def facet_vectors(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         shape, slope = at, np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
         if triangles.shape[1] == 6:  # corners, then the middles of the edges between corners 0 and 1, 1 and 2, 2 and 0
             i, j = ends = np.array([(0, 1, 2), (1, 2, 0)])
-            shape = quadratic_shapes(at, ends.T)
+            shape = compute_quadratic_shapes(at, ends.T)
             middles = 4.0 * (at[i, None] * slope[j] + at[j, None] * slope[i])
             slope = np.vstack([(4.0 * at - 1.0)[:, None] * slope, middles])
         tangents = np.einsum("ski,kd->sdi", nodes[triangles], slope)
@@ -37,19 +37,19 @@ def facet_vectors(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return out
 
 
-def surface_vectors(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The integral (N, 3) [m^2] of N_i n over the whole surface, as `facet_vectors`: of grad N_i over the body.
+def integrate_surface_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The integral (N, 3) [m^2] of N_i n over the whole surface, as `integrate_facet_normals`: of grad N_i over the body.
 
     Engelman, Sani, Gresho 1982, "The implementation of normal and/or tangential boundary conditions in finite element
     codes for incompressible fluid flow", Int. J. Numer. Methods Fluids 2:225-238.
     """
     out = np.zeros_like(nodes)
-    np.add.at(out, triangles, facet_vectors(nodes, triangles))
+    np.add.at(out, triangles, integrate_facet_normals(nodes, triangles))
     return out
 
 
 @cache
-def kernel_of(device: Device) -> wp.Kernel:
+def build_kernel(device: Device) -> wp.Kernel:
     """Kernel of a device's scalar type, over (patch, column)."""
     scalar = device.scalar
 
@@ -88,10 +88,10 @@ class Leak:
     def __init__(self, anatomy: Anatomy, space: Discretisation, device: Device, around: float = 7e-3):
         solid = (anatomy.slide_normal != 0.0).any(axis=1) | anatomy.held.all(axis=1)
         covered = solid[space.mesh.surface].all(axis=1)
-        vectors = facet_vectors(space.nodes, space.surface)
+        vectors = integrate_facet_normals(space.nodes, space.surface)
         corners = space.nodes[space.surface[:, :3]]
         near = KDTree(corners.mean(axis=1)).query_ball_point(corners.mean(axis=1), around)
-        size = areas(corners)
+        size = compute_areas(corners)
         patches = [
             np.array([row]) if not covered[row] else np.array(some)[covered[some]] for row, some in enumerate(near)
         ]
@@ -112,6 +112,6 @@ class Leak:
     def share(self, u: wp.array) -> np.ndarray:
         """Of u (3N, B) [m] on the device: (B,), zero where nothing passes, NaN of what passes where nothing is open."""
         out = wp.zeros((2, u.shape[1]), dtype=wp.float64, device=self._device.name)
-        self._device.launch(kernel_of(self._device), (len(self._arrays[3]), u.shape[1]), [u, *self._arrays], [out])
+        self._device.launch(build_kernel(self._device), (len(self._arrays[3]), u.shape[1]), [u, *self._arrays], [out])
         passed, swept = out.numpy()
         return np.divide(passed, swept, out=np.where(passed > 0.0, np.nan, 0.0), where=swept > 0.0)

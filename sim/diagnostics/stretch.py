@@ -19,7 +19,7 @@ VOLUME, SHARE = 1e-6, 0.1
 
 
 @cache
-def kernel_of(device: Device) -> wp.Kernel:
+def build_kernel(device: Device) -> wp.Kernel:
     """Kernel over (element, column)."""
     scalar, vec, mat = device.scalar, device.vector, device.matrix
     low, high = wp.constant(wp.float64((LEAST - ROUND_OFF) ** 2)), wp.constant(wp.float64((MOST + ROUND_OFF) ** 2))
@@ -82,10 +82,10 @@ class Stretch:
     def measure(self, u: wp.array) -> dict[str, np.ndarray]:
         """Fields `stretch` and `strained` of a `Deformation` at u (3N, B) [m] on the device."""
         found = self._device.array(np.repeat([[1.0], [1.0], [0.0]], u.shape[1], axis=1), wp.float64)
-        self._device.launch(kernel_of(self._device), (len(self._shape[1]), u.shape[1]), [u, *self._shape], [found])
+        self._device.launch(build_kernel(self._device), (len(self._shape[1]), u.shape[1]), [u, *self._shape], [found])
         least, most, volume = found.numpy()
         return {"stretch": np.sqrt(np.stack([least.clip(0.0), most])), "strained": volume}
 
-    def exceeds(self, volume: np.ndarray) -> np.ndarray:
+    def is_beyond_range(self, volume: np.ndarray) -> np.ndarray:
         """Return whether volumes (B,) [m^3] strained beyond the measured range are too large to rely on: (B,) bool."""
         return volume > self._limit

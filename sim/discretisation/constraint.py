@@ -13,7 +13,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..errors import InputError
-from ..runtime.columns import CHUNK, combined, gathered
+from ..runtime.columns import CHUNK, combine_columns, gather_columns
 from ..runtime.device import Device, forward_kernel
 
 
@@ -44,7 +44,7 @@ class ConstraintKernels:
 
 
 @cache
-def kernels_of(device: Device) -> ConstraintKernels:
+def build_kernels(device: Device) -> ConstraintKernels:
     """Kernels of a device's scalar type."""
     scalar, vec = device.scalar, device.vector
     chunk = CHUNK
@@ -167,9 +167,9 @@ class Constraint:
     def keep(self, columns: np.ndarray) -> None:
         """Keep these columns (k,) of the batch."""
         if self._value is not None:
-            self._value = gathered(self.device, self._value, columns)
+            self._value = gather_columns(self.device, self._value, columns)
         if self._weight is not None:
-            self._weight = gathered(self.device, self._weight, columns)
+            self._weight = gather_columns(self.device, self._weight, columns)
             self._target, self._gram = self._target[:, columns], self._gram[columns]
 
     @property
@@ -192,23 +192,23 @@ class Constraint:
     def project_nodes(self, v: wp.array) -> None:
         """Remove from v (3N, b) what held and sliding nodes forbid, in place, whatever the loads."""
         dim = (len(self.held), v.shape[1])
-        self.device.launch(kernels_of(self.device).project, dim, [self._held, self._normal], [v])
+        self.device.launch(build_kernels(self.device).project, dim, [self._held, self._normal], [v])
 
     def close_gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
         """The least motion (3N, b) that takes u (3N, b) to the constraints, and its largest component (b,) [m]."""
         gap = self.device.zeros(*u.shape)
         value = self._value if self._value is not None else gap
         inputs = [self._held, self._normal, self._drag, value, u]
-        self.device.launch(kernels_of(self.device).close, (len(self.held), u.shape[1]), inputs, [gap])
+        self.device.launch(build_kernels(self.device).close, (len(self.held), u.shape[1]), inputs, [gap])
         if self._weight is not None:
             rest = self.device.zeros(*u.shape)
             reached = self._average(u) + self._average(gap)
             self._spread(self._target - reached, rest)
             self.project_nodes(rest)
-            combined(self.device, gap, 1.0, rest, gap)
+            combine_columns(self.device, gap, 1.0, rest, gap)
         return gap, np.abs(gap.numpy()).max(axis=0, initial=0.0)
 
-    def force_on_footprint(self, gradient: wp.array) -> np.ndarray | None:
+    def compute_footprint_force(self, gradient: wp.array) -> np.ndarray | None:
         """The multipliers (3, b) [N]: the force with which the tool moves its footprint, or None without one.
 
         In equilibrium P gradient = P W force. The gradient (3N, b) is projected in place.
@@ -241,7 +241,7 @@ class Constraint:
         assert self._weight is not None
         out = self.device.zeros(3, v.shape[1])
         dim = (-(-len(self.held) // CHUNK), v.shape[1])
-        self.device.launch(kernels_of(self.device).average, dim, [self._weight, v], [out])
+        self.device.launch(build_kernels(self.device).average, dim, [self._weight, v], [out])
         return out.numpy().astype(np.float64)
 
     def _solved(self, mean: np.ndarray) -> np.ndarray:
@@ -249,7 +249,7 @@ class Constraint:
 
     def _spread(self, mean: np.ndarray, v: wp.array) -> None:
         inputs = [self._weight, self.device.array(self._solved(mean))]
-        self.device.launch(kernels_of(self.device).spread, (len(self.held), v.shape[1]), inputs, [v])
+        self.device.launch(build_kernels(self.device).spread, (len(self.held), v.shape[1]), inputs, [v])
 
 
 def _within_free(held: np.ndarray, normal: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:

@@ -40,7 +40,7 @@ class Elements:
         return replace(self, table=np.searchsorted(nodes, self.table).astype(self.table.dtype), nodes=len(nodes))
 
 
-def linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
+def build_linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     """Linear tetrahedra: one quadrature point, gradients constant. `chosen` (T,) bool picks elements."""
     tets = mesh.tets[chosen]
     corners = mesh.nodes[tets]
@@ -51,7 +51,7 @@ def linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     return Elements(tets, gradient[:, None], weight, len(mesh.nodes), np.flatnonzero(chosen), tets)
 
 
-def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray) -> Elements:
+def build_quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray) -> Elements:
     """Ten-node tetrahedra, straight or curved, eight quadrature points of degree 3.
 
     Zienkiewicz, Taylor 2005, "The Finite Element Method", section 4.7. nodes (N, 3) [m]; table (T, 10): corners, then
@@ -63,7 +63,7 @@ def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray)
         An element that its mid-edge nodes fold over.
     """
     table = table[chosen]
-    slope = quadratic_slopes(EIGHT_POINTS)
+    slope = compute_quadratic_slopes(EIGHT_POINTS)
     jacobian = np.einsum("tai,qaj->tqij", nodes[table], slope)
     volume = np.linalg.det(jacobian)
     folded = np.flatnonzero((volume <= 0.0).any(axis=1))
@@ -77,13 +77,13 @@ def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray)
     return Elements(table, gradient, weight, len(nodes), np.flatnonzero(chosen), table[:, :4])
 
 
-def quadratic_shapes(corner: np.ndarray, edges: np.ndarray) -> np.ndarray:
+def compute_quadratic_shapes(corner: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Shape functions (..., n) of a quadratic simplex at corner coordinates (..., d): L (2 L - 1), and 4 L_i L_j."""
     middle = 4.0 * corner[..., edges[:, 0]] * corner[..., edges[:, 1]]
     return np.concatenate([corner * (2.0 * corner - 1.0), middle], axis=-1)
 
 
-def quadratic_slopes(corner: np.ndarray) -> np.ndarray:
+def compute_quadratic_slopes(corner: np.ndarray) -> np.ndarray:
     """Derivatives (q, 10, 3) of the ten shape functions by corner coordinates 1, 2, 3 at points (q, 4)."""
     slope = np.zeros((len(corner), 10, 4))
     slope[:, np.arange(4), np.arange(4)] = 4.0 * corner - 1.0
@@ -92,7 +92,9 @@ def quadratic_slopes(corner: np.ndarray) -> np.ndarray:
     return slope[:, :, 1:] - slope[:, :, :1]
 
 
-def hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray, together: int = 8_000_000) -> sp.csc_array:
+def assemble_hooke_stiffness(
+    elements: Elements, mu: np.ndarray, lam: np.ndarray, together: int = 8_000_000
+) -> sp.csc_array:
     """Stiffness at rest (3N, 3N) [N/m] of isotropic elements with Lamé's mu, lam (T,) [Pa].
 
     K = integral of 2 mu E^T E + lambda D^T D, with the strains E and the change of volume D of a motion. See Hughes

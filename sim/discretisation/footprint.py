@@ -161,7 +161,7 @@ class ContactSurface:
         inputs += [self._division.fineness, self._division.fewest, self._division.most]
         self.device.launch(_press, (len(self._ball), len(imprint.tools)), inputs, [imprint.weight, imprint.sums])
 
-    def demand_touch(self, points: np.ndarray, radii: np.ndarray) -> None:
+    def check_tools_touch(self, points: np.ndarray, radii: np.ndarray) -> None:
         """Refuse tools, as `press` has them, of which one does not touch the surface.
 
         Raises
@@ -204,12 +204,14 @@ class ContactSurface:
             self.device.launch(_settle, fewer.shape, [some], [fewer])
 
 
-def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray) -> sp.csr_array:
+def compute_footprint_weights(
+    nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray
+) -> sp.csr_array:
     """Weights (B, N), each row summing to one; parameters and errors as `ContactSurface` and `ContactSurface.press`, on the host."""
     return ContactSurface(nodes, triangles, find_device("cpu", "float64")).press(points, radii).rows(len(nodes))
 
 
-def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
+def find_nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     """The point (3,) nearest to `point` (3,) on triangles with `corners` (S, 3, 3) [m]."""
     apart = np.arange(3 * len(corners)).reshape(-1, 3)
     skin = ContactSurface(corners.reshape(-1, 3), apart, find_device("cpu", "float64"))

@@ -8,12 +8,12 @@ import numpy as np
 import warp as wp
 
 from ..runtime.device import Device, forward_kernel
-from .element import linear_elements, quadratic_elements
+from .element import build_linear_elements, build_quadratic_elements
 from .space import Discretisation
 
 
 @cache
-def kernel_of(device: Device, size: int, points: int, least: float) -> wp.Kernel:
+def build_kernel(device: Device, size: int, points: int, least: float) -> wp.Kernel:
     """The kernel for tetrahedra of `size` nodes and `points` quadrature points, over (tetrahedron, column)."""
     scalar, vec = device.scalar, device.vector
 
@@ -51,7 +51,9 @@ class Inversion:
         every = np.ones(len(space.mesh.tets), bool)
         quadratic = space.element == "p2"
         elements = (
-            quadratic_elements(space.nodes, space.table, every) if quadratic else linear_elements(space.mesh, every)
+            build_quadratic_elements(space.nodes, space.table, every)
+            if quadratic
+            else build_linear_elements(space.mesh, every)
         )
         self._telling = not (bounded and space.element == "smoothed")
         self._device, self._collapsed = device, collapsed
@@ -76,5 +78,5 @@ class Inversion:
         """Add how many in u (3N, B) [m] to out (B,) int32, on the device alone."""
         _, points, size = self._gradient.shape
         inputs = [u, self._table, self._gradient]
-        kernel = kernel_of(self._device, size, points, self._collapsed)
+        kernel = build_kernel(self._device, size, points, self._collapsed)
         self._device.launch(kernel, (len(self._table), u.shape[1]), inputs, [out])

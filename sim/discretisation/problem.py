@@ -13,9 +13,9 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..loads import Loads
-from ..runtime.columns import combined, norms
+from ..runtime.columns import combine_columns, compute_norms
 from ..runtime.device import Device
-from ..runtime.views import in_order, library, on_host, view
+from ..runtime.views import get_library, run_in_order, to_host, view
 from .constraint import Constraint
 from .term import Barrier, Cases, Paced, Strained, Term
 
@@ -29,7 +29,7 @@ class Imposed:
     target: np.ndarray | None = None
 
 
-def nothing_imposed(loads: Loads) -> Imposed:
+def build_no_imposed(loads: Loads) -> Imposed:
     """Held components stay at zero and no footprint is moved."""
     return Imposed()
 
@@ -46,7 +46,7 @@ class Problem:
     terms: tuple[Term, ...]
     constraint: Constraint
     device: Device
-    impose: Callable[[Loads], Imposed] = nothing_imposed
+    impose: Callable[[Loads], Imposed] = build_no_imposed
     barriers: tuple[Barrier, ...] = ()
     elastic: bool = True
     closed: float = 100.0
@@ -122,11 +122,11 @@ class Problem:
         for term in self.terms:
             own = self.device.zeros(*u.shape)
             term.add_gradient(u, own)
-            scale = np.maximum(scale, norms(self.device, own))
-            combined(self.device, total, 1.0, own, total)
-        whole = norms(self.device, total)
+            scale = np.maximum(scale, compute_norms(self.device, own))
+            combine_columns(self.device, total, 1.0, own, total)
+        whole = compute_norms(self.device, total)
         self.constraint.project(total)
-        free = norms(self.device, total)
+        free = compute_norms(self.device, total)
         with np.errstate(invalid="ignore", over="ignore"):  # forces that overflowed: the caller sees it in `free`
             reaction = np.sqrt(np.maximum(whole**2 - free**2, 0.0))  # the projection is orthogonal
             scale = np.maximum(scale, reaction)
@@ -139,10 +139,10 @@ class Problem:
         What round-off leaves open counts as closed, and its motion is zero.
         """
         gap, size = self.constraint.close_gap(u)
-        with in_order(self.device):
-            largest = on_host(library(self.device).amax(abs(view(u)), 0)) if u.size else np.zeros(u.shape[1])
+        with run_in_order(self.device):
+            largest = to_host(get_library(self.device).amax(abs(view(u)), 0)) if u.size else np.zeros(u.shape[1])
         off = size > self.closed * np.finfo(self.device.precision).eps * largest
-        return combined(self.device, gap, off - 1.0, gap, gap), off
+        return combine_columns(self.device, gap, off - 1.0, gap, gap), off
 
     def linearise(self, u: wp.array, definite: np.ndarray) -> None:
         """Fix where `add_curvature` is taken; definite (b,) asks for positive semi-definite curvature."""

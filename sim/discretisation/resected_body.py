@@ -10,7 +10,7 @@ import numpy as np
 from ..anatomy import Anatomy
 from ..effects import Bonded, Effect, Held, Resection, Slide
 from ..errors import InputError
-from .rigid_modes import check_held, loosened
+from .rigid_modes import check_held, find_loose_tetrahedra
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,23 +39,23 @@ class RemainingBody:
         return f"{said}; {len(self.loose)} tetrahedra that nothing held any more went too"
 
 
-def bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[RemainingBody, ...]:
-    """`remains` under effects, `Resection` one of them: what none of them holds, or keeps on the skull, comes loose.
+def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[RemainingBody, ...]:
+    """`compute_remains` under effects, `Resection` one of them: what none of them holds, or keeps on the skull, comes loose.
 
     Raises
     ------
     InputError
-        As `remains`.
+        As `compute_remains`.
     """
     effects = tuple(effects)
     cut = next(effect for effect in effects if isinstance(effect, Resection))
     kinds = {type(effect) for effect in effects}
     held = Held in kinds or not anatomy.held.any()
     whole = anatomy if held else replace(anatomy, held=np.zeros_like(anatomy.held))
-    return remains(whole, cut, bool(kinds & {Bonded, Slide}))
+    return compute_remains(whole, cut, bool(kinds & {Bonded, Slide}))
 
 
-def remains(anatomy: Anatomy, effect: Resection, slides: bool = True) -> tuple[RemainingBody, ...]:
+def compute_remains(anatomy: Anatomy, effect: Resection, slides: bool = True) -> tuple[RemainingBody, ...]:
     """What is left after 0, 1, ... all steps; `slides`: slide normals keep tissue on the skull.
 
     Raises
@@ -77,7 +77,7 @@ def _remains(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[Rema
         try:
             left = anatomy.without(gone)
             kept = np.setdiff1d(np.arange(len(anatomy.mesh.tets)), gone)
-            loose = kept[loosened(left, slides)]
+            loose = kept[find_loose_tetrahedra(left, slides)]
             yield RemainingBody(done, anatomy.without(np.concatenate([gone, loose])) if len(loose) else left, loose)
         except InputError as error:
             raise InputError(f"step {done} of Resection cannot be done: {error}") from error

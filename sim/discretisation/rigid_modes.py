@@ -7,7 +7,7 @@ import scipy.sparse as sp
 
 from ..anatomy import Anatomy
 from ..errors import InputError
-from ..geometry.tetmesh import FACES, TetMesh, row_keys
+from ..geometry.tetmesh import FACES, TetMesh, compute_row_keys
 
 
 def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, felt: float = 1e-6) -> None:
@@ -51,7 +51,7 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, felt: float 
         )
 
 
-def loosened(anatomy: Anatomy, slides: bool = True, felt: float = 1e-6) -> np.ndarray:
+def find_loose_tetrahedra(anatomy: Anatomy, slides: bool = True, felt: float = 1e-6) -> np.ndarray:
     """Tetrahedra (n,) that can move rigidly: joined by faces to nothing held, nor borne by what slides, if it does."""
     normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
     cluster, nodes = _clusters(anatomy.mesh.tets), anatomy.mesh.nodes
@@ -74,7 +74,7 @@ def _components(first: np.ndarray, second: np.ndarray, count: int) -> np.ndarray
 
 def _clusters(tets: np.ndarray) -> np.ndarray:
     """Numbers (T,) of the clusters of elements that are joined by faces."""
-    keys = row_keys(tets[:, FACES].reshape(-1, 3))
+    keys = compute_row_keys(tets[:, FACES].reshape(-1, 3))
     order = np.argsort(keys)
     same = keys[order[1:]] == keys[order[:-1]]
     return _components(order[:-1][same] // 4, order[1:][same] // 4, len(tets))

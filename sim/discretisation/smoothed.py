@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..geometry.tetmesh import EDGES, TetMesh, row_keys
-from .element import Elements, linear_elements
+from ..geometry.tetmesh import EDGES, TetMesh, compute_row_keys
+from .element import Elements, build_linear_elements
 
 
-def edge_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
+def build_edge_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     """One element for each edge and region, over the `chosen` (T,) bool tetrahedra round it."""
     ends = np.sort(mesh.tets[chosen][:, EDGES].reshape(-1, 2))
-    return _averaged(mesh, chosen, row_keys(ends).reshape(-1, len(EDGES)), ends)
+    return _averaged(mesh, chosen, compute_row_keys(ends).reshape(-1, len(EDGES)), ends)
 
 
-def node_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
+def build_node_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     """One element for each node and region, over the `chosen` (T,) bool tetrahedra round it."""
     corners = mesh.tets[chosen].astype(np.int64)
     return _averaged(mesh, chosen, corners, corners.reshape(-1, 1))
@@ -31,7 +31,7 @@ def _averaged(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray, vertices: np.n
 
     `vertices` (T k, n) are those that each number stands for. Regions are never mixed: their tissues differ.
     """
-    linear = linear_elements(mesh, chosen)
+    linear = build_linear_elements(mesh, chosen)
     count, lent = key.shape
     _, region = np.unique(mesh.region[chosen], return_inverse=True)
     key = key * (region.max(initial=0) + 1) + region[:, None]

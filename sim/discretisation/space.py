@@ -10,10 +10,10 @@ import scipy.sparse as sp
 
 from ..elements import ELEMENTS, RECOMMENDED
 from ..errors import InputError
-from ..geometry.surface import unit
-from ..geometry.tetmesh import QUADRATIC_EDGES, TRIANGLE_EDGES, TetMesh, row_keys
-from .element import Elements, linear_elements, quadratic_elements
-from .smoothed import edge_elements, node_elements
+from ..geometry.surface import normalise_vectors
+from ..geometry.tetmesh import QUADRATIC_EDGES, TRIANGLE_EDGES, TetMesh, compute_row_keys
+from .element import Elements, build_linear_elements, build_quadratic_elements
+from .smoothed import build_edge_elements, build_node_elements
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Discretisation:
     @cached_property
     def nodes(self) -> np.ndarray:
         """Rest positions (N, 3) [m]."""
-        return self.interpolated(self.mesh.nodes)
+        return self.interpolate_field(self.mesh.nodes)
 
     @property
     def marks(self) -> np.ndarray:
@@ -71,7 +71,7 @@ class Discretisation:
         if self.table.shape[1] == 4:
             return corners
         ends, wanted = self.table[:, QUADRATIC_EDGES].reshape(-1, 2), corners[:, TRIANGLE_EDGES].reshape(-1, 2)
-        known, asked = np.split(row_keys(np.vstack([ends, wanted])), [len(ends)])
+        known, asked = np.split(compute_row_keys(np.vstack([ends, wanted])), [len(ends)])
         key, first = np.unique(known, return_index=True)
         middles = self.table[:, 4:].ravel()[first[np.searchsorted(key, asked)]]
         return np.column_stack([corners, middles.reshape(-1, 3)])
@@ -85,9 +85,9 @@ class Discretisation:
             Quadratic elements that are folded over.
         """
         if self.element == "p1":
-            return (ElementPart(linear_elements(self.mesh, chosen), "whole"),)
+            return (ElementPart(build_linear_elements(self.mesh, chosen), "whole"),)
         if self.element == "p2":
-            return (ElementPart(quadratic_elements(self.nodes, self.table, chosen), "whole"),)
+            return (ElementPart(build_quadratic_elements(self.nodes, self.table, chosen), "whole"),)
         edges, nodes = _smoothed(self.mesh, chosen.tobytes())
         return ElementPart(edges, "shape"), ElementPart(nodes, "volume")
 
@@ -123,13 +123,13 @@ class Discretisation:
         near, every = np.zeros_like(out), np.zeros_like(out)
         np.add.at(near, self.surface[wall, 3:], twice[wall, None])
         np.add.at(every, self.surface[:, 3:], twice[:, None])
-        near, every = unit(near[len(normal) :]), unit(every[len(normal) :])
+        near, every = normalise_vectors(near[len(normal) :]), normalise_vectors(every[len(normal) :])
         agrees = (np.einsum("nei,ni->ne", normal[self.edges], every) > facing) | ~slides[self.edges]
         found = np.where(agrees.all(axis=1, keepdims=True), every, near)
         out[len(normal) :] = np.where((near != 0.0).any(axis=1, keepdims=True), found, 0.0)
         return out
 
-    def interpolated(self, field: np.ndarray) -> np.ndarray:
+    def interpolate_field(self, field: np.ndarray) -> np.ndarray:
         """(..., N, 3) from (..., V, 3): linear along each edge."""
         return np.concatenate([field, field[..., self.edges, :].mean(axis=-2)], axis=-2)
 
@@ -138,10 +138,10 @@ class Discretisation:
 def _smoothed(mesh: TetMesh, chosen: bytes) -> tuple[Elements, Elements]:
     """Edge and node elements over the `chosen` tetrahedra (T,), as bytes of bool."""
     tets = np.frombuffer(chosen, bool)
-    return edge_elements(mesh, tets), node_elements(mesh, tets)
+    return build_edge_elements(mesh, tets), build_node_elements(mesh, tets)
 
 
-def recommended(mesh: TetMesh) -> str:
+def recommend_element(mesh: TetMesh) -> str:
     """The element of who names none: `RECOMMENDED`, or p2 on a mesh that brings mid-edge nodes of its own."""
     return RECOMMENDED if mesh.middles is None else "p2"
 
@@ -149,14 +149,14 @@ def recommended(mesh: TetMesh) -> str:
 def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
     """The nodes and elements of type `element`, one of `ELEMENTS`, over a mesh.
 
-    None: the `recommended` one.
+    None: the `recommend_element` one.
 
     Raises
     ------
     InputError
         An unknown type; a linear type on a mesh that brings mid-edge nodes of its own.
     """
-    element = recommended(mesh) if element is None else element
+    element = recommend_element(mesh) if element is None else element
     if element not in tuple(ELEMENTS):  # which need not be hashable
         raise InputError(f"no element is called {element!r}: choose one of {', '.join(ELEMENTS)}.")
     none = np.zeros((0, 2), np.int32)
@@ -167,6 +167,6 @@ def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
     if element != "p2":
         return Discretisation(mesh, element, mesh.tets, none)
     ends = np.sort(mesh.tets[:, QUADRATIC_EDGES].reshape(-1, 2), axis=1)
-    _, first, place = np.unique(row_keys(ends), return_index=True, return_inverse=True)
+    _, first, place = np.unique(compute_row_keys(ends), return_index=True, return_inverse=True)
     middles = len(mesh.nodes) + place.reshape(-1, 6).astype(np.int32)
     return Discretisation(mesh, element, np.hstack([mesh.tets, middles]), ends[first])

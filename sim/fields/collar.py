@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from ..geometry.closest_point import closest
-from ..geometry.tetmesh import faces_once
+from ..geometry.closest_point import find_closest_points
+from ..geometry.tetmesh import find_single_faces
 
 # Triangles, of which one is the closest, and points that are looked at together.
 NEAR, TOGETHER = 16, 4096
@@ -14,20 +14,22 @@ NEAR, TOGETHER = 16, 4096
 SHARE, TINY = 0.5, 1e-30
 
 
-def beyond_surface(nodes: np.ndarray, tets: np.ndarray, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+def extrapolate_beyond_surface(
+    nodes: np.ndarray, tets: np.ndarray, values: np.ndarray, points: np.ndarray
+) -> np.ndarray:
     """Values (n, 3) at points (n, 3) [m] near the surface of tetrahedra (T, 4), from those at vertices (V, 3) of each.
 
     A point has the value of the closest place of the surface, and goes on from there as the field does inside. That is
     by the mean gradient of the tetrahedra round each vertex, and at most by half of the value.
     """
-    surface = faces_once(tets)
-    corners, slopes = nodes[surface], vertex_gradients(nodes, tets, values)
+    surface = find_single_faces(tets)
+    corners, slopes = nodes[surface], compute_vertex_gradients(nodes, tets, values)
     middles = KDTree(corners.mean(axis=1))
     found = np.empty((len(points), 3))
     for first in range(0, len(points), TOGETHER):
         some = slice(first, first + TOGETHER)
         near = middles.query(points[some], k=min(NEAR, len(surface)))[1].reshape(len(points[some]), -1)
-        place, which, weights = closest(points[some], corners[near])
+        place, which, weights = find_closest_points(points[some], corners[near])
         vertices = surface[near[np.arange(len(near)), which]]
         gradient = np.einsum("nc,ncij->nij", weights, slopes[vertices])
         level = np.einsum("nc,nci->ni", weights, values[vertices])
@@ -37,7 +39,7 @@ def beyond_surface(nodes: np.ndarray, tets: np.ndarray, values: np.ndarray, poin
     return found
 
 
-def vertex_gradients(nodes: np.ndarray, tets: np.ndarray, values: np.ndarray) -> np.ndarray:
+def compute_vertex_gradients(nodes: np.ndarray, tets: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Gradients (V, 3, 3) of values (V, 3): the mean of the tetrahedra round each vertex, by volume."""
     corners, at = nodes[tets], values[tets]
     edges = corners[:, 1:] - corners[:, :1]

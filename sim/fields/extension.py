@@ -9,7 +9,7 @@ from scipy import ndimage
 SWEEPS = 6
 
 
-def extended(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:
+def extend_field(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:
     """The field (3, I, J, K) with nodes that are not known (I, J, K) filled in; zero from `reach` [nodes] on.
 
     They have the nearest known value, the less of it the farther away it is, and are smoothed. No value exceeds those
@@ -27,7 +27,7 @@ def extended(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:
 
 
 def _fill(field: np.ndarray, known: np.ndarray, reach: float) -> None:
-    """As `extended`, in place, where what is known and moves is farther than that from the edge."""
+    """As `extend_field`, in place, where what is known and moves is farther than that from the edge."""
     nearest = np.empty((3, *known.shape), np.int32)
     ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True, indices=nearest)
     square = np.zeros(known.shape, np.int32)  # of the distance; SciPy's takes twice the time and memory

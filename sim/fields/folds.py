@@ -26,7 +26,7 @@ ALONG = np.array([[corner, *np.where(np.eye(3, dtype=int), 1 - corner, corner)] 
 SIGNS = (1.0 - 2.0 * CORNERS).prod(axis=1)
 
 
-def jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
+def compute_jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
     """Least determinants (I - 1, J - 1, K - 1) of 1 + the gradient of a field (3, I, J, K) [m], cells of a spacing [m].
 
     A cell has eight corners; at each, gradients are differences along the three edges that meet there. These are the
@@ -56,17 +56,17 @@ def jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
         places = part.reshape(3, -1).T.astype(np.float64) + np.moveaxis(np.indices(part.shape[1:]), 0, -1).reshape(
             -1, 3
         )
-        least[tuple(strong.T)] = volumes(places, corner_nodes(strong, part.shape[1:])).min(axis=1)
+        least[tuple(strong.T)] = compute_corner_volumes(places, find_corner_nodes(strong, part.shape[1:])).min(axis=1)
         found[first : first + TOGETHER] = least
     return found
 
 
-def corner_nodes(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def find_corner_nodes(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Numbers (n, 8, 4) of nodes in a grid of a shape: each corner of cells (n, 3), and the ends of its edges."""
     return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(cells[:, None, None] + ALONG, -1, 0)), shape))
 
 
-def volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def compute_corner_volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Volumes (n, 8) at the corners (n, 8, 4) of cells, from the places (N, 3) of nodes in units of the spacing."""
     at = places[corners]
     return SIGNS * np.linalg.det(at[:, :, 1:] - at[:, :, :1])
@@ -80,7 +80,7 @@ def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: f
     (Simultaneous untangling and smoothing of tetrahedral meshes, 2003). Folds that stay are smoothed, and tried again:
     there the body itself may fold. Returns the least determinant that is left.
     """
-    found = jacobians(field, spacing)
+    found = compute_jacobians(field, spacing)
     for turn in range(TIMES):
         bad = found < TIGHT
         if not bad.any():
@@ -97,7 +97,7 @@ def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: f
                 smooth(part, ndimage.maximum_filter(nodes, 2 * turn + 2), SWEEPS)
             stiff = np.where(inside[window], STIFF, np.where(collar[window], COLLAR, SOFT))
             _mend(part, near, stiff, spacing)
-            found[where] = jacobians(part, spacing)
+            found[where] = compute_jacobians(part, spacing)
     return float(found.min())
 
 
@@ -106,7 +106,7 @@ def _mend(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float)
     shape = near.shape
     near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
     cells = np.argwhere(ndimage.maximum_filter(near, 2, origin=-1)[:-1, :-1, :-1])
-    used, corners = np.unique(corner_nodes(cells, shape), return_inverse=True)
+    used, corners = np.unique(find_corner_nodes(cells, shape), return_inverse=True)
     corners = corners.reshape(-1, 4)
     signs = np.tile(SIGNS, len(cells))
     flat = part.reshape(3, -1)

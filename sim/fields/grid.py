@@ -48,7 +48,7 @@ class Grid:
         return np.stack([ndimage.map_coordinates(part, index, order=1) for part in field], axis=-1)
 
 
-def grid_around(points: np.ndarray, spacing: float, margin: float) -> Grid:
+def build_grid_around(points: np.ndarray, spacing: float, margin: float) -> Grid:
     """The grid of a spacing [m] round points (n, 3) [m], with a margin [m]; nodes lie at multiples of the spacing."""
     low = np.floor((points.min(axis=0) - margin) / spacing)
     high = np.ceil((points.max(axis=0) + margin) / spacing)

@@ -23,7 +23,9 @@ class _Hits(NamedTuple):
     weights: np.ndarray
 
 
-def in_tetrahedra(grid: Grid, nodes: np.ndarray, tets: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def interpolate_in_tetrahedra(
+    grid: Grid, nodes: np.ndarray, tets: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate values (V, 3) at vertices `nodes` (V, 3) [m] of tetrahedra (T, 4), linearly within each.
 
     Returns the field (3, I, J, K) in float32, zero outside, and which nodes are inside (I, J, K).

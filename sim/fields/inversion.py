@@ -12,7 +12,7 @@ EXACT, STEPS, LONGEST = 1e-6, 25, 2.0
 SHORTER = 0.6
 
 
-def inverted(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
+def invert_field(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
     """Find d (n, 3) [m] with d = -forward(y + d) at points y (n, 3) [m], from a guess (n, 3).
 
     Most are found as the fixed point of that equation. It is no way to all: where tissue is sheared by more than 45
@@ -30,12 +30,12 @@ def inverted(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndar
         if not len(going):
             break
     hard = np.concatenate([*left, going])
-    found[hard] = by_newton(grid, forward, points[hard], guess[hard])
+    found[hard] = invert_by_newton(grid, forward, points[hard], guess[hard])
     return found
 
 
-def by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """As `inverted`, by Newton's method; of a point that is not found, the best try comes back."""
+def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """As `invert_field`, by Newton's method; of a point that is not found, the best try comes back."""
     best, least = guess.copy(), np.full(len(points), np.inf)
     trial, going, share = guess.copy(), np.arange(len(points)), np.ones(len(points))
     step = np.zeros_like(guess)

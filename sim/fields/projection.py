@@ -12,7 +12,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from ..geometry.tetmesh import faces_once
+from ..geometry.tetmesh import find_single_faces
 from .grid import Grid
 
 # Tetrahedra in which the sampled field is off by more [m] are fitted.
@@ -101,7 +101,7 @@ def _samples(grid: Grid, body: NodalField, which: np.ndarray, density: float) ->
 
 def _on_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterator[_Samples]:
     """Points of the surface's triangles of which a vertex is touched (V,)."""
-    faces = faces_once(body.tets)
+    faces = find_single_faces(body.tets)
     faces = faces[touched[faces].any(axis=1)]
     a, b, c = body.nodes[faces].transpose(1, 0, 2)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / (2.0 * grid.spacing**2)

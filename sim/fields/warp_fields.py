@@ -9,13 +9,13 @@ import numpy as np
 from scipy import ndimage
 
 from ..anatomy import Anatomy
-from ..geometry.tetmesh import signed_volumes
-from .collar import beyond_surface
-from .extension import extended
+from ..geometry.tetmesh import compute_signed_volumes
+from .collar import extrapolate_beyond_surface
+from .extension import extend_field
 from .folds import unfold
-from .grid import Grid, grid_around
-from .in_tetrahedra import in_tetrahedra
-from .inversion import inverted
+from .grid import Grid, build_grid_around
+from .in_tetrahedra import interpolate_in_tetrahedra
+from .inversion import invert_field
 from .projection import NodalField, project
 
 # Beyond the body the field fades to zero within so much [m], and so many times what the body moves by.
@@ -60,20 +60,20 @@ class WarpFields:
         return not min(self.least[:2]) > 0.0
 
 
-def reach_of(displacement: np.ndarray) -> float:
+def compute_reach(displacement: np.ndarray) -> float:
     """How far from the body the field of displacements (..., 3) [m] fades to zero [m]."""
     return LEAST_REACH + REACHES * float(np.linalg.norm(displacement, axis=-1).max())
 
 
-def faint_of(displacement: np.ndarray) -> float:
+def compute_faint_threshold(displacement: np.ndarray) -> float:
     """What is too faint to count of displacements (..., 3) [m], so that the grid need not hold all of a body [m]."""
     return min(FAINT, SHARE * float(np.linalg.norm(displacement, axis=-1).max()))
 
 
-def faded(displacement: np.ndarray) -> np.ndarray:
+def remove_faint(displacement: np.ndarray) -> np.ndarray:
     """Displacements (..., 3) [m] without those that are too faint to count."""
     size = np.linalg.norm(displacement, axis=-1, keepdims=True)
-    share = np.clip(size / max(faint_of(displacement), TINY) - 1.0, 0.0, 1.0)
+    share = np.clip(size / max(compute_faint_threshold(displacement), TINY) - 1.0, 0.0, 1.0)
     return displacement * (share * share * (3.0 - 2.0 * share))
 
 
@@ -83,14 +83,14 @@ def warp_grid(anatomy: Anatomy, displacements: np.ndarray, spacing: float) -> Gr
     moves = np.asarray(displacements.any(axis=(0, 2)))
     tets, faces = (of[moves[of].any(axis=1)] for of in (mesh.tets, mesh.surface))
     held, outer = np.unique(tets if len(tets) else mesh.tets), np.unique(faces)
-    reach = reach_of(displacements)
+    reach = compute_reach(displacements)
     places = [mesh.nodes[held], *(mesh.nodes[held] + displacements[:, held])]
     for some in (mesh.nodes[outer], *(mesh.nodes[outer] + displacements[:, outer])):
         places += [some - reach, some + reach]
-    return grid_around(np.concatenate(places), spacing, EDGE * spacing)
+    return build_grid_around(np.concatenate(places), spacing, EDGE * spacing)
 
 
-def collar_of(inside: np.ndarray) -> np.ndarray:
+def find_collar(inside: np.ndarray) -> np.ndarray:
     """Nodes (I, J, K) outside a body that are corners of its surface's cells, by the nodes inside."""
     return np.asarray(ndimage.maximum_filter(inside, 3) & ~inside)
 
@@ -102,27 +102,29 @@ def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.
     it goes on as it is, so that what is read there is right up to the surface. From there it fades to zero.
     """
     nodes, tets = body.mesh.nodes, body.mesh.tets
-    field, inside = in_tetrahedra(grid, nodes, tets, displacement)
-    collar = collar_of(inside)
+    field, inside = interpolate_in_tetrahedra(grid, nodes, tets, displacement)
+    collar = find_collar(inside)
     numbers = np.flatnonzero(collar)
-    field.reshape(3, -1)[:, numbers] = beyond_surface(nodes, tets, displacement, grid.points(numbers)).T
+    field.reshape(3, -1)[:, numbers] = extrapolate_beyond_surface(nodes, tets, displacement, grid.points(numbers)).T
     project(grid, field, inside, collar, NodalField(nodes, tets, displacement))
-    filled = extended(field, inside | collar, reach_of(displacement) / grid.spacing)
+    filled = extend_field(field, inside | collar, compute_reach(displacement) / grid.spacing)
     return filled, unfold(filled, inside, collar, grid.spacing)
 
 
-def backward_on(grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np.ndarray) -> tuple[np.ndarray, float]:
+def invert_on_grid(
+    grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np.ndarray
+) -> tuple[np.ndarray, float]:
     """The inverse (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian.
 
     Within the deformed body it is linear in each tetrahedron, and fitted. Outside it is the forward field's inverse.
     """
     now, tets = body.mesh.nodes + displacement, body.mesh.tets
-    field, inside = in_tetrahedra(grid, now, tets, -displacement)
+    field, inside = interpolate_in_tetrahedra(grid, now, tets, -displacement)
     numbers = np.flatnonzero(~inside & (np.abs(forward).max(axis=0) > STILL))
     flat = field.reshape(3, -1)
     guess = -forward.reshape(3, -1)[:, numbers].T.astype(np.float64)
-    flat[:, numbers] = inverted(grid, forward, grid.points(numbers), guess).T
-    collar = collar_of(inside)
+    flat[:, numbers] = invert_field(grid, forward, grid.points(numbers), guess).T
+    collar = find_collar(inside)
     project(grid, field, inside, collar, NodalField(now, tets, -displacement))
     return field, unfold(field, inside, collar, grid.spacing)
 
@@ -139,17 +141,17 @@ def warp_fields(
     `left` is what is left of a body that was cut. Round a body nothing is known: there the fields fade. `made` is
     called when either field is made.
     """
-    displacement = faded(displacement)
+    displacement = remove_faint(displacement)
     body, grid = left or anatomy, warp_grid(anatomy, displacement[None], spacing)
     mesh = body.mesh
     forward, least_forward = forward_on(grid, body, displacement)
     made()
-    backward, least_backward = backward_on(grid, body, displacement, forward)
+    backward, least_backward = invert_on_grid(grid, body, displacement, forward)
     made()
-    share = float((signed_volumes(mesh.nodes + displacement, mesh.tets) / mesh.volumes).min())
+    share = float((compute_signed_volumes(mesh.nodes + displacement, mesh.tets) / mesh.volumes).min())
     gone = np.zeros(grid.shape, bool)
     if len(mesh.tets) < len(anatomy.mesh.tets):
-        gone = in_tetrahedra(grid, anatomy.mesh.nodes, anatomy.mesh.tets, displacement)[1]
-        gone &= ~in_tetrahedra(grid, mesh.nodes, mesh.tets, displacement)[1]
+        gone = interpolate_in_tetrahedra(grid, anatomy.mesh.nodes, anatomy.mesh.tets, displacement)[1]
+        gone &= ~interpolate_in_tetrahedra(grid, mesh.nodes, mesh.tets, displacement)[1]
     least = least_forward, least_backward, share
-    return WarpFields(grid, forward, backward, gone, least, reach_of(displacement))
+    return WarpFields(grid, forward, backward, gone, least, compute_reach(displacement))

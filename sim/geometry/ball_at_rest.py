@@ -10,14 +10,14 @@ from ..errors import InputError
 SLACK = 1e-9
 
 
-def resting_tip(
+def find_resting_tip(
     nodes: np.ndarray, triangles: np.ndarray, through: np.ndarray, inward: np.ndarray, radius: float
 ) -> np.ndarray:
-    """Return the tip (3,) [m] of one ball: `resting_tips` on nodes (V, 3) [m], along a line through (3,) [m]."""
-    return resting_tips(nodes[None], triangles, through[None], inward, np.array([radius]))[0]
+    """Return the tip (3,) [m] of one ball: `find_resting_tips` on nodes (V, 3) [m], along a line through (3,) [m]."""
+    return find_resting_tips(nodes[None], triangles, through[None], inward, np.array([radius]))[0]
 
 
-def resting_tips(
+def find_resting_tips(
     nodes: np.ndarray, triangles: np.ndarray, through: np.ndarray, inward: np.ndarray, radius: np.ndarray
 ) -> np.ndarray:
     """Return the tips (B, 3) [m] of balls that come down a line each until they first touch a surface of their own.

@@ -20,7 +20,7 @@ class Closest(NamedTuple):
     weights: np.ndarray
 
 
-def closest(points: np.ndarray, corners: np.ndarray) -> Closest:
+def find_closest_points(points: np.ndarray, corners: np.ndarray) -> Closest:
     """Find what is closest to points (B, 3) [m] on triangles with corners (S, 3, 3), or (B, S, 3, 3) [m].
 
     It is the foot on a triangle's plane where that lies inside, else the closest point of an edge. Triangles without
@@ -28,12 +28,12 @@ def closest(points: np.ndarray, corners: np.ndarray) -> Closest:
     the closest; the distance to the middle of every one is looked at.
     """
     if corners.ndim == 3:
-        middle, reach = bounding_balls(corners)
+        middle, reach = compute_bounding_balls(corners)
         parts = []
         for first in range(0, len(points), TOGETHER):
             some = points[first : first + TOGETHER]
             near = _candidates(some, middle, reach)
-            found = closest(some, corners[near])
+            found = find_closest_points(some, corners[near])
             parts.append(found._replace(triangle=near[np.arange(len(near)), found.triangle]))
         return parts[0] if len(parts) == 1 else Closest(*map(np.concatenate, zip(*parts, strict=True)))
     edge = np.roll(corners, -1, axis=2) - corners
@@ -63,14 +63,14 @@ def closest(points: np.ndarray, corners: np.ndarray) -> Closest:
     return Closest(np.einsum("bc,bci->bi", weights, corners[row, triangle]), triangle, weights)
 
 
-def bounding_balls(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def compute_bounding_balls(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Middles (S, 3) and radii (S,) [m] of balls that hold a triangle each, of corners (S, 3, 3) [m]."""
     middle = corners.mean(axis=1)
     return middle, np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
 
 
 def _candidates(points: np.ndarray, middle: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Numbers (B, k) of triangles, given by their `bounding_balls`, among which the closest is.
+    """Numbers (B, k) of triangles, given by their `compute_bounding_balls`, among which the closest is.
 
     No middle lies nearer than their nearest corner may.
 

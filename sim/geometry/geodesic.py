@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array, csgraph
 
-from .tetmesh import row_keys
+from .tetmesh import compute_row_keys
 
 
-def distances(
+def compute_geodesic_distances(
     nodes: np.ndarray, triangles: np.ndarray, source: np.ndarray, limit: float, steiner: int = 4
 ) -> np.ndarray:
     """Length (V,) [m] of the shortest path over the surface `triangles` (S, 3) from `source` (3,) to each node.
@@ -29,7 +29,7 @@ def distances(
     points = np.concatenate([points, source[None]])
     start = len(points) - 1
     links = np.concatenate([links, np.stack([first, np.full(len(first), start)], axis=1)])
-    links = links[np.unique(row_keys(links), return_index=True)[1]]  # once each: the graph would add doubles up
+    links = links[np.unique(compute_row_keys(links), return_index=True)[1]]  # once each: the graph would add doubles up
     length = np.linalg.norm(points[links[:, 0]] - points[links[:, 1]], axis=1)
     graph = coo_array((np.maximum(length, 1e-12), links.T), shape=(start + 1, start + 1)).tocsr()
     along = csgraph.dijkstra(graph, directed=False, indices=start, limit=limit)
@@ -41,7 +41,7 @@ def distances(
 def _with_steiner_points(nodes: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """All points of the graph, the nodes first, and those on the rim of each triangle (S, 3 + 3 count)."""
     sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    _, first, number = np.unique(row_keys(sides), return_index=True, return_inverse=True)
+    _, first, number = np.unique(compute_row_keys(sides), return_index=True, return_inverse=True)
     edges = sides[first]
     share = (np.arange(count) + 1.0) / (count + 1.0)
     start, end = nodes[edges[:, 0]], nodes[edges[:, 1]]

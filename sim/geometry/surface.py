@@ -27,7 +27,7 @@ class BlurRange:
     together: int = 2_000
 
 
-def blurred_normals(
+def compute_blurred_normals(
     nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, blur: float, limits: BlurRange = BlurRange()
 ) -> np.ndarray:
     """Unit normals (n, 3) at points (n, 3) [m] of the body within outward triangles (S, 3), seen through a blur.
@@ -51,26 +51,26 @@ def blurred_normals(
         )
         near.data = np.exp(-0.5 * (near.data / blur) ** 2)
         out[some] = near @ twice
-    return unit(out)
+    return normalise_vectors(out)
 
 
-def vertex_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def compute_vertex_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Unit normals (V, 3) at nodes (V, 3) [m] of outward triangles (S, 3): their area-weighted mean; zero off them."""
     corners = nodes[triangles]
     twice = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(nodes)
     for corner in triangles.T:
         np.add.at(total, corner, twice)
-    return unit(total)
+    return normalise_vectors(total)
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
+def normalise_vectors(vectors: np.ndarray) -> np.ndarray:
     """Vectors (n, 3) at unit length; zero stays zero."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)
 
 
-def encloses(corners: np.ndarray, point: np.ndarray) -> bool:
+def is_enclosing(corners: np.ndarray, point: np.ndarray) -> bool:
     """Whether a closed surface of triangles with corners (S, 3, 3) [m] has a point (3,) [m] inside it.
 
     By its winding number: the solid angles of all triangles add up to a whole turn or to none, whichever way they face.
@@ -83,17 +83,17 @@ def encloses(corners: np.ndarray, point: np.ndarray) -> bool:
     return bool(abs(half.sum()) > np.pi)
 
 
-def edge_lengths(corners: np.ndarray) -> np.ndarray:
+def compute_edge_lengths(corners: np.ndarray) -> np.ndarray:
     """Of each edge (S, 3) [m] of triangles with corners (S, 3, 3) [m]."""
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
 
 
-def areas(corners: np.ndarray) -> np.ndarray:
+def compute_areas(corners: np.ndarray) -> np.ndarray:
     """(S,) [m^2] of triangles with corners (S, 3, 3) [m]."""
     a, b, c = np.moveaxis(corners, 1, 0)
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-def vertex_areas(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def compute_vertex_areas(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """A third (n,) [m^2] of the areas of the triangles (S, 3) at each of the nodes (n, 3) [m]."""
-    return np.bincount(triangles.ravel(), np.repeat(areas(nodes[triangles]) / 3.0, 3), len(nodes))
+    return np.bincount(triangles.ravel(), np.repeat(compute_areas(nodes[triangles]) / 3.0, 3), len(nodes))

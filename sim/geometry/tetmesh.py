@@ -27,20 +27,20 @@ class MeshWarning(UserWarning):
     """A mesh that can be used but will cost accuracy or was probably not meant so."""
 
 
-def signed_volumes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
+def compute_signed_volumes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
     """Signed volumes (T,) [m^3] of tetrahedra `tets` (T, 4) over `nodes` (V, 3) [m]."""
     a, b, c, d = (nodes[tets[:, k]] for k in range(4))
     return np.einsum("ti,ti->t", np.cross(b - a, c - a), d - a) / 6.0
 
 
-def faces_once(tets: np.ndarray) -> np.ndarray:
+def find_single_faces(tets: np.ndarray) -> np.ndarray:
     """Triangles (S, 3), outwards, that belong to exactly one of the tetrahedra `tets` (T, 4)."""
     faces = tets[:, FACES].reshape(-1, 3)
-    _, first, count = np.unique(row_keys(faces), return_index=True, return_counts=True)
+    _, first, count = np.unique(compute_row_keys(faces), return_index=True, return_counts=True)
     return faces[np.sort(first[count == 1])]
 
 
-def row_keys(rows: np.ndarray) -> np.ndarray:
+def compute_row_keys(rows: np.ndarray) -> np.ndarray:
     """One number (n,) for each row (n, 2) or (n, 3) of node numbers, the same in whatever order the row names them.
 
     Sorting such numbers is ten times faster than sorting rows. They are distinct up to two million nodes.
@@ -51,7 +51,7 @@ def row_keys(rows: np.ndarray) -> np.ndarray:
     return np.asarray(key)
 
 
-def dihedral_angles(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
+def compute_dihedral_angles(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
     """Dihedral angles (T, 6) [degrees] at the edges of each tetrahedron."""
     corners = nodes[tets[:, FACES]]  # (T, 4, 3, 3)
     normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
@@ -79,7 +79,7 @@ class TetMesh:
     ------
     InputError
         Wrong shapes, non-finite coordinates, node numbers out of range, and elements of zero or negative
-        volume (`oriented` turns negative ones).
+        volume (`orient_tetrahedra` turns negative ones).
 
     Warns
     -----
@@ -109,7 +109,7 @@ class TetMesh:
         if len(bad):
             raise InputError(
                 f"tetrahedron {bad[0]} (and {len(bad) - 1} more) has volume {self.volumes[bad[0]]:.3g} m^3: "
-                "zero or negative. Remove degenerate elements, or turn negative ones with `oriented`."
+                "zero or negative. Remove degenerate elements, or turn negative ones with `orient_tetrahedra`."
             )
         _warn_of_doubtful(self)
         for array in self.arrays:
@@ -129,20 +129,20 @@ class TetMesh:
     @cached_property
     def volumes(self) -> np.ndarray:
         """Element volumes (T,) [m^3], between straight edges."""
-        return signed_volumes(self.nodes, self.tets)
+        return compute_signed_volumes(self.nodes, self.tets)
 
     @cached_property
     def surface(self) -> np.ndarray:
         """Outer triangles (S, 3), outwards, by their corners."""
-        return faces_once(self.tets)
+        return find_single_faces(self.tets)
 
     def within(self, *labels: int) -> np.ndarray:
         """(T,) bool: the elements of these regions."""
         return np.isin(self.region, labels)
 
-    def boundary_of(self, *labels: int) -> np.ndarray:
+    def find_boundary(self, *labels: int) -> np.ndarray:
         """Triangles (S, 3), outwards, by their corners, round the elements of these regions together."""
-        return faces_once(self.tets[self.within(*labels)])
+        return find_single_faces(self.tets[self.within(*labels)])
 
     def nodes_of(self, *labels: int) -> np.ndarray:
         """Sorted node numbers (n,) of the elements of these regions."""
@@ -151,10 +151,10 @@ class TetMesh:
     @cached_property
     def digest(self) -> str:
         """Hash of `arrays` (hexadecimal): the same bytes, the same mesh."""
-        return digest_of(*self.arrays)
+        return compute_digest(*self.arrays)
 
 
-def digest_of(*arrays: np.ndarray) -> str:
+def compute_digest(*arrays: np.ndarray) -> str:
     """SHA-256 of the arrays' bytes and shapes, shortened to 16 hexadecimal digits."""
     sha = hashlib.sha256()
     for array in arrays:
@@ -163,7 +163,7 @@ def digest_of(*arrays: np.ndarray) -> str:
     return sha.hexdigest()[:16]
 
 
-def oriented(nodes: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, int]:
+def orient_tetrahedra(nodes: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, int]:
     """Tetrahedra with every volume positive, and how many were turned. Zero volumes stay as they are.
 
     table (T, 4) corners or (T, 10) corners and middles: when corners change places, so do the edges between them.
@@ -175,7 +175,7 @@ def oriented(nodes: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, int]:
     """
     tets = table[:, :4] if table.shape[1:] == (10,) else table
     _check_corners(nodes, tets)
-    negative = signed_volumes(nodes, tets) < 0.0
+    negative = compute_signed_volumes(nodes, tets) < 0.0
     turned = np.array(table)
     turned[negative] = turned[negative][:, TURNED[: table.shape[1]]]
     return turned, int(negative.sum())
@@ -204,7 +204,7 @@ def _check_middles(mesh: TetMesh) -> None:
     if np.intersect1d(middles, mesh.tets).size:
         raise InputError(f"node {np.intersect1d(middles, mesh.tets)[0]} is a corner and the middle of an edge at once.")
     ends = np.sort(mesh.tets[:, QUADRATIC_EDGES].reshape(-1, 2), axis=1)
-    pairs = np.unique(np.column_stack([row_keys(ends), middles.ravel()]), axis=0)
+    pairs = np.unique(np.column_stack([compute_row_keys(ends), middles.ravel()]), axis=0)
     if len(pairs) != len(np.unique(pairs[:, 0])) or len(pairs) != len(np.unique(pairs[:, 1])):
         raise InputError("tetrahedra that share an edge disagree on its middle node: the mesh does not conform.")
 
@@ -218,7 +218,7 @@ def _warn_of_doubtful(mesh: TetMesh) -> None:
             MeshWarning,
             stacklevel=4,
         )
-    slivers = int((dihedral_angles(mesh.nodes, mesh.tets).min(axis=1) < SLIVER_DEGREES).sum())
+    slivers = int((compute_dihedral_angles(mesh.nodes, mesh.tets).min(axis=1) < SLIVER_DEGREES).sum())
     if slivers:
         warnings.warn(
             f"{slivers} tetrahedra have a dihedral angle below {SLIVER_DEGREES:g} degree: "

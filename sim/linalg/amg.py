@@ -13,7 +13,7 @@ import pyamg
 import scipy.sparse as sp
 
 from ..runtime.device import Device
-from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevel, regular
+from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevel, make_regular
 from .pcg import Preconditioner
 
 Direct = Callable[[sp.csc_array, sp.csc_array, np.ndarray], Preconditioner]
@@ -29,7 +29,7 @@ SETTING: dict[str, Any] = {
 }
 
 
-def algebraic(
+def build_multigrid_cycle(
     stiffness: sp.bsr_array,
     motions: np.ndarray,
     direct: Direct,
@@ -69,10 +69,10 @@ def _direct(stiffness: sp.csc_array, motions: sp.csc_array, size: int, direct: D
 
 
 def _blocks(matrix: sp.bsr_matrix) -> sp.bsr_array:
-    return regular(sp.csr_array(matrix), matrix.blocksize[0])
+    return make_regular(sp.csr_array(matrix), matrix.blocksize[0])
 
 
-def rigid_motions(points: np.ndarray) -> np.ndarray:
+def build_rigid_motions(points: np.ndarray) -> np.ndarray:
     """Translations and rotations (3N, 6) of points (N, 3); lengths as shares of the body's."""
     arm = points - points.mean(axis=0)
     arm /= np.abs(arm).max()

@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from ..runtime.blocks import threads_of, wait
+from ..runtime.blocks import get_block_shape, wait
 from ..runtime.device import Device
 
 
@@ -21,9 +21,9 @@ class BlockFactorFunctions:
 
 
 @cache
-def functions_of(device: Device) -> BlockFactorFunctions:
+def build_functions(device: Device) -> BlockFactorFunctions:
     """Those for the blocks of a device."""
-    down, across = threads_of(device)
+    down, across = get_block_shape(device)
     threads = down * across
 
     @wp.func

@@ -45,7 +45,7 @@ class Exchange:
 
 
 @cache
-def rate(where: str, trial: int = Exchange.trial) -> float:
+def measure_rate_of_work(where: str, trial: int = Exchange.trial) -> float:
     """Multiplications and additions a second in double precision, measured by a second product of side `trial`."""
     one = torch.ones((trial, trial), dtype=torch.float64, device=where)
     spent = 0.0
@@ -61,17 +61,17 @@ def exchange_bytes(count: int, settings: Exchange = Exchange()) -> int:
     return 8 * (count * (count + settings.block) // 2 + BESIDE * min(count, settings.block) * count)
 
 
-def fits(count: int, where: str, besides: int = 0, settings: Exchange = Exchange()) -> bool:
+def can_exchange(count: int, where: str, besides: int = 0, settings: Exchange = Exchange()) -> bool:
     """Whether a card can exchange so many unknowns, beside so many bytes, in its free memory and in time."""
     if not torch.cuda.is_available():
         return False
     free, _ = torch.cuda.mem_get_info(where)
     if exchange_bytes(count, settings) + besides >= settings.share * free:
         return False
-    return count**3 / 2 < settings.longest * rate(where, settings.trial)
+    return count**3 / 2 < settings.longest * measure_rate_of_work(where, settings.trial)
 
 
-def halved(matrix: sp.csc_array, cuts: Sequence[int], where: str) -> list[torch.Tensor]:
+def to_half_rows(matrix: sp.csc_array, cuts: Sequence[int], where: str) -> list[torch.Tensor]:
     """A symmetric matrix (n, n) in rows of blocks between the cuts, each as far as its own block on the diagonal."""
     rows, out = sp.csr_array(matrix), []
     for first, stop in pairwise(cuts):
@@ -84,7 +84,7 @@ def halved(matrix: sp.csc_array, cuts: Sequence[int], where: str) -> list[torch.
 
 
 def invert(rows: Sequence[torch.Tensor]) -> None:
-    """-A^-1 in place of A, as `halved` has them.
+    """-A^-1 in place of A, as `to_half_rows` has them.
 
     Raises
     ------
@@ -108,12 +108,12 @@ def invert(rows: Sequence[torch.Tensor]) -> None:
         rows[k][:, own] = -inverse
 
 
-def cuts_of(count: int, block: int = Exchange.block) -> list[int]:
+def compute_block_cuts(count: int, block: int = Exchange.block) -> list[int]:
     """Where the blocks of so many unknowns begin and end."""
     return [*range(0, count, block), count]
 
 
-def eliminated(
+def eliminate_unknowns(
     matrix: sp.csc_array, border: sp.csc_array, where: str, block: int = Exchange.block
 ) -> tuple[np.ndarray, np.ndarray]:
     """X = A^-1 B (n, m) in single precision and B^T X (m, m), of sparse A (n, n) and B (n, m).
@@ -123,10 +123,10 @@ def eliminated(
     RuntimeError
         A is not positive definite.
     """
-    cuts = cuts_of(len(matrix.indptr) - 1, block)
+    cuts = compute_block_cuts(len(matrix.indptr) - 1, block)
     stop = cuts[-1] + len(border.indptr) - 1
     whole = sp.csc_array(sp.block_array([[matrix, border], [border.T, None]]))
-    *rows, last = halved(whole, [*cuts, stop], where)
+    *rows, last = to_half_rows(whole, [*cuts, stop], where)
     for k in range(len(rows)):
         _eliminate(rows[k], [*rows[k + 1 :], last])
     while rows:  # and back

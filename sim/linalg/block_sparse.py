@@ -42,7 +42,7 @@ LANES = 4
 
 
 @cache
-def kernel_of(device: Device, rows: int, columns: int) -> wp.Kernel:
+def build_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
     """Kernel on a graphics card for blocks (rows, columns) of a device's scalar type, over block rows and columns."""
     scalar = device.scalar
     mat, vec = wp.types.matrix((rows, columns), scalar), wp.types.vector(columns, scalar)
@@ -73,7 +73,7 @@ def kernel_of(device: Device, rows: int, columns: int) -> wp.Kernel:
 
 
 @cache
-def host_kernel_of(device: Device, rows: int, columns: int) -> wp.Kernel:
+def build_host_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
     """The same on the CPU, over block rows."""
     scalar = device.scalar
     real = {"float32": "float", "float64": "double"}[device.precision]
@@ -130,6 +130,6 @@ class Sparse:
         """out (m, b) += factor A x, with x (n, b)."""
         inputs, count = [*self._entries, self._device.scalar(factor), x], self.rows // self._size[0]
         if self._device.on_cuda:
-            self._device.launch(kernel_of(self._device, *self._size), (count, x.shape[1]), inputs, [out])
+            self._device.launch(build_kernel(self._device, *self._size), (count, x.shape[1]), inputs, [out])
         else:
-            self._device.launch(host_kernel_of(self._device, *self._size), (count,), inputs, [out])
+            self._device.launch(build_host_kernel(self._device, *self._size), (count,), inputs, [out])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..discretisation.problem import Problem
-from ..runtime.views import doubled, like, on_host, placed, view
+from ..runtime.views import to_double, to_host, to_library, to_precision_of, view
 from .multifrontal import Factor
 from .pcg import Preconditioner
 
@@ -55,7 +55,7 @@ class Compliance:
         device = problem.device
         self._problem, self._preconditioner, self.nodes = problem, preconditioner, nodes
         self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
-        self.places = placed(device, self.rows)
+        self.places = to_library(device, self.rows)
         self._width = 3 * columns.block
         self.columns = view(replace(device, precision="float64").zeros(len(self.rows), len(self.rows)))
         self.known = np.zeros(len(nodes), bool)
@@ -77,10 +77,10 @@ class Compliance:
         """Motion (3N, b) [m] of all nodes under forces (3n, b) [N] on the first n."""
         device, every = self._problem.device, -(-len(force) // self._width)
         out = view(device.zeros(self._problem.rows, force.shape[1]))
-        force = like(out, force)
+        force = to_precision_of(out, force)
         # A card multiplies by zeros sooner than it says where they are.
         at_hand = device.on_cuda and self.known[: len(force) // 3].all() and every <= self._kept
-        for block in range(every) if at_hand else self._acting(on_host((force != 0.0).any(1))):
+        for block in range(every) if at_hand else self._acting(to_host((force != 0.0).any(1))):
             some = force[self._rows(block)]
             out += self._block(block)[:, : len(some)] @ some
         return out
@@ -88,16 +88,16 @@ class Compliance:
     def moved(self, force: Any) -> Any:
         """Motion (3n, b) [m] of all its nodes under forces (3m, b) [N] on the first m, all of them known."""
         if self._problem.device.on_cuda:
-            return self.columns[: len(force)].T @ doubled(force)
-        acting = np.flatnonzero(on_host((force != 0.0).any(1)))
-        return self.columns[acting].T @ doubled(force[acting])
+            return self.columns[: len(force)].T @ to_double(force)
+        acting = np.flatnonzero(to_host((force != 0.0).any(1)))
+        return self.columns[acting].T @ to_double(force[acting])
 
     def between(self, acting: np.ndarray) -> Any:
         """H (3n, 3n) [m/N] between these n nodes: at least its columns at those that are `acting` (n,) bool."""
-        self.know(acting)
+        self.ensure_known(acting)
         return self.columns.T
 
-    def know(self, acting: np.ndarray) -> None:
+    def ensure_known(self, acting: np.ndarray) -> None:
         """See to it that at least the `columns`, here rows, at `acting` (n,) nodes are `known` (n,)."""
         missing = acting & ~self.known
         if missing.any() and isinstance(self._preconditioner, Factor):
@@ -117,7 +117,7 @@ class Compliance:
         own = self._rows(block)
         unit = np.zeros((self._problem.rows, self._width))
         unit[self.rows[own], np.arange(len(self.rows[own]))] = 1.0
-        whole = self.answered(placed(self._problem.device, unit))[:, : len(self.rows[own])]
+        whole = self.answered(to_library(self._problem.device, unit))[:, : len(self.rows[own])]
         if not self.known[own.start // 3 : own.stop // 3].all():
             self.columns[own], self.known[own.start // 3 : own.stop // 3] = whole[self.places].T, True
         return whole

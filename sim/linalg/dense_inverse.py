@@ -20,7 +20,7 @@ from ..discretisation.problem import Problem
 from ..runtime.columns import add_dots, is_kept
 from ..runtime.device import Device, forward_kernel
 from . import block_inverse
-from .half_symv import add_product, tiles_of
+from .half_symv import add_product, list_tiles
 
 # Tensor cores want rows and columns in multiples of this.
 TILE = 64
@@ -30,18 +30,18 @@ SOME = 8
 LOW = {"float32": wp.float16, "float64": wp.float64}
 
 
-def fits(rows: int, device: Device) -> bool:
+def can_invert(rows: int, device: Device) -> bool:
     """Whether the card can invert `rows` unknowns, in time, and keep the inverse."""
-    return block_inverse.fits(rows, wp.device_to_torch(device.name), kept_bytes(rows, device))
+    return block_inverse.can_exchange(rows, wp.device_to_torch(device.name), estimate_inverse_bytes(rows, device))
 
 
-def kept_bytes(rows: int, device: Device) -> int:
+def estimate_inverse_bytes(rows: int, device: Device) -> int:
     """What the inverse of so many unknowns takes."""
     return wp.types.type_size_in_bytes(LOW[device.precision]) * rows**2
 
 
 @cache
-def kernels_of(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Kernel]:
+def build_kernels(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Kernel]:
     """Kernels into the matrix's unknowns, as numbers of type `low`, and back; each thread takes `some` rows."""
     scalar = device.scalar
 
@@ -118,7 +118,9 @@ class DenseInverse:
         self._device = device
         where = wp.device_to_torch(device.name)
         count = len(motions.indptr) - 1
-        rows = block_inverse.halved(sp.csc_array(motions.T @ stiffness @ motions), block_inverse.cuts_of(count), where)
+        rows = block_inverse.to_half_rows(
+            sp.csc_array(motions.T @ stiffness @ motions), block_inverse.compute_block_cuts(count), where
+        )
         block_inverse.invert(rows)
         scale = torch.cat([-row[:, -len(row) :].diagonal() for row in rows]).sqrt()
         self._size = -(-count // TILE) * TILE
@@ -127,7 +129,7 @@ class DenseInverse:
         self._scale = device.array(scale.cpu().numpy())
         back = motions @ sp.diags_array(scale.cpu().numpy())
         self._into, self._back = (_compressed(sp.csr_array(matrix), device) for matrix in (motions.T, back))
-        self._tiles = tiles_of(self._size, device.name)
+        self._tiles = list_tiles(self._size, device.name)
         self._rooms: dict[int, Buffers] = {}
         torch.cuda.synchronize(where)
 
@@ -138,7 +140,7 @@ class DenseInverse:
         """One dense matrix product, in Warp's stream."""
         device, count = self._device, r.shape[1]
         room, some = self._room(count), SOME if count > 1 else 1
-        lower, raise_ = kernels_of(device, room.right.dtype, some)
+        lower, raise_ = build_kernels(device, room.right.dtype, some)
         room.square.zero_()
         add_dots(device, r, r, room.square)
         inputs = [*self._into, self._scale, room.square, r]

@@ -86,7 +86,7 @@ def _add_product(
     _add_tile(tile[0], tile[1], matrix, x, y)
 
 
-def tiles_of(size: int, device: str) -> wp.array:
+def list_tiles(size: int, device: str) -> wp.array:
     """The tiles (n,) on and above the diagonal of a matrix with so many rows."""
     above = np.stack(np.triu_indices(-(-size // TILE)), axis=1).astype(np.int32)
     return wp.array(above, dtype=wp.vec2i, device=device)

@@ -20,8 +20,8 @@ from scipy.linalg import get_blas_funcs, get_lapack_funcs
 from ..accuracy import Precision
 from ..discretisation.problem import Problem
 from ..runtime.device import Device
-from ..runtime.threads import cores, one_thread, together
-from .symbolic import FRONT_SIZES, Front, FrontSizes, fronts_of
+from ..runtime.threads import choose_threads, limit_to_one_thread, run_together
+from .symbolic import FRONT_SIZES, Front, FrontSizes, build_fronts
 from .triangular_solve import Sweep, add_lower
 
 potrf, trtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
@@ -88,12 +88,14 @@ class Factor:
         settings: Factorisation = Factorisation(),
     ):
         free = sp.csc_array(motions.T @ stiffness @ motions)
-        order, fronts = fronts_of(free, node, cores(len(node)), settings.fronts)
+        order, fronts = build_fronts(free, node, choose_threads(len(node)), settings.fronts)
         motions = sp.csc_array(motions[:, order].astype(device.precision))
         self._motions, self._transposed = sp.csr_array(motions), sp.csr_array(motions.T)
         self._precision, self._settings = precision, settings
-        with one_thread():
-            values, self._panels = panels_of(sp.csc_array(free[order][:, order]), fronts, precision, settings.singular)
+        with limit_to_one_thread():
+            values, self._panels = factorise_panels(
+                sp.csc_array(free[order][:, order]), fronts, precision, settings.singular
+            )
         self._sweep = Sweep(fronts, values, precision)
 
     def prepare(self, problem: Problem, columns: int) -> None:
@@ -132,20 +134,20 @@ class Factor:
                 x = unit[:, strip].toarray(order="C").astype(self._precision)
                 out[:, strip] = chosen @ _swept(panels, x)
 
-        share = cores(len(rows))
-        with one_thread():
-            together([partial(fill, range(size * k, len(rows), size * share)) for k in range(share)])
+        share = choose_threads(len(rows))
+        with limit_to_one_thread():
+            run_together([partial(fill, range(size * k, len(rows), size * share)) for k in range(share)])
         return out
 
     def _solved(self, x: np.ndarray) -> np.ndarray:
         if x.shape[1] <= self._settings.few:
             return self._sweep.solved(x)
         # Threads of BLAS wait for one another at every front, ages where something else runs on their cores.
-        with one_thread():
+        with limit_to_one_thread():
             return _swept(self._panels, x)
 
 
-def node_of(basis: sp.csc_array) -> np.ndarray:
+def find_moved_nodes(basis: sp.csc_array) -> np.ndarray:
     """The node (n,) that each column of a constraint's basis (3N, n) moves."""
     return np.asarray(basis.indices[basis.indptr[:-1]] // 3)
 
@@ -183,7 +185,7 @@ def _swept(panels: Sequence[FrontPanel], x: np.ndarray) -> np.ndarray:
     return x
 
 
-def panels_of(
+def factorise_panels(
     matrix: sp.csc_array, fronts: Sequence[Sequence[Front]], precision: Precision, singular: float
 ) -> tuple[np.ndarray, list[FrontPanel]]:
     """The values of all panels, one after the other in one array; and the panels.
@@ -206,7 +208,7 @@ def panels_of(
     work = _Fronts(matrix, panels, singular)
     lower = [partial(work.eliminate, range(first, stop)) for first, stop in pairwise(ends[:-1])]
     left: list[Updates] = [{} for _ in lower]
-    together([partial(task, updates) for task, updates in zip(lower, left, strict=True)])
+    run_together([partial(task, updates) for task, updates in zip(lower, left, strict=True)])
     meeting: Updates = {}
     for updates in left:
         for number, waiting in updates.items():

@@ -15,7 +15,7 @@ import warp as wp
 
 from ..discretisation.constraint import Constraint
 from ..discretisation.problem import Problem
-from ..runtime.columns import combined, dots, gathered, scattered
+from ..runtime.columns import combine_columns, compute_dots, gather_columns, scatter_columns
 from ..runtime.device import Device, forward_kernel
 from .block_sparse import Sparse
 from .pcg import Preconditioner
@@ -48,7 +48,7 @@ CHEBYSHEV = Chebyshev()
 
 
 @cache
-def kernel_of(device: Device, size: int) -> wp.Kernel:
+def build_kernel(device: Device, size: int) -> wp.Kernel:
     """Kernel of the block-diagonal step, with blocks (size, size)."""
     scalar = device.scalar
     mat, vec = wp.types.matrix((size, size), scalar), wp.types.vector(size, scalar)
@@ -121,14 +121,14 @@ class TwoLevel:
             wp.copy(out, self._cycle(r))
             return
         columns = np.flatnonzero(live)
-        scattered(self._device, self._cycle(gathered(self._device, r, columns)), columns, out)
+        scatter_columns(self._device, self._cycle(gather_columns(self._device, r, columns)), columns, out)
 
     def _cycle(self, r: wp.array) -> wp.array:
         x, correction = self._device.zeros(*r.shape), self._device.zeros(*r.shape)
         every = np.ones(r.shape[1], bool)
         self._smooth(x, wp.clone(r))
         self._coarse.apply(self._residual(r, x), every, correction)
-        combined(self._device, x, np.ones(x.shape[1]), correction, x)
+        combine_columns(self._device, x, np.ones(x.shape[1]), correction, x)
         self._smooth(x, self._residual(r, x))
         return x
 
@@ -151,7 +151,7 @@ class TwoLevel:
         return out
 
     def _step(self, kept: float, added: float, r: wp.array, d: wp.array, x: wp.array) -> None:
-        scalar, step = self._device.scalar, kernel_of(self._device, self._size)
+        scalar, step = self._device.scalar, build_kernel(self._device, self._size)
         inputs = [self._inverse, scalar(kept), scalar(added), r]
         self._device.launch(step, (r.shape[0] // self._size, r.shape[1]), inputs, [d, x])
 
@@ -163,9 +163,9 @@ class TwoLevel:
         for _ in range(self._smoother.power_iterations):
             new, sum_ = device.zeros(*x.shape), device.zeros(*x.shape)
             self._step(0.0, 1.0, self._stiffness.times(x), new, sum_)
-            size = float(np.sqrt(dots(device, new, new)[0]))
-            largest = float(dots(device, x, new)[0] / dots(device, x, x)[0])
-            x = combined(device, device.zeros(*x.shape), np.array([1.0 / size]), new, x)
+            size = float(np.sqrt(compute_dots(device, new, new)[0]))
+            largest = float(compute_dots(device, x, new)[0] / compute_dots(device, x, x)[0])
+            x = combine_columns(device, device.zeros(*x.shape), np.array([1.0 / size]), new, x)
         return largest
 
 
@@ -189,15 +189,15 @@ class ReducedPreconditioner:
         wp.copy(out, self._up.times(solved))
 
 
-def over_free(stiffness: sp.csc_array, constraint: Constraint) -> sp.bsr_array:
+def project_to_free(stiffness: sp.csc_array, constraint: Constraint) -> sp.bsr_array:
     """P K P (3N, 3N) in blocks of nodes, P the projection to what is free; made regular where nothing is."""
     basis = constraint.basis()
     projection = sp.csr_array(basis @ basis.T)
     blocked = sp.eye_array(constraint.held.size) - projection
-    return regular(sp.csr_array(projection @ stiffness @ projection + stiffness.diagonal().mean() * blocked), 3)
+    return make_regular(sp.csr_array(projection @ stiffness @ projection + stiffness.diagonal().mean() * blocked), 3)
 
 
-def regular(matrix: sp.csr_array, size: int) -> sp.bsr_array:
+def make_regular(matrix: sp.csr_array, size: int) -> sp.bsr_array:
     """The matrix in blocks (size, size); unknowns of no element get the mean of its diagonal on theirs."""
     diagonal = matrix.diagonal()
     missing = np.where(diagonal == 0.0, diagonal.mean(), 0.0)

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from ..discretisation.problem import Problem
-from ..runtime.columns import combined, dots, norms
+from ..runtime.columns import combine_columns, compute_dots, compute_norms
 from ..runtime.device import Device, forward_kernel
 
 
@@ -38,7 +38,7 @@ class Preconditioner(Protocol):
 
 
 @cache
-def block_kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
+def build_block_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
     """Kernels of the block-Jacobi preconditioner."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
 
@@ -86,13 +86,13 @@ class BlockJacobi:
     def prepare(self, problem: Problem, columns: int) -> None:
         """Invert the blocks at the last linearisation."""
         blocks = problem.diagonal(columns)
-        self._device.launch(block_kernels_of(self._device)[0], blocks.shape, [], [blocks])
+        self._device.launch(build_block_kernels(self._device)[0], blocks.shape, [], [blocks])
         self._blocks = blocks
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
         """out = B^-1 r, node by node."""
         assert self._blocks is not None
-        self._device.launch(block_kernels_of(self._device)[1], self._blocks.shape, [self._blocks, r], [out])
+        self._device.launch(build_block_kernels(self._device)[1], self._blocks.shape, [self._blocks, r], [out])
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ class LinearSolution:
     iterations: int
 
 
-def conjugate_gradients(
+def solve_conjugate_gradients(
     problem: Problem,
     preconditioner: Preconditioner,
     r: wp.array,
@@ -138,9 +138,9 @@ def conjugate_gradients(
         preconditioner.apply(r, live, z)
         problem.constraint.project(z)
 
-    live = norms(device, r) > tolerance
+    live = compute_norms(device, r) > tolerance
     precondition()
-    p, rz = wp.clone(z), dots(device, r, z)
+    p, rz = wp.clone(z), compute_dots(device, r, z)
     # Inner products x.Mx, x.Mp and p.Mp follow from the coefficients alone: Conn, Gould, Toint 2000, section 7.5.1.
     xx, xp, pp = np.zeros(columns), np.zeros(columns), rz
     truncated = np.zeros(columns, bool)
@@ -149,7 +149,7 @@ def conjugate_gradients(
         q.zero_()
         problem.add_curvature(p, q)
         problem.constraint.project(q)
-        pq = dots(device, p, q)
+        pq = compute_dots(device, p, q)
         with np.errstate(divide="ignore", invalid="ignore"):
             longest = np.where(reach < np.inf, (np.sqrt(xp**2 + pp * (reach**2 - xx).clip(0.0)) - xp) / pp, np.inf)
             alpha = np.where(pq > 0.0, rz / pq, longest)
@@ -157,17 +157,17 @@ def conjugate_gradients(
         alpha = np.minimum(alpha, longest)
         # Nothing bounds it and nothing is gathered yet: the preconditioned gradient is a descent direction.
         alpha = np.where(live, np.where(np.isfinite(alpha), alpha, float(iterations == 0)), 0.0)
-        combined(device, x, alpha, p, x)
-        combined(device, r, -alpha, q, r)
+        combine_columns(device, x, alpha, p, x)
+        combine_columns(device, r, -alpha, q, r)
         xx = xx + 2.0 * alpha * xp + alpha**2 * pp
         truncated |= stop
-        live &= ~stop & (norms(device, r) > tolerance)
+        live &= ~stop & (compute_norms(device, r) > tolerance)
         iterations += 1
         if not live.any():
             break
         precondition()
-        before, rz = np.where(live, rz, 1.0), np.where(live, dots(device, r, z), 0.0)
+        before, rz = np.where(live, rz, 1.0), np.where(live, compute_dots(device, r, z), 0.0)
         beta = rz / before
-        combined(device, z, beta, p, p)
+        combine_columns(device, z, beta, p, p)
         xp, pp = beta * (xp + alpha * pp), rz + beta**2 * pp
     return LinearSolution(x, truncated, np.sqrt(xx.clip(0.0)), iterations)

@@ -16,8 +16,8 @@ from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..errors import InputError
 from ..runtime.device import Device
-from .multifrontal import Factor, node_of
-from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevel, over_free
+from .multifrontal import Factor, find_moved_nodes
+from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevel, project_to_free
 from .pcg import BlockJacobi, Preconditioner
 
 
@@ -72,19 +72,19 @@ def choose_preconditioner(
                 return _solver(stiffness, constraint, space.nodes, device, settings)
             lifted = _on_corners(stiffness, space, constraint, device, settings)
             name = f"p-multigrid on {name_of(lifted.coarse)}"
-            return TwoLevel(lifted, over_free(stiffness, constraint), device, name, settings.smoother)
+            return TwoLevel(lifted, project_to_free(stiffness, constraint), device, name, settings.smoother)
         if space.element == "smoothed" and problem.rows > settings.largest_smoothed_factor:
             # An average resists less than what is averaged, so that the coarse solver never overshoots.
             coarse = _solver(unsmoothed(step), constraint, space.nodes, device, settings)
             name = f"two levels on {name_of(coarse)}"
-            fine = over_free(problem.rest_curvature(step), constraint)
+            fine = project_to_free(problem.rest_curvature(step), constraint)
             return TwoLevel(coarse, fine, device, name, settings.smoother)
         return _solver(problem.rest_curvature(step), constraint, space.nodes, device, settings)
     except RuntimeError as error:
-        raise InputError(why_none(error, device.name)) from error
+        raise InputError(explain_no_factor(error, device.name)) from error
 
 
-def why_none(error: RuntimeError, device: str) -> str:
+def explain_no_factor(error: RuntimeError, device: str) -> str:
     """Why there is no factor, as a person reads it: a device without memory, or a body that is not held."""
     if "allocate" in str(error):
         return f"{device} has too little free memory for this mesh: end what else runs there, or choose --device cpu."
@@ -109,7 +109,7 @@ def is_exact(preconditioner: Preconditioner) -> bool:
     return name_of(preconditioner) in ("sparse factor", "dense inverse")
 
 
-def rest_solver(problem: Problem) -> Preconditioner:
+def build_rest_solver(problem: Problem) -> Preconditioner:
     """The whole free rest stiffness, inverted or factorised, in the problem's own precision.
 
     Raises
@@ -119,7 +119,7 @@ def rest_solver(problem: Problem) -> Preconditioner:
     """
     basis = problem.constraint.basis()
     device = problem.device
-    return direct(problem.rest_curvature(), basis, node_of(basis), device, device.precision)
+    return build_direct(problem.rest_curvature(), basis, find_moved_nodes(basis), device, device.precision)
 
 
 def _on_corners(
@@ -140,22 +140,22 @@ def _solver(
     basis = constraint.basis()
     count = len(basis.indptr) - 1
     if _inverts(count, device) if device.on_cuda else count <= settings.largest_factor:
-        return direct(stiffness, basis, node_of(basis), device)
-    from .amg import algebraic, rigid_motions
+        return build_direct(stiffness, basis, find_moved_nodes(basis), device)
+    from .amg import build_multigrid_cycle, build_rigid_motions
 
-    motions = basis @ (basis.T @ rigid_motions(points))
-    blocks, coarse = over_free(stiffness, constraint), partial(direct, device=device)
-    return algebraic(blocks, motions, coarse, device, settings.largest_last, settings.smoother)
+    motions = basis @ (basis.T @ build_rigid_motions(points))
+    blocks, coarse = project_to_free(stiffness, constraint), partial(build_direct, device=device)
+    return build_multigrid_cycle(blocks, motions, coarse, device, settings.largest_last, settings.smoother)
 
 
 def _inverts(count: int, device: Device) -> bool:
     """Whether a card inverts so many unknowns."""
-    from .dense_inverse import fits
+    from .dense_inverse import can_invert
 
-    return fits(count, device)
+    return can_invert(count, device)
 
 
-def direct(
+def build_direct(
     stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device, precision: Precision = "float32"
 ) -> Preconditioner:
     """K (3N, 3N) over some motions (3N, n), each of one `node` (n,): inverted where that fits, else factorised.

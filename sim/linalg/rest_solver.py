@@ -10,9 +10,9 @@ import warp as wp
 
 from ..discretisation.problem import Problem
 from ..errors import InputError
-from ..runtime.columns import norms
-from .pcg import Preconditioner, conjugate_gradients
-from .preconditioner import is_exact, rest_solver
+from ..runtime.columns import compute_norms
+from .pcg import Preconditioner, solve_conjugate_gradients
+from .preconditioner import build_rest_solver, is_exact
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class RestStiffnessSolver:
     def exact(self) -> Preconditioner | None:
         """The inverse of the rest stiffness in the solver's own precision, where one is had or pays for many solves."""
         pays = not self.problem.device.on_cuda and self.problem.rows <= self.largest_factor
-        return rest_solver(self.problem) if pays or is_exact(self.preconditioner) else None
+        return build_rest_solver(self.problem) if pays or is_exact(self.preconditioner) else None
 
     def answer(self, force: wp.array) -> wp.array:
         """Motions (3N, b) [m] that it answers forces (3N, b) [N] with; the forces are lost.
@@ -62,9 +62,9 @@ class RestStiffnessSolver:
             return out
         problem.linearise(problem.device.zeros(*force.shape), np.zeros(columns, bool))
         self.preconditioner.prepare(problem, columns)
-        wanted = self.tolerance * norms(problem.device, force)
-        found = conjugate_gradients(problem, self.preconditioner, force, wanted, self.inner)
-        if (norms(problem.device, force) > 10.0 * wanted).any():
+        wanted = self.tolerance * compute_norms(problem.device, force)
+        found = solve_conjugate_gradients(problem, self.preconditioner, force, wanted, self.inner)
+        if (compute_norms(problem.device, force) > 10.0 * wanted).any():
             raise InputError(
                 f"a linear solve of the series did not reach {self.tolerance:g} in {self.inner} iterations: ask for an "
                 "Accuracy of more `inner` ones."

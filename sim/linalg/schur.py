@@ -13,8 +13,8 @@ import warp as wp
 
 from ..discretisation.problem import Problem
 from ..runtime.device import Device
-from .multifrontal import node_of
-from .preconditioner import direct
+from .multifrontal import find_moved_nodes
+from .preconditioner import build_direct
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Condensation:
     follow: np.ndarray
 
 
-def condensed(
+def condense_exterior(
     problem: Problem, nodes: np.ndarray, own: sp.csc_array, settings: Condensing = Condensing()
 ) -> Condensation:
     """The rest of a body beside the part of `nodes` (n,), whose own elements have the stiffness `own` (3n, 3n) at rest.
@@ -61,7 +61,7 @@ def condensed(
     beyond = sp.csr_array(whole[part][:, part] - own)
     rows = np.flatnonzero(abs(beyond).max(axis=1).toarray().ravel() > settings.round_off * abs(whole).max())
     stiffness = beyond[rows][:, rows].toarray()
-    far = sp.csc_array(basis[:, ~np.isin(node_of(basis), nodes)])
+    far = sp.csc_array(basis[:, ~np.isin(find_moved_nodes(basis), nodes)])
     follow, taken = _followed(whole, far, sp.csc_array(whole[part[rows]].T), problem.device, settings.strip)
     stiffness -= taken
     return Condensation(rows, (stiffness + stiffness.T) / 2, follow)
@@ -78,13 +78,13 @@ def _followed(
         from . import block_inverse
 
         where = wp.device_to_torch(device.name)
-        if block_inverse.fits(len(far.indptr) + len(coupling.indptr), where):
-            across, taken = block_inverse.eliminated(
+        if block_inverse.can_exchange(len(far.indptr) + len(coupling.indptr), where):
+            across, taken = block_inverse.eliminate_unknowns(
                 sp.csc_array(far.T @ whole @ far), sp.csc_array(far.T @ coupling), where
             )
             return -(far.astype(np.float32) @ across), taken
     fine = Device(device.name, "float64")
-    solver = direct(sp.csc_array(whole), far, node_of(far), fine, "float64")
+    solver = build_direct(sp.csc_array(whole), far, find_moved_nodes(far), fine, "float64")
     count = len(coupling.indptr) - 1
     follow, taken = np.zeros((len(whole.indptr) - 1, count), device.precision), np.zeros((count, count))
     for first in range(0, count, strip):

@@ -50,7 +50,7 @@ class Front:
         return np.concatenate([np.arange(self.first, self.stop), self.border])
 
 
-def fronts_of(
+def build_fronts(
     matrix: sp.csc_array, node: np.ndarray, parts: int = 1, settings: FrontSizes = FRONT_SIZES
 ) -> tuple[np.ndarray, list[list[Front]]]:
     """An order (n,) of a matrix's unknowns with little fill, and its fronts; every front comes before those it touches.
@@ -65,7 +65,7 @@ def fronts_of(
     links = np.ones(int(across.sum()), np.int8), (first[across], second[across])
     graph = sp.csr_array(sp.coo_array(links, shape=(len(number),) * 2))
     graph += graph.T  # an entry may be zero by round-off, and not stored, on one side only
-    order = dissection(graph, settings.leaf)
+    order = order_by_dissection(graph, settings.leaf)
     groups = _groups(sp.csr_array(graph[order][:, order]), weight[order], settings)
     divided = _divided(groups, weight[order], parts, settings.most_above)
     inner = np.concatenate([np.zeros(0, int), *(groups[number][0] for part in divided for number in part)])
@@ -85,7 +85,7 @@ def fronts_of(
     return np.argsort(np.argsort(order)[member], kind="stable"), fronts
 
 
-def dissection(graph: sp.csr_array, leaf: int = FrontSizes.leaf) -> np.ndarray:
+def order_by_dissection(graph: sp.csr_array, leaf: int = FrontSizes.leaf) -> np.ndarray:
     """An order (N,) of a symmetric graph's nodes with little fill: nested dissection.
 
     By METIS: Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392. Without pymetis by levels, down to some unknowns a
@@ -97,24 +97,24 @@ def dissection(graph: sp.csr_array, leaf: int = FrontSizes.leaf) -> np.ndarray:
     try:
         import pymetis
     except ImportError:
-        return dissection_by_levels(graph, np.arange(count), leaf)
+        return order_by_levels(graph, np.arange(count), leaf)
     order, _ = pymetis.nested_dissection(pymetis.CSRAdjacency(np.ravel(graph.indptr), np.ravel(graph.indices)))
     return np.asarray(order)
 
 
-def dissection_by_levels(graph: sp.csr_array, nodes: np.ndarray, leaf: int) -> np.ndarray:
+def order_by_levels(graph: sp.csr_array, nodes: np.ndarray, leaf: int) -> np.ndarray:
     """The same nodes (k,), the middle level between two far ends last; both sides likewise."""
     if 3 * len(nodes) <= leaf:
         return nodes
     inside = graph[nodes][:, nodes]
     count, part = csgraph.connected_components(inside, directed=False)
     if count > 1:
-        return np.concatenate([dissection_by_levels(graph, nodes[part == number], leaf) for number in range(count)])
+        return np.concatenate([order_by_levels(graph, nodes[part == number], leaf) for number in range(count)])
     end = csgraph.breadth_first_order(inside, 0, return_predecessors=False)[-1]
     level = csgraph.dijkstra(inside, indices=end, unweighted=True)
     middle = np.median(level)
     sides = [nodes[level < middle], nodes[level > middle]]
-    return np.concatenate([*(dissection_by_levels(graph, side, leaf) for side in sides), nodes[level == middle]])
+    return np.concatenate([*(order_by_levels(graph, side, leaf) for side in sides), nodes[level == middle]])
 
 
 def _spread(start: np.ndarray, count: np.ndarray) -> np.ndarray:

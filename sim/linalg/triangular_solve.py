@@ -9,7 +9,7 @@ import warp as wp
 
 from ..accuracy import Precision
 from ..runtime.device import Device, forward_kernel
-from ..runtime.threads import together
+from ..runtime.threads import run_together
 from .symbolic import Front
 
 # Upwards: x_own gives way to the first k of t = panel^T x_own, and the border takes the rest. Four rows of a panel at a
@@ -65,7 +65,7 @@ DOWN = """
 
 
 @cache
-def kernel_of(device: Device, code: str) -> wp.Kernel:
+def build_kernel(device: Device, code: str) -> wp.Kernel:
     """The sweep `UP`, which eliminates, or `DOWN`, which substitutes back, in each row of xs (b, n), front by front."""
     scalar = device.scalar
     real = {"float32": "float", "float64": "double"}[device.precision]
@@ -158,7 +158,7 @@ class Sweep:
         columns, parts = x.shape[1], len(self._lower)
         rows = self._device.zeros(parts, columns, len(x))
         work = self._device.zeros(parts, columns, self._longest)
-        values, (up, down) = rows.numpy(), (kernel_of(self._device, code) for code in (UP, DOWN))
+        values, (up, down) = rows.numpy(), (build_kernel(self._device, code) for code in (UP, DOWN))
 
         def sweep(kernel: wp.Kernel, fronts: wp.array, part: int) -> None:
             inputs = [fronts, self._border, self._panel]
@@ -167,12 +167,12 @@ class Sweep:
         for part, own in zip(values, self._lower, strict=True):
             part[:, own] = x.T[:, own]
         values[0, :, self._upper] = x.T[:, self._upper]
-        together([partial(sweep, up, self._fronts[part], part) for part in range(parts)])
+        run_together([partial(sweep, up, self._fronts[part], part) for part in range(parts)])
         values[0, :, self._upper] = values[:, :, self._upper].sum(axis=0)
         for kernel in (up, down):
             sweep(kernel, self._fronts[-1], 0)
         values[1:, :, self._upper] = values[0, :, self._upper]
-        together([partial(sweep, down, self._fronts[part], part) for part in range(parts)])
+        run_together([partial(sweep, down, self._fronts[part], part) for part in range(parts)])
         solved = np.empty((len(x), columns), x.dtype)
         for part, own in zip(values, self._lower, strict=True):
             solved[own] = part[:, own].T

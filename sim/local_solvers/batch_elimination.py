@@ -21,19 +21,19 @@ import numpy as np
 import warp as wp
 from scipy.spatial import KDTree
 
-from ..compile import LocalProblem, compile_part, surrounded
+from ..compile import LocalProblem, add_surrounding_stiffness, compile_part
 from ..discretisation.constraint import Constraint
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Effect
 from ..linalg.pcg import Preconditioner
-from ..linalg.preconditioner import rest_solver
-from ..linalg.schur import condensed
+from ..linalg.preconditioner import build_rest_solver
+from ..linalg.schur import condense_exterior
 from ..minimisers.lbfgs import Descended, Lbfgs
 from ..minimisers.residual import Judge, ResidualState
-from ..runtime.columns import combined, put_rows, rows_taken
-from ..runtime.dense_product import product_with
-from .outer_loop import USUAL, CycleLimits, eliminated
+from ..runtime.columns import combine_columns, put_rows, take_rows
+from ..runtime.dense_product import build_product
+from .outer_loop import USUAL, CycleLimits, eliminate_unknowns
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class BatchElimination:
         def cycle(judge: Judge, now: ResidualState, force: np.ndarray) -> ResidualState:
             return judge(self._corrected(now.u, now.g, force))
 
-        return eliminated(self.problem, start, tolerance, most, self.limits, cycle)
+        return eliminate_unknowns(self.problem, start, tolerance, most, self.limits, cycle)
 
     def _corrected(self, u: wp.array, g: wp.array, force: np.ndarray) -> wp.array:
         """The next state (3N, b), from the free gradient g (3N, b) at u (3N, b); force (b,) [N] may be left near."""
@@ -100,24 +100,24 @@ class BatchElimination:
         e = device.zeros(*u.shape)
         self.preconditioner.apply(g, every, e)
         self.problem.constraint.project_nodes(e)
-        out = combined(device, u, -1.0, e, e)
-        near, aim = rows_taken(device, u, self.rows), rows_taken(device, out, self.rows)
-        back, part = combined(device, near, -1.0, aim, wp.empty_like(aim)), self.part.problem
+        out = combine_columns(device, u, -1.0, e, e)
+        near, aim = take_rows(device, u, self.rows), take_rows(device, out, self.rows)
+        back, part = combine_columns(device, near, -1.0, aim, wp.empty_like(aim)), self.part.problem
         g = device.zeros(*near.shape)
         part.linearise(near, every)  # at rest, as positive definite curvature is
         part.add_curvature(back, g)
         self.part.put(None)
         load = part.gradient(near)
-        self.part.put(combined(device, load, -1.0, g, load))
+        self.part.put(combine_columns(device, load, -1.0, g, load))
         part.constraint.project_nodes(g)
         found = self.lbfgs.descend(
             near, np.zeros(count), self.near.iterations, None, force, self.near.stragglers, (g, back)
         )
-        missed = combined(device, found.u, -1.0, aim, aim)
+        missed = combine_columns(device, found.u, -1.0, aim, aim)
         followed = wp.empty_like(out)
-        self.follow(rows_taken(device, missed, self.shared), followed)
+        self.follow(take_rows(device, missed, self.shared), followed)
         self.problem.constraint.project_nodes(followed)  # what is rounded row by row leaves the planes it slides on
-        combined(device, out, 1.0, followed, out)
+        combine_columns(device, out, 1.0, followed, out)
         put_rows(device, found.u, self.rows, out)
         return out
 
@@ -127,7 +127,7 @@ def has_small_opening(space: Discretisation, constraint: Constraint) -> bool:
     return 0 < len(open_vertices(space, constraint)) <= NEAR.largest_opening * len(np.unique(space.mesh.surface))
 
 
-def near_tetrahedra(space: Discretisation, constraint: Constraint) -> np.ndarray:
+def find_near_tetrahedra(space: Discretisation, constraint: Constraint) -> np.ndarray:
     """(T,) bool: the share `NEAR.share` nearest to where the surface is free."""
     mesh = space.mesh
     distance, _ = KDTree(mesh.nodes[open_vertices(space, constraint)]).query(mesh.nodes[mesh.tets].mean(axis=1))
@@ -140,7 +140,7 @@ def open_vertices(space: Discretisation, constraint: Constraint) -> np.ndarray:
     return surface[~constraint.held[surface].any(axis=1) & ~constraint.normal[surface].any(axis=1)]
 
 
-def batch_elimination(
+def build_batch_elimination(
     problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
 ) -> BatchElimination | None:
     """Of the tissue near the opening, which is small; None where that is too nearly singular to be taken apart.
@@ -149,13 +149,13 @@ def batch_elimination(
     cycle.
     """
     device = problem.device
-    chosen = near_tetrahedra(space, problem.constraint)
+    chosen = find_near_tetrahedra(space, problem.constraint)
     nodes = np.unique(space.table[chosen])
     own = compile_part(effects, space, problem, chosen, nodes)
     try:
-        around = condensed(problem, nodes, own.rest_curvature())
-        part = surrounded(own, around.rows, around.stiffness)
-        solver = rest_solver(part.problem)
+        around = condense_exterior(problem, nodes, own.rest_curvature())
+        part = add_surrounding_stiffness(own, around.rows, around.stiffness)
+        solver = build_rest_solver(part.problem)
     except RuntimeError:
         return None
     return BatchElimination(
@@ -165,5 +165,5 @@ def batch_elimination(
         part=part,
         lbfgs=Lbfgs(part.problem, solver),
         shared=device.array(around.rows, wp.int32),
-        follow=product_with(around.follow, device, rough=True),
+        follow=build_product(around.follow, device, rough=True),
     )

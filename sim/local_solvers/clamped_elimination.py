@@ -14,18 +14,18 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ..discretisation.element import linear_elements
+from ..discretisation.element import build_linear_elements
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Effect
 from ..linalg.pcg import Preconditioner
-from ..minimisers.compact_lbfgs import no_pairs
+from ..minimisers.compact_lbfgs import build_empty_history
 from ..minimisers.lbfgs import Descended
-from ..minimisers.line_search import goes_too_far, kept_of
+from ..minimisers.line_search import backtrack_by_slopes, is_step_too_long
 from ..minimisers.residual import Judge, ResidualState
-from ..runtime.columns import combined
+from ..runtime.columns import combine_columns
 from .clamped_part import ClampedPart
-from .outer_loop import CycleLimits, eliminated
+from .outer_loop import CycleLimits, eliminate_unknowns
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class ClampedElimination:
         chosen, part, pairs = (
             np.zeros(len(self.space.table), bool),
             None,
-            no_pairs(self.problem.rows, self.problem.device.precision),
+            build_empty_history(self.problem.rows, self.problem.device.precision),
         )
         z = np.zeros(0)
 
@@ -101,7 +101,7 @@ class ClampedElimination:
             after = self._solved(new.g)
             s, y = _host(new.u) - _host(now.u), _host(new.g) - _host(now.g)
             if s @ y > 0.0:
-                pairs = pairs.and_one(s, y, after - z)
+                pairs = pairs.add_pair(s, y, after - z)
             if new.free[0] > self.size.left * now.free[0]:
                 more = self._left(_host(new.g), part.nodes)
                 if len(more):
@@ -110,7 +110,7 @@ class ClampedElimination:
             z = after
             return new
 
-        return eliminated(self.problem, start, tolerance, most, self.limits, cycle)
+        return eliminate_unknowns(self.problem, start, tolerance, most, self.limits, cycle)
 
     def _lower(self, judge: Judge, now: ResidualState, part: ClampedPart, d: np.ndarray, force: float) -> ResidualState:
         """A step along d (3N,) that does not go too far, and the part settled to `force` [N] there.
@@ -121,11 +121,11 @@ class ClampedElimination:
         way = device.array(d[:, None])
         length = float(self.problem.longest_step(now.u, way)[0])
         for _ in range(self.size.cuts if promised > 0.0 else 0):
-            new = judge(part.settled(combined(device, now.u, length, way, wp.empty_like(way)), force))
+            new = judge(part.settled(combine_columns(device, now.u, length, way, wp.empty_like(way)), force))
             slope = float(_host(new.g) @ d)
-            if new.finite[0] and not goes_too_far(slope, promised):
+            if new.finite[0] and not is_step_too_long(slope, promised):
                 return new
-            length *= kept_of(slope, promised)
+            length *= backtrack_by_slopes(slope, promised)
         return replace(now, free=np.full(1, np.inf))
 
     def _solved(self, g: wp.array) -> np.ndarray:
@@ -159,7 +159,7 @@ class ClampedElimination:
     @cached_property
     def _slopes(self) -> np.ndarray:
         every = np.ones(len(self.space.mesh.tets), bool)
-        return linear_elements(self.space.mesh, every).gradient[:, 0].astype(np.float32)
+        return build_linear_elements(self.space.mesh, every).gradient[:, 0].astype(np.float32)
 
 
 def _host(column: wp.array) -> np.ndarray:

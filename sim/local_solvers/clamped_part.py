@@ -10,11 +10,11 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..accuracy import FLOOR, Accuracy
-from ..compile import rimmed
+from ..compile import compile_clamped_part
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Effect
-from ..linalg.multifrontal import Factor, node_of
+from ..linalg.multifrontal import Factor, find_moved_nodes
 from ..minimisers.lbfgs import Lbfgs
 from ..minimisers.lbfgs_kernels import BROKEN, DONE
 from ..minimisers.newton import find_equilibrium
@@ -71,7 +71,7 @@ class ClampedPart:
         self._limits = limits
         device, self.nodes = problem.device, np.unique(space.table[chosen])
         self._rows = (3 * self.nodes[:, None] + np.arange(3)).ravel()
-        part, self._curvature = rimmed(effects, space, problem, chosen, self.nodes)
+        part, self._curvature = compile_clamped_part(effects, space, problem, chosen, self.nodes)
         self._part = part.problem
         part.put(device.array(-constant.numpy()[self._rows]))
         values = u.numpy()[self._rows]
@@ -112,5 +112,5 @@ class ClampedPart:
     def _begin_with(self, stiffness: sp.csc_array) -> None:
         """Let L-BFGS begin with a stiffness (3n, 3n) [N/m]."""
         basis = self._part.constraint.basis()
-        self._factor = Factor(stiffness, basis, node_of(basis), self._part.device)
+        self._factor = Factor(stiffness, basis, find_moved_nodes(basis), self._part.device)
         self._lbfgs = Lbfgs(self._part, self._factor)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..minimisers.compact_lbfgs import PairsOfColumns
-from ..minimisers.residual import Judge, relative
+from ..minimisers.residual import Judge, compute_relative
 from .strained_part import StrainedModel
 
 
@@ -25,7 +25,7 @@ class ContactState:
     @property
     def relative(self) -> np.ndarray:
         """The relative residuals (b,)."""
-        return relative(self.free, self.scale)
+        return compute_relative(self.free, self.scale)
 
     @property
     def finite(self) -> np.ndarray:

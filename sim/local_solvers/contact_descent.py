@@ -28,14 +28,23 @@ from ..linalg.preconditioner import is_exact
 from ..minimisers.compact_lbfgs import PairsOfColumns
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
-from ..minimisers.line_search import goes_too_far, kept_of
-from ..minimisers.residual import Judge, judge_of
+from ..minimisers.line_search import backtrack_by_slopes, is_step_too_long
+from ..minimisers.residual import Judge, build_judge
 from ..runtime.device import Device
-from ..runtime.views import columns_of, doubled, from_view, in_order, like, on_host, placed, view
+from ..runtime.views import (
+    from_view,
+    run_in_order,
+    select_columns,
+    to_double,
+    to_host,
+    to_library,
+    to_precision_of,
+    view,
+)
 from .contact_batch import Batch, ContactState
-from .contact_forces import BENT, FORCES, ContactCompliance, ForceLimits, scratch_of, settled
+from .contact_forces import BENT, FORCES, ContactCompliance, ForceLimits, allocate_scratch, solve_contact_forces
 from .contact_limits import CONTACT, ContactLimits
-from .contact_steps import PROMISED, STATUS, ContactSteps, judged
+from .contact_steps import PROMISED, STATUS, ContactSteps, read_step_result
 from .contact_structs import CROWDED, FOUND, Scratch
 from .strained_part import STRAINS, StrainedPart, StrainLimits
 
@@ -73,7 +82,7 @@ class ContactDescent:
         nodes = self.barrier.around(self.strains.near) if exact else own
         compliance = Compliance(self.problem, self.preconditioner, nodes)
         if exact and self.problem.device.on_cuda:  # as much at once as at one node
-            compliance.know(np.arange(len(nodes)) < len(own))
+            compliance.ensure_known(np.arange(len(nodes)) < len(own))
         return compliance
 
     @cached_property
@@ -99,8 +108,8 @@ class ContactDescent:
 
     @cached_property
     def _room(self) -> Callable[[int, int, int], Scratch]:
-        """`scratch_of`, which takes long, of sizes that were asked for lately."""
-        return lru_cache(2)(partial(scratch_of, self._exact))
+        """`allocate_scratch`, which takes long, of sizes that were asked for lately."""
+        return lru_cache(2)(partial(allocate_scratch, self._exact))
 
     @property
     def _exact(self) -> Device:
@@ -112,7 +121,7 @@ class ContactDescent:
         count, device, limits = start.shape[1], self.problem.device, self.limits
         result, live = wp.clone(start), np.arange(count)
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
-        with in_order(device):
+        with run_in_order(device):
             batch = self._begun(start)
             if count == 1 and self.steps is not None:
                 self._replay(self.steps, batch, tolerance, most)
@@ -138,7 +147,7 @@ class ContactDescent:
                 ready = self._tried(batch)
 
     def _begun(self, start: wp.array) -> Batch:
-        judge, count = judge_of(self.problem, start), start.shape[1]
+        judge, count = build_judge(self.problem, start), start.shape[1]
         now = self._judged(judge, view(start) + 0.0)
         force, none = self._felt(now), np.zeros(count)
         rest = self._answered(now.smooth, force)
@@ -160,7 +169,7 @@ class ContactDescent:
         Or until it wants what the others do: more touched nodes than there is room for, or Newton.
         """
         known, judge, limits = None, batch.judge, self.limits
-        if batch.model is None or not steps.stand(judge.constant):
+        if batch.model is None or not steps.set_tools(judge.constant):
             return
         batch.now, batch.force, batch.rest, batch.x = steps.hold(batch.now, batch.force, batch.rest)
         while not self._ended(batch, tolerance, most).any():
@@ -179,13 +188,13 @@ class ContactDescent:
                 continue
             batch.promised[:] = said[PROMISED]
             while True:
-                t, ahead, free, scale = judged(said, judge.square)
+                t, ahead, free, scale = read_step_result(said, judge.square)
                 there, misled = self._decided(batch, t, ahead, free)
                 if there.any() or misled.any():
                     break
                 said = steps.again(batch.length[0])
             if there.any():
-                steps.accept()
+                steps.move_to_last_step()
                 batch.now.free[:], batch.now.scale[:] = free, scale
             else:  # it has forgotten its model
                 known = None
@@ -202,7 +211,7 @@ class ContactDescent:
             fresh = self._strained.model(from_view(self.problem.device, batch.now.u), renewed)
             batch.stale &= ~wanted
             if fresh is not None:
-                batch.model = batch.model.with_columns(renewed, fresh)
+                batch.model = batch.model.merge_columns(renewed, fresh)
 
     def _exactly(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
         """To what share (b,) of themselves the tools' forces are to be found."""
@@ -220,7 +229,7 @@ class ContactDescent:
         bent = self._bends(batch)
         for some, limits in ((np.flatnonzero(wanted & ~bent), FORCES), (np.flatnonzero(wanted & bent), BENT)):
             if len(some):
-                on = columns_of(self.problem.device, some, len(wanted))
+                on = select_columns(self.problem.device, some, len(wanted))
                 force[:, on], found[some] = self._forces(batch, some, tolerance, limits)
         over = self._waits(batch, wanted & ~found)
         some = np.flatnonzero(found)
@@ -245,7 +254,7 @@ class ContactDescent:
     def _direct(self, batch: Batch, some: np.ndarray, force: Any) -> None:
         """The directions of some columns (k,) under the tools' forces (3n, b)."""
         now, device = batch.now, self.problem.device
-        on = columns_of(device, some, len(batch.drag))
+        on = select_columns(device, some, len(batch.drag))
         if batch.model is None:
             batch.rest[:, on] += self.compliance.spread((force - batch.force)[:, on])
             batch.force[:, on] = force[:, on]
@@ -265,7 +274,7 @@ class ContactDescent:
     ) -> tuple[Any, np.ndarray]:
         """The tools' forces (3n, k) where the model of some columns (k,) is in equilibrium, and which (k,) have one."""
         rows, now = self._rows, batch.now
-        on = columns_of(self.problem.device, some, len(batch.drag))
+        on = select_columns(self.problem.device, some, len(batch.drag))
         barrier, known = self.barrier.reduced(some), batch.force[:, on]
         if barrier is None:
             return known, np.ones(len(some), bool)
@@ -274,14 +283,14 @@ class ContactDescent:
         if batch.model is not None:
             free = free - self._bent(batch, batch.force)[1]
             soft = replace(soft, own=batch.model.own[on])
-        free, here = free[:, on], doubled(now.u[rows][:, on])
+        free, here = free[:, on], to_double(now.u[rows][:, on])
         if batch.pairs.most:
             learnt = batch.pairs.of(some)
-            own = doubled(learnt.sw[:, :, rows])
-            soft = replace(soft, learnt=own, middle=doubled(learnt.middle))
+            own = to_double(learnt.sw[:, :, rows])
+            soft = replace(soft, learnt=own, middle=to_double(learnt.middle))
             weights = learnt.weights(self._pull(now.smooth, batch.force)[:, on])
-            free = free - (doubled(weights).mT @ own)[:, 0].T
-        return settled(barrier, soft, here, doubled(free), known, exact, batch.drag[some], most)
+            free = free - (to_double(weights).mT @ own)[:, 0].T
+        return solve_contact_forces(barrier, soft, here, to_double(free), known, exact, batch.drag[some], most)
 
     def _bent(self, batch: Batch, force: Any) -> tuple[Any, Any]:
         """Forces (3N, b) [N] that the body at rest is to follow beside: those of tools that are new, and of a model.
@@ -291,11 +300,11 @@ class ContactDescent:
         assert batch.model is not None
         device, compliance = self.problem.device, self.compliance
         out, change = view(device.zeros(*batch.rest.shape)), force - batch.force
-        near = batch.rest[compliance.places] + like(batch.rest, compliance.moved(change))
+        near = batch.rest[compliance.places] + to_precision_of(batch.rest, compliance.moved(change))
         own = view(batch.model.pressed(device, from_view(device, near)))
-        out[self._rows] = like(out, change)
+        out[self._rows] = to_precision_of(out, change)
         out[compliance.places] += own
-        return out, like(batch.rest, compliance.moved(own)[: len(self._rows)])
+        return out, to_precision_of(batch.rest, compliance.moved(own)[: len(self._rows)])
 
     def _harder(self, drag: np.ndarray) -> np.ndarray:
         return np.maximum(self.limits.drag, self.limits.growth * drag)
@@ -311,13 +320,13 @@ class ContactDescent:
         if not going.any():
             return batch.waiting & ~batch.gone
         new = self._judged(
-            batch.judge, now.u + placed(self.problem.device, t.astype(self.problem.device.precision)) * batch.x
+            batch.judge, now.u + to_library(self.problem.device, t.astype(self.problem.device.precision)) * batch.x
         )
         ahead = np.where(new.finite, _dots(new.whole, batch.x), np.inf)
         there, misled = self._decided(batch, t, ahead, new.free)
         taken = np.flatnonzero(there)
         if len(taken):
-            some = columns_of(self.problem.device, taken, len(t))
+            some = select_columns(self.problem.device, taken, len(t))
             self._learn(batch, new, taken, some)
             now.put(taken, some, new)
         return misled | there | (batch.waiting & ~batch.gone)
@@ -328,8 +337,8 @@ class ContactDescent:
         By the slopes `ahead` (b,) and the free forces (b,) there.
         """
         limits, now, going = self.limits, batch.now, ~(batch.waiting | batch.gone)
-        far = going & goes_too_far(ahead, batch.promised) & (t > limits.least)
-        batch.length, there = np.where(far, t * kept_of(ahead, batch.promised), t), going & ~far
+        far = going & is_step_too_long(ahead, batch.promised) & (t > limits.least)
+        batch.length, there = np.where(far, t * backtrack_by_slopes(ahead, batch.promised), t), going & ~far
         misled = far & (batch.length < limits.shortest)
         if misled.any():  # a card is asked only then
             misled &= batch.learnt
@@ -356,16 +365,16 @@ class ContactDescent:
         batch.rest[:, some] = rest
         felt = np.flatnonzero((_dots(moved, change) > self.limits.felt) & new.finite[taken])
         if len(felt):
-            on = columns_of(self.problem.device, felt, len(taken))
-            batch.pairs.learn(taken[felt], moved[:, on], change[:, on], way[:, on])
+            on = select_columns(self.problem.device, felt, len(taken))
+            batch.pairs.update_history(taken[felt], moved[:, on], change[:, on], way[:, on])
 
     def _felt(self, now: ContactState) -> Any:
         """Forces (3n, b) that balance all that is smooth, where tools touch."""
         barrier, rows = self.barrier.reduced(np.arange(len(now.free))), self._rows
-        own = doubled(now.smooth[rows])
+        own = to_double(now.smooth[rows])
         if barrier is None:
             return 0.0 * own
-        slope = barrier.slope(doubled(now.u[rows]))
+        slope = barrier.slope(to_double(now.u[rows]))
         shape = -1, 3, slope.shape[1]
         touched = (slope != 0.0).reshape(shape).any(1)
         return (-own.reshape(shape) * touched[:, None]).reshape(slope.shape)
@@ -393,4 +402,4 @@ class ContactDescent:
 
 
 def _dots(x: Any, y: Any) -> np.ndarray:
-    return on_host((x * y).sum(0)).astype(np.float64)
+    return to_host((x * y).sum(0)).astype(np.float64)

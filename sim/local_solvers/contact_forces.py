@@ -24,9 +24,9 @@ from ..linalg.compliance import Compliance
 from ..minimisers.lbfgs_kernels import PAIRS
 from ..runtime.blocks import launch
 from ..runtime.device import Device
-from ..runtime.threads import together
-from ..runtime.views import columns_of, from_view, on_host, view
-from .contact_kernel import kernel_of
+from ..runtime.threads import run_together
+from ..runtime.views import from_view, select_columns, to_host, view
+from .contact_kernel import build_kernel
 from .contact_structs import CROWDED, FOUND, OPEN, UNKNOWN, ComplianceModel, Ends, Scratch
 
 
@@ -67,7 +67,7 @@ class ContactCompliance:
     """C of a model: what a body at rest does, and what b columns have learnt since, at the n nodes of the compliance.
 
     `learnt` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision; none where nothing was learnt yet. `own`
-    (b, 3n, 3n) in single precision is what strained tissue changes. `room` is `scratch_of`, which may be kept.
+    (b, 3n, 3n) in single precision is what strained tissue changes. `room` is `allocate_scratch`, which may be kept.
     """
 
     rest: Compliance
@@ -77,12 +77,12 @@ class ContactCompliance:
     middle: Any = None
     own: Any = None
 
-    def know(self, force: Any) -> None:
+    def ensure_known(self, force: Any) -> None:
         """See to it that the compliance is known where forces (3n, b) act on its first nodes."""
         every = self.rest.known.copy()
         if not every[: len(force) // 3].all():
-            every[: len(force) // 3] = on_host((force != 0.0).any(1)).reshape(-1, 3).any(axis=1)
-            self.rest.know(every)
+            every[: len(force) // 3] = to_host((force != 0.0).any(1)).reshape(-1, 3).any(axis=1)
+            self.rest.ensure_known(every)
 
     def model(self, columns: np.ndarray, rounded: float) -> ComplianceModel:
         """Of some columns (k,)."""
@@ -92,13 +92,13 @@ class ContactCompliance:
         kinds = ("learnt", self.device.zeros(count, 0, n)), ("middle", self.device.zeros(count, 0, 0)), ("own", none)
         for name, nothing in kinds:
             known = getattr(self, name)
-            some = None if known is None else known[columns_of(self.device, columns, len(known))]
+            some = None if known is None else known[select_columns(self.device, columns, len(known))]
             setattr(out, name, nothing if some is None else from_view(self.device, some))
         out.rounded = rounded
         return out
 
 
-def settled(
+def solve_contact_forces(
     barrier: Reduction,
     soft: ContactCompliance,
     here: Any,
@@ -115,23 +115,23 @@ def settled(
     `tolerance` (b,), relative. `drag` (b,) is d in units of how stiff a touched node is.
     """
     out, status = known + 0.0, np.full(here.shape[1], OPEN)
-    soft.know(known)
+    soft.ensure_known(known)
     for room in (limits.few, limits.most):
         status[status == CROWDED] = OPEN
         each = max(1, limits.bytes // (4 * 8 * (3 * room) ** 2))
         while (status == OPEN).any():
             some = np.flatnonzero(status == OPEN)[:each]
-            on = columns_of(soft.device, some, len(status))
+            on = select_columns(soft.device, some, len(status))
             own = here[:, on], there[:, on], known[:, on]
             asked = tolerance[some], drag[some]
             force, status[some], touched = _solved(barrier, soft, some, own, asked, limits, room)
             ready = np.flatnonzero(status[some] == FOUND)
             if len(ready):
-                here_too = columns_of(soft.device, ready, len(some))
-                out[:, columns_of(soft.device, some[ready], len(status))] = force[:, here_too]
+                here_too = select_columns(soft.device, ready, len(some))
+                out[:, select_columns(soft.device, some[ready], len(status))] = force[:, here_too]
             lacking = status[some] == UNKNOWN
             if lacking.any():
-                soft.know((on_host(touched)[:, lacking] >= 0).repeat(3, axis=0))
+                soft.ensure_known((to_host(touched)[:, lacking] >= 0).repeat(3, axis=0))
                 status[some[lacking]] = OPEN
     return out, status == FOUND
 
@@ -155,25 +155,29 @@ def _solved(
     out, status = device.zeros(3 * nodes, count), wp.zeros(count, dtype=wp.int32, device=device.name)
     arrays = [from_view(device, x) for x in own] + [device.array(x) for x in asked]
     touching = barrier.stage(columns)
-    kernel, model, ends = kernel_of(device, functions), soft.model(columns, limits.rounded), ends_of(limits, room)
+    kernel, model, ends = (
+        build_kernel(device, functions),
+        soft.model(columns, limits.rounded),
+        allocate_ends(limits, room),
+    )
 
     def part(first: int, stop: int) -> None:
         inputs = [*arrays, first, *touching, model, ends, scratch]
         launch(device, kernel, stop - first, inputs, [out, status])
 
     middle = count if device.on_cuda else (count + 1) // 2
-    together([partial(part, 0, middle), partial(part, middle, count)])
+    run_together([partial(part, 0, middle), partial(part, middle, count)])
     return view(out), status.numpy(), view(scratch.place)[:, :count]
 
 
-def ends_of(limits: ForceLimits, room: int) -> Ends:
+def allocate_ends(limits: ForceLimits, room: int) -> Ends:
     """As the kernel takes them, with room for so many touched nodes."""
     ends = Ends()
     ends.iterations, ends.cuts, ends.late, ends.room = limits.iterations, limits.cuts, limits.late, room
     return ends
 
 
-def scratch_of(device: Device, nodes: int, columns: int, room: int) -> Scratch:
+def allocate_scratch(device: Device, nodes: int, columns: int, room: int) -> Scratch:
     """For so many nodes, columns, and touched nodes."""
 
     def numbers(*shape: int) -> wp.array:

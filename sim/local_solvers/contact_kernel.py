@@ -5,9 +5,9 @@ from functools import cache
 import warp as wp
 
 from ..discretisation.term import BlockFunctions
-from ..linalg.block_factor import functions_of
+from ..linalg.block_factor import build_functions
 from ..minimisers.lbfgs_kernels import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
-from ..runtime.blocks import before, threads_of, total, wait
+from ..runtime.blocks import before, get_block_shape, total, wait
 from ..runtime.device import Device, forward_kernel
 from .contact_structs import CROWDED, FOUND, NONE, OPEN, UNKNOWN, ComplianceModel, Ends, Scratch
 
@@ -17,10 +17,10 @@ TOUCHED, ACTING = wp.constant(0), wp.constant(1)
 
 
 @cache
-def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
+def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
     """It, for what touches: launches over (column, thread)."""
-    down, across = threads_of(device)
-    threads, dense, Stage, Near = down * across, functions_of(device), barrier.stage, barrier.near
+    down, across = get_block_shape(device)
+    threads, dense, Stage, Near = down * across, build_functions(device), barrier.stage, barrier.near
     wide = wp.constant(NARROW if device.on_cuda else WIDE)
     Strip = wp.types.vector(length=wide, dtype=wp.float64)
     overshoot, least, middle, most = (wp.constant(wp.float64(x)) for x in (OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT))
@@ -274,7 +274,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return missing == 0
 
     @forward_kernel(module="unique", launch_bounds=threads)
-    def settle(
+    def copy_to_host(
         here: wp.array2d(dtype=wp.float64),
         there: wp.array2d(dtype=wp.float64),
         known: wp.array2d(dtype=wp.float64),
@@ -395,4 +395,4 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         if me == 0:
             status[c] = verdict
 
-    return settle
+    return copy_to_host

@@ -15,7 +15,7 @@ from ..discretisation.problem import Problem
 from ..discretisation.term import Local
 from ..linalg.compliance import Compliance
 from ..linalg.pcg import BlockJacobi, Preconditioner
-from ..runtime.threads import one_thread
+from ..runtime.threads import limit_to_one_thread
 from .contact_descent import ContactDescent
 from .contact_forces import FORCES
 
@@ -48,7 +48,7 @@ class ContactPreconditioner:
             nodes, curvature = self._barrier.pressed()
             if 0 < len(nodes) <= FORCES.most:
                 # Threads of BLAS wait for one another, ages where something else runs on their cores.
-                with one_thread():
+                with limit_to_one_thread():
                     rows = (3 * nodes[:, None] + np.arange(3)).ravel()
                     own = self._compliance.between(np.isin(np.arange(len(self._compliance.rows) // 3), nodes))
                     whole = np.eye(len(curvature)) + curvature @ own[np.ix_(rows, rows)]
@@ -61,12 +61,14 @@ class ContactPreconditioner:
             z, (nodes, curvature, whole) = out.numpy(), self._felt
             force = np.zeros((len(self._compliance.rows) // 3, 3))
             own = z[self._compliance.rows, 0].reshape(-1, 3)[nodes].ravel()
-            with one_thread():
+            with limit_to_one_thread():
                 force[nodes] = lu_solve(whole, curvature @ own).reshape(-1, 3)
                 out.assign(z - self._compliance.spread(force.reshape(-1, 1)))
 
 
-def knowing_contact(problem: Problem, rest: Preconditioner, contact: ContactDescent | None) -> Preconditioner:
+def build_contact_preconditioner(
+    problem: Problem, rest: Preconditioner, contact: ContactDescent | None
+) -> Preconditioner:
     """A preconditioner that knows what tools touch: as `contact` does where that is, or beside another barrier.
 
     Where a skull lets go too, the rest counts it as half shut, and tools are as stiff as ever.

@@ -16,15 +16,15 @@ from ..discretisation.term import Local
 from ..linalg.compliance import Compliance
 from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs_kernels import FREE, WHOLE
-from ..minimisers.residual import balance, balance_workspace
+from ..minimisers.residual import allocate_balance, compute_balance
 from ..runtime import blocks
-from ..runtime.columns import add_dots, combined, put_rows, rows_taken
-from ..runtime.columns import kernels_of as columns_kernels_of
+from ..runtime.columns import add_dots, combine_columns, put_rows, take_rows
+from ..runtime.columns import build_kernels as columns_kernels_of
 from ..runtime.device import Device, forward_kernel
 from ..runtime.views import from_view, view
 from .contact_batch import ContactState
-from .contact_forces import BENT, FORCES, ends_of, scratch_of
-from .contact_kernel import kernel_of
+from .contact_forces import BENT, FORCES, allocate_ends, allocate_scratch
+from .contact_kernel import build_kernel
 from .contact_structs import ComplianceModel as Softness
 from .contact_structs import Ends
 from .press_kernel import press_of
@@ -50,7 +50,7 @@ class ContactStepKernels:
 
 
 @cache
-def kernels_of(device: Device) -> ContactStepKernels:
+def build_kernels(device: Device) -> ContactStepKernels:
     """Kernels of a device's scalar type, for one column."""
     scalar = device.scalar
 
@@ -126,7 +126,7 @@ def kernels_of(device: Device) -> ContactStepKernels:
     return ContactStepKernels(look, change, shorten, push, report)
 
 
-def judged(said: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def read_step_result(said: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Length, slope ahead [J], free force [N] and its scale [N] of a step, (1,) each, of what `ContactSteps` said.
 
     square (1,) is as `Judge` has it.
@@ -167,7 +167,7 @@ class ContactSteps:
         self._new_u, self._new_smooth, self._new_rest = (numbers(problem.rows) for _ in range(3))
         self._constant, self._pull, self._answer, self._pressed = (numbers(problem.rows) for _ in range(4))
         self._force, self._found, self._here, self._there = (exact.zeros(count, 1) for _ in range(4))
-        self._balance = balance_workspace(problem, 1)
+        self._balance = allocate_balance(problem, 1)
         self._near, self._own, self._more, self._change = (numbers(len(compliance.rows)) for _ in range(4))
         self._rows = device.array(compliance.rows, wp.int32)
         self._touched = self._rows[:count]
@@ -180,7 +180,7 @@ class ContactSteps:
         self._model.learnt, self._model.middle = exact.zeros(1, 0, len(compliance.rows)), exact.zeros(1, 0, 0)
         self._model.own = wp.zeros((1, count + 1, count + 1), dtype=wp.float32, device=name)
         self._model.rounded = FORCES.rounded
-        self._scratch = scratch_of(exact, count // 3, 1, FORCES.few)
+        self._scratch = allocate_scratch(exact, count // 3, 1, FORCES.few)
         self._exact, self._touch = exact, None
         self._status = wp.zeros(1, dtype=wp.int32, device=name)
         self._length = wp.zeros(1, dtype=device.scalar, device=name)
@@ -207,7 +207,7 @@ class ContactSteps:
         returned is written over by what comes next.
         """
         self._up.numpy()[[TOLERANCE, DRAG]] = tolerance, drag
-        ends = ends_of(BENT if bent else FORCES, FORCES.few)
+        ends = allocate_ends(BENT if bent else FORCES, FORCES.few)
         return self._run("bent" if bent else "aim", lambda: self._aim(ends))
 
     def again(self, length: float) -> np.ndarray:
@@ -215,17 +215,17 @@ class ContactSteps:
         self._up.numpy()[LENGTH] = length
         return self._run("again", self._again)
 
-    def accept(self) -> None:
+    def move_to_last_step(self) -> None:
         """Go where the last step led."""
         self._run("accept", self._accept)
 
-    def stand(self, constant: wp.array) -> bool:
+    def set_tools(self, constant: wp.array) -> bool:
         """Tools are where the problem has them, beside constant gradients (3N, 1) [N]; False where there is none."""
         reduction = self._barrier.reduced(np.zeros(1, int))
         if reduction is None:
             return False
         if self._touch is None:
-            self._touch = kernel_of(self._exact, reduction.functions), reduction.stage(np.zeros(1, int))
+            self._touch = build_kernel(self._exact, reduction.functions), reduction.stage(np.zeros(1, int))
         wp.copy(self._constant, constant)
         return True
 
@@ -252,11 +252,11 @@ class ContactSteps:
         return self._down.numpy()
 
     def _aim(self, ends: Ends) -> None:
-        device, k = self._device, kernels_of(self._device)
+        device, k = self._device, build_kernels(self._device)
         assert self._touch is not None
         kernel, stage = self._touch
         wp.copy(self._given, self._up)
-        rows_taken(device, self._rest, self._rows, self._near)
+        take_rows(device, self._rest, self._rows, self._near)
         self._press()
         self._more.zero_()
         self._give(self._own, self._more, len(self._touched))
@@ -271,12 +271,12 @@ class ContactSteps:
         device.launch(k.change, (len(self._touched),), [self._found, self._force], [self._change])
         self._give(self._change, self._near, len(self._rows))
         self._press()
-        combined(device, self._own, 1.0, self._change, self._own)
+        combine_columns(device, self._own, 1.0, self._change, self._own)
         self._pull.zero_()
         put_rows(device, self._own, self._rows, self._pull)
         self._answered(self._answer)
-        combined(device, self._answer, 1.0, self._rest, self._x)
-        combined(device, self._x, -2.0, self._x, self._x)
+        combine_columns(device, self._answer, 1.0, self._rest, self._x)
+        combine_columns(device, self._x, -2.0, self._x, self._x)
         self._length.fill_(1.0)
         for term in self._problem.terms:
             term.longest_step(self._u, self._x, self._length)
@@ -286,19 +286,19 @@ class ContactSteps:
 
     def _again(self) -> None:
         wp.copy(self._given, self._up)
-        self._device.launch(kernels_of(self._device).shorten, (1,), [self._given], [self._length])
+        self._device.launch(build_kernels(self._device).shorten, (1,), [self._given], [self._length])
         self._try()
 
     def _try(self) -> None:
         """Take the step, see what is out of balance there, and how the body at rest would move under it."""
-        device, problem, k = self._device, self._problem, kernels_of(self._device)
+        device, problem, k = self._device, self._problem, build_kernels(self._device)
         inputs = [self._u, self._length, self._x]
         device.launch(columns_kernels_of(device).combine, self._u.shape, inputs, [self._new_u])
-        found = balance(problem, self._new_u, self._constant, self._x, self._balance)
+        found = compute_balance(problem, self._new_u, self._constant, self._x, self._balance)
         self._pressed.zero_()
         self._barrier.add_gradient(self._new_u, self._pressed)
         problem.constraint.project_nodes(self._pressed)
-        combined(device, found.g, -1.0, self._pressed, self._new_smooth)
+        combine_columns(device, found.g, -1.0, self._pressed, self._new_smooth)
         self._ahead.zero_()
         add_dots(device, found.g, self._x, self._ahead)
         wp.copy(self._pull, self._new_smooth)

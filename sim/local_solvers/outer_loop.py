@@ -15,8 +15,8 @@ import warp as wp
 from ..discretisation.problem import Problem
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
-from ..minimisers.residual import Judge, ResidualState, judge_of
-from ..runtime.columns import scattered
+from ..minimisers.residual import Judge, ResidualState, build_judge
+from ..runtime.columns import scatter_columns
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ Cycle = Callable[[Judge, ResidualState, np.ndarray], ResidualState]
 on has a free force that is not finite."""
 
 
-def eliminated(
+def eliminate_unknowns(
     problem: Problem, start: wp.array, tolerance: np.ndarray, most: int, limits: CycleLimits, cycle: Cycle
 ) -> Descended:
     """Go on from start (3N, b) [m], as `Lbfgs.descend`, in at most `most` cycles; nothing is learnt.
@@ -56,7 +56,7 @@ def eliminated(
     Each column is left where its free force was least, or where it came within its tolerance (b,).
     """
     device, count = problem.device, start.shape[1]
-    judge = judge_of(problem, start)
+    judge = build_judge(problem, start)
     now, result, live = judge(start), wp.clone(start), np.arange(count)
     status, steps, residual = np.where(now.finite, LIVE, BROKEN), np.zeros(count, int), np.full(count, np.inf)
     first, least, mark, idle = now.free, np.full(count, np.inf), np.full(count, np.inf), np.zeros(count, int)
@@ -66,7 +66,7 @@ def eliminated(
         # Forces that explode lower the relative residual.
         done = sane & (now.free <= first[live]) & (now.relative <= tolerance[live])
         better = done | (sane & (now.free <= np.fmin(first, least)[live]))
-        scattered(device, now.u, live[better], result, np.flatnonzero(better))
+        scatter_columns(device, now.u, live[better], result, np.flatnonzero(better))
         least[live[better]], residual[live[better]] = now.free[better], now.relative[better]
         steps[live[sane]], status[live[done]] = number, DONE
         halved = now.free <= 0.5 * mark[live]

@@ -17,14 +17,14 @@ import warp as wp
 from scipy.linalg import lu_factor, lu_solve
 from scipy.spatial import KDTree
 
-from ..arguments import all_finite
+from ..arguments import is_all_finite
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..linalg.compliance import Compliance
 from ..linalg.multifrontal import Factor
 from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs import Descended, Lbfgs
-from ..runtime.threads import one_thread
+from ..runtime.threads import limit_to_one_thread
 from .batch_elimination import open_vertices
 from .strained_part import StrainedPart, StrainLimits
 
@@ -93,7 +93,7 @@ class StiffenedPreconditioner:
             return
         z = out.numpy()[:, 0].astype(np.float32)
         pull, more = wp.zeros_like(r), wp.zeros_like(r)
-        with one_thread():
+        with limit_to_one_thread():
             pull.numpy()[self.stiffening.rows, 0] = self.stiffening.pull(z)
         self._problem.constraint.project_nodes(pull)
         self._rest.apply(pull, live, more)
@@ -147,7 +147,7 @@ class StrainedDescent:
         compliance = self._part.compliance
         place = (3 * found[0][0][:, None] + np.arange(3)).ravel()
         added = found[1][0].astype(np.float32)
-        with one_thread():
+        with limit_to_one_thread():
             soft = compliance.columns.take(place, axis=0).take(place, axis=1).astype(np.float32)
             system = sp.csr_array(added) @ (0.5 * (soft + soft.T))
             system[np.diag_indices(len(place))] += 1.0
@@ -168,12 +168,12 @@ class StrainedDescent:
             return None
         if (rows >= self._problem.rows).any() or (pivots >= size).any() or not np.diagonal(factor[0]).all():
             return None
-        if any(array.dtype != np.float32 or not all_finite(array) for array in (added, factor)):
+        if any(array.dtype != np.float32 or not is_all_finite(array) for array in (added, factor)):
             return None
         return StiffnessUpdate(rows[0], added[0], factor[0], pivots[0])
 
 
-def strained_part(
+def build_strained_part(
     problem: Problem, preconditioner: Preconditioner, space: Discretisation, strains: StrainLimits = SINGLE
 ) -> StrainedPart:
     """On a body with a small opening: models have the nodes that are nearest to it."""

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..arguments import all_finite
+from ..arguments import is_all_finite
 from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
-from ..runtime.columns import combined
+from ..runtime.columns import combine_columns
 from ..runtime.device import Device
-from ..runtime.views import in_order, library, like, placed, solved, view
+from ..runtime.views import get_library, run_in_order, solve_dense, to_library, to_precision_of, view
 from .press_kernel import press_of
 from .strained_part import StrainedPart
 
@@ -42,40 +42,40 @@ class UpdatedModel:
         return {NODES: self.nodes.numpy(), MATRIX: self.matrix.numpy()}
 
 
-def bent_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedModel | None:
+def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedModel | None:
     """The model at u (3N, 1) [m], which the problem has begun, of a part that is prepared; None where there is none.
 
     A card is not waited for.
     """
-    with in_order(device):
+    with run_in_order(device):
         found = part.stiffening(u, np.arange(1), full=True)
         if found is None:
             return None
-        lib, (places, added) = library(device), found
-        rows = (3 * places[:, :, None] + like(places, placed(device, np.arange(3)))).reshape(1, -1)
+        lib, (places, added) = get_library(device), found
+        rows = (3 * places[:, :, None] + to_precision_of(places, to_library(device, np.arange(3)))).reshape(1, -1)
         own, of = (
             wp.zeros(shape, dtype=dtype, device=device.name)
             for shape, dtype in ((added.shape, wp.float32), (places.shape, wp.int32))
         )
         bent, nodes = view(own), view(of)
-        added = like(bent, added)
-        system = added @ like(bent, part.soft(rows))
+        added = to_precision_of(bent, added)
+        system = added @ to_precision_of(bent, part.soft(rows))
         diagonal = range(rows.shape[1])
         system[:, diagonal, diagonal] += 1.0
-        matrix = -solved(system, added)
+        matrix = -solve_dense(system, added)
         bent[:] = lib.where(lib.isfinite(matrix).all(), 0.5 * (matrix + matrix.mT), 0.0 * added)
-        nodes[:] = like(nodes, placed(device, part.compliance.nodes))[places]
+        nodes[:] = to_precision_of(nodes, to_library(device, part.compliance.nodes))[places]
         return UpdatedModel(of, own)
 
 
-def bent_from(warm: Mapping[str, np.ndarray], device: Device, count: int, size: int) -> UpdatedModel | None:
+def restore_updated_model(warm: Mapping[str, np.ndarray], device: Device, count: int, size: int) -> UpdatedModel | None:
     """What an answer on so many nodes left warm; None if there is nothing, or it does not fit models of 3n = `size`."""
     if NODES not in warm or MATRIX not in warm:
         return None
     nodes, matrix = np.asarray(warm[NODES]), np.asarray(warm[MATRIX])
     if nodes.shape != (1, size // 3) or matrix.shape != (1, size, size) or nodes.dtype.kind != "i":
         return None
-    if matrix.dtype != np.float32 or not all_finite(matrix) or (nodes < 0).any() or (nodes >= count).any():
+    if matrix.dtype != np.float32 or not is_all_finite(matrix) or (nodes < 0).any() or (nodes >= count).any():
         return None
     return UpdatedModel(device.array(nodes, wp.int32), device.array(matrix, wp.float32))
 
@@ -121,4 +121,4 @@ class UpdatedPreconditioner:
         device.launch(kernel, shape, [self._matrix, self._nodes, out], [self._pull])
         self._problem.constraint.project_nodes(self._pull)
         self._rest.apply(self._pull, live, self._more)
-        combined(device, out, 1.0, self._more, out)
+        combine_columns(device, out, 1.0, self._more, out)

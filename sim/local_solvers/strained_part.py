@@ -18,7 +18,17 @@ from ..discretisation.problem import Problem
 from ..discretisation.term import Strained
 from ..linalg.compliance import Compliance
 from ..runtime.device import Device
-from ..runtime.views import ascending, from_view, largest_first, library, like, on_host, padded, placed, view
+from ..runtime.views import (
+    from_view,
+    get_library,
+    order_by_size,
+    pad_zeros,
+    sort_columns,
+    to_host,
+    to_library,
+    to_precision_of,
+    view,
+)
 from .press_kernel import press_of
 
 
@@ -78,7 +88,7 @@ class StrainedModel:
     @property
     def bent(self) -> np.ndarray:
         """Which columns (b,) have."""
-        return on_host((self.matrix != 0.0).any(-1).any(-1))
+        return to_host((self.matrix != 0.0).any(-1).any(-1))
 
     def rows(self, columns: np.ndarray) -> StrainedModel:
         """Of some columns (k,)."""
@@ -88,7 +98,7 @@ class StrainedModel:
         """Of some columns (k,) only the rest is left."""
         self.matrix[columns], self.own[columns] = 0.0, 0.0
 
-    def with_columns(self, columns: np.ndarray, other: StrainedModel) -> StrainedModel:
+    def merge_columns(self, columns: np.ndarray, other: StrainedModel) -> StrainedModel:
         """With another model's as some columns (k,)."""
         most = max(self.nodes.shape[1], other.nodes.shape[1])
         mine, its = self._widened(most), other._widened(most)
@@ -99,7 +109,7 @@ class StrainedModel:
     def _widened(self, most: int) -> StrainedModel:
         """With places for so many nodes."""
         missing = most - self.nodes.shape[1]
-        nodes, matrix = padded(self.nodes, (missing,)), padded(self.matrix, (3 * missing, 3 * missing))
+        nodes, matrix = pad_zeros(self.nodes, (missing,)), pad_zeros(self.matrix, (3 * missing, 3 * missing))
         return StrainedModel(nodes, matrix, self.own)
 
     def pressed(self, device: Device, motion: wp.array) -> wp.array:
@@ -110,18 +120,18 @@ class StrainedModel:
         return out
 
 
-def chosen(device: Device, strain: Any, least: float, most: int) -> tuple[Any, Any, Any]:
+def choose_strained(device: Device, strain: Any, least: float, most: int) -> tuple[Any, Any, Any]:
     """Of strains (n, b) the `most` rows of each column that are largest, and above the `least`: ascending, (m, b).
 
     n stands where a column has fewer. With them the limit (b,) that they lie above, and how many they are (b,).
     """
-    lib, count = library(device), len(strain)
-    columns, order = placed(device, np.arange(strain.shape[1])), largest_first(strain)
+    lib, count = get_library(device), len(strain)
+    columns, order = to_library(device, np.arange(strain.shape[1])), order_by_size(strain)
     limit = 0.0 * strain[0] + least
     if count > most:
         limit = lib.maximum(limit, strain[order[most], columns])
     kept = strain[order[:most], columns] > limit
-    return ascending(lib.where(kept, order[:most], count)), limit, kept.sum(0)
+    return sort_columns(lib.where(kept, order[:most], count)), limit, kept.sum(0)
 
 
 class StrainedPart:
@@ -157,7 +167,7 @@ class StrainedPart:
 
     def prepare(self) -> None:
         """Find how all nodes give way to forces on each of them, unless that is known."""
-        self.compliance.know(np.ones(len(self.compliance.nodes), bool))
+        self.compliance.ensure_known(np.ones(len(self.compliance.nodes), bool))
 
     def stiffening(self, u: wp.array, columns: np.ndarray, full: bool = False) -> tuple[Any, Any] | None:
         """Places in the compliance (k, n) of the nodes that are strained most, and D (k, 3n, 3n) [N/m] between them.
@@ -170,12 +180,12 @@ class StrainedPart:
         strain = device.zeros(self._problem.rows // 3, count)
         for term, some in self._elements:
             term.raise_strain(some, u, picked, strain)
-        nodes, limit, numbers = chosen(device, view(strain)[view(self._near)], strains.least, strains.nodes)
+        nodes, limit, numbers = choose_strained(device, view(strain)[view(self._near)], strains.least, strains.nodes)
         if strains.cut < np.inf and float(limit.max()) > max(strains.cut, strains.least):
             return None
         wide = len(nodes) if full else int(numbers.max())
         place = wp.full((len(strain), count), -1, dtype=wp.int32, device=device.name)
-        near, axes = len(self._near), placed(device, np.arange(max(wide, count), dtype=np.int32))
+        near, axes = len(self._near), to_library(device, np.arange(max(wide, count), dtype=np.int32))
         ranks = view(wp.full((near + 1, count), -1, dtype=wp.int32, device=device.name))
         ranks[nodes[:wide], axes[:count]] = axes[:wide, None]
         view(place)[view(self._near)] = ranks[:near]
@@ -183,7 +193,7 @@ class StrainedPart:
         if wide:
             for term, some in self._elements:
                 term.add_stiffening(some, u, picked, from_view(device, limit), place, stiffer)
-        return like(ranks, nodes[:wide].T.clip(max=near - 1)), view(stiffer)
+        return to_precision_of(ranks, nodes[:wide].T.clip(max=near - 1)), view(stiffer)
 
     def soft(self, rows: Any) -> Any:
         """C (b, n, n) [m/N] between some rows (b, n) of the compliance, which are known: symmetric."""
@@ -197,7 +207,7 @@ class StrainedPart:
         # One more row and column take what is of nodes that cannot be touched.
         shape = count, 3 * self._touchable + 1, 3 * self._touchable + 1
         own = view(wp.zeros(shape, dtype=wp.float32, device=device.name))
-        matrix, axes = 0.0 * stiffer, placed(device, np.arange(3))
+        matrix, axes = 0.0 * stiffer, to_library(device, np.arange(3))
         each = max(1, self._strains.bytes // (6 * 8 * max(size, 1) ** 2))
         for first in range(0, count if size else 0, each):
             some = slice(first, first + each)
@@ -207,14 +217,14 @@ class StrainedPart:
             diagonal = range(size)
             system[:, diagonal, diagonal] += 1.0
             try:
-                found = library(device).linalg.solve(system, stiffer[some])
-            except library(device).linalg.LinAlgError:
+                found = get_library(device).linalg.solve(system, stiffer[some])
+            except get_library(device).linalg.LinAlgError:
                 continue  # as stiff as at rest
             matrix[some] = -0.5 * (found + found.mT)
             # Those that can be touched come first in every list of nodes.
             most = 3 * int((nodes[some] < self._touchable).sum(-1).max())
             reach = soft[:, :, :most]
             place = rows[:, :most].clip(max=own.shape[1] - 1)
-            columns = like(nodes, placed(device, np.arange(count)))[some][:, None, None]
-            own[columns, place[:, :, None], place[:, None, :]] = like(own, reach.mT @ (matrix[some] @ reach))
+            columns = to_precision_of(nodes, to_library(device, np.arange(count)))[some][:, None, None]
+            own[columns, place[:, :, None], place[:, None, :]] = to_precision_of(own, reach.mT @ (matrix[some] @ reach))
         return StrainedModel(nodes, matrix, own)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..runtime.device import Device
-from ..runtime.views import columns_of, like, on_host, placed, view
+from ..runtime.views import select_columns, to_host, to_library, to_precision_of, view
 from .lbfgs_kernels import PAIRS
 
 
@@ -32,7 +32,7 @@ class CurvaturePairs:
     @cached_property
     def middle(self) -> np.ndarray:
         """M (2m, 2m)."""
-        return middle_of(self.sy, self.yw)
+        return compute_middle(self.sy, self.yw)
 
     def weights(self, force: np.ndarray) -> np.ndarray:
         """M [S, W]' force (2m,), of a force (3N,)."""
@@ -44,7 +44,7 @@ class CurvaturePairs:
         some, others = np.split(weights.astype(self.s.dtype), 2)
         return some @ self.s + others @ self.w
 
-    def and_one(self, s: np.ndarray, y: np.ndarray, w: np.ndarray) -> CurvaturePairs:
+    def add_pair(self, s: np.ndarray, y: np.ndarray, w: np.ndarray) -> CurvaturePairs:
         """With a newer pair (3N,), and the oldest forgotten where there are too many."""
         some = slice(max(0, len(self.s) - PAIRS + 1), None)
         steps, ways = (np.vstack([old[some], new.astype(old.dtype)]) for old, new in ((self.s, s), (self.w, w)))
@@ -56,12 +56,12 @@ class CurvaturePairs:
         return CurvaturePairs(steps, ways, sy, yw)
 
 
-def no_pairs(rows: int, kind: str) -> CurvaturePairs:
+def build_empty_history(rows: int, kind: str) -> CurvaturePairs:
     """Nothing learnt yet of a column of `rows`, kept as numbers of a `kind`."""
     return CurvaturePairs(*np.zeros((2, 0, rows), kind), *np.zeros((2, 0, 0)))
 
 
-def middle_of(sy: np.ndarray, yw: np.ndarray) -> np.ndarray:
+def compute_middle(sy: np.ndarray, yw: np.ndarray) -> np.ndarray:
     """M (..., 2m, 2m) of products s_i . y_j and y_i . w_j (..., m, m), oldest first; pairs of zeros count nothing."""
     upper, eye = np.triu(sy), np.eye(sy.shape[-1])
     own = np.diagonal(upper, axis1=-2, axis2=-1)[..., None] * eye
@@ -113,22 +113,22 @@ class PairsOfColumns:
         both = np.concatenate([order, PAIRS + order], axis=1)
         place = columns[:, None, None], order[:, :, None], order[:, None, :]
         middle = np.empty((len(columns), 2 * PAIRS, 2 * PAIRS))
-        found = middle_of(self._sy[place], self._yw[place])
+        found = compute_middle(self._sy[place], self._yw[place])
         middle[np.arange(len(columns))[:, None, None], both[:, :, None], both[:, None, :]] = found
-        own = self._sw[columns_of(self._device, columns, len(self.count))]
-        learnt = LbfgsHistory(own, placed(self._device, middle.astype(self._device.precision)))
+        own = self._sw[select_columns(self._device, columns, len(self.count))]
+        learnt = LbfgsHistory(own, to_library(self._device, middle.astype(self._device.precision)))
         self._asked = columns, learnt
         return learnt
 
-    def learn(self, columns: np.ndarray, s: Any, y: Any, w: Any) -> None:
+    def update_history(self, columns: np.ndarray, s: Any, y: Any, w: Any) -> None:
         """A newer pair of some columns (k,): s, y and w (3N, k); the oldest is forgotten where there are too many."""
         self._asked = None
-        place, some = self.count[columns] % PAIRS, columns_of(self._device, columns, len(self.count))
-        own, at = placed(self._device, columns), placed(self._device, place)
+        place, some = self.count[columns] % PAIRS, select_columns(self._device, columns, len(self.count))
+        own, at = to_library(self._device, columns), to_library(self._device, place)
         self._sw[own, at], self._sw[own, PAIRS + at] = s.T, w.T
         # y . H0 y' = y' . H0 y: what the new change is worth along old ones, and old changes along the new step.
-        change = like(self._sw, y.T[:, :, None])
-        worth = on_host(self._sw[some] @ change)[:, :, 0].astype(np.float64)
+        change = to_precision_of(self._sw, y.T[:, :, None])
+        worth = to_host(self._sw[some] @ change)[:, :, 0].astype(np.float64)
         self._sy[columns, place] = 0.0
         self._sy[columns, :, place] = worth[:, :PAIRS]
         self._yw[columns, :, place] = self._yw[columns, place] = worth[:, PAIRS:]

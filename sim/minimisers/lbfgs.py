@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..arguments import all_finite
+from ..arguments import is_all_finite
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
 from ..linalg.pcg import Preconditioner
-from ..runtime.columns import EXACT, scattered, width_of
+from ..runtime.columns import EXACT, find_workspace_width, scatter_columns
 from .lbfgs_kernels import LEFT, LIVE, PAIRS
-from .lbfgs_state import Workspace, ground_of
+from .lbfgs_state import Workspace, allocate_ground
 
 # What a descent has learnt about the curvature, on the host, rows first: s and w (b, m, 3N), their products (b, m, m),
 # the newest pair and how many there are (b,).
@@ -129,12 +129,12 @@ class Lbfgs:
             if last or (count > CARRIED and self._width(left) <= self._schedule.smaller * workspace.width):
                 leave = np.flatnonzero(now != LIVE) if not last else np.arange(len(now))
                 there = place[leave]
-                scattered(device, workspace.columns["u"], there, u, leave)
+                scatter_columns(device, workspace.columns["u"], there, u, leave)
                 status[there], steps[there], residual[there] = (
                     workspace.columns[name].numpy()[leave] for name in ("status", "steps", "residual")
                 )
                 if last:
-                    learnt = {name: rows_first(workspace.columns[name]) for name in LEARNT} if carried else {}
+                    learnt = {name: to_rows_first(workspace.columns[name]) for name in LEARNT} if carried else {}
                     return Descended(u, status, steps, residual, learnt)
                 stay = np.flatnonzero(now == LIVE)
                 place, before, workspace = place[stay], workspace, self._workspace(len(stay))
@@ -145,21 +145,21 @@ class Lbfgs:
         width = self._width(count)
         if width > max(self._workspaces, default=0):
             self._workspaces, self._ground = {}, {}  # what is there is given back before more is taken
-            self._ground = ground_of(self._problem, width)
+            self._ground = allocate_ground(self._problem, width)
         if width not in self._workspaces:
             self._workspaces[width] = Workspace(self._problem, self._preconditioner, width, self._ground)
         return self._workspaces[width]
 
     def _width(self, count: int) -> int:
-        return width_of(self._problem.device, count)
+        return find_workspace_width(self._problem.device, count)
 
 
-def rows_first(array: wp.array) -> np.ndarray:
+def to_rows_first(array: wp.array) -> np.ndarray:
     """A copy (b, ...) on the host of an array (..., b) in a workspace."""
     return np.moveaxis(array.numpy(), -1, 0).copy()  # what stands in a workspace is written over
 
 
-def learnt_from(cases: Cases, rows: int) -> dict[str, np.ndarray]:
+def restore_history(cases: Cases, rows: int) -> dict[str, np.ndarray]:
     """What an earlier descent on as many rows = 3N left warm; nothing if that does not fit these cases.
 
     It only shortens the way: what holds numbers that are not finite is forgotten.
@@ -178,4 +178,4 @@ def learnt_from(cases: Cases, rows: int) -> dict[str, np.ndarray]:
     # Other places hold whatever stood in the workspace.
     used = (found["head"][:, None] - np.arange(PAIRS)) % PAIRS < found["known"][:, None]
     places = {"s": used, "w": used} | dict.fromkeys(("sy", "yw"), used[:, :, None] & used[:, None, :])
-    return found if all(all_finite(found[name][place]) for name, place in places.items()) else {}
+    return found if all(is_all_finite(found[name][place]) for name, place in places.items()) else {}

@@ -46,19 +46,21 @@ class LbfgsKernels:
     clamp: wp.Kernel
 
 
-def few_of(device: Device) -> int:
+def get_rows_per_thread(device: Device) -> int:
     """Rows that one thread takes where it keeps much of each."""
     return 1 if device.on_cuda else 4
 
 
 @cache
-def kernels_of(device: Device, pairs: int) -> LbfgsKernels:
+def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
     """Kernels of a device's scalar type for columns that keep so many pairs."""
     scalar = device.scalar
-    several, few_scalars = (wp.types.vector(length=length, dtype=scalar) for length in (SOME, few_of(device)))
+    several, few_scalars = (
+        wp.types.vector(length=length, dtype=scalar) for length in (SOME, get_rows_per_thread(device))
+    )
     weights = wp.types.vector(length=pairs, dtype=wp.float64)
     products_of_pairs = wp.types.matrix(shape=(pairs, pairs), dtype=wp.float64)
-    m, chunk, some, few = pairs, CHUNK, SOME, few_of(device)
+    m, chunk, some, few = pairs, CHUNK, SOME, get_rows_per_thread(device)
     overshoot, least_kept, kept, most_kept = OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT
     cuts, least_curvature = CUTS, LEAST_CURVATURE
     whole_row, free_row, slope_row = WHOLE, FREE, SLOPE

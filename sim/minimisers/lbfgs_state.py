@@ -12,16 +12,16 @@ import warp as wp
 
 from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
-from ..runtime.columns import add_dots, combined, gathered
+from ..runtime.columns import add_dots, combine_columns, gather_columns
 from . import lbfgs_trial_kernels
-from .lbfgs_kernels import DONE, PAIRS, PRODUCTS, SOME, SUMS, few_of, kernels_of
+from .lbfgs_kernels import DONE, PAIRS, PRODUCTS, SOME, SUMS, build_kernels, get_rows_per_thread
 from .lbfgs_trial_kernels import multiply_of
-from .residual import Balance, balance, constants_of
+from .residual import Balance, compute_balance, compute_constant_gradients
 
 Shapes = Mapping[str, tuple[int, ...]]
 
 
-def layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
+def describe_layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
     """By kind of number: its type, the arrays that move with their columns, and those that a turn writes anew."""
     vector, pairs, terms = (problem.rows,), (PAIRS, problem.rows), (len(problem.terms),)
     return {
@@ -52,11 +52,11 @@ def layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
     }
 
 
-def ground_of(problem: Problem, width: int) -> dict[str, wp.array]:
+def allocate_ground(problem: Problem, width: int) -> dict[str, wp.array]:
     """Memory, by kind of number, for rooms of at most this width: they stand in the same place, one at a time."""
     return {
         kind: wp.zeros((_rows(moved) + _rows(written), width), dtype=dtype, device=problem.device.name)
-        for kind, (dtype, moved, written) in layout(problem).items()
+        for kind, (dtype, moved, written) in describe_layout(problem).items()
     }
 
 
@@ -69,11 +69,11 @@ class LbfgsState:
     ground: Mapping[str, wp.array]  # arrays that stand on it do not keep it
 
 
-def standing(problem: Problem, width: int, ground: Mapping[str, wp.array]) -> LbfgsState:
-    """The state of so many columns on a ground that `ground_of` made for at least this width."""
+def allocate_state(problem: Problem, width: int, ground: Mapping[str, wp.array]) -> LbfgsState:
+    """The state of so many columns on a ground that `allocate_ground` made for at least this width."""
     columns: dict[str, wp.array] = {}
     together: dict[str, wp.array] = {}
-    for kind, (_, moved, written) in layout(problem).items():
+    for kind, (_, moved, written) in describe_layout(problem).items():
         first = 0
         for name, shape in {**moved, **written}.items():
             columns[name] = _placed(ground[kind], first, (*shape, width))
@@ -92,16 +92,16 @@ class Workspace:
     width
         How many columns there is workspace for.
     ground
-        As `ground_of` makes it, for at least this width.
+        As `allocate_ground` makes it, for at least this width.
     """
 
     def __init__(self, problem: Problem, preconditioner: Preconditioner, width: int, ground: Mapping[str, wp.array]):
         self.width = width
         self._problem = problem
         self._preconditioner = preconditioner
-        self._kernels = kernels_of(problem.device, PAIRS)
+        self._kernels = build_kernels(problem.device, PAIRS)
         self._graph: wp.Graph | None = None
-        self.state = standing(problem, width, ground)
+        self.state = allocate_state(problem, width, ground)
         self.columns = a = self.state.columns
         self._trial = Balance(a["new_g"], a["part"], a["sums"], a["own"])
 
@@ -115,7 +115,7 @@ class Workspace:
         if spare:
             index = self._padded(np.arange(start.shape[1]))
             self._problem.keep(index)
-            gathered(device, start, index, a["u"])
+            gather_columns(device, start, index, a["u"])
         else:
             wp.copy(a["u"], start)
         for name, value in (("promised", np.inf), ("residual", np.inf), ("head", PAIRS - 1)):
@@ -123,7 +123,7 @@ class Workspace:
         # What is there to fill the workspace ends at once.
         a["tolerance"].assign(np.append(tolerance, np.full(spare, np.inf)))
         a["force"].assign(np.append(force, np.full(spare, np.inf)))
-        constant, loud = constants_of(self._problem, a["u"])
+        constant, loud = compute_constant_gradients(self._problem, a["u"])
         wp.copy(a["constant"], constant)
         wp.copy(a["loud"], loud)
         for name, rows_first in learnt.items():
@@ -134,9 +134,9 @@ class Workspace:
         """The first trial goes along -z (3N, b) from a start that has the free gradient g (3N, b)."""
         a, device, count = self.columns, self._problem.device, g.shape[1]
         index = device.array(self._padded(np.arange(count)), wp.int32)
-        gathered(device, g, index, a["g"])
-        gathered(device, z, index, a["z"])
-        combined(device, a["d"], -1.0, a["z"], a["d"])
+        gather_columns(device, g, index, a["g"])
+        gather_columns(device, z, index, a["z"])
+        combine_columns(device, a["d"], -1.0, a["z"], a["d"])
         a["promised"].zero_()
         add_dots(device, a["g"], a["z"], a["promised"])
         a["t"].fill_(1.0)
@@ -148,7 +148,7 @@ class Workspace:
         self._problem.keep(index)
         there = self._problem.device.array(index, wp.int32)
         for kind, own in self.state.moved.items():
-            wp.copy(own, gathered(self._problem.device, other.state.moved[kind], there))
+            wp.copy(own, gather_columns(self._problem.device, other.state.moved[kind], there))
         if len(stay) < self.width:
             self.columns["status"][len(stay) :].fill_(DONE)
         self.prepare()
@@ -191,9 +191,9 @@ class Workspace:
         problem, device = self._problem, self._problem.device
         rows, count = a["u"].shape
         spread, one = lbfgs_trial_kernels.spread_of(device, count), (count,)
-        step = lbfgs_trial_kernels.kernels_of(device, spread).step
+        step = lbfgs_trial_kernels.build_kernels(device, spread).step
         device.launch(step, (spread.threads(rows), count), [a["u"], a["t"], a["d"]], [a["v"]])
-        found = balance(problem, a["v"], a["constant"], a["d"], self._trial)
+        found = compute_balance(problem, a["v"], a["constant"], a["d"], self._trial)
         inputs = [a["loud"], found.own, a["tolerance"], a["force"], found.sums, a["promised"]]
         names = ("status", "accepted", "steps", "cut", "t", "gone", "residual", "slot", "aiming")
         device.launch(k.judge, one, inputs, [a[name] for name in names])
@@ -203,7 +203,7 @@ class Workspace:
             self._aim()
         inputs = [a["status"], a["accepted"], a["known"], a["slot"], a["gone"], a["along_s"], a["along_w"]]
         outputs = [a["u"], a["d"], a["g"], a["z"], a["s"], a["w"]]
-        device.launch(k.move, (-(-rows // few_of(device)), count), [*inputs, found.g, a["new_z"]], outputs)
+        device.launch(k.move, (-(-rows // get_rows_per_thread(device)), count), [*inputs, found.g, a["new_z"]], outputs)
         self._clamp()
 
     def _aim(self) -> None:

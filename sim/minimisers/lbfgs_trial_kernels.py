@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from ..runtime.columns import lanes_of, summed
+from ..runtime.columns import get_warp_width, summed
 from ..runtime.device import Device, forward_kernel
 from .lbfgs_kernels import FREE, GOLD, GZ, OWN, SLOPE, SOME, WHOLE, YW
 
@@ -34,7 +34,7 @@ def spread_of(device: Device, columns: int) -> ThreadSpread:
     """How the threads of a device share the rows of so many columns."""
     if columns > 1:
         return ThreadSpread(1, SOME)
-    return ThreadSpread(lanes_of(device), EACH if device.on_cuda else EACH_ON_CPU)
+    return ThreadSpread(get_warp_width(device), EACH if device.on_cuda else EACH_ON_CPU)
 
 
 @wp.func
@@ -58,7 +58,7 @@ class LbfgsTrialKernels:
 
 
 @cache
-def kernels_of(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
+def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
     """Kernels of a device's scalar type."""
     scalar, vec = device.scalar, device.vector
     lanes, each = spread.lanes, spread.each

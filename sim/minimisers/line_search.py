@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from ..discretisation.problem import Problem
-from ..runtime.columns import combined, dots
+from ..runtime.columns import combine_columns, compute_dots
 from .lbfgs_kernels import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
 from .newton_cg import Direction
 
@@ -37,12 +37,12 @@ class Search:
     shortest: float = 1e-8
 
 
-def goes_too_far(ahead: Any, promised: Any) -> Any:
+def is_step_too_long(ahead: Any, promised: Any) -> Any:
     """Whether the slopes `ahead` of steps, which promised so much decrease, have risen too far; or are no numbers."""
     return ~(np.asarray(ahead) <= OVERSHOOT * np.abs(promised))
 
 
-def kept_of(ahead: Any, promised: Any) -> Any:
+def backtrack_by_slopes(ahead: Any, promised: Any) -> Any:
     """The shares of steps that went too far to be tried next: where the line through both slopes is zero."""
     with np.errstate(invalid="ignore", divide="ignore"):
         kept = np.divide(promised, np.add(promised, ahead))
@@ -64,9 +64,9 @@ def search(problem: Problem, u: wp.array, direction: Direction, settings: Search
     found, refinements = np.zeros(len(t), bool), np.zeros(len(t), int)
     trial = problem.device.zeros(*u.shape)
     for _ in range(settings.trials):
-        g = problem.gradient(combined(problem.device, u, t, direction.d, trial))
+        g = problem.gradient(combine_columns(problem.device, u, t, direction.d, trial))
         problem.constraint.project(g)
-        slope = dots(problem.device, g, direction.d)
+        slope = compute_dots(problem.device, g, direction.d)
         slope = np.where(np.isfinite(slope), slope, 3.0 * np.abs(promised))
         far = ~found & (slope > OVERSHOOT * promised)
         near = ~found & ~far

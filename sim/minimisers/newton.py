@@ -13,11 +13,11 @@ import warp as wp
 from ..accuracy import Accuracy
 from ..deformation import Outcome
 from ..discretisation.problem import Problem
-from ..runtime.columns import combined, gathered, norms, scattered
+from ..runtime.columns import combine_columns, compute_norms, gather_columns, scatter_columns
 from ..runtime.device import Device
 from .line_search import search
 from .newton_cg import Descent
-from .residual import relative
+from .residual import compute_relative
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def find_equilibrium(
         if step and open_gap.any():  # what is closed stays closed: directions are projected
             gap, open_gap = problem.gap(u)
         vanished = scale <= last_digit**2 * first[live]
-        share = relative(free, np.where(vanished, 0.0, scale))
+        share = compute_relative(free, np.where(vanished, 0.0, scale))
         bad = ~np.isfinite(share)
         done = ~bad & ~open_gap & (share <= accuracy.tolerance)
         idle[live] = np.where(share <= 0.9 * best[live], 0, idle[live] + 1)
@@ -89,8 +89,8 @@ def find_equilibrium(
         stuck = ~done & ~bad & (failed | (idle[live] >= settings.patience))
         still[live] *= stuck
         if stuck.any():
-            moved = norms(device, combined(device, u, -1.0, before, wp.empty_like(u)))
-            still[live] += stuck & (moved <= last_digit * norms(device, u))
+            moved = compute_norms(device, combine_columns(device, u, -1.0, before, wp.empty_like(u)))
+            still[live] += stuck & (moved <= last_digit * compute_norms(device, u))
             failed |= still[live] >= settings.still
             drowned = stuck & ~open_gap & (free <= settings.round_off * round_off(problem, u, g))
             outcome[live[failed]] = Outcome.STALLED
@@ -105,14 +105,14 @@ def find_equilibrium(
         leave = done | bad | failed
         last = leave.all() or step == accuracy.outer
         for state, columns in ((u, ~bad & (leave | last)), (before, bad)):
-            scattered(device, state, live[columns], result, np.flatnonzero(columns))
+            scatter_columns(device, state, live[columns], result, np.flatnonzero(columns))
         if last:
             break
         if leave.any():
             stay = np.flatnonzero(~leave)
             problem.keep(stay)
             descent.keep(device, stay)
-            u, g, gap = (gathered(device, array, stay) for array in (u, g, gap))
+            u, g, gap = (gather_columns(device, array, stay) for array in (u, g, gap))
             live, taken, open_gap, share = live[stay], taken[stay], open_gap[stay], share[stay]
         # Superlinear, and never finer than the tolerance needs.
         forcing = np.clip(
@@ -121,7 +121,7 @@ def find_equilibrium(
         found = descent.find(problem, u, g, gap if open_gap.any() else None, forcing, taken)
         linear_iterations += found.iterations
         length = search(problem, u, found)
-        before, u = u, combined(device, u, length, found.d, wp.empty_like(u))
+        before, u = u, combine_columns(device, u, length, found.d, wp.empty_like(u))
         # A search that fails is repeated once along a direction of positive definite curvature.
         failed = (length == 0.0) & (taken == 0.0)
         taken = length
@@ -136,7 +136,7 @@ def round_off(problem: Problem, u: wp.array, g: wp.array) -> np.ndarray:
     device = problem.device
     near = problem.gradient(_nearest(device, u))
     problem.constraint.project(near)
-    return norms(device, combined(device, near, -1.0, g, near))
+    return compute_norms(device, combine_columns(device, near, -1.0, g, near))
 
 
 def is_stress_free(problem: Problem, u: wp.array, factor: float) -> np.ndarray:
@@ -150,7 +150,7 @@ def is_stress_free(problem: Problem, u: wp.array, factor: float) -> np.ndarray:
         return np.linalg.norm(force.numpy().reshape(-1, 3, u.shape[1]), axis=1)
 
     change = wp.empty_like(u)
-    combined(problem.device, problem.gradient(_nearest(problem.device, u)), -1.0, problem.gradient(u), change)
+    combine_columns(problem.device, problem.gradient(_nearest(problem.device, u)), -1.0, problem.gradient(u), change)
     noise = at_nodes(change)
     out = np.ones(u.shape[1], bool)
     for term in problem.terms:

@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from ..discretisation.problem import Problem
-from ..linalg.pcg import Preconditioner, conjugate_gradients
-from ..runtime.columns import combined, dots, norms
+from ..linalg.pcg import Preconditioner, solve_conjugate_gradients
+from ..runtime.columns import combine_columns, compute_dots, compute_norms
 from ..runtime.device import Device
 
 
@@ -77,14 +77,16 @@ class NewtonCG:
         definite = taken == 0.0
         problem.linearise(u, definite)
         self._preconditioner.prepare(problem, columns)
-        rhs, pulled = right_hand_side(problem, g, gap)
+        rhs, pulled = compute_right_hand_side(problem, g, gap)
         # What follows a gap must follow it whole, and the curvature at rest misleads no one.
         self._radius = np.where(pulled | definite, np.inf, self._followed(taken))
-        tolerance = forcing * norms(device, rhs)
-        found = conjugate_gradients(problem, self._preconditioner, wp.clone(rhs), tolerance, self._most, self._radius)
+        tolerance = forcing * compute_norms(device, rhs)
+        found = solve_conjugate_gradients(
+            problem, self._preconditioner, wp.clone(rhs), tolerance, self._most, self._radius
+        )
         self._size, self._truncated = found.size, found.truncated
-        promised = dots(device, rhs, found.x)
-        return Direction(closing(device, found.x, gap), promised, found.iterations)
+        promised = compute_dots(device, rhs, found.x)
+        return Direction(close_constraints(device, found.x, gap), promised, found.iterations)
 
     def _followed(self, taken: np.ndarray) -> np.ndarray:
         if self._radius is None:
@@ -93,18 +95,18 @@ class NewtonCG:
         return np.where((taken == 1.0) & ~self._truncated, np.maximum(self._radius, step), step)
 
 
-def right_hand_side(problem: Problem, g: wp.array, gap: wp.array | None) -> tuple[wp.array, np.ndarray]:
+def compute_right_hand_side(problem: Problem, g: wp.array, gap: wp.array | None) -> tuple[wp.array, np.ndarray]:
     """-P (g + K gap) (3N, b) [N] at the last linearisation, and which columns (b,) have a gap to close."""
     device, columns = problem.device, g.shape[1]
-    rhs = combined(device, device.zeros(*g.shape), -1.0, g, wp.empty_like(g))
+    rhs = combine_columns(device, device.zeros(*g.shape), -1.0, g, wp.empty_like(g))
     if gap is None:
         return rhs, np.zeros(columns, bool)
     pull = device.zeros(*g.shape)
     problem.add_curvature(gap, pull)
     problem.constraint.project(pull)
-    return combined(device, rhs, -1.0, pull, rhs), norms(device, gap) > 0.0
+    return combine_columns(device, rhs, -1.0, pull, rhs), compute_norms(device, gap) > 0.0
 
 
-def closing(device: Device, x: wp.array, gap: wp.array | None) -> wp.array:
+def close_constraints(device: Device, x: wp.array, gap: wp.array | None) -> wp.array:
     """x (3N, b) and, if any, the motion that closes the constraints, in place."""
-    return x if gap is None else combined(device, x, 1.0, gap, x)
+    return x if gap is None else combine_columns(device, x, 1.0, gap, x)

@@ -8,10 +8,10 @@ import numpy as np
 import warp as wp
 
 from ..discretisation.problem import Problem
-from ..runtime.columns import CHUNK, add_dots, combined, gathered
+from ..runtime.columns import CHUNK, add_dots, combine_columns, gather_columns
 from ..runtime.device import Device
 from . import lbfgs_trial_kernels
-from .lbfgs_kernels import FREE, OWN, PAIRS, SUMS, WHOLE, kernels_of
+from .lbfgs_kernels import FREE, OWN, PAIRS, SUMS, WHOLE, build_kernels
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,14 +27,14 @@ class Balance:
     own: wp.array
 
 
-def balance_workspace(problem: Problem, count: int) -> Balance:
+def allocate_balance(problem: Problem, count: int) -> Balance:
     """Arrays for the balance of so many columns."""
     device = problem.device
     sums, own = (wp.zeros((rows, count), dtype=wp.float64, device=device.name) for rows in (SUMS, len(problem.terms)))
     return Balance(device.zeros(problem.rows, count), device.zeros(problem.rows, count), sums, own)
 
 
-def balance(
+def compute_balance(
     problem: Problem, v: wp.array, constant: wp.array, d: wp.array | None = None, workspace: Balance | None = None
 ) -> Balance:
     """The balance at v (3N, b) [m] of a batch with `constant` gradients (3N, b) [N], and its slope along d (3N, b).
@@ -42,7 +42,7 @@ def balance(
     In the arrays of `workspace`, if it is given.
     """
     device, (rows, count) = problem.device, v.shape
-    workspace = workspace or balance_workspace(problem, count)
+    workspace = workspace or allocate_balance(problem, count)
     varying = [term for term in problem.terms if not term.constant]
     workspace.sums.zero_()
     wp.copy(workspace.g, constant)
@@ -50,7 +50,7 @@ def balance(
         varying[0].add_gradient(v, workspace.g)
         workspace = replace(workspace, own=workspace.sums[OWN : OWN + 1])
     else:
-        absorb = kernels_of(device, PAIRS).absorb
+        absorb = build_kernels(device, PAIRS).absorb
         workspace.own.zero_()
         for number, term in enumerate(varying):
             term.add_gradient(v, workspace.part)
@@ -58,7 +58,7 @@ def balance(
     inputs = [constant, *problem.constraint.nodes, v if d is None else d]
     spread = lbfgs_trial_kernels.spread_of(device, count)
     device.launch(
-        lbfgs_trial_kernels.kernels_of(device, spread).finish,
+        lbfgs_trial_kernels.build_kernels(device, spread).finish,
         (spread.threads(rows // 3), count),
         inputs,
         [workspace.g, workspace.sums],
@@ -66,7 +66,7 @@ def balance(
     return workspace
 
 
-def constants_of(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
+def compute_constant_gradients(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
     """The summed gradient (3N, b) [N] of the terms that are constant, and the square norm (terms, b) of each one's."""
     device = problem.device
     total = device.zeros(*u.shape)
@@ -76,7 +76,7 @@ def constants_of(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
             own = device.zeros(*u.shape)
             term.add_gradient(u, own)
             add_dots(device, own, own, square[number])
-            combined(device, total, 1.0, own, total)
+            combine_columns(device, total, 1.0, own, total)
     return total, square
 
 
@@ -95,7 +95,7 @@ class ResidualState:
     @property
     def relative(self) -> np.ndarray:
         """The relative residuals (b,)."""
-        return relative(self.free, self.scale)
+        return compute_relative(self.free, self.scale)
 
     @property
     def finite(self) -> np.ndarray:
@@ -104,7 +104,7 @@ class ResidualState:
 
     def rows(self, device: Device, stay: np.ndarray) -> ResidualState:
         """Some of the columns (k,)."""
-        u, g = (gathered(device, array, stay) for array in (self.u, self.g))
+        u, g = (gather_columns(device, array, stay) for array in (self.u, self.g))
         return ResidualState(u, g, self.free[stay], self.scale[stay])
 
 
@@ -121,7 +121,7 @@ class Judge:
 
     def __call__(self, u: wp.array) -> ResidualState:
         """The states u (3N, b) [m]."""
-        found = balance(self.problem, u, self.constant)
+        found = compute_balance(self.problem, u, self.constant)
         sums = found.sums.numpy()
         with np.errstate(invalid="ignore", over="ignore"):
             largest = np.maximum(self.square, found.own.numpy().max(axis=0, initial=0.0))
@@ -131,25 +131,25 @@ class Judge:
     def rows(self, stay: np.ndarray) -> Judge:
         """Of some of the columns (k,), which are all that the problem keeps from now on."""
         self.problem.keep(stay)
-        return Judge(self.problem, gathered(self.problem.device, self.constant, stay), self.square[stay])
+        return Judge(self.problem, gather_columns(self.problem.device, self.constant, stay), self.square[stay])
 
 
-def judge_of(problem: Problem, u: wp.array) -> Judge:
+def build_judge(problem: Problem, u: wp.array) -> Judge:
     """Of the batch that the problem has begun, about to start at u (3N, b) [m]."""
-    constant, loud = constants_of(problem, u)
+    constant, loud = compute_constant_gradients(problem, u)
     return Judge(problem, constant, loud.numpy().max(axis=0, initial=0.0))
 
 
-def relative(free: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def compute_relative(free: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Free gradients (b,) [N] over the norms that they are measured against (b,); zero where nothing acts."""
     with np.errstate(invalid="ignore"):  # forces that overflowed
         return np.divide(free, scale, out=np.zeros_like(free), where=scale != 0.0)
 
 
-def shortfall(problem: Problem, u: wp.array) -> np.ndarray:
+def measure_residual(problem: Problem, u: wp.array) -> np.ndarray:
     """The relative residual (b,) of u (3N, b) under the whole load, or the share of imposed motion that is missing."""
     _, free, scale = problem.residual(u)
     gap, size = problem.constraint.close_gap(u)
     largest = np.abs(u.numpy() + gap.numpy()).max(axis=0, initial=0.0)
-    worse = np.maximum(relative(free, scale), relative(size, largest))
+    worse = np.maximum(compute_relative(free, scale), compute_relative(size, largest))
     return np.where(np.isnan(worse), np.inf, worse)

@@ -19,8 +19,8 @@ import scipy.sparse as sp
 from ..discretisation.element import Elements
 from ..discretisation.problem import Problem
 from ..discretisation.term import Strained
-from ..runtime.threads import cores, together
-from ..runtime.views import in_order, on_host, placed
+from ..runtime.threads import choose_threads, run_together
+from ..runtime.views import run_in_order, to_host, to_library
 
 # Elements that are worked on together: what they need of a pair stays in a core's cache, or fills a card.
 FEW, MANY = 256, 4096
@@ -64,9 +64,9 @@ def second_order(
     start = np.searchsorted(first, np.arange(len(moved) + 1))
     terms = [term for term in problem.terms if isinstance(term, Strained)]
     work = [one for term in terms for one in _some(*term.second_order(), MANY if device.on_cuda else FEW)]
-    others, done = placed(device, second), count(1)
-    tasks = 1 if device.on_cuda else cores(sum(len(each.chosen) for each in work))
-    tables = [placed(device, np.zeros((len(first), len(answers)), np.float32)) for _ in range(tasks)]
+    others, done = to_library(device, second), count(1)
+    tasks = 1 if device.on_cuda else choose_threads(sum(len(each.chosen) for each in work))
+    tables = [to_library(device, np.zeros((len(first), len(answers)), np.float32)) for _ in range(tasks)]
 
     def add_all(table: Any, those: list[_Some]) -> None:
         for some in those:
@@ -76,18 +76,18 @@ def second_order(
     def add(table: Any, some: _Some) -> None:
         gradient = _gradients(some.elements, some.chosen)
         weight = np.repeat(some.elements.weight[some.chosen].ravel(), 9)[:, None]
-        strain = placed(device, (gradient @ moved.T).astype(np.float32).reshape(-1, 9, len(moved)))
-        lever = placed(device, (weight * (gradient @ answers.T)).astype(np.float32))
-        tensor = placed(device, some.tensor)
+        strain = to_library(device, (gradient @ moved.T).astype(np.float32).reshape(-1, 9, len(moved)))
+        lever = to_library(device, (weight * (gradient @ answers.T)).astype(np.float32))
+        tensor = to_library(device, some.tensor)
         for component in np.flatnonzero(np.diff(start)).tolist():
             rows = slice(int(start[component]), int(start[component + 1]))
             stiffening = (strain[:, :, component] @ tensor).reshape(-1, 9, 9)
             stress = stiffening @ strain[:, :, others[rows]]
             table[rows] -= stress.reshape(len(lever), -1).T @ lever
 
-    with in_order(device):
-        together([partial(add_all, table, work[k::tasks]) for k, table in enumerate(tables)])
-        table = on_host(sum(tables[1:], tables[0]))
+    with run_in_order(device):
+        run_together([partial(add_all, table, work[k::tasks]) for k, table in enumerate(tables)])
+        table = to_host(sum(tables[1:], tables[0]))
     twice = np.where(first == second, 1.0, 2.0).astype(np.float32)
     return np.column_stack([first, second]), table * twice[:, None]
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import InputError
-from .partial_files import STALE, partial_path, partials_of, remove_left_overs
+from .partial_files import STALE, list_partials, remove_left_overs, to_partial_path
 
 
-def why(error: OSError) -> str:
+def explain_error(error: OSError) -> str:
     """Why a file cannot be had, in the system's own words and not a library's."""
     return os.strerror(error.errno) if error.errno else "the library that writes it failed"
 
@@ -35,23 +35,25 @@ def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: boo
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{path}: its folder cannot be made ({why(error)}). Choose another folder.") from error
+        raise InputError(
+            f"{path}: its folder cannot be made ({explain_error(error)}). Choose another folder."
+        ) from error
     if path.is_dir():
         raise InputError(f"{path}: cannot be written, it is a folder. Choose another name.")
     if sweep:
         remove_left_overs(path.parent, path.name, stale)
-    probe = partial_path(path)
+    probe = to_partial_path(path)
     try:  # permissions alone do not tell: a file system may be read-only, or make no files
         probe.touch()
     except OSError as error:
-        raise InputError(f"{path}: cannot be written there ({why(error)}). Choose another folder.") from error
+        raise InputError(f"{path}: cannot be written there ({explain_error(error)}). Choose another folder.") from error
     finally:
         probe.unlink(missing_ok=True)
     return path
 
 
 @contextmanager
-def written_whole(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Path]:
+def write_atomically(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Path]:
     """A name beside `path`, of the same ending, to write under; it takes the name `path` when the block ends well.
 
     `sweep` is that of `check_output`.
@@ -62,20 +64,20 @@ def written_whole(path: str | Path, suffix: str, sweep: bool = True) -> Iterator
         As `check_output`; and where writing fails.
     """
     path = check_output(path, suffix, sweep=sweep)
-    partial = partial_path(path)
+    partial = to_partial_path(path)
     try:
         yield partial
         with partial.open("rb") as file:  # whole on the disk, before it takes a name that says so
             os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({why(error)}). {REMEDY}") from error
+        raise InputError(f"{path}: cannot be written ({explain_error(error)}). {REMEDY}") from error
     finally:
         partial.unlink(missing_ok=True)
 
 
 @contextmanager
-def written_folder(path: Path, size: int = 0, kept: Callable[[Path], bool] | None = None) -> Iterator[Path]:
+def write_folder_atomically(path: Path, size: int = 0, kept: Callable[[Path], bool] | None = None) -> Iterator[Path]:
     """Yield a hidden folder next to `path`, which takes its name when the block ends well, and is removed if not.
 
     Parameters
@@ -92,20 +94,20 @@ def written_folder(path: Path, size: int = 0, kept: Callable[[Path], bool] | Non
         A file, or a folder that is not empty; a full disk; a place that cannot be written; another process.
     """
     target = path.resolve()
-    partial = partial_path(target)
+    partial = to_partial_path(target)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"{path}: is there and not empty. Choose another name, or remove it.")
     if kept is None:
         remove_left_overs(target.parent, target.name)
         shutil.rmtree(partial, ignore_errors=True)  # of a dead process that had the same number
-        others = partials_of(target)
+        others = list_partials(target)
         if others:
             raise InputError(
                 f"{path}: another run is writing it, in {others[0].name}. Wait for it, or choose another --out; if no "
                 "run is at work, remove that folder."
             )
-    demand_space(target, size)
-    with empty_parents_removed(target):
+    check_disk_space(target, size)
+    with remove_empty_parents(target):
         try:
             partial.mkdir(parents=True, exist_ok=True)
             yield partial
@@ -113,7 +115,7 @@ def written_folder(path: Path, size: int = 0, kept: Callable[[Path], bool] | Non
                 target.rmdir()
             partial.rename(target)
         except OSError as error:
-            raise InputError(f"{path}: cannot be written ({why(error)}). {REMEDY}") from error
+            raise InputError(f"{path}: cannot be written ({explain_error(error)}). {REMEDY}") from error
         finally:
             if kept is None or not kept(partial):
                 shutil.rmtree(partial, ignore_errors=True)
@@ -121,7 +123,7 @@ def written_folder(path: Path, size: int = 0, kept: Callable[[Path], bool] | Non
 
 
 @contextmanager
-def empty_parents_removed(path: Path) -> Iterator[None]:
+def remove_empty_parents(path: Path) -> Iterator[None]:
     """Remove the folders above `path` that were made in the block and stayed empty."""
     missing = [folder for folder in path.parents if not folder.exists()]
     try:
@@ -133,15 +135,15 @@ def empty_parents_removed(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def written_stream(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Stream]:
-    """As `written_whole`, but an open binary file; for HDF5, which ends the process where a write of its own fails.
+def write_stream_atomically(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Stream]:
+    """As `write_atomically`, but an open binary file; for HDF5, which ends the process where a write of its own fails.
 
     Raises
     ------
     InputError
-        As `written_whole`.
+        As `write_atomically`.
     """
-    with written_whole(path, suffix, sweep) as partial, partial.open("w+b", buffering=0) as raw:
+    with write_atomically(path, suffix, sweep) as partial, partial.open("w+b", buffering=0) as raw:
         stream = Stream(raw)
         try:
             yield stream
@@ -196,7 +198,7 @@ class Stream:
         """Nothing: no byte waits."""
 
 
-def demand_space(path: str | Path, size: int, largest: int | None = None) -> None:
+def check_disk_space(path: str | Path, size: int, largest: int | None = None) -> None:
     """Refuse to begin what cannot end: `size` bytes beside `path`, in files of which the `largest` has so many.
 
     Raises

@@ -78,14 +78,14 @@ def before(value: wp.int32) -> wp.int32:
     ...
 
 
-def threads_of(device: Device) -> tuple[int, int]:
+def get_block_shape(device: Device) -> tuple[int, int]:
     """How many threads a block has, as rows and columns: on a card whole warps."""
     return (16, 32) if device.on_cuda else (1, 1)
 
 
 def launch(device: Device, kernel: wp.Kernel, columns: int, inputs: list[Any], outputs: list[Any]) -> None:
     """Launch a kernel over (column, thread)."""
-    rows, along = threads_of(device)
+    rows, along = get_block_shape(device)
     if columns:
         wp.launch(
             kernel,

@@ -33,10 +33,10 @@ class ColumnKernels:
 
 
 @cache
-def kernels_of(device: Device) -> ColumnKernels:
+def build_kernels(device: Device) -> ColumnKernels:
     """Kernels of a device's scalar type."""
     scalar = device.scalar
-    chunk, lanes = CHUNK, lanes_of(device)
+    chunk, lanes = CHUNK, get_warp_width(device)
 
     @forward_kernel(module="unique")
     def dot(
@@ -141,7 +141,7 @@ def kernels_of(device: Device) -> ColumnKernels:
 
 
 @cache
-def moving_kernels_of(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
+def build_moving_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
     """Kernels that take columns out of arrays of any type, and put them back."""
 
     @forward_kernel(module="unique")
@@ -170,14 +170,14 @@ def moving_kernels_of(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
     return gather, scatter
 
 
-def width_of(device: Device, count: int) -> int:
+def find_workspace_width(device: Device, count: int) -> int:
     """How wide a room of L-BFGS for so many columns is."""
     if not device.on_cuda:
         return count
     return next((width for width in WIDTHS if width >= count), -(-count // WIDTHS[-1]) * WIDTHS[-1])
 
 
-def widest_within(device: Device, count: int) -> int:
+def find_widest_workspace(device: Device, count: int) -> int:
     """How wide a room of at most so many columns is; 0 where there is none."""
     if not device.on_cuda or count < 1:
         return count
@@ -207,29 +207,29 @@ class Workspaces:
 
 def add_dots(device: Device, x: wp.array, y: wp.array, out: wp.array) -> None:
     """Add the columns' inner products of x and y (rows, b) to out (b,) float64, on the device."""
-    k, (rows, count) = kernels_of(device), x.shape
+    k, (rows, count) = build_kernels(device), x.shape
     if device.on_cuda and count == 1:
-        lanes = lanes_of(device)
+        lanes = get_warp_width(device)
         device.launch(k.dot_alone, (-(-rows // lanes) * lanes,), [x, y], [out])
     else:
         device.launch(k.dot, (-(-rows // CHUNK), count), [x, y], [out])
 
 
-def dots(device: Device, x: wp.array, y: wp.array) -> np.ndarray:
+def compute_dots(device: Device, x: wp.array, y: wp.array) -> np.ndarray:
     """The columns' inner products (b,) of x and y (rows, b), on the host."""
     out = wp.zeros(x.shape[1], dtype=wp.float64, device=device.name)
     add_dots(device, x, y, out)
     return out.numpy()
 
 
-def norms(device: Device, x: wp.array) -> np.ndarray:
+def compute_norms(device: Device, x: wp.array) -> np.ndarray:
     """The columns' 2-norms (b,) of x (rows, b), on the host."""
-    return np.sqrt(dots(device, x, x))
+    return np.sqrt(compute_dots(device, x, x))
 
 
-def combined(device: Device, x: wp.array, factor: np.ndarray | float, y: wp.array, out: wp.array) -> wp.array:
+def combine_columns(device: Device, x: wp.array, factor: np.ndarray | float, y: wp.array, out: wp.array) -> wp.array:
     """out = x + factor y; factor (b,) from the host, or one for all columns; out may be x."""
-    kernels = kernels_of(device)
+    kernels = build_kernels(device)
     if isinstance(factor, (int, float)):
         device.launch(kernels.add_multiple, x.shape, [x, factor, y], [out])
     else:
@@ -237,28 +237,32 @@ def combined(device: Device, x: wp.array, factor: np.ndarray | float, y: wp.arra
     return out
 
 
-def gathered(device: Device, x: wp.array, columns: np.ndarray | wp.array, out: wp.array | None = None) -> wp.array:
+def gather_columns(
+    device: Device, x: wp.array, columns: np.ndarray | wp.array, out: wp.array | None = None
+) -> wp.array:
     """A copy (..., k) of some columns (k,) of x (..., b); in `out`, if it is given."""
     index = _index(device, columns)
     if out is None:
         out = wp.empty((*x.shape[:-1], len(index)), dtype=x.dtype, device=device.name)
-    gather, _ = moving_kernels_of(x.dtype)
+    gather, _ = build_moving_kernels(x.dtype)
     device.launch(gather, _flat(out).shape, [_flat(x), index], [_flat(out)])
     return out
 
 
-def scattered(device: Device, x: wp.array, columns: np.ndarray, out: wp.array, some: np.ndarray | None = None) -> None:
+def scatter_columns(
+    device: Device, x: wp.array, columns: np.ndarray, out: wp.array, some: np.ndarray | None = None
+) -> None:
     """Copy x (..., k), or `some` (k,) columns of it, to some columns (k,) of out (..., b)."""
-    _, scatter = moving_kernels_of(x.dtype)
+    _, scatter = build_moving_kernels(x.dtype)
     some = np.arange(x.shape[-1]) if some is None else some
     inputs = [_flat(x), _index(device, some), _index(device, columns)]
     device.launch(scatter, (_flat(x).shape[0], len(some)), inputs, [_flat(out)])
 
 
-def unstacked(device: Device, x: wp.array, nodes: np.ndarray) -> np.ndarray:
+def unstack_columns(device: Device, x: wp.array, nodes: np.ndarray) -> np.ndarray:
     """Vectors (b, n, 3) at some nodes (n,) of x (3N, b), in double precision on the host."""
     out = wp.empty((x.shape[1], len(nodes), 3), dtype=wp.float64, device=device.name)
-    device.launch(kernels_of(device).unstack, out.shape[:2], [x, device.array(nodes, wp.int32)], [out])
+    device.launch(build_kernels(device).unstack, out.shape[:2], [x, device.array(nodes, wp.int32)], [out])
     return out.numpy()
 
 
@@ -271,22 +275,22 @@ def _flat(x: wp.array) -> wp.array:
     return x.reshape((int(np.prod(x.shape[:-1])), x.shape[-1]))
 
 
-def rows_taken(device: Device, x: wp.array, rows: wp.array, out: wp.array | None = None) -> wp.array:
+def take_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array | None = None) -> wp.array:
     """A copy (m, b) of some rows of x (n, b); in `out`, if it is given."""
     if out is None:
         out = wp.empty((len(rows), x.shape[1]), dtype=x.dtype, device=device.name)
-    device.launch(kernels_of(device).take, (len(rows), x.shape[1]), [x, rows], [out])
+    device.launch(build_kernels(device).take, (len(rows), x.shape[1]), [x, rows], [out])
     return out
 
 
 def put_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None:
     """Copy x (m, b) to some rows of out (n, b)."""
-    device.launch(kernels_of(device).put, x.shape, [x, rows], [out])
+    device.launch(build_kernels(device).put, x.shape, [x, rows], [out])
 
 
 def add_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None:
     """Add x (m, b) to some rows of out (n, b), each of them once."""
-    device.launch(kernels_of(device).add, x.shape, [x, rows], [out])
+    device.launch(build_kernels(device).add, x.shape, [x, rows], [out])
 
 
 @wp.func_native(
@@ -300,11 +304,11 @@ def add_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None
 def summed(value: wp.float64) -> wp.float64:
     """The sum over the threads that run in step, valid in the first of them; on the CPU the value itself.
 
-    All of them must be here, which launches over multiples of `lanes_of` see to.
+    All of them must be here, which launches over multiples of `get_warp_width` see to.
     """
     ...
 
 
-def lanes_of(device: Device) -> int:
+def get_warp_width(device: Device) -> int:
     """How many threads run in step."""
     return 32 if device.on_cuda else 1

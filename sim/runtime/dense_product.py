@@ -8,10 +8,10 @@ import numpy as np
 import warp as wp
 
 from .device import Device
-from .threads import one_thread
+from .threads import limit_to_one_thread
 
 
-def product_with(matrix: np.ndarray, device: Device, rough: bool = False) -> Callable[[wp.array, wp.array], None]:
+def build_product(matrix: np.ndarray, device: Device, rough: bool = False) -> Callable[[wp.array, wp.array], None]:
     """(x, out) -> out (m, b) = matrix (m, n) x (n, b); `rough` lets CUDA round every number to eight bits."""
     return _on_cuda(matrix, device, rough) if device.on_cuda else _on_cpu(matrix, device)
 
@@ -21,7 +21,7 @@ def _on_cpu(matrix: np.ndarray, device: Device) -> Callable[[wp.array, wp.array]
 
     def multiply(x: wp.array, out: wp.array) -> None:
         # Its threads wait for one another, ages where something else runs on their cores.
-        with one_thread():
+        with limit_to_one_thread():
             np.matmul(kept, x.numpy(), out=out.numpy())
 
     return multiply

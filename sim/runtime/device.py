@@ -104,7 +104,7 @@ def find_device(name: str, precision: Precision) -> Device:
     return Device(alias, precision)
 
 
-def device_names(words: str) -> tuple[str, ...]:
+def parse_device_names(words: str) -> tuple[str, ...]:
     """The devices that `words` list, as this machine calls them: "cuda:0,cuda:1", "cpu,cpu", "all", or a single one.
 
     "all" are the graphics cards. A device may stand there twice: then two processes share it.

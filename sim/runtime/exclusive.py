@@ -17,7 +17,7 @@ class Locked(Protocol):
     lock: RLock
 
 
-def alone(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
+def lock_method(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
     """A method of a `Locked`, in which its lock is held: other threads wait until it returns."""
 
     @wraps(method)

@@ -65,7 +65,7 @@ MESH_BYTES = MeshBytes()
 """Four gigabytes, and a hundred times a file's size."""
 
 
-def too_large(most: int) -> InputError:
+def build_too_large_error(most: int) -> InputError:
     """What is said of a mesh file that asks for more than `most` bytes."""
     return InputError(
         f"its arrays take more than {most / 1e9:.3g} GB: a file of its size holds no such mesh of a brain. "
@@ -74,7 +74,7 @@ def too_large(most: int) -> InputError:
 
 
 @contextmanager
-def at_most(most: int) -> Iterator[None]:
+def limit_memory(most: int) -> Iterator[None]:
     """Refuse a block that takes more than `most` bytes beyond what the process has, where the system counts them.
 
     For what a library reads: no count in a file's header is believed, whatever its format. The limit is the whole
@@ -98,6 +98,6 @@ def at_most(most: int) -> Iterator[None]:
     try:
         yield
     except MemoryError as error:
-        raise too_large(most) from error
+        raise build_too_large_error(most) from error
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

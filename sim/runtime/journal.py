@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
 from ..errors import InputError
-from .atomic_files import why, written_whole
+from .atomic_files import explain_error, write_atomically
 
 MARK = b"sulcus\r\n"
 # Mark, group, first row, length of the payload that follows, digest of all that is not the mark.
@@ -64,7 +64,7 @@ class Journal:
             self._file.flush()
         except OSError as error:
             raise InputError(
-                f"{self._path}: takes no more ({why(error)}). Make room there: the same command goes on."
+                f"{self._path}: takes no more ({explain_error(error)}). Make room there: the same command goes on."
             ) from error
         self._places[batch] = start, HEAD.size + len(payload)
 
@@ -97,7 +97,7 @@ class Journal:
 
 
 @contextmanager
-def opened(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
+def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
     """The journal of the run that `stated` describes, begun or gone on with; the file stays.
 
     Raises
@@ -113,12 +113,12 @@ def opened(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
     opening = _record((RUN, 0), json.dumps(dict(stated)).encode(), b"")
     key = hashlib.sha256(opening).digest()
     if not path.exists():
-        with written_whole(path, path.suffix) as draft:
+        with write_atomically(path, path.suffix) as draft:
             draft.write_bytes(opening)
     try:
         file = path.open("r+b")
     except OSError as error:
-        raise InputError(f"{path}: cannot be opened ({why(error)}). Delete it.") from error
+        raise InputError(f"{path}: cannot be opened ({explain_error(error)}). Delete it.") from error
     with file:
         _lock(path, file)
         yield Journal(path, file, key, _taken_up(path, file, opening, key, stated))
@@ -148,7 +148,7 @@ def _taken_up(
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as held:
         whole = held[: len(opening)] == opening
         if not whole and _proved(held, 0, b"") == (RUN, 0):
-            demand_same(path, json.loads(_payload(held)), stated)
+            check_same_description(path, json.loads(_payload(held)), stated)
         places, damaged = _records(held, len(opening), key)
     if not whole and not places:
         raise InputError(foreign)
@@ -167,7 +167,7 @@ def _taken_up(
     return places
 
 
-def demand_same(
+def check_same_description(
     path: Path, before: Mapping[str, str], stated: Mapping[str, str], verb: str = "begun", remedy: str = "delete it, "
 ) -> None:
     """Reject a file whose description `before` differs from what is `stated` now.

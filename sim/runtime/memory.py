@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..errors import InputError
-from .columns import widest_within, width_of
+from .columns import find_widest_workspace, find_workspace_width
 from .device import Device
 
 # Columns of the solver at its widest: pairs of L-BFGS, those that move elsewhere, vectors of the elimination around it.
@@ -43,14 +43,14 @@ class MemoryBudget:
     group: Path = Path("/sys/fs/cgroup")
 
 
-def free_bytes(device: Device, budget: MemoryBudget = MemoryBudget()) -> int:
+def measure_free_bytes(device: Device, budget: MemoryBudget = MemoryBudget()) -> int:
     """Memory that is free: the card's, or what the host and its control group still give."""
     if device.on_cuda:
         return int(wp.get_device(device.name).free_memory)
-    return host_bytes(budget)
+    return measure_host_bytes(budget)
 
 
-def host_bytes(budget: MemoryBudget = MemoryBudget()) -> int:
+def measure_host_bytes(budget: MemoryBudget = MemoryBudget()) -> int:
     """Memory that the host and its control group still give; without bound where neither says."""
     found = [2**62]
     for line in _lines(Path("/proc/meminfo")):
@@ -64,11 +64,11 @@ def host_bytes(budget: MemoryBudget = MemoryBudget()) -> int:
     return min(found)
 
 
-def fitting_batch(rows: int, device: Device, free: int, budget: MemoryBudget = MemoryBudget()) -> int:
+def choose_batch_size(rows: int, device: Device, free: int, budget: MemoryBudget = MemoryBudget()) -> int:
     """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it and `free` bytes hold."""
     widest = budget.widest_on_cuda if device.on_cuda else budget.widest
-    fitting = int(budget.batches * free / max(column_bytes(rows, device), 1))
-    return int(np.clip(widest_within(device, fitting), 1, widest))
+    fitting = int(budget.batches * free / max(estimate_column_bytes(rows, device), 1))
+    return int(np.clip(find_widest_workspace(device, fitting), 1, widest))
 
 
 def check_fits(
@@ -83,35 +83,35 @@ def check_fits(
     InputError
         Naming what it takes, what is free, and what would fit. Its cause is a MemoryError: others may leave.
     """
-    column = column_bytes(rows, device)
-    free = host_bytes(budget)  # read once: Linux counts for a good part of a millisecond
+    column = estimate_column_bytes(rows, device)
+    free = measure_host_bytes(budget)  # read once: Linux counts for a good part of a millisecond
     each, host = ANSWER_COPIES * 8 * rows, budget.share * free
     answers, alone = each * count, 0 if device.on_cuda else column
     if answers + alone > host:
         fitting = int((host - alone) / each)
         raise InputError(
-            f"the answers to {count} loads take about {gigabytes(answers)}, and {gigabytes(host)} are free: "
+            f"the answers to {count} loads take about {format_gigabytes(answers)}, and {format_gigabytes(host)} are free: "
             + (f"solve at most {fitting} at a time." if fitting > 0 else COARSER)
         ) from MemoryError()
-    available = free_bytes(device) if device.on_cuda else free
+    available = measure_free_bytes(device) if device.on_cuda else free
     room = budget.share * available + held - (0 if device.on_cuda else answers)
     columns = min(batch, count)
-    taken = column * width_of(device, columns)
+    taken = column * find_workspace_width(device, columns)
     if taken > room:
-        fitting = widest_within(device, int(room / column))
+        fitting = find_widest_workspace(device, int(room / column))
         remedy = f"a --batch of {fitting} fits." if fitting > 0 else COARSER
         raise InputError(
-            f"a batch of {columns} loads takes about {gigabytes(taken)}, and {gigabytes(max(room, 0.0))} "
+            f"a batch of {columns} loads takes about {format_gigabytes(taken)}, and {format_gigabytes(max(room, 0.0))} "
             f"are free: {remedy}"
         ) from MemoryError()
 
 
-def column_bytes(rows: int, device: Device) -> int:
+def estimate_column_bytes(rows: int, device: Device) -> int:
     """Bytes that one load case takes while it is solved."""
     return WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
 
 
-def gigabytes(amount: float) -> str:
+def format_gigabytes(amount: float) -> str:
     """Bytes as a person reads them."""
     return f"{amount / 2**30:.3g} GiB"
 

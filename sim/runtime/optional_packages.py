@@ -14,7 +14,7 @@ def install_hint(extra: str) -> str:
 
 
 @contextmanager
-def needed_from(extra: str, what: str) -> Iterator[None]:
+def require_extra(extra: str, what: str) -> Iterator[None]:
     """Import packages of an extra in a block, for `what` needs them: "these environments need".
 
     Raises

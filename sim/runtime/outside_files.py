@@ -19,7 +19,7 @@ CUT_OFF = re.compile(r"truncated file: eof = (\d+),.* stored_eof = (\d+)")
 """What HDF5 says of a file that ends too early: how many bytes it has, and should have."""
 
 
-def path_of(path: object) -> Path:
+def to_path(path: object) -> Path:
     """What names a file.
 
     Raises

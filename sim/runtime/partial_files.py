@@ -53,17 +53,17 @@ def _host() -> str:
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
-def unfinished_path(path: Path) -> Path:
+def to_unfinished_path(path: Path) -> Path:
     """Where a run that goes on keeps what it has done so far of `path`."""
     return path.with_name(path.name + ".partial")
 
 
-def partial_path(path: Path) -> Path:
+def to_partial_path(path: Path) -> Path:
     """The hidden name under which this process writes `path`, a file or a folder; `remove_left_overs` knows it."""
     return path.with_name(f".sulcus-{_host()}-{os.getpid()}-{path.name}")
 
 
-def partials_of(path: Path) -> list[Path]:
+def list_partials(path: Path) -> list[Path]:
     """The hidden names under which any process of any machine writes `path`, or has left it unfinished."""
     form = _partial_form(path.name)
     return sorted(left for left in path.parent.glob(f".sulcus-*-{glob.escape(path.name)}") if form.fullmatch(left.name))

@@ -172,7 +172,7 @@ def _receive(child: Child) -> Any:
     raise answer
 
 
-def card_variables(device: str) -> dict[str, str]:
+def to_gpu_variables(device: str) -> dict[str, str]:
     """Environment in which a process sees the card of a device alone, as "cuda:0"; none of another device."""
     kind, _, number = device.partition(":")
     if kind != "cuda":
@@ -183,7 +183,7 @@ def card_variables(device: str) -> dict[str, str]:
 
 def _started(device: str, make: Callable[..., Any], given: tuple[Any, ...], closing: ExitStack) -> Child:
     ours, theirs = Pipe()
-    variables = card_variables(device)
+    variables = to_gpu_variables(device)
     own = "cuda:0" if variables else device
     process = start_process(_serve, theirs, own, make, given, name=device, variables=variables)
     theirs.close()

@@ -23,7 +23,7 @@ def _loaded() -> ThreadpoolController:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def limit_to_one_thread() -> Iterator[None]:
     """While anyone is in it, the libraries that were loaded when it was first entered use one thread.
 
     The first who enters tells them, the last who leaves gives them back what they had: what is computed inside has the
@@ -59,7 +59,7 @@ class Sharing:
     least: int = 3000
 
 
-def cores(work: int, sharing: Sharing = Sharing()) -> int:
+def choose_threads(work: int, sharing: Sharing = Sharing()) -> int:
     """How many threads native loops over so many elements or unknowns are divided among."""
     if work < sharing.least:
         return 1
@@ -67,7 +67,7 @@ def cores(work: int, sharing: Sharing = Sharing()) -> int:
     return min(sharing.most, here)
 
 
-def together(tasks: Sequence[Task]) -> None:
+def run_together(tasks: Sequence[Task]) -> None:
     """Run tasks at the same time, the first on this thread; back when all have ended. None may call this in its turn.
 
     Threads stay, waiting at a queue: a pool's futures cost four times as long, which a task of a millisecond feels.

@@ -10,7 +10,7 @@ _listening: list[dict[str, float]] = []
 
 
 @contextmanager
-def stage(name: str) -> Iterator[None]:
+def time_stage(name: str) -> Iterator[None]:
     """Add the wall time [s] of the block to the stage `name` of every listener; stages do not lie in each other."""
     began = time.perf_counter()
     try:
@@ -21,7 +21,7 @@ def stage(name: str) -> Iterator[None]:
 
 
 @contextmanager
-def listened() -> Iterator[dict[str, float]]:
+def listen_to_stages() -> Iterator[dict[str, float]]:
     """The seconds of the stages inside the block, in the order in which they end first."""
     seconds: dict[str, float] = {}
     _listening.append(seconds)

@@ -46,14 +46,14 @@ def run_script(path: str | Path) -> ModuleType:
         exec(code, module.__dict__)
     except (Exception, SystemExit) as error:
         del sys.modules[name]
-        raise InputError(error_text(path, error)) from error
+        raise InputError(format_script_error(path, error)) from error
     except BaseException:
         del sys.modules[name]
         raise
     return module
 
 
-def error_text(path: Path, error: BaseException) -> str:
+def format_script_error(path: Path, error: BaseException) -> str:
     """What a user's file raised, and in which of its lines."""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
     where = f"{path}, line {lines[-1]}" if lines else str(path)

@@ -12,7 +12,7 @@ DISTRIBUTION = "sulcus-ar"
 
 
 @cache
-def version_of(package: str) -> str:
+def get_version(package: str) -> str:
     """Version of a package; "sulcus" is this one, which may be a checkout that is not installed."""
     if package != "sulcus":
         return version(package)

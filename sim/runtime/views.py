@@ -10,10 +10,10 @@ import numpy as np
 import warp as wp
 
 from .device import Device
-from .threads import one_thread
+from .threads import limit_to_one_thread
 
 
-def library(device: Device) -> Any:
+def get_library(device: Device) -> Any:
     """It: `linalg.solve` and the arrays' own methods mean the same in both."""
     if device.on_cuda:
         import torch
@@ -33,17 +33,17 @@ def from_view(device: Device, values: Any) -> wp.array:
     return wp.from_torch(values.contiguous()) if device.on_cuda else wp.array(values, device=device.name, copy=False)
 
 
-def doubled(values: Any) -> Any:
+def to_double(values: Any) -> Any:
     """The same in double precision."""
     return values.astype(np.float64) if isinstance(values, np.ndarray) else values.double()
 
 
-def like(other: Any, values: Any) -> Any:
+def to_precision_of(other: Any, values: Any) -> Any:
     """The same in another array's precision."""
     return values.astype(other.dtype) if isinstance(values, np.ndarray) else values.to(other.dtype)
 
 
-def padded(values: Any, more: tuple[int, ...]) -> Any:
+def pad_zeros(values: Any, more: tuple[int, ...]) -> Any:
     """The same with so many more zeros at the end of each of the last axes."""
     shape = (
         *values.shape[: -len(more)],
@@ -54,19 +54,19 @@ def padded(values: Any, more: tuple[int, ...]) -> Any:
     return out
 
 
-def largest_first(values: Any) -> Any:
+def order_by_size(values: Any) -> Any:
     """The rows in the order in which each column (n, b) falls."""
     if isinstance(values, np.ndarray):
         return np.argsort(-values, axis=0, kind="stable")
     return values.argsort(dim=0, descending=True, stable=True)
 
 
-def ascending(values: Any) -> Any:
+def sort_columns(values: Any) -> Any:
     """Each column (n, b) sorted."""
     return np.sort(values, axis=0) if isinstance(values, np.ndarray) else values.sort(dim=0).values
 
 
-def solved(matrix: Any, right: Any) -> Any:
+def solve_dense(matrix: Any, right: Any) -> Any:
     """matrix^-1 right; not finite where that is singular. A card is not waited for."""
     if not isinstance(matrix, np.ndarray):
         import torch
@@ -78,26 +78,26 @@ def solved(matrix: Any, right: Any) -> Any:
         return np.full_like(right, np.nan)
 
 
-def placed(device: Device, values: np.ndarray) -> Any:
+def to_library(device: Device, values: np.ndarray) -> Any:
     """The library's array with the same numbers; on the CPU they are these themselves."""
     return wp.to_torch(wp.array(np.ascontiguousarray(values), device=device.name)) if device.on_cuda else values
 
 
-def columns_of(device: Device, some: np.ndarray, count: int) -> Any:
+def select_columns(device: Device, some: np.ndarray, count: int) -> Any:
     """What picks some columns (k,), ascending, of `count`: all of them by a slice, so that nothing is copied.
 
     A card is not waited for where it stands for many arrays: each index of NumPy's would go up by itself.
     """
-    return slice(None) if len(some) == count else placed(device, some)
+    return slice(None) if len(some) == count else to_library(device, some)
 
 
-def on_host(values: Any) -> np.ndarray:
+def to_host(values: Any) -> np.ndarray:
     """Either library's numbers as NumPy's."""
     return values if isinstance(values, np.ndarray) else values.cpu().numpy()
 
 
 @contextmanager
-def in_order(device: Device) -> Iterator[None]:
+def run_in_order(device: Device) -> Iterator[None]:
     """While in it the library's work takes turns with Warp's, and its BLAS keeps to one thread on the CPU.
 
     Threads of BLAS wait for one another, ages where something else runs on their cores.
@@ -108,5 +108,5 @@ def in_order(device: Device) -> Iterator[None]:
         with torch.cuda.stream(wp.stream_to_torch(device.name)):
             yield
     else:
-        with one_thread():
+        with limit_to_one_thread():
             yield

@@ -15,11 +15,11 @@ from ..discretisation.footprint import ContactSurface
 from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
-from ..local_solvers.strained_frame import UpdatedModel, UpdatedPreconditioner, bent_at
+from ..local_solvers.strained_frame import UpdatedModel, UpdatedPreconditioner, update_model_at
 from ..local_solvers.strained_part import StrainedPart
 from ..minimisers.lbfgs_kernels import LIVE, PAIRS
-from ..minimisers.lbfgs_state import LbfgsState, Workspace, ground_of, standing
-from ..runtime.columns import lanes_of, summed
+from ..minimisers.lbfgs_state import LbfgsState, Workspace, allocate_ground, allocate_state
+from ..runtime.columns import get_warp_width, summed
 from ..runtime.device import Device, forward_kernel
 
 # A frame that takes more evaluations is not one of a tool that moves smoothly.
@@ -45,9 +45,9 @@ class FrameKernels:
 
 
 @cache
-def kernels_of(device: Device) -> FrameKernels:
+def build_kernels(device: Device) -> FrameKernels:
     """Kernels of a device's scalar type, for one column."""
-    scalar, most, m, head, lanes = device.scalar, FRAME_EVALUATIONS, PAIRS, HEAD, lanes_of(device)
+    scalar, most, m, head, lanes = device.scalar, FRAME_EVALUATIONS, PAIRS, HEAD, get_warp_width(device)
 
     @forward_kernel(module="unique")
     def pull(
@@ -191,10 +191,10 @@ class CapturedFrame:
         if part is not None:
             part.prepare()
             self._knowing = UpdatedPreconditioner(preconditioner, problem, part.size)
-        self._workspace = Workspace(problem, self._knowing or preconditioner, 1, ground_of(problem, 1))
+        self._workspace = Workspace(problem, self._knowing or preconditioner, 1, allocate_ground(problem, 1))
         self._workspace.columns["tolerance"].fill_(tolerance)
         self._workspace.prepare()
-        self._before = standing(problem, 1, ground_of(problem, 1))
+        self._before = allocate_state(problem, 1, allocate_ground(problem, 1))
         self._past = problem.device.zeros(problem.rows, 1)
         name = problem.device.name
         self._tried, self._going, self._inverted = (wp.zeros(1, dtype=wp.int32, device=name) for _ in range(3))
@@ -232,10 +232,10 @@ class CapturedFrame:
         for name, rows_first in learnt.items():
             columns[name].assign(np.moveaxis(rows_first, 0, -1).reshape(columns[name].shape))
 
-    def learn(self, steps: float) -> None:
+    def update_history(self, steps: float) -> None:
         """After an answer in so many steps: know what is strained there, unless what was known has served."""
         if self.part is not None and steps > SERVED:
-            self._know(bent_at(self.part, self._device, self._workspace.columns["u"]))
+            self._know(update_model_at(self.part, self._device, self._workspace.columns["u"]))
             self._workspace.columns["known"].zero_()  # pairs belong to the model that they were learnt with
 
     def _know(self, bent: UpdatedModel | None) -> None:
@@ -265,7 +265,7 @@ class CapturedFrame:
         return self._down.numpy()
 
     def _once(self) -> None:
-        a, k, device, imprint = self._workspace.columns, kernels_of(self._device), self._device, self._imprint
+        a, k, device, imprint = self._workspace.columns, build_kernels(self._device), self._device, self._imprint
         wp.copy(self._given, self._up)
         for kind, array in self._before.moved.items():
             wp.copy(array, self._workspace.state.moved[kind])
@@ -276,7 +276,7 @@ class CapturedFrame:
         vectors = [self._past, *(a[name] for name in ("u", "d", "g", "z"))]
         device.launch(k.move_on, (len(self._past),), [self._given], vectors)
         inputs = [self._given, self._skin.numbers, imprint.weight, imprint.sums]
-        lanes = lanes_of(device)
+        lanes = get_warp_width(device)
         device.launch(k.pull, (-(-len(self._skin.numbers) // lanes) * lanes,), inputs, [a["constant"], a["loud"]])
         wp.capture_while(self._going, self._iterate)
         self._inversion.add_count(a["u"], self._inverted)
@@ -287,7 +287,7 @@ class CapturedFrame:
     def _iterate(self) -> None:
         self._workspace.once()
         inputs = [self._workspace.columns["status"]]
-        self._device.launch(kernels_of(self._device).look, (1,), inputs, [self._tried, self._going])
+        self._device.launch(build_kernels(self._device).look, (1,), inputs, [self._tried, self._going])
 
     def _both_sides(self, count: int) -> tuple[wp.array, wp.array]:
         """So many numbers on the device, and as many on the host, from where a card reads without asking."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arguments import all_finite
+from ..arguments import is_all_finite
 from ..loads import Loads, Pushed
 
 # Keys of what is warm: the answer's own loads (B, 2, 7), last those before them; displacements (B, 3N) [m] before it.
@@ -21,7 +21,7 @@ PUSHES, BEFORE = "pushes", "before"
 BACK, ON = -1.0, 2.0
 
 
-def pushes_of(loads: Loads) -> np.ndarray | None:
+def as_pushes(loads: Loads) -> np.ndarray | None:
     """Point [m], force [N] and footprint [m] (B, 7) of each load; None where anything but a push acts."""
     push = loads.only(Pushed)
     if push is None:
@@ -29,7 +29,7 @@ def pushes_of(loads: Loads) -> np.ndarray | None:
     return np.column_stack([push.point, push.force, push.footprint])
 
 
-def shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
+def compute_shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
     """a (B,) for three pushes (B, 7) in turn; zero where one of them has no force, or the last two are the same.
 
     Lengths are measured against the last footprint, forces against the last force.
@@ -46,24 +46,26 @@ def shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
     return np.where(known, share.clip(BACK, ON), 0.0)
 
 
-def knows(warm: Mapping[str, Any], last: np.ndarray) -> bool:
+def has_warm_state(warm: Mapping[str, Any], last: np.ndarray) -> bool:
     """Whether what is warm says how answers (3N, B) came about."""
     if BEFORE not in warm or PUSHES not in warm:
         return False
     fits = warm[BEFORE].shape == last.T.shape and warm[PUSHES].shape == (last.shape[1], 2, 7)
-    return fits and all_finite(warm[BEFORE]) and all_finite(warm[PUSHES])
+    return fits and is_all_finite(warm[BEFORE]) and is_all_finite(warm[PUSHES])
 
 
-def moved_on(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -> np.ndarray:
+def extrapolate_start(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -> np.ndarray:
     """Starts (3N, B) [m] for loads whose last answers (3N, B) were left with it; those answers if it tells no way."""
-    now = pushes_of(loads)
-    if now is None or not knows(warm, last):
+    now = as_pushes(loads)
+    if now is None or not has_warm_state(warm, last):
         return last
     came, before = warm[PUSHES][:, 0], warm[PUSHES][:, 1]
-    return last + shares(now, came, before) * (last - warm[BEFORE].T)
+    return last + compute_shares(now, came, before) * (last - warm[BEFORE].T)
 
 
-def way_of(now: np.ndarray | None, last: np.ndarray | None, warm: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def compute_directions(
+    now: np.ndarray | None, last: np.ndarray | None, warm: Mapping[str, Any]
+) -> dict[str, np.ndarray]:
     """What the answers to pushes (B, 7) hand on, whose last answers (3N, B) were left with it, if there were any."""
     if now is None:
         return {}

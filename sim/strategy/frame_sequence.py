@@ -22,13 +22,13 @@ from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..discretisation.term import Cases
 from ..loads import Loads
-from ..local_solvers.strained_descent import strained_part
-from ..local_solvers.strained_frame import UpdatedModel, bent_from
-from ..minimisers.lbfgs import LEARNT, learnt_from, rows_first
+from ..local_solvers.strained_descent import build_strained_part
+from ..local_solvers.strained_frame import UpdatedModel, restore_updated_model
+from ..minimisers.lbfgs import LEARNT, restore_history, to_rows_first
 from ..minimisers.lbfgs_kernels import DONE
 from ..minimisers.lbfgs_state import LbfgsState
 from .captured_frame import HEAD, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, CapturedFrame
-from .extrapolation import BEFORE, PUSHES, knows, pushes_of, shares, way_of
+from .extrapolation import BEFORE, PUSHES, as_pushes, compute_directions, compute_shares, has_warm_state
 from .strategy import Strategy
 
 # Components of a cross product, a fifth of the time that NumPy's takes.
@@ -48,25 +48,25 @@ class Kept(Mapping[str, Any]):
         self.state: LbfgsState | None = state
         self.bent = bent
 
-    def settle(self) -> None:
+    def copy_to_host(self) -> None:
         """Bring to the host what is still on the device."""
         with self._lock:
             if self.state is not None:
-                self._own |= {name: rows_first(self.state.columns[name]) for name in LEARNT}
+                self._own |= {name: to_rows_first(self.state.columns[name]) for name in LEARNT}
                 self._own |= {} if self.bent is None else self.bent.learnt
                 self.state = None
 
     def __getitem__(self, key: str) -> Any:
         if key not in self._own:
-            self.settle()
+            self.copy_to_host()
         return self._own[key]
 
     def __iter__(self) -> Iterator[str]:
-        self.settle()
+        self.copy_to_host()
         return iter(self._own)
 
     def __len__(self) -> int:
-        self.settle()
+        self.copy_to_host()
         return len(self._own)
 
 
@@ -112,7 +112,7 @@ class FrameSequence:
         out, a descent that does not end well.
         """
         clock = time.perf_counter()
-        now = pushes_of(loads)
+        now = as_pushes(loads)
         if now is None or len(now) != 1 or not now[0, 3:6].any():
             return None
         if start is self._last():
@@ -122,14 +122,18 @@ class FrameSequence:
             if not self._take(loads, start, last):
                 return None
         self._make_way()
-        way = way_of(now, last, start.warm)
-        share = shares(now, way[PUSHES][:, 1], start.warm[PUSHES][:, 1])[0] if knows(start.warm, last) else 0.0
+        way = compute_directions(now, last, start.warm)
+        share = (
+            compute_shares(now, way[PUSHES][:, 1], start.warm[PUSHES][:, 1])[0]
+            if has_warm_state(start.warm, last)
+            else 0.0
+        )
         point, force, radius = now[0, :3], now[0, 3:6], now[0, 6]
         self._last = self._here = _gone
         found = self._frame.push(point, radius, force, share)
         if found[STATUS] != DONE or self._inversion.doubtful(found[INVERTED]):
             return None
-        self._frame.learn(found[STEPS])
+        self._frame.update_history(found[STEPS])
         warm = Kept(way, self._frame.state, self._lock, self._frame.bent)
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
         displacement = found[HEAD:].reshape(1, -1, 3).copy()
@@ -164,34 +168,34 @@ class FrameSequence:
             return False
         here = self._here()
         if here is not None:
-            here.settle()
+            here.copy_to_host()
         self._last = self._here = _gone
-        past = start.warm[BEFORE].T if knows(start.warm, last) else None
-        self._frame.take(last, past, learnt_from(cases, len(last)), self._bent(start.warm))
+        past = start.warm[BEFORE].T if has_warm_state(start.warm, last) else None
+        self._frame.take(last, past, restore_history(cases, len(last)), self._bent(start.warm))
         return True
 
     def _bent(self, warm: Mapping[str, Any]) -> UpdatedModel | None:
         if isinstance(warm, Kept):
             return warm.bent
         part = self._frame.part
-        return None if part is None else bent_from(warm, self._problem.device, len(self._nodes), part.size)
+        return None if part is None else restore_updated_model(warm, self._problem.device, len(self._nodes), part.size)
 
     def _make_way(self) -> None:
         """What stands where the last frame ended is about to move to where it began."""
         there, here = self._there(), self._here()
         if there is not None:
-            there.settle()
+            there.copy_to_host()
         if here is not None and here.state is not None:
             here.state = self._frame.before
         self._there = self._here
 
 
-def frame_sequence(
+def build_frame_sequence(
     strategy: Strategy, space: Discretisation, skin: ContactSurface, diagnostics: Diagnostics, lock: RLock, source: str
 ) -> FrameSequence:
     """By the solvers of a plan that follows frames, on the tissue under a skin."""
     problem, preconditioner, inversion = strategy.problem, strategy.preconditioner, strategy.inversion
-    part = strained_part(problem, preconditioner, space) if strategy.plan.strained else None
+    part = build_strained_part(problem, preconditioner, space) if strategy.plan.strained else None
     frame = CapturedFrame(problem, preconditioner, inversion, skin, strategy.accuracy.tolerance, part)
     return FrameSequence(problem, inversion, frame, diagnostics, lock, source)
 

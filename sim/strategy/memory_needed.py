@@ -11,9 +11,16 @@ from ..anatomy import Anatomy
 from ..discretisation.space import Discretisation, discretise
 from ..errors import InputError
 from ..linalg.preconditioner import Preconditioning
-from ..runtime.columns import widest_within, width_of
+from ..runtime.columns import find_widest_workspace, find_workspace_width
 from ..runtime.device import Device, find_device
-from ..runtime.memory import COARSER, MemoryBudget, column_bytes, fitting_batch, free_bytes, gigabytes
+from ..runtime.memory import (
+    COARSER,
+    MemoryBudget,
+    choose_batch_size,
+    estimate_column_bytes,
+    format_gigabytes,
+    measure_free_bytes,
+)
 
 PER_NODE = {"p1": 2_200, "smoothed": 5_800, "p2": 2_900}
 """Bytes of single precision that each node of an element takes: tables of the elements, and levels of multigrid. The
@@ -54,11 +61,11 @@ class Needed:
     @property
     def peak(self) -> int:
         """The most at any time: a batch stands in a room that may be wider."""
-        return max(self.set_up, self.kept + width_of(self.device, self.batch) * self.column)
+        return max(self.set_up, self.kept + find_workspace_width(self.device, self.batch) * self.column)
 
     def __str__(self) -> str:
         loads = f"{self.batch} loads together" if self.batch > 1 else "one load at a time"
-        taken, free = gigabytes(self.peak), gigabytes(self.free)
+        taken, free = format_gigabytes(self.peak), format_gigabytes(self.free)
         return f"{self.nodes:,} nodes ({self.element}), {loads}: about {taken} of {self.device.name}, {free} free"
 
     def demand(self, budget: MemoryBudget = BUDGET) -> Needed:
@@ -72,12 +79,12 @@ class Needed:
         room = budget.share * self.free
         if self.peak <= room:
             return self
-        fitting = widest_within(self.device, int((room - self.kept) / self.column))
+        fitting = find_widest_workspace(self.device, int((room - self.kept) / self.column))
         fits = self.set_up <= room and fitting > 0
         raise InputError(f"{self}: {f'a --batch of {fitting} fits.' if fits else COARSER}")
 
 
-def foreseen(
+def estimate_needed(
     anatomy: Anatomy,
     element: str | None,
     accuracy: Accuracy,
@@ -99,12 +106,12 @@ def foreseen(
     if not where.on_cuda:
         return None
     space = discretise(anatomy.mesh, element)
-    free = free_bytes(where) // share
+    free = measure_free_bytes(where) // share
     inverted = _inverted(_unknowns(space, anatomy), where)
-    return needed(space, where, inverted, batch, loads, free)
+    return compute_needed(space, where, inverted, batch, loads, free)
 
 
-def needed(
+def compute_needed(
     space: Discretisation,
     device: Device,
     inverted: int,
@@ -117,9 +124,9 @@ def needed(
     rows, width = 3 * space.count, wp.types.type_size_in_bytes(device.scalar)
     tables = FIXED + PER_NODE[space.element] * space.count * width // 4
     taken, left = _inverse_bytes(inverted, device)
-    column = column_bytes(rows, device)
+    column = estimate_column_bytes(rows, device)
     if batch is None:
-        batch = fitting_batch(rows, device, free - tables - left, budget)
+        batch = choose_batch_size(rows, device, free - tables - left, budget)
     return Needed(
         len(space.mesh.nodes), space.element, device, tables + taken, tables + left, column, min(batch, loads), free
     )
@@ -133,16 +140,16 @@ def _unknowns(space: Discretisation, anatomy: Anatomy) -> tuple[int, ...]:
 
 def _inverted(unknowns: tuple[int, ...], device: Device) -> int:
     """How many of them the card inverts, if any."""
-    from ..linalg.dense_inverse import fits
+    from ..linalg.dense_inverse import can_invert
 
     last = 6 * Preconditioning().largest_last
-    return next((count for count in unknowns if fits(count, device)), last)
+    return next((count for count in unknowns if can_invert(count, device)), last)
 
 
 def _inverse_bytes(unknowns: int, device: Device) -> tuple[int, int]:
     """What an inverse takes while it is made, and what is left of that."""
     from ..linalg.block_inverse import exchange_bytes
-    from ..linalg.dense_inverse import kept_bytes
+    from ..linalg.dense_inverse import estimate_inverse_bytes
 
-    left = kept_bytes(unknowns, device)
+    left = estimate_inverse_bytes(unknowns, device)
     return exchange_bytes(unknowns) + left, left

@@ -18,9 +18,9 @@ from ..linalg.multifrontal import Factor
 from ..linalg.multigrid import TwoLevel
 from ..linalg.pcg import BlockJacobi, Preconditioner
 from ..linalg.preconditioner import is_exact, name_of
-from ..local_solvers.batch_elimination import BatchElimination, batch_elimination, has_small_opening
+from ..local_solvers.batch_elimination import BatchElimination, build_batch_elimination, has_small_opening
 from ..local_solvers.clamped_elimination import ClampedElimination
-from ..local_solvers.strained_descent import StrainedDescent, strained_part
+from ..local_solvers.strained_descent import StrainedDescent, build_strained_part
 from .captured_frame import FRAME_EVALUATIONS
 
 Alone = ClampedElimination | StrainedDescent
@@ -175,14 +175,16 @@ def can_follow(space: Discretisation, accuracy: Accuracy) -> bool:
     return not len(space.edges) and accuracy.outer >= FEWEST
 
 
-def local_solvers(
+def build_local_solvers(
     plan: SolverPlan, problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
 ) -> tuple[Callable[[], BatchElimination | None], Alone | None]:
     """What a plan solves by itself: for many loads, made when it is asked for first, and for a single one."""
-    near = cache(partial(batch_elimination, problem, preconditioner, effects, space) if plan.many else lambda: None)
+    near = cache(
+        partial(build_batch_elimination, problem, preconditioner, effects, space) if plan.many else lambda: None
+    )
     if plan.single is SolverStep.CLAMPED:
         return near, ClampedElimination(problem, preconditioner, effects, space)
     if plan.single is SolverStep.STRAINED:
         assert isinstance(preconditioner, Factor)
-        return near, StrainedDescent(problem, preconditioner, strained_part(problem, preconditioner, space))
+        return near, StrainedDescent(problem, preconditioner, build_strained_part(problem, preconditioner, space))
     return near, None

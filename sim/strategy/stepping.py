@@ -88,7 +88,7 @@ class Shares:
         long_enough = self.step >= stepping.least * np.minimum(1.0, 4.0 * longest)
         return shorter, (self.reached < 1.0) & long_enough
 
-    def aims(self, rows: np.ndarray) -> tuple[np.ndarray, float]:
+    def propose_shares(self, rows: np.ndarray) -> tuple[np.ndarray, float]:
         """Shares (k,) that some rows (k,) step to, and the most gaps that their tools go."""
         aim = np.minimum(self.reached[rows] + self.step[rows], 1.0)
         return aim, float(((aim - self.reached[rows]) * self.gaps[rows]).max())

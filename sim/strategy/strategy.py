@@ -18,16 +18,16 @@ from ..discretisation.term import Cases, Local
 from ..linalg.pcg import Preconditioner
 from ..local_solvers.batch_elimination import BatchElimination
 from ..local_solvers.contact_descent import ContactDescent
-from ..local_solvers.contact_preconditioner import knowing_contact
+from ..local_solvers.contact_preconditioner import build_contact_preconditioner
 from ..local_solvers.strained_part import ON_CARD
-from ..minimisers.lbfgs import Lbfgs, learnt_from
+from ..minimisers.lbfgs import Lbfgs, restore_history
 from ..minimisers.lbfgs_kernels import BROKEN, DONE
 from ..minimisers.newton import find_equilibrium
 from ..minimisers.newton_cg import NewtonCG
-from ..minimisers.residual import shortfall
-from ..runtime.columns import gathered, scattered
+from ..minimisers.residual import measure_residual
+from ..runtime.columns import gather_columns, scatter_columns
 from ..runtime.device import Device
-from ..runtime.views import in_order, on_host, view
+from ..runtime.views import run_in_order, to_host, view
 from .plan import Alone, SolverPlan, SolverStep
 from .stepping import GAPS, STEPPING, GapContinuation, LoadStepping, Shares
 
@@ -60,7 +60,7 @@ class SolverResult:
 
     def put(self, index: np.ndarray, other: SolverResult, device: Device) -> None:
         """Write the answer of other cases over some of these (k,); outer steps add up."""
-        scattered(device, other.u, index, self.u)
+        scatter_columns(device, other.u, index, self.u)
         self.iterations[index] += other.iterations
         for name in ("outcome", "residual", "reached", "inverted"):
             getattr(self, name)[index] = getattr(other, name)
@@ -123,7 +123,7 @@ class Strategy:
         """The preconditioner that knows contact: on CUDA half precision is rougher than contact is stiff."""
         if self.problem.device.on_cuda:
             return self.preconditioner
-        return knowing_contact(self.problem, self.preconditioner, self.contact)
+        return build_contact_preconditioner(self.problem, self.preconditioner, self.contact)
 
     @property
     def held(self) -> int:
@@ -145,7 +145,7 @@ class Strategy:
             acts = self._acts(count)
             guess, astray = self._upright([np.where(acts, one, 0.0) for one in guesses])
             started = guess.any(axis=0)
-            learnt = NOTHING if astray.any() else learnt_from(cases, problem.rows)
+            learnt = NOTHING if astray.any() else restore_history(cases, problem.rows)
             if problem.barriers and astray.any():
                 cases = replace(cases, anew=astray.copy())
                 problem.begin(cases)
@@ -172,8 +172,8 @@ class Strategy:
         for term in self.problem.terms:
             if not term.passive:
                 term.add_gradient(rest, loud)
-        with in_order(self.problem.device):
-            acts = on_host((view(loud) != 0.0).any(0))
+        with run_in_order(self.problem.device):
+            acts = to_host((view(loud) != 0.0).any(0))
         if not acts.all():
             acts = np.logical_or.reduce([acts, *(term.buried(rest) for term in self.problem.barriers)])
         return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
@@ -182,7 +182,7 @@ class Strategy:
         """Start (3N, b) [m], or rest where nothing acts there: in float32 no descent would end in letting go."""
         acts = self._acts(start.shape[1])
         if not acts.all():
-            with in_order(self.problem.device):
+            with run_in_order(self.problem.device):
                 view(start := wp.clone(start))[:, ~acts] = 0.0
         return start
 
@@ -237,7 +237,7 @@ class Strategy:
             if len(index) == 0:
                 break
             problem.begin(cases.rows(index))
-            start = gathered(device, found.u, found.left)
+            start = gather_columns(device, found.u, found.left)
         else:
             answer.put(index, self._thorough(start, self.accuracy.outer), device)
         return replace(answer, learnt=gained)
@@ -263,10 +263,10 @@ class Strategy:
         near = np.flatnonzero(~answer.good & (found.residual <= self.gaps.nearly))
         for some in batched(near):
             problem.begin(cases.rows(some))
-            answer.put(some, self._thorough(gathered(device, found.u, some), few), device)
+            answer.put(some, self._thorough(gather_columns(device, found.u, some), few), device)
         left = np.flatnonzero(~answer.good)
         for some in batched(left):
-            answer.put(some, self._closed(cases.rows(some), gathered(device, start, some), outer, gaps), device)
+            answer.put(some, self._closed(cases.rows(some), gather_columns(device, start, some), outer, gaps), device)
         return answer
 
     def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
@@ -316,7 +316,7 @@ class Strategy:
         outcome = failed.outcome[index]
         outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
         none = np.flatnonzero(found.reached <= failed.reached[index])
-        scattered(device, failed.u, none, found.u, index[none])
+        scatter_columns(device, failed.u, none, found.u, index[none])
         found.residual[none], found.reached[none] = failed.residual[index[none]], failed.reached[index[none]]
         return replace(found, outcome=outcome, inverted=self.inversion.count(found.u))
 
@@ -336,7 +336,7 @@ class Strategy:
         none, every = np.zeros(count, int), np.full(count, Outcome.CONVERGED, object)
         answer = SolverResult(device.zeros(*start.shape), every, none, np.zeros(count), np.ones(count), none.copy(), 0)
         if len(acting):
-            part = gathered(device, start, acting)
+            part = gather_columns(device, start, acting)
             answer.put(acting, self._by_steps(cases.rows(acting), part, moved, 1.0, most), device)
         return answer
 
@@ -369,15 +369,15 @@ class Strategy:
             patience = self.stepping.patience * self.accuracy.inner * done
             if len(rows) == 0 or answer.linear_iterations > patience:
                 break
-            aim, gone = shares.aims(rows)
+            aim, gone = shares.propose_shares(rows)
             left -= int(shorter[rows].any())
-            found = self._touching(aimed(cases.rows(rows), aim), gathered(device, u, rows), outer, gone)
+            found = self._touching(aimed(cases.rows(rows), aim), gather_columns(device, u, rows), outer, gone)
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
             shares.take(rows, aim, good)
             growth = wanted / np.maximum(found.iterations, 1)
             shares.resize(rows, good, growth, self.stepping.cut, self.gaps.wider)
-            scattered(device, found.u, rows[good], u, np.flatnonzero(good))
+            scatter_columns(device, found.u, rows[good], u, np.flatnonzero(good))
             answer.iterations[rows] += found.iterations
             answer.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome
             answer = replace(answer, linear_iterations=answer.linear_iterations + found.linear_iterations)
@@ -395,5 +395,5 @@ class Strategy:
             outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0
         if len(short):
             problem.begin(cases.rows(short))
-            answer.residual[short] = shortfall(problem, gathered(problem.device, u, short))
+            answer.residual[short] = measure_residual(problem, gather_columns(problem.device, u, short))
         return replace(answer, inverted=self.inversion.count(u))

@@ -38,16 +38,16 @@ LONGEST = 8.0
 KEPT = 3
 
 
-def quantised(steps: np.ndarray) -> np.ndarray:
+def quantise(steps: np.ndarray) -> np.ndarray:
     """The powers of two (B,) [s] nearest to steps (B,) [s], by ratio; infinite for long steps, zero for none at all."""
     within = (steps > 0.0) & (steps < LONGEST)
     powers = np.exp2(np.round(np.log2(np.where(within, steps, 1.0))))
     return np.where(within, powers, np.where(steps > 0.0, np.inf, 0.0))
 
 
-def alike(steps: np.ndarray, most: int) -> list[tuple[float, np.ndarray]]:
+def group_alike(steps: np.ndarray, most: int) -> list[tuple[float, np.ndarray]]:
     """Batches of at most so many cases, of steps (B,) [s] as good as alike: the step, and the rows (k,) of each."""
-    paces = quantised(steps)
+    paces = quantise(steps)
     return [
         (float(pace), rows[first : first + most])
         for pace in np.unique(paces)

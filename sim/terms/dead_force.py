@@ -10,7 +10,7 @@ import warp as wp
 from ..discretisation.footprint import ContactSurface
 from ..discretisation.term import Cases
 from ..loads import Loads, Nodal, Pushed, check_field
-from ..runtime.columns import CHUNK, gathered
+from ..runtime.columns import CHUNK, gather_columns
 from ..runtime.device import Device, forward_kernel
 
 
@@ -24,7 +24,7 @@ class DeadForceKernels:
 
 
 @cache
-def kernels_of(device: Device) -> DeadForceKernels:
+def build_kernels(device: Device) -> DeadForceKernels:
     """Kernels of a device's scalar type."""
     scalar = device.scalar
     chunk = CHUNK
@@ -81,7 +81,7 @@ class Forces:
     force: wp.array
 
 
-def pushed_forces(skin: ContactSurface, device: Device, loads: Loads) -> Forces | None:
+def build_pushed_forces(skin: ContactSurface, device: Device, loads: Loads) -> Forces | None:
     """Nodal forces of pushing tools on a body's surface; None without any.
 
     Raises
@@ -96,11 +96,11 @@ def pushed_forces(skin: ContactSurface, device: Device, loads: Loads) -> Forces 
     for cause in causes:
         footprints = skin.press(cause.point, cause.footprint)
         inputs = [footprints.weight, footprints.sums, device.array(cause.force, wp.float64)]
-        device.launch(kernels_of(device).spread, footprints.weight.shape, inputs, [force])
+        device.launch(build_kernels(device).spread, footprints.weight.shape, inputs, [force])
     return Forces(skin.numbers, force)
 
 
-def nodal_forces(vertices: int, device: Device, loads: Loads) -> Forces | None:
+def build_nodal_forces(vertices: int, device: Device, loads: Loads) -> Forces | None:
     """Forces given at a mesh's own vertices, of those that carry any; None without any.
 
     Raises
@@ -149,21 +149,21 @@ class DeadForce:
     def keep(self, columns: np.ndarray) -> None:
         """Drop the forces of the others."""
         if self._forces is not None:
-            self._forces = Forces(self._forces.nodes, gathered(self._device, self._forces.force, columns))
+            self._forces = Forces(self._forces.nodes, gather_columns(self._device, self._forces.force, columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """E -= f . u."""
         if self._forces is not None:
             dim = (-(-len(self._forces.nodes) // CHUNK), u.shape[1])
             inputs = [self._forces.nodes, self._forces.force, u]
-            self._device.launch(kernels_of(self._device).subtract_work, dim, inputs, [out])
+            self._device.launch(build_kernels(self._device).subtract_work, dim, inputs, [out])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
         """g -= f."""
         if self._forces is not None:
             dim = (len(self._forces.nodes), u.shape[1])
             inputs = [self._forces.nodes, self._forces.force]
-            self._device.launch(kernels_of(self._device).subtract, dim, inputs, [out])
+            self._device.launch(build_kernels(self._device).subtract, dim, inputs, [out])
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
         """A dead force has no curvature."""

@@ -10,12 +10,12 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..discretisation.element import Elements, hooke_stiffness
+from ..discretisation.element import Elements, assemble_hooke_stiffness
 from ..discretisation.term import Cases
 from ..runtime.columns import Workspaces
 from ..runtime.device import Device
-from ..runtime.threads import cores, together
-from .element_kernels import kernels_of, spreading_of
+from ..runtime.threads import choose_threads, run_together
+from .element_kernels import build_kernels, build_spreading_kernel
 from .laws.law import Law
 from .state_source import StateSource
 
@@ -79,7 +79,7 @@ class ElasticTerm:
         self._rest, self._tissue = (elements, *lame.T), (law, coefficients)
         for source in sources:
             law, count = source.law(law, count), count + source.count
-        self._kernels = kernels_of(law, device, size, count)
+        self._kernels = build_kernels(law, device, size, count)
         self._of = law, device, size, count
         shape = self._shape = [
             device.array(sizes, wp.int32),
@@ -93,7 +93,7 @@ class ElasticTerm:
         self._numbers = Workspaces(lambda columns: device.zeros(*points, count, columns), device)
         self._strains = Workspaces(lambda columns: wp.empty((*points, columns), device.matrix, device.name), device)
         every = len(elements.table)
-        ends = np.linspace(0, every, (1 if device.on_cuda else cores(every)) + 1).astype(int).tolist()
+        ends = np.linspace(0, every, (1 if device.on_cuda else choose_threads(every)) + 1).astype(int).tolist()
         self._parts = [
             _Part(
                 first,
@@ -130,7 +130,7 @@ class ElasticTerm:
             self._cases, numbers = cases, self._numbers.of(len(cases.loads))
             points, own = numbers.shape[:2], self._tissue[1].shape[1]
             dim = (*points, own, len(cases.loads))
-            self._device.launch(spreading_of(self._device), dim, [self._constants], [numbers])
+            self._device.launch(build_spreading_kernel(self._device), dim, [self._constants], [numbers])
             for source in self._sources:
                 source.fill(cases, own, numbers)
                 own += source.count
@@ -162,7 +162,7 @@ class ElasticTerm:
 
     def rest_curvature(self) -> sp.csc_array:
         """Hooke's stiffness, which every law meets at rest."""
-        return hooke_stiffness(*self._rest)
+        return assemble_hooke_stiffness(*self._rest)
 
     def curvature(self) -> sp.csc_array:
         """K(u) (3N, 3N) [N/m] of one column, assembled: each element by itself, along every motion of its nodes."""
@@ -219,9 +219,9 @@ class ElasticTerm:
 
     @cached_property
     def _strain_kernels(self) -> Any:
-        from .strain_kernels import kernels_of
+        from .strain_kernels import build_kernels
 
-        return kernels_of(*self._of)
+        return build_kernels(*self._of)
 
     def raise_strain(self, some: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
         """As `Strained.raise_strain`."""
@@ -244,7 +244,7 @@ class ElasticTerm:
         parts = [some[first:stop] for first, stop in pairwise(ends) if first < stop]
         outputs = [out, *(wp.zeros_like(out) for _ in parts[1:])]
         columns = len(inputs[1])
-        together(
+        run_together(
             [
                 partial(self._device.launch, kernel, (len(part), columns), [part, *inputs], [own])
                 for part, own in zip(parts, outputs, strict=True)
@@ -289,7 +289,7 @@ class ElasticTerm:
         self, kernel: wp.Kernel, inputs: Callable[[_Part], list], outputs: Sequence[wp.array], columns: int
     ) -> None:
         """All parts at the same time, each into an output of its own."""
-        together(
+        run_together(
             [
                 partial(self._device.launch, kernel, (part.count, columns), inputs(part), [out])
                 for part, out in zip(self._parts, outputs, strict=True)

@@ -21,8 +21,8 @@ class ElementFunctions:
 
 
 @cache
-def functions_of(law: Law, device: Device, size: int, count: int) -> ElementFunctions:
-    """Functions for elements of `size` nodes and laws of `count` coefficients, as `kernels_of` takes them."""
+def build_functions(law: Law, device: Device, size: int, count: int) -> ElementFunctions:
+    """Functions for elements of `size` nodes and laws of `count` coefficients, as `build_kernels` takes them."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
 

@@ -6,7 +6,7 @@ from functools import cache
 import warp as wp
 
 from ..runtime.device import Device, forward_kernel
-from .element_functions import functions_of
+from .element_functions import build_functions
 from .laws.invariants import cofactor
 from .laws.law import Law
 
@@ -27,7 +27,7 @@ class ElementKernels:
 
 
 @cache
-def spreading_of(device: Device) -> wp.Kernel:
+def build_spreading_kernel(device: Device) -> wp.Kernel:
     """Kernel that gives every point in every case its element's coefficients."""
     scalar = device.scalar
 
@@ -45,7 +45,7 @@ def spreading_of(device: Device) -> wp.Kernel:
 
 
 @cache
-def kernels_of(law: Law, device: Device, size: int, count: int) -> ElementKernels:
+def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKernels:
     """Kernels for elements of `size` nodes and laws of `count` coefficients.
 
     Each launches over (element, column). Elements of `size` 0 have as many nodes as `sizes` says, each its own number.
@@ -55,7 +55,7 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> ElementKernel
     constants = wp.types.vector(length=count, dtype=scalar)
     stress, stress_change, density = law.stress, law.stress_change, law.energy
     kept = VOLUME_KEPT
-    functions = functions_of(law, device, size, count)
+    functions = build_functions(law, device, size, count)
     gradient_of, at, at_rest, numbers = functions.gradient, functions.at, functions.at_rest, functions.numbers
 
     @wp.func

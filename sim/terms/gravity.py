@@ -8,10 +8,10 @@ from functools import lru_cache
 import numpy as np
 import warp as wp
 
-from ..discretisation.element import EIGHT_POINTS, EIGHT_WEIGHTS, quadratic_shapes, quadratic_slopes
+from ..discretisation.element import EIGHT_POINTS, EIGHT_WEIGHTS, compute_quadratic_shapes, compute_quadratic_slopes
 from ..discretisation.space import Discretisation
 from ..effects import Gravity
-from ..geometry.surface import unit
+from ..geometry.surface import normalise_vectors
 from ..geometry.tetmesh import QUADRATIC_EDGES
 from ..loads import Loads, Posture
 from ..runtime.device import Device
@@ -22,10 +22,12 @@ STANDARD_GRAVITY = 9.80665  # [m/s^2]
 
 def change_of_weight(effect: Gravity, space: Discretisation, device: Device) -> DeadForce:
     """The term of `Gravity` on the nodes of `space`: dead forces, the weight now less the weight in the scan."""
-    return DeadForce("gravity", changes(effect, space, device), device)
+    return DeadForce("gravity", build_weight_change(effect, space, device), device)
 
 
-def changes(effect: Gravity, space: Discretisation, device: Device, kept: int = 64) -> Callable[[Loads], Forces | None]:
+def build_weight_change(
+    effect: Gravity, space: Discretisation, device: Device, kept: int = 64
+) -> Callable[[Loads], Forces | None]:
     """Loads -> the nodal forces f_a = s (w_a(now) - w_a(scan)), or None without a `Posture`.
 
     w_a = g d integral of (rho - rho_csf [x is under the level]) N_a(x) dV in the rest configuration, N_a the elements'
@@ -36,8 +38,8 @@ def changes(effect: Gravity, space: Discretisation, device: Device, kept: int = 
     """
     table, count = space.table, space.count
     ones = np.broadcast_to(np.eye(4), (len(table), 4, 4))
-    whole = nodal_volumes(space, np.arange(len(table)), ones)
-    volume = summed(table, whole, count)
+    whole = integrate_nodal_volumes(space, np.arange(len(table)), ones)
+    volume = sum_by_node(table, whole, count)
 
     @lru_cache(kept)
     def weights(*posture: float) -> np.ndarray:
@@ -46,9 +48,9 @@ def changes(effect: Gravity, space: Discretisation, device: Device, kept: int = 
         height = (-space.nodes @ direction - level)[table[:, :4]]
         corners_under = (height < 0.0).sum(axis=1)
         full, cut = corners_under == 4, np.flatnonzero((corners_under > 0) & (corners_under < 4))
-        owner, parts = parts_under(height[cut])
-        volumes = np.concatenate([whole[full], nodal_volumes(space, cut[owner], parts)])
-        under = summed(np.concatenate([table[full], table[cut[owner]]]), volumes, count)
+        owner, parts = cut_below_plane(height[cut])
+        volumes = np.concatenate([whole[full], integrate_nodal_volumes(space, cut[owner], parts)])
+        under = sum_by_node(np.concatenate([table[full], table[cut[owner]]]), volumes, count)
         mass = effect.density * volume - effect.csf_density * under
         return STANDARD_GRAVITY * mass[:, None] * direction
 
@@ -56,20 +58,20 @@ def changes(effect: Gravity, space: Discretisation, device: Device, kept: int = 
         cause = loads.of(Posture)
         if cause is None:
             return None
-        scan = weights(*downwards(np.array([effect.direction]))[0], effect.csf_level)
-        now = [weights(*row) for row in np.column_stack([downwards(cause.direction), cause.csf_level]).tolist()]
+        scan = weights(*normalise_gravity(np.array([effect.direction]))[0], effect.csf_level)
+        now = [weights(*row) for row in np.column_stack([normalise_gravity(cause.direction), cause.csf_level]).tolist()]
         change = cause.share[:, None, None] * (np.reshape(now, (-1, count, 3)) - scan)
         return Forces(device.array(np.arange(count), wp.int32), device.array(change.reshape(-1, 3 * count).T))
 
     return forces
 
 
-def downwards(direction: np.ndarray) -> np.ndarray:
+def normalise_gravity(direction: np.ndarray) -> np.ndarray:
     """Directions (B, 3) of any length but none, at unit length."""
-    return unit(direction / np.abs(direction).max(axis=1, keepdims=True))
+    return normalise_vectors(direction / np.abs(direction).max(axis=1, keepdims=True))
 
 
-def nodal_volumes(space: Discretisation, owner: np.ndarray, parts: np.ndarray) -> np.ndarray:
+def integrate_nodal_volumes(space: Discretisation, owner: np.ndarray, parts: np.ndarray) -> np.ndarray:
     """Integrals (m, n) [m^3] of the shape functions of tetrahedra `owner` (m,) over a part of each.
 
     parts (m, 4, 4): corner coordinates of the part's own corners. Eight points of degree 3: exact for straight
@@ -79,13 +81,13 @@ def nodal_volumes(space: Discretisation, owner: np.ndarray, parts: np.ndarray) -
     weight = np.abs(np.linalg.det(parts))[:, None] * EIGHT_WEIGHTS
     if space.table.shape[1] == 4:
         return space.mesh.volumes[owner, None] * np.einsum("mq,mqa->ma", weight, points)
-    shape = quadratic_shapes(points, QUADRATIC_EDGES)
-    slope = quadratic_slopes(points.reshape(-1, 4)).reshape(*shape.shape, 3)
+    shape = compute_quadratic_shapes(points, QUADRATIC_EDGES)
+    slope = compute_quadratic_slopes(points.reshape(-1, 4)).reshape(*shape.shape, 3)
     jacobian = np.einsum("mai,mqaj->mqij", space.nodes[space.table[owner]], slope)
     return np.einsum("mq,mqa->ma", weight * np.linalg.det(jacobian) / 6.0, shape)
 
 
-def summed(table: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+def sum_by_node(table: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """Values (m, n) of the nodes in `table` (m, n), summed by node (N,)."""
     return np.bincount(table.ravel(), values.ravel(), count)
 
@@ -102,7 +104,7 @@ PRISM = np.array([[0, 1, 2, 5], [0, 1, 4, 5], [0, 3, 4, 5]])
 PARTS = {1: np.array([[0, 1, 2, 3]]), 2: PRISM, 3: PRISM}
 
 
-def parts_under(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cut_below_plane(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tetrahedra that together are what lies under a plane, none of them inside another.
 
     height (n, 4) [m] of the corners of n tetrahedra above the plane, which has one to three of them below zero. The

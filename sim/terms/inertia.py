@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..discretisation.element import quadratic_elements
+from ..discretisation.element import build_quadratic_elements
 from ..discretisation.space import Discretisation
 from ..discretisation.term import Cases
 from ..runtime.columns import CHUNK, Workspaces
@@ -28,7 +28,7 @@ class InertiaKernels:
 
 
 @cache
-def kernels_of(device: Device) -> InertiaKernels:
+def build_kernels(device: Device) -> InertiaKernels:
     """Kernels of a device's scalar type."""
     scalar, mat = device.scalar, device.matrix
     chunk = CHUNK
@@ -80,7 +80,7 @@ def kernels_of(device: Device) -> InertiaKernels:
     return InertiaKernels(add_energy, add_force, add_blocks)
 
 
-def lumped_mass(density: float, space: Discretisation) -> np.ndarray:
+def compute_lumped_mass(density: float, space: Discretisation) -> np.ndarray:
     """Mass of every node (N,) [kg], positive, in sum density x volume.
 
     A quarter of each linear tetrahedron's; of a quadratic one's as Hinton, Rock, Zienkiewicz 1976, "A note on mass
@@ -91,7 +91,7 @@ def lumped_mass(density: float, space: Discretisation) -> np.ndarray:
     share = np.repeat([CORNER, MIDDLE], [4, 6]) if quadratic else np.full(4, 0.25)
     volume = space.mesh.volumes
     if quadratic:
-        volume = quadratic_elements(space.nodes, space.table, every).weight.sum(axis=1)
+        volume = build_quadratic_elements(space.nodes, space.table, every).weight.sum(axis=1)
     return density * np.bincount(space.table.ravel(), np.outer(volume, share).ravel(), space.count)
 
 
@@ -119,7 +119,7 @@ class InertiaTerm:
     width = 3
 
     def __init__(self, mass: np.ndarray, damping: float, marks: np.ndarray, device: Device):
-        self._device, self._kernels = device, kernels_of(device)
+        self._device, self._kernels = device, build_kernels(device)
         self._damping, self._masses, self.marks = damping, mass, marks
         self._mass = device.array(mass)
         self._weight = Workspaces(lambda columns: device.zeros(columns), device)

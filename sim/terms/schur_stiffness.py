@@ -7,8 +7,8 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..discretisation.term import Cases
-from ..runtime.columns import add_dots, add_rows, combined, is_kept, rows_taken
-from ..runtime.dense_product import product_with
+from ..runtime.columns import add_dots, add_rows, combine_columns, is_kept, take_rows
+from ..runtime.dense_product import build_product
 from ..runtime.device import Device
 
 
@@ -34,7 +34,7 @@ class Exterior:
         self._device = device
         self._rest = rows, stiffness, count
         self._rows = device.array(rows, wp.int32)
-        self._product = product_with(stiffness, device)
+        self._product = build_product(stiffness, device)
         self._rooms: dict[int, tuple[wp.array, wp.array]] = {}
 
     def begin(self, cases: Cases) -> None:
@@ -46,7 +46,7 @@ class Exterior:
     def energy(self, u: wp.array, out: wp.array) -> None:
         """E += u . F u / 2."""
         x, force = self._multiplied(u)
-        add_dots(self._device, combined(self._device, x, -0.5, x, x), force, out)
+        add_dots(self._device, combine_columns(self._device, x, -0.5, x, x), force, out)
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
         """f += F u."""
@@ -88,5 +88,5 @@ class Exterior:
             self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}
             self._rooms[u.shape[1]] = self._device.zeros(*shape), self._device.zeros(*shape)
         x, force = self._rooms[u.shape[1]]
-        self._product(rows_taken(self._device, u, self._rows, x), force)
+        self._product(take_rows(self._device, u, self._rows, x), force)
         return x, force

@@ -6,7 +6,7 @@ from functools import cache
 import warp as wp
 
 from ..runtime.device import Device, forward_kernel
-from .element_functions import functions_of
+from .element_functions import build_functions
 from .laws.law import Law
 
 
@@ -19,12 +19,12 @@ class StrainKernels:
 
 
 @cache
-def kernels_of(law: Law, device: Device, size: int, count: int) -> StrainKernels:
-    """Kernels as those of `element_kernels.kernels_of`; each launches over (place in `some`, in `columns`)."""
+def build_kernels(law: Law, device: Device, size: int, count: int) -> StrainKernels:
+    """Kernels as those of `element_kernels.build_kernels`; each launches over (place in `some`, in `columns`)."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
     stress_change = law.stress_change
-    functions = functions_of(law, device, size, count)
+    functions = build_functions(law, device, size, count)
     gradient_of, at, at_rest, numbers = functions.gradient, functions.at, functions.at_rest, functions.numbers
 
     @forward_kernel(module="unique")

@@ -17,7 +17,7 @@ from .laws.law import Law
 
 
 @cache
-def swollen(law: Law, device: Device, count: int) -> Law:
+def build_swollen_law(law: Law, device: Device, count: int) -> Law:
     """The law on `count` numbers that also takes r = (1 + theta)^(1/3) - 1."""
     scalar, mat = device.scalar, device.matrix
     inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1))
@@ -80,7 +80,7 @@ class SwellingKernels:
 
 
 @cache
-def kernels_of(device: Device) -> SwellingKernels:
+def build_kernels(device: Device) -> SwellingKernels:
     """Kernels of a device's scalar type."""
     scalar, mat = device.scalar, device.matrix
 
@@ -132,17 +132,17 @@ class Swelling:
 
     def law(self, inner: Law, count: int) -> Law:
         """The law of what is left of the motion beside the swelling."""
-        return swollen(inner, self._device, count)
+        return build_swollen_law(inner, self._device, count)
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
         """r at every point."""
         inputs = [self._swells, self._wider(cases), first]
-        self._device.launch(kernels_of(self._device).fill, (*out.shape[:2], out.shape[3]), inputs, [out])
+        self._device.launch(build_kernels(self._device).fill, (*out.shape[:2], out.shape[3]), inputs, [out])
 
     def end(self, cases: Cases, strains: wp.array) -> None:
         """Swelling depends on the time alone; what is elastic of the strains is left to what remembers it."""
         inputs = [self._swells, self._wider(cases)]
-        self._device.launch(kernels_of(self._device).shrink, strains.shape, inputs, [strains])
+        self._device.launch(build_kernels(self._device).shrink, strains.shape, inputs, [strains])
 
     def _wider(self, cases: Cases) -> wp.array:
         """R (b,), accurate for small theta too."""

@@ -12,7 +12,7 @@ law parts shape from volume, as Ogden's, psi(F) - psi(J^(1/3) I) is psi(Fb), and
 others psi(Fb) must not be taken away from psi(F): it outgrows it where tissue is crushed, which then collapses.
 
 The stable neo-Hookean law is finite where J = 0, and Cb is not: whatever pulls on Cb makes it collapse. It is parted in
-its own way (`own_split`): mu relaxes and K does not. The step's potential is psi - (1 - f) psi_shape + C : A / 2, and S
+its own way (`build_own_split`): mu relaxes and K does not. The step's potential is psi - (1 - f) psi_shape + C : A / 2, and S
 pulls on C = F^T F, as in finite linear viscoelasticity. Source: Christensen 1980, "A Nonlinear Theory of
 Viscoelasticity for Application to Elastomers", J. Appl. Mech. 47:762-768.
 """
@@ -36,7 +36,7 @@ SIX = 6
 
 
 @cache
-def relaxing(law: Law, device: Device, count: int) -> Law:
+def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
     """The law on `count` numbers that also takes f - 1 and the components xx, yy, zz, yz, zx, xy of A [Pa]."""
     scalar, mat = device.scalar, device.matrix
     parts = split_of(law, device)
@@ -99,7 +99,7 @@ class ViscoelasticKernels:
 
 
 @cache
-def kernels_of(law: Law, device: Device, count: int) -> ViscoelasticKernels:
+def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
     """Kernels for a law of `count` coefficients; each launches over (element, point, column)."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
@@ -179,7 +179,7 @@ class Prony:
         self, name: str, law: Law, coefficients: np.ndarray, pairs: Sequence[Pairs], points: int, device: Device
     ):
         self._name, self._device = name, device
-        self._kernels = kernels_of(law, device, coefficients.shape[1])
+        self._kernels = build_kernels(law, device, coefficients.shape[1])
         self._coefficients = device.array(
             coefficients, wp.types.vector(length=coefficients.shape[1], dtype=device.scalar)
         )
@@ -191,7 +191,7 @@ class Prony:
 
     def law(self, inner: Law, count: int) -> Law:
         """The law, and its part of shape again, which relaxes."""
-        return relaxing(inner, self._device, count)
+        return build_relaxing_law(inner, self._device, count)
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
         """f - 1 and A."""

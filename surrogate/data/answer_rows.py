@@ -10,7 +10,7 @@ import numpy as np
 from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import Deformation, Outcome
 from sim.effects import Elasticity
-from sim.material import tissue_from_json, tissue_to_json
+from sim.material import read_tissue_json, to_tissue_json
 
 BRAIN = "tissue"
 """Provenance key of the brain's tissue. A region of the same tissue as the brain has no entry."""
@@ -21,13 +21,13 @@ NAME_TYPE = f"S{max(len(outcome.name) for outcome in Outcome)}"
 CHECKSUM = np.dtype("<u4")
 
 
-def stating(tissue: Elasticity) -> dict[str, str]:
+def describe_tissue_source(tissue: Elasticity) -> dict[str, str]:
     """Return the provenance entries of this tissue; none for a brain without law."""
-    stated = {} if tissue.default is None else {BRAIN: tissue_to_json(tissue.default)}
-    return stated | {_key(label): tissue_to_json(tissue.regions[label]) for label in sorted(tissue.regions)}
+    stated = {} if tissue.default is None else {BRAIN: to_tissue_json(tissue.default)}
+    return stated | {_key(label): to_tissue_json(tissue.regions[label]) for label in sorted(tissue.regions)}
 
 
-def stated_tissue(stated: Mapping[str, str]) -> Elasticity:
+def read_tissue_statement(stated: Mapping[str, str]) -> Elasticity:
     """Read the tissue from a provenance, which must contain the brain's.
 
     Raises
@@ -37,21 +37,21 @@ def stated_tissue(stated: Mapping[str, str]) -> Elasticity:
     """
     numbers = (key.removeprefix(REGION) for key in stated if key.startswith(REGION))
     labels = {TUMOUR_LABEL, *(int(number) for number in numbers if number.lstrip("-").isdecimal())}
-    regions = {label: tissue_from_json(stated[_key(label)]) for label in sorted(labels) if _key(label) in stated}
-    return Elasticity(tissue_from_json(stated[BRAIN]), regions)
+    regions = {label: read_tissue_json(stated[_key(label)]) for label in sorted(labels) if _key(label) in stated}
+    return Elasticity(read_tissue_json(stated[BRAIN]), regions)
 
 
-def first_stated(statements: Iterable[Mapping[str, str]]) -> Elasticity | None:
-    """Return `stated_tissue` of the first provenance that contains the brain's; None without one."""
+def find_first_tissue(statements: Iterable[Mapping[str, str]]) -> Elasticity | None:
+    """Return `read_tissue_statement` of the first provenance that contains the brain's; None without one."""
     stated = next((one for one in statements if BRAIN in one), None)
-    return None if stated is None else stated_tissue(stated)
+    return None if stated is None else read_tissue_statement(stated)
 
 
 def _key(label: int) -> str:
     return TUMOUR if label == TUMOUR_LABEL else f"{REGION}{label}"
 
 
-def row_type(vertices: int, tools: int = 0) -> np.dtype:
+def get_row_type(vertices: int, tools: int = 0) -> np.dtype:
     """Return the type of one row: displacement (vertices, 3), outcome, and reaction (tools, 6) of posed tools."""
     # In the file's own number widths, 64 kB a load on a brain of 5,300 nodes: conversion by HDF5 takes three times as
     # long. It is not compressed: deflate, with its bytes in the best order, saves a sixth and takes longer than the
@@ -67,12 +67,12 @@ def row_type(vertices: int, tools: int = 0) -> np.dtype:
     )
 
 
-def rows_of(answer: Deformation, unit: float, tools: int = 0) -> np.ndarray:
+def select_rows(answer: Deformation, unit: float, tools: int = 0) -> np.ndarray:
     """Convert results at every vertex to rows (B,), with displacements in units of `unit` [m].
 
     The reactions of `tools` moved by pose are NaN if the result does not have them.
     """
-    rows = np.empty(len(answer), row_type(answer.displacement.shape[1], tools))
+    rows = np.empty(len(answer), get_row_type(answer.displacement.shape[1], tools))
     rows["displacement"] = answer.displacement / unit if unit != 1.0 else answer.displacement
     rows["outcome"] = [outcome.name for outcome in answer.outcome]
     rows["iterations"] = answer.iterations
@@ -82,12 +82,12 @@ def rows_of(answer: Deformation, unit: float, tools: int = 0) -> np.ndarray:
     return rows
 
 
-def checksums(rows: np.ndarray) -> np.ndarray:
+def compute_row_checksums(rows: np.ndarray) -> np.ndarray:
     """Compute CRC-32 (B,) uint32 of the bytes of each row."""
     return np.array([zlib.crc32(row.data) for row in rows.view(np.uint8).reshape(len(rows), -1)], CHECKSUM)
 
 
-def numbered(rows: np.ndarray) -> str:
+def format_row_numbers(rows: np.ndarray) -> str:
     """Format row numbers: the first few, and their count."""
     shown = ", ".join(map(str, rows[:5]))
     return f"row {shown}" if len(rows) == 1 else f"rows {shown}{f' ... ({len(rows)} in all)' if len(rows) > 5 else ''}"

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.bodies.open_cortex import distances_to, rim_of
+from sim.bodies.open_cortex import compute_distances, find_opening_edge
 from sim.errors import InputError
-from sim.geometry.surface import areas, vertex_normals
+from sim.geometry.surface import compute_areas, compute_vertex_normals
 
-from ..array_functions import squared_distances, taken
+from ..array_functions import compute_squared_distances, take_rows_of
 
 if TYPE_CHECKING:
     from sim.discretisation.footprint import ContactSurface
 
 
-def barycentric_lattice(rows: int) -> np.ndarray:
+def build_barycentric_lattice(rows: int) -> np.ndarray:
     """Compute corner coordinates (rows^2, 3) of the centres of a triangle's equal pieces, `rows` along each edge."""
     upright = [(i + 1.0 / 3.0, j + 1.0 / 3.0) for i in range(rows) for j in range(rows - i)]
     turned = [(i + 2.0 / 3.0, j + 2.0 / 3.0) for i in range(rows - 1) for j in range(rows - 1 - i)]
@@ -48,12 +48,12 @@ class Patch:
     @cached_property
     def areas(self) -> np.ndarray:
         """Triangle areas (S,) [m^2]."""
-        return areas(self.points[self.triangles])
+        return compute_areas(self.points[self.triangles])
 
     @cached_property
     def inward(self) -> np.ndarray:
         """Unit inward normals (m, 3) at the nodes, area-weighted."""
-        return -vertex_normals(self.points, self.triangles)
+        return -compute_vertex_normals(self.points, self.triangles)
 
     @cached_property
     def skin(self) -> ContactSurface:
@@ -67,11 +67,11 @@ class Patch:
     @cached_property
     def rim(self) -> np.ndarray:
         """Edges (E, 2, 3) [m] that belong to one triangle only."""
-        return rim_of(self.points, self.triangles)
+        return find_opening_edge(self.points, self.triangles)
 
-    def rim_distance(self, points: np.ndarray) -> np.ndarray:
+    def compute_edge_distance(self, points: np.ndarray) -> np.ndarray:
         """Compute distances (B,) [m] from `points` (B, 3) to the edge."""
-        return distances_to(self.rim, points)
+        return compute_distances(self.rim, points)
 
     def place(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Map uniform numbers (n, 3) to points (n, 3) [m], uniform by area, and their unit inward normals (n, 3)."""
@@ -82,15 +82,15 @@ class Patch:
         point, normal = (np.einsum("nc,nci->ni", share, field[triangle]) for field in (self.points, self.inward))
         return point, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
-    def normal_near(self, points: np.ndarray) -> np.ndarray:
+    def find_normals(self, points: np.ndarray) -> np.ndarray:
         """Return unit inward normals (B, 3) of the patch nodes nearest to `points` (B, 3) [m]."""
-        return taken(squared_distances(points, self.points).argmin(axis=1), self.inward)
+        return take_rows_of(compute_squared_distances(points, self.points).argmin(axis=1), self.inward)
 
     def covered(self, centres: np.ndarray, radius: float) -> float:
         """Compute the area share within `radius` [m] of one of the `centres` (k, 3) [m], by 16 points a triangle."""
-        share = barycentric_lattice(4)
+        share = build_barycentric_lattice(4)
         samples = np.einsum("qc,scx->sqx", share, self.points[self.triangles])
-        inside = nearest(samples.reshape(-1, 3), centres)[1].reshape(len(samples), -1) <= radius
+        inside = find_nearest(samples.reshape(-1, 3), centres)[1].reshape(len(samples), -1) <= radius
         return float(inside.mean(axis=1) @ self.areas / self.areas.sum())
 
 
@@ -108,7 +108,7 @@ def open_patch(anatomy: Anatomy) -> Patch:
     return Patch(nodes, triangles, anatomy.mesh.nodes[nodes])
 
 
-def nearest(points: np.ndarray, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_nearest(points: np.ndarray, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the nearest of the `sites` (n, 3) to each of the `points` (B, 3): its number (B,), and its distance (B,)."""
-    squared = squared_distances(points, sites)
+    squared = compute_squared_distances(points, sites)
     return squared.argmin(axis=1), np.sqrt(squared.min(axis=1))

@@ -17,9 +17,9 @@ from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.runtime.memory import check_fits
 from sim.runtime.processes import process_pool, run_on_each
-from sim.strategy.memory_needed import Needed, foreseen
+from sim.strategy.memory_needed import Needed, estimate_needed
 
-from .holding import held, series_of
+from .holding import get_relaxation_series, solve_histories
 from .tasks import SolverPool
 
 
@@ -54,12 +54,14 @@ class LazyFem:
     @property
     def needed(self) -> Needed | None:
         """Required GPU memory; None on the CPU."""
-        return foreseen(self.anatomy, self.element, self.accuracy, self.device, self.batch, self.loads, self.share)
+        return estimate_needed(
+            self.anatomy, self.element, self.accuracy, self.device, self.batch, self.loads, self.share
+        )
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Solve as `Fem.deform`; poses in relaxing tissue are histories, as in `held`."""
-        if start is None and series_of(self.effects) and loads.of(Touching) is not None:
-            answer = held(self.fem, loads)
+        """Solve as `Fem.deform`; poses in relaxing tissue are histories, as in `solve_histories`."""
+        if start is None and get_relaxation_series(self.effects) and loads.of(Touching) is not None:
+            answer = solve_histories(self.fem, loads)
             return answer if at is None else answer.at(at)
         return self.fem.deform(loads, start, at)
 
@@ -75,7 +77,7 @@ class Solver:
 
 
 @contextmanager
-def solving(asked: LazyFem, devices: Sequence[str], said: Callable[[str], object]) -> Iterator[Solver]:
+def open_solvers(asked: LazyFem, devices: Sequence[str], said: Callable[[str], object]) -> Iterator[Solver]:
     """Open FEM solvers on each of the devices; with one device it is in this process.
 
     Without a `batch` it is as large as fits. With several GPUs each then gets the same number of batches. `said` first
@@ -91,30 +93,30 @@ def solving(asked: LazyFem, devices: Sequence[str], said: Callable[[str], object
     if len(devices) == 1:
         own = replace(asked, device=devices[0])
         _demand([own.needed], said)
-        yield Solver(own, *described(own, None))
+        yield Solver(own, *describe_fem_task(own, None))
         return
     most, own = max(devices.count(name) for name in devices), -(-asked.loads // len(devices))
-    with process_pool(devices, placed, replace(asked, share=most, loads=own)) as children:
+    with process_pool(devices, place_on_device, replace(asked, share=most, loads=own)) as children:
         none = [None] * len(devices)
-        _demand(run_on_each(children, memory_of, none), said)
-        elements, words, batches = zip(*run_on_each(children, described, none), strict=True)
+        _demand(run_on_each(children, estimate_memory, none), said)
+        elements, words, batches = zip(*run_on_each(children, describe_fem_task, none), strict=True)
         batch = min(batches)
         if asked.batch is None and devices[0].startswith("cuda"):
-            batch = even_batch(batch // most, asked.loads, len(devices))
+            batch = choose_even_batch(batch // most, asked.loads, len(devices))
         yield Solver(SolverPool(asked.anatomy, children), elements[0], words[0], batch)
 
 
-def placed(device: str, asked: LazyFem) -> LazyFem:
+def place_on_device(device: str, asked: LazyFem) -> LazyFem:
     """Return the FEM of a device."""
     return replace(asked, device=device)
 
 
-def memory_of(asked: LazyFem, task: None) -> Needed | None:
+def estimate_memory(asked: LazyFem, task: None) -> Needed | None:
     """Return the GPU memory that the FEM needs."""
     return asked.needed
 
 
-def described(asked: LazyFem, task: None) -> tuple[str, str, int]:
+def describe_fem_task(asked: LazyFem, task: None) -> tuple[str, str, int]:
     """Return the FEM's element, description and batch size, after a check that it fits in memory."""
     if asked.needed is None:  # on the CPU: before a file is created that keeps its batch
         fem = asked.fem
@@ -122,7 +124,7 @@ def described(asked: LazyFem, task: None) -> tuple[str, str, int]:
     return asked.fem.space.element, asked.fem.description, asked.fem.batch
 
 
-def even_batch(most: int, loads: int, devices: int) -> int:
+def choose_even_batch(most: int, loads: int, devices: int) -> int:
     """Compute the widest batch of at most `most` loads with which every device has equally many, but for the last."""
     rounds = -(-loads // (max(most, 1) * devices))
     return max(1, -(-loads // (max(rounds, 1) * devices)))

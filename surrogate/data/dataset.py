@@ -20,14 +20,14 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.deformation import Outcome
 from sim.errors import InputError
-from sim.geometry.tetmesh import TetMesh, digest_of
+from sim.geometry.tetmesh import TetMesh, compute_digest
 from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Touching
 from sim.runtime.file_limits import INFLATION, LARGEST_ARRAY
-from sim.runtime.outside_files import path_of, read_as
-from sim.runtime.partial_files import unfinished_path
-from sim.tools import BuiltIn, stated_tool
+from sim.runtime.outside_files import read_as, to_path
+from sim.runtime.partial_files import to_unfinished_path
+from sim.tools import BuiltIn, read_tool_statement
 
-from .answer_rows import checksums, numbered, row_type
+from .answer_rows import compute_row_checksums, format_row_numbers, get_row_type
 from .cortex_patch import open_patch
 
 CAUSES: dict[str, type[Cause]] = {
@@ -96,7 +96,7 @@ class Dataset:
         wrong = np.flatnonzero(self.good & ~((self.residual >= 0.0) & (self.residual < np.inf)))
         if len(wrong):
             raise InputError(
-                f"{self.path}: {numbered(wrong)} of `answers` converged, but to a residual that is no number: it is "
+                f"{self.path}: {format_row_numbers(wrong)} of `answers` converged, but to a residual that is no number: it is "
                 "damaged. Simulate again."
             )
         try:
@@ -107,7 +107,7 @@ class Dataset:
     @cached_property
     def tool(self) -> BuiltIn | None:
         """Tool of the poses; None for pushes."""
-        return stated_tool(self.provenance.get("shape"), self.provenance.get("ball"))
+        return read_tool_statement(self.provenance.get("shape"), self.provenance.get("ball"))
 
     @property
     def good(self) -> np.ndarray:
@@ -155,7 +155,7 @@ class Dataset:
         found = np.concatenate([each["reaction"] for each, _ in rows])
         return found if np.isfinite(found[self.good]).all() else None
 
-    def unit_response(self, nodes: np.ndarray) -> np.ndarray:
+    def compute_unit_response(self, nodes: np.ndarray) -> np.ndarray:
         """Read small-strain responses (3 m, k, 3) float32 [m/N] of the vertices `nodes` (k,).
 
         Raises
@@ -182,7 +182,7 @@ class Dataset:
             raise InputError(_damaged(self.path, lost, group))
         if len(strange):
             raise InputError(
-                f"{self.path}: {numbered(strange)} of `{group}` move by more than the body measures, {size:.3g} m"
+                f"{self.path}: {format_row_numbers(strange)} of `{group}` move by more than the body measures, {size:.3g} m"
                 f"{'' if force == 1.0 else f', under {force:g} N'}: no solver made them. Simulate again."
             )
         return np.concatenate(chosen)
@@ -190,7 +190,7 @@ class Dataset:
 
 def _damaged(path: Path, lost: np.ndarray, group: str) -> str:
     return (
-        f"{path}: {numbered(lost)} of `{group}` are damaged. Give its `sulcus simulate` again: it solves those alone; "
+        f"{path}: {format_row_numbers(lost)} of `{group}` are damaged. Give its `sulcus simulate` again: it solves those alone; "
         "simulate data of an earlier version again."
     )
 
@@ -203,9 +203,9 @@ def read_dataset(path: str | Path) -> Dataset:
     InputError
         A file that is missing, unfinished, damaged, not HDF5, or not a data set of this project.
     """
-    path = path_of(path)
+    path = to_path(path)
     if not path.is_file():
-        unfinished = unfinished_path(path)
+        unfinished = to_unfinished_path(path)
         remedy = (
             f"{unfinished.name} is an unfinished run: give the same `sulcus simulate` again to resume it"
             if unfinished.exists()
@@ -213,7 +213,7 @@ def read_dataset(path: str | Path) -> Dataset:
         )
         raise InputError(f"{path}: no such file; {remedy}.")
     with read_as(path, "a data set", REMEDY), h5py.File(path, "r") as file:
-        stated = provenance_of(file)
+        stated = read_provenance(file)
         if stated.get("format") not in (FORMAT, UNCHECKED):
             raise InputError(
                 f"{path}: is HDF5, but not a data set that this version knows, {FORMAT!r}: make one with "
@@ -221,25 +221,25 @@ def read_dataset(path: str | Path) -> Dataset:
             )
         anatomy, loads = read_embedded(file), read_loads(file)
         nodes = open_patch(anatomy).nodes if loads.of(Touching) is None else np.zeros(0, int)
-        if not np.array_equal(stored(file, "unit/node", "iu", (3 * len(nodes),))[:], np.repeat(nodes, 3)):
+        if not np.array_equal(read_stored(file, "unit/node", "iu", (3 * len(nodes),))[:], np.repeat(nodes, 3)):
             raise InputError(f"{path}: `unit/node` are not the open cortex's nodes: it is damaged. Simulate again.")
         for group, rows in (("answers", len(loads)), ("unit", 3 * len(nodes))):
-            stored(file, f"{group}/displacement", "f", (rows, len(anatomy.mesh.nodes), 3))
-            if stated["format"] == UNCHECKED and not stored(file, f"{group}/done", "b", (rows,))[:].all():
+            read_stored(file, f"{group}/displacement", "f", (rows, len(anatomy.mesh.nodes), 3))
+            if stated["format"] == UNCHECKED and not read_stored(file, f"{group}/done", "b", (rows,))[:].all():
                 raise InputError(f"{path}: rows of `{group}` are not done, so it was never finished. Simulate again.")
         return Dataset(
             path,
             anatomy,
             loads,
             read_outcomes(file, "answers"),
-            stored(file, "answers/iterations", "iu", (len(loads),))[:],
-            stored(file, "answers/residual", "f", (len(loads),))[:],
+            read_stored(file, "answers/iterations", "iu", (len(loads),))[:],
+            read_stored(file, "answers/residual", "f", (len(loads),))[:],
             np.array([outcome.good for outcome in read_outcomes(file, "unit")], bool),
             stated,
         )
 
 
-def provenance_of(file: h5py.File) -> dict[str, str]:
+def read_provenance(file: h5py.File) -> dict[str, str]:
     """Read the provenance of a file, as text.
 
     Raises
@@ -248,36 +248,36 @@ def provenance_of(file: h5py.File) -> dict[str, str]:
         Texts that do not match the stored digest.
     """
     stated = {name: str(value) for name, value in file.attrs.items()}
-    if stated.get("format") == FORMAT and stated.pop(SEAL, None) != digest_of_texts(stated):
+    if stated.get("format") == FORMAT and stated.pop(SEAL, None) != compute_texts_digest(stated):
         raise InputError(f"{file.filename}: what it states of itself was changed after it was written: simulate again.")
     return stated
 
 
 def write_provenance(file: h5py.File, stated: Mapping[str, str]) -> None:
     """Store the provenance in a file."""
-    file.attrs.update({**stated, SEAL: digest_of_texts(stated)})
+    file.attrs.update({**stated, SEAL: compute_texts_digest(stated)})
 
 
-def digest_of_texts(stated: Mapping[str, str]) -> str:
+def compute_texts_digest(stated: Mapping[str, str]) -> str:
     """Compute the hash of texts and their names."""
-    return digest_of(np.frombuffer(repr(sorted(stated.items())).encode(), np.uint8))
+    return compute_digest(np.frombuffer(repr(sorted(stated.items())).encode(), np.uint8))
 
 
 def read_rows(file: h5py.File, group: str, vertices: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Read rows `first` to `last` (`row_type`) of `answers` or `unit`, and (B,) bool: True if the checksum agrees."""
+    """Read rows `first` to `last` (`get_row_type`) of `answers` or `unit`, and (B,) bool: True if the checksum agrees."""
     here = slice(first, last)
-    displacement = stored(file, f"{group}/displacement", "f", (None, vertices, 3))
+    displacement = read_stored(file, f"{group}/displacement", "f", (None, vertices, 3))
     known = f"{group}/reaction" in file
-    tools = stored(file, f"{group}/reaction", "f", (len(displacement), None, 6)).shape[1] if known else 0
-    rows = np.empty(len(range(*here.indices(len(displacement)))), row_type(vertices, tools))
+    tools = read_stored(file, f"{group}/reaction", "f", (len(displacement), None, 6)).shape[1] if known else 0
+    rows = np.empty(len(range(*here.indices(len(displacement)))), get_row_type(vertices, tools))
     rows["displacement"] = displacement[here]
     for name, kinds in (("outcome", "S"), ("iterations", "iu"), ("residual", "f")):
-        rows[name] = stored(file, f"{group}/{name}", kinds, (len(displacement),))[here]
+        rows[name] = read_stored(file, f"{group}/{name}", kinds, (len(displacement),))[here]
     if tools:
-        rows["reaction"] = stored(file, f"{group}/reaction", "f")[here]
+        rows["reaction"] = read_stored(file, f"{group}/reaction", "f")[here]
     if file.attrs["format"] == UNCHECKED:
         return rows, np.ones(len(rows), bool)
-    return rows, checksums(rows) == stored(file, f"{group}/checksum", "u", (len(displacement),))[here]
+    return rows, compute_row_checksums(rows) == read_stored(file, f"{group}/checksum", "u", (len(displacement),))[here]
 
 
 def write_embedded(file: h5py.File, anatomy: Anatomy) -> None:
@@ -298,8 +298,8 @@ def read_embedded(file: h5py.File) -> Anatomy:
     InputError
         Arrays that do not match the stored digest.
     """
-    array = {name: stored(file, f"anatomy/{name}", "fiu")[:] for name in MESH if f"anatomy/{name}" in file}
-    sets = {name: stored(file, f"anatomy/{name}", "fb")[:] for name in ("held", "slide_normal", "craniotomy")}
+    array = {name: read_stored(file, f"anatomy/{name}", "fiu")[:] for name in MESH if f"anatomy/{name}" in file}
+    sets = {name: read_stored(file, f"anatomy/{name}", "fb")[:] for name in ("held", "slide_normal", "craniotomy")}
     anatomy = Anatomy(TetMesh(**array), **sets)
     if anatomy.digest != file["anatomy"].attrs["digest"]:
         raise InputError(f"{file.filename}: the anatomy inside was changed after it was written: simulate again.")
@@ -323,7 +323,7 @@ def write_loads(file: h5py.File, loads: Loads) -> None:
         for item in fields(cause):
             arrays[item.name] = getattr(cause, item.name)
     group["time"] = loads.times
-    group.attrs["digest"] = digest_of_loads(loads)
+    group.attrs["digest"] = compute_loads_digest(loads)
 
 
 def read_loads(file: h5py.File) -> Loads:
@@ -335,30 +335,30 @@ def read_loads(file: h5py.File) -> Loads:
         Loads that do not match the stored digest.
     """
     causes = tuple(
-        kind(**{item.name: stored(file, f"loads/{name}/{item.name}", "f")[:] for item in fields(kind)})
+        kind(**{item.name: read_stored(file, f"loads/{name}/{item.name}", "f")[:] for item in fields(kind)})
         for name, kind in CAUSES.items()
         if f"loads/{name}" in file
     )
-    loads = Loads(causes, stored(file, "loads/time", "f")[:])
-    if file.attrs.get("format") != UNCHECKED and file["loads"].attrs["digest"] != digest_of_loads(loads):
+    loads = Loads(causes, read_stored(file, "loads/time", "f")[:])
+    if file.attrs.get("format") != UNCHECKED and file["loads"].attrs["digest"] != compute_loads_digest(loads):
         raise InputError(f"{file.filename}: the loads inside were changed after they were written: simulate again.")
     return loads
 
 
-def digest_of_loads(loads: Loads) -> str:
+def compute_loads_digest(loads: Loads) -> str:
     """Compute the hash of every cause's arrays, and of the time."""
     names = ",".join(sorted(type(cause).__name__ for cause in loads.causes)).encode()
     ordered = sorted(loads.causes, key=lambda cause: type(cause).__name__)
     arrays = [getattr(cause, item.name) for cause in ordered for item in fields(cause)]
-    return digest_of(np.frombuffer(names, np.uint8), *arrays, loads.times)
+    return compute_digest(np.frombuffer(names, np.uint8), *arrays, loads.times)
 
 
 def read_outcomes(file: h5py.File, group: str) -> tuple[Outcome, ...]:
     """Read the solver outcomes of `answers` or `unit`."""
-    return tuple(Outcome[name.decode()] for name in stored(file, f"{group}/outcome", "S")[:])
+    return tuple(Outcome[name.decode()] for name in read_stored(file, f"{group}/outcome", "S")[:])
 
 
-def stored(
+def read_stored(
     file: h5py.File, name: str, kinds: str, shape: tuple[int | None, ...] | None = None, largest: int = LARGEST_ARRAY
 ) -> h5py.Dataset:
     """Return an array in the file, of one of the NumPy `kinds`, and of a shape if given (None: any length).

@@ -9,42 +9,42 @@ import numpy as np
 
 from sim.loads import Pushed
 
-from ..array_functions import half_precision
+from ..array_functions import round_to_half
 from .cortex_patch import Patch
-from .indentation import Indented, relaxed_of
+from .indentation import Indented, get_relaxation
 
 Encoder = Callable[[Patch, Pushed], np.ndarray]
 
 
-def directions(pushed: Pushed) -> tuple[np.ndarray, np.ndarray]:
+def split_forces(pushed: Pushed) -> tuple[np.ndarray, np.ndarray]:
     """Return force magnitudes (B,) [N] and unit directions (B, 3); the direction of zero force is zero."""
     magnitude = np.sqrt(np.einsum("bi,bi->b", pushed.force, pushed.force))
     # The root of the smallest number: squares of smaller forces underflow.
     return magnitude, pushed.force / np.maximum(magnitude, np.sqrt(np.finfo(float).tiny))[:, None]
 
 
-def nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
+def compute_nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
     """Compute forces (B, 3 m) at the patch's nodes, for one newton, by the FEM's own integral over the footprint."""
     weights = patch.skin.press(pushed.point, pushed.footprint).rows(len(patch.points))
-    return shared_out(weights.toarray(), pushed)
+    return distribute_forces(weights.toarray(), pushed)
 
 
-def rooted_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """Compute `nodal_shares` times the root of the force: products of two are those of forces, for one newton."""
-    return rooted(nodal_shares(patch, pushed), pushed)
+def compute_rooted_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
+    """Compute `compute_nodal_shares` times the root of the force: products of two are those of forces, for one newton."""
+    return scale_by_root_force(compute_nodal_shares(patch, pushed), pushed)
 
 
-def rooted(shares: np.ndarray, pushed: Pushed) -> np.ndarray:
+def scale_by_root_force(shares: np.ndarray, pushed: Pushed) -> np.ndarray:
     """Multiply shares (B, 3 m) for one newton by the root of each load's force."""
-    return np.sqrt(directions(pushed)[0])[:, None] * shares
+    return np.sqrt(split_forces(pushed)[0])[:, None] * shares
 
 
-def shared_out(weights: np.ndarray, pushed: Pushed) -> np.ndarray:
+def distribute_forces(weights: np.ndarray, pushed: Pushed) -> np.ndarray:
     """Compute forces (B, 3 m) at m nodes, for one newton, distributed by weights (B, m)."""
-    return np.einsum("bm,bi->bmi", weights, directions(pushed)[1]).reshape(-1, 3 * weights.shape[1])
+    return np.einsum("bm,bi->bmi", weights, split_forces(pushed)[1]).reshape(-1, 3 * weights.shape[1])
 
 
-def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
+def compute_tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     """Compute point [m], unit direction, force [N] and footprint radius [m]: (B, 8).
 
     For a rod or a blade followed by its shaft, and products x_i x_j of its other axis, which do not depend on its sign:
@@ -53,7 +53,7 @@ def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     The published 13 features describe the load relative to one node (its distance, its angles). A model of all nodes at
     once needs the load alone, because the basis holds the positions of the nodes.
     """
-    magnitude, direction = directions(pushed)
+    magnitude, direction = split_forces(pushed)
     found = [pushed.point, direction, magnitude, pushed.footprint]
     if isinstance(pushed, Indented):
         x, first, second = pushed.axes[:, :, 0], *np.triu_indices(3)
@@ -61,10 +61,10 @@ def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     return np.column_stack([*found, *_relaxed(pushed)])
 
 
-def core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """Compute a rod's or blade's pose (B, 17): `tool_features` of a ball, centre of its core [m], its axes x and z.
+def compute_core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
+    """Compute a rod's or blade's pose (B, 17): `compute_tool_features` of a ball, centre of its core [m], its axes x and z.
 
-    Last, for relaxing tissue, as `tool_features`.
+    Last, for relaxing tissue, as `compute_tool_features`.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     """
     if not isinstance(pushed, Indented):
         raise TypeError("only rods and blades have a core that stands: give `Indented`.")
-    magnitude, direction = directions(pushed)
+    magnitude, direction = split_forces(pushed)
     middle = pushed.point + pushed.force + pushed.offset
     axes = pushed.axes[:, :, 0], pushed.axes[:, :, 2]
     found = [pushed.point, direction, magnitude, pushed.footprint, middle, *axes]
@@ -82,15 +82,15 @@ def core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
 
 def _relaxed(pushed: Pushed) -> list[np.ndarray]:
     """Return the relaxed share of tissue (B,), if it relaxes: a list of one, or of none."""
-    known = relaxed_of(pushed)
+    known = get_relaxation(pushed)
     return [] if known is None else [known]
 
 
 ENCODERS: dict[str, Encoder] = {
-    "nodal": nodal_shares,
-    "rooted": rooted_shares,
-    "tool": tool_features,
-    "core": core_features,
+    "nodal": compute_nodal_shares,
+    "rooted": compute_rooted_shares,
+    "tool": compute_tool_features,
+    "core": compute_core_features,
 }
 
 
@@ -129,4 +129,4 @@ def reduce(nodes: np.ndarray, response: np.ndarray, tolerance: float, most: int)
     left = np.sqrt(np.maximum(0.0, 1.0 - np.cumsum(size**2) / np.sum(size**2)))
     rank = min(most, int(np.searchsorted(-left, -tolerance)) + 1, len(size))
     complete = rank == matrix.shape[1]
-    return Basis(nodes, np.eye(rank, dtype=np.float32) if complete else half_precision(modes[:rank]))
+    return Basis(nodes, np.eye(rank, dtype=np.float32) if complete else round_to_half(modes[:rank]))

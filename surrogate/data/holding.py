@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim.deformation import Deformation, Deformer, joined
+from sim.deformation import Deformation, Deformer, join_deformations
 from sim.effects import Effect, Elasticity
 from sim.errors import InputError
 from sim.loads import Loads
-from sim.material import Pairs, tissue_from_json
+from sim.material import Pairs, read_tissue_json
 
 BROUGHT = 1.0
 """Maximum time that a tool takes to arrive [s]."""
@@ -25,7 +25,7 @@ SOONEST, LATEST = 0.05, 100.0
 """Range of sampled times [s]."""
 
 
-def drawn_times(count: int, seed: int) -> np.ndarray:
+def sample_times(count: int, seed: int) -> np.ndarray:
     """Sample times (count,) [s] of histories, uniform in their logarithm; time i does not depend on count.
 
     Scenes last a few seconds; slower relaxation matters for a tool that stays.
@@ -34,13 +34,13 @@ def drawn_times(count: int, seed: int) -> np.ndarray:
     return SOONEST * (LATEST / SOONEST) ** source.random(count)
 
 
-def series_of(effects: Iterable[Effect]) -> Pairs:
+def get_relaxation_series(effects: Iterable[Effect]) -> Pairs:
     """Return the Prony series of the effects' tissue; () if it does not relax."""
     defaults = (effect.default for effect in effects if isinstance(effect, Elasticity))
     return next((tissue.prony for tissue in defaults if tissue is not None), ())
 
 
-def held(deformer: Deformer, loads: Loads) -> Deformation:
+def solve_histories(deformer: Deformer, loads: Loads) -> Deformation:
     """Solve histories of B loads: two time steps, of which the second is skipped while a tool still arrives.
 
     A tool without an equilibrium in the first step is not held further, and its result has that outcome.
@@ -52,10 +52,10 @@ def held(deformer: Deformer, loads: Loads) -> Deformation:
     last = deformer.deform(loads.rows(stay), start=first.rows(stay))
     row = np.arange(len(loads))
     row[stay] = len(loads) + np.arange(len(stay))
-    return replace(joined([first, last]).rows(row), time=loads.times)
+    return replace(join_deformations([first, last]).rows(row), time=loads.times)
 
 
-def unfaded(series: Pairs, times: np.ndarray) -> np.ndarray:
+def compute_unfaded(series: Pairs, times: np.ndarray) -> np.ndarray:
     """Compute the remainder (B, n) of each g of a series at the end of histories of B times [s].
 
     As in the FEM's time steps: load that arrives within a step acts for half of it.
@@ -65,10 +65,10 @@ def unfaded(series: Pairs, times: np.ndarray) -> np.ndarray:
     return g * np.exp(-(times - 0.5 * coming)[:, None] / tau)
 
 
-def stated_series(stated: Mapping[str, str]) -> Pairs:
+def read_series(stated: Mapping[str, str]) -> Pairs:
     """Read the Prony series of a data set of histories from its provenance; () for other data."""
     if "history" not in stated or "tissue" not in stated:
         return ()
     if stated["history"] != HISTORY:
         raise InputError(f"unsupported histories ({stated['history']}): simulate again.")
-    return tissue_from_json(stated["tissue"]).prony
+    return read_tissue_json(stated["tissue"]).prony

@@ -12,10 +12,10 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, Retracted, Touching
-from sim.tools import Ball, BuiltIn, Capsule, Core, core_of, extent_of, named
+from sim.tools import Ball, BuiltIn, Capsule, Core, compute_extent, get_core, name_tool
 
 from .cortex_patch import Patch
-from .tool_loads import axes_about
+from .tool_loads import build_axes_about
 
 # Distance of a foot from the surface [m] below which the surface's normal is used.
 ON_IT = 1e-6
@@ -49,18 +49,18 @@ class RelaxingIndented(Indented):
     relaxed: np.ndarray
 
 
-def with_relaxed(pushed: Pushed, relaxed: np.ndarray) -> Pushed:
+def add_relaxation(pushed: Pushed, relaxed: np.ndarray) -> Pushed:
     """Return the same indentations in tissue relaxed by shares (B,)."""
     kind = RelaxingIndented if isinstance(pushed, Indented) else Relaxing
     return kind(**vars(pushed), relaxed=relaxed)
 
 
-def relaxed_of(pushed: Pushed) -> np.ndarray | None:
+def get_relaxation(pushed: Pushed) -> np.ndarray | None:
     """Return the relaxed share of tissue (B,); None if it does not relax."""
     return pushed.relaxed if isinstance(pushed, Relaxing | RelaxingIndented) else None
 
 
-def posed(loads: Loads, tool: BuiltIn) -> np.ndarray:
+def get_poses(loads: Loads, tool: BuiltIn) -> np.ndarray:
     """Return T_world_tool (B, 4, 4) of one tool: of `Touching` of it alone, or of a blade's `Retracted`.
 
     Raises
@@ -74,7 +74,7 @@ def posed(loads: Loads, tool: BuiltIn) -> np.ndarray:
     if retracted is None:
         names = ", ".join(type(cause).__name__ for cause in loads.causes) or "none"
         raise InputError(
-            f"the loads have the causes {names}, but this model was trained on the poses of {named(tool)}: give "
+            f"the loads have the causes {names}, but this model was trained on the poses of {name_tool(tool)}: give "
             "`Touching` of one tool alone, or ask the finite elements."
         )
     pose = retracted.pose.copy()
@@ -82,7 +82,7 @@ def posed(loads: Loads, tool: BuiltIn) -> np.ndarray:
     return pose
 
 
-def indented(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
+def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     """Convert one tool's poses to pushes: point (B, 3) [m] nearest to its foot, normal depth as force [m], radius.
 
     The foot is the centre of a ball, of a rod's lower end, or of a blade. A tool without contact has depth zero.
@@ -92,12 +92,12 @@ def indented(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     InputError
         Loads that are not the poses of one tool.
     """
-    pose, core = posed(loads, tool), core_of(tool)
+    pose, core = get_poses(loads, tool), get_core(tool)
     foot = pose[:, :3, 3] + pose[:, :3, :3] @ (core.centre - [0.0, 0.0, core.half[2]])
     at = np.einsum("bij,kj->bki", pose[:, :3, :3], _places(core)) + pose[:, None, :3, 3]
     near, off = _off(patch, np.concatenate([foot, at.reshape(-1, 3)]))
     point, distance = near[: len(pose)], off[: len(pose)]
-    inward = patch.normal_near(point)
+    inward = patch.find_normals(point)
     on_it = np.abs(distance) < ON_IT
     direction = np.where(on_it[:, None], inward, (point - foot) / np.where(on_it, 1.0, distance)[:, None])
     if isinstance(tool, Ball):
@@ -107,9 +107,9 @@ def indented(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     force = np.maximum(deepest, 0.0)[:, None] * direction
     axes = pose[:, :3, :3]
     if isinstance(tool, Capsule):  # a rod is round: its turn about the shaft does not matter
-        axes = axes_about(axes[:, :, 2])
+        axes = build_axes_about(axes[:, :, 2])
     middle = pose[:, :3, 3] + pose[:, :3, :3] @ core.centre
-    wide = np.full(len(pose), core.radius if isinstance(tool, Capsule) else extent_of(tool))
+    wide = np.full(len(pose), core.radius if isinstance(tool, Capsule) else compute_extent(tool))
     return Indented(point, force, wide, axes, middle - point - force)
 
 
@@ -117,7 +117,7 @@ def _off(patch: Patch, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the nearest places (n, 3) on the undeformed cortex to points (n, 3), and their signed distances (n,) [m]."""
     near = patch.skin.nearest(points, np.full(len(points), np.inf))[0]
     away = near - points
-    return near, np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, patch.normal_near(near)))
+    return near, np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, patch.find_normals(near)))
 
 
 def _places(core: Core) -> np.ndarray:

@@ -17,31 +17,31 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformer
 from sim.errors import InputError
 from sim.loads import Loads, Touching
-from sim.runtime.atomic_files import check_output, demand_space, written_stream
-from sim.runtime.journal import Batch, DamageWarning, Journal, demand_same, opened
+from sim.runtime.atomic_files import check_disk_space, check_output, write_stream_atomically
+from sim.runtime.journal import Batch, DamageWarning, Journal, check_same_description, open_journal
 from sim.runtime.outside_files import read_as
-from sim.runtime.partial_files import unfinished_path
+from sim.runtime.partial_files import to_unfinished_path
 from sim.runtime.processes import LostError
-from sim.runtime.timing import listened, stage
-from sim.runtime.versions import version_of
+from sim.runtime.timing import listen_to_stages, time_stage
+from sim.runtime.versions import get_version
 
-from .answer_rows import CHECKSUM, checksums, row_type
+from .answer_rows import CHECKSUM, compute_row_checksums, get_row_type
 from .array_meanings import TITLE, explain
 from .cortex_patch import open_patch
 from .dataset import (
     FORMAT,
     UNCHECKED,
-    digest_of_loads,
-    provenance_of,
+    compute_loads_digest,
     read_embedded,
     read_loads,
+    read_provenance,
     read_rows,
-    stored,
+    read_stored,
     write_embedded,
     write_loads,
     write_provenance,
 )
-from .tasks import LoadBatch, SolverPool, answered, posed_tools
+from .tasks import LoadBatch, SolverPool, count_posed_tools, solve_batches
 
 # Names of the file's groups in reports of their seconds.
 STAGES = {"unit": "unit responses", "answers": "loads"}
@@ -92,7 +92,7 @@ class SimulationWork:
 
     def row(self, group: str) -> np.dtype:
         """Return the row type of a group."""
-        return row_type(len(self.anatomy.mesh.nodes), posed_tools(self.loads) if group == "answers" else 0)
+        return get_row_type(len(self.anatomy.mesh.nodes), count_posed_tools(self.loads) if group == "answers" else 0)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -154,11 +154,11 @@ def simulate(
     if batch < 1:
         raise InputError(f"a batch of {batch} solves nothing: give --batch >= 1.")
     check_output(path, path.suffix)
-    posed = posed_tools(loads) > 0
+    posed = count_posed_tools(loads) > 0
     nodes = np.zeros(0, int) if posed else open_patch(deformer.anatomy).nodes
     stated = {**provenance, "format": FORMAT, "anatomy": deformer.anatomy.digest, "batch": str(batch)}
     stated |= {"reactions": "kept"} if posed else {}
-    partial = unfinished_path(path)
+    partial = to_unfinished_path(path)
     finished: set[Batch] = set()
     work = SimulationWork(deformer.anatomy, loads, nodes, batch)
     if path.exists():
@@ -170,14 +170,14 @@ def simulate(
             return SimulatedRows()
     size = sum(work.row(group).itemsize * rows for group, rows in work.counts.items())
     held = partial.stat().st_size if partial.exists() else 0
-    demand_space(path, max(size - held, 0) + size, size)
-    run = {**stated, "number of loads": str(len(work.loads)), "hash of the loads": digest_of_loads(work.loads)}
-    with listened() as seconds, opened(partial, run) as journal:
+    check_disk_space(path, max(size - held, 0) + size, size)
+    run = {**stated, "number of loads": str(len(work.loads)), "hash of the loads": compute_loads_digest(work.loads)}
+    with listen_to_stages() as seconds, open_journal(partial, run) as journal:
         try:
             solved = _fill(journal, work, deformer, finished, progress)
         except LostError as error:
             raise InputError(f"{error} What was solved is kept: the same command resumes.") from error
-        with stage(STAGES["answers"]):
+        with time_stage(STAGES["answers"]):
             _write(path, work, {**stated, **_rates(path, solved, seconds)}, journal)
     partial.unlink(missing_ok=True)
     return SimulatedRows(solved["unit"], solved["answers"], *(seconds[name] for name in STAGES.values()))
@@ -198,9 +198,9 @@ def _fill(
     with ThreadPoolExecutor(1) as writer:
         for name in work.counts:
             written: Future[None] | None = None
-            with stage(STAGES[name]):
+            with time_stage(STAGES[name]):
                 left = [work.task(batch) for batch in work.batches if batch[0] == name and batch not in known]
-                for task, rows in answered(deformer, left):
+                for task, rows in solve_batches(deformer, left):
                     if written is not None:
                         written.result()
                     written = writer.submit(journal.add, task.batch, rows)
@@ -220,7 +220,7 @@ def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) 
     before: dict[str, str] = {}
     if path.exists():
         with h5py.File(path, "r") as file:
-            before = provenance_of(file)
+            before = read_provenance(file)
     rates = {}
     for name, words in RATES.items():
         if solved[name]:
@@ -232,7 +232,7 @@ def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) 
 
 def _write(path: Path, work: SimulationWork, stated: Mapping[str, str], journal: Journal) -> None:
     """Write the data set: batches of the journal, and those of the finished file that it replaces."""
-    with written_stream(path, path.suffix) as stream, h5py.File(stream, "w", libver=READERS) as file:
+    with write_stream_atomically(path, path.suffix) as stream, h5py.File(stream, "w", libver=READERS) as file:
         facts = {
             "title": TITLE,
             "length_unit": "m",
@@ -241,7 +241,7 @@ def _write(path: Path, work: SimulationWork, stated: Mapping[str, str], journal:
             "tool": _tool(work.loads, stated),
             "compression": "none: packed, displacements are a sixth smaller",
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            "sulcus version": version_of("sulcus"),
+            "sulcus version": get_version("sulcus"),
         }
         write_provenance(file, {**facts, **stated})
         write_embedded(file, work.anatomy)
@@ -262,7 +262,7 @@ def _write(path: Path, work: SimulationWork, stated: Mapping[str, str], journal:
         def taken(batch: Batch) -> tuple[np.ndarray, np.ndarray]:
             kind = work.row(batch[0])
             rows = np.frombuffer(journal.read(batch), kind) if batch in journal else _kept(path, work, batch)
-            return rows, checksums(rows)
+            return rows, compute_row_checksums(rows)
 
         for batch, (rows, sums) in _ahead(taken, work.batches):
             here = slice(batch[1], batch[1] + len(rows))
@@ -307,13 +307,13 @@ def _batch(file: h5py.File, work: SimulationWork, batch: Batch) -> tuple[np.ndar
 def _earlier(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
     """Read the loads of a finished file; check that they and `loads` share their first rows, and the provenance."""
     with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
-        recorded = provenance_of(file)
+        recorded = read_provenance(file)
         if recorded.get("format") == UNCHECKED:
             raise InputError(f"{path}: is of an earlier version, whose files do not go on: choose another --out.")
-        demand_same(path, recorded, stated, "made", "")
+        check_same_description(path, recorded, stated, "made", "")
         before = read_loads(file)
     shared = np.arange(min(len(before), len(loads)))
-    if digest_of_loads(before.rows(shared)) != digest_of_loads(loads.rows(shared)):
+    if compute_loads_digest(before.rows(shared)) != compute_loads_digest(loads.rows(shared)):
         raise InputError(f"{path}: holds other loads than these: choose another --out.")
     return before
 
@@ -334,7 +334,7 @@ def _whole_batches(path: Path, work: SimulationWork) -> set[Batch]:
     """
     held, damaged = set(), []
     with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
-        rows = {name: len(stored(file, f"{name}/checksum", "u")) for name in work.counts}
+        rows = {name: len(read_stored(file, f"{name}/checksum", "u")) for name in work.counts}
         for batch in work.batches:
             numbers = work.rows(batch)
             if numbers[-1] < rows[batch[0]] and (rows[batch[0]] == work.counts[batch[0]] or len(numbers) == work.batch):

@@ -9,9 +9,9 @@ import numpy as np
 from sim.errors import InputError
 from sim.loads import Pushed
 
-from .cortex_patch import Patch, nearest
-from .encode import directions
-from .tool_loads import across, spread
+from .cortex_patch import Patch, find_nearest
+from .encode import split_forces
+from .tool_loads import find_perpendiculars, spread
 
 FEWEST, MOST, SHARE = 6, 200, 0.15
 # Fraction 1/n of the loads, and maximum number, set aside from every split to calibrate bounds.
@@ -54,7 +54,7 @@ class DiscSplit:
 
     def covers(self, points: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of points (n, 3) [m] in a disc, where a scored model must not be given any data."""
-        return nearest(points, self.centres)[1] <= self.radius
+        return find_nearest(points, self.centres)[1] <= self.radius
 
     def summary(self) -> str:
         """Describe the held-out loads in one line [mm]."""
@@ -99,7 +99,7 @@ def _discs(points: np.ndarray, candidates: np.ndarray, patch: Patch, radius: flo
 
 
 def _split(points: np.ndarray, centres: np.ndarray, patch: Patch, radius: float) -> DiscSplit:
-    which, distance = nearest(points, centres)
+    which, distance = find_nearest(points, centres)
     return DiscSplit(centres, radius, np.where(distance <= radius, which, -1), patch.covered(centres, radius))
 
 
@@ -135,8 +135,8 @@ def leave_sectors_out(pushed: Pushed, patch: Patch) -> Sectors:
     """
     axis = patch.inward.mean(axis=0)
     axis /= np.linalg.norm(axis)
-    first, second = (side[0] for side in across(axis[None]))
-    force = directions(pushed)[1]
+    first, second = (side[0] for side in find_perpendiculars(axis[None]))
+    force = split_forces(pushed)[1]
     angle = np.arctan2(force @ second, force @ first) % (2.0 * np.pi)
     # The first sector is centred on `first`, so that a lattice of directions starting there is not cut at its edge.
     sector = np.rint(angle * SECTORS / (2.0 * np.pi)).astype(int) % SECTORS

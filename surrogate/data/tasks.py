@@ -13,7 +13,7 @@ from sim.loads import Loads, Nodal, Touching
 from sim.runtime.journal import Batch
 from sim.runtime.processes import Child, map_unordered
 
-from .answer_rows import rows_of
+from .answer_rows import select_rows
 from .cortex_patch import open_patch
 
 # Far inside the small-strain range: 1 uN on one node of brain tissue strains its elements by some 1e-5, so that one
@@ -38,31 +38,31 @@ class SolverPool:
     children: Sequence[Child]
 
 
-def answered(deformer: Deformer | SolverPool, tasks: Iterable[LoadBatch]) -> Iterator[tuple[LoadBatch, bytes]]:
-    """Yield each task with its rows from `solved`: one after the other in this process, by a crew in any order."""
+def solve_batches(deformer: Deformer | SolverPool, tasks: Iterable[LoadBatch]) -> Iterator[tuple[LoadBatch, bytes]]:
+    """Yield each task with its rows from `solve_batch`: one after the other in this process, by a crew in any order."""
     if isinstance(deformer, SolverPool):
-        yield from map_unordered(deformer.children, solved, tasks)
+        yield from map_unordered(deformer.children, solve_batch, tasks)
     else:
         for task in tasks:
-            yield task, solved(deformer, task)
+            yield task, solve_batch(deformer, task)
 
 
-def solved(deformer: Deformer, task: LoadBatch) -> bytes:
-    """Solve a batch (`answer_rows.row_type`). Every batch starts undeformed, independent of earlier ones."""
+def solve_batch(deformer: Deformer, task: LoadBatch) -> bytes:
+    """Solve a batch (`answer_rows.get_row_type`). Every batch starts undeformed, independent of earlier ones."""
     anatomy = deformer.anatomy
     unit = task.loads is None
-    loads = unit_loads(anatomy, task.rows) if task.loads is None else task.loads
+    loads = build_unit_loads(anatomy, task.rows) if task.loads is None else task.loads
     answer = deformer.deform(loads).at(np.arange(len(anatomy.mesh.nodes)))
-    return rows_of(answer, UNIT_FORCE if unit else 1.0, 0 if unit else posed_tools(loads)).tobytes()
+    return select_rows(answer, UNIT_FORCE if unit else 1.0, 0 if unit else count_posed_tools(loads)).tobytes()
 
 
-def posed_tools(loads: Loads) -> int:
+def count_posed_tools(loads: Loads) -> int:
     """Return the number of tools that the loads move by pose, whose reactions are stored; 0 for pushes."""
     touching = loads.of(Touching)
     return 0 if touching is None else touching.pose.shape[1]
 
 
-def unit_loads(anatomy: Anatomy, rows: np.ndarray) -> Loads:
+def build_unit_loads(anatomy: Anatomy, rows: np.ndarray) -> Loads:
     """Build loads of `UNIT_FORCE` at open-cortex node row // 3 along axis row % 3, for each of `rows` (B,)."""
     force = np.zeros((len(rows), len(anatomy.mesh.nodes), 3))
     force[np.arange(len(rows)), open_patch(anatomy).nodes[rows // 3], rows % 3] = UNIT_FORCE

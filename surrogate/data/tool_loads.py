@@ -11,7 +11,7 @@ from sim.errors import InputError
 from sim.loads import Loads, Pushed
 from sim.material import BRAIN
 
-from .cortex_patch import Patch, nearest, open_patch
+from .cortex_patch import Patch, find_nearest, open_patch
 
 ATTEMPTS = 2000
 # Loads sampled together (more only take memory); random numbers of a load in each attempt.
@@ -52,7 +52,7 @@ class ToolLoads:
     cone: float = np.pi / 4.0
     even: bool = False
 
-    def admits(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+    def is_surgical(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of surgical pressures and estimated depths; forces (n,) [N], radii (n,) [m]."""
         pressure = force / (np.pi * footprint**2)
         depth = 3.0 * force / (4.0 * PLANE_MODULUS * footprint)
@@ -101,7 +101,7 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     return Loads((Pushed(rows[:, :3], rows[:, 3:6], rows[:, 6]),))
 
 
-def drawn_of(tool: ToolLoads, patch: Patch, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def sample_pushes(tool: ToolLoads, patch: Patch, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample positions of a tool, and its unit directions, (count, 3) each: as `draw`, for any force."""
     free = replace(tool, pressure=(0.0, np.inf), depth=np.inf)
     rows = _in_blocks([free], patch, count, seed)
@@ -115,7 +115,7 @@ def _in_blocks(tools: list[ToolLoads], patch: Patch, count: int, seed: int) -> n
     return np.concatenate([_drawn(tools, patch, key, block) for block in blocks])
 
 
-def refused_share(preset: str) -> float:
+def compute_rejected_share(preset: str) -> float:
     """Compute the share of a preset's nominal loads, by radius and force, that are not sampled: too strong or too deep.
 
     No model is trained on them. Zero for other presets.
@@ -124,15 +124,18 @@ def refused_share(preset: str) -> float:
     middles = (np.arange(LATTICE) + 0.5) / LATTICE
     first, second = (axis.ravel() for axis in np.meshgrid(middles, middles))
     shares = [
-        1.0 - tool.admits(np.exp(between(np.log(tool.force), first)), between(tool.footprint, second)).mean()
+        1.0
+        - tool.is_surgical(
+            np.exp(interpolate_ends(np.log(tool.force), first)), interpolate_ends(tool.footprint, second)
+        ).mean()
         for tool in tools
     ]
     return float(np.mean(shares)) if shares else 0.0
 
 
-def refused_words(preset: str) -> str:
+def describe_rejected(preset: str) -> str:
     """Describe that share; empty if it is zero."""
-    share = refused_share(preset)
+    share = compute_rejected_share(preset)
     return (
         f"{100.0 * share:.0f} % of the nominal loads of {preset} (its forces on its radii) have a pressure or depth "
         "that surgery has not. They are not drawn, and lie outside the training range."
@@ -169,11 +172,15 @@ def _drawn_of(tool: ToolLoads, patch: Patch, key: int, block: range, rows: np.nd
         if not len(waiting):
             return out[rows]
         uniform = _uniform(key, attempt, block)[waiting]
-        footprint = between(tool.footprint, uniform[:, 0])
-        force = between(tool.force, uniform[:, 1]) if tool.even else np.exp(between(np.log(tool.force), uniform[:, 1]))
-        fits = np.flatnonzero(tool.admits(force, footprint))
+        footprint = interpolate_ends(tool.footprint, uniform[:, 0])
+        force = (
+            interpolate_ends(tool.force, uniform[:, 1])
+            if tool.even
+            else np.exp(interpolate_ends(np.log(tool.force), uniform[:, 1]))
+        )
+        fits = np.flatnonzero(tool.is_surgical(force, footprint))
         point, normal = patch.place(uniform[fits, 2:5])
-        inside = patch.rim_distance(point) >= footprint[fits]
+        inside = patch.compute_edge_distance(point) >= footprint[fits]
         fits, point, normal = fits[inside], point[inside], normal[inside]
         direction = _within_cone(normal, tool.cone, uniform[fits, 5:7])
         out[waiting[fits]] = np.column_stack([point, force[fits, None] * direction, footprint[fits]])
@@ -184,7 +191,7 @@ def _drawn_of(tool: ToolLoads, patch: Patch, key: int, block: range, rows: np.nd
     )
 
 
-def between(ends: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.ndarray:
+def interpolate_ends(ends: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.ndarray:
     """Interpolate between two ends, by uniform numbers (n,) in [0, 1)."""
     return ends[0] + (ends[1] - ends[0]) * uniform
 
@@ -193,21 +200,21 @@ def _within_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndar
     """Sample unit vectors (n, 3) within `angle` [rad] of unit vectors `axis` (n, 3), uniform by solid angle."""
     cosine = (1.0 - uniform[:, 0] * (1.0 - np.cos(angle)))[:, None]
     around = (2.0 * np.pi * uniform[:, 1])[:, None]
-    first, second = across(axis)
+    first, second = find_perpendiculars(axis)
     sideways = np.cos(around) * first + np.sin(around) * second
     return cosine * axis + np.sqrt(1.0 - cosine**2) * sideways
 
 
-def across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_perpendiculars(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute two unit vectors (n, 3) each, perpendicular to unit vectors `axis` (n, 3) and to each other."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(axis, first)
 
 
-def axes_about(shaft: np.ndarray) -> np.ndarray:
+def build_axes_about(shaft: np.ndarray) -> np.ndarray:
     """Build rotations (n, 3, 3) whose z are unit vectors `shaft` (n, 3), with arbitrary turns about them."""
-    return np.stack([*across(shaft), shaft], axis=2)
+    return np.stack([*find_perpendiculars(shaft), shaft], axis=2)
 
 
 POSITIONS, DIRECTIONS, MAGNITUDES = 11, 30, np.linspace(0.10, 1.05, 20)
@@ -226,7 +233,7 @@ def _published(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
         raise InputError("the anatomy has no tumour, so no position is 20-28 mm from it: choose another --preset.")
     centre = anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0)
     distance = np.linalg.norm(patch.points - centre, axis=1)
-    inside = patch.rim_distance(patch.points) >= PUBLISHED_FOOTPRINT
+    inside = patch.compute_edge_distance(patch.points) >= PUBLISHED_FOOTPRINT
     near = np.flatnonzero((distance >= 20e-3) & (distance <= 28e-3) & inside)
     if not len(near):
         raise InputError(
@@ -252,7 +259,7 @@ def spread(points: np.ndarray, count: int) -> np.ndarray:
     Starts at the point nearest to the mean, so that it depends on nothing but the points. Gonzalez 1985, Theor. Comput.
     Sci. 38:293-306.
     """
-    chosen = [int(nearest(points.mean(axis=0, keepdims=True), points)[0][0])]
+    chosen = [int(find_nearest(points.mean(axis=0, keepdims=True), points)[0][0])]
     distance = np.linalg.norm(points - points[chosen[0]], axis=1)
     while len(chosen) < count and distance.max() > 0.0:
         chosen.append(int(distance.argmax()))

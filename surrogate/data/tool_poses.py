@@ -10,10 +10,10 @@ from scipy.spatial import KDTree
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, Touching
-from sim.tools import Ball, BuiltIn, Capsule, Spatula, core_of, distances_to, extent_of
+from sim.tools import Ball, BuiltIn, Capsule, Spatula, compute_distances, compute_extent, get_core
 
-from .cortex_patch import Patch, barycentric_lattice, open_patch
-from .tool_loads import TOOLS, across, axes_about, between, draw, drawn_of
+from .cortex_patch import Patch, build_barycentric_lattice, open_patch
+from .tool_loads import TOOLS, build_axes_about, draw, find_perpendiculars, interpolate_ends, sample_pushes
 
 # Presets that a ball can represent.
 ROUND = ("palpation", "bipolar", "dissector")
@@ -27,7 +27,7 @@ TOUCHES, STEPS, ROWS = 1e-6, 200, 4
 AROUND = 10e-3
 
 
-def tool_of(preset: str) -> Ball:
+def choose_ball(preset: str) -> Ball:
     """Return the ball that represents a round tool, with the mean of the tool's radii.
 
     Raises
@@ -59,40 +59,42 @@ def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, tool: Built
     Raises
     ------
     InputError
-        As `draw` and `tool_of`.
+        As `draw` and `choose_ball`.
     """
-    tool, patch = tool_of(preset) if tool is None else tool, open_patch(anatomy)
+    tool, patch = choose_ball(preset) if tool is None else tool, open_patch(anatomy)
     source = np.random.Generator(np.random.Philox(key=seed))
     if isinstance(tool, Ball):
         (pushed,) = draw(preset, anatomy, count, seed).every(Pushed)
         direction = pushed.force / np.linalg.norm(pushed.force, axis=1, keepdims=True)
-        depth = between((SHALLOW * tool.radius, min(DEEP * tool.radius, TOOLS[preset].depth)), source.random(count))
-        return Loads((poses_at(tool, pushed.point, patch.normal_near(pushed.point), depth[:, None] * direction),))
+        depth = interpolate_ends(
+            (SHALLOW * tool.radius, min(DEEP * tool.radius, TOOLS[preset].depth)), source.random(count)
+        )
+        return Loads((compute_poses(tool, pushed.point, patch.find_normals(pushed.point), depth[:, None] * direction),))
     if isinstance(tool, Capsule):
         room, deepest, cone = tool.radius, ROD * tool.radius, TOOLS[preset].cone
     else:
-        room, deepest, cone = extent_of(tool), BLADE * tool.width, LEAN
+        room, deepest, cone = compute_extent(tool), BLADE * tool.width, LEAN
     kind = replace(TOOLS[preset], name=type(tool).__name__, footprint=(room, room), cone=cone)
-    point, direction = drawn_of(kind, patch, count, seed)
+    point, direction = sample_pushes(kind, patch, count, seed)
     share = source.random((count, 2))
-    depth = between((SHALLOW * core_of(tool).radius, min(deepest, TOOLS[preset].depth)), share[:, 0])
+    depth = interpolate_ends((SHALLOW * get_core(tool).radius, min(deepest, TOOLS[preset].depth)), share[:, 0])
     rotation = _turned(-direction, 2.0 * np.pi * share[:, 1])
     return Loads((_lowered(tool, patch, point, rotation, depth),))
 
 
-def poses_at(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.ndarray) -> Touching:
+def compute_poses(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.ndarray) -> Touching:
     """Compute poses of a ball: first contact at point (B, 3) [m] with inward normal (B, 3), then motion (B, 3)."""
     shaft = -motion / np.linalg.norm(motion, axis=1, keepdims=True)
     pose = np.zeros((len(point), 1, 4, 4))
     pose[:, 0, 3, 3] = 1.0
     pose[:, 0, :3, 3] = point + motion - ball.radius * (normal + shaft)
-    pose[:, 0, :3, :3] = axes_about(shaft)
+    pose[:, 0, :3, :3] = build_axes_about(shaft)
     return Touching(pose)
 
 
 def _turned(shaft: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Build rotations (B, 3, 3) whose z is `shaft` (B, 3), turned about it by angles (B,) [rad]."""
-    first, second = across(shaft)
+    first, second = find_perpendiculars(shaft)
     x = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
     return np.stack([x, np.cross(shaft, x), shaft], axis=2)
 
@@ -105,16 +107,16 @@ def _lowered(
     Each step is the distance to the surface's nearest point (Hart 1996, "Sphere tracing", Visual Comput. 12:527-545).
     The surface is sampled by `ROWS`^2 points a triangle.
     """
-    share = barycentric_lattice(ROWS)
+    share = build_barycentric_lattice(ROWS)
     surface = np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)
-    reach, tree = extent_of(tool), KDTree(surface)
+    reach, tree = compute_extent(tool), KDTree(surface)
     pose = np.tile(np.eye(4), (len(point), 1, 1, 1))
     pose[:, 0, :3, :3] = rotation
     for here, start, shaft, deep in zip(pose[:, 0], point, rotation[:, :, 2], depth, strict=True):
         near = surface[tree.query_ball_point(start, 3.0 * max(reach, AROUND))]
         here[:3, 3] = start + reach * shaft
         for _ in range(STEPS):
-            room = float(distances_to(tool, here, near).min())
+            room = float(compute_distances(tool, here, near).min())
             if room < TOUCHES:
                 break
             here[:3, 3] -= room * shaft

@@ -65,7 +65,7 @@ def _time(offer: Offer) -> tuple[float, float]:
     return offer.median_ms, offer.error_mm
 
 
-def unbeaten(places: Mapping[str, tuple[float, float]]) -> frozenset[str]:
+def find_pareto_front(places: Mapping[str, tuple[float, float]]) -> frozenset[str]:
     """Return the names on the Pareto front of two numbers (smaller is better), equals included."""
     return frozenset(
         name

@@ -10,7 +10,7 @@ from sim.deformation import Deformation, Outcome
 from sim.errors import InputError
 from sim.loads import Loads
 
-from ..data.encode import directions
+from ..data.encode import split_forces
 from ..model.conformal import LEVELS
 from ..model.learned import Learned
 
@@ -48,7 +48,7 @@ class Coverage:
     def __str__(self) -> str:
         tenths = " ".join(f"{100 * share:.0f}" for share in self.tenths)
         return (
-            f"{held_words(self.held)}; by tenths of force {tenths}; median bound {self.bound_mm:.4f} mm, median error "
+            f"{format_held(self.held)}; by tenths of force {tenths}; median bound {self.bound_mm:.4f} mm, median error "
             f"{self.error_mm:.4f} mm; {self.extrapolated} loads outside the training range"
         )
 
@@ -69,7 +69,7 @@ def coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
     return _covered(model, loads, answer, worst, answer.bound)
 
 
-def distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
+def measure_distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
     """Compute the coverage of the bound of a model's distance, by the FEM distances `truth` (B,) [m].
 
     Raises
@@ -90,7 +90,7 @@ def _demand_tenths(loads: Loads) -> None:
         raise InputError(f"{len(loads)} loads have no tenths: simulate at least {TENTHS}.")
 
 
-def held_by(error: np.ndarray, bound: np.ndarray) -> Held:
+def measure_held(error: np.ndarray, bound: np.ndarray) -> Held:
     """Compute shares of errors (B,) within bounds (levels, B) of the same unit; None if all bounds are infinite."""
     promised = ~np.isposinf(bound)
     return tuple(
@@ -98,7 +98,7 @@ def held_by(error: np.ndarray, bound: np.ndarray) -> Held:
     )
 
 
-def held_words(held: Held) -> str:
+def format_held(held: Held) -> str:
     """Describe the coverage at each level."""
     shares = zip(held, LEVELS, strict=True)
     return ", ".join(
@@ -107,13 +107,13 @@ def held_words(held: Held) -> str:
     )
 
 
-def covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolated: int) -> Coverage:
+def measure_covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolated: int) -> Coverage:
     """Compute the coverage of errors (B,) [m] by bounds (2, B) [m], overall and by deciles of force (B,) [N]."""
     held = error <= bound[0]
     by_force = np.array_split(np.argsort(force, kind="stable"), TENTHS)
     return Coverage(
         len(error),
-        held_by(error, bound),
+        measure_held(error, bound),
         tuple(float(held[rows].mean()) for rows in by_force),
         1e3 * float(np.median(bound[0])),
         1e3 * float(np.median(error)),
@@ -122,5 +122,5 @@ def covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolate
 
 
 def _covered(model: Learned, loads: Loads, answer: Deformation, error: np.ndarray, bound: np.ndarray) -> Coverage:
-    force = directions(model.asked(loads))[0]
-    return covered(force, error, bound, answer.outcome.count(Outcome.EXTRAPOLATED))
+    force = split_forces(model.asked(loads))[0]
+    return measure_covered(force, error, bound, answer.outcome.count(Outcome.EXTRAPOLATED))

@@ -12,11 +12,11 @@ import numpy as np
 from sim.deformation import Deformer
 from sim.errors import InputError
 from sim.loads import Loads
-from sim.runtime.threads import one_thread
+from sim.runtime.threads import limit_to_one_thread
 
 from ..model.learned import Learned
 from ..model.left_out import FEWEST_FOR_P999
-from .coverage import Held, held_by, held_words
+from .coverage import Held, format_held, measure_held
 
 
 @dataclass(frozen=True)
@@ -85,19 +85,19 @@ class ForceScore:
     def __str__(self) -> str:
         promised = "no bounds"
         if self.held is not None and self.bound is not None:
-            promised = f"bounds held for {held_words(self.held)}; median bound {self.bound:.4f} N"
+            promised = f"bounds held for {format_held(self.held)}; median bound {self.bound:.4f} N"
         return (
             f"mean error {self.mean:.4f} N of {self.force:.3f} N, {self.mean_percent:.2f} % of each load's force, "
             f"p95 {self.p95_percent:.2f} %; {promised}"
         )
 
 
-def force_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def compute_force_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Compute the norms (B,) [N] of the differences between forces (B, 3)."""
     return np.linalg.norm(found - truth, axis=1)
 
 
-def force_score(error: np.ndarray, truth: np.ndarray, bound: np.ndarray | None = None) -> ForceScore:
+def score_forces(error: np.ndarray, truth: np.ndarray, bound: np.ndarray | None = None) -> ForceScore:
     """Score errors (B,) [N] of true forces (B, 3) [N], with bounds (2, B) [N] if there are any.
 
     Raises
@@ -120,15 +120,15 @@ def force_score(error: np.ndarray, truth: np.ndarray, bound: np.ndarray | None =
         float(error[some].mean()),
         float(share.mean()),
         float(np.percentile(share, 95.0)),
-        held_by(error[some], bound[:, some]) if bound is not None else None,
+        measure_held(error[some], bound[:, some]) if bound is not None else None,
         float(np.median(bound[0, some])) if bound is not None else None,
     )
 
 
-def judged_force(model: Learned, loads: Loads, truth: np.ndarray) -> ForceScore:
+def compare_forces(model: Learned, loads: Loads, truth: np.ndarray) -> ForceScore:
     """Score a model's forces relative to FEM forces (B, 3) [N]."""
     answer = model.deform(loads, at=model.anatomy.tumour_nodes)
-    return force_score(force_errors(answer.reaction[:, 0, :3], truth), truth, answer.reaction_bound)
+    return score_forces(compute_force_errors(answer.reaction[:, 0, :3], truth), truth, answer.reaction_bound)
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class Score:
     solves: SolveCounts | None = None
 
 
-def errors(deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+def compute_point_errors(deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Compute errors (B, n) [m] of a deformer relative to `truth` (B, n, 3) [m] at `nodes` (n,)."""
     return np.linalg.norm(deformer.deform(loads, at=nodes).displacement - truth, axis=2)
 
@@ -179,35 +179,35 @@ def score(
     name: str, deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray, solves: SolveCounts | None = None
 ) -> Score:
     """Score a deformer relative to `truth` (B, n, 3) [m] at the vertices `nodes` (n,)."""
-    distance = errors(deformer, loads, truth, nodes)
+    distance = compute_point_errors(deformer, loads, truth, nodes)
     motion = np.linalg.norm(truth, axis=2).mean(axis=1, keepdims=True)
     return Score(
         name,
         *spread(1e3 * distance),
         *spread(100.0 * distance / motion),
         *spread(1e3 * distance.max(axis=1))[:3],
-        microseconds(deformer, loads, nodes),
-        bare_microseconds(deformer, loads),
+        time_single_load(deformer, loads, nodes),
+        time_model_alone(deformer, loads),
         solves,
     )
 
 
-def microseconds(deformer: Deformer, loads: Loads, nodes: np.ndarray) -> float:
+def time_single_load(deformer: Deformer, loads: Loads, nodes: np.ndarray) -> float:
     """Measure the median wall time [us] of one load at a time."""
-    return 1e6 * float(np.median(single_seconds(deformer, loads, nodes, TIMED)))
+    return 1e6 * float(np.median(time_single_loads(deformer, loads, nodes, TIMED)))
 
 
-def bare_microseconds(deformer: Deformer, loads: Loads) -> float | None:
+def time_model_alone(deformer: Deformer, loads: Loads) -> float | None:
     """Measure the median wall time [us] of a trained model alone, of one load at a time; None for other deformers."""
     if not isinstance(deformer, Learned):
         return None
     single = [deformer.asked(loads.rows(slice(row, row + 1))) for row in np.arange(WARM_UP + TIMED) % len(loads)]
     nodes = deformer.anatomy.tumour_nodes
-    with one_thread():
+    with limit_to_one_thread():
         return 1e6 * float(np.median(_timed(lambda one: deformer.motion(one, nodes), single)))
 
 
-def single_seconds(deformer: Deformer, loads: Loads, nodes: np.ndarray, count: int) -> list[float]:
+def time_single_loads(deformer: Deformer, loads: Loads, nodes: np.ndarray, count: int) -> list[float]:
     """Measure wall times [s] of `count` solves of one load at a time, cycling through the loads, warm-up excluded."""
     single = [loads.rows(slice(row, row + 1)) for row in np.arange(WARM_UP + count) % len(loads)]
     return _timed(lambda one: deformer.deform(one, at=nodes), single)
@@ -223,12 +223,12 @@ def _timed(answer: Callable[[T], object], single: Iterable[T]) -> list[float]:
     return seconds[WARM_UP:]
 
 
-def winner(scores: Sequence[Score]) -> Score:
+def find_best(scores: Sequence[Score]) -> Score:
     """Return the score with the smallest mean error."""
     return min(scores, key=lambda row: row.mean_mm)
 
 
-def table(scores: Sequence[Score], motion_mm: float) -> str:
+def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
     """Format the scores, the best of several, and the solves that model types depend on, if known."""
     head = (
         "          mm, all vertices                | mm, a load's worst vertex  | % of motion                 "
@@ -243,7 +243,7 @@ def table(scores: Sequence[Score], motion_mm: float) -> str:
         f"{'' if row.bare_microseconds is None else f'{row.bare_microseconds:.0f}':>5} |{row.microseconds:5.0f}"
         for row in scores
     ]
-    best = winner(scores)
+    best = find_best(scores)
     fastest = min(scores, key=lambda row: row.microseconds)
     verdict = f"{best.mean_mm:.4f} mm mean error at a mean motion of {motion_mm:.3f} mm"
     wins = f"{best.name} wins: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"

@@ -15,18 +15,26 @@ from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.runtime.threads import one_thread
+from sim.runtime.threads import limit_to_one_thread
 
 from ..locating.causes import LETS_GO, YOUNG, Group
 from ..locating.ensemble import ACCURACY
 from ..locating.evidence import Evidence
 from ..locating.locator import Locator
-from ..locating.observation import placed
+from ..locating.observation import to_evidence
 from ..locating.regions import Region
-from .frame import FORCE_SIGMA, Frame, Tool, check_frames, foot
-from .responses import FORCE, POISSONS, RATIOS, Responses, drained_loads, force_loads, responses
+from .frame import FORCE_SIGMA, Frame, Tool, check_frames, find_foot
+from .responses import FORCE, POISSONS, RATIOS, Responses, build_drained_loads, build_force_loads, solve_responses
 from .tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
-from .weighing import errors, of_drained, of_pressed, seen_of, unsupported, white, without
+from .weighing import (
+    factorise_errors,
+    find_unsupported,
+    predict_seen,
+    remove_points,
+    weigh_drained,
+    weigh_pressed,
+    whiten_columns,
+)
 
 EXPONENTS = (9.5, 19.0)
 """Candidate -m of Ogden's law, equally probable: tissue stiffens with indentation, so a dent alone gives no E."""
@@ -45,7 +53,7 @@ ROUNDS = 3
 READINGS, SAMPLES = np.array([-1.4, -0.7, 0.0, 0.7, 1.4]), 101
 
 
-def young_moduli(
+def estimate_young_moduli(
     anatomy: Anatomy,
     frames: Sequence[Frame],
     tissue: FittedTissue,
@@ -67,7 +75,7 @@ def young_moduli(
     total = np.zeros(len(YOUNGS))
     for done, number in enumerate(read):
         progress(done, len(read))
-        evidence, own = placed(anatomy, frames[number].observation), slice(columns[number], columns[number] + 3)
+        evidence, own = to_evidence(anatomy, frames[number].observation), slice(columns[number], columns[number] + 3)
         total += _weighed(anatomy, frames[number].tools[0], evidence, tissue, pressed, own, device)
     progress(len(read), len(read))
     share = np.exp(total - total.max())
@@ -83,9 +91,11 @@ def _weighed(
     name = max(tissue.skulls, key=lambda skull: tissue.skulls[skull])
     skull, (_, poisson, _), (_, ratio, _) = "slide" if name == LETS_GO else name, tissue.poisson, tissue.ratio
     nearest = int(np.abs(POISSONS - poisson).argmin()), int(np.abs(np.log(RATIOS / ratio)).argmin())
-    lower, _ = errors(evidence)
-    value = white(lower, evidence.value)
-    way = np.linalg.lstsq(white(lower, seen_of(pressed, skull, evidence)[nearest][own].T), value, rcond=None)[0]
+    lower, _ = factorise_errors(evidence)
+    value = whiten_columns(lower, evidence.value)
+    way = np.linalg.lstsq(
+        whiten_columns(lower, predict_seen(pressed, skull, evidence)[nearest][own].T), value, rcond=None
+    )[0]
     force, direction = FORCE * float(np.linalg.norm(way)), way / np.linalg.norm(way)
     reading = float(tool.force or 0.0)
     sigma = FORCE_SIGMA * reading if tool.sigma is None else tool.sigma
@@ -98,11 +108,11 @@ def _weighed(
         shapes.append(CubicSpline(np.log(sizes), rows)(np.clip(asked, *np.log(sizes[[0, -1]]))))
     shape, logs = np.stack(shapes), np.zeros(0)
     for _ in range(ROUNDS):
-        off = white(lower, (evidence.value - shape).reshape(-1, len(value)).T)
+        off = whiten_columns(lower, (evidence.value - shape).reshape(-1, len(value)).T)
         logs = -0.5 * (off**2).sum(axis=0).reshape(shape.shape[:-1])
         logs = np.where(inside, logs, logs.min() - 50.0)
         # The model error is a share of the estimated dent.
-        lower, _ = errors(evidence, shape.reshape(-1, len(value))[logs.argmax()])
+        lower, _ = factorise_errors(evidence, shape.reshape(-1, len(value))[logs.argmax()])
     return np.asarray(logsumexp(logs, axis=(0, 1)))
 
 
@@ -111,13 +121,15 @@ def _dents(
     direction: np.ndarray, device: str,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Solve forces in tissue of modulus `YOUNG`; return converged ones (k,) [N] and their observations (k, m) [m]."""
-    loads = force_loads(anatomy, foot(anatomy, tool)[None], np.array([tool.radius]), sizes[:, None] * direction)
+    loads = build_force_loads(
+        anatomy, find_foot(anatomy, tool)[None], np.array([tool.radius]), sizes[:, None] * direction
+    )
     answer = Fem(anatomy, group.effects((0.01,)), ACCURACY, device).deform(loads)
     good = np.array([outcome.good for outcome in answer.outcome])
     if good.sum() < 3:
         raise InputError(f"a force of {tool.force:g} N cannot be what dents this brain so: check its unit and frame.")
     motion = Responses(pressed.nodes, {group.skull: answer.displacement[good][None, None][..., pressed.nodes, :]})
-    return sizes[good], seen_of(motion, group.skull, evidence)[0, 0]
+    return sizes[good], predict_seen(motion, group.skull, evidence)[0, 0]
 
 
 def fit_tissue(
@@ -136,16 +148,16 @@ def fit_tissue(
     Raises
     ------
     InputError
-        As `check_frames` and `unsupported`.
+        As `check_frames` and `find_unsupported`.
     """
     anatomy = locator.anatomy
     check_frames(anatomy, frames)
-    frames = without(frames, unsupported(locator, frames) if left_out is None else left_out)
-    drained, pressed, regions = None, None, beside_tumour(locator)
+    frames = remove_points(frames, find_unsupported(locator, frames) if left_out is None else left_out)
+    drained, pressed, regions = None, None, list_fitted_regions(locator)
     if any(not frame.tools for frame in frames):
-        drained = responses(
+        drained = solve_responses(
             anatomy,
-            drained_loads(anatomy),
+            build_drained_loads(anatomy),
             device,
             folder,
             lambda done, total: progress("drained fluid", done, total),
@@ -153,19 +165,21 @@ def fit_tissue(
         )
     tools = [tool for frame in frames for tool in frame.tools]
     if tools:
-        at, radius = np.array([foot(anatomy, tool) for tool in tools]), np.array([tool.radius for tool in tools])
-        pressed = responses(
+        at, radius = np.array([find_foot(anatomy, tool) for tool in tools]), np.array([tool.radius for tool in tools])
+        pressed = solve_responses(
             anatomy,
-            force_loads(anatomy, at, radius),
+            build_force_loads(anatomy, at, radius),
             device,
             folder,
             lambda done, total: progress("tools", done, total),
             regions,
         )
-    return fitted(locator, frames, drained, pressed, device, lambda done, total: progress("forces", done, total))
+    return fit_from_evidence(
+        locator, frames, drained, pressed, device, lambda done, total: progress("forces", done, total)
+    )
 
 
-def fitted(
+def fit_from_evidence(
     locator: Locator,
     frames: Sequence[Frame],
     drained: Responses | None,
@@ -174,33 +188,33 @@ def fitted(
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> FittedTissue:
     """Estimate the tissue as `fit_tissue`, from solved responses; `progress` receives the number of forces done."""
-    with one_thread():  # products are small
-        probability = probability_of(weighed(locator, frames, drained, pressed))
+    with limit_to_one_thread():  # products are small
+        probability = compute_probability(weigh_tissues(locator, frames, drained, pressed))
     tissue = FittedTissue(locator.anatomy.digest, len(frames), probability, np.zeros(0))
-    return replace(tissue, young=young_moduli(locator.anatomy, frames, tissue, pressed, device, progress))
+    return replace(tissue, young=estimate_young_moduli(locator.anatomy, frames, tissue, pressed, device, progress))
 
 
-def beside_tumour(locator: Locator) -> tuple[Region, ...]:
+def list_fitted_regions(locator: Locator) -> tuple[Region, ...]:
     """Return the regions of a locator other than the tumour, whose stiffness is estimated."""
     return tuple(one for one in locator.regions if one.label != TUMOUR_LABEL)
 
 
-def weighed(
+def weigh_tissues(
     locator: Locator, frames: Sequence[Frame], drained: Responses | None, pressed: Responses | None
 ) -> np.ndarray:
     """Compute the log-likelihood (skulls, poissons, ratios) of all frames in the solved tissues."""
     total, first = np.zeros((1, len(POISSONS), len(RATIOS))), 0
     for frame in frames:
-        evidence, last = placed(locator.anatomy, frame.observation), first + 3 * len(frame.tools)
+        evidence, last = to_evidence(locator.anatomy, frame.observation), first + 3 * len(frame.tools)
         if pressed is not None and frame.tools:
-            total = total + of_pressed(pressed, np.arange(first, last), evidence)
+            total = total + weigh_pressed(pressed, np.arange(first, last), evidence)
         elif drained is not None:
-            total = total + of_drained(drained, locator.prior, evidence)
+            total = total + weigh_drained(drained, locator.prior, evidence)
         first = last
     return total
 
 
-def probability_of(total: np.ndarray) -> np.ndarray:
+def compute_probability(total: np.ndarray) -> np.ndarray:
     """Interpolate probabilities to the fine grid: logarithms are smooth in log ratio and in compressibility."""
     fine = CubicSpline(np.log(RATIOS), total, axis=2)(np.log(FINE_RATIOS))
     order = np.argsort(1.0 - 2.0 * POISSONS)

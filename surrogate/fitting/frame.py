@@ -12,9 +12,9 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
-from sim.geometry.closest_point import closest
+from sim.geometry.closest_point import find_closest_points
 
-from ..locating.observation import FAR_NOW, Observation, placed
+from ..locating.observation import FAR_NOW, Observation, to_evidence
 from ..locating.observed_files import PLACE, SIGMA, read_columns
 
 RADIUS = 6e-3
@@ -65,7 +65,7 @@ def check_frames(anatomy: Anatomy, frames: Sequence[Frame]) -> None:
     Raises
     ------
     InputError
-        No frames; the same frame twice; errors of `placed`; clouds; tools that are off the open cortex, too wide, or
+        No frames; the same frame twice; errors of `to_evidence`; clouds; tools that are off the open cortex, too wide, or
         with an invalid force.
     """
     if not frames:
@@ -74,7 +74,7 @@ def check_frames(anatomy: Anatomy, frames: Sequence[Frame]) -> None:
         try:
             if frame.observation.rest is None:
                 raise InputError("is a cloud, whose points have no names: give points and how they moved.")
-            placed(anatomy, frame.observation)
+            to_evidence(anatomy, frame.observation)
             for tool in frame.tools:
                 _check(anatomy, tool)
             if len(frame.tools) > 1 and any(tool.force is not None for tool in frame.tools):
@@ -88,16 +88,16 @@ def check_frames(anatomy: Anatomy, frames: Sequence[Frame]) -> None:
             raise InputError(f"frames {first} and {second} are the same, which would count twice: leave one out.")
 
 
-def foot(anatomy: Anatomy, tool: Tool) -> np.ndarray:
+def find_foot(anatomy: Anatomy, tool: Tool) -> np.ndarray:
     """Return the point (3,) [m] of the undeformed open cortex nearest to a tool's tip."""
-    return closest(np.array([tool.tip]), open_cortex(anatomy).corners).point[0]
+    return find_closest_points(np.array([tool.tip]), open_cortex(anatomy).corners).point[0]
 
 
 def _check(anatomy: Anatomy, tool: Tool) -> None:
     numbers = [*tool.tip, tool.radius, tool.force or 0.0, tool.sigma or 0.0]
     if not np.isfinite(numbers).all():
         raise InputError("a tool has a number that is not finite: leave it out.")
-    away = float(np.linalg.norm(foot(anatomy, tool) - tool.tip))
+    away = float(np.linalg.norm(find_foot(anatomy, tool) - tool.tip))
     if away > FAR_NOW:
         raise InputError(
             f"a tool is {1e3 * away:.0f} mm from the open cortex, so that it cannot press on it: give millimetres, "

@@ -11,18 +11,18 @@ import numpy as np
 
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
-from sim.bodies.fluid_level import fluid_level
+from sim.bodies.fluid_level import compute_fluid_level
 from sim.bodies.open_cortex import open_cortex
-from sim.discretisation.space import recommended
+from sim.discretisation.space import recommend_element
 from sim.effects import SKULLS, Gravity, Held, ToolForce
 from sim.fem import Fem
-from sim.geometry.tetmesh import digest_of
+from sim.geometry.tetmesh import compute_digest
 from sim.loads import Loads, Posture, Pushed
 
-from ..locating.causes import SPREAD, SUPINE, USUAL, directions, linear
-from ..locating.locator import telling_nodes
-from ..locating.regions import Region, beside
-from ..model.kept_arrays import kept_arrays, kept_path
+from ..locating.causes import SPREAD, SUPINE, USUAL, build_linear_tissue, sample_directions
+from ..locating.locator import find_observed_nodes
+from ..locating.regions import Region, build_tissue
+from ..model.kept_arrays import find_kept_path, keep_arrays
 
 RATIOS = np.geomspace(0.4, 3.2, 4)
 """Candidate ratios of tumour to brain stiffness, for which FEM is solved."""
@@ -56,27 +56,29 @@ class Responses:
     regions: tuple[Region, ...] = ()
 
 
-def drained_loads(anatomy: Anatomy) -> Loads:
+def build_drained_loads(anatomy: Anatomy) -> Loads:
     """Build loads of drained fluid for sampled head positions."""
-    down = directions(np.random.default_rng(SEED), open_cortex(anatomy).axis, replace(USUAL, drainages=POSTURES))
-    every = [(way, fluid_level(anatomy.mesh.nodes, way, left)) for left in LEVELS for way in down]
+    down = sample_directions(np.random.default_rng(SEED), open_cortex(anatomy).axis, replace(USUAL, drainages=POSTURES))
+    every = [(way, compute_fluid_level(anatomy.mesh.nodes, way, left)) for left in LEVELS for way in down]
     way, level = (np.array(each) for each in zip(*every, strict=True))
     middle = np.tile(open_cortex(anatomy).origin, (len(way), 1))
     idle = Pushed(middle, np.zeros_like(middle), np.full(len(way), SPREAD))
     return Loads((idle, Posture(way, level, np.ones(len(way)))))
 
 
-def force_loads(anatomy: Anatomy, point: np.ndarray, radius: np.ndarray, force: np.ndarray | None = None) -> Loads:
+def build_force_loads(
+    anatomy: Anatomy, point: np.ndarray, radius: np.ndarray, force: np.ndarray | None = None
+) -> Loads:
     """Build forces (n, 3) [N] on discs round points (k, 3) with radii (k,) [m]; None: along each axis of each point."""
     some = FORCE * np.tile(np.eye(3), (len(point), 1)) if force is None else force
     each, count = len(some) // len(point), len(some)
     pushed = Pushed(np.repeat(point, each, axis=0), some, np.repeat(radius, each))
-    level = fluid_level(anatomy.mesh.nodes, SUPINE, 1.0)
+    level = compute_fluid_level(anatomy.mesh.nodes, SUPINE, 1.0)
     posture = Posture(np.tile(SUPINE, (count, 1)), np.full(count, level), np.ones(count))
     return Loads((pushed, posture), np.zeros(count))
 
 
-def responses(
+def solve_responses(
     anatomy: Anatomy,
     loads: Loads,
     device: str = "auto",
@@ -88,7 +90,7 @@ def responses(
 
     `progress` receives the number of tissues done and their total.
     """
-    nodes, found = telling_nodes(anatomy), []
+    nodes, found = find_observed_nodes(anatomy), []
     every = list(product(LINEAR, POISSONS, RATIOS))
     progress(0, len(every))
     for done, (skull, poisson, ratio) in enumerate(every, start=1):
@@ -108,13 +110,19 @@ def _kept(
 ) -> np.ndarray:
     """Read motions (loads, n, 3) [m] of one tissue from the folder, or compute and store them."""
     numbers = [array for cause in loads.causes for array in vars(cause).values()]
-    stated = anatomy.digest, recommended(anatomy.mesh), tissue, ACCURACY, digest_of(*numbers)
-    path = kept_path(folder, "", device, *stated)
+    stated = anatomy.digest, recommend_element(anatomy.mesh), tissue, ACCURACY, compute_digest(*numbers)
+    path = find_kept_path(folder, "", device, *stated)
     skull, poisson, ratio, regions = tissue
-    effects = (beside(linear, poisson, ratio, regions), Held(), SKULLS[skull], ToolForce(), Gravity())
+    effects = (
+        build_tissue(build_linear_tissue, poisson, ratio, regions),
+        Held(),
+        SKULLS[skull],
+        ToolForce(),
+        Gravity(),
+    )
 
     def solved() -> dict[str, np.ndarray]:
         answer = Fem(anatomy, effects, ACCURACY, device).deform(loads)
         return {"motion": answer.displacement[:, nodes].astype(np.float32)}
 
-    return kept_arrays(path, "motions of one tissue", ["motion"], solved)["motion"]
+    return keep_arrays(path, "motions of one tissue", ["motion"], solved)["motion"]

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim.effects import SKULLS
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as
 
 FINE_RATIOS = np.geomspace(0.4, 3.2, 33)
@@ -113,7 +113,7 @@ def _quantiles(values: np.ndarray, share: np.ndarray) -> np.ndarray:
     return np.interp(INTERVAL, np.cumsum(share) - 0.5 * share, values)
 
 
-def tissue_path(anatomy: str | Path) -> Path:
+def to_tissue_path(anatomy: str | Path) -> Path:
     """Return the path of an anatomy's fitted tissue: MESH.tissue.json next to MESH.vtu."""
     return Path(anatomy).with_suffix(SUFFIX)
 
@@ -125,7 +125,7 @@ def save_tissue(path: str | Path, tissue: FittedTissue) -> None:
         "poisson": FINE_POISSONS.tolist(), "ratio": FINE_RATIOS.tolist(),
         "probability": tissue.probability.tolist(), "young": tissue.young.tolist(),
     }  # fmt: skip
-    with written_whole(path, ".json") as unfinished:
+    with write_atomically(path, ".json") as unfinished:
         unfinished.write_text(json.dumps(stored) + "\n")
 
 

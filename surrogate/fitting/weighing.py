@@ -12,9 +12,9 @@ from scipy.special import logsumexp
 from sim.effects import SKULLS
 from sim.errors import InputError
 
-from ..array_functions import squared_distances
+from ..array_functions import compute_squared_distances
 from ..locating.causes import DRAINAGE
-from ..locating.evidence import Evidence, alike
+from ..locating.evidence import Evidence, compute_correlation
 from ..locating.locator import Locator
 from ..locating.prior import MotionPrior
 from .frame import Frame
@@ -30,10 +30,10 @@ SIZES = (0.3, 1.0, 3.0)
 COARSENED, COARSENED_TOOLS = 2.0, 8.0
 
 
-def of_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:
+def weigh_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:
     """Compute the log-likelihood (skulls, poissons, ratios) of a frame with drained fluid."""
-    lower, seen = errors(evidence)
-    rows = {name: seen_of(drained, name, evidence) for name in LINEAR}
+    lower, seen = factorise_errors(evidence)
+    rows = {name: predict_seen(drained, name, evidence) for name in LINEAR}
     own = (prior.kind == DRAINAGE) & (prior.skull == list(SKULLS).index("contact"))
     lets_go = prior.seen(*evidence.weights)[:, own].T
     size = np.mean([_size(each) for each in rows.values()])
@@ -43,14 +43,14 @@ def of_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) -> np
     return np.stack([np.broadcast_to(found[name], shape) for name in SKULLS]) / COARSENED
 
 
-def of_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
+def weigh_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
     """Compute the log-likelihood (skulls, 1, 1) of a frame with tools: its `columns` (k,) of the responses.
 
     Dents of tools determine the skull only. Their information on Poisson's ratio and stiffness ratio is mostly that on
     how they stiffen tissue.
     """
-    lower, seen = errors(evidence)
-    rows = {name: seen_of(pressed, name, evidence)[:, :, columns] for name in LINEAR}
+    lower, seen = factorise_errors(evidence)
+    rows = {name: predict_seen(pressed, name, evidence)[:, :, columns] for name in LINEAR}
     size = np.mean([_size(each) for each in rows.values()])
     found = {name: _weighed(each / size, evidence, lower, seen) for name, each in rows.items()}
     found = {name: logsumexp(each) - np.log(each.size) for name, each in found.items()}
@@ -58,7 +58,7 @@ def of_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -> n
     return np.array([found[name] for name in SKULLS])[:, None, None] / COARSENED_TOOLS
 
 
-def seen_of(responses: Responses, skull: str, evidence: Evidence) -> np.ndarray:
+def predict_seen(responses: Responses, skull: str, evidence: Evidence) -> np.ndarray:
     """Compute the observed displacements (poissons, ratios, loads, m) [m] of responses."""
     column = np.searchsorted(responses.nodes, evidence.place.vertices)
     return np.einsum(
@@ -74,7 +74,7 @@ def _size(rows: np.ndarray) -> float:
     return float(np.sqrt((rows**2).sum(axis=-2).mean()))
 
 
-def errors(evidence: Evidence, believed: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+def factorise_errors(evidence: Evidence, believed: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """Compute the Cholesky factor (m, m) of the covariance of all errors, and the root mean square observation [m].
 
     The model error is a share of the motion that is `believed` (m,) [m]; None: of the observation. That includes noise:
@@ -86,22 +86,25 @@ def errors(evidence: Evidence, believed: np.ndarray | None = None) -> tuple[np.n
     off = LACK * np.maximum(length, LEAST * np.sqrt(3.0) * seen)
     axes = evidence.axis @ evidence.axis.T
     noise = (
-        evidence.noise() + np.outer(off, off) * alike(squared_distances(evidence.at, evidence.at), LACK_LENGTH) * axes
+        evidence.noise()
+        + np.outer(off, off)
+        * compute_correlation(compute_squared_distances(evidence.at, evidence.at), LACK_LENGTH)
+        * axes
     )
     noise[np.diag_indices(len(noise))] += off**2
     rigid = evidence.rigid * evidence.rigid_scale
     return cholesky(noise + rigid @ rigid.T, lower=True), max(seen, 1e-6)
 
 
-def white(lower: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def whiten_columns(lower: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Whiten columns (m,) or (m, k) by errors whose covariance has the Cholesky factor `lower` (m, m)."""
     return solve_triangular(lower, columns, lower=True, check_finite=False)
 
 
 def _weighed(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: float) -> np.ndarray:
     """Compute log evidence (poissons, ratios) of motions (poissons, ratios, loads, m) of joint size 1."""
-    motion = seen * white(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
-    gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ white(lower, evidence.value)
+    motion = seen * whiten_columns(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
+    gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ whiten_columns(lower, evidence.value)
     logs = []
     for times in SIZES:
         root = np.linalg.cholesky(np.eye(gram.shape[-1]) + times**2 * gram)
@@ -110,7 +113,7 @@ def _weighed(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: floa
     return logsumexp(logs, axis=0) - np.log(len(SIZES))
 
 
-def unsupported(locator: Locator, frames: Sequence[Frame]) -> tuple[np.ndarray, ...]:
+def find_unsupported(locator: Locator, frames: Sequence[Frame]) -> tuple[np.ndarray, ...]:
     """Return the point numbers (k,), from 0, that `Locator.locate` rejects in each frame.
 
     Raises
@@ -127,7 +130,7 @@ def unsupported(locator: Locator, frames: Sequence[Frame]) -> tuple[np.ndarray, 
     return tuple(found)
 
 
-def without(frames: Sequence[Frame], left_out: Sequence[np.ndarray]) -> list[Frame]:
+def remove_points(frames: Sequence[Frame], left_out: Sequence[np.ndarray]) -> list[Frame]:
     """Remove points of given numbers (k,) from each frame of points with correspondences."""
     return [
         _without(frame, numbers) if len(numbers) else frame for frame, numbers in zip(frames, left_out, strict=True)

@@ -13,18 +13,18 @@ from sim.errors import InputError
 from sim.geometry.locate import Located
 
 from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, Presses
-from .ensemble import Ensemble, surface_size
-from .evidence import SIGMA, Evidence, of_motions
+from .ensemble import Ensemble, compute_surface_motion
+from .evidence import SIGMA, Evidence, build_motion_evidence
 from .observation import Observation
 from .posterior import Posterior
-from .prior import MotionPrior, middle_of, prior_of
-from .rounds import settled
+from .prior import MotionPrior, build_prior, compute_middle
+from .rounds import match_and_update
 
 LEVEL = 0.95
 """Nominal coverage of ellipsoids."""
 RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
 """Squared radius of the 95 % ellipsoid of a Gaussian [standard deviations^2]: chi-squared, 3 degrees of freedom."""
-# Number of trials, and number of nearest trials (by `likeness`) that calibrate the covariance of an observation.
+# Number of trials, and number of nearest trials (by `compute_likeness`) that calibrate the covariance of an observation.
 TRIALS, NEAREST = 960, 120
 # Feature offset that separates clouds from named points (log units); weight of the extent feature.
 UNLIKE, EXTENT = 1e3, 4.0
@@ -42,13 +42,13 @@ LITTLE = 1e-3
 LEAST_SEEN = 0.5e-3
 
 
-def trials(
+def run_trials(
     ensemble: Ensemble,
     presses: Presses,
     progress: Callable[[int, int], object] = lambda done, total: None,
     count: int = TRIALS,
 ) -> np.ndarray:
-    """Run `count` trials: features (`likeness`) and squared Mahalanobis error of each (k, 5).
+    """Run `count` trials: features (`compute_likeness`) and squared Mahalanobis error of each (k, 5).
 
     Groups are held out one at a time, so that a trial's tissue, tumour and directions are not in its prior. One motion
     in three combines two causes. Rigid errors have exactly the reported size, from 0 to 3 mm. Half of the trials use
@@ -60,25 +60,25 @@ def trials(
     InputError
         No skull has two groups, of which one could be held out.
     """
-    fold, found = left_out(ensemble), []
+    fold, found = assign_held_out(ensemble), []
     if fold.max() < 0:
         raise InputError("no skull has two groups to try one by the other: give causes of several Poisson's ratios.")
-    large = surface_size(ensemble.anatomy, ensemble.motion) > LEAST_SEEN
+    large = compute_surface_motion(ensemble.anatomy, ensemble.motion) > LEAST_SEEN
     for turn, numbers in enumerate(np.array_split(np.arange(count), fold.max() + 1)):
-        prior, members = prior_of(ensemble, presses, fold != turn), np.flatnonzero((fold == turn) & large)
+        prior, members = build_prior(ensemble, presses, fold != turn), np.flatnonzero((fold == turn) & large)
         for number in numbers:
             observation, middle = _trial(ensemble, members, int(number), np.random.default_rng(number))
             progress(int(number), count)
             try:
-                posterior, _ = settled(prior, observation)
+                posterior, _ = match_and_update(prior, observation)
             except InputError:
                 continue
-            found.append([*likeness(posterior.evidence), _square(prior, posterior, middle)])
+            found.append([*compute_likeness(posterior.evidence), _square(prior, posterior, middle)])
     progress(count, count)
     return np.array(found)
 
 
-def left_out(ensemble: Ensemble) -> np.ndarray:
+def assign_held_out(ensemble: Ensemble) -> np.ndarray:
     """Compute the fold (N,), from 0, in which members are held out: one group per skull; -1: only group of a skull."""
     turn = np.full(len(ensemble.group), -1)
     for skull in np.unique(ensemble.skull):
@@ -89,23 +89,23 @@ def left_out(ensemble: Ensemble) -> np.ndarray:
     return turn
 
 
-def covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
+def compute_covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
     """Compute the factor on covariances for tumour-centroid ellipsoids to cover 95 % of similar trials."""
-    away = ((tried[:, :-1] - likeness(evidence)) ** 2).sum(axis=1)
+    away = ((tried[:, :-1] - compute_likeness(evidence)) ** 2).sum(axis=1)
     square = np.sort(tried[np.argsort(away, kind="stable")[:NEAREST], -1])
     rank = min(int(np.ceil(LEVEL * (len(square) + 1))), len(square))
     return float(square[rank - 1] / RADIUS_SQUARED)
 
 
-def was_tried(tried: np.ndarray, evidence: Evidence) -> bool:
+def is_within_trials(tried: np.ndarray, evidence: Evidence) -> bool:
     """Return True if the features are in the range of the trials, which include the largest extent."""
-    own = likeness(evidence)
+    own = compute_likeness(evidence)
     alike = tried[tried[:, -2] == own[-1], :-1]
     within = len(alike) and (own >= alike.min(axis=0)).all()
     return bool(within and (own[[0, 1, 3]] <= alike[:, [0, 1, 3]].max(axis=0) + MARGIN).all())
 
 
-def likeness(evidence: Evidence) -> np.ndarray:
+def compute_likeness(evidence: Evidence) -> np.ndarray:
     """Compute the features (4,) by which trials are compared: three logarithms, then 0, or `UNLIKE` for a cloud.
 
     Logarithms of the observed motion over its error (rigid error included), of the number of points, and of the extent
@@ -132,7 +132,9 @@ def _trial(
     chosen = [random.choice(here[ensemble.kind[here] == cause]) for cause in causes]
     softer = np.exp(random.uniform(*np.log(SOFTER)))
     motion = softer * ensemble.motion[chosen].sum(axis=0, dtype=float)
-    evidence = seen_patch(anatomy, motion, random, int(np.exp(random.uniform(*np.log(POINTS)))), random.uniform(*COVER))
+    evidence = sample_seen_patch(
+        anatomy, motion, random, int(np.exp(random.uniform(*np.log(POINTS)))), random.uniform(*COVER)
+    )
     sigma = np.full(len(evidence), SIGMA * np.exp(random.uniform(*np.log(ERRORS))))
     shift = 0.0 if random.uniform() < UNSHIFTED else float(np.exp(random.uniform(*np.log(SHIFTS))))
     evidence = replace(evidence, sigma=sigma, shift=shift)
@@ -143,10 +145,12 @@ def _trial(
     rest = evidence.at[::3]
     now = rest + (evidence.value + off).reshape(-1, 3) + shifted + np.cross(turned, rest - evidence.middle)
     observation = Observation(now, rest if number % 2 else None, sigma[::3], rigid=shift)
-    return observation, middle_of(anatomy, motion[None])[0]
+    return observation, compute_middle(anatomy, motion[None])[0]
 
 
-def seen_patch(anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator, count: int, cover: float) -> Evidence:
+def sample_seen_patch(
+    anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator, count: int, cover: float
+) -> Evidence:
     """Sample `count` error-free points of a motion (V, 3) [m] on a round share `cover` of the open cortex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     corners = nodes[triangles]
@@ -160,7 +164,7 @@ def seen_patch(anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator
     vertices = triangles[triangle]
     at, moved = (np.einsum("nc,nci->ni", weights, field[vertices]) for field in (nodes, motion))
     place = Located(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(count)]))
-    return of_motions(place, at, moved, np.full(count, SIGMA))
+    return build_motion_evidence(place, at, moved, np.full(count, SIGMA))
 
 
 def _square(prior: MotionPrior, found: Posterior, middle: np.ndarray) -> float:

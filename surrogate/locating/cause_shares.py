@@ -47,7 +47,7 @@ class CauseShare:
         return f"{named}{apart} {self.share:.0%} ({self.low:.0%} to {self.high:.0%})"
 
 
-def cause_shares(drawn: np.ndarray) -> tuple[CauseShare, ...]:
+def group_cause_shares(drawn: np.ndarray) -> tuple[CauseShare, ...]:
     """Group `KINDS` as finely as sampled shares (n, kinds) determine; largest share first, negligible ones dropped.
 
     Among several finest groupings, the one with the smallest sum of interval widths is chosen.
@@ -78,7 +78,7 @@ def _partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
                 yield [[first, *some], *groups]
 
 
-def drawn_shares(prior: MotionPrior, posterior: Posterior) -> np.ndarray:
+def compute_cause_shares(prior: MotionPrior, posterior: Posterior) -> np.ndarray:
     """Sample shares (n, kinds) of causes in the mean square motion of the open cortex from the posterior."""
     ends = np.round(DRAWS * np.cumsum([answer.share for answer in posterior.answers])).astype(int)
     normal = np.random.default_rng(0).standard_normal((DRAWS, len(prior.kind)))

@@ -9,7 +9,7 @@ import numpy as np
 
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
-from sim.bodies.fluid_level import fluid_level
+from sim.bodies.fluid_level import compute_fluid_level
 from sim.bodies.open_cortex import open_cortex
 from sim.effects import SKULLS, Effect, Gravity, Held, Pulsation, ToolForce, Wave
 from sim.fem import Fem
@@ -17,7 +17,7 @@ from sim.loads import Loads, Posture, Pushed
 from sim.material import Material, Ogden
 
 from ..data.tool_loads import draw
-from .regions import Region, beside
+from .regions import Region, build_tissue
 
 KINDS = ("tool", "drainage", "swelling", "tumour swelling", "oedema")
 """Names of the causes of an ensemble."""
@@ -88,7 +88,7 @@ LETS_GO = "contact"
 SUPINE = np.array(Gravity().direction)
 
 
-def linear(times: float, poisson: float) -> Material:
+def build_linear_tissue(times: float, poisson: float) -> Material:
     """Build linear tissue `times` as stiff as the brain at small strain."""
     return Material("linear", YOUNG * times, poisson)
 
@@ -122,7 +122,7 @@ class Group:
     def effects(self, swelling: tuple[float, ...], regions: tuple[int, ...] | None = None) -> tuple[Effect, ...]:
         """Build the effects of the FEM, with up to these volume changes in these regions (None: all)."""
         swells = Pulsation(Wave(RISE.frequency, max(map(abs, swelling))), RISE, regions)
-        tissue = beside(self._tissue, self.poisson, self.ratio, self.regions)
+        tissue = build_tissue(self._tissue, self.poisson, self.ratio, self.regions)
         return (tissue, Held(), SKULLS[self.skull], ToolForce(), Gravity(), swells)
 
     def _tissue(self, times: float, poisson: float) -> Ogden:
@@ -131,7 +131,7 @@ class Group:
         return Ogden(((2.0 * mu, -self.exponent),), lam + 2.0 * mu / 3.0)
 
 
-def groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Group, ...]:
+def build_groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Group, ...]:
     """Build groups with each skull and each Poisson's ratio; none if the anatomy has no skull.
 
     In each skull, tumour stiffness, exponent and oedema extent are stratified: one group in every part of each range.
@@ -155,7 +155,7 @@ def _all_over(random: np.random.Generator, count: int, limits: tuple[float, floa
     return np.exp(low + share * (high - low)).tolist()
 
 
-def pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> Loads:
+def build_pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> Loads:
     """Sample the tool loads of a group."""
     count = causes.tools[group.skull == LETS_GO]
     pushed = draw("mixed", anatomy, count, seed * 1000 + group.number).of(Pushed)
@@ -163,17 +163,17 @@ def pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL
     return Loads((pushed, _posture(anatomy, np.tile(SUPINE, (count, 1)), 1.0)), np.zeros(count))
 
 
-def swellings(anatomy: Anatomy, shares: tuple[float, ...]) -> Loads:
+def build_swellings(anatomy: Anatomy, shares: tuple[float, ...]) -> Loads:
     """Build loads of these volume changes; `Group.effects` must have been given the same ones."""
     # The wave gives the time at which each volume change is reached.
     time = np.arcsin(np.array(shares) / max(map(abs, shares))) / (2.0 * np.pi * RISE.frequency)
     return Loads((_idle(anatomy, len(time)), _posture(anatomy, np.tile(SUPINE, (len(time), 1)), 1.0)), time)
 
 
-def drainages(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Loads, ...]:
+def build_drainages(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Loads, ...]:
     """Build loads of drained fluid, level by level, for sampled head directions."""
     random = np.random.default_rng([seed, group.number, 1])
-    down = directions(random, open_cortex(anatomy).axis, causes)
+    down = sample_directions(random, open_cortex(anatomy).axis, causes)
     idle = _idle(anatomy, len(down))
     return tuple(Loads((idle, _posture(anatomy, down, left)), np.zeros(len(down))) for left in causes.levels)
 
@@ -185,11 +185,11 @@ def _idle(anatomy: Anatomy, count: int) -> Pushed:
 
 def _posture(anatomy: Anatomy, down: np.ndarray, left: float) -> Posture:
     """Build postures with gravity along `down` (n, 3) and a share of the fluid left."""
-    level = np.array([fluid_level(anatomy.mesh.nodes, one, left) for one in down])
+    level = np.array([compute_fluid_level(anatomy.mesh.nodes, one, left) for one in down])
     return Posture(down, level, np.ones(len(down)))
 
 
-def directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:
+def sample_directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:
     """Sample directions of gravity (n, 3), uniform by solid angle in a cone round the inward axis."""
     cosine = random.uniform(np.cos(causes.cone), 1.0, causes.drainages)
     angle = random.uniform(0.0, 2.0 * np.pi, causes.drainages)
@@ -215,23 +215,23 @@ class Presses:
     motion: dict[str, np.ndarray]
 
 
-def pressed(
+def solve_presses(
     anatomy: Anatomy, skulls: tuple[str, ...], device: str = "auto", regions: tuple[Region, ...] = ()
 ) -> Presses:
     """Solve linear tissue under forces of 0.01 N on discs of 7 mm radius, for each of some skulls, with `regions`."""
     nodes = anatomy.mesh.nodes[np.unique(anatomy.open_surface)]
-    points = nodes[spaced(nodes, POINTS)]
+    points = nodes[choose_spaced(nodes, POINTS)]
     force = np.tile(0.01 * np.eye(3), (len(points), 1))
     loads = Loads((Pushed(np.repeat(points, 3, axis=0), force, np.full(len(force), SPREAD)),))
     found: dict[str, list[np.ndarray]] = {name: [] for name in skulls}
     for name, (poisson, ratio) in product(skulls, TISSUES):
-        effects = (beside(linear, poisson, ratio, regions), Held(), SKULLS[name], ToolForce())
+        effects = (build_tissue(build_linear_tissue, poisson, ratio, regions), Held(), SKULLS[name], ToolForce())
         motion = Fem(anatomy, effects, ACCURACY, device).deform(loads).displacement
         found[name].append(motion.reshape(len(points), 3, -1, 3).astype(np.float32))
     return Presses(points, {name: np.stack(parts) for name, parts in found.items()})
 
 
-def spaced(points: np.ndarray, count: int) -> np.ndarray:
+def choose_spaced(points: np.ndarray, count: int) -> np.ndarray:
     """Select `count` of the points (n, 3) by farthest-point sampling, starting next to the centroid; return indices."""
     found = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmin())]
     away = np.full(len(points), np.inf)

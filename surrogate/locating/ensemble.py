@@ -12,12 +12,12 @@ from scipy.spatial import KDTree
 from sim.accuracy import Accuracy
 from sim.anatomy import BRAIN_LABEL, PART_LABELS, Anatomy
 from sim.deformation import Deformation
-from sim.discretisation.space import recommended
+from sim.discretisation.space import recommend_element
 from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
 
-from ..model.kept_arrays import kept_arrays, kept_path
+from ..model.kept_arrays import find_kept_path, keep_arrays
 from .causes import (
     DRAINAGE,
     OEDEMA,
@@ -27,10 +27,10 @@ from .causes import (
     USUAL,
     Causes,
     Group,
-    drainages,
-    groups,
-    pushes,
-    swellings,
+    build_drainages,
+    build_groups,
+    build_pushes,
+    build_swellings,
 )
 
 # Relative tolerance: far below observation errors.
@@ -75,7 +75,7 @@ class Ensemble:
     group: np.ndarray
 
 
-def solved(
+def solve_groups(
     anatomy: Anatomy,
     seed: int = 0,
     device: str = "auto",
@@ -94,7 +94,7 @@ def solved(
     """
     if not len(anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour to locate: make one that has.")
-    made = groups(anatomy, seed, causes)
+    made = build_groups(anatomy, seed, causes)
     if not made:
         raise InputError("the anatomy has no skull (`slide_normal`) that brackets what it does: make it again.")
     parts = []
@@ -113,27 +113,27 @@ def _kept(
     anatomy: Anatomy, group: Group, seed: int, device: str, causes: Causes, folder: Path | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Read the motions and kinds of a group from the folder, or compute and keep them; the key holds all inputs."""
-    stated = anatomy.digest, recommended(anatomy.mesh), group, seed, causes, ACCURACY
-    path = kept_path(folder, f"{group.number:03d}-", device, *stated)
+    stated = anatomy.digest, recommend_element(anatomy.mesh), group, seed, causes, ACCURACY
+    path = find_kept_path(folder, f"{group.number:03d}-", device, *stated)
     names = "motion", "kind"
-    arrays = kept_arrays(
+    arrays = keep_arrays(
         path,
         "a group of an ensemble",
         names,
-        lambda: dict(zip(names, members(anatomy, group, seed, device, causes), strict=True)),
+        lambda: dict(zip(names, solve_members(anatomy, group, seed, device, causes), strict=True)),
     )
     return arrays["motion"], arrays["kind"]
 
 
-def members(
+def solve_members(
     anatomy: Anatomy, group: Group, seed: int = 0, device: str = "auto", causes: Causes = USUAL
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute motions (n, V, 3) float32 [m] and kinds (n,) of one group: converged ones that move the open cortex."""
     fem = Fem(anatomy, group.effects(causes.swellings), ACCURACY, device)
     tumour = tuple(np.unique(anatomy.mesh.region[anatomy.in_tumour]).tolist())
     answers = [
-        fem.deform(pushes(group, anatomy, seed, causes)),
-        fem.deform(swellings(anatomy, causes.swellings)),
+        fem.deform(build_pushes(group, anatomy, seed, causes)),
+        fem.deform(build_swellings(anatomy, causes.swellings)),
         _swollen(anatomy, group, causes.tumour_swellings, tumour, device, fem),
     ]
     kind = [TOOL, SWELLING, TUMOUR_SWELLING]
@@ -142,14 +142,14 @@ def members(
         answers.append(_swollen(body, group, causes.oedema, marked, device, fem))
         kind.append(OEDEMA)
     last: Deformation | None = None
-    for loads in drainages(group, anatomy, seed, causes):
+    for loads in build_drainages(group, anatomy, seed, causes):
         last = fem.deform(loads, start=last)
         answers.append(last)
         kind.append(DRAINAGE)
     motion = np.concatenate([answer.displacement for answer in answers])
     kind = np.repeat(kind, [len(answer) for answer in answers])
     good = np.array([outcome.good for answer in answers for outcome in answer.outcome])
-    good &= surface_size(anatomy, motion) > LEAST_MOTION
+    good &= compute_surface_motion(anatomy, motion) > LEAST_MOTION
     if not good.any():
         raise InputError(f"no motion of group {group.number} ({group.skull}, nu {group.poisson:g}) converged.")
     return motion[good].astype(np.float32), kind[good]
@@ -160,10 +160,10 @@ def _swollen(
 ) -> Deformation:
     """Solve for given volume changes of some regions; the stiffness, and so its factor, is that of `fem`."""
     swells = Fem(anatomy, group.effects(shares, regions), ACCURACY, device, stiff_as=fem)
-    return swells.deform(swellings(anatomy, shares))
+    return swells.deform(build_swellings(anatomy, shares))
 
 
-def surface_size(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
+def compute_surface_motion(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
     """Compute root mean square motions (n,) [m] of the open cortex's vertices for motions (n, V, 3) [m]."""
     nodes = np.unique(anatomy.open_surface)
     return np.sqrt((motion[:, nodes] ** 2).sum(axis=2).mean(axis=1))

@@ -9,7 +9,7 @@ from scipy.linalg import cholesky, get_lapack_funcs
 
 from sim.geometry.locate import Located
 
-from ..array_functions import squared_distances
+from ..array_functions import compute_squared_distances
 
 # Non-rigid error of a point [m]: independent noise, spatially correlated noise.
 WHITE, SMOOTH = 0.3e-3, 0.5e-3
@@ -103,9 +103,9 @@ class Evidence:
 
     def noise(self, scale: float = 0.0) -> np.ndarray:
         """Covariance (m, m) [m^2] of non-rigid errors, and of the shapes' model error for motions of `scale` [m]."""
-        share, square = (WHITE / SIGMA) ** 2, squared_distances(self.at, self.at)
-        out = alike(square, LENGTH) * self.sigma * ((1.0 - share) * self.sigma)[:, None]
-        out += alike(square, LACK_LENGTH) * (LACK_SMOOTH * scale) ** 2
+        share, square = (WHITE / SIGMA) ** 2, compute_squared_distances(self.at, self.at)
+        out = compute_correlation(square, LENGTH) * self.sigma * ((1.0 - share) * self.sigma)[:, None]
+        out += compute_correlation(square, LACK_LENGTH) * (LACK_SMOOTH * scale) ** 2
         out *= self.axis @ self.axis.T
         out[np.diag_indices(len(self))] += share * self.sigma**2 + (LACK_WHITE * scale) ** 2
         return out
@@ -141,7 +141,7 @@ class Evidence:
         """Build the transform to independent errors of variance 1, for observed motions of `scale` [m]."""
         copies = self.copies
         lower = cholesky(self.rows(np.arange(0, len(self), copies)).noise(scale), lower=True)
-        return Whitening(triangular_inverse(lower), copies)
+        return Whitening(invert_triangular(lower), copies)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,30 +179,32 @@ class Whitening:
         return np.kron(alike, np.eye(self.copies))
 
 
-def triangular_inverse(lower: np.ndarray) -> np.ndarray:
+def invert_triangular(lower: np.ndarray) -> np.ndarray:
     """Invert a lower triangular matrix (n, n) by recursive halving: matrix products are fastest."""
     half = len(lower) // 2
     if half < SMALL:
         return trtri(lower.T, lower=0)[0].T
     found = np.zeros_like(lower)
-    found[:half, :half] = triangular_inverse(lower[:half, :half])
-    found[half:, half:] = triangular_inverse(lower[half:, half:])
+    found[:half, :half] = invert_triangular(lower[:half, :half])
+    found[half:, half:] = invert_triangular(lower[half:, half:])
     found[half:, :half] = found[half:, half:] @ (lower[half:, :half] @ -found[:half, :half])
     return found
 
 
-def alike(square: np.ndarray, length: float) -> np.ndarray:
+def compute_correlation(square: np.ndarray, length: float) -> np.ndarray:
     """Compute correlations (n, n) of smooth noise: Gaussian of squared distances (n, n) [m^2] and a length [m]."""
     return np.exp(square * (-0.5 / length**2))
 
 
 def smooth_root(points: np.ndarray, length: float = LENGTH) -> np.ndarray:
     """Compute the factor (n, n) from independent noise at points (n, 3) [m] to smooth noise of variance 1."""
-    value, vector = np.linalg.eigh(alike(squared_distances(points, points), length))
+    value, vector = np.linalg.eigh(compute_correlation(compute_squared_distances(points, points), length))
     return vector * np.sqrt(np.maximum(value, 0.0))
 
 
-def of_motions(place: Located, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray, shift: float = SHIFT) -> Evidence:
+def build_motion_evidence(
+    place: Located, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray, shift: float = SHIFT
+) -> Evidence:
     """Build evidence from undeformed points (n, 3) [m] and their motions (n, 3) [m]; three rows a point."""
     count = len(at)
     point = np.repeat(np.arange(count), 3)

@@ -11,16 +11,16 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
-from sim.runtime.threads import one_thread
+from sim.runtime.threads import limit_to_one_thread
 
-from .calibration import covering_factor, was_tried
-from .cause_shares import CauseShare, cause_shares, drawn_shares
+from .calibration import compute_covering_factor, is_within_trials
+from .cause_shares import CauseShare, compute_cause_shares, group_cause_shares
 from .causes import KINDS
-from .observation import Observation, looked_at
-from .posterior import Posterior, within_errors
+from .observation import Observation, choose_points
+from .posterior import Posterior, is_within_errors
 from .prior import MotionPrior
 from .regions import Region
-from .rounds import settled
+from .rounds import match_and_update
 
 # Largest share of outliers; largest `surprise` that a cause of the ensemble can explain.
 MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
@@ -143,7 +143,7 @@ class Location:
     @cached_property
     def within_errors(self) -> bool:
         """True if the observation is within its reported errors, so that no motion is significant."""
-        return within_errors(self.posterior)
+        return is_within_errors(self.posterior)
 
     @cached_property
     def cause_shares(self) -> tuple[CauseShare, ...]:
@@ -151,7 +151,7 @@ class Location:
 
         Empty if the observation is within its errors, or the registration may have slipped.
         """
-        return () if self.slipped or self.within_errors else cause_shares(self._drawn_shares)
+        return () if self.slipped or self.within_errors else group_cause_shares(self._drawn_shares)
 
     @property
     def causes(self) -> dict[str, float]:
@@ -164,7 +164,7 @@ class Location:
 
     @cached_property
     def _drawn_shares(self) -> np.ndarray:
-        return drawn_shares(self.prior, self.posterior)
+        return compute_cause_shares(self.prior, self.posterior)
 
     @property
     def doubt(self) -> str:
@@ -210,7 +210,7 @@ class Location:
 
     @property
     def named_causes(self) -> str:
-        """Description of `cause_shares`, or the reason why no cause is named."""
+        """Description of `group_cause_shares`, or the reason why no cause is named."""
         if self.slipped:
             return "not said, as the registration may have slipped"
         if self.within_errors:
@@ -246,7 +246,7 @@ class Locator:
 
         It accepts observations on the open cortex alone, and gives no motion of other tissue.
         """
-        return replace(self, prior=self.prior.restricted(telling_nodes(self.anatomy)))
+        return replace(self, prior=self.prior.restrict(find_observed_nodes(self.anatomy)))
 
     def locate(self, observation: Observation) -> Location:
         """Locate the tumour by one observation.
@@ -256,42 +256,42 @@ class Locator:
         InputError
             An observation that is too small, is elsewhere, or that no cause of the ensemble explains.
         """
-        with one_thread():  # products are small
+        with limit_to_one_thread():  # products are small
             return self._located(observation)
 
     def _located(self, observation: Observation) -> Location:
         prior, count = self.prior, len(observation.now)
         prior.prepare()
         begun = time.perf_counter()
-        found, near = settled(prior, observation)
+        found, near = match_and_update(prior, observation)
         slipped = not observation.checked and _may_have_slipped(prior.anatomy, found)
         if slipped:
-            found, near = settled(prior, observation, free=True)
-        some = looked_at(count)
+            found, near = match_and_update(prior, observation, free=True)
+        some = choose_points(count)
         outliers = np.union1d(np.setdiff1d(some, near), found.outliers[found.outliers < count])
         _demand_explained(found, len(outliers), len(some))
-        found = replace(found, factor=covering_factor(self.tried, found.evidence))
+        found = replace(found, factor=compute_covering_factor(self.tried, found.evidence))
         return Location(
             prior=prior,
             posterior=found,
-            p95=radius_of(found.covariance(prior.middle[:, None])[0]),
+            p95=compute_radius(found.covariance(prior.middle[:, None])[0]),
             outliers=outliers,
             tips_left_out=found.outliers[found.outliers >= count] - count,
             slipped=slipped,
             checked=observation.checked,
-            calibrated=not slipped and was_tried(self.tried, found.evidence),
+            calibrated=not slipped and is_within_trials(self.tried, found.evidence),
             seconds=time.perf_counter() - begun,
         )
 
 
-def telling_nodes(anatomy: Anatomy) -> np.ndarray:
+def find_observed_nodes(anatomy: Anatomy) -> np.ndarray:
     """Select the sorted vertices (n,) of the tumour and of all tetrahedra at the open cortex."""
     mesh = anatomy.mesh
     at_cortex = np.isin(mesh.tets, anatomy.open_surface).any(axis=1)
     return np.union1d(mesh.tets[at_cortex], anatomy.tumour_nodes)
 
 
-def radius_of(covariance: np.ndarray) -> float:
+def compute_radius(covariance: np.ndarray) -> float:
     """Compute the radius [m] round the mean of a Gaussian, covariance (3, 3) [m^2], that holds 95 % of samples."""
     drawn = _normal() @ np.linalg.cholesky(covariance).T
     return float(np.quantile(np.sqrt((drawn**2).sum(axis=1)), 0.95))

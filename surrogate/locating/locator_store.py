@@ -13,17 +13,17 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.effects import SKULLS
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as
-from sim.runtime.threads import one_thread
-from sim.runtime.versions import version_of
+from sim.runtime.threads import limit_to_one_thread
+from sim.runtime.versions import get_version
 
-from ..model.npz_archive import Archive, seal_of
-from .calibration import TRIALS, trials
-from .causes import KINDS, USUAL, Causes, pressed
-from .ensemble import solved
+from ..model.npz_archive import Archive, compute_seal
+from .calibration import TRIALS, run_trials
+from .causes import KINDS, USUAL, Causes, solve_presses
+from .ensemble import solve_groups
 from .locator import Locator
-from .prior import NOWHERE, PRESSED, MotionPrior, prior_of
+from .prior import NOWHERE, PRESSED, MotionPrior, build_prior
 from .regions import Region, check_regions
 
 FORMAT = "sulcus locator 6"
@@ -32,7 +32,7 @@ LABELS = ("kind", "skull", "place")
 ARRAYS = ("shape", *LABELS, "centre")
 
 
-def locator_path(anatomy: str | Path) -> Path:
+def to_locator_path(anatomy: str | Path) -> Path:
     """Return the path of an anatomy's locator: MESH.locator.npz next to MESH.vtu."""
     return Path(anatomy).with_suffix(".locator.npz")
 
@@ -47,12 +47,12 @@ def save_locator(path: str | Path, locator: Locator) -> None:
     """
     prior = locator.prior
     header = {
-        "format": FORMAT, "anatomy": prior.anatomy.digest, "version": version_of("sulcus"), "kinds": KINDS,
+        "format": FORMAT, "anatomy": prior.anatomy.digest, "version": get_version("sulcus"), "kinds": KINDS,
         "whole": prior.nodes is None, "space": "RAS [m]", "regions": [asdict(one) for one in locator.regions],
     }  # fmt: skip
     arrays = {name: getattr(prior, name) for name in _names(header)} | {"tried": locator.tried}
-    header["seal"] = seal_of(header, arrays)
-    with written_whole(path, ".npz") as unfinished:
+    header["seal"] = compute_seal(header, arrays)
+    with write_atomically(path, ".npz") as unfinished:
         np.savez(unfinished, header=np.array(json.dumps(header)), **arrays)  # pyright: ignore[reportArgumentType]
 
 
@@ -73,7 +73,7 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
             raise InputError(f"{path}: was made for another anatomy: give that one, or another locator.")
         regions = tuple(Region(**one) for one in header.get("regions", ()))
         check_regions(regions, anatomy)
-        arrays = archive.sealed(header, [*_names(header), "tried"])
+        arrays = archive.read_sealed(header, [*_names(header), "tried"])
         _check(path, anatomy, arrays)
         tried = arrays.pop("tried")
         return Locator(MotionPrior(anatomy, **arrays), tried, regions)
@@ -120,9 +120,9 @@ def make_locator(
         member.
     """
     check_regions(causes.regions, anatomy)
-    ensemble = solved(anatomy, seed, device, causes, folder, lambda done, total: progress("causes", done, total))
+    ensemble = solve_groups(anatomy, seed, device, causes, folder, lambda done, total: progress("causes", done, total))
     progress("forces on the cortex", 0, 1)
-    presses = pressed(anatomy, tuple(dict.fromkeys(PRESSED.values())), device, causes.regions)
-    with one_thread():  # products are small
-        tried = trials(ensemble, presses, lambda done, total: progress("trials", done, total), count)
-    return Locator(prior_of(ensemble, presses), tried, causes.regions)
+    presses = solve_presses(anatomy, tuple(dict.fromkeys(PRESSED.values())), device, causes.regions)
+    with limit_to_one_thread():  # products are small
+        tried = run_trials(ensemble, presses, lambda done, total: progress("trials", done, total), count)
+    return Locator(build_prior(ensemble, presses), tried, causes.regions)

@@ -11,12 +11,12 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
-from sim.geometry.closest_point import closest
+from sim.geometry.closest_point import find_closest_points
 from sim.geometry.locate import Located, locate
-from sim.geometry.surface import unit, vertex_normals
+from sim.geometry.surface import compute_vertex_normals, normalise_vectors
 
-from ..array_functions import squared_distances
-from .evidence import SHIFT, SIGMA, Evidence, of_motions
+from ..array_functions import compute_squared_distances
+from .evidence import SHIFT, SIGMA, Evidence, build_motion_evidence
 
 FEWEST = 6
 # Smallest ratio of the spread of points across a line to that along it.
@@ -83,7 +83,7 @@ class Observation:
         return np.full(len(self.now), SIGMA) if self.sigma is None else self.sigma
 
 
-def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
+def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
     """Convert an observation to evidence, with the body undeformed.
 
     Raises
@@ -95,7 +95,7 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
         anatomy.
     """
     _check(observation)
-    some = looked_at(len(observation.now))
+    some = choose_points(len(observation.now))
     if observation.rest is None:
         where, near, far = observation.now[some], NEAR_NOW, FAR_NOW
     else:
@@ -113,15 +113,15 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
                 "millimetres, RAS, or leave it out."
             )
     here = np.zeros_like(anatomy.mesh.nodes)
-    return placed_anew(anatomy, observation, some[off <= far], here, lambda at: np.zeros_like(at))
+    return place_again(anatomy, observation, some[off <= far], here, lambda at: np.zeros_like(at))
 
 
-def looked_at(count: int) -> np.ndarray:
+def choose_points(count: int) -> np.ndarray:
     """Select the numbers (k,) of at most `MOST` points, evenly spread over `count`."""
     return np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
 
 
-def placed_anew(
+def place_again(
     anatomy: Anatomy,
     observation: Observation,
     near: np.ndarray,
@@ -139,7 +139,7 @@ def placed_anew(
     sigma = np.full(len(observation.tips), SIGMA)
     if observation.rest is not None:
         here = observation.rest[near]
-        moved = of_motions(
+        moved = build_motion_evidence(
             locate(anatomy.mesh, here), here, observation.now[near] - here, observation.sigmas[near], observation.rigid
         )
         parts.append(replace(moved, point=near[moved.point]))
@@ -163,10 +163,12 @@ def _along_normals(
     """Build one row a point, with its `number` (n,): displacement of the surface along its deformed normal."""
     triangles, nodes = anatomy.open_surface, anatomy.mesh.nodes
     corners = (nodes + motion)[triangles]
-    _, triangle, weights = closest(cloud - bias(cloud), corners)
+    _, triangle, weights = find_closest_points(cloud - bias(cloud), corners)
     vertices = triangles[triangle]
     # At an edge two triangles are equally near: normals of vertices do not depend on which one is found.
-    normal = unit(np.einsum("nc,nci->ni", weights, vertex_normals(nodes + motion, triangles)[vertices]))
+    normal = normalise_vectors(
+        np.einsum("nc,nci->ni", weights, compute_vertex_normals(nodes + motion, triangles)[vertices])
+    )
     at = np.einsum("nc,nci->ni", weights, nodes[vertices])
     # A fourth vertex of weight 0 gives the layout of a tetrahedron.
     place = Located(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(len(at))]))
@@ -254,10 +256,10 @@ def _demand_spread(where: np.ndarray, near: np.ndarray) -> None:
 def _off_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
     """Compute distances (n,) [m] from the open cortex; within `NEAR` of a vertex, from the nearest vertex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
-    away = np.sqrt(squared_distances(points, nodes[np.unique(triangles)]).min(axis=1))
+    away = np.sqrt(compute_squared_distances(points, nodes[np.unique(triangles)]).min(axis=1))
     far = np.flatnonzero(away > NEAR)
     if len(far):
-        away[far] = np.linalg.norm(closest(points[far], nodes[triangles]).point - points[far], axis=1)
+        away[far] = np.linalg.norm(find_closest_points(points[far], nodes[triangles]).point - points[far], axis=1)
     return away
 
 

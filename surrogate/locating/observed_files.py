@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.errors import InputError
-from sim.runtime.outside_files import path_of, read_as
+from sim.runtime.outside_files import read_as, to_path
 
 from .observation import Observation
 
@@ -61,7 +61,7 @@ def read_columns(
     InputError
         As `read_observation`.
     """
-    path = path_of(path)
+    path = to_path(path)
     known = " or ".join(",".join(names) for names in sorted(allowed))
     remedy = f"Give a CSV file with the header {known}."
     if not path.is_file():

@@ -19,9 +19,9 @@ from scipy.special import chdtrc, chdtri, logsumexp
 from sim.errors import InputError
 
 from .causes import OEDEMA, TOOL
-from .evidence import SHIFT, SLIPPED, Evidence, triangular_inverse
+from .evidence import SHIFT, SLIPPED, Evidence, invert_triangular
 from .prior import RIGIDS, SETS, WITH_PLACE, Hypothesis, MotionPrior
-from .whitened import Equations, WhitenedSystem, whitened, with_places
+from .whitened import Equations, WhitenedSystem, add_places, whiten
 
 # Significance level of a motion, for each of three tests.
 MOVED = 0.005
@@ -37,7 +37,7 @@ MIXED = 24
 (potrs,) = get_lapack_funcs(("potrs",), dtype=np.float64)
 
 
-def within_errors(posterior: Posterior) -> bool:
+def is_within_errors(posterior: Posterior) -> bool:
     """Return True if the observation is within its errors, the reported rigid error included: no motion is significant.
 
     Two tests are of its size: the square Mahalanobis distance has a rigid part, by generalised least squares, and a
@@ -84,7 +84,7 @@ class HypothesisResult:
     @cached_property
     def root(self) -> np.ndarray:
         """Factor R (k, k) of the covariance R^T R."""
-        return self.size * triangular_inverse(self.lower)
+        return self.size * invert_triangular(self.lower)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +130,7 @@ class Posterior:
         """Mean (6,) of the rigid error: translation [m], rotation [rad]."""
         return self.unknown[-6:] * self.evidence.rigid_scale
 
-    def bias_at(self, places: np.ndarray) -> np.ndarray:
+    def compute_bias(self, places: np.ndarray) -> np.ndarray:
         """Compute the mean rigid error (n, 3) [m] at positions (n, 3) [m]."""
         return self.rigid[:3] + np.cross(self.rigid[3:], places - self.evidence.middle)
 
@@ -217,7 +217,12 @@ class ObservedPrior:
         First without a tool, then with one at each place; -inf where none may press.
         """
         # All hypotheses include tools all over the cortex and the rigid error, and each set extends an earlier one.
-        rigid = self._equations().eliminated(TOOL).varied(RIGID, np.minimum(RIGIDS, self.slip)).eliminated(RIGID)
+        rigid = (
+            self._equations()
+            .eliminate_unknowns(TOOL)
+            .varied(RIGID, np.minimum(RIGIDS, self.slip))
+            .eliminate_unknowns(RIGID)
+        )
         found: dict[tuple[int, ...], Equations] = {}
         extended = {some[:-1] for some in SETS}
         evidence = np.full((*rigid.evidence.shape, len(SETS), len(self.odds)), -np.inf)
@@ -225,10 +230,10 @@ class ObservedPrior:
             if OEDEMA in some and not self.named:
                 continue
             last = some not in extended
-            here = found[some] = found[some[:-1]].eliminated(some[-1], last) if some else rigid
+            here = found[some] = found[some[:-1]].eliminate_unknowns(some[-1], last) if some else rigid
             evidence[..., number, 0] = here.evidence
         pressed = [number for number, some in enumerate(SETS) if some in WITH_PLACE and some in found]
-        evidence[..., pressed, 1:] = np.moveaxis(with_places([found[SETS[number]] for number in pressed]), 0, -2)
+        evidence[..., pressed, 1:] = np.moveaxis(add_places([found[SETS[number]] for number in pressed]), 0, -2)
         return self.odds + evidence.swapaxes(1, 2).reshape(-1, len(self.odds)) / COARSENED
 
     def _equations(self) -> Equations:
@@ -266,15 +271,17 @@ class ObservedPrior:
         return HypothesisResult(share, own, mean, size, lower)
 
 
-def seen_prior(prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> ObservedPrior:
+def build_observed_prior(prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> ObservedPrior:
     """Whiten a prior at the points of some evidence; tips of tools (k, 3) [m] touch the cortex."""
     seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
     # A motion and a rigid error may cancel, so that the observation is small; and noise hides smaller motions.
     scale = 1e3 * max(float(np.hypot(seen, np.sqrt(3.0) * evidence.shift)), float(np.median(evidence.sigma)))
-    return ObservedPrior(prior, scale, whitened(prior, evidence, seen), prior.odds(tips), evidence.slip, evidence.named)
+    return ObservedPrior(prior, scale, whiten(prior, evidence, seen), prior.odds(tips), evidence.slip, evidence.named)
 
 
-def conditioned(prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS, free: bool = False) -> Posterior:
+def condition_prior(
+    prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS, free: bool = False
+) -> Posterior:
     """Condition a prior on evidence, without points that no other supports. Tips (k, 3) [m] touch the cortex.
 
     The rigid error is of the reported size, or `free`: then it may be that of a slipped registration.
@@ -287,7 +294,7 @@ def conditioned(prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TI
     kept, point = np.ones(len(evidence), bool), evidence.point
     while True:
         some = evidence.rows(kept)
-        seen = seen_prior(prior, some, tips)
+        seen = build_observed_prior(prior, some, tips)
         answers = seen.answers(free)
         odd = _oddness(seen.rows, answers[0], some.point)
         excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], IMPROBABLE)

@@ -17,8 +17,8 @@ from sim.anatomy import Anatomy
 from sim.effects import SKULLS
 from sim.errors import InputError
 
-from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, TUMOUR_SWELLING, Presses, spaced
-from .ensemble import Ensemble, surface_size
+from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, TUMOUR_SWELLING, Presses, choose_spaced
+from .ensemble import Ensemble, compute_surface_motion
 
 # Maximum number of shapes of each kind in each skull; smallest share of the variance of one of them.
 MOST = {DRAINAGE: 12, SWELLING: 12, TUMOUR_SWELLING: 4, OEDEMA: 8, TOOL: 40}
@@ -129,7 +129,7 @@ class MotionPrior:
         """
         return self.shape[:, self._columns(nodes)]
 
-    def restricted(self, nodes: np.ndarray) -> MotionPrior:
+    def restrict(self, nodes: np.ndarray) -> MotionPrior:
         """Return this prior restricted to some vertices (k,); it raises InputError as `at` does.
 
         Results are unchanged where available. An observation that touches other vertices is rejected.
@@ -145,7 +145,7 @@ class MotionPrior:
     def middle(self) -> np.ndarray:
         """(r, 3) [m]: motion of the centroid of the tumour's volume by each shape."""
         tumour = self.anatomy.tumour_nodes
-        return np.einsum("v,rvi->ri", tumour_share(self.anatomy)[tumour], self.at(tumour))
+        return np.einsum("v,rvi->ri", compute_tumour_share(self.anatomy)[tumour], self.at(tumour))
 
     @cached_property
     def on_cortex(self) -> np.ndarray:
@@ -170,13 +170,13 @@ class MotionPrior:
         """(n, 3, r) float32 [m]: the shapes, with those of one vertex contiguous in memory."""
         return np.ascontiguousarray(self.shape.transpose(1, 2, 0))
 
-    def at_vertices(self, nodes: np.ndarray) -> np.ndarray:
+    def restrict_to_vertices(self, nodes: np.ndarray) -> np.ndarray:
         """Return the shapes (k, 3, r) float32 [m] at some vertices (k,); it raises InputError as `at` does."""
         return self._by_vertex[self._columns(nodes)]
 
     def seen(self, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Compute displacements (m, r) [m] of each shape, by vertices and weights as in `Evidence.weights`."""
-        shape = self.at_vertices(vertices)
+        shape = self.restrict_to_vertices(vertices)
         return (weights @ shape.reshape(weights.shape[1], -1)).reshape(-1, shape.shape[2])
 
     def odds(self, tips: np.ndarray) -> np.ndarray:
@@ -221,20 +221,27 @@ class MotionPrior:
         )
 
 
-def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = None) -> MotionPrior:
+def build_prior(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = None) -> MotionPrior:
     """Build the prior of an ensemble, or of some of its members (N,) bool, and of forces on the open cortex."""
     anatomy, parts = ensemble.anatomy, []
     chosen = np.ones(len(ensemble.kind), bool) if members is None else members
     for kind, skull in product(BESIDE, range(len(SKULLS))):
         some = np.flatnonzero(chosen & (ensemble.kind == kind) & (ensemble.skull == skull))
         if len(some):
-            shape = principal(unit(anatomy, ensemble.motion[some]) / np.float32(np.sqrt(len(some))), MOST[kind])
+            shape = compute_principal_parts(
+                normalise_motions(anatomy, ensemble.motion[some]) / np.float32(np.sqrt(len(some))), MOST[kind]
+            )
             parts.append((shape, kind, skull, NOWHERE))
-    centres = spaced(presses.points, PLACES)
+    centres = choose_spaced(presses.points, PLACES)
     for name in dict.fromkeys(PRESSED.values()):
         skull, motion = list(SKULLS).index(name), presses.motion[name]
         parts.append(
-            (alike(anatomy, principal(motion.reshape(-1, *motion.shape[-2:]), MOST[TOOL])), TOOL, skull, NOWHERE)
+            (
+                normalise_shapes(anatomy, compute_principal_parts(motion.reshape(-1, *motion.shape[-2:]), MOST[TOOL])),
+                TOOL,
+                skull,
+                NOWHERE,
+            )
         )
         for place, centre in enumerate(centres):
             away = ((presses.points - presses.points[centre]) ** 2).sum(axis=1)
@@ -242,7 +249,14 @@ def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = 
             weight = np.exp(-away[near] / (2.0 * REACH**2)).astype(np.float32)
             some = motion[:, near] * weight[:, None, None, None]
             parts.append(
-                (alike(anatomy, principal(some.reshape(-1, *motion.shape[-2:]), PLACE_SHAPES)), TOOL, skull, place)
+                (
+                    normalise_shapes(
+                        anatomy, compute_principal_parts(some.reshape(-1, *motion.shape[-2:]), PLACE_SHAPES)
+                    ),
+                    TOOL,
+                    skull,
+                    place,
+                )
             )
     shapes, *labels = zip(*parts, strict=True)
     counts = [len(shape) for shape in shapes]
@@ -250,22 +264,22 @@ def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = 
     return MotionPrior(anatomy, np.concatenate(shapes), *labels, presses.points[centres])
 
 
-def unit(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
+def normalise_motions(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
     """Scale motions (n, V, 3) [m] to 1 mm root mean square, on the open cortex or in the tumour (the larger).
 
     Scaling by the cortex alone would magnify motions that leave it nearly undeformed.
     """
     tumour = np.sqrt((motion[:, anatomy.tumour_nodes] ** 2).sum(axis=2).mean(axis=1))
-    size = np.maximum(surface_size(anatomy, motion), tumour)
+    size = np.maximum(compute_surface_motion(anatomy, motion), tumour)
     return motion * (1e-3 / size)[:, None, None].astype(np.float32)
 
 
-def alike(anatomy: Anatomy, shape: np.ndarray) -> np.ndarray:
+def normalise_shapes(anatomy: Anatomy, shape: np.ndarray) -> np.ndarray:
     """Scale shapes (k, V, 3) [m] so that together they move the open cortex by 1 mm."""
-    return shape * np.float32(1e-3 / np.sqrt((surface_size(anatomy, shape) ** 2).sum()))
+    return shape * np.float32(1e-3 / np.sqrt((compute_surface_motion(anatomy, shape) ** 2).sum()))
 
 
-def principal(motion: np.ndarray, most: int) -> np.ndarray:
+def compute_principal_parts(motion: np.ndarray, most: int) -> np.ndarray:
     """Compute up to `most` principal components (k, V, 3) of motions (n, V, 3), with the same Gram matrix."""
     flat = motion.reshape(len(motion), -1)
     value, vector = np.linalg.eigh((flat @ flat.T).astype(float))
@@ -274,12 +288,12 @@ def principal(motion: np.ndarray, most: int) -> np.ndarray:
     return (vector[:, chosen].T.astype(np.float32) @ flat).reshape(-1, *motion.shape[1:])
 
 
-def middle_of(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
+def compute_middle(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
     """Compute the motion (n, 3) [m] of the centroid of the tumour's volume for motions (n, V, 3) [m]."""
-    return np.einsum("v,nvi->ni", tumour_share(anatomy), motion)
+    return np.einsum("v,nvi->ni", compute_tumour_share(anatomy), motion)
 
 
-def tumour_share(anatomy: Anatomy) -> np.ndarray:
+def compute_tumour_share(anatomy: Anatomy) -> np.ndarray:
     """Compute the weight (V,) of each vertex in the centroid of the tumour's volume."""
     mesh = anatomy.mesh
     inside = anatomy.in_tumour

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import isclose
 from numbers import Integral
 
-from sim.anatomy import TUMOUR_LABEL, Anatomy, missing_region, region_words
+from sim.anatomy import TUMOUR_LABEL, Anatomy, describe_missing_region, describe_region
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import Material, Tissue
@@ -45,7 +45,7 @@ class Region:
         Material("linear", self.ratio, 0.25 if self.poisson is None else self.poisson)
 
 
-def beside(
+def build_tissue(
     tissue: Callable[[float, float], Tissue], poisson: float, ratio: float, regions: tuple[Region, ...]
 ) -> Elasticity:
     """Build the elasticity of brain, tumour and known regions from `tissue(times, poisson)`.
@@ -57,7 +57,7 @@ def beside(
     return Elasticity(tissue(1.0, poisson), {TUMOUR_LABEL: tissue(ratio, poisson), **known})
 
 
-def known_regions(elasticity: Elasticity) -> tuple[Region, ...]:
+def list_known_regions(elasticity: Elasticity) -> tuple[Region, ...]:
     """Return the regions that have a tissue of their own.
 
     Raises
@@ -81,11 +81,11 @@ def known_regions(elasticity: Elasticity) -> tuple[Region, ...]:
 def check_regions(regions: tuple[Region, ...], anatomy: Anatomy) -> None:
     """Raise InputError for a region that an anatomy does not have."""
     for one in regions:
-        if missing := missing_region(anatomy.mesh, one.label):
+        if missing := describe_missing_region(anatomy.mesh, one.label):
             raise InputError(missing)
 
 
-def differing(elasticity: Elasticity, known: tuple[Region, ...]) -> tuple[int, ...]:
+def find_differing_regions(elasticity: Elasticity, known: tuple[Region, ...]) -> tuple[int, ...]:
     """Return the labels of regions whose tissue differs from the known one.
 
     Regions without an entry count as brain. The tumour is excluded: its stiffness may be unknown. Empty if a tissue has
@@ -93,7 +93,7 @@ def differing(elasticity: Elasticity, known: tuple[Region, ...]) -> tuple[int, .
     """
     if not all(isinstance(tissue, Material) for tissue in (elasticity.default, *elasticity.regions.values())):
         return ()
-    has, knows = ({one.label: one for one in some} for some in (known_regions(elasticity), known))
+    has, knows = ({one.label: one for one in some} for some in (list_known_regions(elasticity), known))
     labels = {*has, *knows} - {TUMOUR_LABEL}
     as_brain = {label: Region(label, 1.0) for label in labels}
     pairs = {label: ({**as_brain, **has}[label], {**as_brain, **knows}[label]) for label in labels}
@@ -104,10 +104,10 @@ def differing(elasticity: Elasticity, known: tuple[Region, ...]) -> tuple[int, .
     )
 
 
-def regions_words(regions: tuple[Region, ...]) -> str:
+def describe_regions(regions: tuple[Region, ...]) -> str:
     """Describe the known regions; empty if there are none."""
     return "; ".join(
-        f"{region_words(one.label)} {one.ratio:.3g} times as stiff as the brain"
+        f"{describe_region(one.label)} {one.ratio:.3g} times as stiff as the brain"
         + ("" if one.poisson is None else f", Poisson's ratio {one.poisson:g}")
         for one in regions
     )

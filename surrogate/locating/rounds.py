@@ -8,35 +8,35 @@ from __future__ import annotations
 
 import numpy as np
 
-from .observation import Observation, placed, placed_anew
-from .posterior import Posterior, conditioned
+from .observation import Observation, place_again, to_evidence
+from .posterior import Posterior, condition_prior
 from .prior import MotionPrior
 
 # Maximum number of iterations; they end once the tumour's centroid moves by less than this [m].
 ROUNDS, STEADY = 6, 0.2e-3
 
 
-def settled(prior: MotionPrior, observation: Observation, free: bool = False) -> tuple[Posterior, np.ndarray]:
+def match_and_update(prior: MotionPrior, observation: Observation, free: bool = False) -> tuple[Posterior, np.ndarray]:
     """Compute the posterior of an observation, and the numbers (k,) of its points near the cortex.
 
-    The rigid error may be `free`, as in `conditioned`.
+    The rigid error may be `free`, as in `condition_prior`.
 
     Raises
     ------
     InputError
-        As `placed`.
+        As `to_evidence`.
     """
     anatomy, tips, count = prior.anatomy, observation.tips, len(observation.now)
-    evidence = placed(anatomy, observation)
+    evidence = to_evidence(anatomy, observation)
     near = np.unique(evidence.point[evidence.point < count])
-    found = conditioned(prior, evidence, tips, free)
+    found = condition_prior(prior, evidence, tips, free)
     if observation.rest is None or len(tips):
         cortex, motion = np.unique(anatomy.open_surface), np.zeros_like(anatomy.mesh.nodes)
         for _ in range(ROUNDS):
             motion[cortex] = np.tensordot(found.weight, prior.at(cortex), 1)
-            evidence = placed_anew(anatomy, observation, near, motion, found.bias_at)
+            evidence = place_again(anatomy, observation, near, motion, found.compute_bias)
             supported = np.delete(np.arange(len(tips)), found.outliers[found.outliers >= count] - count)
-            before, found = found, conditioned(prior, evidence, tips[supported], free)
+            before, found = found, condition_prior(prior, evidence, tips[supported], free)
             if np.linalg.norm((found.weight - before.weight) @ prior.middle) < STEADY:
                 break
     return found, near

@@ -40,7 +40,7 @@ class Equations:
     place: np.ndarray
     evidence: np.ndarray
 
-    def eliminated(self, kind: int, last: bool = False) -> Equations:
+    def eliminate_unknowns(self, kind: int, last: bool = False) -> Equations:
         """Eliminate the unknowns of one kind; the `last` elimination leaves no `table`."""
         first = int(np.argmax(self.kind == kind))
         end = first + np.count_nonzero(self.kind == kind)
@@ -72,7 +72,7 @@ class Equations:
         return Equations(self.kind, table, self.place[..., None, :, :, :], self.evidence[..., None])
 
 
-def with_places(several: Sequence[Equations]) -> np.ndarray:
+def add_places(several: Sequence[Equations]) -> np.ndarray:
     """Compute logarithms (n, ..., p) of the evidence of n equations with one place each, of the eliminated unknowns."""
     # Blocks are small and many: Gaussian elimination of all at once takes a tenth of the time of library calls.
     table = np.ascontiguousarray(np.moveaxis(np.stack([each.place for each in several]), (-2, -1), (0, 1)))
@@ -142,10 +142,10 @@ class WhitenedSystem:
         return found
 
 
-def whitened(prior: MotionPrior, evidence: Evidence, seen: float) -> WhitenedSystem:
+def whiten(prior: MotionPrior, evidence: Evidence, seen: float) -> WhitenedSystem:
     """Build whitened rows of a prior's shapes and of evidence, with their model error for motions of `seen` [m]."""
     whitening = evidence.whitening(seen)
     vertices, weights = evidence.weights
-    shape = prior.at_vertices(vertices).reshape(weights.shape[1], -1).astype(float)
+    shape = prior.restrict_to_vertices(vertices).reshape(weights.shape[1], -1).astype(float)
     rest = np.column_stack([evidence.rigid * evidence.rigid_scale, evidence.value])
     return WhitenedSystem(whitening, whitening.root @ weights, shape, whitening.white(rest))

@@ -24,10 +24,10 @@ from sim.effects import (
     ToolForce,
 )
 from sim.material import Pairs
-from sim.tools import BuiltIn, Tool, named
+from sim.tools import BuiltIn, Tool, name_tool
 
-from ..data.answer_rows import stated_tissue
-from ..data.holding import series_of
+from ..data.answer_rows import read_tissue_statement
+from ..data.holding import get_relaxation_series
 from .learned import Learned
 
 # Effects that do nothing without a load of their kind: training may include them although a scene does not.
@@ -38,7 +38,7 @@ SAME = 1e-9
 UNSAID = frozenset(kind.__name__ for kind in (Elasticity, Held, Slide, ToolForce))
 
 
-def trained_effects(stated: Mapping[str, str]) -> frozenset[str]:
+def read_trained_effects(stated: Mapping[str, str]) -> frozenset[str]:
     """Return the names of the effects that a model was trained under, or a data set was made under, by its file."""
     if "effects" not in stated:
         return UNSAID
@@ -49,13 +49,13 @@ def trained_effects(stated: Mapping[str, str]) -> frozenset[str]:
     return frozenset()
 
 
-def trained_skull(stated: Mapping[str, str]) -> str:
+def read_trained_skull(stated: Mapping[str, str]) -> str:
     """Return the skull model of a data set: one of `sim.effects.SKULLS`."""
-    names = trained_effects(stated)
+    names = read_trained_effects(stated)
     return next((name for name, effect in SKULLS.items() if type(effect).__name__ in names), "bonded")
 
 
-def refusal(model: Learned, effects: Iterable[Effect], element: str | None = None) -> str | None:
+def find_rejection(model: Learned, effects: Iterable[Effect], element: str | None = None) -> str | None:
     """Return the reason why a model does not support these effects or this element, or None if it does.
 
     A model of poses needs contact with its tool, one of pushes a tool's force. If its anatomy has no skull, `Bonded`
@@ -63,12 +63,12 @@ def refusal(model: Learned, effects: Iterable[Effect], element: str | None = Non
     nor is anything missing in the model's file.
     """
     effects = tuple(effects)
-    trained, asked = trained_effects(model.training), frozenset(type(effect).__name__ for effect in effects)
+    trained, asked = read_trained_effects(model.training), frozenset(type(effect).__name__ for effect in effects)
     if model.tool is not None:
         here = tuple(tool for effect in effects for tool in _moved(effect))
         if len(here) != 1 or not _alike(here[0], model.tool):
-            tools = " and ".join(map(named, here)) or "none that is moved"
-            return f"it was trained on the poses of {named(model.tool)}, and here is {tools}"
+            tools = " and ".join(map(name_tool, here)) or "none that is moved"
+            return f"it was trained on the poses of {name_tool(model.tool)}, and here is {tools}"
         asked = asked - {Retraction.__name__} | {ToolContact.__name__}
     elif ToolForce.__name__ not in asked:
         others = ", ".join(sorted(asked - trained))
@@ -98,7 +98,7 @@ def _moved(effect: Effect) -> tuple[Tool, ...]:
 
 def _other_series(trained: Elasticity, here: Elasticity) -> str | None:
     """Return the difference between the relaxation of tissues that are otherwise equal; None without one."""
-    learned, asked = series_of([trained]), series_of([here])
+    learned, asked = get_relaxation_series([trained]), get_relaxation_series([here])
     if learned == asked or here.default is None or replace(cast(Any, here.default), prony=learned) != trained.default:
         return None
     return f"it learned from tissue that {_relaxes(learned)}, and here it {_relaxes(asked)}"
@@ -114,12 +114,12 @@ def _other_body(model: Learned, effects: tuple[Effect, ...], element: str | None
     """Return the difference in tissue or element between a model's FEM and this one; None without one."""
     stated, here = model.training, next((effect for effect in effects if isinstance(effect, Elasticity)), None)
     if "tissue" in stated and here is not None:
-        trained = stated_tissue(stated)
+        trained = read_tissue_statement(stated)
         if (series := _other_series(trained, here)) is not None:
             return series
         if trained != here:
             return f"it learned from the tissue {trained}, and here it is {here}"
-        if series_of([here]) and not model.series:
+        if get_relaxation_series([here]) and not model.series:
             return "it learned from loads without time, and here the tissue relaxes with it"
     if element is not None and stated.get("element", element) != element:
         return f"it learned from {stated['element']} elements, and here they are {element}"

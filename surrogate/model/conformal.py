@@ -14,9 +14,9 @@ import numpy as np
 
 from sim.loads import Pushed
 
-from ..array_functions import taken
-from ..data.indentation import relaxed_of
-from ..regressors.protocol import standardisation
+from ..array_functions import take_rows_of
+from ..data.indentation import get_relaxation
+from ..regressors.protocol import compute_standardisation
 from .training_range import Measured, Outside
 
 LEVELS = (0.95, 0.99)
@@ -68,10 +68,10 @@ class Bound:
         scale = np.exp(_monomials(_standard(features, self.mean, self.deviation)) @ self.weights)
         away = np.maximum(outside.away - self.near, 0.0)
         scale = scale * (1.0 + self.growth * away) * (1.0 + GROWTH * outside.beyond)
-        return taken(np.searchsorted(self.edges, force), self.quantile.T).T * scale
+        return take_rows_of(np.searchsorted(self.edges, force), self.quantile.T).T * scale
 
 
-def fitted_bound(
+def fit_bound(
     seen: tuple[np.ndarray, np.ndarray],
     features: np.ndarray,
     force: np.ndarray,
@@ -101,7 +101,7 @@ def fitted_bound(
     away, growth
         (n,) [m] distances of the calibration loads from the nearest training load; growth of the bound with it [1/m].
     """
-    mean, deviation = standardisation(seen[0])
+    mean, deviation = compute_standardisation(seen[0])
     used = _used(len(mean), LOAD if curved and len(seen[1]) >= BENDS else 0)
     design = _monomials(_standard(seen[0], mean, deviation))[:, used]
     wanted = np.log(np.maximum(seen[1], max(LEAST * seen[1].mean(), np.finfo(float).tiny)))
@@ -115,11 +115,13 @@ def fitted_bound(
     edges = np.unique(np.quantile(force, np.arange(1, count) / count))
     edges = edges[edges < force.max()]  # equal forces are of one class
     count, member = len(edges) + 1, np.searchsorted(edges, force)
-    quantile = np.array([[conformal(ratio[member == k], level) for k in range(count)] for level in LEVELS])
+    quantile = np.array(
+        [[compute_conformal_quantile(ratio[member == k], level) for k in range(count)] for level in LEVELS]
+    )
     return Bound(mean, deviation, weights, edges, quantile, np.array(growth), np.zeros(()))
 
 
-def fitted_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.ndarray]) -> float:
+def fit_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.ndarray]) -> float:
     """Compute the growth [1/m] with which the first of `LEVELS` is covered equally far from and near training loads.
 
     Parameters
@@ -130,10 +132,12 @@ def fitted_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np
     """
 
     def larger(growth: float) -> bool:
-        asked, promised = (conformal(ratio / (1.0 + growth * away), LEVELS[0]) for ratio, away in (far, near))
+        asked, promised = (
+            compute_conformal_quantile(ratio / (1.0 + growth * away), LEVELS[0]) for ratio, away in (far, near)
+        )
         return asked > promised
 
-    if not np.isfinite(conformal(far[0], LEVELS[0])):
+    if not np.isfinite(compute_conformal_quantile(far[0], LEVELS[0])):
         return USUAL_GROWTH
     least, most = 0.0, MOST_GROWTH
     for _ in range(40):
@@ -142,17 +146,17 @@ def fitted_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np
     return most
 
 
-def features_of(pushed: Pushed, known: Measured) -> np.ndarray:
+def compute_features(pushed: Pushed, known: Measured) -> np.ndarray:
     """Compute features (B, 7) of an error's size: logarithms of force and radius, angle, overhang and point [mm].
 
     For relaxing tissue, where all loads have one tool, the relaxed share replaces the radius.
     """
-    force, relaxed = np.log(np.maximum(known.magnitude, np.finfo(float).tiny)), relaxed_of(pushed)
+    force, relaxed = np.log(np.maximum(known.magnitude, np.finfo(float).tiny)), get_relaxation(pushed)
     second = np.log(pushed.footprint) if relaxed is None else relaxed
     return np.column_stack([force, second, known.angle, 1e3 * known.overhang, 1e3 * pushed.point])
 
 
-def conformal(ratio: np.ndarray, level: float) -> float:
+def compute_conformal_quantile(ratio: np.ndarray, level: float) -> float:
     """Return the ceil(level (n + 1))-th smallest of `ratio` (n,): infinite if n is too small for the level."""
     rank = int(np.ceil(level * (len(ratio) + 1)))
     return float(np.sort(ratio)[rank - 1]) if rank <= len(ratio) else np.inf

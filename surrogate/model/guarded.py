@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.deformation import Cost, Deformation, Deformer, Outcome, joined
+from sim.deformation import Cost, Deformation, Deformer, Outcome, join_deformations
 from sim.errors import InputError
-from sim.geometry.surface import vertex_areas
+from sim.geometry.surface import compute_vertex_areas
 from sim.loads import Loads
 
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS
 from ..regressors.rigid_contact import RigidContact
 from .learned import Learned, ModelPart
-from .left_out import LIMIT, HeldOutError, handed_over
+from .left_out import LIMIT, HeldOutError, find_handed_over
 from .tool_contact import HELD
 
 
@@ -83,31 +83,31 @@ class Guarded:
     def unsure(self, predicted: Deformation) -> np.ndarray:
         """Return the mask (B,) of predictions that need FEM."""
         bound = np.where(np.isnan(predicted.bound[0]), self.model.bound, predicted.bound[0])
-        return handed_over(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
+        return find_handed_over(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
 
 
-def off_by(model: Learned) -> HeldOutError:
+def compute_error(model: Learned) -> HeldOutError:
     """Return a model's reported errors on held-out cortex."""
     return HeldOutError(model.bound, model.left_out)
 
 
-def judged(model: Learned) -> str:
+def describe_error(model: Learned) -> str:
     """Describe a model's reported errors, and the deformer used in scenes: see `Guarded`."""
-    stated = off_by(model)
+    stated = compute_error(model)
     guarded = "it plays alone nevertheless, as its tissue relaxes" if model.series else "scenes play it guarded"
     return f"{model.left_out or stated}: {guarded if stated.weak else 'it may answer alone'}"
 
 
-def model_of(deformer: Deformer) -> Learned | None:
+def find_model(deformer: Deformer) -> Learned | None:
     """Return the model that a deformer is, or evaluates first; None for FEM."""
     if isinstance(deformer, Guarded):
         return deformer.model
     return deformer if isinstance(deformer, Learned) else None
 
 
-def answering(deformer: Deformer, answer: Deformation) -> Learned | None:
+def find_first_model(deformer: Deformer, answer: Deformation) -> Learned | None:
     """Return the model that computed the first result of a deformer; None if FEM did."""
-    return model_of(deformer) if answer.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
+    return find_model(deformer) if answer.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
 
 
 def _replaced(predicted: Deformation, rows: np.ndarray, solved: Deformation, pushed: bool) -> Deformation:
@@ -125,10 +125,10 @@ def _replaced(predicted: Deformation, rows: np.ndarray, solved: Deformation, pus
     source = predicted.source
     if len(rows):
         source += f"; for {len(rows)} of {len(predicted)} loads {solved.source}"
-    return replace(joined([ours, theirs]).rows(pick), source=source)
+    return replace(join_deformations([ours, theirs]).rows(pick), source=source)
 
 
-def tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> np.ndarray:
+def compute_tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> np.ndarray:
     """Compute the tool's mean pressure (B, k) [Pa] at each vertex of the bare surface: force by area.
 
     Contact forces are those on linear tissue, scaled so that their sum is the model's predicted force. Areas are thirds
@@ -157,19 +157,19 @@ def tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> np.ndarr
     held = answer.warm.get(HELD)
     if held is None:
         held = contact.held(ENCODERS[part.encoder](patch, model.within(model.asked(loads))[1]))
-    force = contact.held_force(held).reshape(len(loads), -1, 3)
+    force = contact.compute_held_force(held).reshape(len(loads), -1, 3)
     whole = np.linalg.norm(force.sum(axis=1), axis=1)
     size = np.linalg.norm(answer.reaction[:, 0, :3], axis=1)
     factor = np.divide(size, whole, out=np.zeros_like(size), where=whole > 0.0)
     touchable = np.unique(mesh.surface[model.anatomy.bare])
     nodes = np.tile(mesh.nodes, (len(loads), 1, 1))
     nodes[:, answer.nodes] += answer.displacement
-    area = np.stack([vertex_areas(each, mesh.surface)[touchable] for each in nodes])
+    area = np.stack([compute_vertex_areas(each, mesh.surface)[touchable] for each in nodes])
     return factor[:, None] * np.linalg.norm(force, axis=2) / area
 
 
-def knows_pressure(model: Learned) -> bool:
-    """Return True if `tool_pressure` is available for a model."""
+def has_tool_pressure(model: Learned) -> bool:
+    """Return True if `compute_tool_pressure` is available for a model."""
     return _contact_of(model) is not None
 
 

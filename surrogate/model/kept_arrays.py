@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.geometry.tetmesh import digest_of
-from sim.runtime.atomic_files import written_whole
+from sim.geometry.tetmesh import compute_digest
+from sim.runtime.atomic_files import write_atomically
 from sim.runtime.device import find_device
 from sim.runtime.outside_files import read_as
-from sim.runtime.versions import version_of
+from sim.runtime.versions import get_version
 
 from .npz_archive import Archive
 
@@ -19,7 +19,7 @@ REMADE = "Delete it: it is computed again."
 """Remedy for a damaged cache file."""
 
 
-def kept_path(folder: Path | None, stem: str, device: str, *stated: object) -> Path | None:
+def find_kept_path(folder: Path | None, stem: str, device: str, *stated: object) -> Path | None:
     """Return the cache path of arrays that this version computes on a kind of device; None without a folder.
 
     `stated` lists all other inputs that determine their bytes, the element included: each with a distinctive `repr`.
@@ -27,11 +27,11 @@ def kept_path(folder: Path | None, stem: str, device: str, *stated: object) -> P
     if folder is None:
         return None
     on = "cuda" if find_device(device, "float32").on_cuda else "cpu"
-    key = repr((version_of("sulcus"), on, *stated))
-    return folder / f"{stem}{digest_of(np.frombuffer(key.encode(), np.uint8))}.npz"
+    key = repr((get_version("sulcus"), on, *stated))
+    return folder / f"{stem}{compute_digest(np.frombuffer(key.encode(), np.uint8))}.npz"
 
 
-def kept_arrays(
+def keep_arrays(
     path: Path | None,
     kind: str,
     names: Iterable[str],
@@ -54,6 +54,6 @@ def kept_arrays(
             return found
     made = make()
     if path is not None:
-        with written_whole(path, ".npz") as unfinished:
+        with write_atomically(path, ".npz") as unfinished:
             np.savez(unfinished, **made)  # pyright: ignore[reportArgumentType]
     return made

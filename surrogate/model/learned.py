@@ -12,28 +12,28 @@ from operator import add
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.arguments import whole_numbers
-from sim.bodies.tip_distance import tip_gauge
+from sim.arguments import check_whole_numbers
+from sim.bodies.tip_distance import build_tip_gauge
 from sim.deformation import Cost, Deformation, Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, check_loads
 from sim.material import Pairs
-from sim.runtime.threads import one_thread
+from sim.runtime.threads import limit_to_one_thread
 from sim.tools import BuiltIn
 
-from ..data.answer_rows import stated_tissue
-from ..data.cortex_patch import Patch, nearest, open_patch
-from ..data.encode import ENCODERS, Basis, Encoder, directions
-from ..data.holding import stated_series
-from ..data.indentation import indented, posed, with_relaxed
+from ..data.answer_rows import read_tissue_statement
+from ..data.cortex_patch import Patch, find_nearest, open_patch
+from ..data.encode import ENCODERS, Basis, Encoder, split_forces
+from ..data.holding import read_series
+from ..data.indentation import add_relaxation, get_poses, to_indentation
 from ..regressors.protocol import Fitted
 from ..regressors.rigid_contact import RigidContact
-from .conformal import LEVELS, Bound, features_of
+from .conformal import LEVELS, Bound, compute_features
 from .left_out import LeftOut
-from .relaxation import MEMORY, Relaxed, followed
+from .relaxation import MEMORY, Relaxed, follow_relaxation
 from .tip_distance import Distance, TipModel
-from .tool_contact import ForceModel, going_on, held_of, wrench
-from .training_range import Envelope, Measured, Outside, measured
+from .tool_contact import ForceModel, build_warm_encoders, collect_held_state, compute_wrench
+from .training_range import Envelope, Measured, Outside, measure_loads
 
 # Largest force or footprint relative to the training's. On the template's brain FEM finds no equilibrium for three
 # loads of this size, and at twice the force the error of a prediction is up to 31 %.
@@ -111,14 +111,14 @@ class Learned:
     def source(self) -> str:
         """Description of its model type and training, for `source` of results."""
         stated = self.training
-        tissue = str(stated_tissue(stated)) if "tissue" in stated else "tissue not given"
+        tissue = str(read_tissue_statement(stated)) if "tissue" in stated else "tissue not given"
         element = stated.get("element", "not given")
         return f"{stated.get('learner', 'learned')}, from finite elements ({element}; {tissue})"
 
     @cached_property
     def series(self) -> Pairs:
         """Prony series of its tissue, if it follows relaxation in time; else ()."""
-        return () if self.tool is None else stated_series(self.training)
+        return () if self.tool is None else read_series(self.training)
 
     @cached_property
     def nodes(self) -> np.ndarray:
@@ -170,7 +170,7 @@ class Learned:
             return
         force = ("a force", 1.0, "N") if self.tool is None else ("a depth", 1e3, "mm")
         for (name, unit, symbol), size, (_, most) in (
-            (force, directions(pushed)[0], self.envelope.force),
+            (force, split_forces(pushed)[0], self.envelope.force),
             (("a footprint", 1e3, "mm"), pushed.footprint, self.envelope.footprint),
         ):
             far = np.flatnonzero(size > FARTHEST * most)
@@ -180,9 +180,9 @@ class Learned:
                     f"{unit * most:.3g} {symbol} at most: give up to {FARTHEST:g} times that, or ask the finite "
                     "elements."
                 )
-        away = nearest(pushed.point[doubtful], self._patch.points)[1]
+        away = find_nearest(pushed.point[doubtful], self._patch.points)[1]
         if (away > pushed.footprint[doubtful]).any():  # away from nodes, but perhaps not from triangles
-            self._patch.skin.demand_touch(pushed.point, pushed.footprint)
+            self._patch.skin.check_tools_touch(pushed.point, pushed.footprint)
 
     def _demand_known(self, nodes: np.ndarray) -> None:
         inside = (nodes >= 0) & (nodes < len(self._knows))
@@ -217,17 +217,17 @@ class Learned:
             )
         begun = time.perf_counter()
         pushed, past = self._followed(loads, start)
-        nodes = self.nodes if at is None else whole_numbers("at", at)
+        nodes = self.nodes if at is None else check_whole_numbers("at", at)
         self._demand_known(nodes)
-        with one_thread() if len(loads) == 1 else nullcontext():
-            return self._summed(loads, pushed, nodes, begun, past, going_on(self._regressors, start))
+        with limit_to_one_thread() if len(loads) == 1 else nullcontext():
+            return self._summed(loads, pushed, nodes, begun, past, build_warm_encoders(self._regressors, start))
 
     def _summed(
         self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float, past: Relaxed | None,
         encoders: Mapping[str, Encoder],
     ) -> Deformation:  # fmt: skip
         """Sum the parts; the computation began at `begun` [s]."""
-        known = measured(self._patch, pushed)
+        known = measure_loads(self._patch, pushed)
         outside = self.envelope.outside(pushed, known)
         far, small = outside.excess > 0.0, pushed.footprint < self.envelope.reach + STORED
         self._demand_answerable(pushed, np.flatnonzero(far | small))
@@ -235,16 +235,18 @@ class Learned:
         if past is not None:
             far = far | past.strange
         motion = self.motion(pushed, nodes, encoders)
-        answer = predicted(motion, nodes, loads, far, begun, promised, self.source)
+        answer = build_prediction(motion, nodes, loads, far, begun, promised, self.source)
         if past is not None:
             answer = replace(answer, memory={MEMORY: past.memory})
         if self.tool is not None:
-            answer = replace(answer, warm=held_of(self._regressors, self._patch, self.within(pushed)[1], encoders))
+            answer = replace(
+                answer, warm=collect_held_state(self._regressors, self._patch, self.within(pushed)[1], encoders)
+            )
         if self.force is None or self.tool is None:
             return answer
         return replace(
             answer,
-            reaction=wrench(self.exerted(pushed, encoders), posed(loads, self.tool), self.tool),
+            reaction=compute_wrench(self.exerted(pushed, encoders), get_poses(loads, self.tool), self.tool),
             reaction_bound=self.promised(self.force.bound, pushed, known, outside),
             cost=Cost({"predict": time.perf_counter() - begun}),
         )
@@ -268,7 +270,7 @@ class Learned:
 
     def within(self, pushed: Pushed) -> tuple[np.ndarray, Pushed]:
         """Return sizes (B,) of forces [N] or depths [m], and the loads with sizes clipped to the training range."""
-        magnitude, direction = directions(pushed)
+        magnitude, direction = split_forces(pushed)
         return magnitude, replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
 
     def exerted(self, pushed: Pushed, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
@@ -294,7 +296,7 @@ class Learned:
             return np.stack([np.nan * outside.excess] * len(LEVELS))
         # The error, like the motion, is in proportion to a force below the training's smallest.
         weaker = np.minimum(known.magnitude / self.envelope.force[0], 1.0)
-        features = features_of(pushed, self.envelope.within(known))
+        features = compute_features(pushed, self.envelope.within(known))
         return np.where(weaker > 0.0, bound.of(features, known.magnitude, outside), 0.0) * weaker
 
     def distance(self, loads: Loads, answer: Deformation | None = None, apart: np.ndarray | None = None) -> Distance:
@@ -317,15 +319,15 @@ class Learned:
         if apart is None:
             if answer is None:
                 answer = self.deform(loads, at=self.nodes)
-            apart = tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.tool)
+            apart = build_tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.tool)
         tip = self.tip or TipModel()
         magnitude, within = self.within(pushed)
-        found = tip.corrected(apart, self._patch, within, magnitude)
-        known = measured(self._patch, pushed)
+        found = tip.apply_correction(apart, self._patch, within, magnitude)
+        known = measure_loads(self._patch, pushed)
         return Distance(found, self.promised(tip.bound, pushed, known, self.envelope.outside(pushed, known)))
 
     def asked(self, loads: Loads) -> Pushed:
-        """Convert loads to the model's input: pushes, or indentations of its tool's poses (`indentation.indented`).
+        """Convert loads to the model's input: pushes, or indentations of its tool's poses (`indentation.to_indentation`).
 
         Raises
         ------
@@ -337,15 +339,15 @@ class Learned:
     def _followed(self, loads: Loads, start: Deformation | None = None) -> tuple[Pushed, Relaxed | None]:
         """Convert loads as `asked`, from a start, and return the state of relaxation, if tissue relaxes."""
         if self.tool is None:
-            return only_pushed(loads), None
-        pushed = indented(loads, self.tool, self._patch)
+            return get_only_pushes(loads), None
+        pushed = to_indentation(loads, self.tool, self._patch)
         if not self.series:
             return pushed, None
-        past = followed(self.series, pushed, loads.times, start, self.envelope.force[0])
-        return with_relaxed(pushed, past.share), past
+        past = follow_relaxation(self.series, pushed, loads.times, start, self.envelope.force[0])
+        return add_relaxation(pushed, past.share), past
 
 
-def predicted(
+def build_prediction(
     displacement: np.ndarray,
     nodes: np.ndarray,
     loads: Loads,
@@ -379,7 +381,7 @@ def predicted(
     )
 
 
-def only_pushed(loads: Loads) -> Pushed:
+def get_only_pushes(loads: Loads) -> Pushed:
     """Return the pushes of loads without other causes.
 
     Raises

@@ -75,7 +75,7 @@ class HeldOutError:
         return f"{mean}; 99.9th percentile {1e3 * self.left_out.p999:.2g} mm (limit {1e3 * WORST:g} mm)"
 
 
-def handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np.ndarray:
+def find_handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np.ndarray:
     """Return the mask (B,) of loads that need FEM: no bound within the limit, or `outside`.
 
     `bound` (B,) and `limit` are in metres, `outside` (B,) bool.
@@ -83,7 +83,7 @@ def handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np.ndar
     return ~(bound <= limit) | outside
 
 
-def left_out_of(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, outside: np.ndarray) -> LeftOut:
+def measure_held_out(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, outside: np.ndarray) -> LeftOut:
     """Compute errors on B loads, with the largest of `LIMITS` that keeps the guarded model within `MEAN` and `WORST`.
 
     Parameters
@@ -99,7 +99,7 @@ def left_out_of(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, out
     """
     share, left, solved, limit = distance.mean(axis=1) / motion, 0.0, outside, LIMIT
     for limit in LIMITS:
-        solved = handed_over(bound, outside, limit)
+        solved = find_handed_over(bound, outside, limit)
         left = float(np.where(solved, 0.0, share).mean())
         if _enough(left, _p999(np.where(solved[:, None], 0.0, distance))):
             break

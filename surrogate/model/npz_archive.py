@@ -13,18 +13,18 @@ import numpy as np
 from numpy.lib import format as npy
 
 from sim.errors import InputError
-from sim.geometry.tetmesh import digest_of
+from sim.geometry.tetmesh import compute_digest
 from sim.runtime.file_limits import LARGEST_HEADER, LARGEST_MODEL
 
 # Maximum size of an array's header [bytes].
 LONGEST = 10_000
 
 
-def seal_of(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+def compute_seal(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
     """Compute the digest of a file's header, without its own `seal`, and of all its arrays."""
     names = sorted(arrays)
     stated = json.dumps([names, {name: value for name, value in header.items() if name != "seal"}], sort_keys=True)
-    return digest_of(np.frombuffer(stated.encode(), np.uint8), *(arrays[name] for name in names))
+    return compute_digest(np.frombuffer(stated.encode(), np.uint8), *(arrays[name] for name in names))
 
 
 def write_archive(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -69,7 +69,7 @@ class Archive:
         self._demand(wanted, self._largest)
         return {name: self._array(name) for name in wanted}
 
-    def addressed(self, digests: Iterable[str]) -> dict[str, np.ndarray]:
+    def read_by_digest(self, digests: Iterable[str]) -> dict[str, np.ndarray]:
         """Read arrays that are stored under the digest of their content.
 
         Raises
@@ -79,11 +79,11 @@ class Archive:
         """
         found = self.arrays(digests)
         for name, array in found.items():
-            if digest_of(array) != name:
+            if compute_digest(array) != name:
                 raise self._damaged(f"its array {name!r} has another digest")
         return found
 
-    def sealed(self, header: Mapping[str, Any], names: Iterable[str]) -> dict[str, np.ndarray]:
+    def read_sealed(self, header: Mapping[str, Any], names: Iterable[str]) -> dict[str, np.ndarray]:
         """Read arrays by name, and verify the header's `seal` of header and arrays.
 
         Raises
@@ -92,7 +92,7 @@ class Archive:
             As `arrays`; header or arrays that do not match the seal.
         """
         found = self.arrays(names)
-        if seal_of(header, found) != header["seal"]:
+        if compute_seal(header, found) != header["seal"]:
             raise self._damaged("its header and arrays do not have the digest that it states")
         return found
 

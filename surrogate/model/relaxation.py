@@ -18,8 +18,8 @@ from sim.errors import InputError
 from sim.loads import Pushed
 from sim.material import Pairs
 
-from ..data.encode import directions
-from ..data.holding import unfaded
+from ..data.encode import split_forces
+from ..data.holding import compute_unfaded
 
 MEMORY = "relaxation"
 """Key in `Deformation.memory`: depth [m], position of first contact [m], then each h [m]; (B, 4 + pairs)."""
@@ -47,7 +47,9 @@ class Relaxed:
     memory: np.ndarray
 
 
-def followed(series: Pairs, pushed: Pushed, times: np.ndarray, start: Deformation | None, shallowest: float) -> Relaxed:
+def follow_relaxation(
+    series: Pairs, pushed: Pushed, times: np.ndarray, start: Deformation | None, shallowest: float
+) -> Relaxed:
     """Advance relaxation at indentations from the previous result; without one, each is a history of `holding`.
 
     Parameters
@@ -66,9 +68,9 @@ def followed(series: Pairs, pushed: Pushed, times: np.ndarray, start: Deformatio
     InputError
         A start without such a memory, or of later times.
     """
-    depth, (g, tau) = directions(pushed)[0], np.array(series).T
+    depth, (g, tau) = split_forces(pushed)[0], np.array(series).T
     if start is None:
-        left = unfaded(series, times) * depth[:, None]
+        left = compute_unfaded(series, times) * depth[:, None]
         return _relaxed(g, pushed, depth, pushed.point, left, shallowest)
     past = start.memory.get(MEMORY)
     if past is None or past.shape != (len(depth), 4 + len(series)):

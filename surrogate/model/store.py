@@ -14,13 +14,13 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.effects import Elasticity
 from sim.errors import InputError
-from sim.geometry.tetmesh import digest_of
-from sim.runtime.atomic_files import written_whole
-from sim.runtime.outside_files import path_of, read_as
-from sim.runtime.versions import version_of
-from sim.tools import stated_tool
+from sim.geometry.tetmesh import compute_digest
+from sim.runtime.atomic_files import write_atomically
+from sim.runtime.outside_files import read_as, to_path
+from sim.runtime.versions import get_version
+from sim.tools import read_tool_statement
 
-from ..data.answer_rows import first_stated
+from ..data.answer_rows import find_first_tissue
 from ..data.encode import Basis
 from ..regressors.baselines import Ann, Pcr, Svr
 from ..regressors.force_series import ForcePairs, Remainder, Series
@@ -30,12 +30,12 @@ from ..regressors.rigid_contact import RigidContact
 from .conformal import GROWTH, Bound
 from .learned import Learned, ModelPart
 from .left_out import HeldOutError, LeftOut
-from .npz_archive import Archive, seal_of, write_archive
+from .npz_archive import Archive, compute_seal, write_archive
 from .own_learners import find_own, name_of
 from .tip_distance import TipModel
 from .tool_contact import ForceModel
 from .training_range import Envelope
-from .vetting import demand_finite, demand_sound
+from .vetting import check_finite_state, check_model_state
 
 FORMAT = "sulcus model 2"
 REMEDY = "Make one with `sulcus train`."
@@ -67,7 +67,7 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
     def put(array: np.ndarray) -> str:
         if not isinstance(array, np.ndarray) or array.dtype.hasobject:
             raise InputError(f"{path}: a learner's state holds a {type(array).__name__} that is no array of numbers.")
-        name = digest_of(array)  # parts that models share are stored once
+        name = compute_digest(array)  # parts that models share are stored once
         arrays[name] = array
         return name
 
@@ -75,11 +75,11 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
         "format": FORMAT,
         "anatomy": digests.pop(),
         "space": "RAS [m]",
-        "versions": {name: version_of(name) for name in ("sulcus", "numpy")},
+        "versions": {name: get_version(name) for name in ("sulcus", "numpy")},
         "models": {name: _described(model, put) for name, model in models.items()},
     }
-    header["seal"] = seal_of(header, {})  # array names are their digests
-    with written_whole(path, ".npz") as partial:
+    header["seal"] = compute_seal(header, {})  # array names are their digests
+    with write_atomically(path, ".npz") as partial:
         write_archive(partial, {"header": np.array(json.dumps(header)), **arrays})
 
 
@@ -92,7 +92,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
         A file that is missing or not a model file of this project, that was trained on another anatomy, or that holds
         an invalid model.
     """
-    path = path_of(path)
+    path = to_path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; make a model with `sulcus train`.")
     with read_as(path, "a model", REMEDY), path.open("rb") as raw:
@@ -105,14 +105,14 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
                 f"{path}: was trained on the anatomy {str(header['anatomy'])[:40]}, but this one is {anatomy.digest}: "
                 "use the mesh that it was made for, or run `sulcus simulate` and `sulcus train` for this one."
             )
-        arrays = archive.addressed(_keys(header["models"].values()))
+        arrays = archive.read_by_digest(_keys(header["models"].values()))
         models = {name: _rebuilt(description, arrays, anatomy) for name, description in header["models"].items()}
         for name, model in models.items():
-            demand_sound(name, model)
+            check_model_state(name, model)
         return models
 
 
-def stated_errors(path: str | Path) -> dict[str, HeldOutError]:
+def read_reported_errors(path: str | Path) -> dict[str, HeldOutError]:
     """Read the reported errors of a file's models, by name; their arrays are not read.
 
     Raises
@@ -124,7 +124,7 @@ def stated_errors(path: str | Path) -> dict[str, HeldOutError]:
         return {name: HeldOutError(about["bound"], _left_out(about)) for name, about in header["models"].items()}
 
 
-def learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
+def read_learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
     """Read the tissue that a file's models were trained on, regions included; their arrays are not read.
 
     None if the file does not give it, or for models of another anatomy.
@@ -132,18 +132,18 @@ def learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
     Raises
     ------
     InputError
-        As `stated_errors`; an invalid tissue.
+        As `read_reported_errors`; an invalid tissue.
     """
     with _described_in(path) as header:
         if header["anatomy"] != anatomy.digest:
             return None
-        return first_stated(about["training"] for about in header["models"].values())
+        return find_first_tissue(about["training"] for about in header["models"].values())
 
 
 @contextmanager
 def _described_in(path: str | Path) -> Iterator[dict[str, Any]]:
     """Open the header of a model file; errors within the block are reported with the file's name."""
-    path = path_of(path)
+    path = to_path(path)
     with read_as(path, "a model", REMEDY), path.open("rb") as raw:
         yield _header(Archive(raw, REMEDY))
 
@@ -152,7 +152,7 @@ def _header(archive: Archive) -> dict[str, Any]:
     """Read the header of a model file; older files have no seal."""
     header = json.loads(archive.text("header"))
     if "seal" in header:
-        archive.sealed(header, ())
+        archive.read_sealed(header, ())
     return header
 
 
@@ -226,7 +226,7 @@ def _described_regressor(regressor: Fitted, put: Any) -> dict[str, Any]:
 
 def _rebuilt_regressor(description: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Fitted:
     state = {name: arrays[key] for name, key in description["state"].items()}
-    demand_finite(state)
+    check_finite_state(state)
     return _kind(description["regressor"]).restored(state)
 
 
@@ -259,7 +259,7 @@ def _rebuilt_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.nda
         return None
     known = description["correction"]
     state = {} if known is None else {name: arrays[key] for name, key in known.items()}
-    demand_finite(state)
+    check_finite_state(state)
     correction = None if known is None else Gp.restored(state)
     return TipModel(correction, _rebuilt_bound(description["bound"], arrays, reach))
 
@@ -293,7 +293,7 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
         bounds=_rebuilt_bound(description["bounds"], arrays, envelope["reach"]),
         training=description["training"],
         # Missing in older files.
-        tool=stated_tool(description.get("tool"), description.get("ball")),
+        tool=read_tool_statement(description.get("tool"), description.get("ball")),
         tip=_rebuilt_tip(description.get("tip"), arrays, envelope["reach"]),
         left_out=_left_out(description),
         force=_rebuilt_force(description.get("force"), arrays, envelope["reach"]),

@@ -9,8 +9,8 @@ import numpy as np
 from sim.loads import Pushed
 
 from ..data.cortex_patch import Patch
-from ..data.encode import directions, tool_features
-from ..regressors.force_series import with_pressing
+from ..data.encode import compute_tool_features, split_forces
+from ..regressors.force_series import add_pressing
 from ..regressors.gp import Gp
 from .conformal import Bound
 
@@ -44,7 +44,7 @@ class TipModel:
     Parameters
     ----------
     correction
-        Map from `tool_features` and force over radius to the correction [m/N]; None if that did not help.
+        Map from `compute_tool_features` and force over radius to the correction [m/N]; None if that did not help.
     bound
         Bound of the corrected distance, if calibration loads were set aside.
     """
@@ -52,25 +52,25 @@ class TipModel:
     correction: Gp | None = None
     bound: Bound | None = None
 
-    def corrected(self, distance: np.ndarray, patch: Patch, asked: Pushed, magnitude: np.ndarray) -> np.ndarray:
+    def apply_correction(self, distance: np.ndarray, patch: Patch, asked: Pushed, magnitude: np.ndarray) -> np.ndarray:
         """Correct distances (B,) [m] for loads `asked` within the training forces, of true magnitude (B,) [N]."""
         if self.correction is None:
             return distance
-        off = self.correction.predict(correction_features(patch, asked))[:, 0]
+        off = self.correction.predict(compute_correction_features(patch, asked))[:, 0]
         return np.maximum(distance + magnitude * off, 0.0)
 
 
-def correction_features(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """Compute the features of a correction (B, 9): `tool_features`, and force over radius."""
-    return with_pressing(tool_features(patch, pushed))
+def compute_correction_features(patch: Patch, pushed: Pushed) -> np.ndarray:
+    """Compute the features of a correction (B, 9): `compute_tool_features`, and force over radius."""
+    return add_pressing(compute_tool_features(patch, pushed))
 
 
-def fitted_correction(patch: Patch, pushed: Pushed, off: np.ndarray) -> Gp | None:
+def fit_correction(patch: Patch, pushed: Pushed, off: np.ndarray) -> Gp | None:
     """Fit the error `off` (B,) [m] of distances under loads; None if no load presses."""
-    magnitude = directions(pushed)[0]
+    magnitude = split_forces(pushed)[0]
     some = magnitude > 0.0
     if not some.any():
         return None
     return Gp(rows=ROWS, most=MOST).fit(
-        correction_features(patch, pushed)[some], (off[some] / magnitude[some])[:, None]
+        compute_correction_features(patch, pushed)[some], (off[some] / magnitude[some])[:, None]
     )

@@ -42,7 +42,7 @@ class ForceModel:
         return 0.0 if self.learned is None else self.learned.predict(ENCODERS[self.encoder](patch, asked))
 
 
-def wrench(force: np.ndarray, pose: np.ndarray, tool: BuiltIn) -> np.ndarray:
+def compute_wrench(force: np.ndarray, pose: np.ndarray, tool: BuiltIn) -> np.ndarray:
     """Compute force [N] and moment about the tool's origin [N m] at poses (B, 4, 4): (B, 1, 6), from forces (B, 3).
 
     Frictionless pressure on a ball acts through its centre. The moment of other tools is not available: NaN.
@@ -56,7 +56,7 @@ HELD = "where a blade touches"
 """Key of the contact in the warm data of a result: rows of `RigidContact.held`."""
 
 
-def going_on(regressors: Sequence[Fitted], start: Deformation | None) -> Mapping[str, Encoder]:
+def build_warm_encoders(regressors: Sequence[Fitted], start: Deformation | None) -> Mapping[str, Encoder]:
     """Return encoders that start rods and blades from the contact stored in `start`, if there is one."""
     contact, held = _contact(regressors), None if start is None else start.warm.get(HELD)
     if contact is None or held is None or held.shape[1:] != (contact.held_width,) or not np.isfinite(held).all():
@@ -69,7 +69,7 @@ def going_on(regressors: Sequence[Fitted], start: Deformation | None) -> Mapping
     return {**ENCODERS, "core": followed}
 
 
-def held_of(
+def collect_held_state(
     regressors: Sequence[Fitted], patch: Patch, asked: Pushed, encoders: Mapping[str, Encoder]
 ) -> dict[str, np.ndarray]:
     """Return the contact to store with a result for the next warm start: rows (B, h), or nothing."""

@@ -10,9 +10,9 @@ from scipy.spatial import KDTree
 
 from sim.loads import Pushed
 
-from ..array_functions import squared_distances
+from ..array_functions import compute_squared_distances
 from ..data.cortex_patch import Patch
-from ..data.encode import directions
+from ..data.encode import split_forces
 from ..data.indentation import Indented
 
 # Relative tolerance, so that round-off puts no training load outside.
@@ -77,7 +77,7 @@ class Envelope:
 
     def holds(self, patch: Patch, pushed: Pushed) -> np.ndarray:
         """Return the mask (B,) of loads inside the range."""
-        return self.outside(pushed, measured(patch, pushed)).excess == 0.0
+        return self.outside(pushed, measure_loads(patch, pushed)).excess == 0.0
 
     def repeats(self, point: np.ndarray, corners: np.ndarray) -> bool:
         """Return True if any of the points (B, 3) [m] is exactly a training point.
@@ -94,7 +94,7 @@ class Envelope:
     def outside(self, pushed: Pushed, known: Measured) -> Outside:
         """Compute the position of loads relative to the range."""
         magnitude, angle, overhang = known
-        away = np.sqrt(squared_distances(pushed.point, self.points).min(axis=1))
+        away = np.sqrt(compute_squared_distances(pushed.point, self.points).min(axis=1))
         beyond = np.stack(
             [
                 1e3 * (overhang - self.overhang - SLACK),
@@ -109,9 +109,9 @@ class Envelope:
         return Outside(away, beyond, np.maximum(beyond, 1e3 * (away - self.reach - SLACK)))
 
 
-def envelope_of(patch: Patch, trained: Pushed) -> Envelope:
+def compute_training_range(patch: Patch, trained: Pushed) -> Envelope:
     """Compute the envelope of the training loads, from these loads alone."""
-    magnitude, angle, overhang = measured(patch, trained)
+    magnitude, angle, overhang = measure_loads(patch, trained)
     return Envelope(
         trained.point.astype(np.float32),
         _reach(trained.point),
@@ -130,11 +130,11 @@ def _reach(point: np.ndarray) -> float:
     return float(KDTree(point).query(point, 2)[0][:, 1].max())
 
 
-def measured(patch: Patch, pushed: Pushed) -> Measured:
+def measure_loads(patch: Patch, pushed: Pushed) -> Measured:
     """Measure loads for the envelope; for a rod or a blade the shaft's angle counts if it is larger."""
-    (magnitude, direction), inward = directions(pushed), patch.normal_near(pushed.point)
+    (magnitude, direction), inward = split_forces(pushed), patch.find_normals(pushed.point)
     cosine = np.einsum("bi,bi->b", direction, inward)
     if isinstance(pushed, Indented):
         cosine = np.minimum(cosine, -np.einsum("bi,bi->b", pushed.axes[:, :, 2], inward))
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    return Measured(magnitude, angle, pushed.footprint - patch.rim_distance(pushed.point))
+    return Measured(magnitude, angle, pushed.footprint - patch.compute_edge_distance(pushed.point))

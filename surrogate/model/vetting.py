@@ -13,8 +13,8 @@ from sim.tools import Ball
 
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS, Basis
-from ..data.indentation import Indented, with_relaxed
-from ..data.tool_loads import axes_about
+from ..data.indentation import Indented, add_relaxation
+from ..data.tool_loads import build_axes_about
 from ..regressors.rigid_contact import RigidContact
 from .conformal import LEVELS, Bound
 from .learned import Learned, ModelPart
@@ -25,7 +25,7 @@ from .training_range import Envelope
 FEATURES = 7
 
 
-def demand_sound(name: str, model: Learned) -> None:
+def check_model_state(name: str, model: Learned) -> None:
     """Check that a model is valid.
 
     Raises
@@ -51,7 +51,7 @@ def demand_sound(name: str, model: Learned) -> None:
         raise InputError(f"the model {name!r} cannot be: {error}. Make one with `sulcus train`.") from error
 
 
-def demand_finite(state: Mapping[str, np.ndarray]) -> None:
+def check_finite_state(state: Mapping[str, np.ndarray]) -> None:
     """Check that a regressor's state is valid.
 
     Raises
@@ -98,14 +98,14 @@ def _probe(encoder: str, model: Learned) -> np.ndarray:
         return np.ones((1, 3 * len(open_patch(model.anatomy).nodes)))
     envelope = model.envelope
     _check_envelope(envelope)
-    inward = open_patch(model.anatomy).normal_near(envelope.points[:1].astype(float))[0]
+    inward = open_patch(model.anatomy).find_normals(envelope.points[:1].astype(float))[0]
     depth, wide = envelope.force[1], envelope.footprint[1]
     pushed = Pushed(envelope.points[:1].astype(float), depth * inward[None], np.array([wide]))
     if model.tool is not None and not isinstance(model.tool, Ball):
-        axes = axes_about(-inward[None])
+        axes = build_axes_about(-inward[None])
         pushed = Indented(pushed.point, pushed.force, pushed.footprint, axes, -wide * inward[None])
     if model.series:
-        pushed = with_relaxed(pushed, np.zeros(1))
+        pushed = add_relaxation(pushed, np.zeros(1))
     return ENCODERS[encoder](open_patch(model.anatomy), pushed)
 
 

@@ -13,14 +13,14 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.loads import Pushed
-from sim.runtime.atomic_files import written_whole
-from sim.runtime.versions import version_of
+from sim.runtime.atomic_files import write_atomically
+from sim.runtime.versions import get_version
 
 from ..data.cortex_patch import open_patch
-from ..data.encode import rooted, shared_out, tool_features
+from ..data.encode import compute_tool_features, distribute_forces, scale_by_root_force
 from ..model.conformal import LEVELS
 from ..model.learned import Learned
-from ..model.training_range import measured
+from ..model.training_range import measure_loads
 from ..regressors.baselines import Ann, Pcr, Svr
 from ..regressors.force_series import ForcePairs, Remainder, Series
 from ..regressors.gp import Gp
@@ -45,7 +45,7 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
 
     Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.Pushed` has them.
     If the result depends on a compliance matrix, which that of the cortex always does, also `weight` (B, m). It is the
-    share of the force on each of the nodes `pressed` (m,) of the open cortex. `footprint_weights` of
+    share of the force on each of the nodes `pressed` (m,) of the open cortex. `compute_footprint_weights` of
     `sim.discretisation.footprint` integrates it over `Patch`: no operator of a graph could.
 
     Outputs, as in `Learned.deform`: `displacement` (B, n, 3) [m] of the mesh vertices `nodes` (n,), whose undeformed
@@ -82,12 +82,12 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
         return sheet.input("weight", sample, "share of the force on each of the nodes `pressed`")
 
     encoders = {
-        "tool": tool_features,
-        "nodal": lambda _, pushed: shared_out(weight(), pushed),
-        "rooted": lambda _, pushed: rooted(shared_out(weight(), pushed), pushed),
+        "tool": compute_tool_features,
+        "nodal": lambda _, pushed: distribute_forces(weight(), pushed),
+        "rooted": lambda _, pushed: scale_by_root_force(distribute_forces(weight(), pushed), pushed),
     }
     displacement: Any = model.motion(pushed, nodes, encoders)
-    known = measured(patch, pushed)
+    known = measure_loads(patch, pushed)
     outside = envelope.outside(pushed, known)
     excess: Any = outside.excess
     bound: Any = model.promised(model.bounds, pushed, known, outside)
@@ -98,7 +98,7 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
     sheet.output(excess > 0.0, Port("extrapolated", np.bool_, ("B",), "outside: do not rely on it"))
     sheet.output(sheet.constant(nodes), Port("nodes", np.int64, nodes.shape, "of the mesh"))
     sheet.output(sheet.constant(rest), Port("rest", np.float32, rest.shape, "where the vertices `nodes` lie [m], RAS"))
-    return sheet.model(name, TEXT, version_of("sulcus"), _notes(name, model))
+    return sheet.model(name, TEXT, get_version("sulcus"), _notes(name, model))
 
 
 def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False) -> None:
@@ -110,7 +110,7 @@ def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False
         As `onnx_model`; a path that does not end in .onnx, or a folder that cannot be written.
     """
     graph = onnx_model(name, model, cortex)
-    with written_whole(path, ".onnx") as partial:
+    with write_atomically(path, ".onnx") as partial:
         partial.write_bytes(graph.SerializeToString())
 
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from sim.runtime.optional_packages import needed_from
+from sim.runtime.optional_packages import require_extra
 
-from ..array_functions import Rounded, columns_in_use, product_of, squared_distances, taken
+from ..array_functions import Rounded, compute_squared_distances, find_columns_in_use, multiply_rows, take_rows_of
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -197,7 +197,7 @@ class Sheet:
         InputError
             The package `onnx` is not installed.
         """
-        with needed_from("onnx", "an ONNX graph needs"):
+        with require_extra("onnx", "an ONNX graph needs"):
             from onnx import helper, numpy_helper
 
         def described(ports: list[Port]) -> list:
@@ -281,14 +281,14 @@ def _arccos(cosine: Wire) -> Wire:
     return np.where(cosine < 0.0, np.pi - arc, arc)
 
 
-@squared_distances.register
+@compute_squared_distances.register
 def _(points: Wire, sites: np.ndarray) -> Any:
     """Compute |x|^2 - 2 x y + |y|^2, in double precision: differences would take the memory of B n f numbers."""
     x, y = points.astype(np.float64), sites.astype(np.float64)
     return np.maximum((x * x).sum(axis=1, keepdims=True) - x @ (2.0 * y.T) + (y * y).sum(axis=1), 0.0)
 
 
-@taken.register
+@take_rows_of.register
 def _(index: Wire, table: np.ndarray | Rounded) -> Any:
     if not isinstance(table, Rounded):
         return index.sheet.put("Gather", table[index.sample], table, index, axis=0)
@@ -296,12 +296,12 @@ def _(index: Wire, table: np.ndarray | Rounded) -> Any:
     return found.astype(np.float32) * table.step
 
 
-@product_of.register
+@multiply_rows.register
 def _(rows: Wire, table: Rounded, index: np.ndarray) -> Any:
     return (rows @ rows.sheet.constant(table.whole[index]).astype(np.float32)) * table.step
 
 
-@columns_in_use.register
+@find_columns_in_use.register
 def _(rows: Wire) -> np.ndarray:
     """Return all columns: zeros are unknown before the graph runs."""
     return np.arange(rows.shape[1])

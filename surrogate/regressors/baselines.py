@@ -14,8 +14,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..array_functions import squared_distances
-from .protocol import Stored, standardisation
+from ..array_functions import compute_squared_distances
+from .protocol import Stored, compute_standardisation
 
 # Smallest singular value relative to the largest: below is round-off.
 RANK = 1e-9
@@ -78,7 +78,7 @@ class Svr(Stored):
         """Learn from rows X (n, f), Y (n, r)."""
         from sklearn.svm import SVR  # needed to fit, not to predict
 
-        self.mean_, self.deviation_ = standardisation(X)
+        self.mean_, self.deviation_ = compute_standardisation(X)
         scaled = (X - self.mean_) / self.deviation_
         spread = np.subtract(*np.percentile(Y, [75, 25], axis=0))
         dual = np.zeros((len(X), Y.shape[1]))
@@ -103,12 +103,12 @@ class Svr(Stored):
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of features (B, f)."""
-        squared = squared_distances((X - self.mean_) / self.deviation_, self.support_)
+        squared = compute_squared_distances((X - self.mean_) / self.deviation_, self.support_)
         return (np.exp(squared / -len(self.mean_)) @ self.dual_ + self.intercept_).astype(np.float32)
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def limit_to_one_thread() -> Iterator[None]:
     """Limit torch to one thread: with layers this small its threads mostly wait, for minutes on a loaded machine."""
     import torch
 
@@ -154,7 +154,7 @@ class Ann:
         """Learn from rows X (n, f), Y (n, r)."""
         import torch  # needed to fit, not to predict
 
-        self.mean_, self.deviation_ = standardisation(X)
+        self.mean_, self.deviation_ = compute_standardisation(X)
         self.offset_ = Y.mean(axis=0)
         # One scale for all outputs: an error in any mode is weighted as the displacement that it is.
         self.scale_ = np.sqrt(np.mean(np.sum((Y - self.offset_) ** 2, axis=1)) + np.finfo(float).tiny)
@@ -186,7 +186,7 @@ class Ann:
             value.backward()
             return value
 
-        with one_thread():
+        with limit_to_one_thread():
             search.step(closure)
         self.weights_ = [weight.detach().numpy().astype(np.float32) for weight in weights]
         self.biases_ = [bias.detach().numpy().astype(np.float32) for bias in biases]

@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 
 from sim.errors import InputError
 
-from ..array_functions import Rounded, columns_in_use, in_chunks, product_of, taken
+from ..array_functions import Rounded, find_columns_in_use, multiply_rows, predict_in_chunks, take_rows_of
 from .gp import Gp
 
 ORDERS = 3
@@ -31,13 +31,13 @@ FAINT = 0.4
 # Rounding step [m] of the Gaussian process's dual coefficients at the largest force: a file then takes a third of the
 # bytes.
 DUAL_STEP = 2e-6
-# Number of features: `tool_features`, and force over radius.
+# Number of features: `compute_tool_features`, and force over radius.
 FEATURES = 9
 # Smallest spread of places along an axis relative to the largest: a flat cortex has two axes.
 FLAT = 1e-6
 
 
-def forms(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
+def compute_forms(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Compute products (B, 19) of the components of directions (B, 3), times force^(order - 1) of forces (B,) [N]."""
     columns = [direction[:, FACTORS[0][0]]]
     for order, factors in enumerate(FACTORS[1:], start=1):
@@ -81,8 +81,8 @@ class Series:
         return cls(corners, triangles, radii, Rounded.of(table.reshape(-1, len(steps)), steps))
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Predict coefficients (B, r) float32 of `tool_features` (B, 8)."""
-        return in_chunks(self._predicted, X)
+        """Predict coefficients (B, r) float32 of `compute_tool_features` (B, 8)."""
+        return predict_in_chunks(self._predicted, X)
 
     def _predicted(self, X: np.ndarray) -> np.ndarray:
         place, share = self._located(X[:, :3])
@@ -90,8 +90,8 @@ class Series:
         count = place.shape[1] * radius.shape[1]
         row = (place[:, :, None] * len(self.radii) + radius[:, None]).reshape(-1, count)
         factor = (share[:, :, None] * weight[:, None]).reshape(-1, 1, count).astype(np.float32)
-        mixed = (factor @ taken(row, self.table)).reshape(-1, TERMS, len(self.table.step) // TERMS)
-        return (forms(X[:, 3:6], X[:, 6]).astype(np.float32)[:, None] @ mixed)[:, 0]
+        mixed = (factor @ take_rows_of(row, self.table)).reshape(-1, TERMS, len(self.table.step) // TERMS)
+        return (compute_forms(X[:, 3:6], X[:, 6]).astype(np.float32)[:, None] @ mixed)[:, 0]
 
     def state(self) -> dict[str, np.ndarray]:
         """Return places, radii, and the table: whole numbers of steps, `share`, and the step of each column, `unit`."""
@@ -126,11 +126,11 @@ class Series:
         local = (point @ self._columns[:3] + self._columns[3]).reshape(-1, 4, len(self.triangles))
         miss = np.absolute(local[:, 3]) - BESIDE * np.minimum(local[:, :3].min(axis=1), 0.0)
         best = miss.argmin(axis=1)
-        frame = taken(best, self._frames[:, :3])
+        frame = take_rows_of(best, self._frames[:, :3])
         corner = np.maximum(np.einsum("bij,bj->bi", frame[:, :, :3], point) + frame[:, :, 3], 0.0)
         corner = corner / corner.sum(axis=1, keepdims=True)
         share = [corner * (2.0 * corner - 1.0), 4.0 * corner[:, [1, 2, 0]] * corner[:, [2, 0, 1]]]
-        return taken(best, self.triangles), np.concatenate(share, axis=1)
+        return take_rows_of(best, self.triangles), np.concatenate(share, axis=1)
 
     def _between_radii(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return radii (B, k) and weights (B, k): the parabola through the three radii about each radius (B,) [m]."""
@@ -138,7 +138,7 @@ class Series:
         inside = np.clip(radius, self.radii[0], self.radii[-1])
         first = np.clip(np.searchsorted(self.radii, inside) - 2, 0, len(self.radii) - width)
         index = first[:, None] + np.arange(width)
-        at, x = taken(index, np.log(self.radii)), np.log(inside)[:, None]
+        at, x = take_rows_of(index, np.log(self.radii)), np.log(inside)[:, None]
         weight = np.ones((1, width))
         for other in range(1, width):
             beside = at[:, np.roll(np.arange(width), other)]
@@ -150,24 +150,24 @@ class Remainder:
     """Gaussian process of the response's remainder in units of force^3 + faint^3.
 
     The first neglected order is in proportion to force^3, so that the rows of strong and weak loads have equal weight.
-    Its features are `tool_features` and force over radius, to which indentation is in proportion.
+    Its features are `compute_tool_features` and force over radius, to which indentation is in proportion.
     """
 
     gp_: Gp
     faint_: np.ndarray
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
-        """Fit to `tool_features` X (n, 8) and remainders Y (n, r)."""
+        """Fit to `compute_tool_features` X (n, 8) and remainders Y (n, r)."""
         self.faint_ = np.array(FAINT * X[:, 6].max())
-        self.gp_ = Gp().fit(with_pressing(X), Y / self._unit(X))
+        self.gp_ = Gp().fit(add_pressing(X), Y / self._unit(X))
         strongest = X[[X[:, 6].argmax()]]
         step = np.exp2(np.floor(np.log2(DUAL_STEP / (strongest[0, 6] * self._unit(strongest).item()))))
         self.gp_.dual_ = (np.rint(self.gp_.dual_ / step) * step).astype(np.float32)
         return self
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Predict coefficients (B, r) float32 of `tool_features` (B, 8)."""
-        return (self.gp_.predict(with_pressing(X)) * self._unit(X)).astype(np.float32)
+        """Predict coefficients (B, r) float32 of `compute_tool_features` (B, 8)."""
+        return (self.gp_.predict(add_pressing(X)) * self._unit(X)).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the Gaussian process's state, and `faint` [N]."""
@@ -186,14 +186,14 @@ class Remainder:
         return X[:, 6:7] ** ORDERS + self.faint_**ORDERS
 
 
-def with_pressing(X: np.ndarray) -> np.ndarray:
-    """Append force over radius to `tool_features` (n, 8): (n, 9)."""
+def add_pressing(X: np.ndarray) -> np.ndarray:
+    """Append force over radius to `compute_tool_features` (n, 8): (n, 9)."""
     return np.column_stack([X, X[:, 6] / X[:, 7]])
 
 
 @dataclass(frozen=True, eq=False)
 class ForcePairs:
-    """Regressor of the second-order contribution to the response, from `rooted_shares`.
+    """Regressor of the second-order contribution to the response, from `compute_rooted_shares`.
 
     Parameters
     ----------
@@ -207,15 +207,15 @@ class ForcePairs:
     table: Rounded
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Predict coefficients (B, r) float32 of `rooted_shares` (B, 3 m)."""
-        return in_chunks(self._predicted, X)
+        """Predict coefficients (B, r) float32 of `compute_rooted_shares` (B, 3 m)."""
+        return predict_in_chunks(self._predicted, X)
 
     def _predicted(self, X: np.ndarray) -> np.ndarray:
-        used = columns_in_use(X)
+        used = find_columns_in_use(X)
         row = self._rows[used[:, None], used]
         row = row[row >= 0]
         first, second = self.pairs[row].T
-        return product_of((X[:, first] * X[:, second]).astype(np.float32), self.table, row)
+        return multiply_rows((X[:, first] * X[:, second]).astype(np.float32), self.table, row)
 
     @cached_property
     def _rows(self) -> np.ndarray:
@@ -234,7 +234,7 @@ class ForcePairs:
         return cls(state["pairs"], Rounded(state["share"], state["unit"]))
 
 
-def filled(points: np.ndarray, table: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+def fill_table(points: np.ndarray, table: np.ndarray, left_out: np.ndarray) -> np.ndarray:
     """Replace the rows of the `left_out` places of a table by interpolation of the others.
 
     By cubic radial basis functions with a linear polynomial (Duchon 1977, "Splines minimizing rotation-invariant

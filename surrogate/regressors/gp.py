@@ -12,10 +12,10 @@ from scipy.linalg import cho_factor, cho_solve, get_lapack_funcs, solve_triangul
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from sim.runtime.threads import one_thread
+from sim.runtime.threads import limit_to_one_thread
 
-from ..array_functions import squared_distances
-from .protocol import Stored, standardisation
+from ..array_functions import compute_squared_distances
+from .protocol import Stored, compute_standardisation
 
 # Bounds of lengths [standard deviations of a feature], and of the noise relative to the variance of an output.
 LENGTHS, NOISE = (0.05, 1e3), (1e-8, 1.0)
@@ -52,7 +52,7 @@ class Gp(Stored):
         for name in ("_factor", "seen_"):
             vars(self).pop(name, None)
         order = np.random.default_rng(self.seed).permutation(len(X))[: self.most]
-        self.mean_, self.deviation_ = standardisation(X)
+        self.mean_, self.deviation_ = compute_standardisation(X)
         x = self.scaled_ = ((X - self.mean_) / self.deviation_)[order].astype(np.float32)
         self.offset_ = Y.mean(axis=0)
         y = (Y - self.offset_)[order]
@@ -61,9 +61,9 @@ class Gp(Stored):
         loudest = loudest[spread[loudest] > 0.0]
         start = np.log(np.append(np.full(X.shape[1], START_LENGTH), START_NOISE))
         if len(loudest):
-            with one_thread():
+            with limit_to_one_thread():
                 fitted = minimize(
-                    negative_likelihood,
+                    compute_negative_likelihood,
                     start,
                     args=(x[: self.rows], y[: self.rows, loudest] / spread[loudest]),
                     jac=True,
@@ -91,32 +91,32 @@ class Gp(Stored):
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of features (B, f): the mean of the posterior."""
-        return (matern(self._distance(X)) @ self.dual_ + self.offset_).astype(np.float32)
+        return (compute_matern(self._distance(X)) @ self.dual_ + self.offset_).astype(np.float32)
 
     def deviation(self, X: np.ndarray) -> np.ndarray:
         """Predict the posterior standard deviation (B,), noise included, relative to that of the prior."""
-        near = matern(self._distance(X))
+        near = compute_matern(self._distance(X))
         known = solve_triangular(self._factor[0], near.T, lower=True, check_finite=False)
         return np.sqrt(np.maximum(1.0 - np.einsum("nb,nb->b", known, known), 0.0) + self.noise_)
 
     def _distance(self, X: np.ndarray) -> np.ndarray:
-        return np.sqrt(squared_distances((X - self.mean_) / (self.deviation_ * self.length_), self.seen_))
+        return np.sqrt(compute_squared_distances((X - self.mean_) / (self.deviation_ * self.length_), self.seen_))
 
     @cached_property
     def _factor(self) -> tuple[np.ndarray, bool]:
         """Cholesky factor of the covariance of the training rows: computed from them on first use, not stored."""
-        covariance = matern(cdist(self.seen_, self.seen_))
+        covariance = compute_matern(cdist(self.seen_, self.seen_))
         covariance.flat[:: len(covariance) + 1] += self.noise_
         return cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
 
 
-def matern(distance: np.ndarray) -> np.ndarray:
+def compute_matern(distance: np.ndarray) -> np.ndarray:
     """Compute (1 + s + s^2/3) exp(-s), s = sqrt(5) distance: equation 4.17."""
     s = np.sqrt(5.0) * distance
     return (1.0 + s + s * s / 3.0) * np.exp(-s)
 
 
-def negative_likelihood(log: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
+def compute_negative_likelihood(log: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
     """Compute minus the log marginal likelihood of x (n, f), y (n, r), up to a constant, and its gradient (f + 1,).
 
     `log` (f + 1,) holds the logarithms of the lengths and of the noise. Each output's variance is the most likely one,
@@ -125,7 +125,7 @@ def negative_likelihood(log: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[
     count, outputs = y.shape
     u = x / np.exp(log[:-1])
     distance = cdist(u, u)
-    covariance = matern(distance)
+    covariance = compute_matern(distance)
     noise = np.exp(log[-1])
     covariance.flat[:: count + 1] += noise
     factor = cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)

@@ -41,7 +41,7 @@ class Regressor(Fitted, Protocol):
         ...
 
 
-def standardisation(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def compute_standardisation(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute mean and deviation (f,) of the columns of X (n, f); a constant column has the deviation one."""
     deviation = X.std(axis=0)
     return X.mean(axis=0), np.where(deviation > 1e-9 * np.abs(X).max(axis=0), deviation, 1.0)

@@ -22,8 +22,8 @@ from scipy.linalg import get_lapack_funcs
 from scipy.optimize import nnls
 
 from sim.effects import ToolContact
-from sim.geometry.closest_point import bounding_balls
-from sim.runtime.threads import one_thread
+from sim.geometry.closest_point import compute_bounding_balls
+from sim.runtime.threads import limit_to_one_thread
 from sim.tools import Ball
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ LYING, STANDING = 8, 17
 class RigidContact:
     """Regressor of the response to one metre of indentation.
 
-    Its input is `tool_features` of a ball, or `core_features` of a rod or a blade, optionally followed by `held` of the
+    Its input is `compute_tool_features` of a ball, or `compute_core_features` of a rod or a blade, optionally followed by `held` of the
     previous pose of the rod or blade: the search then starts there, which takes a fraction of the time.
 
     The nonlinear contribution far from the tool is nearly a factor on the force that is linear in depth over radius:
@@ -118,7 +118,7 @@ class RigidContact:
         """Return poses of rods or blades, forces and contact points (B, h): a warm start for the next pose."""
         return np.hstack([X[:, : self._width], self._found(X)])
 
-    def held_force(self, held: np.ndarray) -> np.ndarray:
+    def compute_held_force(self, held: np.ndarray) -> np.ndarray:
         """Extract the forces (B, 3 k) [N] from rows of `held`."""
         return held[:, self._width : self._width + len(self.compliance)]
 
@@ -155,7 +155,7 @@ class RigidContact:
         if asked == known:
             return found
         out = np.zeros((len(X), len(self.compliance) + 4 * MOST_HELD))
-        with one_thread():
+        with limit_to_one_thread():
             for row in np.flatnonzero(X[:, 6] > 0.0):
                 out[row] = self._pressed(*self._way(X[row]))
         out.flags.writeable = False
@@ -187,7 +187,7 @@ class RigidContact:
     @cached_property
     def _rounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Centres (S, 3) and radii (S,) [m] of the triangles' bounding balls."""
-        return bounding_balls(self.points[self.triangles])
+        return compute_bounding_balls(self.points[self.triangles])
 
     def _way(self, x: np.ndarray) -> tuple[list[PlacedBox], float, np.ndarray | None]:
         """Compute the tool's path for a row of features, its radius [m], and a row of `_found`, or None.

@@ -6,22 +6,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim.bodies.tip_distance import tip_gauge
+from sim.bodies.tip_distance import build_tip_gauge
 from sim.errors import InputError
-from sim.loads import Loads, Pushed, rows_of
+from sim.loads import Loads, Pushed, select_rows
 
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
-from ..data.holding import stated_series
-from ..data.indentation import indented, with_relaxed
+from ..data.holding import read_series
+from ..data.indentation import add_relaxation, to_indentation
 from ..data.splits import DiscSplit
-from ..evaluation.coverage import Coverage, covered
-from ..evaluation.score import errors, force_errors
-from ..model.conformal import CLASS, Bound, features_of, fitted_bound, fitted_growth
-from ..model.learned import Learned, only_pushed
-from ..model.relaxation import followed
-from ..model.tip_distance import MOST, TipModel, fitted_correction
-from ..model.training_range import Measured, Outside, measured
+from ..evaluation.coverage import Coverage, measure_covered
+from ..evaluation.score import compute_force_errors, compute_point_errors
+from ..model.conformal import CLASS, Bound, compute_features, fit_bound, fit_growth
+from ..model.learned import Learned, get_only_pushes
+from ..model.relaxation import follow_relaxation
+from ..model.tip_distance import MOST, TipModel, fit_correction
+from ..model.training_range import Measured, Outside, measure_loads
 from .examples import Examples
 from .expansion import Expansion
 
@@ -40,24 +40,24 @@ class KnownDistances:
         return KnownDistances(self.loads.rows(index), self.distance[index])
 
 
-def distance_errors(model: Learned, known: KnownDistances) -> np.ndarray:
+def compute_distance_errors(model: Learned, known: KnownDistances) -> np.ndarray:
     """Compute absolute errors (B,) [m] of a model's distances relative to FEM."""
     return np.abs(model.distance(known.loads).value - known.distance)
 
 
-def with_correction(model: Learned, patch: Patch, known: KnownDistances) -> Learned:
+def add_correction(model: Learned, patch: Patch, known: KnownDistances) -> Learned:
     """Add a correction of distances to a model, trained on its training loads or some of them."""
     plain, some = replace(model, tip=TipModel()), known.rows(slice(None, None, -(-len(known.loads) // MOST)))
     off = some.distance - plain.distance(some.loads).value
-    return replace(model, tip=TipModel(fitted_correction(patch, model.asked(some.loads), off)))
+    return replace(model, tip=TipModel(fit_correction(patch, model.asked(some.loads), off)))
 
 
-def corrected_if_better(
+def correct_if_better(
     model: Learned, patch: Patch, trained: KnownDistances, held_out: KnownDistances
 ) -> tuple[Learned, np.ndarray]:
     """Add a correction if it reduces the mean error of held-out distances; return the model and errors (B,) [m]."""
-    candidates = [replace(model, tip=TipModel()), with_correction(model, patch, trained)]
-    error = [distance_errors(each, held_out) for each in candidates]
+    candidates = [replace(model, tip=TipModel()), add_correction(model, patch, trained)]
+    error = [compute_distance_errors(each, held_out) for each in candidates]
     best = int(error[1].mean() < error[0].mean())
     return candidates[best], error[best]
 
@@ -102,7 +102,7 @@ class Missed:
     def rows(self, some: np.ndarray) -> Missed:
         """Select loads by number or (B,) bool."""
         known, outside = Measured(*(each[some] for each in self.known)), Outside(*(each[some] for each in self.outside))
-        return Missed(rows_of(self.pushed, some), known, outside, self.features[some], self.error[some])
+        return Missed(select_rows(self.pushed, some), known, outside, self.features[some], self.error[some])
 
     @property
     def extrapolated(self) -> np.ndarray:
@@ -115,10 +115,12 @@ class Missed:
         return self.known.magnitude
 
 
-def missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarray) -> Missed:
+def collect_missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarray) -> Missed:
     """Combine errors (B,) [m] of a model with its input loads."""
-    known, envelope = measured(patch, pushed), model.envelope
-    return Missed(pushed, known, envelope.outside(pushed, known), features_of(pushed, envelope.within(known)), error)
+    known, envelope = measure_loads(patch, pushed), model.envelope
+    return Missed(
+        pushed, known, envelope.outside(pushed, known), compute_features(pushed, envelope.within(known)), error
+    )
 
 
 def bound_by(near: Missed, way: BoundFit, growth: float, seen: Missed | None = None) -> Bound:
@@ -131,31 +133,31 @@ def bound_by(near: Missed, way: BoundFit, growth: float, seen: Missed | None = N
         fits = _fits(near)
         seen, near = near.rows(fits), near.rows(~fits)
     known = near.features, near.force, near.error
-    return fitted_bound(
+    return fit_bound(
         (seen.features, seen.error), *known, way.each, curved=way.curved, away=near.outside.away, growth=growth
     )
 
 
-def growth_by(near: Missed, far: Missed, way: BoundFit) -> float:
+def compute_growth(near: Missed, far: Missed, way: BoundFit) -> float:
     """Compute the growth [1/m] with which a bound has equal coverage `far` from training loads and near them."""
-    return fitted_growth(*_over_plain(near, far, way))
+    return fit_growth(*_over_plain(near, far, way))
 
 
-def bounds_on_discs(model: Learned, near: Missed, far: Missed, split: DiscSplit, way: BoundFit) -> np.ndarray:
+def compute_held_out_bounds(model: Learned, near: Missed, far: Missed, split: DiscSplit, way: BoundFit) -> np.ndarray:
     """Compute bounds (2, B) [m] of loads on held-out discs, each with the growth estimated from the other discs."""
     known, (ratio, away) = _over_plain(near, far, way)
     disc, bound = split.disc[split.test], np.empty((2, len(far.error)))
     for each in np.unique(disc):
         here = disc == each
-        own = bound_by(near, way, fitted_growth(known, (ratio[~here], away[~here])))
+        own = bound_by(near, way, fit_growth(known, (ratio[~here], away[~here])))
         some = far.rows(here)
         bound[:, here] = model.promised(own, some.pushed, some.known, some.outside)
     return bound
 
 
-def covered_by(bound: np.ndarray, far: Missed) -> Coverage:
+def measure_coverage_by(bound: np.ndarray, far: Missed) -> Coverage:
     """Compute the empirical coverage of bounds (2, B) [m]."""
-    return covered(far.force, far.error, bound, int(far.extrapolated.sum()))
+    return measure_covered(far.force, far.error, bound, int(far.extrapolated.sum()))
 
 
 def _over_plain(near: Missed, far: Missed, way: BoundFit) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -219,29 +221,29 @@ class TrainingSolutions:
     def examples(self, rows: np.ndarray) -> Examples:
         """Select rows (B,) bool as examples, to fit models on."""
         force = None if self.force is None else self.force[rows]
-        return Examples(rows_of(self.pushed, rows), self.tumour[rows], self.cortex[rows], force)
+        return Examples(select_rows(self.pushed, rows), self.tumour[rows], self.cortex[rows], force)
 
-    def vertex_errors(self, model: Learned, rows: np.ndarray) -> np.ndarray:
+    def compute_vertex_errors(self, model: Learned, rows: np.ndarray) -> np.ndarray:
         """Compute errors (k, n) [m] of a model at the tumour's vertices, on selected rows (B,) bool."""
-        return errors(model, self.loads.rows(np.flatnonzero(rows)), self.tumour[rows], self.nodes)
+        return compute_point_errors(model, self.loads.rows(np.flatnonzero(rows)), self.tumour[rows], self.nodes)
 
-    def errors_of(
+    def compute_errors(
         self, model: Learned, rows: np.ndarray, tumour: np.ndarray | None = None, tip: np.ndarray | None = None
     ) -> ModelErrors:
         """Compute a model's errors on rows (B,) bool; those at the tumour or of the tip (k,) [m] may be given."""
-        asked = rows_of(self.pushed, rows)
+        asked = select_rows(self.pushed, rows)
 
         def of(error: np.ndarray) -> Missed:
-            return missed(model, self.patch, asked, error)
+            return collect_missed(model, self.patch, asked, error)
 
         return ModelErrors(
-            of(self.vertex_errors(model, rows).max(axis=1) if tumour is None else tumour),
-            of(distance_errors(model, self.distances.rows(rows)) if tip is None else tip),
-            None if self.force is None else of(force_errors(model.exerted(asked), self.force[rows])),
+            of(self.compute_vertex_errors(model, rows).max(axis=1) if tumour is None else tumour),
+            of(compute_distance_errors(model, self.distances.rows(rows)) if tip is None else tip),
+            None if self.force is None else of(compute_force_errors(model.exerted(asked), self.force[rows])),
         )
 
 
-def answers_of(data: Dataset, shared: Expansion) -> TrainingSolutions:
+def read_solutions(data: Dataset, shared: Expansion) -> TrainingSolutions:
     """Read the FEM results for the converged loads of a data set.
 
     Raises
@@ -262,7 +264,7 @@ def answers_of(data: Dataset, shared: Expansion) -> TrainingSolutions:
     tumour = data.displacement(nodes)[data.good]
     cortex = data.displacement(shared.cortex)[data.good]
     at, both = np.concatenate([nodes, shared.cortex]), np.concatenate([tumour, cortex], axis=1)
-    distances = KnownDistances(loads, tip_gauge(data.anatomy).distances(loads, both, at, data.tool))
+    distances = KnownDistances(loads, build_tip_gauge(data.anatomy).distances(loads, both, at, data.tool))
     reaction = None if data.tool is None else data.reaction()
     force = None if reaction is None else reaction[data.good, 0, :3]
     return TrainingSolutions(loads, pushed, shared.patch, nodes, tumour, cortex, distances, force)
@@ -271,13 +273,13 @@ def answers_of(data: Dataset, shared: Expansion) -> TrainingSolutions:
 def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
     """Convert loads of a data set to a model's input, like `Learned.asked`."""
     if data.tool is not None:
-        pushed, series = indented(loads, data.tool, patch), stated_series(data.provenance)
+        pushed, series = to_indentation(loads, data.tool, patch), read_series(data.provenance)
         if not series:
             return pushed
-        return with_relaxed(pushed, followed(series, pushed, loads.times, None, 0.0).share)
+        return add_relaxation(pushed, follow_relaxation(series, pushed, loads.times, None, 0.0).share)
     if loads.only(Pushed) is None:
         raise InputError(
             "the data holds other loads than `Pushed`, which the learners do not take: simulate pushes, or one tool's "
             "poses."
         )
-    return only_pushed(loads)
+    return get_only_pushes(loads)

@@ -10,7 +10,7 @@ import numpy as np
 from sim.loads import Pushed
 
 from ..data.cortex_patch import Patch
-from ..data.encode import ENCODERS, directions
+from ..data.encode import ENCODERS, split_forces
 from ..model.learned import ModelPart
 
 
@@ -34,9 +34,11 @@ class Examples:
     force: np.ndarray | None = None
 
 
-def left_by(parts: Sequence[ModelPart], patch: Patch, loads: Pushed, moved: np.ndarray) -> np.ndarray:
+def compute_residual_responses(
+    parts: Sequence[ModelPart], patch: Patch, loads: Pushed, moved: np.ndarray
+) -> np.ndarray:
     """Compute residual responses (B, n, 3) [m/N]: motions `moved` (B, n, 3) [m] per newton minus the parts."""
-    response = moved / directions(loads)[0][:, None, None]
+    response = moved / split_forces(loads)[0][:, None, None]
     for part in parts:
         response = response - part.response(ENCODERS[part.encoder](patch, loads))
     return response

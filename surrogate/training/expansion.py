@@ -15,29 +15,29 @@ from sim.accuracy import REFERENCE
 from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.geometry.tetmesh import digest_of
+from sim.geometry.tetmesh import compute_digest
 from sim.loads import Pushed
 from sim.minimisers.second_order import second_order
-from sim.runtime.atomic_files import written_whole
-from sim.runtime.journal import opened
+from sim.runtime.atomic_files import write_atomically
+from sim.runtime.journal import open_journal
 from sim.runtime.outside_files import read_as
-from sim.runtime.versions import version_of
+from sim.runtime.versions import get_version
 
-from ..array_functions import Rounded, half_precision
-from ..data.answer_rows import stated_tissue
+from ..array_functions import Rounded, round_to_half
+from ..data.answer_rows import read_tissue_statement
 from ..data.cortex_patch import Patch, open_patch
 from ..data.dataset import Dataset
-from ..data.encode import Basis, directions, nodal_shares, reduce
+from ..data.encode import Basis, compute_nodal_shares, reduce, split_forces
 from ..data.tool_loads import spread
-from ..model.applicability import trained_skull
+from ..model.applicability import read_trained_skull
 from ..model.kept_arrays import REMADE
-from ..model.learned import ModelPart, only_pushed
+from ..model.learned import ModelPart, get_only_pushes
 from ..model.npz_archive import Archive
-from ..regressors.force_series import FACTORS, SPANS, ForcePairs, Series, filled
+from ..regressors.force_series import FACTORS, SPANS, ForcePairs, Series, fill_table
 from ..regressors.protocol import Linear
 from ..regressors.rigid_contact import RigidContact
-from .examples import Examples, left_by
-from .fem_tables import condensed, in_one_disc, radii_between, side_by_side, tabulated, with_middles
+from .examples import Examples, compute_residual_responses
+from .fem_tables import add_edge_midpoints, choose_radii, condense_exterior, find_disc_nodes, join_bases, tabulate
 
 # Truncation tolerance and maximum number of modes of a model's basis; of the series' contribution beyond the exact
 # orders, a fiftieth of the motion; tolerance of compliance.
@@ -110,7 +110,7 @@ class Expansion:
     @cached_property
     def places(self) -> np.ndarray:
         """Places (P, 3) [m] of the series' table: nodes of the open cortex, and midpoints of its edges."""
-        return with_middles(self.patch)[1]
+        return add_edge_midpoints(self.patch)[1]
 
     @cached_property
     def tables(self) -> tuple[ModelPart, ...]:
@@ -150,7 +150,7 @@ class Expansion:
         """
         both = zip(self.exact, (examples.tumour, examples.cortex), (tumour, cortex), strict=False)
         return [
-            reduce(parts[0].basis.nodes, left_by(parts, self.patch, examples.loads, moved), *limits)
+            reduce(parts[0].basis.nodes, compute_residual_responses(parts, self.patch, examples.loads, moved), *limits)
             for parts, moved, limits in both
         ]
 
@@ -162,15 +162,15 @@ class Expansion:
         InputError
             Data without a tissue.
         """
-        triangles = with_middles(self.patch)[0]
-        inside = self.patch.rim_distance(self.places)[:, None] > self.radii
-        strongest = directions(only_pushed(self.data.loads))[0].max()
+        triangles = add_edge_midpoints(self.patch)[0]
+        inside = self.patch.compute_edge_distance(self.places)[:, None] > self.radii
+        strongest = split_forces(get_only_pushes(self.data.loads))[0].max()
         unit = strongest ** np.repeat([1, 2, 3], [factors.shape[1] for factors in FACTORS])
         found = []
         for added, parts, wide, basis in zip(self._beyond, self.exact, self.tabulated.bases, bases, strict=True):
             # Footprints across the edge press on nodes beyond the open cortex. For others the exact parts leave no
             # residual.
-            every = filled(self.places, added @ (wide.modes @ basis.modes.T), left_out)
+            every = fill_table(self.places, added @ (wide.modes @ basis.modes.T), left_out)
             for order in SPANS[: len(parts)]:
                 every[inside, order] = 0.0
             step = SERIES_STEP * (np.abs(every).max(axis=(0, 1, 3)) * unit).max() / unit
@@ -194,7 +194,7 @@ class Expansion:
         """Forces (P R, 3, 3 m) at the patch's nodes by one newton along each axis, at each place and radius."""
         point = np.repeat(self.places, 3 * len(self.radii), axis=0)
         radius = np.tile(np.repeat(self.radii, 3), len(self.places))
-        shares = nodal_shares(self.patch, Pushed(point, np.tile(np.eye(3), (len(point) // 3, 1)), radius))
+        shares = compute_nodal_shares(self.patch, Pushed(point, np.tile(np.eye(3), (len(point) // 3, 1)), radius))
         return shares.reshape(len(point) // 3, 3, -1)
 
     @cached_property
@@ -207,13 +207,13 @@ class Expansion:
             Data without a tissue.
         """
         begun = time.perf_counter()
-        contact, bases = condensed(self.fem(), self._known, self.data.tool)
+        contact, bases = condense_exterior(self.fem(), self._known, self.data.tool)
         return contact, bases, time.perf_counter() - begun
 
     def _compliance(self, nodes: np.ndarray) -> ModelPart:
-        response = self.data.unit_response(nodes)
+        response = self.data.compute_unit_response(nodes)
         basis = reduce(nodes, response, TABLE_TOLERANCE, len(response))
-        return ModelPart("nodal", Linear().fit(np.eye(len(response)), half_precision(basis.encode(response))), basis)
+        return ModelPart("nodal", Linear().fit(np.eye(len(response)), round_to_half(basis.encode(response))), basis)
 
     @cached_property
     def tabulated(self) -> Tabulated:
@@ -242,13 +242,13 @@ class Expansion:
         if self.kept is not None:
             arrays = {f"modes{k}": basis.modes for k, basis in enumerate(bases)}
             arrays |= {"table": table, "pairs": pairs, "second": second, "second_modes": pair_basis.modes}
-            with written_whole(self.kept, ".npz") as partial:
+            with write_atomically(self.kept, ".npz") as partial:
                 np.savez(partial, seconds=np.array(found.seconds), **arrays)  # pyright: ignore[reportArgumentType]
         return found
 
     def _paired(self, fem: Fem, basis: Basis) -> tuple[np.ndarray, np.ndarray, Basis]:
         """Compute pairs within one footprint, the tumour's second order of each, and a basis of modes for it."""
-        near = in_one_disc(self.patch, float(self.radii[-1]))
+        near = find_disc_nodes(self.patch, float(self.radii[-1]))
         if 4.5 * near.sum() > self.most_pairs:
             return np.zeros((0, 2), int), np.zeros((0, 0), np.float32), Basis(basis.nodes, basis.modes[:0])
         reading = fem.reading(basis.nodes, basis.modes.reshape(len(basis.modes), -1, 3))
@@ -256,7 +256,7 @@ class Expansion:
         units = fem.reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
         pairs, table = second_order(fem.problem, units.answers, reading.answers, near)
         turn = reduce(basis.nodes, table, SECOND, len(basis.modes)).modes
-        return pairs, table @ turn.T, Basis(basis.nodes, half_precision(turn @ basis.modes))
+        return pairs, table @ turn.T, Basis(basis.nodes, round_to_half(turn @ basis.modes))
 
     def _tabulate(self, fem: Fem) -> tuple[list[Basis], np.ndarray, bool]:
         """Compute motions at a few places, the bases that they span, and the table of all places as their coefficients.
@@ -269,23 +269,23 @@ class Expansion:
         for first in range(0, 3 * len(every), STRIP):
             components = np.eye(3 * len(every))[first : first + STRIP].reshape(-1, len(every), 3)
             reading = fem.reading(every, components)
-            motions.append(tabulated(fem, self.places[few], self.radii, reading, lambda n, _: self.progress(n, count)))
+            motions.append(tabulate(fem, self.places[few], self.radii, reading, lambda n, _: self.progress(n, count)))
         cuts = 3 * np.cumsum([len(nodes) for nodes in self._known])[:-1]
         parts = np.split(np.concatenate(motions, axis=-1), cuts, axis=-1)
         # The cortex's first order is given by its compliance.
         orders = (SPANS, SPANS[1:])
         bases = [_spanned(*each) for each in zip(self._known, parts, orders, strict=False)]
-        whole = side_by_side(bases)
+        whole = join_bases(bases)
         reading = fem.reading(whole.nodes, whole.modes.reshape(len(whole.modes), -1, 3))
         table = np.empty((count, *parts[0].shape[1:3], reading.count), np.float32)
         others = np.setdiff1d(np.arange(count), few)
         table[few] = np.concatenate([part @ basis.modes.T for part, basis in zip(parts, bases, strict=True)], axis=-1)
         anew = True
         if len(others):
-            what = {"version": version_of("sulcus"), "table": digest_of(whole.modes, self.places, self.radii)}
-            with nullcontext() if self.begun is None else opened(self.begun, what) as journal:
+            what = {"version": get_version("sulcus"), "table": compute_digest(whole.modes, self.places, self.radii)}
+            with nullcontext() if self.begun is None else open_journal(self.begun, what) as journal:
                 anew = not journal
-                table[others] = tabulated(
+                table[others] = tabulate(
                     fem, self.places[others], self.radii, reading, lambda n, _: self.progress(n + len(few), count),
                     journal,
                 )  # fmt: skip
@@ -299,8 +299,8 @@ class Expansion:
     @cached_property
     def radii(self) -> np.ndarray:
         """Radii (R,) [m] of the series' table: from the narrowest tool of the data to the widest."""
-        footprint = only_pushed(self.data.loads).footprint
-        return radii_between(float(footprint.min()), float(footprint.max()))
+        footprint = get_only_pushes(self.data.loads).footprint
+        return choose_radii(float(footprint.min()), float(footprint.max()))
 
     def fem(self) -> Fem:
         """Build the data's FEM, in double precision.
@@ -316,7 +316,7 @@ class Expansion:
                 f"{self.data.path}: does not state its tissue, so series and contact are not available: "
                 "choose other learners, or simulate again."
             )
-        effects = pushed_effects(self.data.anatomy, stated_tissue(stated), trained_skull(stated))
+        effects = pushed_effects(self.data.anatomy, read_tissue_statement(stated), read_trained_skull(stated))
         return Fem(self.data.anatomy, effects, REFERENCE, self.device, self.batch, stated.get("element"))
 
 

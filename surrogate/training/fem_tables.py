@@ -8,13 +8,13 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from sim.fem import Fem
-from sim.geometry.surface import edge_lengths
+from sim.geometry.surface import compute_edge_lengths
 from sim.loads import Loads, Pushed
 from sim.minimisers.power_series import SeriesReading
 from sim.runtime.journal import Journal
-from sim.tools import Ball, BuiltIn, core_of
+from sim.tools import Ball, BuiltIn, get_core
 
-from ..array_functions import squared_distances
+from ..array_functions import compute_squared_distances
 from ..data.cortex_patch import Patch
 from ..data.encode import Basis, reduce
 from ..regressors.force_series import FACTORS, ORDERS, STENCIL, TERMS
@@ -26,7 +26,9 @@ STRIP = 64
 TOLERANCE = 1e-4
 
 
-def condensed(fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None) -> tuple[RigidContact, list[Basis]]:
+def condense_exterior(
+    fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None
+) -> tuple[RigidContact, list[Basis]]:
     """Condense the contact of a tool with an undeformed body; return it with a basis for each of `parts`, vertex sets.
 
     Without a `tool` it is a ball of the radius in the features. The contact returns coefficients of the bases, one
@@ -34,7 +36,7 @@ def condensed(fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None) ->
     """
     surface = fem.anatomy.mesh.surface[fem.anatomy.bare]
     nodes, triangles = np.unique(surface, return_inverse=True)
-    response = unit_responses(fem, nodes, np.concatenate([nodes, *parts]))
+    response = compute_unit_responses(fem, nodes, np.concatenate([nodes, *parts]))
     compliance, *answers = np.split(response, np.cumsum([len(nodes), *map(len, parts[:-1])]), axis=1)
     bases = [reduce(some, each, TOLERANCE, len(each)) for some, each in zip(parts, answers, strict=True)]
     coefficients = np.hstack([basis.encode(each) for basis, each in zip(bases, answers, strict=True)])
@@ -52,17 +54,17 @@ def condensed(fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None) ->
 
 def _sizes(tool: BuiltIn) -> np.ndarray:
     """Return the half sizes of a tool's core, and its radius (4,) [m]."""
-    core = core_of(tool)
+    core = get_core(tool)
     return np.append(core.half, core.radius)
 
 
-def side_by_side(bases: list[Basis]) -> Basis:
+def join_bases(bases: list[Basis]) -> Basis:
     """Combine bases of different vertices into one."""
     modes = np.asarray(block_diag(*(basis.modes for basis in bases)))
     return Basis(np.concatenate([basis.nodes for basis in bases]), modes)
 
 
-def unit_responses(fem: Fem, nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
+def compute_unit_responses(fem: Fem, nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Compute displacements (3 n, k, 3) float32 [m/N] of vertices `at` (k,) by small unit forces on `nodes` (n,)."""
     found = []
     for first in range(0, len(nodes), STRIP):
@@ -76,7 +78,7 @@ def unit_responses(fem: Fem, nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
 RATIO = 1.5
 
 
-def radii_between(least: float, greatest: float) -> np.ndarray:
+def choose_radii(least: float, greatest: float) -> np.ndarray:
     """Compute radii [m] at which to tabulate footprints from `least` to `greatest`: one, or at least three."""
     if greatest <= least * (1.0 + 1e-9):
         return np.array([least])
@@ -84,7 +86,7 @@ def radii_between(least: float, greatest: float) -> np.ndarray:
     return np.geomspace(least, greatest, max(STENCIL, steps + 1))
 
 
-def tabulated(
+def tabulate(
     fem: Fem,
     places: np.ndarray,
     radii: np.ndarray,
@@ -119,17 +121,17 @@ def tabulated(
     return table
 
 
-def in_one_disc(patch: Patch, radius: float) -> np.ndarray:
+def find_disc_nodes(patch: Patch, radius: float) -> np.ndarray:
     """Return the mask (m, m) of node pairs that a disc of a radius [m], or adjacent triangles, may load at once.
 
     Triangles extend into a disc from nodes that are farther apart, but these contribute 1 in 100,000 of the tumour's
     motion.
     """
-    longest = edge_lengths(patch.points[patch.triangles]).max()
-    return squared_distances(patch.points, patch.points) <= (2.0 * max(radius, longest)) ** 2
+    longest = compute_edge_lengths(patch.points[patch.triangles]).max()
+    return compute_squared_distances(patch.points, patch.points) <= (2.0 * max(radius, longest)) ** 2
 
 
-def with_middles(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
+def add_edge_midpoints(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
     """Build triangles (S, 6) with the midpoint of the edge opposite each corner, and their places (P, 3) [m]."""
     edges = np.sort(patch.triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
     ends, middle = np.unique(edges, axis=0, return_inverse=True)

@@ -11,8 +11,8 @@ import numpy as np
 from sim.errors import InputError
 from sim.loads import Pushed
 
-from ..data.cortex_patch import Patch, nearest
-from ..data.encode import ENCODERS, Basis, directions, reduce
+from ..data.cortex_patch import Patch, find_nearest
+from ..data.encode import ENCODERS, Basis, reduce, split_forces
 from ..data.splits import DiscSplit
 from ..data.tool_loads import spread
 from ..evaluation.score import SolveCounts
@@ -24,9 +24,9 @@ from ..regressors.force_series import TERMS, Remainder
 from ..regressors.gp import Gp
 from ..regressors.protocol import Fitted, RegressorFactory
 from ..regressors.rigid_contact import RigidContact
-from .examples import Examples, left_by
+from .examples import Examples, compute_residual_responses
 from .expansion import ADDED, COARSE, EXPANDED, TOUCHED, Expansion
-from .fem_tables import side_by_side
+from .fem_tables import join_bases
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ class Tuned:
     settings: tuple[Callable[[], RegressorFactory], ...]
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:
-        """Fit the best of the regressors to rows X (n, f) of `tool_features`, Y (n, r)."""
+        """Fit the best of the regressors to rows X (n, f) of `compute_tool_features`, Y (n, r)."""
         return self.settings[self.best(X, Y)]().fit(X, Y)
 
     def best(self, X: np.ndarray, Y: np.ndarray) -> int:
@@ -113,7 +113,7 @@ class Tuned:
         if len(X) < FEWEST or len(self.settings) == 1:
             return 0
         X, Y = X[:MOST], Y[:MOST]
-        left_out = inner_discs(X[:, :3])
+        left_out = find_inner_discs(X[:, :3])
         strongest = Y[:, np.sort(np.argsort(-Y.std(axis=0), kind="stable")[:STRONGEST])]
         errors = []
         for make in self.settings:
@@ -122,9 +122,9 @@ class Tuned:
         return int(np.argmin(errors))
 
 
-def inner_discs(points: np.ndarray) -> np.ndarray:
+def find_inner_discs(points: np.ndarray) -> np.ndarray:
     """Return the mask (n,) of points in discs round `CENTRES` of the points (n, 3), far from each other."""
-    distance = nearest(points, points[spread(points, CENTRES)])[1]
+    distance = find_nearest(points, points[spread(points, CENTRES)])[1]
     return distance <= np.quantile(distance, SHARE)
 
 
@@ -144,7 +144,7 @@ LEARNT: dict[str, tuple[str, Callable[[], RegressorFactory]]] = {
 POSED = ("gp", "ann", "svr")
 
 
-def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[ModelPart, ...]:
+def fit_parts(name: str, inputs: SharedInputs, examples: Examples) -> tuple[ModelPart, ...]:
     """Fit the summands of one model type to examples: for the tumour, and for the remaining open cortex."""
     known = inputs.expansion
     trained = partial(_trained, known.patch, examples.loads)
@@ -172,7 +172,7 @@ def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Model
     return (*before, learnt, *cortex)
 
 
-def force_of(name: str, parts: Sequence[ModelPart], patch: Patch, examples: Examples) -> ForceModel | None:
+def fit_force_model(name: str, parts: Sequence[ModelPart], patch: Patch, examples: Examples) -> ForceModel | None:
     """Fit one pose model's tool force, given its trained motion `parts`; None if the examples have no force."""
     if examples.force is None:
         return None
@@ -180,7 +180,7 @@ def force_of(name: str, parts: Sequence[ModelPart], patch: Patch, examples: Exam
         return ForceModel()
     encoder, make = LEARNT["gp"] if name in TOUCHED else _learnt(name)
     X = ENCODERS[encoder](patch, examples.loads)
-    left = examples.force / directions(examples.loads)[0][:, None]
+    left = examples.force / split_forces(examples.loads)[0][:, None]
     for part in parts:
         if isinstance(part.regressor, RigidContact):
             left = left - part.regressor.exerted(ENCODERS[part.encoder](patch, examples.loads))
@@ -203,12 +203,12 @@ def _touched(known: Expansion, examples: Examples) -> tuple[ModelPart, list[tupl
     """Fit the contact on stiffening tissue to examples; return its part, and its residuals: vertices, (B, n, 3) [m]."""
     contact, bases, _ = known.contact
     encoder = "core" if len(contact.core) else "tool"
-    features, size = ENCODERS[encoder](known.patch, examples.loads), directions(examples.loads)[0][:, None, None]
+    features, size = ENCODERS[encoder](known.patch, examples.loads), split_forces(examples.loads)[0][:, None, None]
     truth = [examples.tumour, examples.cortex][: len(bases)]
     coefficients = np.hstack([basis.encode(each / size) for basis, each in zip(bases, truth, strict=True)])
     alike = np.repeat(np.arange(len(bases)), [len(basis.modes) for basis in bases])
     force = None if examples.force is None else examples.force / size[:, 0]
-    part = ModelPart(encoder, contact.fitted(features, coefficients, alike, force), side_by_side(bases))
+    part = ModelPart(encoder, contact.fitted(features, coefficients, alike, force), join_bases(bases))
     answered = np.split(size * part.response(features), [len(known.tumour)], axis=1)
     return part, [(basis.nodes, one - other) for basis, one, other in zip(bases, truth, answered, strict=False)]
 
@@ -222,7 +222,7 @@ def _trained(
     truth: np.ndarray,
 ) -> ModelPart:
     """Fit a part to the residual of `truth` (B, n, 3) [m] after parts `before`: `on` a basis, or on vertices (n,)."""
-    response = left_by(before, patch, loads, truth)
+    response = compute_residual_responses(before, patch, loads, truth)
     basis = on if isinstance(on, Basis) else reduce(on, response, *COARSE)
     encoder, make = kind
     X, Y = ENCODERS[encoder](patch, loads), basis.encode(response)

@@ -8,35 +8,35 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim.errors import InputError
-from sim.runtime.timing import stage
+from sim.runtime.timing import time_stage
 
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
 from ..data.splits import APART, MOST_APART, DiscSplit, leave_discs_out
 from ..evaluation.coverage import TENTHS, Coverage
-from ..evaluation.score import ForceScore, Score, force_score, score
-from ..model.conformal import LEVELS, USUAL_GROWTH, conformal
+from ..evaluation.score import ForceScore, Score, score, score_forces
+from ..model.conformal import LEVELS, USUAL_GROWTH, compute_conformal_quantile
 from ..model.learned import Learned, ModelPart
-from ..model.left_out import left_out_of
+from ..model.left_out import measure_held_out
 from ..model.own_learners import OWN, find_own
 from ..model.tip_distance import TipModel
 from ..model.tool_contact import ForceModel
-from ..model.training_range import Envelope, envelope_of
+from ..model.training_range import Envelope, compute_training_range
 from .bounds import (
     WAYS,
     ModelErrors,
     TrainingSolutions,
-    answers_of,
+    add_correction,
     bound_by,
-    bounds_on_discs,
-    corrected_if_better,
-    covered_by,
-    growth_by,
-    with_correction,
+    compute_growth,
+    compute_held_out_bounds,
+    correct_if_better,
+    measure_coverage_by,
+    read_solutions,
 )
 from .examples import Examples
 from .expansion import EXPANDED, TOUCHED, Expansion
-from .learners import LEARNT, POSED, SharedInputs, force_of, parts_of
+from .learners import LEARNT, POSED, SharedInputs, fit_force_model, fit_parts
 
 # Model types for pushes, and for poses.
 LEARNERS = ("linear", *LEARNT, *EXPANDED)
@@ -68,7 +68,7 @@ class Trained:
     force: dict[str, ForceScore]
 
 
-def learners_for(data: Dataset) -> tuple[str, ...]:
+def list_learners(data: Dataset) -> tuple[str, ...]:
     """Return the model types that a data set can train: series and contact need FEM of a known tissue."""
     stated = "tissue" in data.provenance
     kinds = LEARNERS if data.tool is None else OF_POSES
@@ -132,13 +132,13 @@ def train(
         than `Pushed` or the `Touching` of one tool, an anatomy without tumour, too few loads, or unit responses that
         did not converge.
     """
-    wanted = learners_for(data) if learners is None else tuple(dict.fromkeys(learners))
+    wanted = list_learners(data) if learners is None else tuple(dict.fromkeys(learners))
     check_learners(wanted, of_poses=data.tool is not None, where=str(data.path))
     if most is not None and most < 1:
         raise InputError(f"{most} loads train nothing: give at least 1.")
-    with stage("read"):
+    with time_stage("read"):
         shared = expansion or Expansion(data)
-        answers = answers_of(data, shared)
+        answers = read_solutions(data, shared)
     apart = np.zeros(len(answers.loads), bool)
     if split is None:
         apart[len(apart) - min(len(apart) // APART, MOST_APART) :] = True
@@ -173,9 +173,9 @@ class Fit:
 
     def parts(self, name: str, patch: Patch) -> tuple[tuple[ModelPart, ...], ForceModel | None]:
         """Fit a model type: the parts of its model, and its model of a tool's force."""
-        with stage(f"learn {name}"):
-            parts = parts_of(name, self.inputs, self.examples)
-            return parts, force_of(name, parts, patch, self.examples)
+        with time_stage(f"learn {name}"):
+            parts = fit_parts(name, self.inputs, self.examples)
+            return parts, fit_force_model(name, parts, patch, self.examples)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +191,9 @@ class Result:
 
 def _fit_of(answers: TrainingSolutions, rows: np.ndarray, shared: Expansion, left: DiscSplit | None) -> Fit:
     examples = answers.examples(rows)
-    return Fit(rows, examples, SharedInputs(examples, shared, left), envelope_of(answers.patch, examples.loads))
+    return Fit(
+        rows, examples, SharedInputs(examples, shared, left), compute_training_range(answers.patch, examples.loads)
+    )
 
 
 def _learn(
@@ -202,35 +204,42 @@ def _learn(
     parts, force = outside.parts(name, patch)
     training = {"learner": name, **data.provenance}
     model = Learned(data.anatomy, parts, outside.envelope, training=training, tool=data.tool, force=force)
-    with stage("score"):
+    with time_stage("score"):
         test = answers.loads.rows(np.flatnonzero(split.test))
         solves = outside.inputs.solve_counts(name, outside.examples)
         scored = score(name, model, test, answers.tumour[split.test], answers.nodes, solves)
-        distance = answers.vertex_errors(model, split.test)
+        distance = answers.compute_vertex_errors(model, split.test)
         trained, held_out = (answers.distances.rows(rows) for rows in (outside.rows, split.test))
-        model, off = corrected_if_better(model, patch, trained, held_out)
-        far = answers.errors_of(model, split.test, distance.max(axis=1), off)
-        model = replace(model, bound=min(conformal(far.tumour.error, LEVELS[0]), float(far.tumour.error.max())))
+        model, off = correct_if_better(model, patch, trained, held_out)
+        far = answers.compute_errors(model, split.test, distance.max(axis=1), off)
+        model = replace(
+            model, bound=min(compute_conformal_quantile(far.tumour.error, LEVELS[0]), float(far.tumour.error.max()))
+        )
     growth = dict.fromkeys(WAYS, USUAL_GROWTH)
     of_tumour = of_tip = None
     promised, beside = None, apart & ~split.covers(answers.pushed.point)
     if beside.sum() >= 2 * FEWEST_APART and len(test) >= TENTHS:
-        with stage("calibrate"):
-            near, there = answers.errors_of(model, beside).known(), far.known()
-            growth = {way: growth_by(near[way], there[way], WAYS[way]) for way in near}
-            bound = {way: bounds_on_discs(model, near[way], there[way], split, WAYS[way]) for way in near}
-            of_tumour, of_tip = covered_by(bound["tumour"], far.tumour), covered_by(bound["tip"], far.tip)
+        with time_stage("calibrate"):
+            near, there = answers.compute_errors(model, beside).known(), far.known()
+            growth = {way: compute_growth(near[way], there[way], WAYS[way]) for way in near}
+            bound = {way: compute_held_out_bounds(model, near[way], there[way], split, WAYS[way]) for way in near}
+            of_tumour, of_tip = (
+                measure_coverage_by(bound["tumour"], far.tumour),
+                measure_coverage_by(bound["tip"], far.tip),
+            )
             motion = _motion(answers, split.test)
-            model = replace(model, left_out=left_out_of(distance, motion, bound["tumour"][0], far.tumour.extrapolated))
+            model = replace(
+                model, left_out=measure_held_out(distance, motion, bound["tumour"][0], far.tumour.extrapolated)
+            )
             promised = bound.get("force")
     forces = None
     if far.force is not None and answers.force is not None:
-        forces = force_score(far.force.error, answers.force[split.test], promised)
+        forces = score_forces(far.force.error, answers.force[split.test], promised)
     if apart.any():
         model = _fitted_on_all(name, model, answers, fits[1])
     if apart.sum() >= FEWEST_APART:
-        with stage("calibrate"):
-            model = _calibrated(model, answers.errors_of(model, apart), growth, far)
+        with time_stage("calibrate"):
+            model = _calibrated(model, answers.compute_errors(model, apart), growth, far)
     return Result(model, scored, of_tumour, of_tip, forces)
 
 
@@ -240,8 +249,8 @@ def _fitted_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: F
     fitted = replace(model, parts=parts, envelope=fit.envelope, force=force)
     if model.tip is None or model.tip.correction is None:
         return fitted
-    with stage(f"learn {name}"):
-        return with_correction(fitted, answers.patch, answers.distances.rows(fit.rows))
+    with time_stage(f"learn {name}"):
+        return add_correction(fitted, answers.patch, answers.distances.rows(fit.rows))
 
 
 def _calibrated(model: Learned, near: ModelErrors, growth: Mapping[str, float], far: ModelErrors) -> Learned:

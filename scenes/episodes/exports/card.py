@@ -12,17 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
+from sim.runtime.atomic_files import write_atomically
 
-from ..bodies import models_of, said_of_weak
-from ..reading.contents import EpisodeContents, opened, read_contents
-from ..reading.validation import solved_figures
-from ..reading.windows import episode_paths, numbers_in
-from ..run_folder import RunSettings, episode_name, failed, read_run
+from ..bodies import describe_weak, list_model_errors
+from ..reading.contents import EpisodeContents, open_episode, read_contents
+from ..reading.validation import count_solved_frames
+from ..reading.windows import list_episode_paths, read_numbers
+from ..run_folder import RunSettings, list_failed, read_run, to_episode_name
 from .columns import LICENCE as LICENCE_NAME
-from .columns import SHEET, task_of
-from .croissant import COLUMNS, croissant
-from .datasheet import MARK, NAME, datasheet, notice_of_template, of_template
+from .columns import SHEET, describe_task
+from .croissant import COLUMNS, build_croissant_metadata
+from .datasheet import MARK, NAME, get_template_notice, has_template, write_datasheet
 
 TABLE = "episodes.csv"
 NAMES = (TABLE, "croissant.json", SHEET, LICENCE_NAME)
@@ -67,25 +67,27 @@ def write_card(
         if not force and (folder / name).exists() and not is_card(folder / name):
             raise InputError(f"{folder / name}: is not of a card. Move it away, or give --force to replace it.")
     episodes, rows = [], []
-    for one in progress(contents or episode_paths(folder)):
+    for one in progress(contents or list_episode_paths(folder)):
         episodes.append(read_contents(one) if isinstance(one, Path) else one)
-        rows.append(row_of(episodes[-1], folder))
+        rows.append(build_row(episodes[-1], folder))
     inside = "episodes/*.h5" if (folder / "episodes").is_dir() else "*.h5"
-    table = table_of(rows)
-    gone = len(failed(folder))
-    missing = [f"Of those asked for {gone} could not be made and are missing: `failed` says why."] if gone else []
-    notes = [*missing, *said_of_weak(models_of(folder))]
-    sheet = datasheet(folder.resolve().name, episodes, rows, notes, run_of(folder))
+    table = format_table(rows)
+    gone = len(list_failed(folder))
+    missing = [f"Of those asked for {gone} could not be made and are missing: `list_failed` says why."] if gone else []
+    notes = [*missing, *describe_weak(list_model_errors(folder))]
+    sheet = write_datasheet(folder.resolve().name, episodes, rows, notes, run_of(folder))
     description = (
         f"{len(rows)} episodes of scripted surgery on simulated brains with a tumour: pictures, depth, poses of camera "
         "and tool, forces, and where the tumour is by finite elements."
     )
     date = max(str(one.said.get("date", ""))[:10] for one in episodes) or datetime.now(UTC).date().isoformat()
-    described = croissant(folder.resolve().name, description, date, TABLE, sha256(table.encode()).hexdigest(), inside)
-    licence = LICENCE + (notice_of_template() if of_template(episodes) else "")
+    described = build_croissant_metadata(
+        folder.resolve().name, description, date, TABLE, sha256(table.encode()).hexdigest(), inside
+    )
+    licence = LICENCE + (get_template_notice() if has_template(episodes) else "")
     texts = (table, json.dumps(described, indent=1) + "\n", sheet, licence)
     for name, text in zip(NAMES, texts, strict=True):
-        with written_whole(folder / name, Path(name).suffix) as partial:
+        with write_atomically(folder / name, Path(name).suffix) as partial:
             partial.write_text(text, encoding="utf-8")
     return {"out": str(folder), "episodes": len(rows), "frames": sum(one.frames for one in episodes), "files": NAMES}
 
@@ -104,7 +106,7 @@ def keep_card(
     changed
         Whether episodes were made, or failed, since the card was written.
     """
-    if not numbers or not (changed or _differs(folder, {episode_name(number) for number in numbers})):
+    if not numbers or not (changed or _differs(folder, {to_episode_name(number) for number in numbers})):
         return None
     if len(numbers) > MOST_EPISODES:
         return f"No data sheet of more than {MOST_EPISODES} episodes: `sulcus convert {folder} --to card` writes it."
@@ -117,7 +119,7 @@ def keep_card(
 
 def _differs(folder: Path, names: set[str]) -> bool:
     """Return True if a folder's card lists other episodes than these; for many, sizes are not compared."""
-    listed = listed_files(folder) if has_card(folder) else {}
+    listed = list_card_files(folder) if has_card(folder) else {}
     if listed.keys() != names or len(names) > MOST_EPISODES:
         return listed.keys() != names
     return any((folder / name).stat().st_size != size for name, size in listed.items())
@@ -128,7 +130,7 @@ def has_card(folder: Path) -> bool:
     return all((folder / name).is_file() for name in NAMES)
 
 
-def listed_files(folder: Path) -> dict[str, int]:
+def list_card_files(folder: Path) -> dict[str, int]:
     """Names and sizes of the episodes that a folder's card lists; none where there is no such table."""
     try:
         with (folder / TABLE).open(newline="", encoding="utf-8") as file:
@@ -151,17 +153,17 @@ def is_card(path: Path) -> bool:
     return MARK in head or head.startswith(",".join(COLUMNS)) or ("mlcommons.org/croissant" in head and NAME in head)
 
 
-def row_of(contents: EpisodeContents, folder: Path) -> dict[str, object]:
+def build_row(contents: EpisodeContents, folder: Path) -> dict[str, object]:
     """An episode as a row of the table."""
-    with opened(contents.path) as file:
-        times = numbers_in(file, contents, "time")
-        solved, _, error = solved_figures(file, contents)
+    with open_episode(contents.path) as file:
+        times = read_numbers(file, contents, "time")
+        solved, _, error = count_solved_frames(file, contents)
     width, height = contents.size
     path = contents.path.resolve()
     return {
         "file": path.relative_to(folder.resolve()).as_posix(),
         "family": contents.family,
-        "task": task_of(contents),
+        "task": describe_task(contents),
         "frames": contents.frames,
         "solved": solved,
         "seconds": round(float(times[-1] - times[0]), 6),
@@ -176,7 +178,7 @@ def row_of(contents: EpisodeContents, folder: Path) -> dict[str, object]:
     }
 
 
-def table_of(rows: Sequence[dict[str, object]]) -> str:
+def format_table(rows: Sequence[dict[str, object]]) -> str:
     """The table as CSV."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(COLUMNS), lineterminator="\n")

@@ -14,7 +14,7 @@ from sim.errors import InputError
 
 from ..reading.contents import LONGEST_TEXT, EpisodeContents
 from ..reading.schema import PICTURES
-from ..reading.windows import numbers_in
+from ..reading.windows import read_numbers
 
 TASKS = {
     "press": "Press on one place of the open cortex, hold, and let go.",
@@ -31,12 +31,12 @@ TASKS = {
 HELD_OUT = 10
 
 
-def task_of(contents: EpisodeContents) -> str:
+def describe_task(contents: EpisodeContents) -> str:
     """The sentence for an episode's family; of one that has none, its scene's name."""
     return TASKS.get(contents.family, f"Play the scene {contents.family}.")
 
 
-def held_out(episodes: Sequence[EpisodeContents]) -> list[bool]:
+def mark_held_out(episodes: Sequence[EpisodeContents]) -> list[bool]:
     """Return which episodes are held out for validation: every tenth body, or every tenth episode if there are fewer
     than ten bodies.
 
@@ -67,7 +67,7 @@ SHEET, LICENCE = "DATASHEET.md", "LICENSE.md"
 """Their names."""
 
 
-def shared_pictures(episodes: Sequence[EpisodeContents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:
+def list_shared_images(episodes: Sequence[EpisodeContents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:
     """List the requested images that every episode has.
 
     Raises
@@ -82,7 +82,7 @@ def shared_pictures(episodes: Sequence[EpisodeContents], wanted: Sequence[str] =
     return tuple(name for name in wanted if all(name in one.shapes for one in episodes))
 
 
-def shared_numbers(episodes: Sequence[EpisodeContents]) -> tuple[str, ...]:
+def list_shared_numbers(episodes: Sequence[EpisodeContents]) -> tuple[str, ...]:
     """Those `NUMBERS` that every episode has in the same shape: two bodies' tumours have not."""
     first = episodes[0].shapes
     return tuple(
@@ -93,7 +93,7 @@ def shared_numbers(episodes: Sequence[EpisodeContents]) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def rate_of(contents: EpisodeContents, time: np.ndarray) -> float:
+def measure_rate(contents: EpisodeContents, time: np.ndarray) -> float:
     """Frames a second.
 
     Raises
@@ -107,7 +107,7 @@ def rate_of(contents: EpisodeContents, time: np.ndarray) -> float:
     return round(1.0 / float(steps.mean()), 6)
 
 
-def numbers_of(file: h5py.File, contents: EpisodeContents, names: Sequence[str]) -> dict[str, np.ndarray]:
+def collect_numbers(file: h5py.File, contents: EpisodeContents, names: Sequence[str]) -> dict[str, np.ndarray]:
     """`state` (T, 7), `action` (T, 6) and the named arrays, as float32; `time` as it is stored.
 
     Raises
@@ -117,39 +117,39 @@ def numbers_of(file: h5py.File, contents: EpisodeContents, names: Sequence[str])
     """
     if "T_world_tool" not in contents.shapes:
         raise InputError(f"{contents.path}: has no tool, and so no actions: leave it out.")
-    poses = numbers_in(file, contents, "T_world_tool")
-    found = {"state": states(poses), "action": twists(poses)}
-    found |= {name: framed(file, contents, name).astype(np.float32) for name in names}
-    return {**found, "time": numbers_in(file, contents, "time")}
+    poses = read_numbers(file, contents, "T_world_tool")
+    found = {"state": build_states(poses), "action": build_twists(poses)}
+    found |= {name: read_per_frame(file, contents, name).astype(np.float32) for name in names}
+    return {**found, "time": read_numbers(file, contents, "time")}
 
 
-def framed(file: h5py.File, contents: EpisodeContents, name: str) -> np.ndarray:
+def read_per_frame(file: h5py.File, contents: EpisodeContents, name: str) -> np.ndarray:
     """Rows (T, ...) of a named array; of `K` (T, 3, 3) that of each frame, which changes where the camera zooms."""
     if name != "K":
-        return numbers_in(file, contents, name)
+        return read_numbers(file, contents, name)
     if "K_of_frame" in contents.shapes:
-        return numbers_in(file, contents, "K_of_frame")
-    return np.tile(numbers_in(file, contents, "K"), (contents.frames, 1, 1))
+        return read_numbers(file, contents, "K_of_frame")
+    return np.tile(read_numbers(file, contents, "K"), (contents.frames, 1, 1))
 
 
-def blocks(frames: int) -> Iterator[range]:
+def split_into_blocks(frames: int) -> Iterator[range]:
     """All frames, `BLOCK` at a time."""
     return (range(start, min(start + BLOCK, frames)) for start in range(0, frames, BLOCK))
 
 
-def named_axes(name: str) -> list[str] | None:
+def name_axes(name: str) -> list[str] | None:
     """Names of a vector's components, where they have some."""
     return {"state": list(STATE), "action": list(ACTION), "distance": ["m"]}.get(
         name, list("xyz") if name in ("force", "force_read", "tip", "contact") else None
     )
 
 
-def stored_size(episodes: Sequence[EpisodeContents]) -> int:
+def measure_stored_size(episodes: Sequence[EpisodeContents]) -> int:
     """Bytes of all their files."""
     return sum(one.path.stat().st_size for one in episodes)
 
 
-def file_names(episodes: Sequence[EpisodeContents]) -> Mapping[EpisodeContents, str]:
+def name_files(episodes: Sequence[EpisodeContents]) -> Mapping[EpisodeContents, str]:
     """A name for each, its file's; where two have the same, with a number."""
     taken: set[str] = set()
     found = {}
@@ -160,7 +160,7 @@ def file_names(episodes: Sequence[EpisodeContents]) -> Mapping[EpisodeContents, 
     return found
 
 
-def states(poses: np.ndarray) -> np.ndarray:
+def build_states(poses: np.ndarray) -> np.ndarray:
     """(T, 7) float32 of `T_world_tool` (T, 4, 4): origin [m], and quaternion x, y, z, w that does not jump in sign."""
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     flips = np.sign(np.einsum("ij,ij->i", turns[1:], turns[:-1]))
@@ -168,7 +168,7 @@ def states(poses: np.ndarray) -> np.ndarray:
     return np.concatenate([poses[:, :3, 3], turns], axis=1).astype(np.float32)
 
 
-def twists(poses: np.ndarray) -> np.ndarray:
+def build_twists(poses: np.ndarray) -> np.ndarray:
     """(T, 6) float32: shift of the tool's origin [m] and its turn [rad], both in world axes, to the next frame.
 
     The last is zero.
@@ -179,9 +179,9 @@ def twists(poses: np.ndarray) -> np.ndarray:
     return np.concatenate([found, np.zeros((1, 6))]).astype(np.float32)
 
 
-def texts_along(episodes: Sequence[EpisodeContents]) -> Mapping[str, str]:
+def collect_texts(episodes: Sequence[EpisodeContents]) -> Mapping[str, str]:
     """The texts by the names that they go by; those of several folders are numbered. None where there are none."""
-    homes = dict.fromkeys(home_of(one.path.resolve().parent) for one in episodes)
+    homes = dict.fromkeys(find_dataset_folder(one.path.resolve().parent) for one in episodes)
     found = {}
     for number, home in enumerate(homes):
         for path in (home / SHEET, home / LICENCE):
@@ -193,10 +193,10 @@ def texts_along(episodes: Sequence[EpisodeContents]) -> Mapping[str, str]:
 
 def write_along(episodes: Sequence[EpisodeContents], folder: Path) -> None:
     """Write the texts into a folder."""
-    for name, text in texts_along(episodes).items():
+    for name, text in collect_texts(episodes).items():
         (folder / name).write_text(text, encoding="utf-8")
 
 
-def home_of(folder: Path) -> Path:
+def find_dataset_folder(folder: Path) -> Path:
     """The data set's folder, of that which its episodes lie in."""
     return folder.parent if folder.name == "episodes" and not (folder / LICENCE).exists() else folder

@@ -54,7 +54,9 @@ COLUMNS: Mapping[str, tuple[str, str]] = {
 """Columns of the table of episodes: type and meaning."""
 
 
-def croissant(name: str, description: str, date: str, table: str, sha256: str, inside: str) -> dict[str, Any]:
+def build_croissant_metadata(
+    name: str, description: str, date: str, table: str, sha256: str, inside: str
+) -> dict[str, Any]:
     """The metadata, as JSON.
 
     Parameters

@@ -17,24 +17,24 @@ from ..run_folder import RUN, RunSettings
 MOST_DRAWN = 100
 
 
-def parameters_of(contents: EpisodeContents) -> dict[str, Any]:
+def read_parameters(contents: EpisodeContents) -> dict[str, Any]:
     """Return the sampled parameters of an episode by dotted names; empty if not recorded as JSON.
 
     Tumours are sampled for synthetic anatomies only; those of others have no effect and are excluded.
     """
     try:
-        found = dict(leaves(json.loads(contents.said.get("parameters", "{}"))))
+        found = dict(list_leaves(json.loads(contents.said.get("parameters", "{}"))))
     except (TypeError, ValueError, RecursionError):
         return {}
     placed = found.get("bodies.anatomies", "drawn") == "drawn"
     return {key: value for key, value in found.items() if placed or not key.startswith("bodies.tumour.")}
 
 
-def drawn_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
+def format_variation_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
     """Lines of two tables: ranges of numbers and how often each text came; what is the same wherever it is."""
     values: dict[str, list[Any]] = {}
     for one in episodes:
-        for key, value in parameters_of(one).items():
+        for key, value in read_parameters(one).items():
             values.setdefault(key, []).append(value)
     varied = {key: found for key, found in values.items() if any(one != found[0] for one in found)}
     same = {key: found for key, found in values.items() if key not in varied}
@@ -43,14 +43,14 @@ def drawn_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
     if varied:
         yield "\nWhat was drawn at random, from least to greatest:\n"
         yield "| what | from | to | episodes |\n|---|---|---|---|"
-        yield from [range_row(key, found) for key, found in varied.items()][:MOST_DRAWN]
+        yield from [format_range_row(key, found) for key, found in varied.items()][:MOST_DRAWN]
     if same:
         yield "\nWhat is the same in all episodes that have it:\n"
         yield "| what | value | episodes |\n|---|---|---|"
         yield from [f"| `{key}` | {cell_of(found[0])} | {len(found)} |" for key, found in same.items()][:MOST_DRAWN]
 
 
-def range_row(key: str, found: Sequence[Any]) -> str:
+def format_range_row(key: str, found: Sequence[Any]) -> str:
     """A row of what varies."""
     if all(is_number(one) for one in found):
         return f"| `{key}` | {cell_of(min(found))} | {cell_of(max(found))} | {len(found)} |"
@@ -68,15 +68,15 @@ def cell_of(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+def list_leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Numbers and texts of nested JSON by their dotted names; lists are numbered."""
     match value:
         case dict():
             for key, inner in value.items():
-                yield from leaves(inner, f"{name}.{key}".strip("."))
+                yield from list_leaves(inner, f"{name}.{key}".strip("."))
         case list():
             for place, inner in enumerate(value):
-                yield from leaves(inner, f"{name}.{place}".strip("."))
+                yield from list_leaves(inner, f"{name}.{place}".strip("."))
         case _:
             yield name, value
 
@@ -87,25 +87,25 @@ TEMPLATE, DRAWN, UNSTATED = "template", "drawn", ""
 
 def origin_of(contents: EpisodeContents) -> str:
     """Return the origin of an episode's anatomy: `TEMPLATE`, `DRAWN`, the name of an own one, or `UNSTATED`."""
-    stated = parameters_of(contents).get("bodies.anatomies")
+    stated = read_parameters(contents).get("bodies.anatomies")
     if stated is not None:
         return str(stated)
     return TEMPLATE if is_template(str(contents.said.get("anatomy"))) else UNSTATED
 
 
-def notice_of_template() -> str:
+def get_template_notice() -> str:
     """Return the notice that the template's authors require in all copies, as Markdown."""
     lines = template_path().with_suffix(".notice.txt").read_text(encoding="utf-8").splitlines()
     head = "The template's brain, also in `bodies`, is made from the ICBM 152 template of 2009 (MNI152). Its notice:"
     return "\n".join(["", head, "", *(f"> {line}" for line in lines), ""])
 
 
-def of_template(episodes: Sequence[EpisodeContents]) -> bool:
+def has_template(episodes: Sequence[EpisodeContents]) -> bool:
     """Return True if any episode uses the template's brain."""
     return any(origin_of(one) in (TEMPLATE, DRAWN) for one in episodes)
 
 
-def origins(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
+def format_origins(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
     """Lines of the data sheet."""
     for origin, count in Counter(origin_of(one) for one in episodes).most_common():
         if origin in (TEMPLATE, DRAWN):
@@ -127,7 +127,7 @@ NAME = "with sulcus"
 MOST_LISTED = 12
 
 
-def datasheet(
+def write_datasheet(
     name: str,
     episodes: Sequence[EpisodeContents],
     rows: Sequence[Mapping[str, Any]],
@@ -142,9 +142,9 @@ def datasheet(
         f"# Data sheet: {name}\n\n{MARK}\n",
         "Made by sulcus from the files themselves. The questions are those of Gebru et al. (2021), *Datasheets for "
         "Datasets*.\n",
-        motivation(),
-        composition(episodes, rows, notes),
-        collection(episodes, run),
+        describe_motivation(),
+        describe_composition(episodes, rows, notes),
+        describe_collection(episodes, run),
         UNKNOWN,
         "## Preprocessing\n\nColour is JPEG, depth PNG of 16 bits and labels PNG of 8 bits. Nothing else was changed. "
         "`sulcus validate` compares pictures, arrays and checksums.\n",
@@ -153,12 +153,12 @@ def datasheet(
         "## Distribution\n\nUnder CC BY 4.0, as `LICENSE.md` says in plain words.\n",
         "## Maintenance\n\nWhoever gives these data out answers for them: write here who, and where errors are "
         "reported. The plan below and the seeds above make them anew.\n",
-        *plans(episodes),
+        *format_plans(episodes),
     )
     return "\n".join(parts)
 
 
-def motivation() -> str:
+def describe_motivation() -> str:
     """Describe the motivation."""
     return (
         "## Motivation\n\nA tool that presses moves the brain, and the tumour in it. Where the tumour is at each "
@@ -166,7 +166,9 @@ def motivation() -> str:
     )
 
 
-def composition(episodes: Sequence[EpisodeContents], rows: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> str:
+def describe_composition(
+    episodes: Sequence[EpisodeContents], rows: Sequence[Mapping[str, Any]], notes: Sequence[str]
+) -> str:
     """Describe the composition: counts, sizes, arrays."""
     lines = ["## Composition\n", "| family | episodes | frames | solved | seconds | GB |", "|---|---|---|---|---|---|"]
     for family in [*sorted({row["family"] for row in rows}), None]:
@@ -175,7 +177,7 @@ def composition(episodes: Sequence[EpisodeContents], rows: Sequence[Mapping[str,
             sum(row[key] for row in those) for key in ("frames", "solved", "seconds", "bytes")
         )
         lines.append(f"| {family or 'all'} | {len(those)} | {frames} | {solved} | {seconds:.1f} | {size / 1e9:.3f} |")
-    lines.append(f"\n*Solved* are frames that finite elements answered. {bodies_said(episodes)}")
+    lines.append(f"\n*Solved* are frames that finite elements answered. {describe_bodies(episodes)}")
     lines += [*notes, ""]
     lines += ["| array | unit | in episodes |", "|---|---|---|"]
     counts = Counter(name for one in episodes for name in one.shapes)
@@ -195,33 +197,39 @@ def composition(episodes: Sequence[EpisodeContents], rows: Sequence[Mapping[str,
     return "\n".join(lines)
 
 
-def bodies_said(episodes: Sequence[EpisodeContents]) -> str:
+def describe_bodies(episodes: Sequence[EpisodeContents]) -> str:
     """Describe the numbers of anatomies and image sizes."""
     bodies = len({one.said.get("anatomy") for one in episodes})
     sizes = sorted({one.size for one in episodes})
     said_sizes = ", ".join(f"{width} x {height}" for width, height in sizes)
-    return "\n".join([f"Anatomies: {bodies}. Pictures: {said_sizes} pixels.\n", *origins(episodes)])
+    return "\n".join([f"Anatomies: {bodies}. Pictures: {said_sizes} pixels.\n", *format_origins(episodes)])
 
 
-def collection(episodes: Sequence[EpisodeContents], run: RunSettings | None) -> str:
+def describe_collection(episodes: Sequence[EpisodeContents], run: RunSettings | None) -> str:
     """Describe the collection process, and the random variation."""
     lines = ["## Collection\n", "A scripted tool moved on a simulated brain, and a camera drew what it would see.\n"]
-    tools = [str(tool).partition("(")[0] for tool in said(episodes, "tool")]  # sizes are among what was drawn
-    lines += [*listed("what moved the tissue", said(episodes, "answered_by"))]
-    lines += [*listed("what solved it", said(episodes, "finite_elements")), *listed("tool", tools)]
-    versions = sorted(set(map(str, said(episodes, "sulcus_version"))))
-    dates = sorted(str(date)[:10] for date in said(episodes, "date"))
+    tools = [str(tool).partition("(")[0] for tool in format_value(episodes, "tool")]  # sizes are among what was drawn
+    lines += [*format_counts("what moved the tissue", format_value(episodes, "answered_by"))]
+    lines += [
+        *format_counts("what solved it", format_value(episodes, "finite_elements")),
+        *format_counts("tool", tools),
+    ]
+    versions = sorted(set(map(str, format_value(episodes, "sulcus_version"))))
+    dates = sorted(str(date)[:10] for date in format_value(episodes, "date"))
     if versions:
         lines.append(f"- sulcus {', '.join(versions)}" + (f", {dates[0]} to {dates[-1]}" if dates else ""))
-    lines += [*listed("plan", said(episodes, "plan_name")), *listed("seed", said(episodes, "seed"))]
+    lines += [
+        *format_counts("plan", format_value(episodes, "plan_name")),
+        *format_counts("seed", format_value(episodes, "seed")),
+    ]
     if run is not None:
         parts = ", ".join(f"{part} {version}" for part, version in run.versions.items())
         lines.append(f"- device: {run.device}; packages: {parts} (as `{RUN}` says)")
-    lines += drawn_tables(episodes)
+    lines += format_variation_tables(episodes)
     return "\n".join(lines) + "\n"
 
 
-def listed(title: str, texts: Sequence[Any]) -> Iterator[str]:
+def format_counts(title: str, texts: Sequence[Any]) -> Iterator[str]:
     """Lines of how often there is what; of many different ones, those that are there most often."""
     often = Counter(map(str, texts)).most_common()
     yield from (f"- {title}: {text} (in {count})" for text, count in often[:MOST_LISTED])
@@ -230,14 +238,14 @@ def listed(title: str, texts: Sequence[Any]) -> Iterator[str]:
         yield f"- {title}: {len(often) - MOST_LISTED} others (in {others})"
 
 
-def said(episodes: Sequence[EpisodeContents], key: str) -> list[Any]:
+def format_value(episodes: Sequence[EpisodeContents], key: str) -> list[Any]:
     """An attribute of all episodes that have it."""
     return [one.said[key] for one in episodes if key in one.said]
 
 
-def plans(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
+def format_plans(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
     """The plans, as they stand in the files."""
-    for text in dict.fromkeys(map(str, said(episodes, "plan"))):
+    for text in dict.fromkeys(map(str, format_value(episodes, "plan"))):
         yield f"## Plan\n\n```toml\n{text.strip()}\n```\n"
 
 

@@ -17,21 +17,21 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_folder
+from sim.runtime.atomic_files import write_folder_atomically
 
-from ..reading.contents import EpisodeContents, opened
-from ..reading.schema import COLOUR, DEPTH, PICTURES, suffix_of
-from ..reading.windows import code_of, picture_of
+from ..reading.contents import EpisodeContents, open_episode
+from ..reading.schema import COLOUR, DEPTH, PICTURES, get_suffix
+from ..reading.windows import read_image_bytes, read_one_image
 from .columns import (
     SPACE,
-    blocks,
-    named_axes,
-    numbers_of,
-    rate_of,
-    shared_numbers,
-    shared_pictures,
-    stored_size,
-    task_of,
+    collect_numbers,
+    describe_task,
+    list_shared_images,
+    list_shared_numbers,
+    measure_rate,
+    measure_stored_size,
+    name_axes,
+    split_into_blocks,
     write_along,
 )
 
@@ -107,31 +107,36 @@ def write_lerobot(
     InputError
         Episodes without a tool, of different sizes or rates, or damaged; a folder that cannot be written.
     """
-    pictures = shared_pictures(episodes, EXPORTED)
-    names = shared_numbers(episodes)
-    tasks = list(dict.fromkeys(task_of(one) for one in episodes))
+    pictures = list_shared_images(episodes, EXPORTED)
+    names = list_shared_numbers(episodes)
+    tasks = list(dict.fromkeys(describe_task(one) for one in episodes))
     rates: set[float] = set()
-    with written_folder(folder, stored_size(episodes)) as partial:
+    with write_folder_atomically(folder, measure_stored_size(episodes)) as partial:
         tables = Tables(partial)
         rows, whole, shapes = [], {}, {}
         first = 0
         try:
             for number, contents in enumerate(progress(episodes)):
-                with opened(contents.path) as file:
-                    numbers = numbers_of(file, contents, names)
-                    rates.add(rate_of(contents, numbers.pop("time")))
+                with open_episode(contents.path) as file:
+                    numbers = collect_numbers(file, contents, names)
+                    rates.add(measure_rate(contents, numbers.pop("time")))
                     if len(rates) > 1:
                         slow, fast = sorted(rates)
                         raise InputError(f"{contents.path}: {slow:g} and {fast:g} frames a second: convert them apart.")
-                    columns = counted(contents.frames, number, first, tasks.index(task_of(contents)), *rates)
-                    columns |= {key_of(name): rows_ for name, rows_ in numbers.items()}
+                    columns = build_columns(
+                        contents.frames, number, first, tasks.index(describe_task(contents)), *rates
+                    )
+                    columns |= {to_key(name): rows_ for name, rows_ in numbers.items()}
                     place = tables.write(file, contents, columns, pictures)
                     spreads = {name: RowStatistics.of(array) for name, array in columns.items()}
-                    spreads |= {f"observation.images.{name}": looks(file, contents, name) for name in pictures}
+                    spreads |= {
+                        f"observation.images.{name}": measure_image_statistics(file, contents, name)
+                        for name in pictures
+                    }
                 rows.append(
                     {
                         "episode_index": number,
-                        "tasks": [task_of(contents)],
+                        "tasks": [describe_task(contents)],
                         "length": contents.frames,
                         "data/chunk_index": place[0],
                         "data/file_index": place[1],
@@ -142,7 +147,7 @@ def write_lerobot(
                         **{
                             f"stats/{name}/{key}": value
                             for name, spread in spreads.items()
-                            for key, value in shaped(name, spread).items()
+                            for key, value in to_lerobot_statistics(name, spread).items()
                         },
                     }
                 )
@@ -154,22 +159,24 @@ def write_lerobot(
         (partial / "meta").mkdir()
         (partial / EPISODES).parent.mkdir(parents=True)
         pq.write_table(pa.Table.from_pylist(rows), partial / EPISODES)
-        pq.write_table(task_table(tasks), partial / "meta/tasks.parquet")
-        write_json(partial / "meta/stats.json", {name: shaped(name, spread) for name, spread in whole.items()})
-        features = {**features_of(shapes), **picture_features(episodes[0], pictures)}
-        described = info(len(episodes), first, len(tasks), rates.pop(), features)
+        pq.write_table(build_task_table(tasks), partial / "meta/tasks.parquet")
+        write_json(
+            partial / "meta/stats.json", {name: to_lerobot_statistics(name, spread) for name, spread in whole.items()}
+        )
+        features = {**compute_features(shapes), **describe_image_features(episodes[0], pictures)}
+        described = build_info(len(episodes), first, len(tasks), rates.pop(), features)
         write_json(partial / "meta/info.json", described)
         write_json(partial / "meta/spaces.json", {"spaces": SPACE})
         write_along(episodes, partial)
     return {"out": str(folder), "episodes": len(episodes), "frames": first, "features": sorted(features)}
 
 
-def key_of(name: str) -> str:
+def to_key(name: str) -> str:
     """LeRobot's name of an array of ours."""
     return "action" if name == "action" else f"observation.{name}"
 
 
-def counted(frames: int, episode: int, first: int, task: int, rate: float) -> dict[str, np.ndarray]:
+def build_columns(frames: int, episode: int, first: int, task: int, rate: float) -> dict[str, np.ndarray]:
     """The columns that each LeRobot data set has."""
     every = np.arange(frames)
     same = np.ones(frames, np.int64)
@@ -192,10 +199,10 @@ class Tables:
         """Write an episode; returns the numbers of the folder and the file that it is in."""
         if self.writer is not None and self.path.stat().st_size > 1e6 * FILE_MEGABYTES:
             self.close()
-        for block in blocks(len(columns["index"])):
-            arrays = {name: column_of(array[block.start : block.stop]) for name, array in columns.items()}
+        for block in split_into_blocks(len(columns["index"])):
+            arrays = {name: to_arrow_column(array[block.start : block.stop]) for name, array in columns.items()}
             for name in pictures:
-                arrays[f"observation.images.{name}"] = pa.array(coded(file, contents, name, block), PICTURE)
+                arrays[f"observation.images.{name}"] = pa.array(encode_images(file, contents, name, block), PICTURE)
             table = pa.table(arrays)
             if self.writer is None:
                 self.number += 1
@@ -213,13 +220,16 @@ class Tables:
             self.writer = None
 
 
-def coded(file: h5py.File, contents: EpisodeContents, name: str, frames: range) -> Iterator[dict[str, Any]]:
+def encode_images(file: h5py.File, contents: EpisodeContents, name: str, frames: range) -> Iterator[dict[str, Any]]:
     """Yield images as LeRobot stores them."""
-    suffix = suffix_of(name)
-    return ({"bytes": code_of(file, contents, name, frame), "path": f"{name}_{frame:06d}.{suffix}"} for frame in frames)
+    suffix = get_suffix(name)
+    return (
+        {"bytes": read_image_bytes(file, contents, name, frame), "path": f"{name}_{frame:06d}.{suffix}"}
+        for frame in frames
+    )
 
 
-def column_of(array: np.ndarray) -> pa.Array:
+def to_arrow_column(array: np.ndarray) -> pa.Array:
     """Rows (T, ...) as a column: numbers, vectors, or lists of lists."""
     if array.ndim == 1:
         return pa.array(array)
@@ -232,17 +242,17 @@ def column_of(array: np.ndarray) -> pa.Array:
     return inner
 
 
-def looks(file: h5py.File, contents: EpisodeContents, name: str) -> RowStatistics:
+def measure_image_statistics(file: h5py.File, contents: EpisodeContents, name: str) -> RowStatistics:
     """Compute statistics of a few images: colour and labels relative to 255, depth in its own steps."""
     found = []
     for frame in np.unique(np.linspace(0, contents.frames - 1, LOOKED_AT).round().astype(int)).tolist():
-        picture = picture_of(file, contents, name, frame)[::SPARSE, ::SPARSE]
+        picture = read_one_image(file, contents, name, frame)[::SPARSE, ::SPARSE]
         scale = contents.depth_scale if PICTURES[name] == DEPTH else 255.0
         found.append(picture.reshape(-1, picture.shape[2] if picture.ndim == 3 else 1) / scale)
     return RowStatistics.of(np.concatenate(found))
 
 
-def shaped(name: str, spread: RowStatistics) -> dict[str, list]:
+def to_lerobot_statistics(name: str, spread: RowStatistics) -> dict[str, list]:
     """Convert statistics to LeRobot's form: of an image (channels, 1, 1)."""
     said = spread.said()
     if not name.startswith("observation.images."):
@@ -250,7 +260,7 @@ def shaped(name: str, spread: RowStatistics) -> dict[str, list]:
     return {key: value if key == "count" else [[[one]] for one in value] for key, value in said.items()}
 
 
-def task_table(tasks: Sequence[str]) -> pa.Table:
+def build_task_table(tasks: Sequence[str]) -> pa.Table:
     """Tasks with their numbers; the sentence is the index that pandas restores."""
     index = "__index_level_0__"
     table = pa.table({"task_index": np.arange(len(tasks)), index: list(tasks)})
@@ -269,17 +279,17 @@ def task_table(tasks: Sequence[str]) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(described)})
 
 
-def features_of(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
-    """Numbers as `info.json` describes them."""
+def compute_features(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+    """Numbers as `build_info.json` describes them."""
     kinds = {name: "float32" if name not in COUNTED or name == "timestamp" else "int64" for name in shapes}
     return {
-        name: {"dtype": kinds[name], "shape": list(shape) or [1], "names": named_axes(name.rpartition(".")[2])}
+        name: {"dtype": kinds[name], "shape": list(shape) or [1], "names": name_axes(name.rpartition(".")[2])}
         for name, shape in shapes.items()
     }
 
 
-def picture_features(contents: EpisodeContents, pictures: Sequence[str]) -> dict[str, Any]:
-    """Describe images for `info.json`; for depth its step, and its range [m]."""
+def describe_image_features(contents: EpisodeContents, pictures: Sequence[str]) -> dict[str, Any]:
+    """Describe images for `build_info.json`; for depth its step, and its range [m]."""
     width, height = contents.size
     found = {}
     for name in pictures:
@@ -299,8 +309,8 @@ def picture_features(contents: EpisodeContents, pictures: Sequence[str]) -> dict
     return found
 
 
-def info(episodes: int, frames: int, tasks: int, rate: float, features: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the contents of `info.json`."""
+def build_info(episodes: int, frames: int, tasks: int, rate: float, features: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the contents of `build_info.json`."""
     return {
         "codebase_version": VERSION,
         "robot_type": "simulated hand-held tool",

@@ -11,12 +11,12 @@ from typing import Any
 import h5py
 import numpy as np
 
-from sim.runtime.atomic_files import written_folder
+from sim.runtime.atomic_files import write_folder_atomically
 
-from ..reading.contents import EpisodeContents, opened
-from ..reading.schema import ARRAYS, PICTURES, SOLVED, suffix_of
-from ..reading.windows import code_of, numbers_in, rows_of
-from .columns import file_names, stored_size, write_along
+from ..reading.contents import EpisodeContents, open_episode
+from ..reading.schema import ARRAYS, PICTURES, SOLVED, get_suffix
+from ..reading.windows import read_image_bytes, read_numbers, select_rows
+from .columns import measure_stored_size, name_files, write_along
 
 WIDE = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")
 """Arrays with many numbers a frame, each in a table of its own."""
@@ -32,12 +32,12 @@ def write_folder(
     InputError
         An episode that is damaged; a folder that cannot be written.
     """
-    with written_folder(folder, 2 * stored_size(episodes)) as partial:
-        names = file_names(episodes)
+    with write_folder_atomically(folder, 2 * measure_stored_size(episodes)) as partial:
+        names = name_files(episodes)
         for contents in progress(episodes):
             place = partial / names[contents]
             place.mkdir()
-            with opened(contents.path) as file:
+            with open_episode(contents.path) as file:
                 write_pictures(place, file, contents)
                 write_tables(place, file, contents)
                 write_description(place / "episode.json", file, contents)
@@ -50,9 +50,9 @@ def write_pictures(place: Path, file: h5py.File, contents: EpisodeContents) -> N
     for name in PICTURES:
         if name in contents.shapes:
             (place / name).mkdir()
-            suffix = suffix_of(name)
+            suffix = get_suffix(name)
             for frame in range(contents.frames):
-                (place / name / f"{frame:06d}.{suffix}").write_bytes(code_of(file, contents, name, frame))
+                (place / name / f"{frame:06d}.{suffix}").write_bytes(read_image_bytes(file, contents, name, frame))
 
 
 def write_tables(place: Path, file: h5py.File, contents: EpisodeContents) -> None:
@@ -62,7 +62,7 @@ def write_tables(place: Path, file: h5py.File, contents: EpisodeContents) -> Non
         described = ARRAYS.get(name)
         if described is None or name == "fem_frames" or not (described.framed or described.axes[0] == SOLVED):
             continue
-        rows = rows_of(file, contents, name)
+        rows = select_rows(file, contents, name)
         if name in WIDE:
             flat = np.asarray(rows).reshape(contents.frames, -1)
             axes = [f"{node}{axis}" for node in range(flat.shape[1] // 3) for axis in ("_x", "_y", "_z")]
@@ -96,7 +96,7 @@ def write_description(path: Path, file: h5py.File, contents: EpisodeContents) ->
         arrays[name] = {key: str(item.attrs[key]) for key in ("meaning", "unit") if key in item.attrs}
         described = ARRAYS.get(name)
         if described is not None and not described.framed and described.axes[0] != SOLVED:
-            arrays[name]["values"] = numbers_in(file, contents, name).tolist()
+            arrays[name]["values"] = read_numbers(file, contents, name).tolist()
     said = {
         name: value if isinstance(value, str | int | float | list) else str(value)
         for name, value in contents.said.items()

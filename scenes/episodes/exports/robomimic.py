@@ -10,23 +10,23 @@ from typing import Any
 import h5py
 import numpy as np
 
-from sim.runtime.atomic_files import Stream, demand_space, written_stream
-from sim.runtime.versions import version_of
+from sim.runtime.atomic_files import Stream, check_disk_space, write_stream_atomically
+from sim.runtime.versions import get_version
 
-from ..reading.contents import EpisodeContents, opened
+from ..reading.contents import EpisodeContents, open_episode
 from ..reading.schema import COLOUR, PICTURES
-from ..reading.windows import numbers_in
+from ..reading.windows import read_numbers
 from .columns import (
     SPACE,
-    blocks,
-    held_out,
-    numbers_of,
-    rate_of,
-    shared_numbers,
-    shared_pictures,
-    stored_size,
-    task_of,
-    texts_along,
+    collect_numbers,
+    collect_texts,
+    describe_task,
+    list_shared_images,
+    list_shared_numbers,
+    mark_held_out,
+    measure_rate,
+    measure_stored_size,
+    split_into_blocks,
 )
 
 EXPORTED = ("colour", "colour_right", "depth", "segmentation")
@@ -46,26 +46,28 @@ def write_robomimic(
     InputError
         Episodes without a tool, of different image sizes, or damaged; a file that cannot be written.
     """
-    pictures, names = shared_pictures(episodes, EXPORTED), shared_numbers(episodes)
-    demand_space(path, SWELLS * stored_size(episodes))
+    pictures, names = list_shared_images(episodes, EXPORTED), list_shared_numbers(episodes)
+    check_disk_space(path, SWELLS * measure_stored_size(episodes))
     total, rates = 0, []
-    with written_stream(path, ".hdf5") as stream, h5py.File(stream, "w") as out:
+    with write_stream_atomically(path, ".hdf5") as stream, h5py.File(stream, "w") as out:
         data = out.create_group("data")
         for number, contents in enumerate(progress(episodes)):
             demo = data.create_group(f"demo_{number}")
-            with opened(contents.path) as file:
-                numbers = numbers_of(file, contents, names)
-                rates.append(rate_of(contents, numbers.pop("time")))
+            with open_episode(contents.path) as file:
+                numbers = collect_numbers(file, contents, names)
+                rates.append(measure_rate(contents, numbers.pop("time")))
                 obs = demo.create_group("obs")
                 write_demo(demo, obs, contents, numbers)
                 write_pictures(obs, file, contents, pictures, stream)
             total += contents.frames
-        data.attrs.update({"total": total, "env_args": json.dumps(environment(episodes, rates)), "space": SPACE})
+        data.attrs.update(
+            {"total": total, "env_args": json.dumps(describe_environment(episodes, rates)), "space": SPACE}
+        )
         names_of = np.array([f"demo_{number}" for number in range(len(episodes))], "S")
-        out_of = np.array(held_out(episodes))
+        out_of = np.array(mark_held_out(episodes))
         out.create_dataset("mask/train", data=names_of[~out_of])
         out.create_dataset("mask/valid", data=names_of[out_of])
-        for name, text in texts_along(episodes).items():
+        for name, text in collect_texts(episodes).items():
             out[name] = text
     return {"out": str(path), "episodes": len(episodes), "frames": total, "held_out": int(out_of.sum())}
 
@@ -82,7 +84,7 @@ def write_demo(demo: h5py.Group, obs: h5py.Group, contents: EpisodeContents, num
     demo.create_dataset("dones", data=dones)
     for name, rows in {"tool_position": state[:, :3], "tool_quaternion": state[:, 3:], **numbers}.items():
         obs.create_dataset(name, data=rows.reshape(contents.frames, -1))
-    demo.attrs.update({"num_samples": contents.frames, "task": task_of(contents), "episode": contents.path.name})
+    demo.attrs.update({"num_samples": contents.frames, "task": describe_task(contents), "episode": contents.path.name})
 
 
 def write_pictures(
@@ -98,19 +100,19 @@ def write_pictures(
             f"{name}_image", (contents.frames, *shape), kind, chunks=(1, *shape), compression="gzip",
             compression_opts=1, shuffle=name == "depth",
         )  # fmt: skip
-        for block in blocks(contents.frames):
-            rows = numbers_in(file, contents, name, block).reshape(len(block), *shape)
+        for block in split_into_blocks(contents.frames):
+            rows = read_numbers(file, contents, name, block).reshape(len(block), *shape)
             store[block.start : block.stop] = rows
             if stream.failure is not None:
                 raise stream.failure
 
 
-def environment(episodes: Sequence[EpisodeContents], rates: Sequence[float]) -> dict[str, Any]:
+def describe_environment(episodes: Sequence[EpisodeContents], rates: Sequence[float]) -> dict[str, Any]:
     """Return the environment metadata of robomimic: no environment replays the actions, so the scenes are named."""
     families = sorted({one.family for one in episodes})
     return {
         "env_name": "sulcus",
         "type": GYM,
-        "env_version": version_of("sulcus"),
+        "env_version": get_version("sulcus"),
         "env_kwargs": {"families": families, "frames_per_second": sorted(set(rates))},
     }

@@ -11,12 +11,12 @@ from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
 import h5py
 import numpy as np
 
-from sim.runtime.atomic_files import written_folder, written_stream
+from sim.runtime.atomic_files import write_folder_atomically, write_stream_atomically
 
-from ..reading.bodies import anatomy_of, surface_rows
-from ..reading.contents import EpisodeContents, array_in, opened
-from ..reading.windows import numbers_in
-from .columns import SPACE, file_names, stored_size, write_along
+from ..reading.bodies import find_anatomy, find_surface_rows
+from ..reading.contents import EpisodeContents, get_array, open_episode
+from ..reading.windows import read_numbers
+from .columns import SPACE, measure_stored_size, name_files, write_along
 
 SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
 """Contents to write, and the surface of their anatomy."""
@@ -36,20 +36,20 @@ def write_xdmf(
         An episode that is damaged; a folder that cannot be written.
     """
     bare = 0
-    with written_folder(folder, stored_size(episodes)) as partial:
-        names = file_names(episodes)
+    with write_folder_atomically(folder, measure_stored_size(episodes)) as partial:
+        names = name_files(episodes)
         for contents in progress(episodes):
-            anatomy = anatomy_of(contents)
+            anatomy = find_anatomy(contents)
             bare += anatomy is None
             root = Element("Xdmf", Version="3.0")
             domain = SubElement(root, "Domain")
             SubElement(domain, "Information", Name="space", Value=SPACE)
-            with opened(contents.path) as file, hdf5(partial / f"{names[contents]}.h5") as out:
-                times = numbers_in(file, contents, "time")
+            with open_episode(contents.path) as file, open_hdf5(partial / f"{names[contents]}.h5") as out:
+                times = read_numbers(file, contents, "time")
                 for name, surface in SURFACES.items():
                     if f"{name}_predicted" in contents.shapes and f"{name}_rest" in contents.shapes:
-                        nodes = numbers_in(file, contents, f"{name}_nodes")
-                        triangles = None if anatomy is None else surface_rows(getattr(anatomy, surface), nodes)
+                        nodes = read_numbers(file, contents, f"{name}_nodes")
+                        triangles = None if anatomy is None else find_surface_rows(getattr(anatomy, surface), nodes)
                         group = out.create_group(name)
                         write_arrays(group, file, contents, name, triangles)
                         add_series(domain, group, f"{names[contents]}.h5", times)
@@ -60,9 +60,9 @@ def write_xdmf(
 
 
 @contextmanager
-def hdf5(path: Path) -> Iterator[h5py.File]:
+def open_hdf5(path: Path) -> Iterator[h5py.File]:
     """A new HDF5 file; a full disk ends in a sentence."""
-    with written_stream(path, ".h5") as stream, h5py.File(stream, "w") as file:
+    with write_stream_atomically(path, ".h5") as stream, h5py.File(stream, "w") as file:
         yield file
 
 
@@ -70,10 +70,10 @@ def write_arrays(
     out: h5py.Group, file: h5py.File, contents: EpisodeContents, name: str, triangles: np.ndarray | None
 ) -> None:
     """Write positions, displacement and difference of each frame, single precision."""
-    at = numbers_in(file, contents, f"{name}_predicted")
-    arrays = {"positions": at, "displacement": at - numbers_in(file, contents, f"{name}_rest")}
+    at = read_numbers(file, contents, f"{name}_predicted")
+    arrays = {"positions": at, "displacement": at - read_numbers(file, contents, f"{name}_rest")}
     if f"{name}_fem" in contents.shapes:
-        truth = numbers_in(file, contents, f"{name}_fem")
+        truth = read_numbers(file, contents, f"{name}_fem")
         arrays["from_finite_elements"] = np.linalg.norm(at - truth, axis=2)
     for key, rows in arrays.items():
         for frame, row in enumerate(rows):
@@ -88,7 +88,7 @@ def add_series(domain: Element, group: h5py.Group, name: str, times: np.ndarray)
     series = SubElement(
         domain, "Grid", Name=str(group.name).strip("/"), GridType="Collection", CollectionType="Temporal"
     )
-    cells = array_in(group, "cells")
+    cells = get_array(group, "cells")
     kind = (
         {"TopologyType": "Triangle"} if cells.shape[1] == 3 else {"TopologyType": "Polyvertex", "NodesPerElement": "1"}
     )
@@ -96,11 +96,11 @@ def add_series(domain: Element, group: h5py.Group, name: str, times: np.ndarray)
         grid = SubElement(series, "Grid", Name=frame, GridType="Uniform")
         SubElement(grid, "Time", Value=repr(float(times[int(frame)])))
         add_item(SubElement(grid, "Topology", kind, NumberOfElements=str(len(cells))), cells, name)
-        add_item(SubElement(grid, "Geometry", GeometryType="XYZ"), array_in(group, f"positions/{frame}"), name)
+        add_item(SubElement(grid, "Geometry", GeometryType="XYZ"), get_array(group, f"positions/{frame}"), name)
         for key, form in (("displacement", "Vector"), ("from_finite_elements", "Scalar")):
             if f"{key}/{frame}" in group:
                 attribute = SubElement(grid, "Attribute", Name=f"{key} [m]", AttributeType=form, Center="Node")
-                add_item(attribute, array_in(group, f"{key}/{frame}"), name)
+                add_item(attribute, get_array(group, f"{key}/{frame}"), name)
 
 
 def add_item(above: Element, array: h5py.Dataset, name: str) -> None:

@@ -13,17 +13,17 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.runtime.device import find_device
-from sim.runtime.file_limits import at_most
+from sim.runtime.file_limits import limit_memory
 from sim.runtime.outside_files import read_as
 from sim.runtime.processes import LostError, map_apart
 
-from ...play.reference import following, past_matters, truth_of
-from ..make import Opened, body_path, opened_body
+from ...play.reference import build_reference_fem, is_history_dependent, solve_reference_frames
+from ..make import Opened, open_body, to_body_path
 from ..plan import plan_from
-from ..scripted import drawn_episode, scene_of
-from .contents import REMEDY, contents_of, said_by_validate
+from ..scripted import build_scene, sample_episode
+from .contents import REMEDY, format_finding, inspect_contents
 from .validation import Report, validate_episode
-from .windows import numbers_in
+from .windows import read_numbers
 
 # Largest difference of two solutions [mm]: at training accuracy; of played frames, at live accuracy.
 SAME_MM, LIVE_MM = 0.02, 0.2
@@ -31,25 +31,25 @@ SAME_MM, LIVE_MM = 0.02, 0.2
 MOST_BYTES = 8 * 1024**3
 
 
-def solved_again(report: Report, count: int, device: str = "auto") -> Report:
+def solve_again(report: Report, count: int, device: str = "auto") -> Report:
     """A report with what solving `count` of its frames again found: where the tumour comes to lie elsewhere.
 
     Frames are spread evenly. Where the past matters, all that were solved before them are solved too, in their order.
     """
     try:
         with read_as(report.path, "an episode", REMEDY), h5py.File(report.path, "r") as file:
-            contents = contents_of(file, report.path)
+            contents = inspect_contents(file, report.path)
             missing = [name for name in ("plan", "seed", "episode", "body") if name not in contents.said]
             if missing or "tumour_fem" not in contents.shapes:
                 return _skipped(report, f"frames solved again: it states no {(*missing, 'tumour_fem')[0]}")
-            place = body_path(report.path.parent, int(contents.said["body"]))
+            place = to_body_path(report.path.parent, int(contents.said["body"]))
             if not place.is_dir():
                 return _skipped(report, "frames solved again: its body is not beside it")
-            frames, found = _answers(contents.said, opened_body(place, device), contents.fem_frames, count)
-            stored = numbers_in(file, contents, "tumour_fem")[frames]
-            rest = numbers_in(file, contents, "tumour_rest")
+            frames, found = _answers(contents.said, open_body(place, device), contents.fem_frames, count)
+            stored = read_numbers(file, contents, "tumour_fem")[frames]
+            rest = read_numbers(file, contents, "tumour_rest")
     except InputError as error:
-        words = f"frames cannot be solved again: {said_by_validate(error, report.path)}"
+        words = f"frames cannot be solved again: {format_finding(error, report.path)}"
         return replace(report, problems=[*report.problems, words])
     off = 1e3 * np.linalg.norm(rest + found - stored, axis=2).max(axis=1)
     allowed = LIVE_MM if contents.said.get("deformer") == "fem" else SAME_MM
@@ -67,16 +67,16 @@ def _answers(said: Mapping[str, Any], opened: Opened, solved: np.ndarray, count:
     plan = plan_from(str(said["plan"]), str(said.get("plan_name", "plan")), Path())
     seed, number = int(said["seed"]), int(said["episode"])
     body, theatre = opened.body, opened.theatre
-    scene = scene_of(plan, body, theatre.site, drawn_episode(plan.contents, seed, number), seed, number)
-    fem = following(theatre, scene)
+    scene = build_scene(plan, body, theatre.site, sample_episode(plan.contents, seed, number), seed, number)
+    fem = build_reference_fem(theatre, scene)
     rows = np.unique(np.linspace(0, len(solved) - 1, min(count, len(solved))).astype(int))
-    asked = np.arange(rows[-1] + 1) if past_matters(fem) else rows
+    asked = np.arange(rows[-1] + 1) if is_history_dependent(fem) else rows
     loads = [scene.loads(theatre.site, scene.path(time), time) for time in map(float, scene.times[solved[asked]])]
-    answer = truth_of(theatre, scene, loads, fem=fem).at(theatre.anatomy.tumour_nodes)
+    answer = solve_reference_frames(theatre, scene, loads, fem=fem).at(theatre.anatomy.tumour_nodes)
     return solved[rows], answer.displacement[np.searchsorted(asked, rows)]
 
 
-def validated(
+def validate_files(
     paths: Sequence[Path], workers: int, look: Callable[[Path], Report] = validate_episode
 ) -> Iterator[Report]:
     """A report of each file, as they come; `workers` processes at a time.
@@ -100,7 +100,7 @@ def validated(
 def _looked_at(look: Callable[[Path], Report], path: Path) -> Report:
     find_device("cpu", "float32")  # keeps Warp's notes out of the report
     try:
-        with at_most(MOST_BYTES):
+        with limit_memory(MOST_BYTES):
             return look(path)
     except InputError as error:
         return Report(path, [str(error)])

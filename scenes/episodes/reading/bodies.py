@@ -15,7 +15,7 @@ from ...script.shipped_files import template_path
 from .contents import EpisodeContents
 
 
-def anatomy_of(contents: EpisodeContents) -> Anatomy | None:
+def find_anatomy(contents: EpisodeContents) -> Anatomy | None:
     """Find the anatomy with an episode's digest; None if it is neither the template nor in a nearby folder.
 
     It is searched in `bodies/*/anatomy.vtu` of the episode's folder, and of the folder above.
@@ -29,7 +29,7 @@ def is_template(digest: str) -> bool:
     return template is not None and template.digest == digest
 
 
-def surface_rows(surface: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+def find_surface_rows(surface: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Those triangles (S, 3) of mesh vertices whose corners are all among sorted `nodes` (n,), as numbers of these."""
     places = np.searchsorted(nodes, surface).clip(max=len(nodes) - 1)
     return places[(nodes[places] == surface).all(axis=1)]

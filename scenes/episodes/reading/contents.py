@@ -14,7 +14,7 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.runtime.file_limits import INFLATION, LARGEST_ARRAY
-from sim.runtime.outside_files import path_of, read_as
+from sim.runtime.outside_files import read_as, to_path
 
 from .schema import ARRAYS, FORMATS, FRAMES, NEEDED, PICTURES, SOLVED, Array
 
@@ -22,13 +22,13 @@ HINT = "`sulcus validate` says more; "
 REMEDY = f"{HINT}make it anew, or leave it out."
 
 
-def opened(path: Path) -> h5py.File:
+def open_episode(path: Path) -> h5py.File:
     """An episode's file; InputError where it is not there, or no HDF5."""
     with read_as(path, "an episode", REMEDY):
         return h5py.File(path, "r")
 
 
-def said_by_validate(error: InputError, path: Path) -> str:
+def format_finding(error: InputError, path: Path) -> str:
     """Return the fault of an episode, without its path, and without the hint to the command that reports it."""
     return str(error).removeprefix(f"{path}: ").replace(f"{HINT}make", "Make")
 
@@ -66,7 +66,7 @@ class OpenFiles:
         if path not in self._open:
             while len(self._open) >= self.most:
                 self._open.popitem(last=False)[1].close()
-            self._open[path] = opened(path)
+            self._open[path] = open_episode(path)
         self._open.move_to_end(path)
         return self._open[path]
 
@@ -138,12 +138,12 @@ def read_contents(path: str | Path) -> EpisodeContents:
         No such file, or none of an episode. Links to other files; arrays of other shapes or kinds than ours, or larger
         than the file can hold.
     """
-    path = path_of(path)
+    path = to_path(path)
     with read_as(path, "an episode", REMEDY), h5py.File(path, "r") as file:
-        return contents_of(file, path)
+        return inspect_contents(file, path)
 
 
-def contents_of(file: h5py.File, path: Path) -> EpisodeContents:
+def inspect_contents(file: h5py.File, path: Path) -> EpisodeContents:
     """Read the contents of an open file.
 
     Raises
@@ -151,7 +151,7 @@ def contents_of(file: h5py.File, path: Path) -> EpisodeContents:
     InputError
         As `read_contents`.
     """
-    said = attributes_of(file)
+    said = read_attributes(file)
     if said.get("format") not in FORMATS:
         raise InputError(f"it is no episode, but {said.get('format', 'HDF5')!r}. Give files of `sulcus collect`.")
     arrays = dict(_arrays(file))
@@ -165,7 +165,7 @@ def contents_of(file: h5py.File, path: Path) -> EpisodeContents:
     return EpisodeContents(path, said, shapes, _solved(arrays, shapes))
 
 
-def attributes_of(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
+def read_attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
     """Attributes as Python's own texts, numbers, and lists of them.
 
     Raises
@@ -184,7 +184,7 @@ def attributes_of(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
     return found
 
 
-def array_in(group: h5py.Group, name: str) -> h5py.Dataset:
+def get_array(group: h5py.Group, name: str) -> h5py.Dataset:
     """An array by its name; InputError of what is none."""
     found = group[name]
     if not isinstance(found, h5py.Dataset):

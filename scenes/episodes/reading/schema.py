@@ -51,7 +51,7 @@ PICTURES: Mapping[str, str] = {
 """Images, one per frame in the group `pictures`, and the decoder of each."""
 
 
-def suffix_of(name: str) -> str:
+def get_suffix(name: str) -> str:
     """Return the file ending of an image's bytes: colour is JPEG, all else PNG."""
     return "jpg" if PICTURES[name] == COLOUR else "png"
 

@@ -11,16 +11,16 @@ import numpy as np
 
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.overlay.outlines import silhouette
+from ar.overlay.outlines import compute_silhouette
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
-from ..checksums import SUM, broken
-from .bodies import anatomy_of, surface_rows
-from .contents import REMEDY, EpisodeContents, array_in, attributes_of, contents_of, said_by_validate
+from ..checksums import SUM, find_broken
+from .bodies import find_anatomy, find_surface_rows
+from .contents import REMEDY, EpisodeContents, format_finding, get_array, inspect_contents, read_attributes
 from .schema import ARRAYS, LABELS, PICTURES
-from .windows import numbers_in, picture_of
+from .windows import read_numbers, read_one_image
 
 # Frames that are drawn again, spread evenly.
 LOOKED_AT = 12
@@ -45,20 +45,20 @@ def mask_findings(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy |
         return [], [f"silhouettes: there is no {missing[0]!r}"]
     if anatomy is None:
         return [], ["silhouettes: its anatomy is neither the template nor in `bodies` beside it"]
-    nodes = numbers_in(file, contents, "tumour_nodes")
-    triangles = surface_rows(anatomy.tumour_surface, nodes)
+    nodes = read_numbers(file, contents, "tumour_nodes")
+    triangles = find_surface_rows(anatomy.tumour_surface, nodes)
     if len(triangles) < len(anatomy.tumour_surface):
         return ["'tumour_nodes' are not those of its anatomy."], []
     whole = np.ones(contents.frames, bool)
     if "tumour_left" in shapes:
-        whole = numbers_in(file, contents, "tumour_left").all(axis=1)
+        whole = read_numbers(file, contents, "tumour_left").all(axis=1)
     frames = np.flatnonzero(whole)
     left = [] if whole.all() else [f"silhouettes of {int((~whole).sum())} frames in which tumour is cut out"]
     for frame in frames[np.unique(np.linspace(0, len(frames) - 1, LOOKED_AT).astype(int))] if len(frames) else ():
-        found = picture_of(file, contents, "tumour_mask", int(frame)) > 0
-        at = numbers_in(file, contents, "tumour_predicted", range(frame, frame + 1))[0]
+        found = read_one_image(file, contents, "tumour_mask", int(frame)) > 0
+        at = read_numbers(file, contents, "tumour_predicted", range(frame, frame + 1))[0]
         try:
-            truth = silhouette(camera_of(file, contents, int(frame)), at, triangles)
+            truth = compute_silhouette(read_episode_camera(file, contents, int(frame)), at, triangles)
         except (ValueError, InputError) as error:
             return [f"frame {frame} has no camera that draws: {error}"], left
         off = int(np.count_nonzero(found != truth))
@@ -70,16 +70,16 @@ def mask_findings(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy |
     return [], left
 
 
-def camera_of(file: h5py.File, contents: EpisodeContents, frame: int) -> Camera:
+def read_episode_camera(file: h5py.File, contents: EpisodeContents, frame: int) -> Camera:
     """The camera of a frame; ValueError where its numbers are none of a camera."""
     moves = "K_of_frame" in contents.shapes
     K = (
-        numbers_in(file, contents, "K_of_frame", range(frame, frame + 1))[0]
+        read_numbers(file, contents, "K_of_frame", range(frame, frame + 1))[0]
         if moves
-        else numbers_in(file, contents, "K")
+        else read_numbers(file, contents, "K")
     )
-    pose = numbers_in(file, contents, "T_camera_world", range(frame, frame + 1))[0]
-    lens = Lens(*numbers_in(file, contents, "distortion").tolist()) if "distortion" in contents.shapes else None
+    pose = read_numbers(file, contents, "T_camera_world", range(frame, frame + 1))[0]
+    lens = Lens(*read_numbers(file, contents, "distortion").tolist()) if "distortion" in contents.shapes else None
     return Camera(K, pose, *contents.size, lens)
 
 
@@ -123,40 +123,40 @@ def validate_episode(path: Path) -> Report:
     skipped: list[str] = []
     try:
         with read_as(path, "an episode", REMEDY), h5py.File(path, "r") as file:
-            contents = contents_of(file, path)
-            for check in (unit_findings, number_findings, pose_findings, picture_findings):
+            contents = inspect_contents(file, path)
+            for check in (check_units, check_numbers, check_poses, check_images):
                 problems += check(file, contents)
             if SUM in contents.said:
-                problems += [f"{words}." for words in broken(file)]
+                problems += [f"{words}." for words in find_broken(file)]
             else:
                 skipped.append("checksums: it states none")
             if not problems:
-                anatomy = anatomy_of(contents)
+                anatomy = find_anatomy(contents)
                 wrong, left = mask_findings(file, contents, anatomy)
                 problems += wrong
                 skipped += left
-            solved, unsolved, error = solved_figures(file, contents)
+            solved, unsolved, error = count_solved_frames(file, contents)
             return Report(path, problems, skipped, contents.frames, solved, unsolved, error)
     except InputError as error:
-        return Report(path, [*problems, said_by_validate(error, path)], skipped)
+        return Report(path, [*problems, format_finding(error, path)], skipped)
 
 
-def unit_findings(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
+def check_units(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
     """Yield findings on missing or unexpected units, and on unknown arrays."""
     for name in contents.shapes:
         if name in PICTURES:
             continue
-        unit, said = ARRAYS[name].unit, attributes_of(array_in(file, name)).get("unit")
+        unit, said = ARRAYS[name].unit, read_attributes(get_array(file, name)).get("unit")
         if name not in ("fem_frames",) and unit is not None and said != unit:
             yield f"'{name}' has the unit {said!r} in place of {unit!r}."
 
 
-def number_findings(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
+def check_numbers(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
     """Numbers that are not finite and must be; infinite ones anywhere; times that do not grow."""
     for name in contents.shapes:
         if name in PICTURES or ARRAYS[name].kind != "f":
             continue
-        array = array_in(file, name)
+        array = get_array(file, name)
         for start in range(0, array.shape[0], BLOCK):
             rows = array[start : start + BLOCK]
             wrong = (np.isnan(rows) & ARRAYS[name].known) | (np.isinf(rows) & ARRAYS[name].limited)
@@ -164,18 +164,18 @@ def number_findings(file: h5py.File, contents: EpisodeContents) -> Iterator[str]
                 row = start + int(np.argwhere(wrong)[0][0])
                 yield f"'{name}' has a number in row {row} that is not finite."
                 break
-    times = numbers_in(file, contents, "time")
+    times = read_numbers(file, contents, "time")
     if (np.diff(times) <= 0.0).any():
         row = int(np.argmax(np.diff(times) <= 0.0)) + 1
         yield f"'time' does not grow from row {row - 1} to row {row}."
 
 
-def pose_findings(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
+def check_poses(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
     """Poses that are no rotation and translation; a camera matrix that is none."""
     for name in POSES:
         if name not in contents.shapes:
             continue
-        poses = numbers_in(file, contents, name)
+        poses = read_numbers(file, contents, name)
         known = np.isfinite(poses).all(axis=(1, 2))
         turns = poses[:, :3, :3]
         with np.errstate(all="ignore"):
@@ -185,13 +185,13 @@ def pose_findings(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
             yield f"'{name}' of row {int(np.argmax(known & ~rigid))} is no rotation and translation."
     for name in ("K", "K_of_frame"):
         if name in contents.shapes:
-            found = numbers_in(file, contents, name).reshape(-1, 3, 3)
+            found = read_numbers(file, contents, name).reshape(-1, 3, 3)
             good = (found[:, 0, 0] > 0.0) & (found[:, 1, 1] > 0.0) & (found[:, 2] == [0.0, 0.0, 1.0]).all(axis=1)
             if not good.all():
                 yield f"'{name}' is no matrix of a camera."
 
 
-def picture_findings(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
+def check_images(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
     """Yield findings on images that cannot be decoded, have another size than declared, or have undeclared labels."""
     labels = {int(word.split()[0]) for word in str(contents.said.get("segmentation", "")).split(",") if word.strip()}
     for name, kind in PICTURES.items():
@@ -200,16 +200,16 @@ def picture_findings(file: h5py.File, contents: EpisodeContents) -> Iterator[str
         allowed = {0, 1} if name == "tumour_mask" else labels
         for frame in range(contents.frames):
             try:
-                picture = picture_of(file, contents, name, frame)
+                picture = read_one_image(file, contents, name, frame)
             except InputError as error:
-                yield said_by_validate(error, contents.path).removesuffix(" Make the episode anew.")
+                yield format_finding(error, contents.path).removesuffix(" Make the episode anew.")
                 break
             if kind == LABELS and not (found := set(np.unique(picture).tolist())) <= allowed:
                 yield f"the picture {name!r} of frame {frame} has labels {sorted(found - allowed)} that nothing names."
                 break
 
 
-def solved_figures(file: h5py.File, contents: EpisodeContents) -> tuple[int, int, tuple[float, float] | None]:
+def count_solved_frames(file: h5py.File, contents: EpisodeContents) -> tuple[int, int, tuple[float, float] | None]:
     """Return the numbers of solved and of unconverged frames, and the errors of the prediction [mm].
 
     The errors are None if FEM played the scene.
@@ -217,13 +217,13 @@ def solved_figures(file: h5py.File, contents: EpisodeContents) -> tuple[int, int
     solved = len(contents.fem_frames)
     unsolved = 0
     if "outcome_fem" in contents.shapes:
-        unsolved = sum(not text.startswith(b"CONVERGED") for text in array_in(file, "outcome_fem")[:])
+        unsolved = sum(not text.startswith(b"CONVERGED") for text in get_array(file, "outcome_fem")[:])
     played = contents.said.get("deformer") == "fem"
     if played or not solved or not {"tumour_fem", "tumour_predicted"} <= set(contents.shapes):
         return solved, unsolved, None
-    truth, total, worst = array_in(file, "tumour_fem"), 0.0, 0.0
+    truth, total, worst = get_array(file, "tumour_fem"), 0.0, 0.0
     for start in range(0, solved, BLOCK):
         frames = contents.fem_frames[start : start + BLOCK]
-        away = np.linalg.norm(array_in(file, "tumour_predicted")[frames] - truth[start : start + BLOCK], axis=2)
+        away = np.linalg.norm(get_array(file, "tumour_predicted")[frames] - truth[start : start + BLOCK], axis=2)
         total, worst = total + float(away.mean()) * len(frames), max(worst, float(away.max(initial=0.0)))
     return solved, unsolved, (1e3 * total / solved, 1e3 * worst)

@@ -12,17 +12,17 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ar.screen import decoded_colour, decoded_depth, decoded_labels
+from ar.screen import decode_colour, decode_depth, decode_labels
 from sim.errors import InputError
-from sim.runtime.outside_files import path_of, read_as
+from sim.runtime.outside_files import read_as, to_path
 
-from .contents import REMEDY, EpisodeContents, OpenFiles, array_in, read_contents
+from .contents import REMEDY, EpisodeContents, OpenFiles, get_array, read_contents
 from .schema import ARRAYS, COLOUR, DEPTH, PICTURES, SOLVED
 
 Rows = np.ndarray | list[str]
 
 
-def rows_of(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> Rows:
+def select_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> Rows:
     """Read the rows of some frames, or of all: (frames, ...) numbers or decoded images, or a list of texts.
 
     An array without frames is read whole.
@@ -37,45 +37,45 @@ def rows_of(file: h5py.File, contents: EpisodeContents, name: str, frames: range
     """
     frames = range(contents.frames) if frames is None else frames
     if name in PICTURES:
-        return np.stack([picture_of(file, contents, name, frame) for frame in frames])
+        return np.stack([read_one_image(file, contents, name, frame) for frame in frames])
     with read_as(contents.path, "an episode", REMEDY):
-        array = array_in(file, name)
+        array = get_array(file, name)
         if ARRAYS[name].axes[0] == SOLVED and name != "fem_frames":
             return _solved(array, contents, frames)
         return _read(array, frames) if ARRAYS[name].framed else array[:]
 
 
-def numbers_in(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> np.ndarray:
-    """Read rows as `rows_of`, from an array without texts."""
-    return np.asarray(rows_of(file, contents, name, frames))
+def read_numbers(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> np.ndarray:
+    """Read rows as `select_rows`, from an array without texts."""
+    return np.asarray(select_rows(file, contents, name, frames))
 
 
-def picture_of(file: h5py.File, contents: EpisodeContents, name: str, frame: int) -> np.ndarray:
+def read_one_image(file: h5py.File, contents: EpisodeContents, name: str, frame: int) -> np.ndarray:
     """Read and decode one image.
 
     Raises
     ------
     InputError
-        As `rows_of`.
+        As `select_rows`.
     """
-    code = code_of(file, contents, name, frame)
+    code = read_image_bytes(file, contents, name, frame)
     width, height = contents.size
     try:
         if PICTURES[name] == COLOUR:
-            return decoded_colour(code, width, height)
+            return decode_colour(code, width, height)
         if PICTURES[name] == DEPTH:
-            return decoded_depth(code, width, height, contents.depth_scale)
-        return decoded_labels(code, width, height)
+            return decode_depth(code, width, height, contents.depth_scale)
+        return decode_labels(code, width, height)
     except ValueError as error:
         raise InputError(
             f"{contents.path}: the picture {name!r} of frame {frame} cannot be decoded: {error}. Make the episode anew."
         ) from error
 
 
-def code_of(file: h5py.File, contents: EpisodeContents, name: str, frame: int) -> bytes:
+def read_image_bytes(file: h5py.File, contents: EpisodeContents, name: str, frame: int) -> bytes:
     """Read the stored bytes of one image; InputError if the file is damaged."""
     with read_as(contents.path, "an episode", REMEDY):
-        return np.asarray(array_in(file, f"pictures/{name}")[frame], np.uint8).tobytes()
+        return np.asarray(get_array(file, f"pictures/{name}")[frame], np.uint8).tobytes()
 
 
 def _read(array: h5py.Dataset, frames: range) -> Rows:
@@ -107,7 +107,7 @@ FEM_KNOWN = "fem_known"
 """(T,) bool for arrays of FEM: solved frames."""
 
 
-def episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
+def list_episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
     """Files of episodes, in the order of their names: those given, and those in a folder, or in its `episodes`.
 
     Raises
@@ -117,7 +117,7 @@ def episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
     """
     paths: list[Path] = []
     for one in [given] if isinstance(given, str | Path) else given:
-        place = path_of(one)
+        place = to_path(one)
         if not place.is_dir():
             paths.append(place)
             continue
@@ -215,7 +215,7 @@ class Episodes(Sequence[dict[str, Any]]):
             raise InputError(f"{contents.path}: no {self.span} of its {contents.frames} frames begin at {first}.")
         frames = range(first, first + self.span, self.step)
         file = self.files.file(contents.path)
-        found: dict[str, Any] = {name: rows_of(file, contents, name, frames) for name in self.keys}
+        found: dict[str, Any] = {name: select_rows(file, contents, name, frames) for name in self.keys}
         if any(name in ARRAYS and ARRAYS[name].axes[0] == SOLVED for name in self.keys):
             found[FEM_KNOWN] = np.isin(np.asarray(frames), contents.fem_frames)
         return {**found, "episode": episode, "frame": np.asarray(frames)}
@@ -258,9 +258,9 @@ def read_episodes(
     Raises
     ------
     InputError
-        As `episode_paths`, `read_contents` and `Episodes`.
+        As `list_episode_paths`, `read_contents` and `Episodes`.
     """
-    contents = tuple(read_contents(path) for path in episode_paths(paths))
+    contents = tuple(read_contents(path) for path in list_episode_paths(paths))
     if keys is None:
         common = set.intersection(*(set(one.shapes) for one in contents)) - {"fem_frames"}
         keys = sorted(name for name in common if name in PICTURES or ARRAYS[name].kind != "O")

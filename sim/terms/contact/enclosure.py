@@ -13,7 +13,7 @@ from ...runtime.device import Device, forward_kernel
 
 
 @cache
-def kernel_of(device: Device) -> wp.Kernel:
+def build_kernel(device: Device) -> wp.Kernel:
     """It launches over (triangle, column)."""
     scalar = device.scalar
 
@@ -42,10 +42,12 @@ def kernel_of(device: Device) -> wp.Kernel:
     return add_angle
 
 
-def any_enclosed(device: Device, points: np.ndarray, rest: wp.array, triangles: wp.array, u: wp.array) -> np.ndarray:
+def find_enclosing_columns(
+    device: Device, points: np.ndarray, rest: wp.array, triangles: wp.array, u: wp.array
+) -> np.ndarray:
     """In which columns (b,) any of their points (b, p, 3) [m] lies inside the surface, outwards, moved by u (3N, b)."""
     points = np.ascontiguousarray(points.swapaxes(0, 1))
     angle = wp.zeros(points.shape[:2], dtype=wp.float64, device=device.name)
     inputs = [device.array(points, wp.vec3d), rest, triangles, u]
-    device.launch(kernel_of(device), (len(triangles), points.shape[1]), inputs, [angle])
+    device.launch(build_kernel(device), (len(triangles), points.shape[1]), inputs, [angle])
     return (angle.numpy() > np.pi).any(axis=0)

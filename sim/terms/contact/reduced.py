@@ -11,7 +11,7 @@ import warp as wp
 from ...discretisation.term import BlockFunctions, Term
 from ...runtime.device import Device
 from ...runtime.views import view
-from .tool_blocks import ContactStage, NearPairs, functions_of
+from .tool_blocks import ContactStage, NearPairs, build_functions
 
 
 class DenseTerm(Term, Protocol):
@@ -47,7 +47,7 @@ class Reduced:
     @property
     def functions(self) -> BlockFunctions:
         """As `Reduction.functions`."""
-        return functions_of(self._device, self._nodes)
+        return build_functions(self._device, self._nodes)
 
     def stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
         """As `Reduction.stage`."""

@@ -20,7 +20,7 @@ from ...discretisation.term import Cases
 from ...effects import SkullContact
 from ...runtime.device import Device, forward_kernel
 from .barrier import RELAXED, barrier, barrier_curvature, barrier_slope
-from .skull_surface import BONE, Bone, BoneSettings, bone_of
+from .skull_surface import BONE, Bone, BoneSettings, build_bone
 
 # A step takes no node farther than this share of its distance to the bone.
 ROOM_KEPT = wp.constant(0.9)
@@ -144,7 +144,7 @@ def fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.f
 
 
 @cache
-def kernels_of(device: Device) -> SkullKernels:
+def build_kernels(device: Device) -> SkullKernels:
     """Kernels of a device's scalar type; distances are in double precision."""
     scalar, mat = device.scalar, device.matrix
 
@@ -255,7 +255,7 @@ class Skull:
     constant, passive, steep = False, False, True
 
     def __init__(self, bone: Bone, count: int, shear: float, device: Device, settings: SkullBarrier = SkullBarrier()):
-        self._device, self._kernels, self._bone, self._settings = device, kernels_of(device), bone, settings
+        self._device, self._kernels, self._bone, self._settings = device, build_kernels(device), bone, settings
         self._wall = Wall()
         self._wall.nodes = device.array(bone.nodes, wp.int32)
         self._wall.bend = device.array(bone.bend, wp.mat33d)
@@ -343,7 +343,7 @@ class Skull:
         self._device.launch(kernel, (len(self._bone.nodes), out.shape[-1]), [*inputs, self._wall], [out])
 
 
-def skull_of(
+def build_skull(
     effect: SkullContact,
     anatomy: Anatomy,
     space: Discretisation,
@@ -353,4 +353,4 @@ def skull_of(
     settings: SkullBarrier = SkullBarrier(),
 ) -> Skull:
     """The term of `SkullContact` on tissue with a shear modulus [Pa]."""
-    return Skull(bone_of(anatomy, space, effect.gap, bone), space.count, shear, device, settings)
+    return Skull(build_bone(anatomy, space, effect.gap, bone), space.count, shear, device, settings)

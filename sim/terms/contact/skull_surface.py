@@ -11,7 +11,13 @@ from scipy.special import ndtri
 from ...anatomy import Anatomy
 from ...discretisation.space import Discretisation
 from ...errors import InputError
-from ...geometry.surface import BlurRange, areas, blurred_normals, edge_lengths, unit
+from ...geometry.surface import (
+    BlurRange,
+    compute_areas,
+    compute_blurred_normals,
+    compute_edge_lengths,
+    normalise_vectors,
+)
 
 # What was under bone stays so far [m] from where it ends, and is barred wherever it goes.
 UNDER_BONE = -1.0
@@ -83,7 +89,7 @@ class Bone:
     edge: float
 
 
-def bone_of(anatomy: Anatomy, space: Discretisation, gap: float, settings: BoneSettings = BONE) -> Bone:
+def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: BoneSettings = BONE) -> Bone:
     """Over what a skull covers, and over the craniotomy near its edge; `gap` [m] at rest. Held nodes stay.
 
     Raises
@@ -100,15 +106,17 @@ def bone_of(anatomy: Anatomy, space: Discretisation, gap: float, settings: BoneS
         )
     inside, way = np.full(space.count, UNDER_BONE), np.zeros_like(normal)
     felt = np.full(space.count, min(settings.felt, gap))
-    edge, rim = 0.0, rim_of(anatomy)
+    edge, rim = 0.0, find_opening_edge(anatomy)
     if len(rim):
         opened = np.zeros(space.count, bool)
-        opened[space.surface[about_opening(anatomy) & anatomy.craniotomy[space.mesh.surface].any(axis=1)]] = True
+        opened[
+            space.surface[find_triangles_about_opening(anatomy) & anatomy.craniotomy[space.mesh.surface].any(axis=1)]
+        ] = True
         opened &= ~slides & ~held
-        edge = edge_of(space.nodes, rim)
+        edge = compute_edge_radius(space.nodes, rim)
         blur, points = settings.blur * edge, space.nodes[opened]
-        normal[opened] = blurred_normals(space.nodes, space.surface[:, :3], points, blur)
-        r, way[opened] = inside_opening(anatomy, points, normal[opened], edge, settings.far)
+        normal[opened] = compute_blurred_normals(space.nodes, space.surface[:, :3], points, blur)
+        r, way[opened] = measure_inside_opening(anatomy, points, normal[opened], edge, settings.far)
         inside[opened], felt[opened] = r.clip(0.0), settings.edge_felt * edge
     nodes = np.flatnonzero(slides | (way != 0.0).any(axis=1))
     return Bone(
@@ -126,7 +134,7 @@ def bone_of(anatomy: Anatomy, space: Discretisation, gap: float, settings: BoneS
 
 def _areas(space: Discretisation) -> np.ndarray:
     """Of the surface, what each node (N,) [m^2] stands for."""
-    area = areas(space.nodes[space.surface[:, :3]])
+    area = compute_areas(space.nodes[space.surface[:, :3]])
     shares = np.full(3, 1.0 / 3.0) if space.surface.shape[1] == 3 else np.repeat([CORNER, MIDDLE], 3)
     return np.bincount(space.surface.ravel(), (area[:, None] * shares).ravel(), space.count)
 
@@ -156,19 +164,19 @@ def bend_of(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BON
     return np.einsum("kam,km,kbm->kab", along, values.clip(0.0), along)
 
 
-def rim_of(anatomy: Anatomy) -> np.ndarray:
+def find_opening_edge(anatomy: Anatomy) -> np.ndarray:
     """Surface triangles (R, 3) that the edge of the craniotomy crosses: part open, part under bone."""
-    around = anatomy.mesh.surface[about_opening(anatomy)]
+    around = anatomy.mesh.surface[find_triangles_about_opening(anatomy)]
     opened = anatomy.craniotomy[around]
     return around[opened.any(axis=1) & ~opened.all(axis=1)]
 
 
-def edge_of(nodes: np.ndarray, rim: np.ndarray) -> float:
+def compute_edge_radius(nodes: np.ndarray, rim: np.ndarray) -> float:
     """How round [m] an edge looks across triangles (R, 3) of nodes (V, 3) [m]: as theirs are long, on average."""
-    return float(edge_lengths(nodes[rim]).mean())
+    return float(compute_edge_lengths(nodes[rim]).mean())
 
 
-def inside_opening(
+def measure_inside_opening(
     anatomy: Anatomy, points: np.ndarray, normal: np.ndarray, blur: float, far: float = BONE.far
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far (n,) [m] points (n, 3) [m] of the surface are inside the craniotomy, and which way its middle is (n, 3).
@@ -180,7 +188,7 @@ def inside_opening(
     point that is r inside. That is inverted.
     """
     mesh, opened = anatomy.mesh, anatomy.craniotomy
-    triangles = mesh.surface[about_opening(anatomy)]
+    triangles = mesh.surface[find_triangles_about_opening(anatomy)]
     a, b, c = np.moveaxis(mesh.nodes[triangles], 1, 0)
     twice, middle, bare = np.cross(b - a, c - a), (a + b + c) / 3.0, opened[triangles].mean(axis=1)
     seen = KDTree(points).sparse_distance_matrix(KDTree(middle), BlurRange.reach * blur, output_type="coo_matrix")
@@ -192,12 +200,12 @@ def inside_opening(
     share = np.divide(part, whole, out=np.zeros_like(part), where=whole > 0.0)
     # The share's gradient, but for a positive factor.
     uphill = seen @ (middle * bare[:, None]) - share[:, None] * (seen @ middle)
-    across = unit(uphill - (uphill * normal).sum(axis=1, keepdims=True) * normal)
+    across = normalise_vectors(uphill - (uphill * normal).sum(axis=1, keepdims=True) * normal)
     inside = ndtri(share).clip(-far, far)
     return blur * inside, np.where(np.abs(inside[:, None]) < far, across, 0.0)
 
 
-def about_opening(anatomy: Anatomy) -> np.ndarray:
+def find_triangles_about_opening(anatomy: Anatomy) -> np.ndarray:
     """(S,) bool: surface triangles whose corners all lie in the craniotomy or under bone."""
     covered = np.logical_or(anatomy.slide_normal.any(axis=1), anatomy.held.all(axis=1))
     return np.all(np.logical_or(anatomy.craniotomy, covered)[anatomy.mesh.surface], axis=1)

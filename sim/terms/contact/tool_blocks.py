@@ -5,10 +5,10 @@ from functools import cache
 import warp as wp
 
 from ...discretisation.term import BlockFunctions
-from ...runtime.blocks import largest, threads_of, wait
+from ...runtime.blocks import get_block_shape, largest, wait
 from ...runtime.device import Device
 from .tool_functions import BULGE, ROOM_KEPT, Scale, Surface, Tools
-from .tool_functions import functions_of as at_triangles
+from .tool_functions import build_functions as at_triangles
 
 
 @wp.struct
@@ -31,9 +31,9 @@ class NearPairs:
 
 
 @cache
-def functions_of(device: Device, size: int) -> BlockFunctions:
+def build_functions(device: Device, size: int) -> BlockFunctions:
     """Functions for surface triangles of `size` nodes, 3 or 6."""
-    down, across = threads_of(device)
+    down, across = get_block_shape(device)
     threads, one = down * across, at_triangles(device, size)
 
     bulge, kept = wp.constant(wp.float64(BULGE)), wp.constant(wp.float64(ROOM_KEPT))

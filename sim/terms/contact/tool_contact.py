@@ -13,15 +13,15 @@ from ...discretisation.space import Discretisation
 from ...discretisation.term import Cases
 from ...effects import Retraction, ToolContact
 from ...errors import InputError
-from ...geometry.surface import areas, edge_lengths, vertex_normals
+from ...geometry.surface import compute_areas, compute_edge_lengths, compute_vertex_normals
 from ...loads import Retracted, Touching
 from ...runtime.device import Device
-from ...tools import Tool, cores_of
-from .enclosure import any_enclosed
+from ...tools import Tool, list_cores
+from .enclosure import find_enclosing_columns
 from .reduced import Reduced
 from .tool_blocks import ContactStage, NearPairs
 from .tool_functions import Scale, Surface, Tools
-from .tool_kernels import kernels_of
+from .tool_kernels import build_kernels
 from .tool_path import TOUCH, ContactSampling, ToolPath, approach
 
 # Of a triangle cut into smaller ones, the farthest point is so many of their edges from the nearest centre.
@@ -72,13 +72,13 @@ class ToolContactTerm:
         touch: ContactSampling = TOUCH,
     ):
         self.name = name
-        cores = [core for tool in tools for core in cores_of(tool)]
-        self._owner = np.repeat(np.arange(len(tools)), [len(cores_of(tool)) for tool in tools])
+        cores = [core for tool in tools for core in list_cores(tool)]
+        self._owner = np.repeat(np.arange(len(tools)), [len(list_cores(tool)) for tool in tools])
         self._first, self._sag = np.unique(self._owner, return_index=True)[1], touch.sag * gap
         self._nodes, self._corners = nodes, [core.corners for core in cores]
         self._triangles, self._closed = triangles, device.array(whole, wp.int32)
         self._shapes, self._way, self._device, self._touch = tools, way, device, touch
-        self._kernels = kernels_of(device, triangles.shape[1])
+        self._kernels = build_kernels(device, triangles.shape[1])
         fine = np.sqrt(2.0 * min(core.radius for core in cores) * touch.sag * gap) / FARTHEST
         self._surface, self._rows = _sampled(nodes, triangles, fine / touch.stretch, device)
         self._bone, _ = _sampled(nodes, bone, fine, device)
@@ -118,7 +118,7 @@ class ToolContactTerm:
             corners @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
             for corners, pose in zip(self._corners, self._pose[:, self._owner].swapaxes(0, 1), strict=True)
         ]
-        return any_enclosed(self._device, np.concatenate(points, axis=1), self._surface.rest, self._closed, u)
+        return find_enclosing_columns(self._device, np.concatenate(points, axis=1), self._surface.rest, self._closed, u)
 
     def overlaps(self, u: wp.array) -> np.ndarray:
         """As `Barrier.overlaps`: deeper than the gap."""
@@ -278,7 +278,7 @@ class ToolContactTerm:
             self._device.launch(kernel, dim, [*inputs, self._surface, self._tools, self._scale], [out])
 
 
-def contact_of(
+def build_tool_contact(
     effect: ToolContact | Retraction,
     anatomy: Anatomy,
     space: Discretisation,
@@ -293,7 +293,7 @@ def contact_of(
     if not len(triangles):
         raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is held or slides.")
     touchable, reach = np.unique(triangles), _reach(space.nodes, triangles)
-    points, normals = space.nodes[touchable], vertex_normals(space.nodes, triangles[:, :3])[touchable]
+    points, normals = space.nodes[touchable], compute_vertex_normals(space.nodes, triangles[:, :3])[touchable]
 
     @lru_cache(touch.kept)
     def came_from(number: int, pose: bytes) -> np.ndarray:
@@ -335,12 +335,12 @@ def contact_of(
 def _sampled(nodes: np.ndarray, triangles: np.ndarray, fine: float, device: Device) -> tuple[Surface, int]:
     """Surface triangles with sample points at most `fine` [m] apart, and the most rows of points in a triangle."""
     corners = nodes[triangles[:, :3]]
-    pieces = np.ceil(edge_lengths(corners).max(axis=1) / fine).astype(np.int32)
+    pieces = np.ceil(compute_edge_lengths(corners).max(axis=1) / fine).astype(np.int32)
     out = Surface()
     out.rest = device.array(nodes, wp.vec3d)
     out.table = device.array(triangles, wp.int32)
     out.pieces = device.array(pieces, wp.int32)
-    out.area = device.array(areas(corners), wp.float64)
+    out.area = device.array(compute_areas(corners), wp.float64)
     return out, int(pieces.max(initial=0))
 
 
@@ -358,5 +358,7 @@ def _reach(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """How far (n,) [m] each of a surface's own nodes, ascending, is at most from the points that are nearest to it."""
     numbers, table = np.unique(triangles, return_inverse=True)
     out = np.zeros(len(numbers))
-    np.maximum.at(out, table.reshape(triangles.shape), edge_lengths(nodes[triangles[:, :3]]).max(axis=1)[:, None])
+    np.maximum.at(
+        out, table.reshape(triangles.shape), compute_edge_lengths(nodes[triangles[:, :3]]).max(axis=1)[:, None]
+    )
     return out / np.sqrt(3.0)

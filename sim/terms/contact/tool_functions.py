@@ -122,7 +122,7 @@ class ToolFunctions:
 
 
 @cache
-def functions_of(device: Device, size: int) -> ToolFunctions:
+def build_functions(device: Device, size: int) -> ToolFunctions:
     """Functions for surface triangles of `size` nodes, 3 or 6.
 
     Positions and distances are in double precision whatever the device's scalar: gaps are small beside bodies.

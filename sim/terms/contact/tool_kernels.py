@@ -7,7 +7,7 @@ import warp as wp
 
 from ...runtime.device import Device, forward_kernel
 from .barrier import barrier_slope
-from .tool_functions import BULGE, ROOM_KEPT, Scale, Surface, Tools, clear, curvature_at, functions_of, touch_of
+from .tool_functions import BULGE, ROOM_KEPT, Scale, Surface, Tools, build_functions, clear, curvature_at, touch_of
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class ToolKernels:
 
 
 @cache
-def kernels_of(device: Device, size: int) -> ToolKernels:
+def build_kernels(device: Device, size: int) -> ToolKernels:
     """Kernels for surface triangles of `size` nodes, 3 or 6. Each launches over (triangle, column)."""
     scalar, mat = device.scalar, device.matrix
-    here, kept = functions_of(device, size), wp.constant(wp.float64(ROOM_KEPT))
+    here, kept = build_functions(device, size), wp.constant(wp.float64(ROOM_KEPT))
     stretch = wp.constant(wp.float64(1.0 if size == 6 else BULGE))
     forces, nodes_of, motion_of, seen, spread = here.forces, here.nodes_of, here.motion_of, here.seen, here.spread
     weight_of, is_near, least_distance, reach_of, pace_of, shape_of = (

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...tools import Core, Tool, cores_of, distances_to, extent_of
+from ...tools import Core, Tool, compute_distances, compute_extent, list_cores
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ class ToolPath:
         before, after = self.begin[:, :, :3], self.end[:, :, :3]
         turn = (before[..., :3].swapaxes(2, 3) @ after[..., :3]).reshape(-1, 3, 3)
         angle = Rotation.from_matrix(turn).magnitude().reshape(self.end.shape[:2])
-        extent = np.array([extent_of(tool) for tool in tools])
+        extent = np.array([compute_extent(tool) for tool in tools])
         return np.linalg.norm(after[..., 3] - before[..., 3], axis=2) + angle * extent
 
     def stride(self, tools: tuple[Tool, ...], clear: np.ndarray, touch: ContactSampling = TOUCH) -> np.ndarray:
         """The longest shares (B,), at most 1, of the way that tools may go at once that are `clear` (B, tools) [m]."""
-        most = clear + touch.stride * np.array([min(core.radius for core in cores_of(tool)) for tool in tools])
+        most = clear + touch.stride * np.array([min(core.radius for core in list_cores(tool)) for tool in tools])
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
 
 
@@ -92,9 +92,9 @@ def approach(
     there. The surface has vertices `points` (n, 3) [m] with unit `normals` (n, 3) and extends `reach` (n,) [m] round
     each vertex. The tool is followed through the air in `march` steps at most.
     """
-    cores, R = cores_of(tool), pose[:3, :3]
+    cores, R = list_cores(tool), pose[:3, :3]
     along_shaft = _cleared(tool, pose, R, cores, points, reach, march)
-    touched = distances_to(tool, pose, points) < reach
+    touched = compute_distances(tool, pose, points) < reach
     outward = normals[touched].sum(axis=0)
     if not outward.any():
         return along_shaft
@@ -120,7 +120,7 @@ def _cleared(
     for _ in range(march):
         back = max(0.0, back - room)
         out[:3, 3] = pose[:3, 3] + back * R[:, 2]
-        room = max(0.0, float((distances_to(tool, out, points) - reach).min()))
+        room = max(0.0, float((compute_distances(tool, out, points) - reach).min()))
     return out
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ...errors import InputError
-from ...material import Tissue, portion
+from ...material import Tissue, get_portion
 from ...runtime.device import Device, Precision, find_device, forward_kernel
 
 
@@ -67,7 +67,7 @@ class Evaluator:
 
 
 @cache
-def evaluator(of: Tissue, precision: Precision) -> Evaluator:
+def build_evaluator(of: Tissue, precision: Precision) -> Evaluator:
     """The functions of a tissue's law on the CPU."""
     device = find_device("cpu", precision)
     scalar, mat = device.scalar, device.matrix
@@ -142,7 +142,7 @@ def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Itera
             "give as many."
         )
     yield Finding("coefficients_at its own Lamé constants are its coefficients", _off(again, given), 1e-12)
-    double, random = evaluator(tissue, "float64"), np.random.default_rng(3)
+    double, random = build_evaluator(tissue, "float64"), np.random.default_rng(3)
     H = random.normal(0.0, strains.large, (3 * count, 3, 3))
     J = np.linalg.det(np.eye(3) + H)
     positive = tissue.functions.needs_positive_volume
@@ -154,11 +154,11 @@ def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Itera
     yield Finding("no energy and no stress at rest", max(_largest(still.stress), abs(still.energy[0])) / mu, 1e-9)
     small = random.normal(0.0, strains.small, (count, 3, 3))
     for carries in ("whole", "shape", "volume"):
-        share = portion(tissue, carries)
+        share = get_portion(tissue, carries)
         stress = double.at(small, None, tissue.coefficients_at(*share)).stress
         name = "" if carries == "whole" else f" where elements carry {carries} alone"
-        yield Finding(f"Hooke's law at small strain{name}", _off(stress, hooke(small, *share)), 1e-4)
-    parts = [double.at(H, D, tissue.coefficients_at(*portion(tissue, carries))) for carries in ("shape", "volume")]
+        yield Finding(f"Hooke's law at small strain{name}", _off(stress, compute_hooke_stress(small, *share)), 1e-4)
+    parts = [double.at(H, D, tissue.coefficients_at(*get_portion(tissue, carries))) for carries in ("shape", "volume")]
     for name in ("energy", "stress", "change"):
         shape, volume = (getattr(part, name) for part in parts)
         yield Finding(f"shape and volume make the whole {name}", _off(shape + volume, getattr(here, name)), 1e-8)
@@ -186,12 +186,12 @@ def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Itera
         yield Finding(
             "infinite energy where J < 0, which needs_positive_volume promises", float(inverted < np.inf), 0.0
         )
-    single = evaluator(tissue, "float32")
+    single = build_evaluator(tissue, "float32")
     strained = random.normal(0.0, strains.single, (count, 3, 3)).astype(np.float32).astype(np.float64)
     yield Finding("stress in single precision", _off(single(strained).stress, double(strained).stress), 1e-3)
 
 
-def hooke(H: np.ndarray, mu: float, lam: float) -> np.ndarray:
+def compute_hooke_stress(H: np.ndarray, mu: float, lam: float) -> np.ndarray:
     """Hooke's stress (n, 3, 3) [Pa] at displacement gradients (n, 3, 3), of Lamé's constants [Pa]."""
     trace = np.trace(H, axis1=1, axis2=2)[:, None, None]
     return mu * (H + H.transpose(0, 2, 1)) + lam * trace * np.eye(3)

@@ -49,11 +49,11 @@ class LawSplit:
 
 def split_of(law: Law, device: Device) -> LawSplit:
     """As the law itself has it, or by the isochoric part of F."""
-    return isochoric_split(law, device) if law.of_shape is None else own_split(law, law.of_shape, device)
+    return build_isochoric_split(law, device) if law.of_shape is None else build_own_split(law, law.of_shape, device)
 
 
 @cache
-def isochoric_split(law: Law, device: Device) -> LawSplit:
+def build_isochoric_split(law: Law, device: Device) -> LawSplit:
     """Shape is psi(F) - psi(J^(1/3) I), and E = (Fb^T Fb - I) / 2 with Fb = J^(-1/3) F."""
     scalar, mat = device.scalar, device.matrix
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
@@ -106,7 +106,7 @@ def isochoric_split(law: Law, device: Device) -> LawSplit:
 
 
 @cache
-def own_split(law: Law, of_shape: wp.Function, device: Device) -> LawSplit:
+def build_own_split(law: Law, of_shape: wp.Function, device: Device) -> LawSplit:
     """Shape is the law itself with its coefficients `of_shape`, and E = (F^T F - I) / 2.
 
     The potential is infinite nowhere that the law is not; the overstress is where J is exactly 0. Tissue that has
