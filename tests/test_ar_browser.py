@@ -227,7 +227,7 @@ def test_a_recording_is_one_whole_film_as_long_as_it_took(page, monkeypatch):
     assert wait_for(lambda: page.recorder.recording is None and button.label == RECORDS) and len(sent) == 1
 
 
-def test_slices_and_the_last_seconds_arrive_together_and_not_too_often(page):
+def test_slices_and_history_arrive_together_at_limited_rate(page):
     drawn: list[int] = []
 
     def draw(number: int) -> tuple[np.ndarray, str]:
@@ -248,7 +248,7 @@ def test_slices_and_the_last_seconds_arrive_together_and_not_too_often(page):
     visitor.wire.close()
 
 
-def test_what_a_visitor_sets_is_heard_while_the_page_sets_the_same(heard):
+def test_user_input_wins_over_concurrent_page_update(heard):
     page = open_page(heard, free_port(), limits=ConnectionLimits(sendings=2000.0))
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
@@ -320,12 +320,12 @@ def test_a_visitor_saves_the_picture_as_it_is_shown(page, monkeypatch):
     visitor.wire.close()
 
 
-def test_saving_comes_before_the_controls_which_a_low_window_cuts_off(page):
+def test_low_window_keeps_save_button_before_controls(page):
     after = [handle.order for handle in page.inputs.values()]
     assert page.frame.order < page.saver.order < min(after)
 
 
-def test_on_a_phone_distance_and_playback_come_before_what_explains_the_picture(page):
+def test_phone_layout_puts_distance_and_playback_first(page):
     """There all stands in one column: the report, which scrolls by itself on a low one, then controls, then words."""
     assert page.folder is not None
     assert page.text.order < page.folder.order < page.words.order
@@ -360,7 +360,7 @@ def test_the_line_over_the_picture_comes_and_goes(page):
     assert wait_for(lambda: page.line.content == "")
 
 
-def test_the_line_over_the_picture_leaves_the_words_at_its_head_in_sight():
+def test_status_line_leaves_header_visible():
     """They stand at the left."""
     (rule,) = re.findall(rf"#{STATUS} {{ position: fixed; (.*?) }}", build_style(4 / 3))
     assert "right: calc(100vw - var(--w)" in rule and "left:" not in rule
@@ -393,7 +393,7 @@ def test_a_body_changes_its_colour(page):
     assert wait_for(lambda: tuple(page.meshes["tumour"].color) == (128, 0, 255))
 
 
-def test_the_rules_know_the_picture_s_shape_and_the_page_s_elements(page):
+def test_style_rules_use_image_shape_and_page_elements(page):
     sheet = build_style(4 / 3)
     assert "--aspect: 1.3333" in sheet and sheet.startswith("<style>") and sheet.count("{") == sheet.count("}")
     assert f".{NOTE}" in sheet

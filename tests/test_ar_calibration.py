@@ -86,7 +86,7 @@ def test_any_yaml_reader_reads_what_we_write_for_ros(calibration):
     assert np.array_equal(np.reshape(found["rectification_matrix"]["data"], (3, 3)), np.eye(3))
 
 
-def test_pictures_of_another_size_are_scaled_only_if_asked_and_of_the_same_shape():
+def test_image_scaling_requires_request_and_same_shape():
     with pytest.raises(ValueError, match=r"640 x 480, not 320 x 240: calibrate with that size, or ask"):
         SOME.resize_calibration(320, 240)
     with pytest.raises(ValueError, match=r"not 640 x 360, which have another shape"):

@@ -191,7 +191,7 @@ def test_converging_eyes_meet_at_the_working_distance():
     )
 
 
-def test_points_are_found_again_from_both_pictures_of_eyes_with_a_lens():
+def test_points_are_refound_in_both_distorted_images():
     """By OpenCV: undistorted and triangulated."""
     for pair in (stereo_pair(seen_by(SOME)), stereo_pair(seen_by(SOME), working_distance=0.14)):
         seen = []
@@ -261,7 +261,7 @@ def test_each_row_is_drawn_where_the_camera_is_when_it_is_taken():
     assert max(moved) > 1.0  # the test would see a shutter that does not roll
 
 
-def test_a_camera_that_stays_has_one_band_and_rows_beyond_the_picture_are_its_borders():
+def test_fixed_camera_has_one_row_band():
     ((rows, camera),) = split_row_bands(lambda after: CAMERA, READOUT, GRID)
     assert rows == slice(0, 300) and (camera.width, camera.height) == (400, 300)
     np.testing.assert_allclose(compute_row_time(np.array([-5, 0, 299, 400]), 300, 0.03), [-0.015, -0.015, 0.015, 0.015])
@@ -287,7 +287,7 @@ def player():
     return Player(theatre.stage(replace(find_scene("palpate"), viewpoint=view, duration=0.1)), Still(theatre.anatomy))
 
 
-def test_a_film_rolls_and_what_is_drawn_into_it_says_how_far_off_that_makes_it(player):
+def test_rolling_shutter_error_is_drawn_on_video(player):
     mounts = mount_targets(player)
     shots = list(render_shots(player, mounts, Taking(noise=0.0)))
     calibration = player.scene.viewpoint.calibration

@@ -4,7 +4,7 @@ from ar.page.control_lock import IDLE, ControlLock
 
 
 class TestLead:
-    def test_the_lead_passes_to_who_asked_first_and_else_to_who_is_here_longest(self):
+    def test_control_passes_to_first_request_then_oldest(self):
         lead = ControlLock()
         lead.see({2, 3, 4}, 0.0)
         assert lead.leader == 2 and lead.act(2, 1.0) and not lead.act(3, 1.0)

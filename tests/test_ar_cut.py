@@ -23,7 +23,7 @@ def test_a_cut_holds_camera_tip_and_middle():
     np.testing.assert_allclose(plane.coordinates(plane.points(places)), places, atol=1e-15)
 
 
-def test_a_cut_shows_the_surface_the_section_and_nothing_in_the_air():
+def test_cut_shows_surface_section_and_no_air():
     picture, at = seen(0.0), tumour()
     plane: CutPlane = build_plane(CAMERA, at.vertices.mean(axis=0), None)
     roles = Roles((), (CORTEX,)).of(picture.segmentation)

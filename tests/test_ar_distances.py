@@ -35,7 +35,7 @@ def written(sheet, number):
     return int((cv2.matchTemplate(sheet[..., :3].copy(), stamp, cv2.TM_CCOEFF_NORMED) > 0.9).sum())
 
 
-def test_each_long_piece_of_a_ring_has_its_number_and_each_ring_one_at_least():
+def test_long_ring_pieces_are_labelled():
     rows, columns = np.mgrid[:480, :640]
     far = (0.1e-3 * np.hypot(rows - 240.0, columns - 320.0)).astype(np.float32)
     far[:, 300:340] = np.nan  # halves of rings of 50, 100 and 150 pixels

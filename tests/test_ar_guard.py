@@ -228,7 +228,7 @@ class TestToken:
         assert ask(far, Cookie=f"page-{far.port}=wrong")[0] == 403
         assert ask(far, f"/?token={token}", Host="evil.example")[0] == 403
 
-    def test_the_page_is_loaded_with_the_token_and_its_socket_opened_with_the_cookie(self, far):
+    def test_page_needs_token_and_socket_needs_cookie(self, far):
         status, headers = ask(far, urlsplit(far.address).path + "?" + urlsplit(far.address).query)
         assert status == 200 and "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
         cookie = headers["Set-Cookie"].split(";")[0]

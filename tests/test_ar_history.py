@@ -9,7 +9,7 @@ from ar.page.history import SPAN, History, Line, Sample, round_up_scale
 
 
 class TestHistory:
-    def test_the_chart_is_of_the_last_seconds_with_the_error_as_a_band(self):
+    def test_chart_shows_last_seconds_with_error_band(self):
         history = History((Line("distance", "mm", "#fff"), Line("force", "N", "#f00")))
         for time in np.arange(0.0, 60.0, 0.1):
             history.add(Sample(float(time), (10.0, None), (2.0 if time < 50.0 else None, None)))
@@ -26,7 +26,7 @@ class TestHistory:
         chart = History((Line("a<b", "mm", "#fff"),)).chart()
         assert "<polyline" not in chart and "nothing yet" in chart
 
-    def test_a_moment_alone_is_a_dot_and_nothing_is_drawn_across_what_is_not_known(self):
+    def test_single_sample_is_a_dot_and_gaps_stay_empty(self):
         history = History((Line("distance", "mm", "#fff"),))
         for time, value in ((0.0, 3.0), (5.0, 4.0), (6.0, 4.0), (7.0, None), (8.0, 5.0)):
             history.add(Sample(time, (value,), (None,)))

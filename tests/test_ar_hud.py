@@ -61,7 +61,7 @@ def test_letters_stand_at_the_edges():
     assert not changed[40:200, 40:280].any() and (plain == 90).all()
 
 
-def test_a_panel_leaves_out_lines_that_the_picture_is_too_low_for():
+def test_panel_drops_lines_that_do_not_fit():
     plain = np.full((100, 320, 3), 90, np.uint8)
     lines = ["first", "second", "third", "fourth", "fifth"]
     few = draw_text_panel(plain, lines, below=30)
@@ -80,7 +80,7 @@ def test_a_panel_leaves_out_lines_that_the_picture_is_too_low_for():
         (0.0, 1e-6, "0.0 +- 0.1 mm"),  # nothing is known to be without error
     ],
 )
-def test_a_length_is_read_in_millimetres_with_what_it_may_be_off_by(length, error, text):
+def test_length_is_printed_in_millimetres_with_error(length, error, text):
     assert format_millimetres(length, error) == text
 
 
@@ -100,7 +100,7 @@ def test_letters_at_an_edge_give_way_along_it():
     assert np.array_equal(letters[:40], plain[:40]) and np.array_equal(letters[60:], free[60:])
 
 
-def test_words_take_their_place_and_without_room_only_the_needed_are_written():
+def test_labels_take_place_and_optional_ones_drop():
     colour, taken = np.zeros((100, 200, 3), np.uint8), np.zeros((100, 200), np.uint8)
     lay(colour, taken, ["first"], (0, 100))
     (low,) = np.nonzero(taken.any(axis=1))[0][[-1]]
@@ -150,7 +150,7 @@ def test_a_number_stays_beside_its_name_and_its_unit(text, held):
         assert " ".join(lines) == text and all(any(each in line for line in lines) for each in held)
 
 
-def test_a_panel_leaves_out_its_last_lines_rather_than_hide_what_must_be_seen():
+def test_panel_drops_last_lines_before_required_marks():
     colour, hidden = np.full((300, 400, 3), 90, np.uint8), np.ones((300, 400), np.uint8)
     hidden[40:120, 200:] = 0
     lines = ["the first line", "the second", "the third", "the fourth", "the fifth", "the sixth"]
@@ -160,7 +160,7 @@ def test_a_panel_leaves_out_its_last_lines_rather_than_hide_what_must_be_seen():
     assert (draw_text_panel(colour, lines[:2], sights=[hidden]) != colour).any(axis=2).sum() < changed.sum()
 
 
-def test_words_cover_thin_lines_rather_than_stand_far_from_their_wish():
+def test_labels_may_cover_thin_lines():
     """As a number does rings: without that it went far below the line that it belongs to."""
     rows = {}
     for name, thin in (("far", None), ("near", True)):

@@ -132,7 +132,7 @@ def test_small_balls_are_drawn_where_opencv_has_them():
                 assert np.abs(found - at).max() < 0.05, (x, y)
 
 
-def test_colours_depth_and_segmentation_are_those_of_a_large_straight_picture():
+def test_image_layers_match_a_large_undistorted_image():
     camera, layers = seen_by(), scene()
     picture = render(camera, layers, LAMP)
     wide = replace(camera, lens=None, K=camera.K + [[0, 0, 200.0], [0, 0, 200.0], [0, 0, 0]], width=720, height=640)
@@ -148,7 +148,7 @@ def test_colours_depth_and_segmentation_are_those_of_a_large_straight_picture():
     assert np.percentile(np.abs(depth - picture.depth)[on], 99) < 2e-4
 
 
-def test_what_stands_still_and_pictures_together_look_the_same_through_a_lens():
+def test_static_and_batched_images_agree_through_lens():
     renderer, still = Renderer(scene(still=True), LAMP), scene()
     cameras = [seen_by(), seen_by(None), seen_by(LENSES["folding"])]
     together = renderer.pictures(np.stack([ball().vertices] * 3), cameras)
@@ -159,7 +159,7 @@ def test_what_stands_still_and_pictures_together_look_the_same_through_a_lens():
             assert np.array_equal(getattr(together, name).numpy()[row], getattr(other, name))
 
 
-def test_a_lens_that_does_nothing_is_none_and_its_kernel_draws_the_same():
+def test_identity_lens_is_none_and_draws_the_same():
     assert seen_by(Lens()).lens is None
     one, other = (render(seen_by(lens), scene(), LAMP) for lens in (None, Lens(k3=1e-15)))
     assert (one.segmentation == other.segmentation).mean() > 0.9999

@@ -74,7 +74,7 @@ def test_the_nearer_layer_is_seen_in_any_order():
     assert np.array_equal(one.colour, other.colour)
 
 
-def test_normals_face_the_camera_whichever_way_the_triangles_turn():
+def test_normals_face_camera_for_any_orientation():
     there = cortex()
     turned = replace(there, triangles=there.triangles[:, ::-1])
     one, other = (render(camera(), [layer], LAMP) for layer in (there, turned))
@@ -336,7 +336,7 @@ def test_what_cannot_be_drawn_is_refused(attempt, reason):
         attempt()
 
 
-def test_an_outline_is_off_by_what_is_astray_and_by_what_is_missing():
+def test_outline_error_counts_misplaced_and_missing_pixels():
     """One that stands 12 pixels off beside the true one, and one of which the right half is not drawn."""
     here, ink = camera(400, 300), (20.0, 240.0, 60.0)
     true = compute_silhouette(here, tumour().vertices, tumour().triangles)

@@ -102,7 +102,7 @@ def test_corners_are_found_where_the_lens_puts_them(scene):
     assert not Detector((CUBE,)).seen(np.full((600, 800), 120, np.uint8))
 
 
-def test_the_tip_is_where_it_was_put_within_what_its_covariance_says(scene):
+def test_tip_error_lies_within_its_covariance(scene):
     picture, poses = scene
     tracked = Tracker(CAMERA, (CUBE, PLATE)).track(picture)
     assert set(tracked.verdicts.values()) == {Verdict.GOOD}

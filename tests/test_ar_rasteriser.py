@@ -58,7 +58,7 @@ def test_a_triangle_that_reaches_the_camera_may_cover_every_row(depth):
     assert drawn.mask[-1].any() and not drawn.mask[: here.height // 2].any()
 
 
-def test_a_closed_surface_has_no_cracks_and_the_same_depth_as_rays():
+def test_closed_surface_without_cracks_matches_ray_depth():
     smooth, triangles = build_sphere()
     here = camera(640, 480)
     # A crack would show the far wall, behind the sphere's middle.

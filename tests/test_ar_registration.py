@@ -91,7 +91,7 @@ def test_what_determines_no_registration_is_refused():
         )
 
 
-def test_each_pair_s_residual_is_that_of_a_registration_without_it():
+def test_pair_residual_uses_registration_without_pair():
     patient = moved(SCAN) + 5e-4 * np.random.default_rng(3).normal(size=SCAN.shape)
     fits = compute_pair_residuals(SCAN, patient)
     for row in range(len(SCAN)):
@@ -104,7 +104,7 @@ def test_each_pair_s_residual_is_that_of_a_registration_without_it():
     )
 
 
-def test_a_wrong_pair_is_suspect_as_often_as_the_docs_say_and_sound_ones_seldom():
+def test_wrong_pair_suspicion_rate_matches_docs():
     rng, sound, wrong = np.random.default_rng(0), [], []
     for number in range(300):
         patient = moved(SCAN[:6]) + 5e-4 * rng.normal(size=(6, 3))

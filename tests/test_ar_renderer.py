@@ -68,7 +68,7 @@ def test_depth_and_segmentation_are_what_rays_see():
     assert np.abs(picture.depth - cast.depth)[same].max() < 1e-6
 
 
-def test_colours_follow_from_the_formulas_at_the_points_that_rays_see():
+def test_colours_follow_the_shading_formulas():
     """Without texture and shadow, in NumPy: base (ambient + wrapped Lambert) + Fresnel x lobe, under the lamp's rim."""
     here, layer, light = camera(0.0, 320, 240), ball(gloss=0.4, shininess=30.0), as_light(LAMP)
     picture, cast = render(here, [layer], LAMP), raycast(here, layer.vertices, layer.triangles)
@@ -117,7 +117,7 @@ def test_what_stands_still_is_drawn_once_and_looks_the_same():
     assert none is None and again is first is moving and first.camera is here and last.camera is there
 
 
-def test_without_shadows_or_anything_that_moves_it_looks_the_same():
+def test_static_scene_without_shadows_looks_the_same():
     for layers, moved in (([striped(), ball()], [ball().vertices]), ([striped()], [])):
         still = [replace(layers[0], still=True), *layers[1:]]
         one, other = Renderer(still, LAMP).picture(camera(), moved), render(camera(), layers, LAMP)

@@ -57,7 +57,7 @@ class TestViews:
         widths = [len(part) * PITCH for part in np.split(row, np.flatnonzero(np.diff(row) > 1) + 1)]
         assert widths == pytest.approx([10e-3, 10e-3], abs=1e-3)
 
-    def test_where_the_error_is_not_known_or_the_place_is_doubtful_there_is_no_band(self):
+    def test_unknown_error_or_unreliable_place_has_no_band(self):
         known = Cut(ball(12e-3), ball(12e-3, (2e-3, 0.0, 0.0)), 4e-3)
         green = [np.count_nonzero(tinted(view(PLANES[0], None, np.zeros(3), cut))) for cut in (
             known, Cut(known.now, known.before), Cut(known.now, known.before, 4e-3, True)

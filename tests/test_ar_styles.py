@@ -83,7 +83,7 @@ def test_tools_and_masks_stay_in_front_of_every_style(style):
 
 
 @pytest.mark.parametrize("style", DRAWN)
-def test_under_the_drape_the_outline_is_broken_and_nothing_shines_through(style):
+def test_outline_under_drape_is_broken(style):
     picture, at = seen(0.0), tumour()
     shown = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING)).colour
     mask, shut = compute_silhouette(CAMERA, at.vertices, at.triangles), picture.segmentation == DRAPE
@@ -155,7 +155,7 @@ def test_a_mask_of_another_size_is_refused():
         composite(seen(), CAMERA, tumour(), cover=Cover(covered=np.zeros((4, 4), bool)))
 
 
-def test_a_cut_has_letters_at_both_ends_also_where_a_tool_hides_one():
+def test_cut_has_letters_at_both_ends_despite_tool():
     at = tumour((0.0, 0.0, -0.014))
     for tool in (False, True):
         picture = seen()
@@ -203,7 +203,7 @@ def test_a_ring_s_number_keeps_off_the_line_from_the_tip():
     assert not (cv2.erode(again.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)[boxes].any()
 
 
-def test_a_ring_s_caption_stands_apart_from_the_number_beside_the_tip():
+def test_ring_caption_keeps_clear_of_tip_number():
     """Right under the number, it would read as its explanation."""
     at, said = tumour((0.0, 0.0, -0.014)), "rings: mm to the surface; error not known"
     tip = CAMERA.unproject(np.array([[440.0, 20.0]]), np.array([0.2]))[0]

@@ -106,7 +106,7 @@ def pivoting(count, tilt=30.0, around=1.0):
     return np.array(found)
 
 
-def test_a_tip_is_found_and_its_deviation_is_that_of_repeated_pivoting():
+def test_tip_deviation_matches_repeated_pivoting():
     exact = calibrate_pivot(pivoting(20))
     np.testing.assert_allclose(exact.tip, TIP, atol=1e-12)
     np.testing.assert_allclose(exact.centre, [0.1, 0.2, 0.3], atol=1e-12)

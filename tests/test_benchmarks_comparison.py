@@ -160,7 +160,7 @@ def test_tled_finds_the_same_field_on_a_graphics_card(case, judge):
         assert all(answer.good and answer.apart < 1e-4 for answer in row.answers)
 
 
-def test_tled_of_another_law_is_found_out_and_one_that_ends_too_soon_says_so(case, judge, tmp_path):
+def test_tled_of_other_law_or_early_end_is_detected(case, judge, tmp_path):
     other = engine(tmp_path, "other", EXPLICIT + "serve(lambda case: set_up(replace(case, lam=1.001 * case.lam)))")
     hasty = engine(tmp_path, "hasty", EXPLICIT + "peer_tled.STEPS = 50; serve(set_up)")
     bold = engine(tmp_path, "bold", EXPLICIT + "peer_tled.SAFETY = 1.9; serve(set_up)")

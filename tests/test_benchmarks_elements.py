@@ -55,7 +55,7 @@ def test_soft_tissue_locks_linear_elements_alone():
     assert 0.8 < share["smoothed"] < 1.05
 
 
-def test_contact_force_of_p2_depends_less_on_the_mesh_than_that_of_p1():
+def test_p2_contact_force_depends_less_on_mesh_than_p1():
     anatomy = make_box(cells=(5, 5, 3), spacing=8e-3, tumour=12e-3, opening=34e-3)
     stiff, exact = contact_mesh.rows(anatomy, ["p1", "p2"], [2e-3], 8e-3, Material("neo-hookean", 3000.0, 0.45), "cpu")
     assert stiff.along.shape == stiff.fine.shape == (5,) and stiff.depth == 2e-3

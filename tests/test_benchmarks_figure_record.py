@@ -47,7 +47,7 @@ def brain(tmp_path_factory):
     return path
 
 
-def test_one_fails_one_is_skipped_one_is_measured_and_the_same_command_goes_on(brain, tmp_path, capsys, monkeypatch):
+def test_failed_and_skipped_figures_resume(brain, tmp_path, capsys, monkeypatch):
     out = tmp_path / "new.json"
     names = ("elements-limit-cpu", "live-cuda", "throughput-cpu")
     for name in names:  # small counts, as nobody waits for more
@@ -311,7 +311,7 @@ def test_a_damaged_record_is_one_sentence(kind, tmp_path, capsys):
 PAGE = "# Page\n\n<!-- bench: live-cpu stages-cpu -->\nold\n<!-- end -->\n\nBy hand: | 1 |\n"
 
 
-def test_tables_are_written_between_their_marks_and_stay_as_they_are(tmp_path, capsys):
+def test_tables_are_rewritten_only_between_marks(tmp_path, capsys):
     page, record = tmp_path / "page.md", put(tmp_path / "new.json", entry(a=0.01234, b=19183.0))
     page.write_text(PAGE)
     words = ["all", "--tables", str(page), "--from", record]

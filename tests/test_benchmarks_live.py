@@ -27,7 +27,7 @@ def site():
     return site_of(make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3))
 
 
-def test_it_wanders_at_one_speed_within_its_circle_and_everywhere():
+def test_wandering_path_has_one_speed_within_circle():
     times = np.arange(0.0, 60.0, 0.01)
     path = wander(0.25, 10e-3, 20e-3)
     places = np.array([(touch.x, touch.y) for touch in map(path, times.tolist())])
@@ -51,7 +51,7 @@ def test_the_tool_presses_where_it_moves(site):
     assert np.median(steps) == pytest.approx(20e-3 / 30.0, rel=0.01)
 
 
-def test_each_frame_starts_from_the_last_and_the_first_do_not_count(site, pretender):
+def test_frames_start_from_last_and_first_do_not_count(site, pretender):
     starts = []
 
     class Watched:

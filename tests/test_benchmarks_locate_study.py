@@ -100,7 +100,7 @@ def test_thin_plates_go_on_linearly_and_smooth_noise_away(tumour):
     assert thin_plates(rest)(rest, wavy) == pytest.approx(wavy, abs=1e-4)
 
 
-def test_kelvinlets_meet_kelvins_solution_far_away_and_are_symmetric():
+def test_kelvinlets_match_kelvin_far_and_are_symmetric():
     """Kelvin 1848: u = (1 / r) ((3 - 4 nu) I + r r^T / r^2) f / (16 pi mu (1 - nu)), times 4 pi mu."""
     nu, arm = 0.49, np.array([0.3, -0.2, 0.4])
     found = kelvinlets(arm[None], np.zeros((1, 3)), spread=1e-4)[0, :, 0]
@@ -124,7 +124,7 @@ def test_forces_at_the_points_are_found_again(tumour):
     assert np.abs(kelvin_forces(tumour)(twice, torn)).max() < 1e-3
 
 
-def test_a_body_on_soft_springs_goes_along_and_one_on_stiff_springs_stays(body):
+def test_soft_springs_follow_and_stiff_springs_hold(body):
     motion = np.cross([0.02, 0.01, -0.03], body.mesh.nodes - body.mesh.nodes.mean(axis=0)) + [1e-3, 2e-3, -3e-3]
     seen, true = observed(body, motion, PointsSeen(40, 60, 0), (0,)), motion[body.tumour_nodes]
     found = springs(body, skull=1.0, point=100.0)(seen.rest, seen.now - seen.rest)
@@ -186,7 +186,7 @@ def test_squares_are_by_the_stated_covariance_of_the_centroid(locator, body):
     assert refused.refused and refused.square is None and np.array_equal(refused.error, refused.motion)
 
 
-def test_what_is_seen_lies_on_the_same_points_at_every_level_of_noise(locator, body):
+def test_observations_use_same_points_at_any_noise(locator, body):
     motion = some_motion(locator, 2)
     exact, low, high = (observed(body, motion, PointsSeen(50, 36, noise), (3, 1)) for noise in (0, 1, 2))
     assert np.array_equal(exact.rest, low.rest) and np.array_equal(exact.rest, high.rest)
@@ -259,7 +259,7 @@ def test_errors_are_as_large_as_is_said(translation):
         assert 1e6 * left.var(axis=0).mean() == pytest.approx(0.3**2 + 0.5**2, rel=0.15)
 
 
-def test_twins_depend_on_seed_and_number_alone_and_have_what_is_said():
+def test_twins_depend_only_on_seed_and_number():
     many = [drawn(0, number) for number in range(200)]
     assert drawn(0, 5) == many[5] != replace(drawn(0, 9), number=5) and drawn(1, 5) != many[5]
     assert [one.cause for one in many[:8]] == [*CAUSES, *CAUSES]
@@ -301,7 +301,7 @@ def test_a_twin_is_an_equilibrium_of_its_loads(body):
     assert 0.02e-3 < deep < np.linalg.norm(motion[near])
 
 
-def test_twins_are_kept_one_by_one_and_read_at_the_bodys_vertices(body, tmp_path, monkeypatch):
+def test_twins_are_stored_and_read_at_body_vertices(body, tmp_path, monkeypatch):
     finer, made = refined(body), []
 
     def linear(anatomy, draw, device, element):
@@ -378,6 +378,6 @@ def test_the_command_prints_a_row_for_each_estimator_and_goes_on(body, locator, 
         (["--anatomy", "own.vtu"], "--anatomy needs --finer"),
     ],
 )
-def test_what_cannot_be_measured_is_refused_before_anything_is_solved(words, match, capsys):
+def test_unmeasurable_input_is_rejected_before_solving(words, match, capsys):
     assert main(["locate", *words]) == 2
     assert match in capsys.readouterr().err

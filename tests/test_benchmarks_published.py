@@ -227,7 +227,7 @@ def test_what_it_does_not_know_is_refused(model, box, loads, truth):
         trained_in_turn("published-ann", box, draw("palpation", box, 40, 0), truth[:40])
 
 
-def test_damping_that_rounding_swallows_leaves_no_singular_matrix():
+def test_underflowing_damping_keeps_matrix_regular():
     """Two slopes alike, and noise that counts as none: before, training on few loads stopped with a traceback."""
     held = 1e20 * np.ones((1, 2, 2)) + 1e-6 * np.eye(2)
     with pytest.raises(np.linalg.LinAlgError):

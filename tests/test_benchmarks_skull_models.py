@@ -53,7 +53,7 @@ def test_the_bench_measures_what_it_says(brain, capsys):
     assert bonded["bond"] == pytest.approx(answer.bond.max(), rel=1e-3)
 
 
-def test_a_skull_that_only_presses_lets_the_tumour_go_farther_than_one_that_holds(brain, capsys):
+def test_pressing_skull_allows_more_motion_than_bonded(brain, capsys):
     words = [brain[0], "--loads", "1", "--poisson", "0.45", "--device", "cpu", "--json"]
     assert main(["benchmarks", "skull", *words, "--skulls", "bonded", "tearing", "pressing"]) == 0
     bonded, tearing, pressing = json.loads(capsys.readouterr().out)["rows"]

@@ -26,7 +26,7 @@ def shot(tip, off=None, deviation=1e-3, markers=30.0):
     return Shot(np.array(tip, float), markers, found, None if off is None else deviation**2 * np.eye(3), 0.01)
 
 
-def test_a_row_counts_what_was_found_where_it_could_be_and_what_was_wrong():
+def test_row_counts_findings_and_faults():
     shots = [shot([0, 0, 0], [1e-3, 0, 0]), shot([0, 0, 0], [0, 2e-3, 0]), shot([0, 0, 0]), shot([0, 0, 0], markers=10)]
     row = build_row(
         "trial", shots, lambda certain: np.array([np.linalg.norm(each.found - each.tip) for each in certain])

@@ -189,7 +189,7 @@ def test_no_module_imports_itself_by_way_of_others():
     assert list(TopologicalSorter(graph).static_order())
 
 
-def test_newton_knows_no_particular_term_and_terms_are_imported_in_their_arm_alone():
+def test_solver_imports_terms_only_where_compiled():
     own = re.compile(r"sim\.terms\.(?!laws\b)")
     for path in FILES:
         name = name_of(path)
@@ -218,7 +218,7 @@ def test_rooms_without_pictures_or_networks_import_none():
     assert not {name for name in importers("warp") if name.startswith("surrogate/")}
 
 
-def test_what_is_imported_is_declared_and_what_is_declared_is_imported():
+def test_imports_and_declared_dependencies_agree():
     project = tomllib.loads((HOUSE / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     of_users = (extras[name] for name in ("camera", "data", "gym", "heads", "onnx", "report", "slicer"))

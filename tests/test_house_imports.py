@@ -22,7 +22,7 @@ def test_the_command_line_waits_for_nothing():
     assert "viser" not in fresh(f"import scenes.commands.check, scenes.episodes.episode; {print_heavy}")
 
 
-def test_public_names_are_there_and_importing_them_changes_no_setting():
+def test_public_names_import_without_side_effects():
     fresh(
         "import sys; import sim, surrogate, ar, scenes; packages = (sim, surrogate, ar, scenes)\n"
         "assert not {'numpy', 'warp', 'torch', 'cv2'} & set(sys.modules)\n"

@@ -60,7 +60,7 @@ def test_install_hint_names_an_extra_that_exists(extra):
     assert extra in EXTRAS and install_hint(extra).endswith(f"pip install -e '.[{extra}]'.")
 
 
-def test_version_of_checkout_that_is_not_installed_is_the_projects(monkeypatch):
+def test_version_of_uninstalled_checkout_is_the_projects(monkeypatch):
     def gone(name):
         raise versions.PackageNotFoundError(name)
 
@@ -124,7 +124,7 @@ def test_names_in_backticks_exist():
     assert not [(place, name) for place, name in found if not set(filter(None, name.split("."))) <= known]
 
 
-def test_cited_titles_are_those_that_were_compared_with_their_sources():
+def test_cited_titles_match_their_checked_list():
     """A new citation, or one that a rename has changed, is compared with its source, then listed."""
     listed = set((HOUSE / "tests/data/citations.txt").read_text().splitlines())
     paths = [

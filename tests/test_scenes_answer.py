@@ -75,7 +75,7 @@ def test_a_pose_that_is_none_is_refused_and_counted(follower, registration, besi
 
 
 @pytest.mark.parametrize("sent", [True, False])
-def test_a_registration_of_nobody_knows_whom_is_used_and_doubtful(follower, registration, beside, truth, sent):
+def test_unverified_registration_is_used_with_warning(follower, registration, beside, truth, sent):
     into = in_mm(np.linalg.inv(registration.T_patient_scan))
     expected = 1e3 * (follower.motion.stage.tumour_at_rest.vertices + truth.displacement[10])
 
@@ -103,7 +103,7 @@ def test_a_registration_of_nobody_knows_whom_is_used_and_doubtful(follower, regi
     played(scene())
 
 
-def test_a_tool_that_was_near_and_is_then_too_far_for_any_tracker_is_doubtful(follower, registration, beside):
+def test_distant_tool_is_marked_unreliable(follower, registration, beside):
     async def scene():
         async with linked(follower, registration) as port, peers(port, 1) as (tracker,):
             tracker.send("TRANSFORM", NAMES.tool, transform(beside[10]), NOW)

@@ -42,7 +42,7 @@ def refused(words, capsys):
     return line
 
 
-def test_a_folder_of_pictures_gives_the_camera_and_its_covariance(folder, tmp_path, capsys):
+def test_image_folder_gives_camera_and_covariance(folder, tmp_path, capsys):
     out = tmp_path / "new" / "camera.yaml"
     assert main(["calibrate", str(folder), "--out", str(out)]) == 0
     said = capsys.readouterr().out

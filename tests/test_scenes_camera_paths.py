@@ -26,7 +26,7 @@ TIMES = np.linspace(0.0, 4.0, 41)
 
 
 @pytest.mark.parametrize("name", PATHS)
-def test_a_path_is_a_pure_function_that_keeps_the_site_in_the_picture(site, name):
+def test_camera_path_is_pure_and_keeps_site_in_image(site, name):
     view = replace(USUAL, path=PATHS[name](3))
     cameras = [view.camera(site, float(time)) for time in TIMES]
     again = [view.camera(site, float(time)) for time in TIMES[::-1]][::-1]
@@ -37,7 +37,7 @@ def test_a_path_is_a_pure_function_that_keeps_the_site_in_the_picture(site, name
     assert np.ptp([one.project(site.origin)[0] for one in cameras], axis=0).max() > 2.0
 
 
-def test_the_same_hand_moves_in_the_same_way_and_another_does_not(site):
+def test_hand_motion_is_deterministic_per_seed(site):
     one, same, other = (replace(USUAL, path=HandHeld(seed)).camera(site, 1.7) for seed in (5, 5, 6))
     assert np.array_equal(one.T_camera_world, same.T_camera_world)
     assert np.abs(one.T_camera_world - other.T_camera_world).max() > 1e-5

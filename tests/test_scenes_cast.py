@@ -120,7 +120,7 @@ def ask_for_frame_12(demo, gated, page, steps):
     assert wait_for(lambda: shows(page, steps - 1) and gated.solved[steps])
 
 
-def test_frames_on_the_way_are_shown_as_they_come_and_the_slider_stays(demo, gated, monkeypatch):
+def test_intermediate_frames_show_and_slider_stays(demo, gated, monkeypatch):
     said, begun = [], demo.busy.on
     monkeypatch.setattr(demo.busy, "on", lambda what: said.append(what) or begun(what))
     with Loop(demo) as page:
@@ -185,7 +185,7 @@ def test_without_an_effect_others_answer_and_those_before_stop(demo, gated):
         assert full.truth.number == 3 and wait_for(lambda: gated.solved[4] == 2)  # then they are compared
 
 
-def test_a_storm_of_jumps_solves_nothing_twice_and_ends_where_the_last_one_went(demo, gated):
+def test_jumps_reuse_solutions_and_end_at_last_target(demo, gated):
     gated.let(10_000)
     before = set(threading.enumerate())
     with Loop(demo) as page:
@@ -211,7 +211,7 @@ def test_the_overlay_changes_while_a_solve_is_waited_for(demo, gated):
         assert shows(page, 0) and gated.solved == Counter((0, 1))
 
 
-def test_the_body_is_seen_at_rest_while_the_finite_elements_are_prepared(gated, monkeypatch):
+def test_body_is_shown_while_fem_prepares(gated, monkeypatch):
     prepared, said = threading.Event(), []
     player = Theatre.player
 
@@ -232,7 +232,7 @@ def test_the_body_is_seen_at_rest_while_the_finite_elements_are_prepared(gated, 
     demo.close()
 
 
-def test_of_many_scenes_only_those_that_are_waited_for_are_prepared(demo, monkeypatch):
+def test_only_awaited_scenes_are_prepared(demo, monkeypatch):
     """A visitor leafs through the scenes while the first is prepared."""
     prepared, made = threading.Event(), []
     player = Theatre.player

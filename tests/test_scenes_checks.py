@@ -49,7 +49,7 @@ def lab(colour, eye):
 
 
 @pytest.mark.parametrize("eye", EYES)
-def test_lines_differ_from_each_other_and_from_the_ground_for_every_eye(eye):
+def test_line_colours_are_distinct_for_colour_blind_eyes(eye):
     for name, colour in LINES.items():
         for other, ground in (LINES | GROUNDS).items():
             if name != other:

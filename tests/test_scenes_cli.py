@@ -29,7 +29,7 @@ def test_help_texts_come_without_warp_and_scipy():
 
 
 @pytest.mark.parametrize("name", ["linear", "fem"])
-def test_the_page_opens_while_kernels_are_compiled_and_plays_when_they_are(name, box, tmp_path, monkeypatch):
+def test_page_opens_during_compilation_then_plays(name, box, tmp_path, monkeypatch):
     """A model's first answer belongs to what is made ready."""
     done, predicted = [], SceneSolvers.predicted
     opened = threading.Event()

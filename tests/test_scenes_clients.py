@@ -29,7 +29,7 @@ async def until(what):
             await asyncio.sleep(0.005)
 
 
-def test_every_client_hears_the_newest_and_a_new_one_what_it_missed():
+def test_every_client_receives_the_newest():
     async def scene():
         async with served() as (clients, port):
             clients.publish("a", [pack_message("STRING", "A", encode_string("one"), NOW)])
@@ -45,7 +45,7 @@ def test_every_client_hears_the_newest_and_a_new_one_what_it_missed():
     played(scene())
 
 
-def test_a_client_that_does_not_read_gets_the_newest_later_and_keeps_nobody_waiting():
+def test_slow_client_gets_newest_and_blocks_nobody():
     count, large = 200, bytes(200_000)
 
     async def scene():

@@ -18,7 +18,7 @@ from sim.bodies.meshfile import write_anatomy, write_mesh
     ["render x --out o", "collect x --out o.h5", "film x --out o", "demo x", "check press x", "effects x", "budget x",
      "uncertainty press x", "benchmarks frame x", "benchmarks stages x"],
 )  # fmt: skip
-def test_a_wrong_name_of_a_scene_is_refused_before_an_anatomy_is_opened(words, tmp_path, monkeypatch, capsys):
+def test_unknown_scene_is_rejected_before_anatomy_opens(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main([*words.split(), "--anatomy", "no.vtu"]) == 2
     assert "no scene is called 'x'" in capsys.readouterr().err

@@ -28,7 +28,7 @@ def shown(tally: AccuracyTimeTable, name: str, loads: Iterable[str], millisecond
         tally.missed(name, load, 1e-3 * millimetres)
 
 
-def test_deformers_are_ranked_over_the_loads_that_all_of_them_had():
+def test_deformers_are_ranked_on_common_loads():
     tally = AccuracyTimeTable()
     assert tally.rows == [] and format_cost_table(tally.rows) == ""
     shown(tally, "quick", "abc", 1.0, 0.2)
@@ -54,7 +54,7 @@ def test_without_a_common_load_nobody_is_ranked():
     assert "not comparable" in words and "best" not in words
 
 
-def test_a_load_shown_again_counts_once_and_old_loads_are_forgotten():
+def test_repeated_load_counts_once_and_old_ones_expire():
     tally = AccuracyTimeTable()
     for load in range(RECENT):
         shown(tally, "a", [str(load)], 9.0, 9.0)

@@ -28,7 +28,7 @@ def follower():
     return follower_of(template_theatre().stage(find_scene("palpate")))
 
 
-def test_changes_are_noted_once_and_a_status_is_not_repeated_ten_times_a_second(follower):
+def test_status_changes_are_logged_once(follower):
     lines = []
     with socket.socket() as free:
         free.bind((HOST, 0))
@@ -121,7 +121,7 @@ def test_link_slow_solver_reports_each_second_and_empties(follower):
     played(scene())
 
 
-def test_a_console_gets_no_storm_and_nothing_that_a_terminal_obeys(capsys):
+def test_console_limits_rate_and_strips_control_codes(capsys):
     now, lines = [0.0], []
     note = limit_rate(lines.append, lambda: now[0])
     for number in range(100):

@@ -44,7 +44,7 @@ class TestControls:
             seen.append(wish.style)
         assert seen[:3] == ["window", "contour", "fill"] and overlay.start == overlay.options[0]
 
-    def test_each_way_of_the_camera_and_each_place_of_the_slices_is_offered(self, theatre):
+    def test_camera_and_slice_choices_are_offered(self, theatre):
         wish = Requests("fem", Touch())
         found = {
             control.label: control for control in build_controls(short(), theatre.site, ("fem",), wish, print, print)
@@ -70,7 +70,7 @@ class TestControls:
 
 
 class TestHand:
-    def test_a_still_hand_pauses_the_script_and_play_takes_the_tool_back(self):
+    def test_still_hand_pauses_script_and_play_resumes(self):
         wish = Requests("svr", Touch())
         wish.hand(force=0.2)
         assert not wish.plays and wish.now()[2] == Touch(force=0.2)

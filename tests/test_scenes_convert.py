@@ -26,7 +26,7 @@ def test_folders_are_not_mixed_with_others(name, folder, tmp_path, capsys):
     assert main(words) == 0 and [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_what_does_not_go_together_is_a_sentence_and_leaves_nothing(folder, box, tmp_path, capsys):
+def test_conflicting_options_give_message_and_no_file(folder, box, tmp_path, capsys):
     wide = write_episode(tmp_path / "in/wide.h5", box, Wanted(4, width=48))
     bare = write_episode(tmp_path / "in/bare.h5", box, Wanted(4))
     with h5py.File(bare, "a") as file:

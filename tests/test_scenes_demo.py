@@ -181,7 +181,7 @@ def test_the_scene_changes_without_a_new_server(demo):
     assert demo.wish.deformer == demo.theatre.usual(demo.first) != "fem"  # its own, not that of the scene before
 
 
-def test_a_scene_that_this_body_cannot_play_is_said_and_the_old_one_goes_on(demo):
+def test_unplayable_scene_is_reported_and_old_one_stays(demo):
     demo.wish.set(scene="no such scene")
     demo.run(0.5)
     assert demo.stage.scene is demo.first and demo.wish.scene == "press"
@@ -229,7 +229,7 @@ def test_a_long_solve_is_reported_while_it_lasts(demo, monkeypatch):
     assert said[-1] == ""
 
 
-def test_a_model_answers_while_the_finite_elements_are_in_a_solve(demo, monkeypatch):
+def test_model_predicts_while_fem_solves(demo, monkeypatch):
     solved, begun, deform = threading.Event(), [], Fem.deform
 
     def waiting(fem, loads, start=None, at=None):

@@ -103,7 +103,7 @@ def test_a_curved_mesh_is_in_equilibrium_by_independent_formulas(solve) -> None:
 
 
 @pytest.mark.parametrize("seen", ["in a mirror", "with corners exchanged"])
-def test_a_curved_mesh_of_negative_orientation_has_the_mirrored_answer(solve, seen: str) -> None:
+def test_curved_mesh_of_negative_orientation_is_mirrored(solve, seen: str) -> None:
     """Corners are turned; every middle stays on its edge, or the curved elements would be others."""
     data = {"fixed": BASE.astype(int), "force": FORCE}
     plain = solve(CURVED, data)[2]
@@ -115,7 +115,7 @@ def test_a_curved_mesh_of_negative_orientation_has_the_mirrored_answer(solve, se
     np.testing.assert_allclose(found, plain * mirror, rtol=0, atol=1e-8 * np.abs(plain).max())
 
 
-def test_a_mid_edge_node_of_the_file_is_held_only_where_it_is_fixed(solve) -> None:
+def test_mid_edge_node_is_fixed_only_where_file_fixes_it(solve) -> None:
     corners = BASE & (np.arange(ALL) < COUNT)
     found = solve(STRAIGHT, {"fixed": corners.astype(int), "force": FORCE})[2]
     assert not found[corners].any() and (np.abs(found[BASE & ~corners]).max(axis=1) > 0.0).all()
@@ -144,7 +144,7 @@ def test_a_stray_node_among_quadratic_tetrahedra_stays(solve) -> None:
     assert code == 0 and "1 nodes belong to no tetrahedron" in errors and not found[-1].any()
 
 
-def test_an_element_folded_by_its_mid_edge_node_counts_as_inside_out(solve) -> None:
+def test_element_folded_at_mid_edge_counts_as_inverted(solve) -> None:
     """All corners stay where they are: their tetrahedra look sound."""
     assert STRAIGHT.middles is not None
     node = STRAIGHT.middles[0, 0]

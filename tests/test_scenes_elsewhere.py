@@ -69,7 +69,7 @@ def twist(found, true):
 
 
 @pytest.mark.parametrize(("rate", "late"), [(20.0, 0.08), (30.0, 0.05), (60.0, 0.03)])
-def test_between_samples_poses_are_better_than_the_newest_and_as_sure_as_they_say(rate, late):
+def test_pose_interpolation_beats_newest_sample(rate, late):
     rng = np.random.default_rng(int(rate))
     stream = sampled(swung, np.arange(0.0, 4.0, 1.0 / rate), rng)
     plain, found, inside = [], [], []
@@ -85,7 +85,7 @@ def test_between_samples_poses_are_better_than_the_newest_and_as_sure_as_they_sa
     assert np.mean(inside) > 0.93
 
 
-def test_gaps_have_no_pose_and_the_last_one_goes_on_for_a_moment_only():
+def test_pose_gap_extrapolates_for_a_moment_only():
     times = np.concatenate([np.arange(0.0, 1.0, 0.04), np.arange(1.3, 2.0, 0.04)])
     stream = sampled(swung, times)
     last = times[times < 1.0][-1]
@@ -346,7 +346,7 @@ def test_the_command_takes_poses_and_finds_their_clock(bodies, tmp_path, capsys)
         read_hand_eye(tmp_path / "h.json")
 
 
-def test_a_calibration_s_error_is_in_the_band_as_far_as_the_reference_does_not_take_it_up(follower, stage, tmp_path):
+def test_calibration_error_in_band_unless_reference_absorbs_it(follower, stage, tmp_path):
     follower = replace(follower, motion=replace(follower.motion, deformer=Still()))
     first, deviations = (
         next(iter(read_video(FILM / "film.mp4", 30.0))),

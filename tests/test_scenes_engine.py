@@ -46,7 +46,7 @@ def undisturbed(workers, tmp_path_factory):
     return held(folder)
 
 
-def test_what_is_there_is_skipped_and_any_order_gives_the_same_bytes(workers, undisturbed, tmp_path):
+def test_existing_episodes_are_skipped_in_any_order(workers, undisturbed, tmp_path):
     assert len(undisturbed) == 12
     assert played(tmp_path, workers, 3).made == 3  # upwards
     assert played(tmp_path, workers, 12).made == 9  # in a random order
@@ -90,7 +90,7 @@ def test_a_full_disk_ends_the_run_and_says_so(workers, tmp_path):
     assert played(tmp_path, workers, 12).failed == 0 and len(held(tmp_path)) == 12
 
 
-def test_each_process_has_a_card_of_its_own_and_is_replaced_if_it_fails(undisturbed, tmp_path):
+def test_each_process_has_its_gpu_and_is_replaced(undisturbed, tmp_path):
     """A card that has failed answers nothing any more; the number of an episode that broke it is tried anew."""
     with start_own_workers(["cuda:0", "cuda:1"]) as workers:
         tally = played(tmp_path, workers, 12, Trouble({3: "broken once"}, seconds=0.05))
@@ -181,7 +181,7 @@ def test_a_folder_is_one_runs_own(tmp_path):
         begin(tmp_path, tiny_run(), PLAN)
 
 
-def test_left_overs_of_dead_processes_are_removed_and_others_are_not(tmp_path):
+def test_leftovers_of_dead_processes_only_are_removed(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     remove = tmp_path / "probe.h5"

@@ -18,7 +18,7 @@ def test_gymnasium_finds_nothing_wrong(observation, boxed):
         assert environment.action_space.shape == (6,)
 
 
-def test_the_same_seed_and_actions_give_the_same_bytes_wherever_they_are():
+def test_same_seed_and_actions_give_same_bytes():
     """Alone, and second of three, whose neighbours do something else; pictures too."""
     alone = played(made(observation="rgbd"), 7, 18)
     vector = many(3, observation="rgbd")
@@ -104,7 +104,7 @@ def test_hostile_input_is_refused():
         compute_scripted_actions("juggle", np.zeros(24))
 
 
-def test_a_spatula_is_answered_by_its_model_alone_and_among_others():
+def test_spatula_model_is_used_alone_and_among_others():
     """Byte for byte, through contact; and with a process of its own."""
     alone = played(made("Retract"), 2, 16, "retract")
     vector = many(2, "Retract")

@@ -269,7 +269,7 @@ class TestRender:
         assert 2 <= json.loads(capsys.readouterr().out)["not_good"] <= 5
 
 
-def test_an_episode_that_no_file_may_hold_is_reported_before_the_work(theatre, tmp_path):
+def test_oversized_episode_is_reported_before_work(theatre, tmp_path):
     resource = pytest.importorskip("resource")
     before, play = resource.getrlimit(resource.RLIMIT_FSIZE), player(theatre, short(), "linear")
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))

@@ -70,7 +70,7 @@ def test_a_run_that_ends_has_a_data_sheet_of_what_is_there(box, tmp_path, capsys
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_all_processes_at_once_and_leaves_what_can_go_on(number, tmp_path):
+def test_signal_stops_processes_and_keeps_resumable_work(number, tmp_path):
     command = [sys.executable, "-m", "scenes.cli", "episodes", "small", "--count", "5", "--workers", "1"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     folder = tmp_path / "data"

@@ -61,7 +61,7 @@ def test_nothing_is_off_where_nobody_contributes(filmed):
         assert np.abs(values).max() < 1e-12
 
 
-def test_registration_segmentation_model_and_mesh_are_as_large_as_they_are_said_to_be(filmed):
+def test_error_sources_have_their_stated_size(filmed):
     moved = compute_errors(filmed, [REGISTRATION], COUNT)
     assert np.sqrt(np.mean(moved.middle**2)) == pytest.approx(np.sqrt(3.0) * OF_REGISTRATION.range[1], rel=0.1)
     assert np.sqrt(np.mean(moved.along**2)) == pytest.approx(OF_REGISTRATION.range[1], rel=0.15)
@@ -135,7 +135,7 @@ def test_registration_errs_along_the_axes_of_the_reference(filmed, axis):
     assert np.std(found.along) == pytest.approx(1e-3 * abs(toward @ T[:3, axis]), rel=0.15, abs=2e-6)
 
 
-def test_a_rolling_shutter_costs_what_the_camera_moves_between_the_rows_of_reference_and_tumour(filmed):
+def test_rolling_shutter_error_from_camera_motion(filmed):
     calibration = replace(USUAL, readout=0.02)
     moving = replace(filmed, viewpoint=replace(VIEW, calibration=calibration, path=sideways), duration=0.1)
     camera, middle = VIEW.camera(moving.site), (filmed.rest + filmed.field).mean(axis=0)
@@ -156,14 +156,14 @@ def test_a_rolling_shutter_costs_what_the_camera_moves_between_the_rows_of_refer
     assert compute_errors(replace(moving, viewpoint=replace(VIEW, path=sideways)), [SHUTTER], 20).worst.max() < 1e-12
 
 
-def test_twice_the_noise_of_corners_puts_the_tumour_off_by_twice_as_much(filmed):
+def test_doubled_corner_noise_doubles_tumour_error(filmed):
     once, twice = (compute_errors(replace(filmed, corner=noise), [MARKERS], COUNT).worst for noise in (0.1, 0.2))
     assert np.median(twice) == pytest.approx(2.0 * np.median(once), rel=0.1)
     # Sixteen corners 60 mm wide, 80 mm beside the tumour.
     assert 0.05e-3 < np.median(once) < 0.5e-3
 
 
-def test_a_calibration_is_as_sure_as_one_of_pictures_and_wrong_ones_cost_more(filmed):
+def test_calibration_covariance_and_wrong_images_raise_error(filmed):
     deviations = np.sqrt(np.diag(filmed.covariance))
     assert (deviations[:4] > 0.05).all() and (deviations[:4] < 3.0).all()
     assert change_calibration(USUAL, np.arange(9.0)).focal == (1400.0, 1401.0)
@@ -173,7 +173,7 @@ def test_a_calibration_is_as_sure_as_one_of_pictures_and_wrong_ones_cost_more(fi
     assert np.median(worse.worst) > 5.0 * np.median(compute_errors(filmed, TECHNICAL[:1], 50).worst)
 
 
-def test_the_band_holds_for_twins_and_not_for_bodies_that_differ_more(filmed):
+def test_band_covers_twins_but_not_other_bodies(filmed):
     here, other = (
         1e-3 * np.random.default_rng(seed).normal(size=(600, 1, 3)) + np.zeros_like(filmed.rest) for seed in (2, 3)
     )

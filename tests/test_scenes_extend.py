@@ -97,7 +97,7 @@ def test_the_command_says_how_large_the_tumour_is(capsys):
     assert float(capsys.readouterr().out.removesuffix(" ml\n")) == pytest.approx(4 / 3 * np.pi * 1.2**3, rel=0.05)
 
 
-def test_every_part_of_ones_own_is_on_the_page_and_every_name_there_exists():
+def test_custom_parts_on_the_page_exist():
     for part in ("nearest", "sucker", "veins", "yeoh"):
         assert f"examples/{part}.py" in PAGE
     names = set(re.findall(r"`((?:sim|scenes|surrogate)(?:\.[a-z_]+)*)\.([A-Z]\w+)`", PAGE))

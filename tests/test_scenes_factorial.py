@@ -77,7 +77,7 @@ def test_the_command_writes_table_and_plot(few, tmp_path, monkeypatch, capsys):
     assert main([*words, "--anatomy", "mine.vtu", "--force"]) == 2 and "leave --anatomy out" in capsys.readouterr().err
 
 
-def test_the_plot_has_a_panel_for_each_opening_and_a_curve_for_each_change():
+def test_plot_has_panel_per_opening_and_curve_per_change():
     whole = [Cell(dict(zip(LEVELS, each, strict=True)), 1.0, 1.0) for each in product(*LEVELS.values())]
     drawn = build_panels(whole)
     assert len(drawn) == 3 and [len(panel.curves) for panel in drawn] == [5, 5, 5]

@@ -43,14 +43,14 @@ class Rows:
 
 
 @pytest.mark.parametrize(("cores", "elements", "learners"), [(2, 1, 1), (4, 2, 2), (16, 2, 5)])
-def test_learners_are_measured_side_by_side_where_there_are_cores(study, cores, elements, learners):
+def test_learners_run_in_parallel_on_spare_cores(study, cores, elements, learners):
     run = Rows()
     assert [row.name for row in measure_rows(study, SPECS, run, cores)] == [spec.name for spec in SPECS]
     assert run.most[FemVariant] == elements and run.most[LearnerSpec] == learners
 
 
 @pytest.mark.parametrize(("cores", "learners"), [(4, 2), (16, 4)])
-def test_beside_a_card_learners_are_measured_together_with_finite_elements(study, cores, learners):
+def test_learners_run_together_with_fem_on_a_gpu(study, cores, learners):
     run = Rows()
     found = [row.name for row in measure_rows(study, SPECS, run, cores, on_card=True)]
     assert found == [spec.name for spec in SPECS] and run.most == {FemVariant: 2, LearnerSpec: learners}

@@ -21,7 +21,7 @@ from scenes.tracked.tracked_tool import TrackedTool
 from sim.tools import Ball
 
 
-def test_a_registration_that_is_not_sure_is_in_the_band_and_beyond_a_limit_not_to_be_relied_on(follower):
+def test_uncertain_registration_is_in_band_up_to_limit(follower):
     first = next(iter(pictures())).picture
     for shift, state in ((1e-3, TumourState.REST), (3e-3, TumourState.UNSURE)):
         covariance = np.diag(np.repeat([shift**2, 0.0], 3))
@@ -32,7 +32,7 @@ def test_a_registration_that_is_not_sure_is_in_the_band_and_beyond_a_limit_not_t
         assert ("do not rely" in known.words) is (state is TumourState.UNSURE)
 
 
-def test_a_registration_that_does_not_say_whose_it_is_is_not_relied_on(follower):
+def test_registration_without_anatomy_is_not_reliable(follower):
     first = next(iter(pictures())).picture
     other = replace(follower, registration=replace(follower.registration, scanned=None))
     known = other.step(first.grey, 0.0)

@@ -157,7 +157,7 @@ def test_an_error_that_passes_keeps_what_was_solved(plan, undisturbed, solved, t
     assert files_of(tmp_path) == undisturbed and not partial.exists()
 
 
-def test_the_most_that_anybody_has_is_taken_and_other_loads_are_not(tmp_path):
+def test_fullest_data_set_is_used(tmp_path):
     stated, folders = {"seed": "1"}, [tmp_path / str(number) for number in range(4)]
     for folder, size in zip(folders, (0, 10, 30, 50), strict=True):
         folder.mkdir()

@@ -35,7 +35,7 @@ def test_a_rigid_matrix_of_single_precision_is_taken_in_metres():
     assert T[:3, 3] == pytest.approx([0.01, -0.02, 0.03]) and T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3))
 
 
-def test_bodies_in_the_trackers_frame_are_brought_to_the_reference():
+def test_tracker_frame_bodies_map_to_reference():
     names = TransformNames(tool="StylusTipToTracker")
     heard = ReceivedTransforms(names, 0.3).add_transform(names.tool, matrix(), STAMP, 1.0, 0)
     assert heard.beside(names.tool, 1.0) == "no ReferenceToTracker yet"

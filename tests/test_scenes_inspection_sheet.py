@@ -94,7 +94,7 @@ def test_what_looks_wrong_is_said(tmp_path, capsys):
     assert "stored LAS (mirrored, as many scanners do; left is where its affine says)" in text and "warnings:" in text
 
 
-def test_a_folder_that_is_not_there_is_made_and_one_that_cannot_be_is_refused(tmp_path, capsys):
+def test_missing_folder_is_made_or_rejected(tmp_path, capsys):
     ball(tmp_path)
     (tmp_path / "file").touch()
     words = ["patient", str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--inspect", "--out"]
@@ -132,7 +132,7 @@ def test_a_scan_in_lps_that_is_stated_as_ras_is_refused(tmp_path, capsys):
             assert said in (error := capsys.readouterr().err) and "one of the two states LPS as RAS" in error
 
 
-def test_the_side_of_a_tumour_is_stated_where_nothing_else_tells_it(tmp_path, capsys):
+def test_tumour_side_is_printed_where_not_obvious(tmp_path, capsys):
     ball(tmp_path)
     labels = tmp_path / "labels.nii.gz"
     own = moved(tmp_path, "labels", "own.nii", nibabel.load(labels).affine, -2)

@@ -10,7 +10,7 @@ from scenes.warp.landmarks import NEAREST, list_landmarks
 from sim.geometry.locate import locate
 
 
-def test_each_landmark_is_a_place_in_tissue_that_the_field_for_points_carries(warp_out):
+def test_landmarks_are_tissue_points_moved_by_field(warp_out):
     field = sitk.ReadImage(str(warp_out / "field_modeling.nrrd"), sitk.sitkVectorFloat64)
     transform = sitk.DisplacementFieldTransform(field)
     controls = json.loads((warp_out / "landmarks.mrk.json").read_text())["markups"][0]["controlPoints"]

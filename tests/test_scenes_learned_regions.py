@@ -52,7 +52,7 @@ class TestScenes:
         scene = asked(theatre, short())
         assert scene.elasticity == TISSUE and theatre.list_rejections(scene) == {"series-gp": None}
 
-    def test_that_ask_for_another_keep_the_rest_and_are_refused_the_model(self, theatre, capsys):
+    def test_other_scenes_keep_settings_and_reject_model(self, theatre, capsys):
         scene = asked(theatre, short(), "--region", "5:400")
         assert scene.elasticity == Elasticity(BRAIN, {TUMOUR_LABEL: STIFF, NECROSIS_LABEL: replace(BRAIN, young=400.0)})
         kept = "press keeps, as the models beside the anatomy have it: region 2 (tumour): neo-hookean, E 9 kPa, nu 0.49"

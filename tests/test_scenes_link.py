@@ -16,7 +16,7 @@ from scenes.script.shipped_files import template_path
 SELF = "localhost", "127.0.0.1", socket.gethostname()
 
 
-def test_the_command_serves_this_machine_alone_and_ends_at_a_signal():
+def test_server_is_local_and_stops_on_signal():
     words = ["link", template_path(), "--tool", FILM / "tool.json", "--deformer", "rest", "--port", "0"]
     command = [sys.executable, "-m", "scenes.cli", *map(str, words), "--device", "cpu"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

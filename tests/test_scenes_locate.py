@@ -97,7 +97,7 @@ def test_what_a_tracker_is_known_to_do_is_given_in_millimetres(files, capsys):
     assert bias[0] < 1e-4 < bias[1] < bias[2]
 
 
-def test_motions_and_errors_in_metres_are_refused_and_no_zero_has_a_sign(files, tmp_path, capsys):
+def test_metre_input_is_rejected_and_zero_has_no_sign(files, tmp_path, capsys):
     """Motions of nothing at all are answered."""
     folder, _ = files
     table, path = np.loadtxt(folder / "vessels.csv", delimiter=",", skiprows=1), tmp_path / "seen.csv"
@@ -111,7 +111,7 @@ def test_motions_and_errors_in_metres_are_refused_and_no_zero_has_a_sign(files, 
         assert "-0.0" not in said.out and ("by 0.0, 0.0, 0.0 mm" in said.out) is (times == 0.0)
 
 
-def test_points_whose_errors_say_nothing_are_refused_unless_they_are_few(files, tmp_path, capsys):
+def test_uninformative_points_are_rejected_unless_few(files, tmp_path, capsys):
     folder, _ = files
     table, path = np.loadtxt(folder / "vessels.csv", delimiter=",", skiprows=1), tmp_path / "unsure.csv"
     for unsure, code in ((len(table) - 1, 2), (len(table) // 5, 0)):

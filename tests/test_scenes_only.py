@@ -189,7 +189,7 @@ def test_elements_need_no_term_of_their_own(witnessed, element):
     assert (grids <= {name.split(":")[0] for name in found["launched"]}) == (element == "p2")
 
 
-def test_every_kernel_of_a_frame_was_compiled_and_the_plain_frame_is_short(witnessed):
+def test_frame_kernels_are_precompiled(witnessed):
     """The ear hears: what is launched is what was compiled, and a scene that lies still steers nothing."""
     press, sinking = witnessed("press"), witnessed("brain_shift")
     assert press["launched"] <= press["compiled"] and len(press["launched"]) > 10

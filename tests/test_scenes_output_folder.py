@@ -167,7 +167,7 @@ def test_what_makes_no_sense_is_refused(words, reason, folder, capsys):
     assert reason in error and not (folder / "refused").exists()
 
 
-def test_results_of_other_meshes_and_labels_that_are_none_are_refused(folder, box, capsys):
+def test_foreign_results_and_unknown_labels_are_rejected(folder, box, capsys):
     other = box.without(np.arange(5)).mesh
     write_mesh(folder / "other.vtu", other, {"displacement": dimple(other.nodes)})
     for name, reason in (("other.vtu", "another mesh"), ("box.vtu", "no point data `displacement`")):
@@ -213,7 +213,7 @@ def test_intensities_that_are_given_as_labels_are_doubted(folder, box):
         assert ("as intensities do: give them by --image" in said) == doubted
 
 
-def test_what_is_empty_is_a_share_of_the_volume_and_not_of_vertices(folder, box):
+def test_empty_share_is_by_volume_not_vertices(folder, box):
     index = np.rint((1e3 * box.mesh.nodes - AFFINE[:3, 3]) / 2.0).astype(int)
     values = np.ones((40, 40, 32), np.float32)
     values[tuple(index.T)] = 0.0  # one voxel round each vertex

@@ -130,7 +130,7 @@ def put_data(path, **stated):
         file.attrs.update({"format": "sulcus data 1", **stated})
 
 
-def test_data_and_models_of_another_anatomy_are_found_beside_a_mesh(tmp_path):
+def test_foreign_data_and_models_are_found_next_to_mesh(tmp_path):
     mesh = tmp_path / "me.vtu"
     assert find_foreign_files(mesh, "new") == []
     put_data(tmp_path / "me.h5", anatomy="new")

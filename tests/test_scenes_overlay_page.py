@@ -121,7 +121,7 @@ def test_a_film_plays_on_and_after_its_end_anew(follower, stage):
     assert one.colour.size == one.known.motion.positions.size == 0 and one.middle.shape == (3,)
 
 
-def test_a_camera_s_picture_is_dimmed_once_it_is_old_and_goes_on_when_it_is_back(follower, stage):
+def test_camera_image_dims_when_stale_and_recovers(follower, stage):
     first = next(read_video(FILM / "film.mp4", 30.0, colour=True))
 
     def pictures():
@@ -154,7 +154,7 @@ def test_a_camera_s_picture_is_dimmed_once_it_is_old_and_goes_on_when_it_is_back
             page.watch(iter([replace(first, grey=first.grey[::2])]), 0.1)
 
 
-def test_the_command_s_page_is_of_films_and_of_cameras_and_the_demo_says_so(capsys):
+def test_video_and_camera_pages_differ_from_demo(capsys):
     given = [f"--camera={FILM}/camera.yaml", f"--registration={FILM}/registration.json", "--device", "cpu"]
     film, port = str(FILM / "film.mp4"), str(free_port())
     assert main(["overlay", film, *given, "--page", "--port", port, "--seconds", "2"]) == 1  # nobody knows the motion

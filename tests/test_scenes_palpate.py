@@ -131,7 +131,7 @@ class TestPalpate:
             if force is not None and not known:
                 assert batch.reaction[row] == pytest.approx(solved.deformation.reaction[0], abs=2e-3)
 
-    def test_an_episode_holds_the_force_of_the_model_and_of_the_finite_elements(self, theatre, tmp_path):
+    def test_episode_stores_model_and_fem_force(self, theatre, tmp_path):
         scene = replace(small("palpate"), path=lambda time: Touch(depth=2e-3), duration=0.1)
         both = replace(theatre, models={"contact": untrained(theatre.anatomy, scene)})
         collect(tmp_path / "palpate.h5", both, player(both, scene, "contact"), "contact", iter)

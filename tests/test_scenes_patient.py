@@ -16,7 +16,7 @@ from sim.runtime.timing import time_stage
 from surrogate.model.store import load
 
 
-def test_a_patient_hands_force_and_opening_on_and_begins_nothing_that_it_cannot_end(tmp_path, monkeypatch, capsys):
+def test_patient_passes_options_and_checks_them_first(tmp_path, monkeypatch, capsys):
     steps = []
     monkeypatch.setattr("scenes.cli.main", lambda words: steps.append(words) or 0)
     words = ["patient", "labels.nii.gz", "--brain", "1", "--tumour", "2", "--device", "cpu"]

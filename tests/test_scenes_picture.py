@@ -10,7 +10,7 @@ from scenes.report.picture import find_rested_tip
 from scenes.script.site import site_of
 
 
-def test_the_tool_of_a_report_s_picture_rests_on_the_cortex_and_pierces_it_nowhere(box):
+def test_report_image_tool_rests_without_piercing(box):
     site, radius = site_of(box), 5e-3
     nodes = box.mesh.nodes.copy()
     top = site.contact(0.0, 0.0, radius).point

@@ -65,7 +65,7 @@ def test_the_overlay_is_in_register_under_each_path(theatre, path):
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_a_scene_passes_its_checks_under_each_path_and_not_another_camera(theatre, path):
+def test_scene_checks_pass_on_path_and_fail_on_other_camera(theatre, path):
     play = filmed(theatre, path=PATHS[path](1), eye="left")
     frames = list(play.frames(every=30))
     truth = solve_reference_frames(theatre, play.scene, [frame.loads for frame in frames])

@@ -49,7 +49,7 @@ def at(heard, time, now=None, stamped=True):
     return place_camera(heard.course(heard.names.camera), time if now is None else now, stamp, middle, heard.stale)
 
 
-def test_a_picture_between_two_poses_has_a_pose_between_and_its_error_says_what_is_left():
+def test_interpolated_pose_reports_remaining_error():
     times = STEP * np.arange(40)
     heard = heard_of(times)
     for late, share in ((2, 0.5), (5, 0.3), (12, 0.9), (1, 0.6)):  # poses that came after the picture's
@@ -61,7 +61,7 @@ def test_a_picture_between_two_poses_has_a_pose_between_and_its_error_says_what_
     assert off(ahead, times[-1] + 0.03) <= ahead.moved < 4e-3
 
 
-def test_where_no_two_poses_are_round_a_picture_the_newest_counts_with_how_far_the_camera_went():
+def test_newest_pose_counts_with_camera_travel():
     times = STEP * np.arange(12)
     middle = camera(0.0) @ [*1e3 * TUMOUR, 1.0]
     here, there = (np.linalg.inv(camera(time)) @ middle for time in times[-2:])
@@ -78,7 +78,7 @@ def test_where_no_two_poses_are_round_a_picture_the_newest_counts_with_how_far_t
     assert "alone" in at(heard_of(times[-1:]), times[-1])
 
 
-def test_poses_of_another_client_or_before_a_clock_was_set_back_are_no_neighbours():
+def test_poses_of_other_client_or_time_are_not_neighbours():
     heard = heard_of(STEP * np.arange(9))
     name = heard.names.camera
     taken_over = heard.add_transform(name, camera(0.4), to_stamp(BEGUN + 0.4), 1.0, 1)

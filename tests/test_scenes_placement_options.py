@@ -47,7 +47,7 @@ def test_the_skull_is_opened_over_the_piece_that_is_asked_for(tmp_path):
         place_craniotomy(replace(subject, pieces=(large,)), SimpleNamespace(**asked | {"opening_over": 2}))
 
 
-def test_an_anatomy_says_where_its_pieces_lie_and_refuses_to_leave_data_behind(tmp_path, capsys):
+def test_anatomy_lists_pieces_and_keeps_existing_data(tmp_path, capsys):
     two_foci(tmp_path)
     out = tmp_path / "me.vtu"
     words = ["anatomy", "--labels", str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--nodes", "2000"]

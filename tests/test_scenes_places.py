@@ -97,7 +97,7 @@ def test_a_spacing_follows_from_the_landmarks_error_too(dented):
     assert finer is not None and finer < 1.5e-3
 
 
-def test_folds_are_found_however_slight_and_the_largest_comes_first(small_box):
+def test_folds_are_found_and_sorted_by_size(small_box):
     """Two inner vertices go through a face of theirs: one of them hardly."""
     mesh, moved = small_box.mesh, np.zeros_like(small_box.mesh.nodes)
     inner = np.setdiff1d(np.arange(len(mesh.nodes)), mesh.surface)
@@ -116,7 +116,7 @@ def test_a_spacing_of_too_many_nodes_is_refused(small_box):
         list_fields(choose_moment(small_box, np.full_like(small_box.mesh.nodes, 40e-3)), 0.3e-3, lambda more: None)
 
 
-def test_where_the_finite_elements_fold_the_fields_do_not_and_it_is_said(small_box, tmp_path, capsys):
+def test_fields_avoid_folds_of_fem_and_report_them(small_box, tmp_path, capsys):
     mesh = small_box.mesh
     middle = mesh.nodes.mean(axis=0)
     vertex = int(np.linalg.norm(mesh.nodes - middle, axis=1).argmin())

@@ -59,7 +59,7 @@ def test_a_place_under_the_bone_is_refused_said_and_shown(play, way):
     assert inside.remark == "" and not says(inside.shown, frame.remark)
 
 
-def test_tissue_that_carries_the_tool_into_the_bone_is_not_relied_on(theatre):
+def test_tissue_pressed_into_bone_is_not_reliable(theatre):
     """Drawn aside with all that the model knows, beside the rim: the ball stays inside, and the picture says why."""
     play = player(theatre, replace(small(), viewpoint=Viewpoint()), "fem")
     reach = play.site.reach(play.scene.tool.radius)
@@ -68,7 +68,7 @@ def test_tissue_that_carries_the_tool_into_the_bone_is_not_relied_on(theatre):
     assert play.site.across(frame.tip[None])[0] <= reach + 1e-9 and frame.distance_error is None
 
 
-def test_a_lighter_touch_rests_higher_and_an_idle_tool_stands_off(play):
+def test_lighter_touch_rests_higher_and_idle_tool_above(play):
     depth = [(play.draw(0, 0.0, Touch(force=force)).tip - play.site.origin) @ play.site.axis for force in (0, 0.1, 0.2)]
     assert depth[0] == pytest.approx(-4e-3) and 0.0 < depth[1] < depth[2]
 
@@ -164,7 +164,7 @@ def test_the_overlay_lies_where_the_tumour_is(play):
     assert seen.sum() > 4 and changed[row, column][seen].mean() > 0.97
 
 
-def test_a_frame_finds_the_resting_tool_and_the_nearest_point_once(play, monkeypatch):
+def test_frame_computes_rest_and_nearest_point_once(play, monkeypatch):
     found = []
     for place, name in (
         ("scenes.play.player", "find_resting_tip"),

@@ -45,7 +45,7 @@ class TestPriors:
     def test_from_a_skull_that_lets_go_nothing_is_bonded(self):
         assert list_skulls(find_scene("brain_shift")) == ("slide", "contact")
 
-    def test_meshes_are_farther_off_where_the_brain_slides_and_the_farthest_under_weight(self):
+    def test_mesh_error_grows_with_sliding_and_weight(self):
         press, sinking = find_scene("press"), find_scene("brain_shift")
         assert build_skull(press) == "bonded" and build_skull(sinking) == "contact"
         draws = [replace(SAME, skull=share, mesh=1.0) for share in (0.1, 0.5, 0.9)]

@@ -18,7 +18,7 @@ def test_they_are_registered_once():
         assert spec.kwargs == {"task": name.lower()} and spec.max_episode_steps == 200 and name.lower() in TASKS
 
 
-def test_without_gymnasium_there_is_a_remedy_and_nothing_else_needs_it():
+def test_missing_gymnasium_gives_remedy():
     code = (
         "import sys; sys.modules['gymnasium'] = None; import scenes.cli, sim\n"
         "try:\n    import scenes.gym\nexcept sim.InputError as error:\n    print(error)"

@@ -108,7 +108,7 @@ class TestReel:
         for calls in range(1, 20):
             assert reel.towards(40)[0] == calls - 1 and ran == list(range(calls))
 
-    def test_a_long_way_goes_by_frames_between_from_wherever_is_nearest(self) -> None:
+    def test_long_jump_goes_through_frames_from_nearest(self) -> None:
         ran: list[tuple[int, int | None]] = []
         reel = FrameCache(
             50, lambda number, before: ran.append((number, before)) or number, ReplayOrder(6, back=True, kept=64)
@@ -131,7 +131,7 @@ class TestReel:
         assert list(reel.kept) == [0]
 
 
-def test_jumps_go_by_frames_between_where_the_brain_comes_off_the_skull(theatre) -> None:
+def test_jumps_use_frames_where_brain_separates(theatre) -> None:
     """And nowhere else; tissue that relaxes is answered in order."""
     box = theatre.anatomy
     sides = box.held.any(axis=1) & (box.mesh.nodes[:, 2] > box.mesh.nodes[:, 2].min() + 1e-9)
@@ -226,7 +226,7 @@ class TestPages:
         for page in pages:
             page.close()
 
-    def test_two_pages_scrub_switch_and_play_and_show_the_straight_run(self, theatre, pages, monkeypatch):
+    def test_two_pages_scrub_switch_and_play(self, theatre, pages, monkeypatch):
         scene = pages[0].stage.scene
         full = straight(theatre.player("fem", scene))
         less = straight(theatre.player("fem", remove_effect(scene, Gravity())))

@@ -85,7 +85,7 @@ def test_the_page_needs_nothing_but_itself(page, study_rows):
 
 
 @pytest.mark.parametrize("fine", [False, True])
-def test_what_has_the_reference_s_own_elements_is_off_by_its_tolerance_alone(study, fine):
+def test_reference_elements_differ_by_tolerance_only(study, fine):
     here = replace(study, fine=fine)
     said = {
         (element, mesh): describe_difference(here, FemVariant("it", element=element, mesh=mesh))
@@ -97,7 +97,7 @@ def test_what_has_the_reference_s_own_elements_is_off_by_its_tolerance_alone(stu
     assert describe_difference(here, FemVariant("it", "linear", *alone)) == DIFFERENCE
 
 
-def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, study_rows, monkeypatch, capsys):
+def test_page_is_written_and_missing_row_reported(study, study_rows, monkeypatch, capsys):
     """Everything is solved already; the rows are those found."""
     words = ["report", "--quick", "--loads", str(study.loads), "--data", str(study.data), "--out", str(study.folder)]
     words += ["--device", "cpu"]

@@ -31,7 +31,7 @@ class TestWish:
         wish.go_on(number, 3)
         return number
 
-    def test_who_seeks_is_not_overruled_by_the_frame_that_is_being_drawn(self):
+    def test_seek_is_not_overridden_by_current_frame(self):
         wish = Requests("linear", Touch())
         wish.set(number=2)
         wish.go_on(0, 3)
@@ -105,7 +105,7 @@ def refuse(monkeypatch, refused, error):
     monkeypatch.setattr(Player, "loads", refusing)
 
 
-def test_a_load_that_is_refused_is_said_on_the_page_which_goes_on(running, monkeypatch):
+def test_rejected_load_is_shown_on_the_page(running, monkeypatch):
     refuse(monkeypatch, lambda number, touch: touch and touch.force > 0.3, InputError("0.35 N is too much: push less."))
     one, other = Visitor(running.browser, 1200), Visitor(running.browser, 1200)
     assert wait_for(lambda: running.browser.visitors == 2)
@@ -127,7 +127,7 @@ def test_a_defect_is_said_in_a_line_and_playing_goes_on(demo, monkeypatch, capfd
     assert said.count("\n") == 1 and "sulcus demo: a defect: IndexError, none such (line" in said
 
 
-def test_loads_that_the_finite_elements_refuse_are_left_out_alone(theatre, scene, monkeypatch):
+def test_loads_without_fem_solution_are_left_out(theatre, scene, monkeypatch):
     refuse(monkeypatch, lambda number, touch: number == 7, InputError("7 is refused."))
     player = theatre.player("linear", scene)  # as quick to have, and asked the same way
     monkeypatch.setattr(Theatre, "player", lambda *words: player)

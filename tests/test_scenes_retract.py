@@ -25,7 +25,7 @@ class TestRetract:
         assert reads[0] == 0.0 and all(one.good or one is Outcome.OVERSTRAINED for one in outcomes)
 
     @pytest.mark.parametrize("touch", [Touch(depth=-AIR), Touch(depth=3e-3), Touch(0.0, 0.0, 0.0, (0.5, 0.0), 3e-3)])
-    def test_the_blade_is_laid_on_clear_of_the_tissue_and_moved_to_where_the_hand_is(self, theatre, touch):
+    def test_blade_is_laid_clear_of_tissue_then_moved(self, theatre, touch):
         scene, site = small("retract"), theatre.site
         cause = scene.loads(site, touch, 0.0).of(Retracted)
         apart = compute_distances(scene.tool.shape, cause.pose[0], theatre.anatomy.mesh.nodes)

@@ -57,7 +57,7 @@ np.savez(out, losses=losses, counts=[len(each) for each in sets.values()], actio
 
 
 @pytest.mark.skipif(ROBOMIMIC is None, reason="needs SULCUS_ROBOMIMIC_PYTHON, a Python with robomimic")
-def test_robomimics_own_reader_reads_what_ours_reads_and_trains_on_it(box, tmp_path):
+def test_robomimic_reader_agrees_and_trains(box, tmp_path):
     for number, (frames, family) in enumerate(((7, "press"), (9, "slide"))):
         write_episode(tmp_path / f"in/episode_{number:06d}.h5", box, Wanted(frames, 3, number, family))
     path, out = tmp_path / "set.open_hdf5", tmp_path / "read.npz"

@@ -37,7 +37,7 @@ def film(count):
     return islice(read_video(FILM / "film.mp4", 30.0, colour=True), count)
 
 
-def test_nothing_is_drawn_over_what_is_white_and_the_picture_says_how_much_that_hides(parts):
+def test_white_areas_stay_clear_and_share_is_reported(parts):
     follower, painter = parts
     (whole,) = draw_overlay(read_timed(film(1)), follower, painter)
     camera, tumour = whole.known.camera, painter.stage.tumour_at_rest

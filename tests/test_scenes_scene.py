@@ -81,7 +81,7 @@ SCENE = replace(LAID, tool=TOOL, duration=1.0, viewpoint=Viewpoint(width=160, he
 """
 
 
-def test_a_tool_of_ones_own_is_seen_as_its_own_mesh_and_touches_as_its_own_shape(folder, monkeypatch, capsys):
+def test_custom_tool_uses_its_own_mesh_and_shape(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     (folder / "own_sucker.py").write_text(SUCKER.read_text())
     (folder / "held.py").write_text(HELD_BY)
@@ -164,7 +164,7 @@ SCENE = replace(PRESS, effects=(MINE, *PRESS.effects[1:]))
 """
 
 
-def test_a_law_that_is_derived_from_a_built_in_one_is_held_to_the_same(tmp_path):
+def test_derived_law_passes_conformance(tmp_path):
     path = tmp_path / "derived.py"
     path.write_text(DERIVED)
     words = r"derived\.py: the law neo-hookean does not hold: .*stress is the energy's derivative"

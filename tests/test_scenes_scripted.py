@@ -12,7 +12,7 @@ from scenes.gym.tasks import PALPATE
 from sim.errors import InputError
 
 
-def test_the_scripted_policy_palpates_and_pushing_on_ends_at_the_limit():
+def test_scripted_policy_palpates_until_limit():
     rows = played(made(), 3, 60)
     truth = rows[-1][2]
     assert truth["success"] and truth["violations"] == 0 and abs(truth["reached"] / truth["asked"] - 1.0) < 0.15
@@ -29,7 +29,7 @@ def test_the_scripted_policy_palpates_and_pushing_on_ends_at_the_limit():
         environment.unwrapped.step(DOWN)
 
 
-def test_an_episode_is_drawn_by_itself_and_each_value_by_its_name():
+def test_episode_sampling_depends_on_seed_and_name_only():
     plain, more = plan_from(TINY, "a"), plan_from(f"{TINY}tool_deg = [0, 1]\n[hand]\ntremor_mm = [0, 1]\n", "b")
     first, again = sample_episode(plain.contents, 4, 7), sample_episode(plain.contents, 4, 7)
     assert first == again and choose_body(plain, 4, 7) == first.body

@@ -101,7 +101,7 @@ def test_known_motions_are_those_of_the_known_forces(found):
     assert whole.motion.largest_mm == pytest.approx(whole.force.largest_mm, rel=1e-6)
 
 
-def test_a_softer_tumour_moves_more_and_so_it_does_the_less_the_skull_holds(found):
+def test_softer_tumour_and_freer_skull_move_more(found):
     motion = [found["tumour's stiffness", now].force.motion for now in ("0.5 x", "2 x", "3 x")]
     assert motion[0] > 1.0 > motion[1] > motion[2]
     assert 1.0 < found["skull", "slide"].force.motion < found["skull", "contact"].force.motion

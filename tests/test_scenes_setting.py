@@ -36,7 +36,7 @@ def test_a_reward_is_a_difference_of_potentials_and_its_limits():
     )
 
 
-def test_the_goal_follows_the_tumour_and_its_middle_is_of_what_is_left(boxed):
+def test_debulk_goal_tracks_remaining_tumour(boxed):
     environment = made("Debulk", anatomy=boxed)
     rows = played(environment, 0, 120, "debulk")
     setting = environment.unwrapped.episode.setting

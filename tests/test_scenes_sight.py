@@ -212,7 +212,7 @@ def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
     assert not any(line.startswith("lines: ") for line in said)
 
 
-def test_a_visitor_reads_number_and_errors_before_what_explains_them(play, frames):
+def test_numbers_and_errors_come_before_explanations(play, frames):
     words = report(frames[1], play.stage, "fem", "", (), 100)
     order = "by the estimate (truly", "solved to its tolerance", "Error of the tumour", "<b>estimate</b> from", "frame "
     places = [words.index(each) for each in order]
@@ -252,7 +252,7 @@ def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
     assert "sulcus train" not in said and "is the truth, as finite elements have it" in said
 
 
-def test_a_locator_that_knows_other_regions_than_the_scene_is_refused(theatre, scene):
+def test_locator_of_other_regions_is_rejected(theatre, scene):
     other = replace(theatre)
     other.__dict__["locator"] = replace(theatre.locator, regions=(Region(PART_LABELS["oedema"], 0.5),))
     with pytest.raises(InputError, match=r"another stiffness of region 3 \(oedema\) than the scene has"):

@@ -29,7 +29,7 @@ def site(tmp_path_factory):
     return site_of(read_anatomy(folder / "long.vtu"))
 
 
-def test_the_opening_is_where_it_was_asked_for_and_its_axis_points_inwards(site):
+def test_craniotomy_axis_points_inwards_at_request(site):
     middle = site.anatomy.mesh.nodes.mean(axis=0)
     assert np.linalg.norm(site.origin - 1e-3 * np.array([-42.0, 18.0, 12.0])) < 6e-3
     assert site.axis @ (middle - site.origin) > 0.02 and site.axis[0] > 0.9
@@ -37,7 +37,7 @@ def test_the_opening_is_where_it_was_asked_for_and_its_axis_points_inwards(site)
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_each_scene_touches_the_open_cortex_of_another_head_from_outside(name, site):
+def test_scenes_touch_open_cortex_of_another_head(name, site):
     scene, cortex = find_scene(name), site.anatomy.mesh.nodes[site.anatomy.open_surface]
     check_causes(scene.get_effects_on(site.anatomy), scene.loads(site, scene.path(0.0), 0.0))
     stage = Stage(scene, site)

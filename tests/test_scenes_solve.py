@@ -213,7 +213,7 @@ def test_single_precision(solve) -> None:
     assert np.linalg.norm(run.displacement - exact.displacement) < 1e-3 * np.linalg.norm(exact.displacement)
 
 
-def test_what_has_no_equilibrium_exits_with_one_and_writes_a_finite_state(solve) -> None:
+def test_missing_equilibrium_exits_1_with_finite_state(solve) -> None:
     """The top is pressed through the base: the logarithmic law has no such state."""
     mesh = box((1, 1, 1), 0.1)
     top = mesh.nodes[:, 2] > 0.05

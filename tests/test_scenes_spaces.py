@@ -121,7 +121,7 @@ def test_fields_lead_there_and_back(folder):
     assert header["space"] == "left-posterior-superior" and header["space units"] == ["mm"] * 3
 
 
-def test_surfaces_points_and_segments_are_where_the_tumour_is_now(folder):
+def test_surfaces_points_and_segments_follow_tumour(folder):
     warp, now = folder / "warp", TUMOUR + SHIFT
     near(LPS * trimesh.load(warp / "tumour.stl").center_mass, now)
     assert b"SPACE=LPS" in (warp / "tumour.stl").read_bytes()[:80]

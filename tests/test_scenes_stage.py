@@ -25,7 +25,7 @@ def seen(values, scene=None):
     return picture
 
 
-def test_the_cortex_has_the_same_colours_whatever_the_scanner_wrote():
+def test_cortex_colours_are_independent_of_scan_scale():
     grey = template_theatre().intensity.values.astype(np.float64)
     brain = grey[grey > 0.0]
     usual = seen(grey)
@@ -57,7 +57,7 @@ def test_a_scan_of_one_value_gives_one_colour_and_no_folds():
     assert shares.std() < 0.03
 
 
-def test_a_round_field_is_dark_beyond_its_rim_and_changes_nothing_else():
+def test_round_field_darkens_only_beyond_its_edge():
     grey = template_theatre().intensity.values
     whole, field = seen(grey), add_vignette(seen(grey), 1.0)
     row, column = np.mgrid[:240, :320]

@@ -181,7 +181,7 @@ class TestRefusals:
                 StereoSight(**wrong)
 
 
-def test_the_tumour_is_located_from_pictures_and_a_blind_eye_is_drawn_as_refused(observer, moved):
+def test_tumour_is_located_and_blind_eye_is_rejected(observer, moved):
     found = observer.estimate(30, moved)
     assert found.held and found.off < 0.6 * np.linalg.norm(found.true) and found.location.calibrated
     stage = replace(observer.stage, observer=replace(observer, sight=replace(EXACT, darker=0.999)))

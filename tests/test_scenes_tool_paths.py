@@ -57,7 +57,7 @@ class TestPaths:
         held = motion[np.linspace(0.0, 2.5, 251) >= 1.5]
         assert np.allclose(held[:, 2], 0.3) and np.allclose(held[:, 3], 0.6)
 
-    def test_a_tool_is_laid_on_from_the_air_tilted_towards_x_and_stays(self):
+    def test_laid_tool_tilts_towards_x_and_stays(self):
         path = lay(3e-3, tilt=0.4, rise=1.0, at=(0.002, -0.001))
         assert path(-1.0).depth == path(0.0).depth == -AIR and path(0.5).depth == pytest.approx(0.5 * (3e-3 - AIR))
         for time in (1.0, 5.0):

@@ -9,7 +9,7 @@ from scenes.cli import main
 from scenes.commands.train import list_notes
 
 
-def test_training_says_what_takes_long_and_what_too_few_loads_cannot_give():
+def test_training_notes_slow_parts_and_too_few_loads():
     few, many = (SimpleNamespace(good=np.ones(count, bool)) for count in (20, 76))
     series, bounds = list_notes(few, ["linear", "series-gp"])
     assert "minutes on a CPU" in series and "of 20 loads 5 are kept" in bounds and "--count 76" in bounds

@@ -92,7 +92,7 @@ class TestEnsemble:
             lengths = [np.linalg.norm(field, axis=1).mean() for field in (theirs, ours)]
             assert lengths[1] > 1e-5 and lengths[0] / lengths[1] == pytest.approx(times, rel=0.12)
 
-    def test_registration_and_segmentation_add_to_what_the_model_is_off_by(self):
+    def test_registration_and_segmentation_add_to_model_error(self):
         off = np.array([[[3.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
         normals = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         shift, wide = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), np.array([0.5, 0.0])
@@ -142,7 +142,7 @@ class TestEnsemble:
         with pytest.raises(InputError, match="1 of 300 synthetic patients"):
             coverage(scene, still, found, twins, [*answers(twins)[:1], *[None] * 299], 1)
 
-    def test_draws_without_equilibrium_are_counted_and_too_many_refused(self, theatre):
+    def test_draws_without_equilibrium_are_counted(self, theatre):
         field = np.ones((9, 3))
         still, draws = SurfaceMotions((0.0,), (field,), (field,)), sample_priors(10, 0)
         answers = [SolvedMotions((field,), inverted) for inverted in [0, 0, 5, 1, 0, 0, 0, 0, 0]]
@@ -152,7 +152,7 @@ class TestEnsemble:
             estimate_uncertainty(theatre, short(), still, draws, [*answers[:7], None, None, None])
 
     @pytest.mark.parametrize(("failing", "asked"), [((), 5), ((1,), 9), ((1, 3), 4)])
-    def test_a_moment_that_is_not_reached_at_once_is_by_way_of_times_between(self, theatre, failing, asked):
+    def test_unreachable_time_is_reached_by_substeps(self, theatre, failing, asked):
         """After a call that failed the solver is asked again from the moment before; failing again is no answer."""
         hasty = Hasty(theatre, failing)
         found, whole = solve_scene(hasty, short()), solve_scene(theatre, short())
@@ -165,7 +165,7 @@ class TestEnsemble:
         if failing:
             assert hasty.starts[1] is hasty.starts[2] is not None
 
-    def test_a_force_beyond_the_law_turns_tetrahedra_inside_out_and_is_counted(self, theatre):
+    def test_excessive_force_counts_inverted_tetrahedra(self, theatre):
         """The scene itself turns none; at a tenth of its stiffness some are."""
         weak = solve_scene(theatre, apply_sample(short(), replace(SAME, stiffness=0.1)))
         assert solve_scene(theatre, short()).inverted == 0 and weak is not None and weak.inverted > 0
@@ -205,7 +205,7 @@ class TestStored:
         )  # fmt: skip
         assert [knowing.uncertainty(other) for other in others] == [None] * 5
 
-    def test_between_moments_it_goes_in_proportion_and_a_model_adds_its_own(self, theatre):
+    def test_error_interpolates_between_moments_plus_model(self, theatre):
         found = stated(short(), theatre)
         for time, most, largest in ((0.0, 2e-3, "registration"), (0.15, 3.5e-3, "E")):
             error = found.at(time)

@@ -29,7 +29,7 @@ def test_the_command_names_broken_files_and_ends_with_one(whole, tmp_path, capsy
     assert main(["validate", str(whole), "--workers", "0"]) == 2
 
 
-def test_figures_are_of_whole_episodes_and_what_the_card_names_is_missed(box, tmp_path, capsys):
+def test_statistics_cover_whole_episodes_and_name_missing(box, tmp_path, capsys):
     for number in range(3):
         write_episode(tmp_path / f"episode_00000{number}.h5", box, Wanted(4 + number, every=1))
     with h5py.File(tmp_path / "episode_000000.h5", "a") as file:

@@ -39,7 +39,7 @@ def centroids(image, near):
 
 
 @pytest.mark.parametrize("kind", GRIDS)
-def test_simpleitk_lands_landmarks_where_the_finite_elements_have_them(kind, warp_folder, warp_out, middles):
+def test_simpleitk_landmarks_match_fem(kind, warp_folder, warp_out, middles):
     field = sitk.ReadImage(str(warp_out / "field_resampling.nii.gz"), sitk.sitkVectorFloat64)
     transform = sitk.DisplacementFieldTransform(field)
     scan = sitk.ReadImage(str(warp_folder / f"{kind}.nii.gz"))

@@ -99,7 +99,7 @@ def test_a_body_that_is_cut_shared_by_threads() -> None:
         same(theirs, own)
 
 
-def test_what_an_answer_left_on_the_device_is_its_own_while_others_answer() -> None:
+def test_device_results_survive_later_solves() -> None:
     """Frame after frame, each thread on its own way; what is warm is read after others have moved on."""
     fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), LIVE, "cpu", element="p1")
     fem.strategy = replace(fem.strategy, plan=replace(fem.plan, frames=True))

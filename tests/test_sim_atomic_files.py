@@ -48,7 +48,7 @@ class TestWriting:
         assert sorted(tmp_path.iterdir()) == sorted([path, living, other])
 
     @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no such file system")
-    def test_a_folder_that_takes_no_files_is_reported_before_the_work(self) -> None:
+    def test_read_only_folder_is_reported_before_work(self) -> None:
         with pytest.raises(InputError, match=r"cannot be written there \(No such file or directory\)"):
             check_output("/proc/a.txt", ".txt")
 

@@ -107,7 +107,7 @@ def test_the_condensed_surroundings_are_the_schur_complement() -> None:
     np.testing.assert_allclose(around.follow, moved[:, around.rows], atol=1e-5)
 
 
-def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves() -> None:
+def test_batch_solver_passes_on_unconverged_columns() -> None:
     anatomy, space = body()
     effects = (Elasticity(tissue("stable-neo-hookean")), *EFFECTS)
     fem, without = (

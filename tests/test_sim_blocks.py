@@ -13,7 +13,7 @@ ON_A_CARD = pytest.param(
 
 
 @pytest.mark.parametrize("name", ["cpu", ON_A_CARD])
-def test_every_thread_has_the_sum_the_largest_and_what_lies_before_it(name: str) -> None:
+def test_block_scan_returns_sum_maximum_and_prefix(name: str) -> None:
     device, count = Device(name, "float64"), 3
     threads = int(np.prod(get_block_shape(device)))
 

@@ -215,7 +215,7 @@ def test_a_footprint_that_is_held_cannot_be_moved() -> None:
         fem.deform(Loads((Displaced(POINT[:1], MOTION[:1], RADIUS[:1]),)))
 
 
-def test_a_footprint_that_only_slides_cannot_be_moved_off_its_plane() -> None:
+def test_sliding_footprint_cannot_leave_its_plane() -> None:
     anatomy = hold(MESH, BASE, np.where(TOP[:, None], [0.0, 0.0, 1.0], 0.0))
     fem = Fem(anatomy, [SOFT, Held(), Slide(), ToolDisplacement()], TIGHT, "cpu", element="p1")
     with pytest.raises(InputError, match="held"):

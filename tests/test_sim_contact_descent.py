@@ -145,7 +145,7 @@ def test_columns_are_what_the_preconditioner_does() -> None:
     np.testing.assert_allclose(soft.moved(force), expected[soft.rows], atol=1e-6 * size)
 
 
-def test_columns_are_the_same_bits_in_whatever_order_they_are_made() -> None:
+def test_columns_are_bit_identical_in_any_order() -> None:
     fem, descent = parts()
     nodes, preconditioner = descent.barrier.touchable, cast(Preconditioner, Rough(fem.strategy.preconditioner, 0.0))
     assert len(nodes) > 3 * Columns().block
@@ -199,7 +199,7 @@ def test_what_is_touched_is_known_to_the_preconditioner() -> None:
     assert missed(preconditioner) > 1.0
 
 
-def test_a_tool_beside_a_skull_is_known_to_the_preconditioner_too() -> None:
+def test_contact_preconditioner_includes_skull() -> None:
     """The answer is the same, in fewer linear iterations."""
     mesh, down = box((12, 12, 6), SIDE), at(0.031, 0.028, HEIGHT - 5e-3)
     wall = np.where((mesh.nodes[:, :1] > SIDE - 1e-9) & (mesh.nodes[:, 2:] > 1e-9), [1.0, 0.0, 0.0], 0.0)

@@ -139,7 +139,7 @@ def test_body_and_tools_moved_together_bear_the_same() -> None:
         np.testing.assert_allclose(seen.reaction[0, :, part], expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_turning_a_tool_about_its_own_axis_of_symmetry_is_nothing() -> None:
+def test_rotation_about_symmetry_axis_has_no_effect() -> None:
     spun = BESIDE @ at(0.0, 0.0, 0.0, turn=Rotation.from_rotvec([0.0, 0.0, 1.3]).as_matrix())
     for tool in (BALL, ROD):
         one, other = body((tool,)).deform(touching(BESIDE)), body((tool,)).deform(touching(spun))

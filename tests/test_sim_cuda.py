@@ -189,7 +189,7 @@ def test_block_jacobi_reaches_what_the_inverse_reaches(box):
     np.testing.assert_allclose(plain.deform(pushes()).displacement, reference, atol=1e-6 * np.abs(reference).max())
 
 
-def test_a_near_part_is_solved_by_itself_and_the_batch_ends_where_the_whole_does():
+def test_local_part_is_solved_alone_with_same_result():
     """More columns than one room has, so that rooms change."""
     anatomy = read_anatomy(template_path())
     effects, loads = (Elasticity(), Held(), Slide(), ToolForce()), draw("mixed", anatomy, 150, 3)

@@ -12,7 +12,7 @@ import warp as wp
 from sim.runtime.device import Device, forward_kernel
 
 
-def test_a_kernel_that_threads_launch_at_once_is_compiled_by_one_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_concurrent_kernel_is_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
     inside, most = [], []
     load = wp.load_module
 

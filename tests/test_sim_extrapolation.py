@@ -64,7 +64,7 @@ def test_a_tool_that_stood_still_or_was_lifted_tells_no_way():
         assert share_of(*loads) == 0.0
 
 
-def test_the_start_lies_on_the_line_through_two_answers_for_each_load_by_itself():
+def test_extrapolation_follows_line_per_load():
     last, before = np.random.default_rng(0).normal(size=(2, 12, 2))
     pushes = np.stack([np.concatenate([build_row(pushed(x)) for x in (1e-3, 0.0)]).reshape(2, 7)] * 2)
     warm = {PUSHES: pushes, BEFORE: before.T}
@@ -75,7 +75,7 @@ def test_the_start_lies_on_the_line_through_two_answers_for_each_load_by_itself(
     assert extrapolate_start(loads, last, warm | {BEFORE: before.T[:, :9]}) is last  # another element's
 
 
-def test_frames_of_a_moving_tool_take_fewer_steps_to_the_same_answers(body):
+def test_moving_tool_frames_converge_in_fewer_steps(body):
     fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     exact = Fem(body, EFFECTS, replace(LIVE, tolerance=1e-4), "cpu", element="p1")
     steps, last, plain = np.zeros(2, int), None, None

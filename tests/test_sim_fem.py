@@ -313,7 +313,7 @@ def test_a_hopeless_case_returns_its_last_accepted_state(law: str) -> None:
     assert found.reached[1] == 1.0
 
 
-def test_a_load_that_is_too_large_stops_at_the_share_that_has_an_equilibrium() -> None:
+def test_too_large_load_stops_at_reachable_share() -> None:
     """The top is pressed through the base: under the share that was reached an independent residual vanishes."""
     mesh = box((2, 2, 2), 0.1)
     top = mesh.nodes[:, 2] > 0.1 - 1e-9

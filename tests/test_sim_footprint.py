@@ -78,7 +78,7 @@ def test_a_small_tool_on_large_triangles() -> None:
     np.testing.assert_allclose(weight, [0.5, 0.3, 0.2, 0.0], atol=2e-3)
 
 
-def test_what_was_pressed_last_is_kept_for_the_same_place_and_radius_alone() -> None:
+def test_last_press_is_kept_for_same_place_and_radius() -> None:
     nodes, triangles = sheet(300)
     skin = ContactSurface(nodes, triangles, find_device("cpu", "float64"))
     for point, radius in ((POINT, RADIUS), (POINT, 0.5 * RADIUS), (-POINT, 0.5 * RADIUS), (POINT, RADIUS)):
@@ -110,7 +110,7 @@ def test_a_point_off_the_surface_is_refused(offset: list[float]) -> None:
 
 
 @pytest.mark.parametrize("radius", [1e-12, 1e-300])
-def test_a_footprint_too_small_for_the_triangles_is_refused_at_once(radius: float) -> None:
+def test_too_small_footprint_is_rejected(radius: float) -> None:
     """It would be cut into more pieces than there are whole numbers."""
     with pytest.raises(InputError, match="too small for the triangles of this surface: give a radius of at least"):
         weights(*sheet(30), radius=radius)
@@ -173,7 +173,7 @@ def test_quadratic_triangles_against_a_sum_over_the_disc() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 30, 300])
-def test_quadratic_triangles_take_over_force_moment_and_second_moments(count: int) -> None:
+def test_quadratic_footprint_preserves_moments(count: int) -> None:
     """Quadratic functions are integrated exactly on any mesh: linear triangles have the first two alone."""
     nodes, triangles = quadratic_sheet(count)
     weight = weights(nodes, triangles)

@@ -145,7 +145,7 @@ def test_vertices_are_picked_from_the_same_answer(fem):
     np.testing.assert_array_equal(picked.displacement, fem.deform(pushed(5e-3), last).displacement[:, some])
 
 
-def test_a_body_of_another_element_or_a_small_budget_is_not_followed():
+def test_frame_sequence_requires_linear_elements_and_budget():
     linear, quadratic = (discretise(BODY.mesh, element) for element in ("p1", "p2"))
     assert can_follow(linear, LIVE) and FRAME_EVALUATIONS > 20
     assert not can_follow(linear, replace(LIVE, outer=5)) and not can_follow(quadratic, LIVE)

@@ -72,7 +72,7 @@ def test_both_fields_lead_each_vertex_where_it_goes(box, moved, fields):
     assert np.quantile(error, 0.98) < 0.04e-3 and error[:, inner].max() < 0.05e-3
 
 
-def test_what_is_too_faint_to_count_is_left_and_the_grid_need_not_hold_it(box, moved, fields):
+def test_faint_motion_is_cut_and_grid_may_omit_it(box, moved, fields):
     rest = warp_fields(box, 1e-3 * moved, 1e-3)
     faint = compute_faint_threshold(moved)
     assert compute_faint_threshold(1e-3 * moved) == pytest.approx(2.5e-6 * np.linalg.norm(moved, axis=1).max())
@@ -86,7 +86,7 @@ def test_what_is_too_faint_to_count_is_left_and_the_grid_need_not_hold_it(box, m
     assert half.shape[0] < fields.grid.shape[0]
 
 
-def test_nothing_folds_and_least_jacobians_are_those_of_the_fields(fields):
+def test_fields_do_not_fold_and_jacobians_match(fields):
     assert not fields.folds and min(fields.least) > 0.5
     for field, least in ((fields.forward, fields.least[0]), (fields.backward, fields.least[1])):
         gradient = np.stack(np.gradient(field.astype(float), fields.grid.spacing, axis=(1, 2, 3)), axis=-1)

@@ -68,7 +68,7 @@ def skull(tmp_path, monkeypatch):
     return path
 
 
-def test_fsaverage_is_what_its_inner_skull_holds_at_the_size_asked_for(skull, tmp_path, capsys):
+def test_fsaverage_has_its_inner_skull_and_size(skull, tmp_path, capsys):
     words = ("--head", "fsaverage", "--brain-ml", 1300, "--nodes", 2000, "--cover", 8, "--json")
     code, text, _ = run(capsys, *words, "--out", tmp_path / "fs.vtu")
     summary = json.loads(text)
@@ -134,7 +134,7 @@ def masked(tmp_path):
     return tmp_path
 
 
-def test_a_tumour_is_drawn_in_a_mask_where_the_site_is_and_t1_goes_with_it(masked, capsys):
+def test_tumour_is_drawn_in_mask_with_t1(masked, capsys):
     words = ("--mask", masked / "brain.nii.gz", "--t1", masked / "t1.nii.gz", "--nodes", 2000, "--radius", 10, "--json")
     code, text, noted = run(capsys, *words, "--out", masked / "own.vtu")
     own = json.loads(text)

@@ -8,7 +8,7 @@ from sim.errors import InputError
 from sim.runtime.journal import HEAD, DamageWarning, open_journal, run_of
 
 
-def test_records_of_another_run_are_not_taken_up_where_its_beginning_is_damaged(tmp_path):
+def test_damaged_journal_header_discards_records(tmp_path):
     """Their own run still finds them: only its beginning is lost."""
     path, batch = tmp_path / "data.h5.partial", ("answers", 0)
     with open_journal(path, {"seed": "0"}) as journal:

@@ -123,7 +123,7 @@ def test_labels_that_cannot_be_used(tmp_path, brain, tumour, reason):
         volume_subject(path, brain, tumour)
 
 
-def test_labels_of_no_meaning_are_named_and_most_of_a_tumour_is_not_left_out(tmp_path):
+def test_unknown_labels_are_named_and_tumour_kept(tmp_path):
     """Oedema that nobody named, 5, is the brain's upper half; in the lower one is a small piece of the tumour."""
     affine, places = grid(AFFINES["thick slices"])
     labels = np.where(ellipsoid(places), np.where(places[..., 2] > MIDDLE[2], 5, 1), 0)
@@ -263,7 +263,7 @@ def with_plates(path, count):
     return save(path, labels, affine)
 
 
-def test_pieces_that_vanish_are_named_and_the_others_keep_their_volume(tmp_path, capsys):
+def test_lost_pieces_are_named_and_others_keep_volume(tmp_path, capsys):
     path = with_plates(tmp_path / "l.nii", 1)
     words = ["anatomy", "--labels", str(path), "--brain", "1", "--tumour", "3", "--nodes", "3000", "--json"]
     assert main([*words, "--craniotomy", "30", "--out", str(tmp_path / "a.vtu")]) == 0

@@ -102,7 +102,7 @@ def test_it_ends_where_newton_does(device: Device, law: str) -> None:
     np.testing.assert_allclose(found.residual[:-1], free[:-1] / scale[:-1], rtol=1e-4, atol=1e-15)
 
 
-def test_hookes_law_is_solved_by_the_first_step_and_no_load_by_none(device: Device) -> None:
+def test_linear_law_converges_in_one_step_and_none(device: Device) -> None:
     found = descended(read_problem(device, "linear"))
     np.testing.assert_array_equal(found.steps, [1, 1, 1, 1, 1, 0])
     assert not found.u.numpy()[:, -1].any()

@@ -157,7 +157,7 @@ def test_search_does_not_move_what_it_is_given(problem: Problem) -> None:
     np.testing.assert_array_equal(direction.d.numpy(), before)
 
 
-def test_a_radius_bounds_the_solution_in_the_preconditioners_norm(problem: Problem) -> None:
+def test_radius_bounds_solution_in_preconditioner_norm(problem: Problem) -> None:
     """Half of what the whole solution takes, and less where the curvature is negative; a large one changes nothing."""
     K, r = dense(problem, 1e-2 * CRUSHED), compute_right_hand_side(problem)
     rest, solver = dense(problem, REST), build_rest_solver(problem)

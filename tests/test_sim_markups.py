@@ -10,7 +10,7 @@ from surrogate.locating.observed_files import read_observation
 
 
 @pytest.mark.parametrize("system", ["LPS", "RAS", None])
-def test_coordinates_are_of_the_system_that_is_stated_or_else_of_slicers(tmp_path, system):
+def test_coordinates_use_stated_system_or_slicers(tmp_path, system):
     found = read_markup(markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0], [1.0, 2.0, 3.0]], "Line", system))
     np.testing.assert_allclose(found.points, [[0.01, 0.02, 0.03], [0.001, 0.002, 0.003]])
 

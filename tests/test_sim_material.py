@@ -86,7 +86,7 @@ def test_a_tissue_written_is_the_tissue_read(tissue: Tissue) -> None:
 
 
 @pytest.mark.parametrize("name", MATERIALS)
-def test_named_tissues_say_when_they_hold_and_where_they_come_from(name: str) -> None:
+def test_named_tissues_report_range_and_source(name: str) -> None:
     known = MATERIALS[name]
     assert any(word in known.time_scale for word in ("second", "minutes", "hours", "no fluid leaves"))
     assert len(known.source) > 20
@@ -137,7 +137,7 @@ def test_series_that_no_tissue_has(law: str, series: tuple, words: str) -> None:
             Ogden(((1000.0, 2.0),), 1e4, series)
 
 
-def test_the_named_relaxing_tissue_keeps_a_fifth_of_its_stiffness() -> None:
+def test_relaxing_tissue_keeps_a_fifth_of_stiffness() -> None:
     named = MATERIALS["viscoelastic"].tissue
     assert named.lame[0] == pytest.approx(842.0)
     assert named.lame[1] / (2.0 * (named.lame[0] + named.lame[1])) == pytest.approx(0.49)

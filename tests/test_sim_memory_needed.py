@@ -19,7 +19,7 @@ SPACE = discretise(box((6, 6, 6)), "smoothed")
 TABLES = FIXED + PER_NODE["smoothed"] * SPACE.count
 
 
-def test_what_a_card_must_have_is_the_tables_the_inverse_and_the_loads() -> None:
+def test_gpu_memory_is_tables_inverse_and_loads() -> None:
     """An inverse takes half its square in double precision at first, and is kept in half precision."""
     rows, free = 3 * SPACE.count, 2**40
     one = compute_needed(SPACE, CARD, 0, 1, 5, free)
@@ -36,7 +36,7 @@ def test_what_a_card_must_have_is_the_tables_the_inverse_and_the_loads() -> None
     assert wide.column == 2 * one.column and wide.kept - FIXED == 2 * (one.kept - FIXED)
 
 
-def test_what_does_not_fit_on_a_card_is_refused_with_the_batch_that_does() -> None:
+def test_gpu_overflow_is_rejected_with_fitting_batch() -> None:
     free = 2 * FIXED
     fits = compute_needed(SPACE, CARD, 0, None, 10**6, free).demand()
     assert fits.peak <= 0.9 * free and fits.batch > 100

@@ -39,7 +39,7 @@ def test_smallest_sine_is_that_of_the_dihedral_angles(body):
     assert (compute_smallest_sines(body.nodes[body.tets[:, [0, 1, 3, 2]]]) < 0.0).all()
 
 
-def test_fitting_brings_the_surface_nearer_and_encloses_the_volume(body):
+def test_surface_fit_reduces_distance_at_same_volume(body):
     triangles = find_single_faces(body.tets)
     movable = np.ones(len(body.nodes), bool)
     volume = 4 / 3 * np.pi * RADIUS**3
@@ -77,7 +77,7 @@ def test_where_a_field_is_flat_nodes_do_not_fly_away():
     np.testing.assert_allclose(steep[:, 0], 0.0, atol=1e-9)
 
 
-def test_bad_angles_improve_and_surface_nodes_stay_on_the_surface(body):
+def test_smoothing_improves_angles_on_the_surface(body):
     rng = np.random.default_rng(1)
     surface = np.zeros(len(body.nodes), bool)
     surface[find_single_faces(body.tets)] = True

@@ -54,7 +54,7 @@ def test_it_is_the_inverse_over_the_free_motions(precision: Precision) -> None:
 
 
 @pytest.mark.parametrize("precision", EXACT)
-def test_its_compliance_at_some_rows_is_what_unit_forces_do_there(precision: Precision) -> None:
+def test_compliance_rows_match_unit_forces(precision: Precision) -> None:
     stiffness, motions = system(sliding())
     factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
     rows = np.random.default_rng(1).choice(stiffness.shape[0], 2 * STRIP + 7, replace=False)

@@ -115,7 +115,7 @@ def test_columns_that_are_done_change_nothing(kind: str) -> None:
     np.testing.assert_allclose(*answers.values(), atol=1e-4 * np.abs(answers["float64"]).max())
 
 
-def test_a_device_without_memory_is_not_taken_for_a_body_that_is_not_held():
+def test_device_out_of_memory_differs_from_free_body():
     full = RuntimeError("Failed to allocate 21322944 bytes on device 'cuda:0'")
     assert explain_no_factor(full, "cuda:0").startswith(
         "cuda:0 has too little free memory for this mesh: end what else runs"

@@ -43,7 +43,7 @@ def test_of_triangles_without_area_edges_are_closest():
     assert np.allclose(found.point, [[0.5, 0.0, 0.0], [5.0, 0.0, 0.0]])
 
 
-def test_large_and_small_triangles_at_corners_far_off_and_in_the_middle():
+def test_large_and_small_triangles_near_and_far():
     """Triangles of very different sizes, from which those that may be the closest are chosen; the others are not."""
     random = np.random.default_rng(1)
     size = 10.0 ** random.uniform(-3.0, 0.7, (80, 1, 1))

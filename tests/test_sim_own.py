@@ -71,7 +71,7 @@ class TestEffect:
         alike = answer(Elasticity(), loads=Loads((*loads.causes, Nodal(force))))
         assert np.abs(alike - tied).max() < 1e-5 * np.abs(tied).max()
 
-    def test_no_shortcut_is_taken_past_them_and_forces_of_ones_own_keep_it(self):
+    def test_custom_effects_disable_acceleration(self):
         def problem(*effects):
             return compile_problem((Elasticity(), Held(), *effects), BODY, find_device("cpu", "float64"))
 
@@ -79,7 +79,7 @@ class TestEffect:
         names = [term.name for term in problem(VEINS.Veins((5,)), ToolForce()).terms]
         assert names[-1] == "veins" and "tool force" in names
 
-    def test_an_unknown_effect_is_named_with_the_known_ones_and_the_way_to_ones_own(self):
+    def test_unknown_effect_lists_known_ones_and_extension(self):
         class Glue:
             pass
 

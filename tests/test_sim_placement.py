@@ -21,7 +21,7 @@ def cortex():
     return np.concatenate([outer, fissure])
 
 
-def test_an_opening_is_centred_on_the_nearest_cortex_that_can_be_reached(cortex):
+def test_craniotomy_is_centred_on_reachable_cortex(cortex):
     asked = np.array([-0.055, 0.02, 0.05])
     site = find_opening_at(cortex, asked)
     assert np.linalg.norm(site - asked) == pytest.approx(np.linalg.norm(cortex - asked, axis=1).min())

@@ -55,7 +55,7 @@ def test_the_table(more, one, few, many):
     assert plan.steps(WORTH, imposed=True) == (SolverStep.NEWTON,) and not plan.frames
 
 
-def test_contact_is_settled_apart_where_one_kind_of_tool_is_all_that_touches():
+def test_contact_is_solved_apart_for_one_tool_kind_only():
     assert planned(**POSED).contact is SolverStep.CONTACT and planned().contact is None
     both = (*POSED["effects"], Retraction(Spatula(12e-3, 20e-3, 1e-3)))
     assert planned(**{**POSED, "effects": both}).contact is SolverStep.NEWTON
@@ -81,7 +81,7 @@ def test_what_is_avoided_is_not_tried(avoid, steps):
 @pytest.mark.parametrize(
     ("count", "more"), [(1, {"live": True, "element": "smoothed"}), (WORTH, {}), (1, {"element": "p2"})]
 )
-def test_a_budget_of_evaluations_bounds_all_that_comes_before_newton(count, more, evaluations, monkeypatch):
+def test_evaluation_budget_bounds_work_before_newton(count, more, evaluations, monkeypatch):
     """Counted at the element's kernels, of the whole body: a local solver's part is another problem."""
     accuracy, looks = replace(TRAIN, evaluations=evaluations, outer=FEWEST, steps=0), []
     fem = Fem(BODY, PUSHED, accuracy, "cpu", **{"element": "p1", **more})

@@ -59,7 +59,7 @@ def test_cards_are_listed_and_not_mixed_with_processors(monkeypatch):
         parse_device_names("cuda:0,cpu")
 
 
-def test_every_task_is_answered_once_and_processes_end_with_the_block():
+def test_every_task_is_solved_once_and_processes_end():
     with process_pool(["cpu", "cpu"], named, "a body") as children:
         found = dict(map_unordered(children, doing, range(7)))
         assert sorted(found) == list(range(7))
@@ -102,7 +102,7 @@ def test_what_goes_wrong_names_its_device():
         run_on_each(children, doing, [1, "fail"])
 
 
-def test_what_others_had_ready_is_given_before_a_death_is_reported():
+def test_finished_results_precede_reported_death():
     """One dies and the other has its answer while nobody looks; what was not begun then is not begun."""
     given = []
     with process_pool(["cpu", "cpu"], named) as children, pytest.raises(LostError) as lost:

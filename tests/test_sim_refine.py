@@ -46,7 +46,7 @@ def test_what_holds_the_body_holds_it_still(box):
     assert near.max() < 8e-3
 
 
-def test_refined_near_opening_halves_cells_there_and_nowhere_else(box):
+def test_refinement_near_opening_halves_only_those_cells(box):
     fine = refined(box, near_opening=True)
     mesh, count = fine.mesh, len(box.mesh.nodes)
     np.testing.assert_array_equal(mesh.nodes[:count], box.mesh.nodes)
@@ -74,7 +74,7 @@ def test_fine_opening_of_a_mesh_plan_is_refined():
     assert len(fine.open_surface) == 4 * len(plain.open_surface) and fine.digest != plain.digest
 
 
-def test_what_is_held_or_slides_is_not_open_even_where_a_tool_was_let(box):
+def test_fixed_or_sliding_surface_is_not_open(box):
     everywhere = np.isin(np.arange(len(box.mesh.nodes)), box.mesh.surface)
     fine = refined(replace(box, craniotomy=everywhere))
     assert fine.craniotomy.any() and not fine.held[fine.craniotomy].any()

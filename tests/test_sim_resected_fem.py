@@ -22,7 +22,7 @@ RELAXING = Material("neo-hookean", 3000.0, 0.4, prony=((0.5, 0.2), (0.2, 5.0)))
 
 
 @pytest.mark.parametrize("element", ["p1", "p2"])
-def test_batches_after_different_steps_remember_as_each_by_itself(element: str) -> None:
+def test_batches_of_unequal_steps_keep_their_own_history(element: str) -> None:
     """What elements went through is kept case by case: another body's beside it, or another's cut, takes none away."""
     fem = finite_elements(BODY, (*EFFECTS[1:], Elasticity(RELAXING), Inertia(), STEPS), TIGHT, "cpu", element=element)
     frames = [(0, 1), (1, 1), (1, 2)]

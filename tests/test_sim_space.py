@@ -88,7 +88,7 @@ def sliding() -> tuple[Discretisation, np.ndarray, np.ndarray, np.ndarray]:
     return space, held, normal, space.sliding(normal, held, FACING)
 
 
-def test_an_added_node_slides_along_the_triangles_that_meet_there() -> None:
+def test_added_node_slides_along_adjacent_triangles() -> None:
     """Brute force over edges: along all of them where they face as its ends do, else along those of the wall."""
     space, held, normal, found = sliding()
     np.testing.assert_array_equal(found[: len(normal)], normal)

@@ -5,7 +5,7 @@ import numpy as np
 from sim.strategy.stepping import Shares
 
 
-def test_a_good_step_grows_and_a_failed_one_is_cut_and_begins_from_the_wider_gap_that_is_asked():
+def test_step_size_grows_on_success_and_shrinks_on_failure():
     shares, rows, good = Shares.at_rest(0.25, np.ones(2)), np.arange(2), np.array([True, False])
     aim, _ = shares.propose_shares(rows)
     shares.take(rows, aim, good)

@@ -77,7 +77,7 @@ def stiffer(fem: Fem, u: wp.array, column: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("element", "tissue"), [("p1", "plain"), ("smoothed", "plain"), ("p1", "relaxing")])
-def test_what_is_added_is_what_the_curvature_is_more_than_at_rest(element: str, tissue: str) -> None:
+def test_added_curvature_is_excess_over_rest(element: str, tissue: str) -> None:
     """Of all elements, whatever their number of nodes and points, and of some columns alone."""
     fem, _ = solver(element, tissue)
     problem, count = fem.problem, fem.space.count
@@ -181,7 +181,7 @@ def test_columns_of_different_widths_go_together() -> None:
     assert both.bent.tolist() == [True, False] and not both.own[1].any()
 
 
-def test_there_is_no_model_where_it_would_be_right_in_patches_only() -> None:
+def test_model_is_absent_where_valid_only_in_patches() -> None:
     """Where its room leaves out tissue that is strained far more than what counts as strained."""
     fem, descent = solver()
     u, few = bent(fem.problem, 4e-4), StrainLimits(least=0.08, nodes=5, cut=0.1)

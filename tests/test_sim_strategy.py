@@ -108,7 +108,7 @@ def test_a_start_that_leads_inside_out_is_not_followed() -> None:
     assert found.inverted[0] == 0
 
 
-def test_from_rest_what_lies_inside_out_is_the_loads_doing_and_counted() -> None:
+def test_inverted_elements_from_rest_are_counted() -> None:
     """A brutal push: an equilibrium of the law, but no tissue's."""
     load, free = loads(np.array([[0.0, 0.0, -20.0]])), fem(replace(ACCURACY, limit_strain=False))
     found = free.deform(load)
@@ -120,7 +120,7 @@ def test_from_rest_what_lies_inside_out_is_the_loads_doing_and_counted() -> None
 
 
 @pytest.mark.parametrize(("law", "followed"), [("neo-hookean", True), ("stable-neo-hookean", False)])
-def test_single_tetrahedra_that_averages_leave_inside_out_are_followed(law: str, followed: bool) -> None:
+def test_inverted_single_tetrahedra_are_tracked(law: str, followed: bool) -> None:
     """Where the law is infinite before an average turns over: a deep press turns some, from wherever it is solved."""
     effects = (Elasticity(tissue(law)), *openings.EFFECTS)
     deep = 8.0 * np.array([[0.2, 0.1, -1.0]])

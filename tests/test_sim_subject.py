@@ -106,7 +106,7 @@ def test_what_is_fitted_without_folds_is_left_as_it_is(tmp_path, monkeypatch):
     assert len(make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)).mesh.nodes)
 
 
-def test_a_mesh_that_misses_much_of_the_tumour_is_refused_with_how_many_nodes_would_do(tmp_path):
+def test_mesh_without_tumour_detail_names_needed_nodes(tmp_path):
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], rough_tumour(0.6, 2.0))
     subject, plan = volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)
     with pytest.raises(InputError, match="too intricate for 2000 nodes: ask for") as caught:

@@ -40,7 +40,7 @@ def effects(strength):
 
 
 @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
-def test_what_bears_too_much_lets_go_and_nothing_passes_the_skull(slab, element):
+def test_overloaded_bonds_release_outside_the_skull(slab, element):
     loads = lifted(slab, 0.05)
     whole = Fem(slab, effects(1e3), REFERENCE, "cpu", element=element).deform(loads)
     strength = 1e3 * 0.8 * float(whole.bond[0])

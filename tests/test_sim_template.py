@@ -83,7 +83,7 @@ def test_the_cap_lies_as_deep_as_asked():
         assert subject.brain(subject.site[None])[0] == pytest.approx(0.0, abs=5e-5)
 
 
-def test_a_tumour_lies_where_it_is_put_and_the_skull_is_opened_over_it():
+def test_tumour_and_craniotomy_are_where_requested():
     subject = template_subject(Tumour(middle=(-0.030, 0.010, 0.040), radius=0.010))
     np.testing.assert_array_equal(subject.tumour.middle, [-0.030, 0.010, 0.040])
     assert [piece.volume for piece in subject.pieces] == [subject.tumour_volume]
@@ -127,7 +127,7 @@ def test_the_boundary_is_stem_skull_and_craniotomy(subject, anatomy):
     ).mean() > 0.95
 
 
-def test_the_skull_s_normals_are_the_integral_of_the_gradient_of_each_shape_function(anatomy):
+def test_skull_normals_integrate_shape_gradients(anatomy):
     """Summed over the volume: linear shape functions, whose gradient is the same in a whole tetrahedron."""
     mesh, skull = anatomy.mesh, anatomy.slide_normal.any(axis=1)
     a, *others = np.moveaxis(mesh.nodes[mesh.tets], 1, 0)

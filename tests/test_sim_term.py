@@ -223,7 +223,7 @@ def test_linearisation_does_not_follow_the_state(term: Term, example: Example, d
 
 @pytest.mark.parametrize("law", LOGARITHMIC)
 @pytest.mark.parametrize("size", [1e-3, 1e-2, 0.1, 10.0])
-def test_steps_of_the_logarithmic_laws_keep_a_tenth_of_every_volume(law: str, device: Device, size: float) -> None:
+def test_log_law_steps_keep_a_tenth_of_volume(law: str, device: Device, size: float) -> None:
     """At every point of the way; and twice the step would not, so that nothing is given away."""
     example = EXAMPLES[law]
     term = example.build(device)

@@ -21,7 +21,7 @@ from sim.tools import (
 )
 
 
-def test_a_tool_is_read_from_what_it_prints_as_and_nothing_else_is() -> None:
+def test_tool_repr_round_trip_rejects_other_text() -> None:
     for tool in (Ball(7e-3), ROD_OF_4, SMALL_BLADE):
         assert parse_tool(repr(tool)) == tool
     assert name_tool(ROD_OF_4) == "a rod of 2 mm radius and 20 mm length"
@@ -32,7 +32,7 @@ def test_a_tool_is_read_from_what_it_prints_as_and_nothing_else_is() -> None:
         parse_tool("(" * 100_000)
 
 
-def test_the_foremost_point_is_on_the_tool_and_nothing_of_it_is_farther() -> None:
+def test_foremost_point_is_farthest_on_tool() -> None:
     rng = np.random.default_rng(0)
     for tool in (Ball(7e-3), ROD_OF_4, SMALL_BLADE):
         pose = np.tile(np.eye(4), (5, 1, 1))

@@ -35,7 +35,7 @@ def evidence(body):
     return sample_seen_patch(body, motion, np.random.default_rng(0), 60, 0.5)
 
 
-def test_points_lie_on_a_patch_of_the_open_cortex_and_move_with_it(body, evidence):
+def test_patch_points_lie_on_moving_open_cortex(body, evidence):
     assert len(evidence) == 180 and evidence.value.reshape(60, 3) == pytest.approx(np.tile(MOTION, (60, 1)))
     places = evidence.at[::3]
     on = body.mesh.nodes[np.unique(body.open_surface)]
@@ -49,13 +49,13 @@ def test_points_lie_on_a_patch_of_the_open_cortex_and_move_with_it(body, evidenc
     assert moved == pytest.approx(evidence.at)
 
 
-def test_likeness_is_of_motion_over_error_and_of_the_number_of_points(evidence):
+def test_likeness_uses_relative_motion_and_point_count(evidence):
     exact, shifted = (replace(evidence, sigma=np.full(180, 3e-4), shift=shift) for shift in (0.0, 4e-4))
     assert compute_likeness(exact)[:2] == pytest.approx(np.log([3e-3 / 3e-4, 60.0]))
     assert compute_likeness(shifted)[:2] == pytest.approx(np.log([3e-3 / 5e-4, 60.0]))
 
 
-def test_likeness_is_of_the_size_of_the_patch_however_many_points_lie_on_it(body, evidence):
+def test_likeness_uses_patch_size_not_point_count(body, evidence):
     """The same patch twice as wide is as far off for few points as for many; a patch of half the area is smaller."""
     wide = replace(evidence, at=2.0 * evidence.at)
     few, many = (
@@ -70,7 +70,7 @@ def test_likeness_is_of_the_size_of_the_patch_however_many_points_lie_on_it(body
     assert max(sizes[0]) < min(sizes[1]) and max(sizes[1]) < min(sizes[2])
 
 
-def test_trials_on_patches_of_its_size_say_how_far_a_covariance_grows(evidence):
+def test_patch_trials_give_covariance_growth(evidence):
     small = replace(evidence, at=0.5 * evidence.at)
     tried = np.concatenate(
         [

@@ -20,12 +20,12 @@ def test_draws_depend_on_the_seed_and_the_group_alone(body):
     assert np.array_equal(*down) and (falling[1].causes[1].csf_level < falling[0].causes[1].csf_level).all()
 
 
-def test_a_skull_that_lets_go_is_not_asked_for_swollen_fluid_tissue(body):
+def test_separating_skull_rejects_swollen_fluid_tissue(body):
     made = {(group.skull, group.poisson) for group in build_groups(body, 0, FEW)}
     assert (LETS_GO, 0.45) in made and (LETS_GO, 0.485) not in made and ("slide", 0.485) in made
 
 
-def test_each_skull_has_soft_and_stiff_tumours_and_tissue_that_stiffens_little_and_much(body):
+def test_each_skull_has_soft_and_stiff_tumours(body):
     """One in each part of the range, for every seed; at small strain all have what their group says."""
     for seed in range(20):
         for skull in ("bonded", "slide"):

@@ -72,7 +72,7 @@ def test_growth_is_that_by_which_errors_grow_with_the_distance(growth):
     assert abs(np.median(found) - growth) < 0.3 * growth + 40.0
 
 
-def test_too_few_far_loads_tell_no_growth_and_none_is_beyond_all_bounds():
+def test_too_few_far_loads_give_no_growth():
     near, far = far_and_near(300.0, 0)
     assert fit_growth(near, (far[0][:18], far[1][:18])) == USUAL_GROWTH
     assert fit_growth(near, (1e9 * far[0], far[1])) == MOST_GROWTH
@@ -115,7 +115,7 @@ def placed(count, seed, discs=None):
 
 
 @pytest.mark.parametrize("curved", [True, False])
-def test_a_scale_seen_in_few_discs_does_not_run_away_between_them(curved):
+def test_scale_from_few_discs_stays_bounded_between_them(curved):
     discs = np.array([[-12.0, -9.0, 5.0], [2.0, 11.0, -8.0], [13.0, -4.0, 9.0]])
     features, _, error = placed(400, 5, discs)
     bound = fit_bound((features, error), *placed(1000, 6), curved=curved)

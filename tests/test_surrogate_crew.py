@@ -89,7 +89,7 @@ def test_two_processes_on_one_card_answer_as_one(tmp_path, body):
     assert np.abs(units[0] - units[1]).max() <= 2e-3 * np.abs(units[0]).max()
 
 
-def test_a_killed_process_is_a_sentence_and_loses_no_finished_case(tmp_path, body):
+def test_killed_process_loses_no_finished_case(tmp_path, body):
     """It dies at the sixth of ten batches; one process alone goes on, and the bytes are those of an undisturbed run."""
     loads, whole, path = draw("palpation", body, COUNT, 0), tmp_path / "whole.h5", tmp_path / "data.h5"
     undisturbed = mortal("cpu", COUNT, 0, tmp_path)
@@ -122,7 +122,7 @@ def test_batches_are_shared_evenly():
     assert choose_even_batch(0, 7, 2) == 1 and choose_even_batch(64, 7, 1) == 7
 
 
-def test_the_command_goes_on_with_other_devices_and_the_same_batches(tmp_path, box_file, capsys):
+def test_run_resumes_on_other_devices_in_same_batches(tmp_path, box_file, capsys):
     """What was begun with another batch than the default is finished with it, unless another is asked for."""
     words = ["simulate", box_file, "--out", str(tmp_path / "a.h5"), "--json"]
     assert main([*words, "--count", "12", "--batch", "5", "--device", "cpu,cpu"]) == 0

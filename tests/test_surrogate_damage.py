@@ -183,7 +183,7 @@ class TestFinished:
             with pytest.raises(InputError, match=r"data.h5: 'Ball\(radius=.*' is no tool: .* damaged: simulate again"):
                 replace(data, provenance={**data.provenance, "ball": radius})
 
-    def test_files_of_the_version_before_are_read_if_they_were_finished(self, tmp_path, pretender, loads, whole):
+    def test_finished_files_of_previous_version_are_read(self, tmp_path, pretender, loads, whole):
         path = Path(shutil.copy(whole, tmp_path))
         with h5py.File(path, "r+") as file:
             del file.attrs[SEAL]

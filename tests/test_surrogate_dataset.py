@@ -138,7 +138,7 @@ def undated(path):
     return raw
 
 
-def test_a_killed_run_ends_with_the_bytes_of_an_uninterrupted_one(tmp_path, pretender, loads):
+def test_killed_run_resumes_to_the_same_bytes(tmp_path, pretender, loads):
     whole, killed = tmp_path / "whole.h5", tmp_path / "killed.h5"
     simulate(whole, pretender, loads, SAID, 8)
     # Before the first batch; in the middle of one of unit responses, and one of answers; while the file is written.

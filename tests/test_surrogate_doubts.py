@@ -47,7 +47,7 @@ def sideways(body, length):
 
 
 @pytest.mark.parametrize("length", [8e-3, 12e-3, 20e-3])
-def test_points_that_slip_sideways_are_in_doubt_and_the_error_spans_it(locator, length):
+def test_sideways_slip_is_marked_and_within_error(locator, length):
     """Nothing moved but the registration."""
     seen = observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), NAMED, (0, 0))
     found = locator.locate(replace(seen, now=seen.now + sideways(locator.anatomy, length)))
@@ -91,7 +91,7 @@ def test_a_registration_that_was_checked_is_not_doubted(locator):
     assert np.linalg.norm(believed.centroid) > np.linalg.norm(doubted.centroid) and believed.p95 < doubted.p95
 
 
-def test_a_shift_along_the_axis_is_answered_as_sinking_and_said_to_look_alike(locator):
+def test_axial_shift_is_reported_as_ambiguous_with_sinking(locator):
     body = locator.anatomy
     seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
     found = locator.locate(replace(seen, now=seen.now + 12e-3 * open_cortex(body).axis))
@@ -141,7 +141,7 @@ def test_locate_cloud_rounding_changes_no_result(locator, sunk, seed):
     assert again == pytest.approx(found, abs=1e-8)
 
 
-def test_a_cloud_that_sinks_has_drained_though_a_brain_that_shrinks_looks_alike(locator):
+def test_point_cloud_drainage_and_atrophy_look_alike(locator):
     """All of it by 5 mm, along the opening's axis."""
     body = locator.anatomy
     still = observed(body, np.zeros_like(body.mesh.nodes), PointsSeen(100, 90, 1, named=False), (0, 0))
@@ -158,7 +158,7 @@ def test_where_nothing_moved_no_cause_is_named(locator, sight):
     assert found.named_causes == "none, as what was seen is within its errors"
 
 
-def test_a_dent_is_seen_by_its_form_though_it_is_no_larger_than_errors(locator):
+def test_dent_of_error_size_is_seen_by_its_form(locator):
     """Of 3 mm, 12 mm wide, at 60 points that are off by less than is stated; and such points without a dent."""
     body, random = locator.anatomy, np.random.default_rng(0)
     cortex = body.mesh.nodes[np.unique(body.open_surface)]
@@ -171,7 +171,7 @@ def test_a_dent_is_seen_by_its_form_though_it_is_no_larger_than_errors(locator):
     assert not dented.within_errors and dented.cause_shares and still.within_errors
 
 
-def test_a_locator_of_trials_without_the_size_of_patches_is_refused(locator, tmp_path):
+def test_locator_without_patch_sizes_is_rejected(locator, tmp_path):
     """Its format says so, before its arrays are looked at."""
     with np.load(to_locator_path(template_path())) as file:
         arrays = {name: file[name] for name in file.files}

@@ -19,7 +19,7 @@ FEW = Causes(
 )  # fmt: skip
 
 
-def test_brain_within_reach_of_the_tumour_swells_and_oedema_that_is_marked(body):
+def test_swelling_near_tumour_includes_marked_oedema(body):
     middle = body.mesh.nodes[body.mesh.tets].mean(axis=1)
     away = np.linalg.norm(middle[:, None] - body.mesh.nodes[body.tumour_nodes], axis=2).min(axis=1)
     far = PART_LABELS["oedema"]
@@ -42,7 +42,7 @@ def test_oedema_reaches_near_and_far_in_each_skull(body):
         assert np.floor(count * np.sort(share)).tolist() == list(range(count))
 
 
-def test_oedema_is_solved_and_bulges_over_the_tumour_more_than_a_brain_that_swells(body):
+def test_oedema_bulges_more_than_brain_swelling(body):
     motion, kind = solve_members(body, build_groups(body, 0, FEW)[0], 0, "cpu", FEW)
     assert (kind == OEDEMA).sum() == len(FEW.oedema) * FEW.reaches[0]
     size = np.linalg.norm(motion[:, np.unique(body.open_surface)], axis=2)

@@ -124,7 +124,7 @@ def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, p
             assert miss < 0.06 * np.linalg.norm(wanted[:, terms])  # rounded to 1 in 500 of the largest
 
 
-def test_two_orders_of_the_tumour_are_exact_wherever_a_tool_presses(expansion, box):
+def test_two_series_orders_are_exact_for_any_tool(expansion, box):
     """Of loads inside the rim nothing is left of them; over it the table holds what is missing."""
     fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
     loads = pushes(expansion.patch, 40, 8, (7e-3, 7e-3))
@@ -142,7 +142,7 @@ def test_two_orders_of_the_tumour_are_exact_wherever_a_tool_presses(expansion, b
         np.testing.assert_allclose(more, np.tile(few, (3, 1, 1)), rtol=1e-4, atol=1e-6)
 
 
-def test_a_run_that_went_on_has_the_same_table_and_states_no_seconds(tmp_path):
+def test_resumed_run_has_same_table_without_seconds(tmp_path):
     small = make_box(cells=(8, 8, 4), spacing=8e-3, tumour=12e-3, depth=20e-3, opening=22e-3)
     data = simulated(tmp_path / "data.h5", small, 100)
     whole, later = (Expansion(data, "cpu", begun=tmp_path / "rows", most_pairs=0) for _ in range(2))
@@ -172,7 +172,7 @@ def test_a_series_beats_the_table_of_first_order(trained):
     assert series.mean_mm < 0.2 * linear.mean_mm and learnt.mean_mm < 1.5 * series.mean_mm
 
 
-def test_on_known_cortex_the_process_beats_the_series_by_a_factor_of_two(tmp_path):
+def test_gp_halves_series_error_on_known_cortex(tmp_path):
     """What `series-gp` is there for: nine open nodes, 300 loads among them, every fourth tested wherever it lies.
 
     A process that has lost its units leaves the series as it is.
@@ -185,7 +185,7 @@ def test_on_known_cortex_the_process_beats_the_series_by_a_factor_of_two(tmp_pat
     assert learnt.mean_percent < 0.5 * series.mean_percent and learnt.mean_mm < 0.5 * series.mean_mm
 
 
-def test_nothing_inside_the_discs_left_out_is_known_of_the_series(trained, data, expansion, tmp_path):
+def test_held_out_discs_are_unknown_to_series(trained, data, expansion, tmp_path):
     """Bit for bit: wild answers to all loads that were not trained on, and wild series at all places of the discs."""
     split = trained.split
     rows = np.flatnonzero(data.good)[~split.train]

@@ -78,7 +78,7 @@ def test_each_load_is_judged_by_its_own_bound(guarded, loads, predicted, solved)
     assert f"for {handed.sum()} of {len(loads)} loads" in answer.source
 
 
-def test_where_no_equilibrium_is_found_the_model_stands_with_its_bound(guarded, loads, predicted, box):
+def test_model_stands_with_bound_where_fem_fails(guarded, loads, predicted, box):
     answer = replace(guarded, limit=0.0, fem=AtRest(box)).deform(loads)
     assert np.array_equal(answer.displacement, predicted.displacement) and answer.outcome == predicted.outcome
     assert answer.bound == pytest.approx(predicted.bound, nan_ok=True)
@@ -130,13 +130,13 @@ def test_the_limit_is_the_user_s(theatre):
             build_requested_theatre(parser.parse_args(["--guard-mm", words, "--device", "cpu"]))
 
 
-def test_it_is_named_where_a_model_knows_the_scene_and_says_what_it_is(theatre):
+def test_scene_model_is_named_with_description(theatre):
     assert GUARDED in theatre.names(small()) and "where that may be over 0.2 mm off" in theatre.described(
         GUARDED, small()
     )
 
 
-def test_errors_on_left_out_cortex_count_what_finite_elements_answer_as_exact():
+def test_held_out_errors_count_fem_solutions_as_exact():
     distance = 1e-3 * np.array([[0.1, 0.3], [0.02, 0.02], [0.4, 0.4]])
     stated = measure_held_out(
         distance, np.full(3, 10e-3), 1e-3 * np.array([0.5, 0.1, 0.1]), np.array([False, False, True])
@@ -149,7 +149,7 @@ def test_errors_on_left_out_cortex_count_what_finite_elements_answer_as_exact():
     assert measure_held_out(distance[1:2], np.full(1, 10e-3), np.full(1, np.nan), np.zeros(1, bool)).solved == 1.0
 
 
-def test_finite_elements_answer_as_much_as_a_model_s_errors_on_left_out_cortex_ask_for(theatre):
+def test_fem_share_matches_held_out_errors(theatre):
     """The widest limit that leaves 1 % of the motion, and 0.2 mm at 99.9 % of the vertices; at none all are solved."""
     bound, inside = 1e-3 * np.array([0.15, 0.08, 0.03, 0.005]), np.zeros(4, bool)
     distance = 1e-3 * np.array([[0.30], [0.06], [0.02], [0.004]])
@@ -177,7 +177,7 @@ def test_finite_elements_answer_as_much_as_a_model_s_errors_on_left_out_cortex_a
         (None, np.nan, GUARDED),
     ],
 )
-def test_whoever_asks_for_nobody_gets_a_model_alone_only_where_it_may_be(theatre, mean, bound, who):
+def test_default_deformer_is_model_alone_where_valid(theatre, mean, bound, who):
     (_, model), *_ = theatre.models.items()
     stated = None if mean is None else LeftOut(mean, 0.001, None, 0.3)
     some = replace(theatre, models={"series-gp": replace(model, bound=bound, left_out=stated)})

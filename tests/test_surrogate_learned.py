@@ -140,7 +140,7 @@ def test_what_is_used_was_trained_on_the_discs_too(trained, scored, data):
     assert [row.mean_mm for row in trained.scores] == [row.mean_mm for row in scored.scores]
 
 
-def test_bounds_are_calibrated_on_loads_that_nothing_was_trained_on(trained, data, fresh, pretender):
+def test_bounds_are_calibrated_on_untrained_loads(trained, data, fresh, pretender):
     apart = np.flatnonzero(data.good)[-trained.calibrated :]
     assert (trained.split.disc[-trained.calibrated :] == -2).all()
     for name, model in trained.models.items():
@@ -154,7 +154,7 @@ def test_bounds_are_calibrated_on_loads_that_nothing_was_trained_on(trained, dat
         assert np.mean(worst <= answer.bound[0]) > 0.85, name
 
 
-def test_how_bounds_hold_in_the_discs_left_out_is_reported_of_a_model_that_knows_neither(trained, scored, data):
+def test_held_out_coverage_is_reported(trained, scored, data):
     """Recomputed: the scored model, bounds from the loads that are apart and outside every disc."""
     good = data.loads.rows(np.flatnonzero(data.good))
     truth = data.displacement(data.anatomy.tumour_nodes)[data.good]
@@ -316,7 +316,7 @@ def test_threads_that_share_a_model_get_their_own_answers(trained, fresh, name):
     assert all(np.array_equal(answer, wanted[k]) for k, answer in enumerate(sum(zip(*answers, strict=True), ())))
 
 
-def test_fresh_loads_lie_inside_the_envelope_and_those_of_left_out_discs_outside(trained, scored, data, fresh):
+def test_test_loads_are_inside_and_held_out_outside(trained, scored, data, fresh):
     inside = [outcome is Outcome.PREDICTED for outcome in trained.models["linear"].deform(fresh).outcome]
     assert np.mean(inside) > 0.9  # a few exceed the extremes in training, or lie in a gap
     held_out = data.loads.rows(np.flatnonzero(data.good)[trained.split.test])

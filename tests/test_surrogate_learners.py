@@ -23,7 +23,7 @@ def test_tuned_settings_halve_the_error_of_the_published_ones():
     assert np.array_equal(again.predict(asked), Tuned(SVR).fit(X, Y).predict(asked)) and isinstance(again, Svr)
 
 
-def test_settings_are_chosen_on_discs_that_the_inner_fits_are_not_trained_on():
+def test_settings_are_chosen_on_inner_held_out_discs():
     """One fit for each of the settings without the discs, and one of the best to all."""
     X, Y = nearby(100, 0)
     seen, left_out = [], find_inner_discs(X[:, :3])

@@ -56,7 +56,7 @@ def test_unit_responses_inside_the_discs_are_given_and_counted(trained, data, bo
         np.testing.assert_allclose(found, unit[node, 2], atol=2e-3 * np.abs(unit[node, 2]).max())
 
 
-def test_learners_without_a_table_are_given_no_unit_response_of_the_tumour(trained, data, tmp_path):
+def test_learners_without_table_get_no_unit_response(trained, data, tmp_path):
     """Bit for bit: wild ones change the cortex alone, which is not scored."""
     rows = np.arange(len(data.unit_good))
     wild, _ = poisoned(data.path, tmp_path / "wild.h5", rows, "unit")

@@ -69,7 +69,7 @@ def test_an_ensemble_has_every_cause_in_every_skull(ensemble, body):
     assert np.isfinite(ensemble.motion).all() and ensemble.motion.shape[1:] == body.mesh.nodes.shape
 
 
-def test_shapes_of_each_place_and_skull_move_the_open_cortex_by_a_millimetre(locator, body):
+def test_prior_shapes_move_open_cortex_by_1_mm(locator, body):
     prior = locator.prior
     for skull in (0, 1):
         for place in (NOWHERE, 0, int(prior.place.max())):
@@ -98,7 +98,7 @@ def test_a_stopped_ensemble_goes_on(body, tmp_path, monkeypatch, ensemble):
         assert np.array_equal(getattr(found, name), getattr(ensemble, name)), name
 
 
-def test_a_small_locator_answers_as_the_whole_one_does_where_it_can(locator, body, truth, tmp_path):
+def test_small_locator_agrees_with_full_one(locator, body, truth, tmp_path):
     """Points with names, a cloud, and tips; read from its file, which is much smaller on a body with more inside."""
     save_locator(tmp_path / "small.npz", locator.small())
     small = load_locator(tmp_path / "small.npz", body)
@@ -134,7 +134,7 @@ def test_a_small_locator_refuses_what_it_does_not_know(locator, body, truth):
         small.locate(replace(deep, sigma=None))
 
 
-def test_files_of_locators_are_read_as_they_were_and_refused_where_they_do_not_belong(locator, body, tmp_path):
+def test_locator_files_round_trip_and_reject_foreign(locator, body, tmp_path):
     path = tmp_path / "box.locator.npz"
     save_locator(path, locator)
     again = load_locator(path, body)
@@ -163,7 +163,7 @@ def test_files_of_locators_are_read_as_they_were_and_refused_where_they_do_not_b
             load_locator(tmp_path / "wild.npz", body)
 
 
-def test_most_of_the_tumours_motion_is_found_and_ellipsoids_hold_it(locator, body, truth):
+def test_most_tumour_motion_is_found_within_ellipsoids(locator, body, truth):
     """Other tissue, loads and errors than the ensemble knows; the covariance holds for nine of ten at least."""
     left, all_of_it, held = 0.0, 0.0, []
     for seed, (motion, _) in enumerate(truth):
@@ -217,7 +217,7 @@ def test_a_rigid_error_that_is_stated_is_found(locator, body, truth):
     assert off[2] < off[1] < off[0]
 
 
-def test_a_cloud_without_names_tells_the_motion_along_the_surfaces_normal(locator, body, truth):
+def test_point_cloud_gives_normal_motion(locator, body, truth):
     left, all_of_it = 0.0, 0.0
     for seed, (motion, _) in enumerate(truth):
         named = observed(body, motion, seed, count=150, noise=0.2)
@@ -262,7 +262,7 @@ def test_points_off_the_cortex_are_left_out_and_named(locator, body, truth):
         locator.locate(spoilt[1])
 
 
-def test_a_tip_without_support_is_left_out_and_says_nothing_of_the_tool(locator, body, truth):
+def test_unsupported_tip_is_left_out(locator, body, truth):
     clean = observed(body, truth[0][0], 3, noise=0.1)
     sure = replace(clean, sigma=np.full(60, 1e-4))
     wrong = replace(sure, tips=clean.now[:1] + [0.0, 0.0, 0.025])

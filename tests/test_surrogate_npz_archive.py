@@ -20,7 +20,7 @@ def test_arrays_that_are_larger_than_a_model_may_be_are_refused(tmp_path):
                 archive.arrays(["few", "many"])
 
 
-def test_an_array_of_more_bytes_than_its_member_is_refused_before_memory_is_taken(tmp_path):
+def test_oversized_array_is_rejected_before_allocation(tmp_path):
     """As many bytes as the header has numbers, each of eight."""
     np.savez(tmp_path / "m.npz", many=np.zeros(2**20))
     with zipfile.ZipFile(tmp_path / "m.npz") as source:

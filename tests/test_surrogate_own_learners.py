@@ -110,7 +110,7 @@ def test_a_patients_learner_may_be_ones_own(folder, tmp_path, monkeypatch, capsy
     assert "none.nii.gz: no such file" in said and "no learner" not in said
 
 
-def test_a_package_brings_one_that_is_looked_for_only_when_its_name_is_asked(tmp_path, monkeypatch, clean):
+def test_package_tool_is_imported_only_when_named(tmp_path, monkeypatch, clean):
     (tmp_path / "labs_learners.py").write_text(NEAREST.read_text().replace('"nearest"', '"labs"'))
     made = tmp_path / "labs_learners-1.0.dist-info"
     made.mkdir()

@@ -90,7 +90,7 @@ def test_cloud_is_compared_without_its_rigid_error(prior):
     assert len(rest) > 3 and found.at == pytest.approx(rest, abs=1e-9)
 
 
-def test_hypotheses_are_sets_of_causes_in_one_skull_with_and_without_a_tool(prior):
+def test_hypotheses_cover_causes_skulls_and_tool(prior):
     assert len(prior.hypotheses) == 3 * len(SETS) * len(RIGIDS)
     taking = set()
     for number, hypothesis in enumerate(prior.hypotheses):
@@ -106,7 +106,7 @@ def test_hypotheses_are_sets_of_causes_in_one_skull_with_and_without_a_tool(prio
 
 
 @pytest.mark.parametrize("single", [False, True])
-def test_an_answer_is_that_of_the_normal_equations_and_its_evidence_that_of_the_covariance(prior, single):
+def test_posterior_matches_normal_equations_and_evidence(prior, single):
     """Bayes' formula by precisions instead of covariances, and the density of what is seen, with a place or without.
 
     Of whole motions, and of one with a row less, so that axes are not alike. A skull has fewer shapes of swelling.
@@ -157,7 +157,7 @@ def test_axes_that_are_alike_are_whitened_as_all_rows_together(prior):
 
 
 @pytest.mark.parametrize("count", [12, 90])
-def test_rows_of_unknowns_and_their_products_are_those_of_all_points(prior, count):
+def test_block_rows_match_products_of_all_points(prior, count):
     """Of fewer points than vertices and of more, which are seen as fewer rows; of whole motions, and of single rows."""
     box, random = prior.anatomy, np.random.default_rng(0)
     some = random.integers(40, size=(count, 4))
@@ -258,7 +258,7 @@ def test_a_tool_is_believed_to_press_where_its_tip_touches(prior):
     assert near.logs[-1, 0] - without.logs[-1, 0] == pytest.approx(near.odds[0])  # with which no tool may press
 
 
-def test_what_is_seen_may_be_little_because_a_motion_and_a_rigid_error_cancel(prior):
+def test_motion_and_rigid_error_may_cancel(prior):
     """Motions may then be as large as a rigid error: its prior's translation has a length of 1.4 mm."""
     little, much = (seen(prior, np.full_like(prior.anatomy.mesh.nodes, each)) for each in (1e-5, 3e-3))
     assert build_observed_prior(prior, little).scale == pytest.approx(np.sqrt(3.0) * 0.8, rel=1e-3)

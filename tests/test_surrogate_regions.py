@@ -93,7 +93,7 @@ def test_a_file_keeps_the_regions_and_an_older_one_has_none(body, locators, tmp_
     assert knowing.regions == (STIFF,) and knowing.small().regions == (STIFF,) and other.regions == ()
 
 
-def test_a_fit_finds_the_tumours_stiffness_whatever_the_locator_knew(locators):
+def test_fit_finds_tumour_stiffness_for_any_locator(locators):
     both = replace(locators[0], regions=(Region(2, 3.0), STIFF))
     assert list_fitted_regions(both) == (STIFF,)
 

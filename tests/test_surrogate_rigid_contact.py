@@ -196,7 +196,7 @@ def test_a_model_learns_a_rod_and_keeps_it(tmp_path, data, model, elements, box)
     np.testing.assert_array_equal(again.deform(fresh).displacement, found.displacement)
 
 
-def test_a_rod_that_leans_more_than_any_in_training_is_extrapolated(model, box):
+def test_rod_tilted_beyond_training_is_extrapolation(model, box):
     pose = get_poses(upright(box, ROD_OF_4, 1e-3), ROD_OF_4)
     angle = np.radians(70.0)
     pose[0, :3, :3] = [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]
@@ -204,7 +204,7 @@ def test_a_rod_that_leans_more_than_any_in_training_is_extrapolated(model, box):
     assert model.deform(Loads((Touching(pose[:, None]),))).outcome == (Outcome.EXTRAPOLATED,)
 
 
-def test_models_of_blades_play_retraction_on_tissue_that_does_not_relax(model):
+def test_blade_models_play_retraction_without_relaxation(model):
     blade = SMALL_BLADE
     tissue = to_tissue_json(BRAIN)
     effects = (Elasticity(), Held(), ToolContact((blade,)))

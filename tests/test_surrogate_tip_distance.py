@@ -72,7 +72,7 @@ def surface(positions, triangles):
     return trimesh.Trimesh(positions, triangles, process=False)
 
 
-def test_it_is_measured_from_a_ball_that_rests_on_the_deformed_cortex(box, pretender, gauge):
+def test_distance_is_measured_from_resting_ball(box, pretender, gauge):
     loads = draw("palpation", box, 6, 3)
     answer = pretender.deform(loads)
     pushed, axis = get_only_pushes(loads), open_cortex(box).axis
@@ -147,7 +147,7 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
     assert 0.93 <= found.held[0] <= 0.97 and min(found.tenths) > 0.85 and found.held[1] > 0.975
 
 
-def test_how_its_bound_holds_in_the_discs_left_out_is_reported_of_a_model_that_knows_neither(trained, data, gauge):
+def test_held_out_coverage_of_its_bound_is_reported(trained, data, gauge):
     """Recomputed: the scored model, a bound from the loads that are apart and outside every disc."""
     good, split = data.loads.rows(np.flatnonzero(data.good)), trained.split
     distance = gauge.distances(good, data.displacement(gauge.nodes)[data.good], gauge.nodes)
@@ -178,7 +178,7 @@ def test_the_correction_brings_distances_nearer(model, fresh):
     assert left < 0.5 * off
 
 
-def test_without_a_push_nothing_is_off_and_far_outside_the_bound_is_wide(model, fresh):
+def test_no_push_gives_zero_and_far_bound_is_wide(model, fresh):
     loads = fresh[0].rows(slice(0, 20))
     idle = model.distance(loads.scaled(0.0))
     still = np.zeros((20, len(model.nodes), 3))
@@ -207,7 +207,7 @@ def test_the_store_keeps_it(model, fresh, tmp_path):
     assert models["bare"].tip is None and models["none"].tip == TipModel()
 
 
-def test_the_models_that_ship_bound_the_distance_of_a_strong_press_within_a_millimetre_and_a_half():
+def test_shipped_models_bound_strong_press_distance():
     theatre, scene = open_theatre(device="cpu"), find_scene("press")
     at = open_cortex(theatre.anatomy).place()
     loads = Loads((Pushed(at.point[None], 0.3 * at.inward[None], np.array([7e-3])),))

@@ -36,7 +36,7 @@ def test_tools_stay_in_their_ranges(box, patch, name):
     assert (patch.compute_edge_distance(loads.point) >= loads.footprint).all()
 
 
-def test_points_are_uniform_by_area_directions_by_solid_angle_and_forces_by_logarithm(box, patch):
+def test_points_directions_and_forces_are_uniform(box, patch):
     loads = pushes("bipolar", box, 4000, 0)
     inner = np.linalg.norm(loads.point[:, :2], axis=1) < 10e-3
     allowed = patch.covered(np.zeros((1, 3)), 10e-3) * patch.areas.sum()

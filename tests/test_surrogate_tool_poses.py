@@ -115,7 +115,7 @@ def test_a_stored_model_knows_its_tool(tmp_path, trained, box):
     np.testing.assert_array_equal(again.deform(fresh).displacement, trained.models["gp"].deform(fresh).displacement)
 
 
-def test_poses_nearest_to_the_same_corner_are_not_taken_for_the_same_poses():
+def test_poses_sharing_nearest_corner_stay_distinct():
     """A data set to judge by is told apart from the training's own by what is not a vertex of the cortex."""
     template = read_anatomy(template_path())
     patch, corners = open_patch(template), template.mesh.nodes
@@ -129,7 +129,7 @@ def test_poses_nearest_to_the_same_corner_are_not_taken_for_the_same_poses():
     assert known.repeats(same.point, corners)
 
 
-def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(trained, box):
+def test_pose_and_force_models_reject_each_others_loads(trained, box):
     model = trained.models["gp"]
     with pytest.raises(InputError, match="causes Pushed, but this model was trained on the poses of a ball"):
         model.deform(draw("palpation", box, 2, 0))
