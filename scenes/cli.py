@@ -121,7 +121,10 @@ def limit_threads() -> None:
 
 
 def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
-    """The parser of `sulcus`, and that of each command by name; those asked for know their arguments and examples."""
+    """Return the parser of `sulcus`, and that of each command by name.
+
+    Those asked for know their arguments and examples.
+    """
     parser = argparse.ArgumentParser(
         prog="sulcus",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -167,7 +170,7 @@ def add_plugin(parser: argparse.ArgumentParser) -> None:
 
 
 def join_points(arguments: Sequence[str]) -> list[str]:
-    """The arguments, with a point joined to the option before it: `--opening-at=-3,4,5`."""
+    """Return the arguments, with a point joined to the option before it: `--opening-at=-3,4,5`."""
     joined: list[str] = []
     for argument in arguments:
         if joined and joined[-1].startswith("--") and POINT.fullmatch(argument):

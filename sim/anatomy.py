@@ -22,12 +22,12 @@ REGION_NAMES = {"brain": BRAIN_LABEL, "tumour": TUMOUR_LABEL, **PART_LABELS}
 
 
 def name_region(label: int) -> str:
-    """A region's name; "region 7" where it has none."""
+    """Return a region's name; "region 7" where it has none."""
     return next((name for name, number in REGION_NAMES.items() if number == label), f"region {label}")
 
 
 def describe_region(label: int) -> str:
-    """A region by its label, and by its name if it has one."""
+    """Return a region by its label, and by its name if it has one."""
     return f"region {label} ({name_region(label)})" if label in REGION_NAMES.values() else name_region(label)
 
 
@@ -86,7 +86,9 @@ class Anatomy:
         return orphaned
 
     def without(self, elements: np.ndarray) -> Anatomy:
-        """The body without some tetrahedra `elements` (n,), under the same vertex numbers; what they bared is free.
+        """Return the body without some tetrahedra `elements` (n,), under the same vertex numbers.
+
+        What they bared is free.
 
         Vertices that lose their last tetrahedron are held, and neither slide nor may be touched.
 

@@ -90,7 +90,7 @@ def check_vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
 
 
 def check_at_least(name: str, value: object, least: int) -> int:
-    """A whole number, at least `least`.
+    """Return a whole number, at least `least`.
 
     Raises
     ------

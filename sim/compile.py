@@ -159,7 +159,7 @@ def compile_problem(
 
 
 def _compatible(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """The effects, if they can act together."""
+    """Return the effects, if they can act together."""
     effects = tuple(effects)
     for effect in effects:
         if isinstance(effect, type):
@@ -188,7 +188,7 @@ def _check_names(terms: Iterable[Term], own: Iterable[Term]) -> None:
 
 
 def _shear(effects: Iterable[Effect]) -> float:
-    """The shear modulus [Pa] of the softest tissue."""
+    """Return the shear modulus [Pa] of the softest tissue."""
     effect = next(effect for effect in effects if isinstance(effect, Elasticity))
     return min(tissue.lame[0] for tissue in (effect.default, *effect.regions.values()) if tissue is not None)
 
@@ -241,7 +241,7 @@ def compile_part(
 
 
 def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> LocalProblem:
-    """A part and a stiffness (m, m) [N/m] around it, which its rows (m,) of 3n touch."""
+    """Return a part and a stiffness (m, m) [N/m] around it, which its rows (m,) of 3n touch."""
     from .terms.schur_stiffness import Exterior
 
     return _loaded(replace(part, terms=(*part.terms, Exterior(rows, stiffness, part.rows, part.device))))
@@ -326,7 +326,7 @@ def _obeying(
     device: Device,
     swelling: tuple[Pulsation, np.ndarray] | None,
 ) -> Curved:
-    """The term of elements of tissues that obey one law, `which` (T,) of them each; all of them relax, or none.
+    """Return the term of elements of tissues that obey one law, `which` (T,) of them each; all of them relax, or none.
 
     `swelling`: the effect, and which elements (T,) bool it swells.
     """

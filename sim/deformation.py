@@ -144,7 +144,7 @@ class Deformation:
         return len(self.displacement)
 
     def rows(self, index: np.ndarray) -> Deformation:
-        """Some of the answers (k,), as a deformation; the cost stays that of all."""
+        """Return some of the answers (k,), as a deformation; the cost stays that of all."""
         return replace(
             self,
             displacement=self.displacement[index],
@@ -160,7 +160,7 @@ class Deformation:
         )
 
     def at(self, nodes: np.ndarray) -> Deformation:
-        """The rows of some mesh vertices `nodes` (n,).
+        """Return the rows of some mesh vertices `nodes` (n,).
 
         Raises
         ------
@@ -237,7 +237,7 @@ def check_start(start: Deformation, count: int, vertices: int) -> None:
 
 
 def guess(displacement: np.ndarray) -> Deformation:
-    """A start for a deformer: displacements (B, V, 3) [m] of every vertex that somebody has thought of.
+    """Return a start for a deformer: displacements (B, V, 3) [m] of every vertex that somebody has thought of.
 
     Raises
     ------

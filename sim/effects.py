@@ -46,22 +46,22 @@ class Elasticity:
                 check_described(tissue)
 
     def of(self, label: int) -> Tissue | None:
-        """The law of a region, if it has any."""
+        """Return the law of a region, if it has any."""
         return self.regions.get(label, self.regions.get(_around(label), self.default))
 
     def on(self, labels: Iterable[int]) -> Elasticity:
-        """The same for a body of these regions: without laws that none of them obeys."""
+        """Return the same for a body of these regions: without laws that none of them obeys."""
         obeyed = {each for label in labels for each in (label, _around(label))}
         return replace(self, regions={label: law for label, law in self.regions.items() if label in obeyed})
 
     def __str__(self) -> str:
-        """The tissues as they are named beside every answer."""
+        """Return the tissues as they are named beside every answer."""
         named = [] if self.default is None else [str(self.default)]
         return "; ".join([*named, *(f"{describe_region(label)}: {tissue}" for label, tissue in self.regions.items())])
 
 
 def _around(label: int) -> int:
-    """The region that a region lies in, or itself."""
+    """Return the region that a region lies in, or itself."""
     return TUMOUR_LABEL if label == NECROSIS_LABEL else label
 
 

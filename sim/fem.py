@@ -148,7 +148,7 @@ class Fem:
 
     @lock_method
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Static equilibrium under every load case.
+        """Return static equilibrium under every load case.
 
         `start` (B rows, every vertex) is the first guess and brings its memory; at rest without one. `at` (n,) picks
         vertices of the answer.
@@ -191,7 +191,7 @@ class Fem:
         return Strategy(self.problem, preconditioner, self.strategy.inversion, self.accuracy, self.plan)
 
     def _batches(self, count: int) -> Iterator[slice]:
-        """The rows of each batch, at least one."""
+        """Return the rows of each batch, at least one."""
         return (slice(first, first + self.batch) for first in range(0, max(count, 1), self.batch))
 
     @cached_property
@@ -218,7 +218,7 @@ class Fem:
 
     @lock_method
     def residual(self, loads: Loads, answer: Deformation) -> np.ndarray:
-        """The relative residual (B,), in this solver's precision, of somebody's answers at every vertex.
+        """Return the relative residual (B,), in this solver's precision, of somebody's answers at every vertex.
 
         Raises
         ------

@@ -175,7 +175,7 @@ class Loads:
         return self.time
 
     def of(self, kind: type[C]) -> C | None:
-        """The cause of one kind, or None.
+        """Return the cause of one kind, or None.
 
         Raises
         ------
@@ -192,19 +192,19 @@ class Loads:
         return tuple(cause for cause in self.causes if isinstance(cause, kind))
 
     def without_kind(self, kind: type[Cause]) -> Loads:
-        """The same loads without the cause of one kind."""
+        """Return the same loads without the cause of one kind."""
         return Loads(tuple(cause for cause in self.causes if not isinstance(cause, kind)), self.times)
 
     def only(self, kind: type[C]) -> C | None:
-        """The cause of one kind, or None where there is none, or another beside it."""
+        """Return the cause of one kind, or None where there is none, or another beside it."""
         return self.of(kind) if len(self.causes) == 1 else None
 
     def rows(self, index: slice | np.ndarray) -> Loads:
-        """Some of the load cases, as loads."""
+        """Return some of the load cases, as loads."""
         return Loads(tuple(select_rows(cause, index) for cause in self.causes), self.times[index])
 
     def scaled(self, fraction: float | np.ndarray) -> Loads:
-        """The same causes with every magnitude that they have times `fraction` (scalar or (B,))."""
+        """Return the same causes with every magnitude that they have times `fraction` (scalar or (B,))."""
 
         def grown(cause: Cause) -> Any:
             name = MAGNITUDE.get(type(cause)) if isinstance(cause, BuiltIn) else cause.magnitude
@@ -218,12 +218,12 @@ class Loads:
 
 
 def select_rows(cause: C, index: slice | np.ndarray) -> C:
-    """A cause of some of the load cases, by number, a slice, or (B,) bool."""
+    """Return a cause of some of the load cases, by number, a slice, or (B,) bool."""
     return replace(cause, **{item.name: getattr(cause, item.name)[index] for item in fields(cause)})
 
 
 def stacked(parts: Sequence[Loads]) -> Loads:
-    """The load cases of several loads, one after the other.
+    """Return the load cases of several loads, one after the other.
 
     Raises
     ------
@@ -257,7 +257,7 @@ def check_loads(loads: object) -> None:
 
 
 def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) -> Loads:
-    """Loads of one pushing tool: point (3,) or (B, 3) [m], force (3,) or (B, 3) [N], footprint radius [m].
+    """Return loads of one pushing tool: point (3,) or (B, 3) [m], force (3,) or (B, 3) [N], footprint radius [m].
 
     Raises
     ------

@@ -67,7 +67,7 @@ class Material:
         check_prony(self.prony, self.law)
 
     def __str__(self) -> str:
-        """The tissue as it is named beside every answer."""
+        """Return the tissue as it is named beside every answer."""
         return f"{self.law}, E {1e-3 * self.young:g} kPa, nu {self.poisson:g}{', relaxing' if self.prony else ''}"
 
     @property
@@ -82,7 +82,7 @@ class Material:
         return self.lame
 
     def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
-        """The same with other Lamé constants (mu, lambda) [Pa]."""
+        """Return the same with other Lamé constants (mu, lambda) [Pa]."""
         return mu, lam
 
     @property
@@ -133,7 +133,7 @@ class Ogden:
         check_prony(self.prony, self.law)
 
     def __str__(self) -> str:
-        """The tissue as it is named beside every answer."""
+        """Return the tissue as it is named beside every answer."""
         terms = "; ".join(f"{c:g},{m:g}" for c, m in self.terms)
         return f"{self.law} {terms} Pa, K {1e-3 * self.bulk:g} kPa{', relaxing' if self.prony else ''}"
 
@@ -149,7 +149,7 @@ class Ogden:
         return self.coefficients_at(*self.lame)
 
     def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
-        """The same with other Lamé constants (mu, lambda) [Pa] at small strain."""
+        """Return the same with other Lamé constants (mu, lambda) [Pa] at small strain."""
         share = mu / self.lame[0]
         return (lam + 2.0 * mu / 3.0, *(number for c, m in self.terms for number in (share * c, m)))
 
@@ -190,7 +190,7 @@ class Tissue(Protocol):
         ...
 
     def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
-        """The same with other Lamé constants (mu, lambda) [Pa] at small strain, mu = 0 among them.
+        """Return the same with other Lamé constants (mu, lambda) [Pa] at small strain, mu = 0 among them.
 
         The energy is linear in the two: smoothed elements carry shape and volume apart.
         """
@@ -220,7 +220,7 @@ def check_described(tissue: object) -> None:
 
 
 def build_functions(tissues: Iterable[Tissue]) -> Law:
-    """The Warp functions that tissues of one name share.
+    """Return the Warp functions that tissues of one name share.
 
     Raises
     ------
@@ -263,7 +263,7 @@ def to_tissue_json(tissue: Tissue) -> str:
 
 
 def read_tissue_json(text: str) -> Tissue:
-    """The tissue that `to_tissue_json` wrote.
+    """Return the tissue that `to_tissue_json` wrote.
 
     Raises
     ------

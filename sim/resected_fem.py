@@ -95,7 +95,7 @@ class OperatedFem:
         return np.full(len(loads), len(self._bodies) - 1) if cause is None else cause.done.astype(int)
 
     def _begun(self, start: Deformation, stage: int, stays: bool) -> Deformation:
-        """An answer as one of the body at a stage, which `stays` what it was or was another."""
+        """Return an answer as one of the body at a stage, which `stays` what it was or was another."""
         memory = dict(start.memory) if stays else self._lasting(start.memory, stage)
         memory.pop(DONE, None)
         for name, place in self._places(memory, stage).items():
@@ -104,7 +104,7 @@ class OperatedFem:
         return replace(start, displacement=self._masked(start, stage), memory=memory, warm=start.warm if stays else {})
 
     def _ended(self, answer: Deformation, stage: int) -> Deformation:
-        """The answer of the body at a stage as one of the whole body, marked with the steps that it is of."""
+        """Return the answer of the body at a stage as one of the whole body, marked with the steps that it is of."""
         memory = {**answer.memory, DONE: np.full(len(answer), float(stage))}
         for name, place in self._places(memory, stage).items():
             own = memory[name]
@@ -173,7 +173,7 @@ def finite_elements(
     element: str | None = None,
     live: bool = False,
 ) -> Fem | OperatedFem:
-    """The finite elements that effects ask for, `Resection` among them; else as `Fem`.
+    """Return the finite elements that effects ask for, `Resection` among them; else as `Fem`.
 
     Raises
     ------

@@ -123,7 +123,7 @@ Tool = BuiltIn | OwnTool
 
 
 def parse_tool(text: str) -> BuiltIn:
-    """The tool whose `repr` is this text, of a file from outside: nothing of it is carried out.
+    """Return the tool whose `repr` is this text, of a file from outside: nothing of it is carried out.
 
     Raises
     ------

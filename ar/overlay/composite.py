@@ -124,7 +124,7 @@ def composite(
     marks: Marks = NO_MARKS,
     words: Words = NO_WORDS,
 ) -> Overlaid:
-    """The picture with a hidden surface drawn into it. On a card, no depth comes back from it but for a cut.
+    """Return the picture with a hidden surface drawn into it. On a card, no depth comes back from it but for a cut.
 
     Parameters
     ----------

@@ -144,9 +144,9 @@ class Words:
     Parameters
     ----------
     doubt
-        Reason why the surface's position is unreliable. It is written at the bottom of the image, see `format_warning`, in
-        any style. The outline is amber and broken. No error is guaranteed: no margin is drawn, and the number next to
-        the tip has no error.
+        Reason why the surface's position is unreliable. It is written at the bottom of the image, see `format_warning`,
+        in any style. The outline is amber and broken. No error is guaranteed: no margin is drawn, and the number next
+        to the tip has no error.
     head
         Lines at the top of the image, in any style and over anything.
     names

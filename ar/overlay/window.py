@@ -96,7 +96,8 @@ def draw_overlay(
     inputs = [
         box[0].start, box[1].start, camera.width, seen.nearest[0], seen.points, seen.triangles, seen.unbent.pixels,
         from_edge(seen), wp.array(looks, dtype=wp.vec4f, device=device), drawn.depth[0], drawn.segmentation[0],
-        get_on_device(roles.front, roles.open, device), front, int(SHADES.get(style, 0)), lines.solid, wp.vec3f(lines.ink),
+        get_on_device(roles.front, roles.open, device), front, int(SHADES.get(style, 0)), lines.solid,
+            wp.vec3f(lines.ink),
         to_flat_sheet(lines.under, device), to_flat_sheet(lines.above, device),
     ]  # fmt: skip
     ground = wp.clone(drawn.colour[0])

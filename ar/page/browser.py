@@ -220,7 +220,8 @@ class Browser:
     def show_beside(self, drawn: Callable[[], tuple[np.ndarray, str]]) -> None:
         """Show an image (H, W, 3) uint8 of slices, and charts (HTML) of the last seconds, in tabs next to the 3-D view.
 
-        `drawn` makes them, on the page's own thread, as often as `ConnectionLimits` allow: intermediate ones are skipped.
+        `drawn` makes them, on the page's own thread, as often as `ConnectionLimits` allow: intermediate ones are
+        skipped.
         """
         with self.lock:
             self.drawn = drawn

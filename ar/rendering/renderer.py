@@ -216,7 +216,8 @@ class Renderer:
         stack = self.stack
         matrices = wp.array([compute_projection(camera) for camera in cameras], dtype=wp.mat44d, device=self.device)
         inputs = [
-            since, stack.still, moved, matrices, wp.mat44d(compute_projection(self.lamp_camera)), stack.surfaces.triangles,
+            since, stack.still, moved, matrices, wp.mat44d(compute_projection(self.lamp_camera)),
+            stack.surfaces.triangles,
             stack.around, stack.faces,
         ]  # fmt: skip
         launch_in_bands(place, inputs, [placed], len(cameras) * (stack.vertices - since), self.device)

@@ -118,7 +118,8 @@ def refined(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Ne
     Raises
     ------
     ValueError
-        As `register_points`; too few points, or points that remain farther than 5 mm from the surface (root mean square).
+        As `register_points`; too few points, or points that remain farther than 5 mm from the surface (root mean
+        square).
     """
     if len(seen) < FEWEST_SURFACE:
         raise ValueError(f"{len(seen)} points of the surface are too few: trace {FEWEST_SURFACE} or more.")

@@ -39,7 +39,7 @@ def time_offers(theatre: Theatre, scene: Scene) -> list[Offer]:
 
 
 def _stated(deformer: Deformer) -> float:
-    """The error that a deformer states of itself [m]."""
+    """Return the error that a deformer states of itself [m]."""
     if isinstance(deformer, Guarded):
         return float(np.fmin(deformer.model.bound, deformer.limit))
     return deformer.bound if isinstance(deformer, Learned) else PROMISED

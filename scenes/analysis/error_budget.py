@@ -155,7 +155,7 @@ def compute_errors(filmed: Filmed, contributors: Sequence[str], count: int, seed
 def _samples(
     filmed: Filmed, contributors: frozenset[str], count: int, seed: int
 ) -> Iterator[tuple[Camera, Camera, np.ndarray, np.ndarray]]:
-    """The true and the believed camera, the tumour's surface as it is, and as it is drawn (n, 3) [m]."""
+    """Yield the true and the believed camera, the tumour's surface as it is, and as it is drawn (n, 3) [m]."""
     target = build_patient_reference()
     corners = sum(len(face.corners) for face in target.faces)
 
@@ -192,7 +192,7 @@ def _samples(
 
 
 def _begun(filmed: Filmed, seed: int, number: int) -> tuple[np.random.Generator, float, int]:
-    """The numbers of a sample, of which the first say its time [s] and its body."""
+    """Return the numbers of a sample, of which the first say its time [s] and its body."""
     random = np.random.default_rng([seed, number])
     return random, random.uniform(0.0, filmed.duration), int(random.integers(len(filmed.bodies)))
 
@@ -213,7 +213,7 @@ def _camera_after(filmed: Filmed, time: float, seconds: float) -> Camera:
 
 
 def _shift(filmed: Filmed, numbers: np.ndarray) -> np.ndarray:
-    """An error of registration (6,): a shift [m] and a turn [rad] in the frame of the patient's reference."""
+    """Return an error of registration (6,): a shift [m] and a turn [rad] in the frame of the patient's reference."""
     if filmed.registration is None:
         return np.append(OF_REGISTRATION.range[1] * numbers[:3], np.zeros(3))
     scale = np.repeat([1.0, 0.1], 3)  # so that metres and radians are alike
@@ -265,7 +265,7 @@ class ErrorBudget:
         return float(np.quantile(self.clinical.worst, LEVEL))
 
     def largest(self, what: Literal["middle", "worst"]) -> str:
-        """The contributor that alone puts the middle, or the worst point, off the most in 95 of 100 samples."""
+        """Return the contributor that alone puts the middle, or the worst point, off the most in 95 of 100 samples."""
         return max(self.alone, key=lambda name: float(np.quantile(getattr(self.alone[name], what), LEVEL)))
 
 
@@ -300,7 +300,7 @@ def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | No
 
 
 def choose_moment(still: SurfaceMotions, answers: Sequence[tuple[np.ndarray, ...]], meshes: np.ndarray) -> int:
-    """The moment of a scene at which its bodies differ the most; `meshes` (b,) as of `compute_error`."""
+    """Return the moment of a scene at which its bodies differ the most; `meshes` (b,) as of `compute_error`."""
     sizes = []
     for number, here in enumerate(still.fields):
         off = compute_error(np.stack([answer[number] for answer in answers]), here, meshes)

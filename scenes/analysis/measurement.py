@@ -60,7 +60,10 @@ def measure_peak_memory() -> float | None:
 
 @contextmanager
 def watch_gpu_memory(device: str) -> Iterator[list[int]]:
-    """The bytes of the card that are taken while the block runs, beyond those taken before; zero without a card."""
+    """Yield the bytes of the card that are taken while the block runs, beyond those taken before.
+
+    Zero without a card.
+    """
     where = wp.get_device(None if device == "auto" else device)
     taken = [0]
     if not where.is_cuda:

@@ -36,7 +36,7 @@ class BodyVariant:
 
 @dataclass(frozen=True)
 class Aim:
-    """Perturbation of a load: force or motion scaled by `share` and rotated by `turn` [rad], point moved by `shift` [m].
+    """Perturbation of a load: force or motion scaled by `share` and turned by `turn` [rad], point moved by `shift` [m].
 
     In several ways each: more and less, about two axes, to four sides.
     """
@@ -58,7 +58,7 @@ class Variant:
 
 
 def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] = ()) -> list[Variant]:
-    """The tool's uncertainty, the tissue's, the skull's, and other `elements`."""
+    """Return the tool's uncertainty, the tissue's, the skull's, and other `elements`."""
     tissue = body.tissue
     young, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
     changed = [
@@ -87,7 +87,10 @@ def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] =
 
 
 def apply_aim(loads: Loads, aim: Aim, patch: Patch) -> Loads:
-    """The loads of one tool as `aim` has them, one block for each way; points are shifted along the open cortex."""
+    """Return the loads of one tool as `aim` has them, one block for each way.
+
+    Points are shifted along the open cortex.
+    """
     (cause,) = loads.causes
     if not isinstance(cause, Pushed | Displaced):
         raise InputError(f"loads of the kind {type(cause).__name__} have no aim: give `Pushed` or `Displaced`.")
@@ -154,7 +157,7 @@ class SensitivityStudy:
     device: str = "auto"
 
     def fem(self, body: BodyVariant) -> Fem:
-        """The finite elements of a body, for tools of either kind."""
+        """Return the finite elements of a body, for tools of either kind."""
         tissue = body.tissue
         _, *others = pushed_effects(self.anatomy, tissue, body.skull)
         elasticity = Elasticity(tissue, {TUMOUR_LABEL: replace(tissue, young=body.tumour * tissue.young)})

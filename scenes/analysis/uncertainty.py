@@ -85,7 +85,7 @@ class SurfaceMotions:
 
 
 def apply_sample(scene: Scene, draw: PatientSample) -> Scene:
-    """The scene with another tissue, tumour, skull and place of the tool.
+    """Return the scene with another tissue, tumour, skull and place of the tool.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def estimate_mesh_deviations(scene: Scene, draws: Sequence[PatientSample]) -> np
 
 
 def get_tissue(scene: Scene) -> Material:
-    """The brain's tissue in a scene; regions may have another.
+    """Return the brain's tissue in a scene; regions may have another.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def get_tissue(scene: Scene) -> Material:
 
 
 def get_tumour_tissue(scene: Scene) -> Material:
-    """The tumour's tissue in a scene, or the brain's where it has none of its own.
+    """Return the tumour's tissue in a scene, or the brain's where it has none of its own.
 
     Raises
     ------
@@ -181,7 +181,7 @@ def _aside(path: Path, tip: Sequence[float]) -> Path:
 
 
 def list_moments(scene: Scene) -> tuple[float, ...]:
-    """The times [s] of a scene that are solved."""
+    """Return the times [s] of a scene that are solved."""
     return tuple(np.linspace(0.0, scene.duration, MOMENTS).tolist())
 
 
@@ -206,7 +206,7 @@ def get_nominal(theatre: Theatre, scene: Scene) -> SurfaceMotions:
 
 
 def solve_scene(theatre: Theatre, scene: Scene) -> Answer:
-    """The tumour's motions at each moment; None where some has no equilibrium.
+    """Return the tumour's motions at each moment; None where some has no equilibrium.
 
     A moment that has none from the one before is gone to by way of times between.
     """
@@ -236,7 +236,7 @@ def _surface(stage: Stage, answer: Deformation) -> np.ndarray:
 
 
 def solve_ensemble(theatre: Theatre, scene: Scene, draws: Sequence[PatientSample]) -> Iterator[Answer]:
-    """The motions of every draw."""
+    """Yield the motions of every draw."""
     for draw in draws:
         yield solve_scene(theatre, apply_sample(scene, draw))
 
@@ -244,7 +244,7 @@ def solve_ensemble(theatre: Theatre, scene: Scene, draws: Sequence[PatientSample
 def find_sound_draws(
     draws: Sequence[PatientSample], answers: Iterable[Answer]
 ) -> list[tuple[PatientSample, tuple[np.ndarray, ...]]]:
-    """The draws that have an equilibrium at each moment, with their motions."""
+    """Return the draws that have an equilibrium at each moment, with their motions."""
     return [(draw, answer.motions) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
 
 
@@ -373,7 +373,7 @@ def coverage(
     answers: Iterable[Answer],
     seed: int,
 ) -> Uncertainty:
-    """The uncertainty with its coverage on synthetic patients: other draws, with other errors of registration.
+    """Return the uncertainty with its coverage on synthetic patients: other draws, with other errors of registration.
 
     Raises
     ------

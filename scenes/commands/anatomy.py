@@ -211,7 +211,7 @@ def _pieces(pieces: list[dict[str, Any]], over: str) -> list[str]:
 
 
 def _region(name: str, volume: float, figures: dict) -> str:
-    """A region's line."""
+    """Return a region's line."""
     missed = figures["regions_volume_error_percent"][name]
     off = "" if missed is None else f" ({missed:+} % of the label's)"
     return f"{name} {volume:g} ml{off}, region {PART_LABELS[name]}{' of the tumour' if name == 'necrosis' else ''}"

@@ -180,7 +180,7 @@ def _seen(args: argparse.Namespace, theatre: Theatre) -> Scene:
 
 
 def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
-    """The covariance (9, 9) of the camera's intrinsics.
+    """Return the covariance (9, 9) of the camera's intrinsics.
 
     Raises
     ------
@@ -206,7 +206,7 @@ def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
 
 
 def _bodies(args: argparse.Namespace, theatre: Theatre, scene: Scene, count: int, seed: int) -> Bodies:
-    """Sample bodies from the priors and solve the tumour's surface motion in each, without those that have no equilibrium.
+    """Sample bodies from the priors and solve the tumour's surface motion; drop those without equilibrium.
 
     Raises
     ------
@@ -233,7 +233,7 @@ def _at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarr
 
 
 def _promised(theatre: Theatre, scene: Scene, time: float) -> float:
-    """The bound [m] of the model that plays a scene, at a time [s]; 0 where finite elements do."""
+    """Return the bound [m] of the model that plays a scene, at a time [s]; 0 where finite elements do."""
     player = theatre.player(theatre.usual(scene), scene)
     number = int(np.abs(scene.times - time).argmin())
     return player.draw(number, time, scene.path(time)).model_error or 0.0
@@ -274,7 +274,7 @@ def _figures(errors: OverlayErrors) -> dict[str, dict[str, float]]:
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
-    """The same in lines."""
+    """Return the same in lines."""
     camera = report["camera"]
     lines = [
         f"{report['scene']} at {report['time_s']:.1f} s, the tumour has moved by {report['moved_mm']:.2f} mm. "

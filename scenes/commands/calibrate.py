@@ -67,7 +67,8 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        Nothing, or two things to calibrate; files that cannot be read or written; data that do not determine the result.
+        Nothing, or two things to calibrate; files that cannot be read or written; data that do not determine the
+        result.
     """
     asked = [each for each in (args.pictures, args.pivot, args.hand_eye) if each is not None]
     if len(asked) != 1:
@@ -150,7 +151,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _tip(args: argparse.Namespace) -> int:
-    """A tool's tip, from its poses while it pivots."""
+    """Return a tool's tip, from its poses while it pivots."""
     from ar.tracking.tracker_calibration import calibrate_pivot
 
     from ..tracked.pose_file import read_numbered_poses

@@ -126,7 +126,7 @@ def _tracking(args: argparse.Namespace, theatre: Theatre, table: TextIO) -> dict
 
 
 def _errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:
-    """The largest of a scene's frames: what the model promises [m], and how far the tumour may be off."""
+    """Return the largest of a scene's frames: what the model promises [m], and how far the tumour may be off."""
     from ..play.frame_text import find_worst
 
     promised = [frame.model_error for frame in frames if frame.model_error is not None]

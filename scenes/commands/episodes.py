@@ -165,7 +165,7 @@ def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Wo
 def _progress(
     out: Path, there: RunStatistics, total: int, stop_if_asked: Callable[[], None]
 ) -> Iterator[ProgressListener]:
-    """A bar of episodes, with frames a second and what failed; and what each task took, into the folder."""
+    """Yield a bar of episodes, with frames a second and what failed; and what each task took, into the folder."""
     from tqdm import tqdm
 
     from ..episodes.engine import BODY

@@ -151,7 +151,7 @@ def _demand_troubles(troubles: Sequence[Trouble], times: np.ndarray) -> None:
 
 
 def _scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
-    """The scene as the camera sees it, and no longer than is asked for."""
+    """Return the scene as the camera sees it, and no longer than is asked for."""
     scene = film_with_targets(args, build_requested_scene(args, args.scene, theatre))
     if args.readout is not None:
         view = scene.viewpoint

@@ -136,6 +136,6 @@ next: look at a scene that fails: sulcus render SCENE --out frames""",
 
 
 def format_guidance(command: str) -> str:
-    """The text below a command's help."""
+    """Return the text below a command's help."""
     scenes = f"scenes: {NAMES};\n  `sulcus scenes` says what happens in each\n\n" if command in PLAYING else ""
     return scenes + EXAMPLES[command]

@@ -82,7 +82,7 @@ class Inspection:
     warnings: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """The same in a few lines of text."""
+        """Return the same in a few lines of text."""
         error = max(self.voxel)
         pieces = [
             f"  piece {number}: {volume:.2f} ml, {place}" for number, (volume, place) in enumerate(self.pieces, 1)

@@ -75,7 +75,7 @@ class InspectionView:
         return self.middle + steps[:, None, None] * self.down + steps[None, :, None] * self.right
 
     def letters(self) -> dict[str, str]:
-        """The patient's sides at the left, right, upper and lower edge, by the axis that lies most along it."""
+        """Return the patient's sides at the left, right, upper and lower edge, by the axis that lies most along it."""
         found = {}
         for edge, direction in (
             ("left", -self.right),
@@ -89,7 +89,10 @@ class InspectionView:
 
 
 def draw_inspection_sheet(found: Inspection, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
-    """The sheet (H, W, 3) uint8; `opened` (n,) bool says which points of the subject's cortex are in the opening."""
+    """Return the sheet (H, W, 3) uint8.
+
+    `opened` (n,) bool says which points of the subject's cortex are in the opening.
+    """
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     centre = subject.pieces[0].centre
     panels, drawn = [], {"opening"}
@@ -162,7 +165,7 @@ def _nearest_is(cortex: np.ndarray, chosen: np.ndarray, points: np.ndarray) -> n
 
 
 def _outside(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
-    """The cortex as seen along the opening's middle, with the tumour's shadow under it."""
+    """Return the cortex as seen along the opening's middle, with the tumour's shadow under it."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     inward = 0.5 * (low + high) - subject.site
     if opened.sum() > 3:  # across the plane of the opening
@@ -207,7 +210,7 @@ def _seen(view: InspectionView, points: np.ndarray, inward: np.ndarray, cell: fl
 
 
 def _framed(colour: np.ndarray, view: InspectionView) -> np.ndarray:
-    """The panel with its name, the patient's sides and a scale."""
+    """Return the panel with its name, the patient's sides and a scale."""
     picture = Image.fromarray(colour)
     ink = ImageDraw.Draw(picture)
     ink.rectangle([0, 0, SIDE - 1, SIDE - 1], outline=(60, 60, 64))

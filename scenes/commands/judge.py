@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Returns 0: what the figures are is for the reader to judge.
+    """Return 0: what the figures are is for the reader to judge.
 
     Raises
     ------

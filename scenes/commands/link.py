@@ -225,7 +225,7 @@ def _linked(args: argparse.Namespace, source: tuple[str, int] | None, closing: E
 
 
 def open_link(args: argparse.Namespace) -> LinkSession:
-    """The link that the arguments ask for; in an event loop.
+    """Return the link that the arguments ask for; in an event loop.
 
     Raises
     ------
@@ -288,7 +288,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
 
 
 def _tool_of(theatre: Theatre, path: Path) -> TrackedTool:
-    """The tool that the best model of poses knows, at its tip as PLUS has it: z points away from the shaft."""
+    """Return the tool that the best model of poses knows, at its tip as PLUS has it: z points away from the shaft."""
     from ..tracked.tracked_tool import TrackedTool
 
     posed = [(model.bound, model.tool) for model in theatre.models.values() if model.tool is not None]

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="RESULT.vtu",
-        help="file for mean displacement and covariance of every vertex. Without it, only the tumour is reported, for which a "
+        help="file for mean displacement and covariance of every vertex. Without it, the tumour alone is reported: a "
         "small locator is enough",
     )
     parser.add_argument(

@@ -317,7 +317,7 @@ def _report(shown: list[Shown], who: str) -> dict[str, object]:
 
 
 def _words(report: dict) -> str:
-    """The same for people."""
+    """Return the same for people."""
     count, latency = report["pictures"], report["latency"]
     lines = [f"{count} pictures; motion by {report['motion_by']}"]
     lines += [f"  {100.0 * number / count:5.1f} %  {state}" for state, number in report["states"].items()]

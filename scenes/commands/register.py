@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Returns 0 when the registration is written.
+    """Return 0 when the registration is written.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def _stored(fits: PairResiduals) -> dict[str, object]:
 
 
 def _table(fits: PairResiduals) -> list[str]:
-    """The same for people: a row for each pair, and what the worst one means."""
+    """Return the same for people: a row for each pair, and what the worst one means."""
     if np.isnan(fits.chance):
         rows = [f"{row + 1:4d} {1e3 * off:7.2f} mm" for row, off in enumerate(fits.off)]
         return ["pair   is off", *rows, "three pairs do not tell a wrong one: touch a fourth, better six"]
@@ -114,7 +114,7 @@ def _table(fits: PairResiduals) -> list[str]:
 
 
 def _nearest_on(anatomy: Anatomy) -> Nearest:
-    """The nearest place on the surface of the brain, and its normal."""
+    """Return the nearest place on the surface of the brain, and its normal."""
     from sim.geometry.closest_point import find_closest_points
 
     corners = anatomy.mesh.nodes[anatomy.mesh.surface]

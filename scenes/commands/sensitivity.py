@@ -165,7 +165,7 @@ def _opening(study: SensitivityStudy, preset: str) -> str:
 
 
 def _bound(model: Learned | None) -> list[str]:
-    """The surrogate's line of the table, if there is one."""
+    """Return the surrogate's line of the table, if there is one."""
     if model is None or not np.isfinite(model.bound):
         return []
     bound = ("", f"{1e3 * model.bound:.3f}", "", "")

@@ -99,7 +99,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Returns 0: the file is complete, whether or not every case converged; it says which did."""
+    """Return 0: the file is complete, whether or not every case converged; it says which did."""
     out = check_output_path(args.out, ".h5", args.force, resumed="anatomy" in read_statements(Path(args.out)))
     with time_stage("draw"):
         anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
@@ -153,7 +153,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _drawn(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:
-    """The tool whose poses were asked for, if they were, and the loads; of tissue that relaxes with times."""
+    """Return the tool whose poses were asked for, if they were, and the loads; of tissue that relaxes with times."""
     asked = _asked(args)
     if not args.poses:
         if asked is not None:
@@ -165,7 +165,7 @@ def _drawn(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[
 
 
 def _asked(args: argparse.Namespace) -> BuiltIn | None:
-    """The tool that the options name, if they name one.
+    """Return the tool that the options name, if they name one.
 
     Raises
     ------

@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def start_of(file: MeshFile, name: str, metre: float) -> Deformation | None:
-    """The first guess in a file's point data `start`, if there is one. `metre`: the file's unit of length in m.
+    """Return the first guess in a file's point data `start`, if there is one. `metre`: the file's unit of length in m.
 
     Raises
     ------

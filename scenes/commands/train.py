@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="MODEL.npz", help="file for all models")
     parser.add_argument(
         "--learners",
-        help=f"model types, from {', '.join(LEARNERS)}, or for poses {', '.join(OF_POSES)}, separated by commas (default: "
+        help=f"model types: {', '.join(LEARNERS)}, or for poses {', '.join(OF_POSES)}, separated by commas (default: "
         "all that the data can train)",
     )
     parser.add_argument("--most", type=int, metavar="LOADS", help="maximum number of training loads (default: all)")
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Returns 0 when the models are written."""
+    """Return 0 when the models are written."""
     out = check_output_path(args.out, ".npz", args.force)
     device = parse_device_names(args.device)[0]
     if args.force:
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def parse_learners(words: str) -> list[str]:
-    """The names in `--learners`, of which none is empty."""
+    """Return the names in `--learners`, of which none is empty."""
     names = [name.strip() for name in words.split(",")]
     if not all(names):
         raise InputError(f"--learners {words!r}: name each learner, with one comma between two, or leave it out.")

@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_device(parser, "finite elements")
     parser.add_argument(
         "--out", type=Path, metavar="FILE.json",
-        help="file to which scenes are added (default: MESH.uncertainty.json next to the anatomy, where `sulcus demo` reads it)",
+        help="file to which scenes are added (default: MESH.uncertainty.json next to the anatomy, for `sulcus demo`)",
     )  # fmt: skip
     add_json(parser)
 
@@ -146,7 +146,7 @@ def _flat(theatre: Theatre, scene: Scene, found: Uncertainty) -> dict[str, Any]:
 
 
 def _lines(row: dict[str, Any]) -> Sequence[str]:
-    """The same in lines."""
+    """Return the same in lines."""
     lines = [f"{row['scene']}:", *(f"  {line}" for line in row["said"])]
     lines.append(
         f"  at {row['time_s']:.1f} s, when it moved {row['moved_mm']:.2f} mm; its middle is within "

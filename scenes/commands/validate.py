@@ -84,7 +84,7 @@ def list_lost_episodes(folder: Path) -> list[Report]:
 
 
 def as_json(report: Report) -> dict[str, object]:
-    """A report with its path as text."""
+    """Return a report with its path as text."""
     return {**asdict(report), "path": str(report.path)}
 
 

@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--spacing", type=float, metavar="MM",
-        help="grid spacing of the fields, 0.3 to 5 mm (default: 1, or finer until tumour and landmarks are within 0.05 mm)",
+        help="grid spacing, 0.3 to 5 mm (default: 1, or finer until tumour and landmarks are within 0.05 mm)",
     )  # fmt: skip
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="new output folder")
     add_trajectory(parser)
@@ -82,7 +82,10 @@ def load(text: str) -> tuple[float, float, float, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve, write and report; return 1 if the solution did not converge or the field folds (all is written nevertheless)."""
+    """Solve, write and report.
+
+    Return 1 if the solution did not converge or the field folds (all is written nevertheless).
+    """
     from tqdm import tqdm
 
     from sim.runtime.atomic_files import write_folder_atomically
@@ -150,7 +153,7 @@ def check_warp_options(args: argparse.Namespace) -> None:
 
 
 def build_scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
-    """The scene that is asked for; a load is one whose tool pushes all the time.
+    """Return the scene that is asked for; a load is one whose tool pushes all the time.
 
     Raises
     ------
@@ -199,7 +202,7 @@ def build_pushing_scene(theatre: Theatre, asked: tuple[float, float, float, floa
 def select_moments(
     args: argparse.Namespace, theatre: Theatre, scene: Scene | None
 ) -> tuple[DeformedAnatomy, list[tuple[float, DeformedAnatomy]]]:
-    """The moment that is asked for, and those of a sequence with their times [s]; None as scene: of a file.
+    """Return the moment that is asked for, and those of a sequence with their times [s]; None as scene: of a file.
 
     Raises
     ------

@@ -64,7 +64,10 @@ class EpisodeBody:
         return get_tissue(self.drawn)
 
     def effects(self, *more: Effect, lets_go: bool = False) -> tuple[Effect, ...]:
-        """Return the effects: constraints, skull and others; with `lets_go`, the skull separates whatever was sampled."""
+        """Return the effects: constraints, skull and others.
+
+        With `lets_go`, the skull separates whatever was sampled.
+        """
         return (self.tissue, Held(), SKULLS["contact" if lets_go else self.drawn["bodies.tissue.skull"]], *more)
 
     def theatre(self, device: str) -> Theatre:
@@ -80,7 +83,7 @@ class EpisodeBody:
 
 
 def get_tissue(values: Mapping[str, Any]) -> Elasticity:
-    """The tissue of drawn values."""
+    """Return the tissue of drawn values."""
     law, young, poisson = (values[f"bodies.tissue.{name}"] for name in ("law", "young_pa", "poisson"))
     ratio = {name: values.get(_ratio(name), 1.0) for name in ("tumour", *PART_LABELS)}
     times = {**ratio, "necrosis": ratio["necrosis"] * ratio["tumour"]}
@@ -145,7 +148,7 @@ def write_body(
 
 
 def read_body(folder: Path) -> EpisodeBody:
-    """A body that `write_body` made.
+    """Return a body that `write_body` made.
 
     Raises
     ------
@@ -160,7 +163,7 @@ def read_body(folder: Path) -> EpisodeBody:
 
 
 def _anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy, Intensity | None, dict[str, Any]]:
-    """An anatomy, its scan, and what was drawn."""
+    """Return an anatomy, its scan, and what was drawn."""
     bodies = plan.contents.bodies
     values = sample_body(bodies, seed, number)
     kind = str(values["bodies.anatomies"])
@@ -206,7 +209,8 @@ def _train(
     fem = Fem(anatomy, effects, TRAIN, device, 64)
     first = int(build_generator(seed, number, "bodies.learner").integers(2**31))
     stated = {
-        "effects": repr(effects), **describe_tissue_source(body.tissue), "element": fem.space.element, "accuracy": repr(TRAIN),
+        "effects": repr(effects), **describe_tissue_source(body.tissue), "element": fem.space.element,
+        "accuracy": repr(TRAIN),
         "preset": PRESET, "seed": str(first),
     }  # fmt: skip
     data = body.folder / DATA
@@ -223,7 +227,7 @@ def _train(
 
 
 def _undated(model: Learned) -> Learned:
-    """A model that says of its training nothing but what is the same whenever it is trained."""
+    """Return a model that says of its training nothing but what is the same whenever it is trained."""
     return replace(model, training={key: text for key, text in model.training.items() if key not in OF_ITS_MAKING})
 
 
@@ -261,7 +265,7 @@ def describe_weak(models: Mapping[int, HeldOutError]) -> list[str]:
 
 
 def to_weak_json(models: Mapping[int, HeldOutError]) -> list[dict[str, float | int | None]]:
-    """The weak ones as numbers."""
+    """Return the weak ones as numbers."""
     return [
         {
             "body": number,

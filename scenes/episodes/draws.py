@@ -56,7 +56,7 @@ def build_generator(seed: int, number: int, name: str) -> np.random.Generator:
 
 
 def spread_of(value: object) -> Distribution:
-    """A plan's value as a `Distribution`."""
+    """Return a plan's value as a `Distribution`."""
     if isinstance(value, Distribution):
         return value
     if isinstance(value, tuple):

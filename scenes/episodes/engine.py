@@ -45,7 +45,10 @@ class ProgressListener(Protocol):
 
 @dataclass(frozen=True)
 class RunStatistics:
-    """Statistics of a run: episodes made now, present before, failed permanently, lost for now; frames and bytes made."""
+    """Statistics of a run: episodes made now, present before, failed permanently, lost for now.
+
+    Frames and bytes made.
+    """
 
     made: int = 0
     skipped: int = 0
@@ -69,8 +72,8 @@ def find_still_missing(
 ) -> tuple[RunStatistics, list[int]]:
     """Count episodes that exist or have failed permanently, and list the missing ones in their order of execution.
 
-    The first client takes them in ascending order. Later clients use a random order, so that two in one folder seldom make the
-    same episode at the same time. If they do, one writes over the other's file the same bytes.
+    The first client takes them in ascending order. Later clients use a random order, so that two in one folder seldom
+    make the same episode at the same time. If they do, one writes over the other's file the same bytes.
 
     Parameters
     ----------

@@ -211,7 +211,7 @@ def _jpeg(colour: np.ndarray) -> np.ndarray:
 
 
 def _right(player: Player, frame: Frame) -> Camera:
-    """The camera of the right eye."""
+    """Return the camera of the right eye."""
     return replace(player.scene.viewpoint, eye="right").camera(player.site, frame.time)
 
 

@@ -109,7 +109,7 @@ def _longer(first: Sequence[Rate], others: Sequence[Rate]) -> Amount:
 
 
 def _mean(values: Sequence[float]) -> Amount:
-    """A mean and its standard error."""
+    """Return a mean and its standard error."""
     error = float(np.std(values, ddof=1)) / np.sqrt(len(values)) if len(values) > 1 else np.nan
     return Amount(float(np.mean(values)), error)
 
@@ -121,12 +121,12 @@ def _sum(values: Sequence[float], count: int) -> Amount:
 
 
 def _added(amounts: Sequence[Amount]) -> Amount:
-    """A sum of independent amounts."""
+    """Return a sum of independent amounts."""
     return Amount(sum(one.mean for one in amounts), float(np.hypot.reduce([one.error for one in amounts])))
 
 
 def format_estimate(estimate: RunEstimate) -> list[str]:
-    """A table of it."""
+    """Return a table of it."""
     found = estimate
     rows = [
         ("disk", _plus_minus(found.bytes, 1e9, "GB")),

@@ -158,7 +158,7 @@ class ScenarioInputs:
     reach: Callable[[float], float]
 
     def place(self, radius: float) -> tuple[float, float]:
-        """A place for a tool of this radius [m], in the plane of the open cortex [m]."""
+        """Return a place for a tool of this radius [m], in the plane of the open cortex [m]."""
         far = self.values["spread"] * self.reach(radius)
         angle = self.random.uniform(0.0, 2.0 * np.pi)
         return far * float(np.cos(angle)), far * float(np.sin(angle))
@@ -170,7 +170,7 @@ class ScenarioInputs:
 
 
 def sample_press_scenario(chance: ScenarioInputs) -> Scenario:
-    """The act of `Press`."""
+    """Return the act of `Press`."""
     probe = chance.probe
     at = chance.place(probe.radius)
     tilt, angle = np.radians(chance.values["tilt_deg"]), chance.random.uniform(0.0, 2.0 * np.pi)
@@ -184,7 +184,7 @@ def sample_press_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_slide_scenario(chance: ScenarioInputs) -> Scenario:
-    """The act of `SlideMotion`."""
+    """Return the act of `SlideMotion`."""
     probe = chance.probe
     start, end = chance.place(probe.radius), chance.place(probe.radius)
     rise = 0.12 * chance.seconds
@@ -192,7 +192,7 @@ def sample_slide_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_draw_scenario(chance: ScenarioInputs) -> Scenario:
-    """The act of `DrawMotion`."""
+    """Return the act of `DrawMotion`."""
     probe, rise = chance.probe, 0.25 * chance.seconds
     tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(probe.radius)
     way = draw(chance.values["force_n"], tilt, rise, 0.2 * chance.seconds, at)
@@ -206,7 +206,7 @@ def sample_draw_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_reach_scenario(chance: ScenarioInputs) -> Scenario:
-    """The act of `Reach`."""
+    """Return the act of `Reach`."""
     probe, count = chance.probe, round(chance.values["places"])
     places = np.array([chance.place(probe.radius) for _ in range(count)])
     forces = chance.values["force_n"] * chance.random.uniform(0.5, 1.0, count)
@@ -225,7 +225,7 @@ def sample_reach_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def walk(chance: ScenarioInputs) -> Scenario:
-    """The act of `Walk`."""
+    """Return the act of `Walk`."""
     probe, seed = chance.probe, int(chance.random.integers(2**31))
     far, force = 0.5 * chance.values["spread"] * chance.reach(probe.radius), chance.values["force_n"]
 
@@ -238,7 +238,7 @@ def walk(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_palpate_scenario(chance: ScenarioInputs) -> Scenario:
-    """The act of `Palpate`."""
+    """Return the act of `Palpate`."""
     probe, rise = chance.probe, 0.2 * chance.seconds
     start, end = chance.place(probe.radius), chance.place(probe.radius)
     way = palpate(1e-3 * chance.values["depth_mm"], start, end, chance.seconds - 2.0 * rise, rise)
@@ -246,7 +246,7 @@ def sample_palpate_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_retract_scenario(chance: ScenarioInputs) -> Scenario:
-    """The act of `Retract`."""
+    """Return the act of `Retract`."""
     blade = Blade()
     tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(blade.radius)
     way = lay(1e-3 * chance.values["depth_mm"], tilt, 0.4 * chance.seconds, at)
@@ -254,14 +254,14 @@ def sample_retract_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_drain_scenario(chance: ScenarioInputs) -> Scenario:
-    """The act of `Drain`."""
+    """Return the act of `Drain`."""
     turn, fluid = float(np.radians(chance.values["turn_deg"])), chance.values["fluid"]
     lie = build_drained_turn(0.5 * chance.seconds, 0.1 * chance.seconds, 0.3 * chance.seconds, turn, fluid)
     return Scenario(effects=(Gravity(),), lying=lie, lets_go=True)
 
 
 def debulk_tumour(chance: ScenarioInputs) -> Scenario:
-    """The act of `Debulk`."""
+    """Return the act of `Debulk`."""
     count, fluid = round(chance.values["steps"]), chance.values["fluid"]
     lie = build_drained_turn(0.3 * chance.seconds, 0.0, 1.0, 0.0, fluid)
     times = tuple((chance.seconds * np.linspace(0.4, 0.9, count)).tolist())
@@ -269,14 +269,15 @@ def debulk_tumour(chance: ScenarioInputs) -> Scenario:
 
 
 FAMILIES: dict[str, Callable[[ScenarioInputs], Scenario]] = {
-    "press": sample_press_scenario, "slide": sample_slide_scenario, "draw": sample_draw_scenario, "reach": sample_reach_scenario, "walk": walk, "palpate": sample_palpate_scenario,
+    "press": sample_press_scenario, "slide": sample_slide_scenario, "draw": sample_draw_scenario,
+    "reach": sample_reach_scenario, "walk": walk, "palpate": sample_palpate_scenario,
     "retract": sample_retract_scenario, "drain": sample_drain_scenario, "debulk": debulk_tumour,
 }  # fmt: skip
 """Scenario of each family of `FamilyMotions`."""
 
 
 def add_tremor(path: Path, seed: int, place: float, force: float) -> Path:
-    """A path with a hand's tremor and drift: standard deviations of place [m] and force [N]; none in the air."""
+    """Return a path with a hand's tremor and drift: standard deviations of place [m] and force [N]; none in the air."""
 
     def trembles(time: float) -> Touch:
         touch, way = path(time), sample_wandering(seed, time)

@@ -81,12 +81,12 @@ PASSING = OSError, MemoryError
 
 
 def to_episode_path(folder: Path, number: int) -> Path:
-    """The file of an episode."""
+    """Return the file of an episode."""
     return folder / to_episode_name(number)
 
 
 def to_body_path(folder: Path, number: int) -> Path:
-    """The folder of a body."""
+    """Return the folder of a body."""
     return folder / BODIES / f"{number:04d}"
 
 
@@ -159,7 +159,7 @@ class Opened:
 
 @lru_cache(maxsize=KEPT)
 def open_body(place: Path, device: str) -> Opened:
-    """A body that was made, read once for many episodes; InputError as `read_body`."""
+    """Return a body that was made, read once for many episodes; InputError as `read_body`."""
     body = read_body(place)
     return Opened(body, body.theatre(device))
 

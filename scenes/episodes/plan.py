@@ -41,7 +41,10 @@ FIXED = "fixed"
 
 
 def format_msgspec_error(error: str) -> str:
-    """An error of msgspec as a sentence that begins with the key in question; what else it says stays as it is."""
+    """Return an error of msgspec as a sentence that begins with the key in question.
+
+    What else it says stays as it is.
+    """
     words, _, place = error.partition(" - at `$.")
     table = place.rstrip("`")
     strange, missing = (re.search(rf"{kind} field `(.*?)`", words) for kind in ("unknown", "required"))
@@ -202,7 +205,7 @@ def list_shipped() -> list[str]:
 
 
 def load_plan(name: str) -> EpisodePlan:
-    """A plan that ships, by name, or one's own, by the path of its .toml.
+    """Return a plan that ships, by name, or one's own, by the path of its .toml.
 
     Raises
     ------
@@ -239,7 +242,7 @@ def compute_anatomy_digest(plan: EpisodePlan, anatomy: str) -> str:
 
 
 def plan_from(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
-    """The plan that a TOML text holds.
+    """Return the plan that a TOML text holds.
 
     Raises
     ------
@@ -286,7 +289,7 @@ def _kinds_of(table: type[msgspec.Struct]) -> dict[str, tuple[object, ValueLimit
 
 
 def list_tables(contents: PlanContents) -> dict[str, msgspec.Struct]:
-    """The tables of a plan by name: those whose fields are drawn for each episode, and those of bodies."""
+    """Return the tables of a plan by name: those whose fields are drawn for each episode, and those of bodies."""
     bodies, motion = contents.bodies, {f"motion.{name}": each for name, each in contents.motion.named.items()}
     of_bodies = {f"bodies.{name}": getattr(bodies, name) for name in ("tumour", "tissue", "learner")}
     seen = {"look": contents.look, "hand": contents.hand, "noise": contents.noise}
@@ -324,7 +327,7 @@ def _check(contents: PlanContents) -> None:
 
 
 def to_ratio_key(region: str) -> str:
-    """The key of a region's stiffness in `bodies.tissue`, by the region's name."""
+    """Return the key of a region's stiffness in `bodies.tissue`, by the region's name."""
     return f"{region}_ratio"
 
 

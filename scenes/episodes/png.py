@@ -31,7 +31,7 @@ def encode_png(picture: np.ndarray) -> np.ndarray:
 
 
 def _differences(picture: np.ndarray) -> np.ndarray:
-    """The rows' bytes, each less that of the sample to its left, and before them the filter's number."""
+    """Return the rows' bytes, each less that of the sample to its left, and before them the filter's number."""
     height, width = picture.shape
     size = picture.itemsize
     samples = picture.astype(picture.dtype.newbyteorder(">"), order="C").view(np.uint8).reshape(height, size * width)

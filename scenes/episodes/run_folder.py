@@ -60,12 +60,12 @@ class Failure:
 
 @cache
 def get_versions() -> Mapping[str, str]:
-    """The versions of this process's packages."""
+    """Return the versions of this process's packages."""
     return {name: get_version(name) for name in PARTS}
 
 
 def to_episode_name(number: int) -> str:
-    """The name of an episode's file."""
+    """Return the name of an episode's file."""
     return f"episode_{number:06d}.h5"
 
 
@@ -136,7 +136,7 @@ def list_finished(folder: Path) -> set[int]:
 
 
 def list_failures(folder: Path) -> dict[int, Failure]:
-    """The episodes that could not be made, by number."""
+    """Return the episodes that could not be made, by number."""
     return {number: one for number in list_failed(folder) if (one := read_failure(folder, number)) is not None}
 
 
@@ -213,6 +213,6 @@ def _demand_same(folder: Path, found: RunSettings, run: RunSettings, force: bool
 
 
 def describe_versions(others: Mapping[str, str], ours: Mapping[str, str]) -> str:
-    """The packages of other versions in words; none if all are alike."""
+    """Return the packages of other versions in words; none if all are alike."""
     names = [name for name in sorted({*others, *ours}) if others.get(name) != ours.get(name)]
     return ", ".join(f"{name} {others.get(name, 'none')} and not {ours.get(name, 'none')}" for name in names)

@@ -47,13 +47,13 @@ class EpisodeSample:
     values: Mapping[str, Any]
 
     def group(self, table: str) -> dict[str, Any]:
-        """The values of one table of the plan."""
+        """Return the values of one table of the plan."""
         head = f"{table}."
         return {name.removeprefix(head): value for name, value in self.values.items() if name.startswith(head)}
 
 
 def sample_body_number(contents: PlanContents, seed: int, number: int) -> int:
-    """The number of the body that an episode is played on."""
+    """Return the number of the body that an episode is played on."""
     return int(build_generator(seed, number, "body").integers(contents.bodies.count))
 
 
@@ -104,7 +104,7 @@ def build_scene(
 
 
 def make_relaxing(tissue: Elasticity) -> Elasticity:
-    """The same tissues, relaxing."""
+    """Return the same tissues, relaxing."""
 
     def relaxed(each: object) -> Any:
         return replace(cast(Any, each), prony=PRONY)
@@ -114,7 +114,7 @@ def make_relaxing(tissue: Elasticity) -> Elasticity:
 
 
 def _viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int, number: int) -> Viewpoint:
-    """The camera of an episode."""
+    """Return the camera of an episode."""
     random = build_generator(seed, number, "look.camera")
     width, height = contents.size
     path = None if look["path"] == FIXED else PATHS[look["path"]](int(random.integers(2**31)))

@@ -50,7 +50,7 @@ class Made:
 
 @dataclass(frozen=True)
 class RunWork:
-    """Functions that make bodies and episodes: module-level, so that workers can import them, or partial functions of these.
+    """Functions that make bodies and episodes: at module level, so that workers can import them, or partials of these.
 
     Parameters
     ----------

@@ -174,7 +174,7 @@ class Workers:
 def start_own_workers(
     devices: Sequence[str], settings: Mapping[str, object] | None = None, starts: int = 10
 ) -> Iterator[Workers]:
-    """Processes of this machine, one for each name in `devices`, each with the card that its name has.
+    """Yield processes of this machine, one for each name in `devices`, each with the card that its name has.
 
     They are spawned, started again when they end, and killed when the block ends or this process does. A scheduler and
     its workers run what any client sends them: keys that exist in the memory of these processes alone (TLS) keep other
@@ -206,7 +206,7 @@ def start_own_workers(
 
 @contextmanager
 def connect_workers(address: str, device: str, patience: float = PATIENCE) -> Iterator[Workers]:
-    """The workers of a running scheduler, who may come and go.
+    """Yield the workers of a running scheduler, who may come and go.
 
     Parameters
     ----------

@@ -246,7 +246,7 @@ class Operations(VectorEnv):
         return {"rgb": colour, "depth": depth, "states": states}
 
     def _infos(self, steps: Sequence[EpisodeStep]) -> dict[str, Any]:
-        """The truth as arrays with a row for each environment, and Gymnasium's masks of who has it: all."""
+        """Return the truth as arrays with a row for each environment, and Gymnasium's masks of who has it: all."""
         infos = {name: np.stack([step.info[name] for step in steps]) for name in steps[0].info}
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
 
@@ -257,8 +257,8 @@ def make_many(task: str, count: int, processes: bool = False, **given: Any) -> V
     Parameters
     ----------
     processes
-        Whether each has a process of its own. Children are spawned, because a process that uses a GPU cannot be forked: a script
-        that asks for them needs `if __name__ == "__main__":`.
+        Whether each has a process of its own. Children are spawned, because a process that uses a GPU cannot be forked:
+        a script that asks for them needs `if __name__ == "__main__":`.
     given
         Other arguments of `Operation`.
 

@@ -58,7 +58,7 @@ class EpisodeScore:
 
 
 def compute_reward(before: EpisodeScore, now: EpisodeScore, success: bool, ended: bool) -> float:
-    """The reward of a step from one state to the next; `ended`: at a limit, without success."""
+    """Return the reward of a step from one state to the next; `ended`: at a limit, without success."""
     reward = now.potential - before.potential - STEP
     if now.load > 1.0:
         reward -= OVER_LIMIT

@@ -44,7 +44,7 @@ class PosedElements:
     together: bool = False
 
     def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
-        """Solve as `Answers.answer`; environments at the start of an episode form a separate batch."""
+        """Solve as `TissueModel.answer`; environments at the start of an episode form a separate batch."""
         found: dict[int, Touched] = {}
         begin = [row for row, each in enumerate(asked) if each.last is None]
         going = [row for row, each in enumerate(asked) if each.last is not None]
@@ -112,7 +112,7 @@ class CutElements:
     _surfaces: dict[int, HealthySurface] = field(default_factory=dict)
 
     def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
-        """Solve as `Answers.answer`; earlier requests have no influence, because levels are solved in one order."""
+        """Solve as `TissueModel.answer`; earlier requests have no influence, because levels are solved in one order."""
         return [self._touched(each) for each in asked]
 
     def _touched(self, asked: TissueRequest) -> Touched:
@@ -128,7 +128,10 @@ class CutElements:
         return Touched(motion, np.arange(len(motion)), force, self.ball.pressure(size), good)
 
     def _at(self, level: int, done: int) -> Deformation:
-        """Return the solution at a fluid level, started from the level above; after more steps, from that after fewer."""
+        """Return the solution at a fluid level, started from the level above.
+
+        After more steps, from that after fewer.
+        """
         key = level, done
         if key not in self._solved:
             start = None

@@ -49,7 +49,7 @@ class Hertz:
         return 2.0 * mu / (1.0 - 0.5 * lame / (lame + mu))
 
     def force(self, depth: np.ndarray) -> np.ndarray:
-        """Forces [N] at depths [m]: F = 4/3 E' sqrt(r) d^1.5; none above the surface."""
+        """Return forces [N] at depths [m]: F = 4/3 E' sqrt(r) d^1.5; none above the surface."""
         return 4.0 / 3.0 * self.modulus * np.sqrt(self.radius) * np.maximum(depth, 0.0) ** 1.5
 
     def contact(self, force: np.ndarray) -> np.ndarray:
@@ -57,11 +57,11 @@ class Hertz:
         return np.cbrt(0.75 * force * self.radius / self.modulus)
 
     def pressure(self, force: float) -> float:
-        """The pressure [Pa] in the middle of the contact under a force [N]: 3 F / (2 pi a^2)."""
+        """Return the pressure [Pa] in the middle of the contact under a force [N]: 3 F / (2 pi a^2)."""
         return 1.5 * force / (np.pi * float(self.contact(np.array(force))) ** 2) if force > 0.0 else 0.0
 
     def deeper(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-        """Return the extra depth [m] of the ball's centre compared with a wider footprint (k,) [m] under the same forces (k,).
+        """Return the extra depth [m] of the ball's centre compared with a wider footprint (k,) [m] under equal forces (k,).
 
         The middle of a footprint sqrt(1 - (s/a)^2) sinks by 3 F / (4 E' a).
         """
@@ -99,7 +99,7 @@ class PressedModel:
         return open_patch(self.site.anatomy)
 
     def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
-        """Predict as `Answers.answer`."""
+        """Predict as `TissueModel.answer`."""
         poses = np.stack([each.pose for each in asked])
         parts = [poses] if self.together else np.split(poses, len(poses))
         return [touched for part in parts for touched in self._answered(part)]
@@ -132,7 +132,7 @@ class PressedModel:
         return np.clip(self.ball.contact(size), *self.model.envelope.footprint)
 
     def _forces(self, point: np.ndarray, inward: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Find forces (k,) [N] at points (k, 3) by the secant method, and whether each brings a ball to its depth (k,) [m]."""
+        """Find forces (k,) [N] at points (k, 3) by the secant method, and whether each reaches its depth (k,) [m]."""
         patch, rows = self._patch, np.arange(len(depth))
         place = find_closest_points(point, patch.points[patch.triangles])
         corners, most = patch.triangles[place.triangle], STRONGEST * self.model.envelope.force[1]
@@ -160,7 +160,8 @@ class PressedModel:
 class PosedModel:
     """Prediction of motion, force and bound by a model of tool poses; a blade continues from its last state.
 
-    The pressure under a ball is that of Hertz under its force; under a blade it is the highest of `compute_tool_pressure`.
+    The pressure under a ball is that of Hertz under its force; under a blade it is the highest of
+    `compute_tool_pressure`.
 
     Parameters
     ----------
@@ -174,7 +175,10 @@ class PosedModel:
     ball: Hertz | None
 
     def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
-        """Predict as `Answers.answer`, one by one. If the model rejects a pose, the tissue stays and is marked unreliable."""
+        """Predict as `TissueModel.answer`, one by one.
+
+        If the model rejects a pose, the tissue stays and is marked unreliable.
+        """
         return [self._answered(each.pose, each.last) for each in asked]
 
     def _answered(self, pose: np.ndarray, last: Touched | None) -> Touched:

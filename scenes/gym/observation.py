@@ -25,7 +25,7 @@ FARTHEST = 2.0
 
 
 def build_action_space() -> spaces.Box:
-    """The space of actions: twists (6,) of a tool."""
+    """Return the space of actions: twists (6,) of a tool."""
     return spaces.Box(-1.0, 1.0, (6,), np.float32)
 
 

@@ -127,7 +127,7 @@ def open_setting(
     model: str | None = None,
     together: bool | None = None,
 ) -> TaskSetting:
-    """A task on a body, read once for all environments of a process.
+    """Return a task on a body, read once for all environments of a process.
 
     Parameters
     ----------
@@ -135,7 +135,8 @@ def open_setting(
         "template", or the path of a .vtu file.
     physics
         "model": the best trained model of the tool's poses, or of pushes where the tool is a ball. "fem": finite
-        elements. "auto": the model where there is one; if one exists that is not applicable, a warning gives the reason.
+        elements. "auto": the model where there is one; if one exists that is not applicable, a warning gives the
+        reason.
     device
         As of `Fem`.
     size
@@ -144,8 +145,8 @@ def open_setting(
         A file of trained models. None: the one next to the anatomy; of the template and a spatula the one that ships.
         Regions have the tissue that its models learned.
     together
-        Whether all environments are solved in one batch; None: on a GPU only. On the CPU that is several times as fast, but
-        the last digits depend on the neighbours.
+        Whether all environments are solved in one batch; None: on a GPU only. On the CPU that is several times as fast,
+        but the last digits depend on the neighbours.
 
     Raises
     ------

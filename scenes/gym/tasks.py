@@ -139,7 +139,7 @@ TASKS = {task.name: task for task in (PALPATE, RETRACT, DEBULK)}
 
 
 def find_task(name: object) -> GymTask:
-    """A task by name.
+    """Return a task by name.
 
     Raises
     ------

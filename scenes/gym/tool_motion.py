@@ -43,12 +43,12 @@ def compute_lever(tool: Instrument) -> float:
 
 
 def build_tool_frame(site: Site) -> np.ndarray:
-    """The frame of twists and observations, as columns (3, 3): the open cortex's right, up, and outwards."""
+    """Return the frame of twists and observations, as columns (3, 3): the open cortex's right, up, and outwards."""
     return np.column_stack([site.right, site.up, -site.axis])
 
 
 def lay_tool(site: Site, tool: Instrument, tip: np.ndarray) -> RobotTool:
-    """A tool in its first posture, its lowest point at `tip` (3,) [m]."""
+    """Return a tool in its first posture, its lowest point at `tip` (3,) [m]."""
     turned = tool.pose(tip, site.axis, site.right)[:3, :3]
     return RobotTool(tip - compute_lever(tool) * site.axis, turned)
 
@@ -56,7 +56,7 @@ def lay_tool(site: Site, tool: Instrument, tip: np.ndarray) -> RobotTool:
 def move_tool(
     hand: RobotTool, site: Site, tool: Instrument, twist: np.ndarray, tilt: float, deepest: float
 ) -> RobotTool:
-    """A tool after a twist (6,) [m, rad], in the frame of `build_tool_frame`, about its own point.
+    """Return a tool after a twist (6,) [m, rad], in the frame of `build_tool_frame`, about its own point.
 
     The bone stops it at the opening's edge. It goes no deeper than `deepest` [m] below the open cortex's middle. It
     leans by no more than `tilt` [rad] from its first posture: a turn beyond that is left out.

@@ -258,7 +258,7 @@ class Clients:
 
 
 def _found(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> bytes | None:
-    """A message of a type: that of a name if there is one, else the first of those with the last time stamp."""
+    """Return a message of a type: that of a name if there is one, else the first of those with the last time stamp."""
     every = [(read_header(each[: HEADER.size]), each) for messages in newest.values() for each in messages]
     alike = [(header, each) for header, each in every if header.kind == kind]
     named = (each for header, each in alike if header.name == name)

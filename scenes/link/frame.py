@@ -58,7 +58,7 @@ class Header:
 
 
 def read_header(raw: bytes) -> Header:
-    """The header in 58 bytes.
+    """Return the header in 58 bytes.
 
     Raises
     ------
@@ -119,16 +119,16 @@ def read_metadata(header: Header, body: bytes) -> dict[str, str]:
 
 
 def pack_message(kind: str, name: str, body: bytes, stamp: int) -> bytes:
-    """A whole message of version 1, which every client reads; a name longer than 20 bytes is cut."""
+    """Return a whole message of version 1, which every client reads; a name longer than 20 bytes is cut."""
     text = name.encode("ascii", "replace")[:NAME_BYTES]
     return HEADER.pack(1, kind.encode(), text, stamp, len(body), crc64.ecma_182(body)) + body
 
 
 def to_stamp(time: float) -> int:
-    """The time stamp of a moment [s since 1970]."""
+    """Return the time stamp of a moment [s since 1970]."""
     return int(time * TICKS)
 
 
 def to_time(stamp: int) -> float:
-    """The moment of a time stamp [s since 1970]."""
+    """Return the moment of a time stamp [s since 1970]."""
     return stamp / TICKS

@@ -139,7 +139,7 @@ def check_status(metadata: Mapping[str, str]) -> None:
 
 
 def to_rigid(matrix: np.ndarray) -> np.ndarray:
-    """The rigid motion (4, 4) [m] of a matrix (4, 4) [mm], rid of single precision's rounding.
+    """Return the rigid motion (4, 4) [m] of a matrix (4, 4) [mm], rid of single precision's rounding.
 
     Raises
     ------

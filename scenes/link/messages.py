@@ -74,7 +74,7 @@ def transform(T: np.ndarray) -> bytes:
 
 
 def read_transform(content: bytes) -> np.ndarray:
-    """The matrix (4, 4) [mm] of a TRANSFORM, whatever it holds.
+    """Return the matrix (4, 4) [mm] of a TRANSFORM, whatever it holds.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def read_transform(content: bytes) -> np.ndarray:
 
 
 def read_position(content: bytes) -> np.ndarray:
-    """The matrix (4, 4) [mm] of a POSITION: a place, and a unit quaternion, the real part last.
+    """Return the matrix (4, 4) [mm] of a POSITION: a place, and a unit quaternion, the real part last.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def read_image(content: bytes) -> np.ndarray:
 
 
 def encode_string(text: str) -> bytes:
-    """STRING: a text of ASCII characters."""
+    """Return STRING: a text of ASCII characters."""
     raw = text.encode("ascii", "replace")[:LONGEST_TEXT]
     return struct.pack(">HH", ASCII, len(raw)) + raw
 

@@ -71,7 +71,7 @@ class Outgoing:
         return ("Tumour", self.stage.tumour_vertices, tumour), ("Cortex", cortex, SentMesh.of(faces.reshape(-1, 3)))
 
     def scan(self, stamp: int) -> bytes:
-        """The tumour as the scan has it."""
+        """Return the tumour as the scan has it."""
         _, vertices, mesh = self._surfaces[0]
         at = self.stage.anatomy.mesh.nodes[vertices]
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * at, mesh), stamp)
@@ -150,7 +150,7 @@ class Outgoing:
         return encode_points([places.names[row] for row in here], at[here])
 
     def _distance_words(self, answer: PoseResult) -> str:
-        """The distance from tip to tumour with its error and what that is of; or why it is not known."""
+        """Return the distance from tip to tumour with its error and what that is of; or why it is not known."""
         known, gauge = answer.known, answer.gauge
         if gauge is None:
             return f"not known: {known.words}"
@@ -178,7 +178,7 @@ def _but(known: TrackingResult) -> str:
 
 
 def _listed(names: list[str]) -> str:
-    """Some of many, and how many others there are."""
+    """Return some of many, and how many others there are."""
     others = len(names) - MOST_NAMED
     return ", ".join(names[:MOST_NAMED]) + (f" and {others} others" if others > 0 else "")
 
@@ -190,7 +190,7 @@ def _follows(known: TrackingResult, vertices: np.ndarray) -> bool:
 
 
 def fit_rigid(rest: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """The rigid motion (4, 4) that takes points (n, 3) nearest to where they are now (n, 3), in their unit."""
+    """Return the rigid motion (4, 4) that takes points (n, 3) nearest to where they are now (n, 3), in their unit."""
     middle, there = rest.mean(axis=0), now.mean(axis=0)
     T = np.eye(4)
     T[:3, :3] = Rotation.align_vectors(now - there, rest - middle)[0].as_matrix()

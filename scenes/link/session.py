@@ -55,11 +55,11 @@ class PoseResponderLike(Protocol):
     def answer(
         self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
     ) -> PoseResult:
-        """Compute the result, as `Answering.answer`."""
+        """Compute the result, as `PoseResponder.answer`."""
         ...
 
     def camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
-        """Return the scan's pose, as `Answering.camera`."""
+        """Return the scan's pose, as `PoseResponder.camera`."""
         ...
 
 

@@ -43,7 +43,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def apply_camera_options(args: argparse.Namespace, scene: Scene) -> Scene:
-    """The scene as the camera of `add_camera`'s options sees it, where there are any.
+    """Return the scene as the camera of `add_camera`'s options sees it, where there are any.
 
     Raises
     ------

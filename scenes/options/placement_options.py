@@ -52,12 +52,12 @@ def point_or_file(text: str) -> Point | Path:
 
 
 def parse_opening(text: str) -> int | Point | Path:
-    """A piece's number, X,Y,Z or a file of markups, for argparse."""
+    """Return a piece's number, X,Y,Z or a file of markups, for argparse."""
     return int(text) if text.isdecimal() else point_or_file(text)
 
 
 def to_opening_options(args: argparse.Namespace) -> list[str]:
-    """The options as words for another command."""
+    """Return the options as words for another command."""
     given = {"--opening-at": args.opening_at, "--opening-over": args.opening_over}
     texts = {
         name: ",".join(map(repr, value)) if isinstance(value, tuple) else str(value)
@@ -68,7 +68,7 @@ def to_opening_options(args: argparse.Namespace) -> list[str]:
 
 
 def get_trajectory_option(args: argparse.Namespace) -> Path | None:
-    """The file of the trajectory that the options name, if they name one."""
+    """Return the file of the trajectory that the options name, if they name one."""
     given = args.opening_over if args.opening_at is None else args.opening_at
     return given if isinstance(given, Path) and read_markup(given).kind == "Line" else None
 
@@ -119,7 +119,7 @@ def _depth(subject: Subject, place: np.ndarray) -> float:
 
 
 def _marked(subject: Subject, markup: Markup) -> Subject:
-    """The subject opened at a point, where a trajectory enters the brain, or within an outline."""
+    """Return the subject opened at a point, where a trajectory enters the brain, or within an outline."""
     _demand_kind(markup, "--opening-at", Fiducial=1, Line=2, ClosedCurve=None)
     if markup.kind == "ClosedCurve":
         outline = markup.curve()

@@ -64,7 +64,7 @@ def check_pose_options(args: argparse.Namespace) -> None:
 
 
 def _clock(words: list[str]) -> tuple[float, float]:
-    """An offset, and by how much it is off [s]."""
+    """Return an offset, and by how much it is off [s]."""
     try:
         offset, error = float(words[0]), float(words[1]) if len(words) > 1 else 0.0
     except ValueError:
@@ -75,7 +75,7 @@ def _clock(words: list[str]) -> tuple[float, float]:
 
 
 def open_external_tracker(args: argparse.Namespace, calibration: Calibration) -> ExternalTracker | None:
-    """The other tracker's poses; None where none are asked for.
+    """Return the other tracker's poses; None where none are asked for.
 
     Raises
     ------

@@ -78,7 +78,7 @@ def parse_labels(text: str) -> tuple[Label, ...]:
 
 
 def parse_sources(args: argparse.Namespace) -> Sources:
-    """The files and labels that the options name."""
+    """Return the files and labels that the options name."""
     return Sources(
         args.labels,
         args.brain or (),
@@ -92,7 +92,7 @@ def parse_sources(args: argparse.Namespace) -> Sources:
 
 
 def parse_regions(args: argparse.Namespace) -> tuple[str, ...]:
-    """The parts of brain and tumour that become regions of their own."""
+    """Return the parts of brain and tumour that become regions of their own."""
     return tuple(dict.fromkeys((*(name for name in _parts(args) if name in PART_LABELS), *args.regions)))
 
 
@@ -101,7 +101,7 @@ def _parts(args: argparse.Namespace) -> dict[str, tuple[Label, ...]]:
 
 
 def label_words(args: argparse.Namespace) -> list[str]:
-    """The options as words for `sulcus anatomy`."""
+    """Return the options as words for `sulcus anatomy`."""
     given = {
         "--labels": args.labels,
         "--brain": args.brain and ",".join(map(str, args.brain)),
@@ -126,7 +126,7 @@ def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
     drawn.add_argument(
         "--head",
         choices=("template", "fsaverage"),
-        help="healthy head: the ICBM template (default), or the inside of fsaverage's inner skull, from the package mne. Or give "
+        help="healthy head: the ICBM template (default), or fsaverage's inner skull, from the package mne. Or give "
         "--mask, the brain of any healthy head, with --t1 if you like",
     )
     drawn.add_argument(
@@ -171,7 +171,9 @@ def check_no_drawn_options(args: argparse.Namespace) -> None:
 
 
 def build_drawn_subject(args: argparse.Namespace, chosen: dict[str, Any]) -> Subject:
-    """Return the synthetic subject of the options; `chosen` has lengths [mm], shape and site after presets and defaults.
+    """Return the synthetic subject of the options.
+
+    `chosen` has lengths [mm], shape and site after presets and defaults.
 
     Raises
     ------

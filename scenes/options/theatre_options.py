@@ -45,7 +45,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     parser.add_argument(
         "--deformer",
-        help="deformation model: a trained model (linear, ann, svr, ...), fem, or guarded: the best trained model, and finite "
+        help="deformation model: a trained one (linear, ann, svr, ...), fem, or guarded: the best trained one, and finite "
         "elements where it is unsure. auto: chosen by --within-mm or --within-ms. Default: the model of least error",
     )
     parser.add_argument(
@@ -74,7 +74,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
 
 
 def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> Theatre:
-    """The theatre that `add_theatre`'s arguments ask for, to play scenes of these names there.
+    """Return the theatre that `add_theatre`'s arguments ask for, to play scenes of these names there.
 
     Raises
     ------

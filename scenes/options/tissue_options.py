@@ -111,7 +111,7 @@ def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMEND
 
 
 def get_tissue(args: argparse.Namespace) -> Tissue:
-    """The tissue asked for.
+    """Return the tissue asked for.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def get_tissue(args: argparse.Namespace) -> Tissue:
 
 
 def _elastic(args: argparse.Namespace) -> Material | Ogden:
-    """The tissue asked for, with the series that it has of its own."""
+    """Return the tissue asked for, with the series that it has of its own."""
     known = MATERIALS[args.material].tissue if args.material in MATERIALS else None
     ours = {"--ogden": args.ogden, "--bulk": args.bulk}
     if args.material == Ogden.law or isinstance(known, Ogden):
@@ -161,7 +161,7 @@ def _elastic(args: argparse.Namespace) -> Material | Ogden:
 
 
 def parse_elasticity(args: argparse.Namespace, mesh: TetMesh) -> Elasticity:
-    """The tissue asked for, of a mesh and its regions.
+    """Return the tissue asked for, of a mesh and its regions.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def parse_elasticity(args: argparse.Namespace, mesh: TetMesh) -> Elasticity:
 
 
 def parse_optional_tissue(args: argparse.Namespace) -> Tissue | None:
-    """The tissue asked for, or None where no option of it is given."""
+    """Return the tissue asked for, or None where no option of it is given."""
     constants = (args.young, args.poisson, args.ogden, args.bulk, args.prony)
     given = args.material != "default" or any(value is not None for value in constants)
     return get_tissue(args) if given else None
@@ -255,7 +255,7 @@ def _warn(option: str, tissue: Tissue) -> None:
 
 
 def parse_region_label(text: str) -> int:
-    """A region's label, by its number or its name.
+    """Return a region's label, by its number or its name.
 
     Raises
     ------

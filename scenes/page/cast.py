@@ -51,7 +51,7 @@ class SceneSolvers:
             self.player(deformer)
 
     def stage(self, off: frozenset[str] = ALL) -> Stage:
-        """The stage of the scene without some effects, of the tissue that it has with them."""
+        """Return the stage of the scene without some effects, of the tissue that it has with them."""
         if off not in self.stages:
             scene = self.stages[ALL].scene
             for effect in scene.get_effects_on(self.theatre.anatomy):
@@ -60,7 +60,7 @@ class SceneSolvers:
         return self.stages[off]
 
     def solver(self, off: frozenset[str] = ALL) -> FemWorker:
-        """The finite elements of the scene without some effects."""
+        """Return the finite elements of the scene without some effects."""
         if off not in self.solvers:
             self.solvers[off] = FemWorker(self.theatre, self.stage(off).scene, self.turn)
         return self.solvers[off]
@@ -80,7 +80,7 @@ class SceneSolvers:
         return self.players[name, off]
 
     def seen(self, name: str, off: frozenset[str], path: str) -> Player:
-        """The same, with the camera on a path of that name; "" as the scene has it."""
+        """Return the same, with the camera on a path of that name; "" as the scene has it."""
         player = self.player(name, off)
         if not path:
             return player

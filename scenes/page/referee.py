@@ -123,13 +123,13 @@ class FemWorker:
                 self.wake.notify_all()
 
     def _next(self) -> Question | None:
-        """The newest question, once there is one; None at the end."""
+        """Return the newest question, once there is one; None at the end."""
         with self.wake:
             self.wake.wait_for(lambda: self.closed.is_set() or self.newest is not None)
             return None if self.closed.is_set() else self.newest
 
     def _prepared(self, theatre: Theatre, scene: Scene) -> ReplaySession | None:
-        """The finite elements; None where they are not wanted any more when it is their turn."""
+        """Return the finite elements; None where they are not wanted any more when it is their turn."""
         with self.turn:
             if self.closed.is_set() or self.newest is None:
                 return None

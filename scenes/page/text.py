@@ -87,7 +87,7 @@ def format_page_legend(scene: Scene) -> str:
 
 
 def format_legend(keys: Sequence[tuple[str, str]]) -> str:
-    """A legend: each line's attributes as SVG has them, and what it means."""
+    """Return a legend: each line's attributes as SVG has them, and what it means."""
     lines = (
         f'<span><svg width="26" height="8"><line x1="1" y1="4" x2="25" y2="4" {line}/></svg>{text}</span>'
         for line, text in keys
@@ -96,7 +96,7 @@ def format_legend(keys: Sequence[tuple[str, str]]) -> str:
 
 
 def to_stroke(colour: Sequence[float]) -> str:
-    """A colour, sRGB in [0, 1], as a line has it in HTML."""
+    """Return a colour, sRGB in [0, 1], as a line has it in HTML."""
     return 'stroke="#' + "".join(f"{round(255.0 * share):02x}" for share in colour) + '"'
 
 
@@ -104,7 +104,8 @@ def describe_scene(theatre: Theatre, scene: Scene, anatomy: str) -> str:
     """Describe the anatomy, the side, and the tissue of the FEM model."""
     mesh = theatre.anatomy.mesh
     return (
-        f"Brain: {anatomy}, opened {describe_side_of_brain(theatre.site)}; {len(mesh.nodes)} mesh points. Finite elements: "
+        f"Brain: {anatomy}, opened {describe_side_of_brain(theatre.site)}; {len(mesh.nodes)} mesh points. "
+        "Finite elements: "
         f"{describe_fem(theatre, scene)}."
     )
 
@@ -124,7 +125,7 @@ def describe_fem(theatre: Theatre, scene: Scene) -> str:
 
 
 def describe_tissue(tissue: Tissue | None) -> str:
-    """A tissue's law and constants."""
+    """Return a tissue's law and constants."""
     if tissue is None:
         return "a tissue for each region"
     fades = ", which relaxes under a held load" if tissue.prony else ""
@@ -274,13 +275,16 @@ def compute_estimate(found: TumourEstimate) -> list[str]:
 
 
 def format_tip_distance(distance: float, error: float | None, inside: bool) -> str:
-    """The page's first line: from the tip to the tumour's surface, with its error [m], as HTML; None: not known."""
+    """Return the page's first line: from the tip to the tumour's surface, with its error [m], as HTML.
+
+    None: not known.
+    """
     what = "tip inside the tumour, its edge" if inside else "tip to tumour"
     return f'<p class="number">{what} {format_unbroken(distance, error)}</p>'
 
 
 def format_unbroken(length: float, error: float | None = None) -> str:
-    """A length and its error [m] in millimetres, whose unit no new line parts from them."""
+    """Return a length and its error [m] in millimetres, whose unit no new line parts from them."""
     said = hud.format_millimetres(length, error).replace("+-", "\N{PLUS-MINUS SIGN}")
     return said.replace(" ", "&nbsp;")
 
@@ -306,7 +310,7 @@ def format_cost_table(rows: Sequence[ComparisonRow]) -> str:
 
 
 def _off(millimetres: float) -> str:
-    """The error in millimetres; a small one is not rounded to none."""
+    """Return the error in millimetres; a small one is not rounded to none."""
     return f"{millimetres:.3f}" if millimetres >= 1e-3 else "under 0.001"
 
 

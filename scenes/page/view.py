@@ -50,7 +50,7 @@ def build_brain(stage: Stage) -> list[SceneSurface]:
 
 
 def list_orientation_labels(site: Site) -> list[Sign]:
-    """The patient's sides round the brain."""
+    """Return the patient's sides round the brain."""
     nodes = site.anatomy.mesh.nodes
     middle, half = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + BESIDE
     ways = zip(("RL", "AP", "SI"), np.diag(half), strict=True)

@@ -86,7 +86,7 @@ class SceneFigures:
     doubt: str = ""
 
     def broken(self, bounds: Bounds) -> list[str]:
-        """A sentence for each bound that is not kept."""
+        """Return a sentence for each bound that is not kept."""
         rules = {
             f"overlap {self.overlap:.4f} is below {bounds.overlap}": self.overlap >= bounds.overlap,
             f"error {self.error_mm:.4f} mm is above {1e3 * bounds.error:g} mm": self.error_mm <= 1e3 * bounds.error,

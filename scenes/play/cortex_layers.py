@@ -34,7 +34,7 @@ DARK, MOTTLE, MOTTLED = 0.75, 0.12, 0.35e-3
 def add_vessels(
     intensity: Intensity | None, site: Site, seed: int, dark: tuple[float, float, float], relief: float
 ) -> Solid:
-    """The scan round an opening as a solid texture with vessels upon it, which the seed draws.
+    """Return the scan round an opening as a solid texture with vessels upon it, which the seed draws.
 
     They go with the tissue, and have no height. Without a scan, tissue is evenly bright. `dark` and `relief` as of
     `Solid`.

@@ -101,7 +101,7 @@ class Theatre:
         return scene.sight is not None and (self.locator_file is None or not self.locator_file.is_file())
 
     def stage(self, scene: Scene) -> Stage:
-        """A scene's stage on this anatomy, drawn on this theatre's device.
+        """Return a scene's stage on this anatomy, drawn on this theatre's device.
 
         Raises
         ------
@@ -174,7 +174,7 @@ class Theatre:
         return name in self.models and not self.models[name].series
 
     def described(self, name: str, scene: Scene) -> str:
-        """A deformer by name, in words: what solves, or what it learned from."""
+        """Return a deformer by name, in words: what solves, or what it learned from."""
         solver = describe_solver(self.choose_element(scene), scene.effects)
         if name == GUARDED:
             model, limit = self.models[self.best(scene)], 1e3 * self.limit_of(scene)
@@ -187,11 +187,11 @@ class Theatre:
         return finite_elements(self.anatomy, effects, accuracy, self.device, batch, element, live)
 
     def choose_element(self, scene: Scene) -> str:
-        """The element of a scene, or the one that is recommended for the mesh."""
+        """Return the element of a scene, or the one that is recommended for the mesh."""
         return scene.element or recommend_element(self.anatomy.mesh)
 
     def deformer(self, name: str, scene: Scene) -> Deformer:
-        """A deformer by name; finite elements are made for the scene's accuracy.
+        """Return a deformer by name; finite elements are made for the scene's accuracy.
 
         Raises
         ------
@@ -224,7 +224,7 @@ class Theatre:
         return self.models[name]
 
     def player(self, name: str, scene: Scene) -> Player:
-        """A scene on this anatomy's open cortex with a deformer by name.
+        """Return a scene on this anatomy's open cortex with a deformer by name.
 
         Raises
         ------
@@ -246,7 +246,7 @@ class AtRest:
     anatomy: Anatomy
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """A guess that nothing moves, whatever acts."""
+        """Return a guess that nothing moves, whatever acts."""
         rest = guess(np.zeros((len(loads), *self.anatomy.mesh.nodes.shape)))
         return rest if at is None else rest.at(at)
 
@@ -271,8 +271,8 @@ def open_theatre(
     Raises
     ------
     InputError
-        As `check_scene_exists`, before anything is read. Files that are missing, unreadable, or do not belong together; a
-        device that is not there.
+        As `check_scene_exists`, before anything is read. Files that are missing, unreadable, or do not belong together;
+        a device that is not there.
     """
     for name in scenes:
         check_scene_exists(name)

@@ -54,7 +54,7 @@ class AblationRow:
 
 
 def remove_effect(scene: Scene, effect: Effect) -> Scene:
-    """The scene without one of its effects."""
+    """Return the scene without one of its effects."""
     if effect not in scene.effects:  # it depends on the body
         return replace(scene, surgery=None)
     return replace(scene, effects=tuple(other for other in scene.effects if other != effect))

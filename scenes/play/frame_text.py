@@ -136,7 +136,7 @@ def format_tumour_error(error: TumourError, brief: bool = False) -> str:
 
 
 def find_worst(errors: Sequence[TumourError]) -> TumourError:
-    """The largest of several frames' errors; not known where one is not."""
+    """Return the largest of several frames' errors; not known where one is not."""
     known = [error for error in errors if error.bound is not None]
     if len(known) < len(errors) or not known:
         return TumourError(None)

@@ -35,5 +35,5 @@ def _beside(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
 
 
 def _at_once(tissue: Tissue) -> Tissue:
-    """A tissue as if it did not relax."""
+    """Return a tissue as if it did not relax."""
     return replace(tissue, prony=()) if isinstance(tissue, Material | Ogden) else tissue

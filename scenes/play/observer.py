@@ -240,7 +240,10 @@ def sample_rigid_error(sight: Sight | StereoSight, number: int) -> RigidError:
 
 
 def find_touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> np.ndarray:
-    """The place of the cortex (1, 3) [m] that a tool with corners (t, 3) [m] touches; (0, 3) where it is in the air."""
+    """Return the place of the cortex (1, 3) [m] that a tool with corners (t, 3) [m] touches.
+
+    (0, 3) where it is in the air.
+    """
     triangles = anatomy.open_surface
     near = tool[np.argsort(KDTree(positions[np.unique(triangles)]).query(tool)[0])[:CORNERS]]
     place = find_closest_points(near, positions[triangles]).point

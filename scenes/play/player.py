@@ -175,7 +175,7 @@ class Player:
         return self.scene.viewpoint.camera(self.site)
 
     def camera_at(self, time: float) -> Camera:
-        """The scene's camera at a time [s]: one that stays is the same, whose backdrop is kept."""
+        """Return the scene's camera at a time [s]: one that stays is the same, whose backdrop is kept."""
         view = self.scene.viewpoint
         return self.camera if view.path is None else view.camera(self.site, time)
 

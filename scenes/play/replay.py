@@ -65,7 +65,7 @@ class FrameCache(Generic[T]):
         self._last: dict[int, T] = {}
 
     def towards(self, number: int) -> tuple[int, T]:
-        """The frame, or one nearer to it, and its number: a call takes one step at most."""
+        """Return the frame, or one nearer to it, and its number: a call takes one step at most."""
         known = self.kept | self._last
         starts = known if self._course.back else [other for other in known if other <= number]
         reached = min(starts, key=lambda other: abs(number - other), default=-1)

@@ -65,7 +65,7 @@ class Thumbnail:
 
 
 def render_thumbnail(player: Player, name: str) -> Thumbnail:
-    """The frame of a deformer `name` in which the tumour has moved most, of those after the last cut, small."""
+    """Return the frame of a deformer `name` in which the tumour has moved most, of those after the last cut, small."""
     every = max(1, (len(player.scene.times) - 1) // (DRAWN - 1))
     frames = list(player.frames(every))
     best = max(frames, key=lambda frame: (_cuts(player, frame), frame.moved))

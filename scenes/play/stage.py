@@ -91,7 +91,7 @@ class Stage:
         return self.site.anatomy if self.left is None else self.left.anatomy
 
     def at(self, loads: Loads) -> Stage:
-        """The stage as the first load case has it: after the steps of a resection that are done."""
+        """Return the stage as the first load case has it: after the steps of a resection that are done."""
         cause = loads.of(Resected)
         return self if cause is None else self._after[int(cause.done[0])]
 
@@ -118,7 +118,7 @@ class Stage:
         return replace(lamp, position=site.origin + turned, strength=look.lamp, ambient=look.ambient)
 
     def cortex(self, positions: np.ndarray) -> Layer:
-        """The open cortex at `positions` (V, 3) [m]."""
+        """Return the open cortex at `positions` (V, 3) [m]."""
         return self._cortex.at(positions)
 
     def visible(self, positions: np.ndarray) -> Layer:
@@ -166,7 +166,7 @@ class Stage:
         return self.shown(camera, positions, self.corners(pose))
 
     def shown(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
-        """The same, of a tool by its corners (t, 3) [m]."""
+        """Return the same, of a tool by its corners (t, 3) [m]."""
         layers = self._layers(positions, corners)
         count = len(layers)
         if count not in self._renderers:
@@ -187,7 +187,7 @@ class Stage:
         return {}
 
     def tumour(self, positions: np.ndarray) -> Layer:
-        """The tumour's surface at `positions` (V, 3) [m]."""
+        """Return the tumour's surface at `positions` (V, 3) [m]."""
         vertices, triangles = self._tumour
         return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
 
@@ -260,7 +260,7 @@ class Stage:
 def clip_surface(
     points: np.ndarray, triangles: np.ndarray, value: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The part of a surface where a linear field is positive: points (n, 3), triangles (m, 3), cut edges (k, 2).
+    """Return the part of a surface where a linear field is positive: points (n, 3), triangles (m, 3), cut edges (k, 2).
 
     points (V, 3), triangles (F, 3), value (V,). Triangles that the zero line crosses are cut along it.
     """

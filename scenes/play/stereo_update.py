@@ -58,7 +58,7 @@ class StereoPair:
     tool: tuple[np.ndarray, np.ndarray] | None = None
 
     def seen(self, site: Site) -> StereoView:
-        """The windows about an opening.
+        """Return the windows about an opening.
 
         Raises
         ------
@@ -145,7 +145,10 @@ def observe_points(site: Site, first: First, shot: StereoPair, rigid: Rigid, tip
 
 
 def observe_point_cloud(site: Site, shot: StereoPair, count: int, rigid: Rigid, tips: np.ndarray) -> Observation:
-    """Return `count` cortex points without correspondences, from one pair; arguments and errors as of `observe_points`."""
+    """Return `count` cortex points without correspondences, from one pair.
+
+    Arguments and errors as of `observe_points`.
+    """
     view = shot.seen(site)
     pixels = build_pixel_grid(site, view, count)
     found = triangulate_seen_points(site, view, pixels)
@@ -212,7 +215,7 @@ def check_no_motion(first: First, view: StereoView, rigid: Rigid) -> None:
 
 
 def find_on_cortex(site: Site, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The places of the scan's cortex nearest to points (n, 3) [m], and how far they are (n,) [m]."""
+    """Return the places of the scan's cortex nearest to points (n, 3) [m], and how far they are (n,) [m]."""
     if not len(points):
         return points, np.zeros(0)
     anatomy = site.anatomy

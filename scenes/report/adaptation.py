@@ -24,7 +24,10 @@ SHARE = 0.2
 
 
 def debulk_tumour(anatomy: Anatomy) -> Anatomy:
-    """The body without a fifth of its tumour, from the middle outwards; what no tetrahedron is left at is gone too."""
+    """Return the body without a fifth of its tumour, from the middle outwards.
+
+    What no tetrahedron is left at is gone too.
+    """
     mesh = anatomy.mesh
     tumour = np.flatnonzero(anatomy.in_tumour)
     middle, volume = mesh.nodes[mesh.tets[tumour]].mean(axis=1), mesh.volumes[tumour]
@@ -39,7 +42,7 @@ def debulk_tumour(anatomy: Anatomy) -> Anatomy:
 
 
 def build_debulked_study(study: ReportStudy) -> ReportStudy:
-    """The same study of the debulked body, once `simulate_debulked` has made its data."""
+    """Return the same study of the debulked body, once `simulate_debulked` has made its data."""
     return replace(study, data=_path(study))
 
 

@@ -54,7 +54,7 @@ class FemVariant:
 
 
 def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, np.ndarray]:
-    """The row, and displacements (n, k, 3) [m] of the tumour's vertices under the played loads.
+    """Return the row, and displacements (n, k, 3) [m] of the tumour's vertices under the played loads.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def describe_difference(study: ReportStudy, spec: FemVariant) -> str:
 
 
 def find_body(study: ReportStudy, mesh: str) -> Anatomy:
-    """The body on a mesh by name; meshes of the template are made once and kept."""
+    """Return the body on a mesh by name; meshes of the template are made once and kept."""
     if mesh == OWN:
         return study.anatomy
     if mesh == HALVED:
@@ -117,7 +117,7 @@ def find_body(study: ReportStudy, mesh: str) -> Anatomy:
 
 
 def build_template_mesh(folder: Path, size: int) -> Path:
-    """The template's brain of about `size` nodes; made if it is not there."""
+    """Return the template's brain of about `size` nodes; made if it is not there."""
     path = folder / f"template_{size}.vtu"
     if not path.exists():
         write_anatomy(path, make_anatomy(template_subject(Tumour()), MeshPlan(size)))
@@ -125,12 +125,12 @@ def build_template_mesh(folder: Path, size: int) -> Path:
 
 
 def get_law_name(tissue: Elasticity) -> str | None:
-    """The name of the brain's law."""
+    """Return the name of the brain's law."""
     return None if tissue.default is None else tissue.default.law
 
 
 def get_tissue(tissue: Elasticity, law: str | None) -> Elasticity:
-    """The tissue, in all regions, with another law of the same constants.
+    """Return the tissue, in all regions, with another law of the same constants.
 
     Raises
     ------
@@ -150,7 +150,7 @@ def get_tissue(tissue: Elasticity, law: str | None) -> Elasticity:
 
 
 def move_pushes_onto(body: Anatomy, loads: Loads) -> Loads:
-    """The same pushes at the nearest points of another mesh's open cortex."""
+    """Return the same pushes at the nearest points of another mesh's open cortex."""
     (pushed,) = loads.every(Pushed)
     corners = body.mesh.nodes[body.open_surface]
     return Loads(

@@ -30,7 +30,7 @@ class LearnerSpec:
 
 
 def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, np.ndarray]:
-    """The row, and displacements (n, k, 3) [m] of the tumour's vertices under the played loads.
+    """Return the row, and displacements (n, k, 3) [m] of the tumour's vertices under the played loads.
 
     Raises
     ------

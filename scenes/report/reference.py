@@ -27,7 +27,10 @@ TOGETHER = 16
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSolutions:
-    """Solutions of n loads: displacement (n, k, 3) [m]; good (n,) bool, which converged; seconds (n,) that each took."""
+    """Solutions of n loads: displacement (n, k, 3) [m]; good (n,) bool, which converged.
+
+    Seconds (n,) that each took.
+    """
 
     displacement: np.ndarray
     good: np.ndarray

@@ -48,7 +48,10 @@ def prepare_rows(device: str, study: ReportStudy) -> ReportStudy:
 
 
 def measure_row(study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
-    """Measure the row of a deformation model, and render its worst case; `ReportRow.state` gives the reason for a missing one."""
+    """Measure the row of a deformation model, and render its worst case.
+
+    `ReportRow.state` gives the reason for a missing one.
+    """
     try:
         if isinstance(spec, FemVariant):
             with watch_gpu_memory(study.device) as taken:
@@ -84,7 +87,7 @@ CORES = 4
 
 
 def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
-    """The data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`."""
+    """Return the data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`."""
     meshes = {} if not remesh else MESHES if study.of_template else {"halved edges": HALVED}
     return (
         FemVariant("FEM"),
@@ -137,7 +140,7 @@ def measure_rows(
     cores: int | None = None,
     on_card: bool | None = None,
 ) -> Iterator[ReportRow]:
-    """A row for each of the `specs`; those whose inputs are the same as before are read.
+    """Yield a row for each of the `specs`; those whose inputs are the same as before are read.
 
     A row is kept as soon as it is measured, unless it could not be. By default each has a process of its own. Finite
     elements are measured one by one; of learners one for every `CORES` of the machine's cores. On a card, whose finite
@@ -209,7 +212,7 @@ FORMER_NAMES = {"teacher": "own_fem", "taught": "loads"}
 
 
 def _kept(path: Path, digest: str) -> ReportRow | None:
-    """The row in a file, if it is there, whole, and of the same inputs."""
+    """Return the row in a file, if it is there, whole, and of the same inputs."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8-sig"))
         row = {FORMER_NAMES.get(name, name): value for name, value in stored["row"].items()}

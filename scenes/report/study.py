@@ -89,7 +89,7 @@ class ReportStudy:
         return read_tissue_statement(stated) if BRAIN in stated else Elasticity()
 
     def get_tissue_on(self, body: Anatomy) -> Elasticity:
-        """The same for a body that may lack some of the regions."""
+        """Return the same for a body that may lack some of the regions."""
         return self.tissue.on(np.unique(body.mesh.region).tolist())
 
     @property

@@ -33,7 +33,7 @@ class Approach:
     line: bool = False
 
     def followed(self, path: Path) -> Path:
-        """The same motion of the hand, begun at the entry instead of the middle, and along the trajectory."""
+        """Return the same motion of the hand, begun at the entry instead of the middle, and along the trajectory."""
 
         def along(time: float) -> Touch:
             touch = path(time)
@@ -43,7 +43,10 @@ class Approach:
         return along
 
     def held(self, tool: Instrument) -> Instrument:
-        """The same tool with its shaft along the line; a blade, whose contact depends on its posture, keeps it."""
+        """Return the same tool with its shaft along the line.
+
+        A blade, whose contact depends on its posture, keeps it.
+        """
         if not (self.line and isinstance(tool, Probe)):
             return tool
         right, up = -np.tan(self.tilt)
@@ -98,7 +101,7 @@ def approach_of(markup: Markup, site: Site) -> Approach:
 
 
 def _approach(site: Site, entry: np.ndarray, way: np.ndarray) -> Approach:
-    """The approach at a point (3,) [m] of the cortex, in a direction (3,)."""
+    """Return the approach at a point (3,) [m] of the cortex, in a direction (3,)."""
     axes = np.stack([site.right, site.up])
     place = axes @ (entry - site.origin)
     for _ in range(CORRECTIONS):

@@ -25,7 +25,7 @@ class CameraPath(Protocol):
     """A pure function of the camera as it starts, the point that it looks at (3,) [m], and a time [s]."""
 
     def __call__(self, camera: Camera, target: np.ndarray, time: float) -> Camera:
-        """The camera at that time."""
+        """Return the camera at that time."""
         ...
 
 
@@ -56,7 +56,7 @@ class HandHeld:
             raise InputError(f"a hand has the seed {self.seed}: give a whole number that is not below 0.")
 
     def __call__(self, camera: Camera, target: np.ndarray, time: float) -> Camera:
-        """The camera at a time [s]."""
+        """Return the camera at a time [s]."""
         way = sample_wandering(self.seed, time)
         lifted = np.array([0.0, self.breath * np.sin(2.0 * np.pi * BREATH * time), 0.0])
         turn = self.turn * way[3:]
@@ -85,7 +85,7 @@ class Orbit:
             raise InputError(f"an orbit has a period of {self.period} s: give a number above 0.")
 
     def __call__(self, camera: Camera, target: np.ndarray, time: float) -> Camera:
-        """The camera at a time [s]."""
+        """Return the camera at a time [s]."""
         degrees = np.degrees(self.reach * np.sin(2.0 * np.pi * time / self.period))
         to_target = camera.to_camera_frame(np.asarray(target))
         # About the target in place of the camera's own centre.
@@ -133,7 +133,7 @@ class Microscope:
             raise InputError("a microscope's distances and zooms are multiples of the first: give numbers above 0.")
 
     def __call__(self, camera: Camera, target: np.ndarray, time: float) -> Camera:
-        """The camera at a time [s]."""
+        """Return the camera at a time [s]."""
         distance, zoom = 1.0, 1.0
         for setting in self.settings:
             share = np.clip((time - setting.since) / self.takes, 0.0, 1.0)

@@ -185,5 +185,5 @@ def sample_rigid_errors(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarr
 
 
 def choose_name(share: float, names: Sequence[str]) -> str:
-    """The name that a share in [0, 1) chooses, each as probable."""
+    """Return the name that a share in [0, 1) chooses, each as probable."""
     return names[min(int(share * len(names)), len(names) - 1)]

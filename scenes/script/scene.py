@@ -162,7 +162,7 @@ class Scene:
         return next((effect for effect in self.effects if isinstance(effect, Elasticity)), Elasticity(None))
 
     def replace_regions(self, regions: Mapping[int, Tissue]) -> Scene:
-        """The scene with tissues of some regions by label, in place of those that it has of them."""
+        """Return the scene with tissues of some regions by label, in place of those that it has of them."""
 
         def made(effect: Effect) -> Effect:
             own = isinstance(effect, Elasticity)
@@ -182,7 +182,7 @@ class Scene:
         return kept if self.surgery is None else (*kept, _resection(self.surgery, anatomy))
 
     def contact(self, site: Site, touch: Touch) -> Place:
-        """The material point that the tool touches."""
+        """Return the material point that the tool touches."""
         assert self.tool is not None
         return site.contact(touch.x, touch.y, self.tool.radius)
 
@@ -255,7 +255,7 @@ SCENES = (
 
 
 def find_scene(name: str) -> Scene:
-    """A built-in scene by name, or the SCENE of a user's own file by its path, which ends in .py.
+    """Return a built-in scene by name, or the SCENE of a user's own file by its path, which ends in .py.
 
     The file is run as any Python file is: with all the rights of who runs it.
 

@@ -12,5 +12,5 @@ def template_path() -> Path:
 
 
 def get_spatula_model_path() -> Path:
-    """A model of a spatula on the template, by its pose, in tissue that does not relax."""
+    """Return a model of a spatula on the template, by its pose, in tissue that does not relax."""
     return template_path().with_suffix(".spatula.npz")

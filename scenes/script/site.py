@@ -31,20 +31,20 @@ class Site(OpenCortex):
         return point - max(0.0, 1.0 - self.reach(radius) / max(length, np.finfo(float).tiny)) * aside
 
     def contact(self, x: float, y: float, radius: float) -> Place:
-        """The material point of the open cortex nearest to the place (x, y) [m] of its tangent plane.
+        """Return the material point of the open cortex nearest to the place (x, y) [m] of its tangent plane.
 
         A tool of this `radius` [m] stays inside the opening: the place is brought back to where the bone stops it.
         """
         return self.nearest(self.within(self.origin + x * self.right + y * self.up, radius))
 
     def direction(self, touch: Touch) -> np.ndarray:
-        """Unit direction (3,) of a touch's force: inwards, tilted."""
+        """Return unit direction (3,) of a touch's force: inwards, tilted."""
         along = self.axis + np.tan(touch.tilt[0]) * self.right + np.tan(touch.tilt[1]) * self.up
         return along / np.linalg.norm(along)
 
 
 def site_of(anatomy: Anatomy) -> Site:
-    """The frame of an anatomy's open cortex.
+    """Return the frame of an anatomy's open cortex.
 
     Raises
     ------

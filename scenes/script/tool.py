@@ -16,20 +16,20 @@ SHAFT = 1.8e-3
 
 
 def build_sphere(subdivisions: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """A sphere of radius 1: vertices (n, 3), and triangles (m, 3), which point outwards."""
+    """Return a sphere of radius 1: vertices (n, 3), and triangles (m, 3), which point outwards."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     return np.asarray(ball.vertices), np.asarray(ball.faces)
 
 
 def build_capsule(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """A rod with round ends, from the origin along +z: vertices (n, 3) [m], and triangles (m, 3)."""
+    """Return a rod with round ends, from the origin along +z: vertices (n, 3) [m], and triangles (m, 3)."""
     rod = trimesh.creation.capsule(length, radius, count=(20, 20))
     rod.apply_translation([0.0, 0.0, -float(rod.bounds[0, 2])])
     return np.asarray(rod.vertices), np.asarray(rod.faces)
 
 
 def add_shaft(shape: BuiltIn, top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A tool of which the shape alone is known, on a straight shaft to `top` (3,) [m].
+    """Return a tool of which the shape alone is known, on a straight shaft to `top` (3,) [m].
 
     Vertices (n, 3) [m] in the tool's own frame, and triangles (m, 3).
     """

@@ -131,7 +131,7 @@ class Uncertainty:
         return self.few or self.folded > 0
 
     def at(self, time: float, surrogate: float = 0.0) -> TumourError:
-        """The error at a time [s], where a trained model adds its own bound [m]."""
+        """Return the error at a time [s], where a trained model adds its own bound [m]."""
         parts = {name: self.read(values, time) for name, values in self.parts.items()}
         parts[SURROGATE] = surrogate / DEVIATIONS
         worst = float(np.hypot(self.read(self.worst, time), surrogate))

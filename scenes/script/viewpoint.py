@@ -128,7 +128,7 @@ class Viewpoint:
         return site.origin + UNDER * site.axis
 
     def camera(self, site: Site, time: float = 0.0) -> Camera:
-        """The camera that looks at a site at a time [s]."""
+        """Return the camera that looks at a site at a time [s]."""
         outward = -np.cos(self.tilt) * site.axis + np.sin(self.tilt) * site.up
         target = self.target(site)
         found = look_at(target + self.distance * outward, target, site.up, self.fov, self.width, self.height)

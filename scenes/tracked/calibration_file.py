@@ -22,14 +22,15 @@ LARGEST_HAND_EYE, RIGID = 1 << 16, 1e-4
 
 
 def read_calibration(path: str | Path) -> Calibration:
-    """The calibration in a YAML file of OpenCV, or of ROS's camera_info.
+    """Return the calibration in a YAML file of OpenCV, or of ROS's camera_info.
 
     OpenCV's has image_width, image_height, camera_matrix and distortion_coefficients. ROS's has distortion_model too.
 
     Raises
     ------
     InputError
-        No such file, one that is too large or of another kind, or what `ar.optics.calibration.parse_calibration` refuses.
+        No such file, one that is too large or of another kind, or what `ar.optics.calibration.parse_calibration`
+        refuses.
     """
     path = to_path(path)
     with read_as(path, "a camera's calibration", WANTED):

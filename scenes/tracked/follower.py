@@ -216,7 +216,7 @@ class Follower:
         return doubt, near
 
     def _without_reference(self, tracked: TrackedTargets, time: float, before: TrackingResult | None) -> TrackingResult:
-        """The reference is not seen: for a moment the overlay stays where it was."""
+        """Return the reference is not seen: for a moment the overlay stays where it was."""
         seen = None if before is None else before.seen
         motion = self.motion.rest if before is None else before.motion
         held = before is not None and seen is not None and 0.0 <= time - seen < HELD + ROUNDING

@@ -93,7 +93,7 @@ class Painter:
         return [*self.stage.layers(known.motion.positions, None), *([] if tool is None else [tool])]
 
     def held(self, known: TrackingResult, cubed: bool = True) -> Layer | None:
-        """The tool where it is seen, with its cube or without."""
+        """Return the tool where it is seen, with its cube or without."""
         pose = known.T_scan_tool
         if self.tool is None or pose is None:
             return None
@@ -109,7 +109,7 @@ class Painter:
         return Gauge(gauge.tip, gauge.nearest, error=float(np.hypot(spread, known.motion.error)))
 
     def _grey(self, colour: np.ndarray, known: TrackingResult, covered: np.ndarray | None) -> Overlaid:
-        """The outline in grey, if it has a place, and why."""
+        """Return the outline in grey, if it has a place, and why."""
         over = Overlaid(colour.copy(), np.zeros(colour.shape[:2], np.uint8))
         if known.camera is not None and self.style != "none":
             self._dot(over, known.camera, self.stage.tumour(known.motion.positions))

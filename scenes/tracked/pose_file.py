@@ -38,7 +38,7 @@ USUAL = 0.25e-3, float(np.radians(0.1))
 
 
 def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) [s] and poses (n, 4, 4) [m] of a file with the columns time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw.
+    """Return times (n,) [s] and poses (n, 4, 4) [m] of a file with the columns time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw.
 
     A pose leads from the body to the tracker: x_tracker = T x_body. Rows without a pose are passed over. So
     are rows in which the tracker did not see the body, with a warning: a status that is not OK, zeros or the identity.
@@ -84,7 +84,7 @@ def read_stream(path: str | Path) -> PoseStream:
 
 
 def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times (n,), poses (n, 4, 4) and covariances (n, 6, 6) of all rows; without a pose they are NaN."""
+    """Return times (n,), poses (n, 4, 4) and covariances (n, 6, 6) of all rows; without a pose they are NaN."""
     with_errors = (TIME, *PLACE, *TURN, *COVARIANCE)
     unseen = Counter[str]()
     columns = read_columns(path, {with_errors[:8], with_errors}, with_errors[1:], partial(_is_unseen, unseen=unseen))

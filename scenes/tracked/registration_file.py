@@ -27,7 +27,7 @@ _UNITS = np.repeat([1e3, 1.0], 3)
 
 
 def read_registration(path: str | Path) -> Registration:
-    """The registration in a file of `sulcus register`.
+    """Return the registration in a file of `sulcus register`.
 
     `T_patient_scan_mm` (4 x 4) takes a place in the scan, RAS, to the frame of the patient's reference. `covariance`
     (6 x 6) is of a shift [mm] in that frame, and of a small turn [rad] about `centre_mm`, a place in the scan.

@@ -61,11 +61,11 @@ class Shown:
     stamped: bool = False
 
     def drop_image(self) -> Shown:
-        """The same without its colours, which take memory."""
+        """Return the same without its colours, which take memory."""
         return replace(self, colour=np.empty((0, 0, 3), np.uint8))
 
     def drop_mesh(self) -> Shown:
-        """The same without where the brain is, and without its colours."""
+        """Return the same without where the brain is, and without its colours."""
         motion = replace(self.known.motion, positions=np.empty((0, 3)), answer=None)
         return replace(self.drop_image(), known=replace(self.known, motion=motion))
 

@@ -74,7 +74,7 @@ class TrackedTool:
 
 
 def _cube() -> tuple[np.ndarray, np.ndarray]:
-    """The printed cube as a box in its own frame: corners (8, 3) [m], and triangles (12, 3)."""
+    """Return the printed cube as a box in its own frame: corners (8, 3) [m], and triangles (12, 3)."""
     half = float(max(abs(face.T_target_face[:3, 3]).max() for face in build_tool_cube().faces))
     signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -83,7 +83,7 @@ def _cube() -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_tool(path: str | Path) -> TrackedTool:
-    """The tool in a JSON file, whose lengths are millimetres.
+    """Return the tool in a JSON file, whose lengths are millimetres.
 
     Raises
     ------

@@ -59,7 +59,7 @@ class TrackingFigures:
     off: float
 
     def broken(self) -> list[str]:
-        """A sentence for each bound that is not kept."""
+        """Return a sentence for each bound that is not kept."""
         rules = {
             f"{self.confident} images draw a lost or old position as if it were known": self.confident == 0,
             f"{self.unsaid} images do not say that something is lost or old": self.unsaid == 0,

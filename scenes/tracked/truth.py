@@ -72,7 +72,7 @@ def write_truth(path: Path, truth: VideoGroundTruth) -> None:
 
 
 def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LARGEST_FILM) -> VideoGroundTruth:
-    """The truth in a file, of a body with this digest and number of `vertices` on its tumour's surface.
+    """Return the truth in a file, of a body with this digest and number of `vertices` on its tumour's surface.
 
     Its arrays inflate to at most `largest` bytes.
 

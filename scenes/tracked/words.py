@@ -65,7 +65,7 @@ def report(shown: Shown, gauge: Gauge | None, tooled: bool, place: str) -> str:
 
 
 def format_distance(gauge: Gauge | None, relied: bool) -> str:
-    """The distance from tip to tumour with its error, where there is one that may be relied on."""
+    """Return the distance from tip to tumour with its error, where there is one that may be relied on."""
     if gauge is None:
         return '<p class="number">tip to tumour: not known</p>'
     return format_tip_distance(gauge.distance, gauge.error if relied else None, gauge.inside)

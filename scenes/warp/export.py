@@ -58,7 +58,7 @@ def write_warp(
     asked: WarpSettings,
     sequence: Sequence[tuple[float, DeformedAnatomy]],
 ) -> dict[str, Any]:
-    """Write a moment into the folder that `write_folder_atomically` yields, and moments of a `sequence` with their times [s].
+    """Write a moment into the folder of `write_folder_atomically`, and moments of a `sequence` with their times [s].
 
     Returns the figures.
 

@@ -45,7 +45,7 @@ TOGETHER = 8
 
 
 def measure_shown_share(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float:
-    """The share by volume of a brain that lies within voxels (I, J, K), whose affine leads to metres (RAS)."""
+    """Return the share by volume of a brain that lies within voxels (I, J, K), whose affine leads to metres (RAS)."""
     _, inside = _voxels(affine, shape, _middles(anatomy))
     return float(np.average(inside, weights=anatomy.mesh.volumes))
 
@@ -102,7 +102,7 @@ def _like_labels(values: np.ndarray) -> bool:
 
 
 def _alike(values: np.ndarray) -> float:
-    """The share of voxels, but for those that are 0, that have the value of the next along the first axis."""
+    """Return the share of voxels, but for those that are 0, that have the value of the next along the first axis."""
     one, two = values[:-1:SAMPLED, ::SAMPLED, ::SAMPLED], values[1::SAMPLED, ::SAMPLED, ::SAMPLED]
     full = (one != 0) & (two != 0)
     return float((one == two)[full].mean()) if full.any() else 1.0
@@ -114,14 +114,14 @@ def _middles(anatomy: Anatomy) -> np.ndarray:
 
 
 def _voxels(affine: np.ndarray, shape: tuple[int, ...], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest voxels (n, 3) to points (n, 3) [m], and which of these lie within the volume (n,)."""
+    """Return the nearest voxels (n, 3) to points (n, 3) [m], and which of these lie within the volume (n,)."""
     index, last = index_of(affine, points), np.array(shape) - 1
     inside = np.asarray(((index >= -0.5) & (index <= last + 0.5)).all(axis=1))
     return np.clip(np.rint(index), 0, last).astype(int), inside
 
 
 def index_of(affine: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Indices (n, 3) of points (n, 3) [m] in a volume of an affine (4, 4)."""
+    """Return indices (n, 3) of points (n, 3) [m] in a volume of an affine (4, 4)."""
     return (points - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
 
 
@@ -170,7 +170,10 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> 
 
 
 def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
-    """The image as its NIfTI file has it; of another format, the same values in the same place, whole ones whole."""
+    """Return the image as its NIfTI file has it.
+
+    Of another format, the same values in the same place, whole ones whole.
+    """
     if path.name.lower().endswith((".nii", ".nii.gz")):
         return load_nifti(path)
     values = np.nan_to_num(volume.values)
@@ -183,7 +186,7 @@ def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
 
 
 def to_warped_name(path: Path) -> str:
-    """The name of a warped image: that of its file, with `_deformed`."""
+    """Return the name of a warped image: that of its file, with `_deformed`."""
     ending = next((end for end in SUFFIXES if path.name.lower().endswith(end)), "")
     return f"{path.name[: len(path.name) - len(ending)]}_deformed.nii.gz"
 
@@ -213,7 +216,10 @@ def write_warped(folder: Path, picture: PatientImage, fields: WarpFields, order:
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Count the voxels that moved, came from outside the image, or from removed tissue; also return the blank ones (I, J, K)."""
+    """Count the voxels that moved, came from outside the image, or from removed tissue.
+
+    Also return the blank ones (I, J, K).
+    """
 
     moved: int
     outside: int

@@ -59,7 +59,7 @@ def list_landmarks(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, .
 
 
 def compute_centroid(body: Anatomy, displacement: np.ndarray) -> np.ndarray | None:
-    """The centroid (3,) [m] of the tumour's volume as it is now; None without a tumour."""
+    """Return the centroid (3,) [m] of the tumour's volume as it is now; None without a tumour."""
     tumour = body.mesh.tets[body.in_tumour]
     if not len(tumour):
         return None

@@ -46,14 +46,14 @@ class Cause:
 
 
 def play_scene_cause(scene: Scene, number: int) -> Cause:
-    """A moment of a scene, by the number of its frame."""
+    """Return a moment of a scene, by the number of its frame."""
     time = float(scene.times[number])
     record = {"kind": "scene", "scene": scene.name, "frame": number, "time_s": time}
     return Cause(f"scene {scene.name}, frame {number}, {time:.2f} s", record)
 
 
 def load_cause(loads: Loads) -> Cause:
-    """The one push of a load case."""
+    """Return the one push of a load case."""
     (pushed,) = loads.every(Pushed)
     place, force = 1e3 * pushed.point[0], pushed.force[0]
     newton = float(np.linalg.norm(force))
@@ -72,7 +72,7 @@ def load_cause(loads: Loads) -> Cause:
 
 
 def read_file_cause(path: Path) -> Cause:
-    """A displacement that a file holds."""
+    """Return a displacement that a file holds."""
     return Cause(f"displacement of {path.name}", {"kind": "file", "file": path.name})
 
 
@@ -115,7 +115,10 @@ class DeformedAnatomy:
         return self.anatomy.mesh.nodes + self.displacement
 
     def gap(self) -> tuple[np.ndarray, float] | None:
-        """The tumour's point (3,) [m] nearest to the tip, and how far it is [m], 0 inside; None where there is none."""
+        """Return the tumour's point (3,) [m] nearest to the tip, and how far it is [m], 0 inside.
+
+        None where there is none.
+        """
         triangles = self.left.tumour_surface
         if self.tip is None or not len(triangles):
             return None
@@ -135,7 +138,7 @@ class Played:
     def moments(
         self, frames: Sequence[int], progress: Callable[[int], object] = lambda more: None
     ) -> list[DeformedAnatomy]:
-        """The moments of some frames, in rising order."""
+        """Return the moments of some frames, in rising order."""
         fem = self.theatre.fem(self.scene, TRAIN, 1, live=True)
         needed = range(frames[-1] + 1) if is_history_dependent(fem) else frames
         answers = solve_reference_frames(
@@ -168,7 +171,7 @@ class Played:
 
 
 def read_moment(path: Path, anatomy: Anatomy) -> DeformedAnatomy:
-    """The moment in a result of `sulcus locate` or `sulcus solve` for an anatomy.
+    """Return the moment in a result of `sulcus locate` or `sulcus solve` for an anatomy.
 
     Raises
     ------

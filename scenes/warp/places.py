@@ -142,7 +142,7 @@ def list_fields(moment: DeformedAnatomy, spacing: float | None, step: Callable[[
 
 
 def find_finer_spacing(moment: DeformedAnatomy, fields: WarpFields) -> float | None:
-    """A spacing [m] at which both are exact enough, or as near as size allows; None where no finer one helps."""
+    """Return a spacing [m] at which both are exact enough, or as near as size allows; None where no finer one helps."""
     now = fields.grid.spacing
     places = list_places(moment)
     worst = float(places.errors(fields)[places.tumour | places.landmarks].max(initial=0.0))

@@ -55,7 +55,7 @@ These are errors of the grid. How far the tumour may be off: {bound}
 
 
 def write_readme(report: dict, images: Sequence[Warped]) -> str:
-    """The text of README.txt from the figures of a warp."""
+    """Return the text of README.txt from the figures of a warp."""
     sequence = (
         "field_sequence.seq.nrrd  the same of many moments, which Slicer plays.\n" if report["sequence_frames"] else ""
     )

@@ -100,7 +100,7 @@ def _sections(lines: Iterable[str]) -> Iterator[tuple[str, dict[str, str], list[
 
 
 def _translation(instances: list[tuple[str, list[str]]]) -> np.ndarray:
-    """Translation (3,) that all instances (name of the part, data lines) share; 0 without instances."""
+    """Return translation (3,) that all instances (name of the part, data lines) share; 0 without instances."""
     parts = [part for part, _ in instances if part]
     if any(len(rows) > 1 for _, rows in instances):
         raise InputError("an *INSTANCE is rotated: its nodes must be listed where they lie. Save it as one mesh.")

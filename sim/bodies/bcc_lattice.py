@@ -36,7 +36,7 @@ class Lattice:
 
 
 def build_graded_lattice(low: np.ndarray, high: np.ndarray, coarsest: float, levels: int, size: Sizing) -> Lattice:
-    """The lattice over the box from `low` (3,) to `high` (3,) [m].
+    """Return the lattice over the box from `low` (3,) to `high` (3,) [m].
 
     Cells of edge `coarsest` [m] are halved up to `levels` times where they are larger than `size` asks for.
     Neighbours, diagonal ones too, differ by one halving at most.

@@ -24,7 +24,7 @@ def add_boundary_conditions(
     outline: np.ndarray | None = None,
     septa: Sequence[Septum] = (),
 ) -> Anatomy:
-    """The anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
+    """Return the anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
 
     The stem is held: surface nodes within a share of the brain's height from the lowest one (least superior). The
     craniotomy is free: surface nodes within half of the diameter `craniotomy` [m] along the surface from the point

@@ -34,7 +34,7 @@ class Septum:
 
 
 def synthesise_falx(cortex: np.ndarray, depth: float) -> Septum:
-    """A falx in the midline of a head that has none, from points (n, 3) [m, RAS] of its surface.
+    """Return a falx in the midline of a head that has none, from points (n, 3) [m, RAS] of its surface.
 
     It hangs from the convexity by a `depth` [m], the same everywhere, and ends at half of the head's height. A real
     one is narrow in front and wide behind. The outline of the head is convex, as the skull is, and sulci are ignored.

@@ -17,7 +17,7 @@ FLOATS, INTEGERS = (0x40000004, ">f4"), (0x40000003, ">i4")
 
 
 def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The one surface in a FIF file: vertices (n, 3) [m, RAS of the MRI], triangles (m, 3).
+    """Return the one surface in a FIF file: vertices (n, 3) [m, RAS of the MRI], triangles (m, 3).
 
     Raises
     ------

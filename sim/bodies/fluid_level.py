@@ -7,7 +7,7 @@ SPARE = 1e-3
 
 
 def compute_fluid_level(nodes: np.ndarray, down: np.ndarray, share: float) -> float:
-    """The level [m] above the origin, against `down` (3,), a unit vector, round a body of nodes (V, 3) [m].
+    """Return the level [m] above the origin, against `down` (3,), a unit vector, round a body of nodes (V, 3) [m].
 
     `share` is from 0, wholly drained, to 1, over the highest vertex.
     """

@@ -94,7 +94,7 @@ def check_one_body(points: np.ndarray, tets: np.ndarray) -> None:
 
 
 def note_pieces(mesh: TetMesh) -> tuple[str, ...]:
-    """A note on a mesh in pieces that share no node; none where it is one."""
+    """Return a note on a mesh in pieces that share no node; none where it is one."""
     links = mesh.tets[:, [0, 0, 0]].ravel(), mesh.tets[:, 1:].ravel()
     graph = coo_array((np.ones(len(links[0])), links), shape=(len(mesh.nodes),) * 2)
     piece = connected_components(graph, directed=False)[1]

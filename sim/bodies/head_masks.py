@@ -164,7 +164,7 @@ def read_head_masks(sources: Sources) -> HeadMasks:
 
 
 def _unnamed(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
-    """A note on labels of the file that were given no meaning."""
+    """Return a note on labels of the file that were given no meaning."""
     names = {(one.layer, one.value): one.name for one in whole.segments}
     found = {(layer, value) for layer, present in enumerate(whole.present) for value in present}
     left = [names.get(place, place[1]) for place in sorted(found - set(whole.places(named)))]
@@ -172,7 +172,7 @@ def _unnamed(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
 
 
 def _doubtful(whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tuple[Label, ...]]) -> tuple[str, ...]:
-    """A note on labels of one's own that the anatomy contradicts."""
+    """Return a note on labels of one's own that the anatomy contradicts."""
     if whole.layers.shape[-1] > 1 or not {NECROSIS, "oedema"}.intersection(parts):
         return ()
     own = {name: tuple(value for _, value in whole.places(labels)) for name, labels in parts.items()}
@@ -183,7 +183,7 @@ def _doubtful(whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tupl
 
 
 def _side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
-    """A note on which side the tumour lies, as nothing else tells whether a file is of the right space."""
+    """Return a note on which side the tumour lies, as nothing else tells whether a file is of the right space."""
     low, high = Mask(path, marked["brain"], affine).box
     centre = affine[:3, :3] @ np.argwhere(marked["tumour"]).mean(axis=0) + affine[:3, 3]
     return (
@@ -193,7 +193,7 @@ def _side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
 
 
 def _outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[str, ...]:
-    """A note, if much of what is labelled lies outside of the brain's mask."""
+    """Return a note, if much of what is labelled lies outside of the brain's mask."""
     labelled = np.logical_or.reduce([mask for name, mask in marked.items() if name != "brain"])
     out = int((labelled & ~marked["brain"]).sum())
     if out <= OUTSIDE * labelled.sum():
@@ -203,19 +203,20 @@ def _outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[str, ..
 
 
 def _cavity(whole: LabelMap, convention: Convention | None, named: Mapping[str, Sequence[Label]]) -> tuple[str, ...]:
-    """A note on fluid that a convention of tumours marks, as a mask of the brain holds it."""
+    """Return a note on fluid that a convention of tumours marks, as a mask of the brain holds it."""
     fluid = _there(convention.csf, whole) if convention and convention.tumour else ()
     if not fluid or set(fluid) <= {label for labels in named.values() for label in labels}:
         return ()
     ml = 1e6 * int(whole.mask(fluid).sum()) * abs(float(np.linalg.det(whole.affine[:3, :3])))
     return (
-        f"{ml:.2g} ml are a cavity, label {format_labels(fluid)}: where the mask holds it, it becomes brain. For a region "
+        f"{ml:.2g} ml are a cavity, label {format_labels(fluid)}: where the mask holds it, it becomes brain. "
+        "For a region "
         f"with a stiffness of its own add --ventricles {','.join(map(str, fluid))}",
     )
 
 
 def _cropped(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The masks where brain or tumour are, and `SURROUNDINGS` voxels round them; and the affine (4, 4) there."""
+    """Return the masks where brain or tumour are, and `SURROUNDINGS` voxels round them; and the affine (4, 4) there."""
     anything = marked["brain"] | marked["tumour"]
     ends = [np.flatnonzero(anything.any(axis=tuple({0, 1, 2} - {axis})))[[0, -1]] for axis in range(3)]
     low = np.maximum(0, np.array(ends)[:, 0] - SURROUNDINGS)
@@ -228,7 +229,7 @@ def _cropped(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict[st
 def _meant(
     whole: LabelMap, sources: Sources, convention: Convention | None
 ) -> tuple[tuple[Label, ...], tuple[Label, ...]]:
-    """The labels of brain and tumour: those given, or the convention's that are there."""
+    """Return the labels of brain and tumour: those given, or the convention's that are there."""
     brain, tumour = sources.brain, sources.tumour
     if convention is not None:
         necrosis = sources.parts.get(NECROSIS, ())
@@ -323,7 +324,8 @@ def _demand_one_meaning(whole: LabelMap, named: Mapping[str, tuple[str, Sequence
         both = [label for label, place in zip(others, whole.places(others), strict=True) if place in places]
         if both:
             raise InputError(
-                f"{whole.path}: label {format_labels(both)} is named by {option} and by {other}: give it to one of them."
+                f"{whole.path}: label {format_labels(both)} is named by {option} and by {other}: "
+                "give it to one of them."
             )
 
 

@@ -49,7 +49,7 @@ def build_masked_head(mask: Path, t1: Path | None = None, volume: float | None =
 
 
 def read_fsaverage_head(volume: float) -> HealthyHead:
-    """The head of fsaverage, scaled to a `volume` [m^3]: all that its inner skull encloses counts as brain.
+    """Return the head of fsaverage, scaled to a `volume` [m^3]: all that its inner skull encloses counts as brain.
 
     The surface of this body is the skull: no fluid lies between them, and no sulci are in it.
 

@@ -61,7 +61,7 @@ class Intensity:
         return ndimage.map_coordinates(self.values, index, order=1, mode="constant", output=np.float64) / 255.0
 
     def around(self, points: np.ndarray, mesh: TetMesh, margin: float = 0.015) -> Intensity:
-        """The part round the box of points (n, 3) [m], with a margin [m], in the 8-bit grey of `KEPT`.
+        """Return the part round the box of points (n, 3) [m], with a margin [m], in the 8-bit grey of `KEPT`.
 
         Raises
         ------
@@ -81,7 +81,7 @@ class Intensity:
         return Intensity(np.rint(255.0 * part.apply_window(mesh, KEPT)).astype(np.uint8), affine)
 
     def apply_window(self, mesh: TetMesh, window: Window = Window()) -> np.ndarray:
-        """The values (I, J, K) float32 in 0 .. 1 by a window on the brain, a mesh in the same frame.
+        """Return the values (I, J, K) float32 in 0 .. 1 by a window on the brain, a mesh in the same frame.
 
         What is no number, or far too bright for tissue, becomes the brain's median.
 

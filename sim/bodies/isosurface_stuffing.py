@@ -75,7 +75,7 @@ class Pieces:
     surface: np.ndarray
 
     def kept(self, keep: np.ndarray) -> Pieces:
-        """The tetrahedra marked in `keep` (T,), and their nodes, renumbered in order."""
+        """Return the tetrahedra marked in `keep` (T,), and their nodes, renumbered in order."""
         used = np.zeros(len(self.nodes), bool)
         used[self.tets[keep]] = True
         tets = (np.cumsum(used) - 1)[self.tets[keep]]
@@ -83,7 +83,7 @@ class Pieces:
 
 
 def build_whole(lattice: Lattice) -> Pieces:
-    """A lattice that nothing has cut yet."""
+    """Return a lattice that nothing has cut yet."""
     kind = np.where(lattice.centre, CENTRE, CORNER)
     everywhere = np.ones(len(lattice.tets), bool)
     return Pieces(lattice.nodes, kind, lattice.tets, everywhere, np.zeros(len(kind), bool))
@@ -144,7 +144,7 @@ def _crossings(field: Field, nodes: np.ndarray, edges: np.ndarray, values: np.nd
 
 
 def _snapping_reach(pieces: Pieces, edges: np.ndarray, settings: IsosurfaceStuffingOptions) -> np.ndarray:
-    """The share (E, 2) of each edge within which a crossing pulls either end."""
+    """Return the share (E, 2) of each edge within which a crossing pulls either end."""
     kinds = pieces.kind[edges]
     share = np.where(kinds[:, 0] == kinds[:, 1], settings.snap_long, settings.snap_short)
     share = np.where((kinds == CUT).any(axis=1), settings.snap_other, share)
@@ -186,7 +186,7 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
     keys = edges[:, 0] * len(side) + edges[:, 1]
 
     def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """The node on edge a-b: its crossing, or the end b that lies on the surface itself."""
+        """Return the node on edge a-b: its crossing, or the end b that lies on the surface itself."""
         key = np.minimum(a, b) * len(side) + np.maximum(a, b)
         crossing = np.searchsorted(keys, key) + len(side)
         return np.where(side[b] == 0, b, crossing)

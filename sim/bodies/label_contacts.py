@@ -97,7 +97,7 @@ def find_contradiction(contacts: Contacts, convention: Convention) -> Contradict
 
 
 def build_contradiction_check(whole: LabelMap, chosen: Convention) -> Callable[[Convention], str]:
-    """Function that says why the anatomy contradicts a convention; empty where it does not.
+    """Return function that says why the anatomy contradicts a convention; empty where it does not.
 
     What rare tumours show, too, is held against the `chosen` convention only where another one fits.
     """

@@ -74,7 +74,7 @@ class LabelMap:
         return found
 
     def places(self, labels: Sequence[Label]) -> list[tuple[int, int]]:
-        """The layer and the number there of each label.
+        """Return the layer and the number there of each label.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class LabelMap:
 
 
 def read_labels(path: str | Path, voxels: Voxels = OF_BRAINS) -> LabelMap:
-    """The label map in a file; values within 1e-3 of whole numbers are rounded, with a note.
+    """Return the label map in a file; values within 1e-3 of whole numbers are rounded, with a note.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def has_whole_numbers(values: np.ndarray) -> bool:
 
 
 def format_labels(labels: Sequence[Label]) -> str:
-    """The first twenty, and how many there are."""
+    """Return the first twenty, and how many there are."""
     shown = ", ".join(map(str, labels[:20]))
     return f"{shown}, ... ({len(labels)} in all)" if len(labels) > 20 else shown
 
@@ -189,7 +189,7 @@ class Mask:
         return np.stack([self.outline.min(axis=0), self.outline.max(axis=0)])
 
     def onto(self, shape: tuple[int, ...], affine: np.ndarray) -> np.ndarray:
-        """Marks (I, J, K) on the grid of another volume: those of the nearest voxels."""
+        """Return marks (I, J, K) on the grid of another volume: those of the nearest voxels."""
         if _alike(shape, affine, self):
             return self.marked
         matrix = np.linalg.inv(self.affine) @ affine

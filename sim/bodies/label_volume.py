@@ -57,7 +57,7 @@ def volume_subject(
     t1: str | Path | None = None,
     settings: Labelling = Labelling(),
 ) -> Subject:
-    """The subject in a file of whole-number labels, of which some are `brain` and some `tumour`.
+    """Return the subject in a file of whole-number labels, of which some are `brain` and some `tumour`.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def build_masked_subject(
     settings: Labelling = Labelling(),
     regions: Sequence[str] = (),
 ) -> Subject:
-    """The subject whose brain and tumour are masks of voxels.
+    """Return the subject whose brain and tumour are masks of voxels.
 
     The solid is brain or tumour, its largest component, with holes filled; tumour components outside it are left out,
     and each such change is noted. The skull is opened over the largest of them. `t1` is a volume of intensities in the
@@ -117,7 +117,7 @@ def build_masked_subject(
 
 
 def _septum(name: str, masks: HeadMasks) -> Septum:
-    """A sheet of dura where voxels mark it."""
+    """Return a sheet of dura where voxels mark it."""
     edges = masks.affine[:3, :3]
     points = np.argwhere(masks.parts[name]) @ edges.T + masks.affine[:3, 3]
     return Septum(name, points, 0.5 * float(np.sqrt((edges**2).sum())))
@@ -126,7 +126,7 @@ def _septum(name: str, masks: HeadMasks) -> Septum:
 def _parts(
     masks: HeadMasks, solid: np.ndarray, tumour: np.ndarray, regions: Sequence[str], settings: Labelling
 ) -> tuple[SubjectPart, ...]:
-    """The parts that become regions; their volumes are those that lie in brain or tumour, as the mesh has it."""
+    """Return the parts that become regions; their volumes are those that lie in brain or tumour, as the mesh has it."""
     voxel, parts = abs(float(np.linalg.det(masks.affine[:3, :3]))), []
     taken = np.zeros_like(solid)
     for name in reversed(regions):  # of two that overlap the later counts
@@ -138,7 +138,9 @@ def _parts(
 
 
 def fill_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelling()) -> np.ndarray:
-    """The voxels (I, J, K) bool of a head's brain and tumour in one piece without holes; what is changed is noted.
+    """Return the voxels (I, J, K) bool of a head's brain and tumour in one piece without holes.
+
+    What is changed is noted.
 
     Raises
     ------
@@ -163,7 +165,7 @@ def fill_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelli
 
 
 def _whole(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:
-    """The component of brain or tumour that holds most of the brain, its holes filled."""
+    """Return the component of brain or tumour that holds most of the brain, its holes filled."""
     component, _ = cast(tuple[np.ndarray, int], ndimage.label(brain | tumour))
     solid = component == np.bincount(component[brain]).argmax()
     lost = int((brain & ~solid).sum())
@@ -184,7 +186,7 @@ def _inside(
     notes: list[str],
     settings: Labelling,
 ) -> np.ndarray:
-    """The tumour's components that lie in the solid, but for specks."""
+    """Return the tumour's components that lie in the solid, but for specks."""
     inside = tumour & solid
     if not inside.any():
         raise InputError(f"{name}: the tumour lies outside the brain. Check the labels given as brain and as tumour.")
@@ -213,7 +215,7 @@ def _inside(
 
 
 def _extended(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray:
-    """The tumour, and up to `by` voxels beside the brain those whose nearest one in the solid is tumour.
+    """Return the tumour, and up to `by` voxels beside the brain those whose nearest one in the solid is tumour.
 
     A tumour that reaches the cortex then goes on beyond it, and its field crosses the cortex instead of touching it.
     """
@@ -228,7 +230,7 @@ def _extended(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray:
 
 
 def _pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[Piece, ...]:
-    """The tumour's connected pieces, the largest first; of a piece's surface voxels the mean is its centre."""
+    """Return the tumour's connected pieces, the largest first; of a piece's surface voxels the mean is its centre."""
     component, count = cast(tuple[np.ndarray, int], ndimage.label(tumour, np.ones((3, 3, 3))))
     voxel = abs(float(np.linalg.det(affine[:3, :3])))
     pieces = []

@@ -52,7 +52,7 @@ class Markup:
 
 
 def read_markup(path: str | Path) -> Markup:
-    """The markup in a `.mrk.json` file, or the points in a `.fcsv` file.
+    """Return the markup in a `.mrk.json` file, or the points in a `.fcsv` file.
 
     Raises
     ------

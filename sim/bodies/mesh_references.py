@@ -76,7 +76,7 @@ def check_hdf5_storage(path: Path, limits: MeshBytes) -> None:
 
 
 def _named(path: Path) -> set[Path]:
-    """The HDF5 files in its folder that an XDMF file names."""
+    """Return the HDF5 files in its folder that an XDMF file names."""
     folder = path.resolve().parent
     named = set()
     for item in ElementTree.parse(path).iter():

@@ -49,7 +49,9 @@ class Smoothing:
 
 
 def compute_smallest_sines(corners: np.ndarray) -> np.ndarray:
-    """The smallest sine (...,) of a dihedral angle in each tetrahedron of `corners` (..., 4, 3); negative if inverted.
+    """Return the smallest sine (...,) of a dihedral angle in each tetrahedron of `corners` (..., 4, 3).
+
+    Negative if inverted.
 
     Small for angles near 0 and near 180 degrees alike (Klingner & Shewchuk 2007).
     """

@@ -102,7 +102,7 @@ class Solids:
 
 
 def build_mesh(solids: Solids, count: int, settings: Meshing = Meshing()) -> TetMesh:
-    """The mesh of `solids` with `count` nodes, to within 10 % and mostly 3 % by default.
+    """Return the mesh of `solids` with `count` nodes, to within 10 % and mostly 3 % by default.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def _would_do(solids: Solids, count: int, settings: Meshing) -> bool:
 
 
 def _meshed(solids: Solids, count: int, settings: Meshing) -> TetMesh | tuple[str, str]:
-    """The mesh with `count` nodes, or what is amiss with it and what helps. Raises as `build_mesh`."""
+    """Return the mesh with `count` nodes, or what is amiss with it and what helps. Raises as `build_mesh`."""
     volume = float(np.prod(solids.high - solids.low))
     edge, best = (volume / count) ** (1.0 / 3.0), None
     for _ in range(settings.trials):
@@ -171,7 +171,7 @@ def _meshed(solids: Solids, count: int, settings: Meshing) -> TetMesh | tuple[st
 
 
 def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
-    """The solid on a lattice of coarsest cell `edge` [m], split along the tumour's surface."""
+    """Return the solid on a lattice of coarsest cell `edge` [m], split along the tumour's surface."""
     radius = (0.75 / np.pi * solids.tumour_volume) ** (1.0 / 3.0)
     fine, growth = settings.fine * edge, settings.growth
     wanted = (
@@ -195,7 +195,7 @@ def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
 
 
 def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | tuple[str, str]:
-    """The pieces fitted and improved, in a second try without what folds them; else as `_meshed`."""
+    """Return the pieces fitted and improved, in a second try without what folds them; else as `_meshed`."""
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
     lost = find_lost_pieces(solids.pieces, pieces.nodes, pieces.tets[pieces.inside], settings)
@@ -244,7 +244,7 @@ def _surfaces(pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _projection(solids: Solids, pieces: Pieces, slack: float) -> Projection:
-    """Keeps each node within `slack` [m] of the levels of the fields on which it lies now."""
+    """Return keeps each node within `slack` [m] of the levels of the fields on which it lies now."""
     surface, interface = _surfaces(pieces)
     interface[np.setdiff1d(pieces.tets[pieces.inside], pieces.tets[~pieces.inside])] = False  # cortex that is tumour
     levels = solids.brain(pieces.nodes), solids.tumour(pieces.nodes)

@@ -198,7 +198,10 @@ def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndar
 
 
 def _said(space: str) -> str:
-    """Unit and space, as a comment and as field data; meshio, which wrote the file, reads no field data of text."""
+    """Return unit and space, as a comment and as field data.
+
+    Meshio, which wrote the file, reads no field data of text.
+    """
     name = f"{space}, metres per unit".removeprefix(", ")
     return (
         f"<!-- sulcus: {space or 'a space of its own'}; metres --><FieldData>"

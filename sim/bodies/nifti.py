@@ -23,7 +23,7 @@ METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}
 
 
 def read_nifti(path: Path, voxels: Voxels) -> Volume:
-    """The voxels of a NIfTI file of one part.
+    """Return the voxels of a NIfTI file of one part.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def read_nifti(path: Path, voxels: Voxels) -> Volume:
 
 
 def load_nifti(path: Path) -> Nifti1Image:
-    """The image of a NIfTI file of one part, packed or not, whatever its name says.
+    """Return the image of a NIfTI file of one part, packed or not, whatever its name says.
 
     Raises
     ------
@@ -97,7 +97,9 @@ def _holder(path: Path) -> FileHolder:
 
 
 def read_mgh(path: Path, voxels: Voxels) -> Volume:
-    """The voxels of a volume that FreeSurfer wrote; its file is in millimetres, and `voxels` say nothing about it.
+    """Return the voxels of a volume that FreeSurfer wrote.
+
+    Its file is in millimetres, and `voxels` say nothing about it.
 
     Raises
     ------

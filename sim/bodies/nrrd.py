@@ -44,7 +44,9 @@ ONE_FILE = "Save it as one file (.nrrd), with its header and voxels together."
 
 
 def read_nrrd(path: Path, voxels: Voxels) -> Volume:
-    """The voxels of an NRRD file, or of the one file beside it that it names; of layers of segments, (I, J, K, L).
+    """Return the voxels of an NRRD file, or of the one file beside it that it names.
+
+    Of layers of segments, (I, J, K, L).
 
     NRRD states its unit, millimetres if none, and one affine: `voxels` say nothing about it.
 
@@ -103,12 +105,12 @@ def _header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]
 
 
 def _named(fields: Mapping[str, str]) -> str:
-    """The name of the file that holds the voxels; empty where it is this one."""
+    """Return the name of the file that holds the voxels; empty where it is this one."""
     return fields.get("data file", fields.get("datafile", ""))
 
 
 def _beside(path: Path, fields: Mapping[str, str]) -> Path | None:
-    """The file beside this one that holds the voxels; None where this one does."""
+    """Return the file beside this one that holds the voxels; None where this one does."""
     name = _named(fields)
     if not name:
         return None

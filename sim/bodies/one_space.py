@@ -81,7 +81,7 @@ def _same(one: VoxelGrid, other: VoxelGrid) -> bool:
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:
-    """Some `SAMPLED` of them, at least."""
+    """Return some `SAMPLED` of them, at least."""
     return points[:: max(1, len(points) // SAMPLED)]
 
 
@@ -91,7 +91,7 @@ def _places(grid: VoxelGrid, index: np.ndarray) -> np.ndarray:
 
 
 def share_on(shape: tuple[int, ...], affine: np.ndarray, points: np.ndarray) -> float:
-    """The share of points (n, 3) [m] that lie in a voxel (I, J, K), whose affine (4, 4) leads to metres."""
+    """Return the share of points (n, 3) [m] that lie in a voxel (I, J, K), whose affine (4, 4) leads to metres."""
     inverse = np.linalg.inv(affine)
     index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3])
     return float(((index >= 0) & (index < np.array(shape))).all(axis=1).mean())
@@ -104,7 +104,7 @@ def _corners(mask: Mask) -> np.ndarray:
 
 
 def _share_within(planes: np.ndarray, points: np.ndarray) -> float:
-    """The share of points (n, 3) that no plane of a convex hull cuts off."""
+    """Return the share of points (n, 3) that no plane of a convex hull cuts off."""
     outermost = np.full(len(points), -np.inf)
     for part in np.array_split(planes, max(1, len(planes) // 64)):
         np.maximum(outermost, (points @ part[:, :3].T + part[:, 3]).max(axis=1), out=outermost)

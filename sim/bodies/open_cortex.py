@@ -89,13 +89,13 @@ class OpenCortex:
         return np.linalg.norm(arm - np.outer(arm @ self.axis, self.axis), axis=1)
 
     def nearest(self, point: np.ndarray) -> Place:
-        """The place that is nearest to a point (3,) [m]."""
+        """Return the place that is nearest to a point (3,) [m]."""
         at, triangle, weights = (found[0] for found in find_closest_points(point[None], self.corners))
         vertices = self.anatomy.open_surface[triangle]
         return Place(at, normalise_vectors((weights @ self._inward[vertices])[None])[0], vertices, weights)
 
     def place(self, right_mm: float = 0.0, up_mm: float = 0.0) -> Place:
-        """The place so many millimetres to the right of the middle, and up, in the tangent plane.
+        """Return the place so many millimetres to the right of the middle, and up, in the tangent plane.
 
         Raises
         ------

@@ -74,13 +74,13 @@ def describe_side(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings
 
 
 def find_reachable_site(cortex: np.ndarray, centre: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
-    """The point (3,) [m] of `cortex` (n, 3) nearest to `centre` (3,) that can be reached through the skull."""
+    """Return the point (3,) [m] of `cortex` (n, 3) nearest to `centre` (3,) that can be reached through the skull."""
     floor = min(cortex[:, 2].min() + settings.base * np.ptp(cortex[:, 2]), centre[2])
     return _nearest_outer(cortex[cortex[:, 2] >= floor], centre, cortex, settings)
 
 
 def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
-    """The reachable point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) at the surface.
+    """Return the reachable point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) at the surface.
 
     Raises
     ------

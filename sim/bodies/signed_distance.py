@@ -49,7 +49,7 @@ class LevelSet:
 
 
 def mask_field(mask: np.ndarray, affine: np.ndarray, blur: Blur = Blur()) -> LevelSet:
-    """The field of the voxels `mask` (I, J, K) bool whose indices `affine` (4, 4) takes to metres.
+    """Return the field of the voxels `mask` (I, J, K) bool whose indices `affine` (4, 4) takes to metres.
 
     The mask is blurred and the blur of a plane, P = Phi(-d / sigma), is solved for the distance d.
     Where voxels are oblong the mean of the three blurs stands for sigma, so that distances are right to a factor.
@@ -63,7 +63,7 @@ def mask_field(mask: np.ndarray, affine: np.ndarray, blur: Blur = Blur()) -> Lev
 
 
 def crop_to(mask: np.ndarray, affine: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """The part of a mask within `margin` voxels of what is marked, padded with zeros, and its affine (4, 4)."""
+    """Return the part of a mask within `margin` voxels of what is marked, padded with zeros, and its affine (4, 4)."""
     (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(mask.astype(np.uint8)))
     low = np.array([part.start for part in box]) - margin
     shifted = affine.copy()

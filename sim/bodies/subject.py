@@ -138,7 +138,7 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
 
 
 def _with_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
-    """The mesh with the regions of the subject's parts.
+    """Return the mesh with the regions of the subject's parts.
 
     Each has those tetrahedra that lie in it with the largest share, as many as come nearest to its volume.
     """

@@ -192,7 +192,7 @@ def template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
 
 
 def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: Head = Head()) -> Subject:
-    """A healthy head with a tumour drawn in it. Of `head`, volume and threshold do not count here.
+    """Return a healthy head with a tumour drawn in it. Of `head`, volume and threshold do not count here.
 
     Raises
     ------
@@ -263,7 +263,7 @@ def _site(
 
 
 def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobed:
-    """The tumour round a `middle` (3,) [m], given its shape at unit scale and its scale [m]."""
+    """Return the tumour round a `middle` (3,) [m], given its shape at unit scale and its scale [m]."""
     rng, lobes = np.random.default_rng(tumour.seed), tumour.lobes
     directions = rng.normal(size=(lobes.count if tumour.shape == "lobed" else 0, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -128,5 +128,5 @@ class TipGauge:
 
 @lru_cache(8)
 def build_tip_gauge(anatomy: Anatomy) -> TipGauge:
-    """The gauge of an anatomy; every frame asks for it."""
+    """Return the gauge of an anatomy; every frame asks for it."""
     return TipGauge(anatomy)

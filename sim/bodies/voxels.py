@@ -94,7 +94,7 @@ class VoxelGrid:
 
 
 def open_volume(path: Path) -> Any:
-    """A file opened at its first byte, unpacked as its content says, whatever it is called.
+    """Return a file opened at its first byte, unpacked as its content says, whatever it is called.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def _opener(path: Path) -> Callable[..., Any]:
 
 
 def check_volume(path: Path, volume: Volume, voxels: Voxels, finite: bool, layered: bool) -> Volume:
-    """The volume without axes of one voxel beyond the third, if it is one of numbers with a place.
+    """Return the volume without axes of one voxel beyond the third, if it is one of numbers with a place.
 
     `layered` lets several layers of a segmentation pass, as (I, J, K, L).
 

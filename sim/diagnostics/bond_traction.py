@@ -15,7 +15,7 @@ from ..runtime.device import Device, forward_kernel
 
 @cache
 def build_kernel(device: Device) -> wp.Kernel:
-    """The kernel of a device's scalar type, over (patch, column)."""
+    """Return the kernel of a device's scalar type, over (patch, column)."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -85,11 +85,14 @@ class Bond:
         return share.numpy()
 
     def share(self, force: wp.array) -> np.ndarray:
-        """The largest of `shares` (B,): above 1 the bond would tear. NaN where no skull is."""
+        """Return the largest of `shares` (B,): above 1 the bond would tear. NaN where no skull is."""
         return self._largest(force).numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
 
     def _largest(self, force: wp.array, share: wp.array | None = None) -> wp.array:
-        """The largest share of each column (B,), on the device; all of them (n, B) into `share`, where it is given."""
+        """Return the largest share of each column (B,), on the device.
+
+        All of them (n, B) into `share`, where it is given.
+        """
         most = wp.zeros(force.shape[1], dtype=wp.float64, device=self._device.name)
         inputs = [force, *self._arrays, wp.float64(self._effect.tension), wp.float64(self._effect.shear)]
         self._device.launch(build_kernel(self._device), (len(self.nodes), force.shape[1]), inputs, [share, most])

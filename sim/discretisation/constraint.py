@@ -209,7 +209,7 @@ class Constraint:
         return gap, np.abs(gap.numpy()).max(axis=0, initial=0.0)
 
     def compute_footprint_force(self, gradient: wp.array) -> np.ndarray | None:
-        """The multipliers (3, b) [N]: the force with which the tool moves its footprint, or None without one.
+        """Return the multipliers (3, b) [N]: the force with which the tool moves its footprint, or None without one.
 
         In equilibrium P gradient = P W force. The gradient (3N, b) is projected in place.
         """
@@ -253,7 +253,9 @@ class Constraint:
 
 
 def _within_free(held: np.ndarray, normal: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (N, 3) with their held components removed, of unit length again; zero where next to nothing is left.
+    """Return normals (N, 3) with their held components removed, of unit length again.
+
+    Zero where next to nothing is left.
 
     And (N, 3) the motion along them that a unit of each held component causes: normal . u stays zero.
     """

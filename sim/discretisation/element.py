@@ -36,7 +36,7 @@ class Elements:
     size: np.ndarray | None = None
 
     def on(self, nodes: np.ndarray) -> Elements:
-        """The same elements, of a body that has these nodes (n,) alone, ascending: theirs among them."""
+        """Return the same elements, of a body that has these nodes (n,) alone, ascending: theirs among them."""
         return replace(self, table=np.searchsorted(nodes, self.table).astype(self.table.dtype), nodes=len(nodes))
 
 
@@ -84,7 +84,7 @@ def compute_quadratic_shapes(corner: np.ndarray, edges: np.ndarray) -> np.ndarra
 
 
 def compute_quadratic_slopes(corner: np.ndarray) -> np.ndarray:
-    """Derivatives (q, 10, 3) of the ten shape functions by corner coordinates 1, 2, 3 at points (q, 4)."""
+    """Return derivatives (q, 10, 3) of the ten shape functions by corner coordinates 1, 2, 3 at points (q, 4)."""
     slope = np.zeros((len(corner), 10, 4))
     slope[:, np.arange(4), np.arange(4)] = 4.0 * corner - 1.0
     for place, (i, j) in enumerate(QUADRATIC_EDGES, start=4):

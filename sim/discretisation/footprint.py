@@ -119,7 +119,10 @@ class ContactSurface:
         self._last: tuple[bytes, Footprints] | None = None
 
     def nearest(self, points: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The nearest points (B, 3) [m] to `points` (B, 3) and how far they are; inf if not `within` (B,) [m]."""
+        """Return the nearest points (B, 3) [m] to `points` (B, 3) and how far they are.
+
+        Inf if not `within` (B,) [m].
+        """
         imprint = self.imprint(self._tools(points, within))
         self._touch(imprint)
         touched = imprint.touched.numpy().reshape(-1, 4)
@@ -207,12 +210,15 @@ class ContactSurface:
 def compute_footprint_weights(
     nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray
 ) -> sp.csr_array:
-    """Weights (B, N), each row summing to one; parameters and errors as `ContactSurface` and `ContactSurface.press`, on the host."""
+    """Weights (B, N), each row summing to one.
+
+    Parameters and errors as `ContactSurface` and `ContactSurface.press`, on the host.
+    """
     return ContactSurface(nodes, triangles, find_device("cpu", "float64")).press(points, radii).rows(len(nodes))
 
 
 def find_nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """The point (3,) nearest to `point` (3,) on triangles with `corners` (S, 3, 3) [m]."""
+    """Return the point (3,) nearest to `point` (3,) on triangles with `corners` (S, 3, 3) [m]."""
     apart = np.arange(3 * len(corners)).reshape(-1, 3)
     skin = ContactSurface(corners.reshape(-1, 3), apart, find_device("cpu", "float64"))
     return skin.nearest(point[None], np.array([np.inf]))[0][0]
@@ -220,7 +226,7 @@ def find_nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
 
 @wp.func
 def _on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
-    """The point nearest to `point` between a and b."""
+    """Return the point nearest to `point` between a and b."""
     edge = b - a
     square = wp.dot(edge, edge)
     along = wp.float64(0.0)
@@ -237,7 +243,7 @@ def _nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
-    """The point nearest to `point` on a triangle.
+    """Return the point nearest to `point` on a triangle.
 
     Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the plane's foot where it lies inside, else the
     nearest of the three edges. A needle has no foot to round-off: its edges serve.

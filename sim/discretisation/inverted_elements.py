@@ -14,7 +14,7 @@ from .space import Discretisation
 
 @cache
 def build_kernel(device: Device, size: int, points: int, least: float) -> wp.Kernel:
-    """The kernel for tetrahedra of `size` nodes and `points` quadrature points, over (tetrahedron, column)."""
+    """Return the kernel for tetrahedra of `size` nodes and `points` quadrature points, over (tetrahedron, column)."""
     scalar, vec = device.scalar, device.vector
 
     @forward_kernel(module="unique")

@@ -37,7 +37,7 @@ class PlacedBox:
     half: np.ndarray
 
     def moved(self, way: np.ndarray) -> PlacedBox:
-        """The same, moved by (3,) [m]."""
+        """Return the same, moved by (3,) [m]."""
         return replace(self, middle=self.middle + way)
 
     @property
@@ -47,7 +47,7 @@ class PlacedBox:
         return self.middle + (signs * self.half) @ self.axes.T
 
     def nearest(self, corners: np.ndarray) -> NearestPlaces:
-        """The places nearest to it on triangles with `corners` (S, 3, 3) [m].
+        """Return the places nearest to it on triangles with `corners` (S, 3, 3) [m].
 
         A place of one takes turns with the nearest of the other, with momentum (Beck, Teboulle 2009, "A fast iterative
         shrinkage-thresholding algorithm", SIAM J. Imaging Sci. 2:183-202, equations 4.1 to 4.3).
@@ -153,7 +153,7 @@ def _through(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d)
 
 @wp.func
 def _of_box(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.vec3d:
-    """The box's place that is nearest to a point."""
+    """Return the box's place that is nearest to a point."""
     local = wp.transpose(axes) @ (point - middle)
     for i in range(3):
         local[i] = wp.clamp(local[i], -half[i], half[i])

@@ -95,7 +95,7 @@ class Problem:
             term.keep(columns)
 
     def end(self, u: wp.array) -> Mapping[str, Any]:
-        """The memory of every term that has one, by name."""
+        """Return the memory of every term that has one, by name."""
         kept = {term.name: term.end(u) for term in self.terms}
         return {name: memory for name, memory in kept.items() if memory is not None}
 
@@ -107,14 +107,14 @@ class Problem:
         return out.numpy()
 
     def gradient(self, u: wp.array) -> wp.array:
-        """The terms' summed gradient (3N, b) [N]."""
+        """Return the terms' summed gradient (3N, b) [N]."""
         out = self.device.zeros(*u.shape)
         for term in self.terms:
             term.add_gradient(u, out)
         return out
 
     def residual(self, u: wp.array) -> tuple[wp.array, np.ndarray, np.ndarray]:
-        """The free gradient (3N, b) [N], its 2-norm (b,), and the scale (b,) that it is measured against.
+        """Return the free gradient (3N, b) [N], its 2-norm (b,), and the scale (b,) that it is measured against.
 
         The scale is the largest 2-norm among the terms' own gradients and the reaction at constrained nodes.
         """
@@ -170,7 +170,7 @@ class Problem:
         return reduce(lambda a, b: a + b, offered, sp.csc_array((self.rows, self.rows)))
 
     def longest_step(self, u: wp.array, du: wp.array) -> np.ndarray:
-        """The longest fraction (b,), at most 1, of du (3N, b) that every term allows."""
+        """Return the longest fraction (b,), at most 1, of du (3N, b) that every term allows."""
         out = wp.full(u.shape[1], 1.0, dtype=self.device.scalar, device=self.device.name)
         for term in self.terms:
             term.longest_step(u, du, out)

@@ -32,7 +32,7 @@ class RemainingBody:
     loose: np.ndarray
 
     def __str__(self) -> str:
-        """The sentence that a user reads."""
+        """Return the sentence that a user reads."""
         said = f"{self.done} step{'' if self.done == 1 else 's'} done"
         if not len(self.loose):
             return said
@@ -40,7 +40,7 @@ class RemainingBody:
 
 
 def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[RemainingBody, ...]:
-    """`compute_remains` under effects, `Resection` one of them: what none of them holds, or keeps on the skull, comes loose.
+    """Return `compute_remains` under effects with a `Resection`, without tissue that none of them holds.
 
     Raises
     ------

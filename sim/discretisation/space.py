@@ -142,12 +142,12 @@ def _smoothed(mesh: TetMesh, chosen: bytes) -> tuple[Elements, Elements]:
 
 
 def recommend_element(mesh: TetMesh) -> str:
-    """The element of who names none: `RECOMMENDED`, or p2 on a mesh that brings mid-edge nodes of its own."""
+    """Return the element of who names none: `RECOMMENDED`, or p2 on a mesh that brings mid-edge nodes of its own."""
     return RECOMMENDED if mesh.middles is None else "p2"
 
 
 def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
-    """The nodes and elements of type `element`, one of `ELEMENTS`, over a mesh.
+    """Return the nodes and elements of type `element`, one of `ELEMENTS`, over a mesh.
 
     None: the `recommend_element` one.
 

@@ -57,7 +57,7 @@ class Cases:
         return steps
 
     def rows(self, index: slice | np.ndarray) -> Cases:
-        """Some of the cases."""
+        """Return some of the cases."""
         memory = {name: value[index] for name, value in self.memory.items()}
         displacement = None if self.displacement is None else self.displacement[index]
         share = None if self.share is None else self.share[index]
@@ -281,7 +281,7 @@ class Reduction(Protocol):
         ...
 
     def stage(self, columns: np.ndarray) -> tuple[Any, Any]:
-        """The structs `stage` and `near` for some columns (k,)."""
+        """Return the structs `stage` and `near` for some columns (k,)."""
         ...
 
     def slope(self, w: Any) -> Any:

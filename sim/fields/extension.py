@@ -10,7 +10,7 @@ SWEEPS = 6
 
 
 def extend_field(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:
-    """The field (3, I, J, K) with nodes that are not known (I, J, K) filled in; zero from `reach` [nodes] on.
+    """Return the field (3, I, J, K) with nodes that are not known (I, J, K) filled in; zero from `reach` [nodes] on.
 
     They have the nearest known value, the less of it the farther away it is, and are smoothed. No value exceeds those
     that are known.

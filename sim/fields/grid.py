@@ -24,7 +24,7 @@ class Grid:
         return affine
 
     def index(self, points: np.ndarray) -> np.ndarray:
-        """Indices (..., 3), not whole, of points (..., 3) [m]."""
+        """Return indices (..., 3), not whole, of points (..., 3) [m]."""
         return (points - self.origin) / self.spacing
 
     def points(self, numbers: np.ndarray) -> np.ndarray:
@@ -43,13 +43,16 @@ class Grid:
         return numbers, weights.reshape(-1, 8)
 
     def read(self, field: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """A field (3, I, J, K) at points (n, 3) [m]: linear between nodes, and zero (n, 3) outside."""
+        """Return a field (3, I, J, K) at points (n, 3) [m]: linear between nodes, and zero (n, 3) outside."""
         index = self.index(points).T
         return np.stack([ndimage.map_coordinates(part, index, order=1) for part in field], axis=-1)
 
 
 def build_grid_around(points: np.ndarray, spacing: float, margin: float) -> Grid:
-    """The grid of a spacing [m] round points (n, 3) [m], with a margin [m]; nodes lie at multiples of the spacing."""
+    """Return the grid of a spacing [m] round points (n, 3) [m], with a margin [m].
+
+    Nodes lie at multiples of the spacing.
+    """
     low = np.floor((points.min(axis=0) - margin) / spacing)
     high = np.ceil((points.max(axis=0) + margin) / spacing)
     i, j, k = (high - low).astype(int) + 1

@@ -87,7 +87,7 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
 
 
 def _read(flat: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """A flat field (3, N) between nodes: (n, 3)."""
+    """Return a flat field (3, N) between nodes: (n, 3)."""
     return np.stack([np.einsum("nc,nc->n", part[numbers], weights) for part in flat], axis=-1)
 
 
@@ -139,7 +139,7 @@ def _lattice(order: int, size: int) -> np.ndarray:
 
 
 def _rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> sparse.csr_matrix:
-    """Sums (n, free) of nodes (n, m) by weights (n, m), those that are free."""
+    """Return sums (n, free) of nodes (n, m) by weights (n, m), those that are free."""
     columns = column[numbers]
     free = columns >= 0
     row = np.repeat(np.arange(len(numbers)), free.sum(axis=1))

@@ -96,7 +96,7 @@ def find_collar(inside: np.ndarray) -> np.ndarray:
 
 
 def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.ndarray, float]:
-    """The field (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian.
+    """Return the field (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian.
 
     It is linear in each tetrahedron, and fitted where sampling that is not exact between the grid's nodes. Just outside
     it goes on as it is, so that what is read there is right up to the surface. From there it fades to zero.
@@ -114,7 +114,7 @@ def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.
 def invert_on_grid(
     grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """The inverse (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian.
+    """Return the inverse (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian.
 
     Within the deformed body it is linear in each tetrahedron, and fitted. Outside it is the forward field's inverse.
     """
@@ -136,7 +136,7 @@ def warp_fields(
     left: Anatomy | None = None,
     made: Callable[[], object] = lambda: None,
 ) -> WarpFields:
-    """The fields of a displacement (V, 3) [m] on a grid of a spacing [m].
+    """Return the fields of a displacement (V, 3) [m] on a grid of a spacing [m].
 
     `left` is what is left of a body that was cut. Round a body nothing is known: there the fields fade. `made` is
     called when either field is made.

@@ -67,7 +67,7 @@ def _vertices(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np
 
 
 def _edges(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """The same of what lies between the ends of the triangles' edges (M, 3)."""
+    """Return the same of what lies between the ends of the triangles' edges (M, 3)."""
     edge = np.roll(corners, -1, axis=1) - corners
     square = np.einsum("mei,mei->me", edge, edge)
     unit = edge / np.sqrt(np.where(square > 0.0, square, 1.0))[..., None]
@@ -83,7 +83,7 @@ def _edges(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.nd
 
 
 def _faces(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """The same of the triangles' insides (M, 1), whichever side the ball comes from."""
+    """Return the same of the triangles' insides (M, 1), whichever side the ball comes from."""
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(ab, ac)
     twice = np.linalg.norm(normal, axis=1)

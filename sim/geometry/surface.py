@@ -30,7 +30,7 @@ class BlurRange:
 def compute_blurred_normals(
     nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, blur: float, limits: BlurRange = BlurRange()
 ) -> np.ndarray:
-    """Unit normals (n, 3) at points (n, 3) [m] of the body within outward triangles (S, 3), seen through a blur.
+    """Return unit normals (n, 3) at points (n, 3) [m] of the body within outward triangles (S, 3), seen through a blur.
 
     They are the gradient of the body's indicator after a Gaussian of standard deviation `blur` [m]. By the divergence
     theorem that is the integral over its surface of the Gaussian times the inward normal. Of folds narrower than the
@@ -95,5 +95,5 @@ def compute_areas(corners: np.ndarray) -> np.ndarray:
 
 
 def compute_vertex_areas(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """A third (n,) [m^2] of the areas of the triangles (S, 3) at each of the nodes (n, 3) [m]."""
+    """Return a third (n,) [m^2] of the areas of the triangles (S, 3) at each of the nodes (n, 3) [m]."""
     return np.bincount(triangles.ravel(), np.repeat(compute_areas(nodes[triangles]) / 3.0, 3), len(nodes))

@@ -73,7 +73,7 @@ def _blocks(matrix: sp.bsr_matrix) -> sp.bsr_array:
 
 
 def build_rigid_motions(points: np.ndarray) -> np.ndarray:
-    """Translations and rotations (3N, 6) of points (N, 3); lengths as shares of the body's."""
+    """Return translations and rotations (3N, 6) of points (N, 3); lengths as shares of the body's."""
     arm = points - points.mean(axis=0)
     arm /= np.abs(arm).max()
     turns = [np.cross(axis, arm) for axis in np.eye(3)]

@@ -28,7 +28,9 @@ def build_functions(device: Device) -> BlockFactorFunctions:
 
     @wp.func
     def factor(a: wp.array3d(dtype=wp.float64), size: int, c: int, me: int) -> bool:
-        """A = L L', of whose upper half A is read: L' is left there and L in the lower. False where A is not positive.
+        """Return a = L L', of whose upper half A is read: L' is left there and L in the lower.
+
+        False where A is not positive.
 
         Then nothing that is left means anything.
         """

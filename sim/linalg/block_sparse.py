@@ -74,7 +74,7 @@ def build_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
 
 @cache
 def build_host_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
-    """The same on the CPU, over block rows."""
+    """Return the same on the CPU, over block rows."""
     scalar = device.scalar
     real = {"float32": "float", "float64": "double"}[device.precision]
     code = ROW.replace("real", real).replace("WIDE", str(-(-rows // LANES) * LANES))
@@ -121,7 +121,7 @@ class Sparse:
         self._entries = [*indices, blocks]
 
     def times(self, x: wp.array) -> wp.array:
-        """A x (m, b) of x (n, b)."""
+        """Return a x (m, b) of x (n, b)."""
         out = self._device.zeros(self.rows, x.shape[1])
         self.add_to(out, 1.0, x)
         return out

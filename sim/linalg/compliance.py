@@ -106,7 +106,7 @@ class Compliance:
             self._block(block)
 
     def _acting(self, rows: np.ndarray) -> list[int]:
-        """The blocks that some rows (3n,) bool are in."""
+        """Return the blocks that some rows (3n,) bool are in."""
         return np.unique(np.flatnonzero(rows) // self._width).tolist()
 
     def _rows(self, block: int) -> slice:

@@ -172,7 +172,10 @@ class DenseInverse:
 
 
 def _scaled(rows: list[torch.Tensor], scale: torch.Tensor, size: int, kind: torch.dtype) -> torch.Tensor:
-    """The matrix (size, size) whose negative lower half is in `rows` of blocks, over scales; rows are given back."""
+    """Return the matrix (size, size) whose negative lower half is in `rows` of blocks, over scales.
+
+    Rows are given back.
+    """
     out = torch.zeros((size, size), dtype=kind, device=scale.device)
     while rows:
         row = rows.pop()

@@ -87,7 +87,7 @@ def _add_product(
 
 
 def list_tiles(size: int, device: str) -> wp.array:
-    """The tiles (n,) on and above the diagonal of a matrix with so many rows."""
+    """Return the tiles (n,) on and above the diagonal of a matrix with so many rows."""
     above = np.stack(np.triu_indices(-(-size // TILE)), axis=1).astype(np.int32)
     return wp.array(above, dtype=wp.vec2i, device=device)
 

@@ -148,7 +148,7 @@ class Factor:
 
 
 def find_moved_nodes(basis: sp.csc_array) -> np.ndarray:
-    """The node (n,) that each column of a constraint's basis (3N, n) moves."""
+    """Return the node (n,) that each column of a constraint's basis (3N, n) moves."""
     return np.asarray(basis.indices[basis.indptr[:-1]] // 3)
 
 
@@ -188,7 +188,7 @@ def _swept(panels: Sequence[FrontPanel], x: np.ndarray) -> np.ndarray:
 def factorise_panels(
     matrix: sp.csc_array, fronts: Sequence[Sequence[Front]], precision: Precision, singular: float
 ) -> tuple[np.ndarray, list[FrontPanel]]:
-    """The values of all panels, one after the other in one array; and the panels.
+    """Return the values of all panels, one after the other in one array; and the panels.
 
     Raises
     ------
@@ -245,7 +245,7 @@ class _Fronts:
                 panel.values[:, size:] = -trsm(1.0, root, across, side=1, lower=1).T
 
     def _rows(self, front: Front) -> np.ndarray:
-        """The matrix (k + m, k + m) at a front's unknowns, as far as its own columns hold; the lower half."""
+        """Return the matrix (k + m, k + m) at a front's unknowns, as far as its own columns hold; the lower half."""
         start, rows, size = self._matrix.indptr, front.rows, front.stop - front.first
         whole = np.zeros((len(rows), len(rows)), order="F")
         entries = slice(start[front.first], start[front.stop])

@@ -156,7 +156,7 @@ class TwoLevel:
         self._device.launch(step, (r.shape[0] // self._size, r.shape[1]), inputs, [d, x])
 
     def _power(self) -> float:
-        """The largest eigenvalue of D^-1 K."""
+        """Return the largest eigenvalue of D^-1 K."""
         device = self._device
         x = device.array(np.random.default_rng(0).normal(size=(self._stiffness.rows, 1)))
         largest = 1.0
@@ -198,7 +198,7 @@ def project_to_free(stiffness: sp.csc_array, constraint: Constraint) -> sp.bsr_a
 
 
 def make_regular(matrix: sp.csr_array, size: int) -> sp.bsr_array:
-    """The matrix in blocks (size, size); unknowns of no element get the mean of its diagonal on theirs."""
+    """Return the matrix in blocks (size, size); unknowns of no element get the mean of its diagonal on theirs."""
     diagonal = matrix.diagonal()
     missing = np.where(diagonal == 0.0, diagonal.mean(), 0.0)
     return sp.bsr_array(sp.csr_array(matrix + sp.diags_array(missing)), blocksize=(size, size))

@@ -51,7 +51,9 @@ def choose_preconditioner(
     step: float = math.inf,
     settings: Preconditioning = Preconditioning(),
 ) -> Preconditioner:
-    """The rest stiffness, inverted (CUDA) or factorised where that pays; two levels where it has too many entries.
+    """Return the rest stiffness, inverted (CUDA) or factorised where that pays.
+
+    Two levels where it has too many entries.
 
     Algebraic multigrid where even the coarse level does not fit; block Jacobi where nothing is free to move.
     `unsmoothed` assembles the rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh. It does so over a
@@ -110,7 +112,7 @@ def is_exact(preconditioner: Preconditioner) -> bool:
 
 
 def build_rest_solver(problem: Problem) -> Preconditioner:
-    """The whole free rest stiffness, inverted or factorised, in the problem's own precision.
+    """Return the whole free rest stiffness, inverted or factorised, in the problem's own precision.
 
     Raises
     ------

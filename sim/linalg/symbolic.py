@@ -53,7 +53,9 @@ class Front:
 def build_fronts(
     matrix: sp.csc_array, node: np.ndarray, parts: int = 1, settings: FrontSizes = FRONT_SIZES
 ) -> tuple[np.ndarray, list[list[Front]]]:
-    """An order (n,) of a matrix's unknowns with little fill, and its fronts; every front comes before those it touches.
+    """Return an order (n,) of a matrix's unknowns with little fill, and its fronts.
+
+    Every front comes before those it touches.
 
     `node` (n,): unknowns of one node stay together. The fronts come in so many parts that do not touch one another, of
     about the same work, and in a last one, which all of them touch.
@@ -86,7 +88,7 @@ def build_fronts(
 
 
 def order_by_dissection(graph: sp.csr_array, leaf: int = FrontSizes.leaf) -> np.ndarray:
-    """An order (N,) of a symmetric graph's nodes with little fill: nested dissection.
+    """Return an order (N,) of a symmetric graph's nodes with little fill: nested dissection.
 
     By METIS: Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392. Without pymetis by levels, down to some unknowns a
     `leaf`, with more fill: George, Liu 1978, SIAM J. Numer. Anal. 15:1053-1069.
@@ -103,7 +105,7 @@ def order_by_dissection(graph: sp.csr_array, leaf: int = FrontSizes.leaf) -> np.
 
 
 def order_by_levels(graph: sp.csr_array, nodes: np.ndarray, leaf: int) -> np.ndarray:
-    """The same nodes (k,), the middle level between two far ends last; both sides likewise."""
+    """Return the same nodes (k,), the middle level between two far ends last; both sides likewise."""
     if 3 * len(nodes) <= leaf:
         return nodes
     inside = graph[nodes][:, nodes]
@@ -123,7 +125,7 @@ def _spread(start: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 
 def _parents(graph: sp.csr_array) -> list[int]:
-    """The elimination tree (N,) of a graph in its order; -1 at roots. Liu 1990, algorithm 4.2."""
+    """Return the elimination tree (N,) of a graph in its order; -1 at roots. Liu 1990, algorithm 4.2."""
     count = len(graph.indptr) - 1
     parent, ancestor = [-1] * count, [-1] * count
     starts, neighbours = np.ravel(graph.indptr).tolist(), np.ravel(graph.indices).tolist()
@@ -229,13 +231,13 @@ def _divided(
 
 
 def _bits(nodes: np.ndarray, count: int) -> int:
-    """Some of `count` nodes as the bits of a whole number."""
+    """Return some of `count` nodes as the bits of a whole number."""
     flags = np.zeros(count, bool)
     flags[nodes] = True
     return int.from_bytes(np.packbits(flags, bitorder="little").tobytes(), "little")
 
 
 def _nodes(bits: int, count: int) -> np.ndarray:
-    """The nodes again, ascending."""
+    """Return the nodes again, ascending."""
     packed = np.frombuffer(bits.to_bytes(-(-count // 8), "little"), np.uint8)
     return np.flatnonzero(np.unpackbits(packed, bitorder="little"))

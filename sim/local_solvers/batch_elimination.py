@@ -94,7 +94,10 @@ class BatchElimination:
         return eliminate_unknowns(self.problem, start, tolerance, most, self.limits, cycle)
 
     def _corrected(self, u: wp.array, g: wp.array, force: np.ndarray) -> wp.array:
-        """The next state (3N, b), from the free gradient g (3N, b) at u (3N, b); force (b,) [N] may be left near."""
+        """Return the next state (3N, b), from the free gradient g (3N, b) at u (3N, b).
+
+        Force (b,) [N] may be left near.
+        """
         device, count = self.problem.device, u.shape[1]
         every = np.ones(count, bool)
         e = device.zeros(*u.shape)

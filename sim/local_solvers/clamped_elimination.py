@@ -113,7 +113,7 @@ class ClampedElimination:
         return eliminate_unknowns(self.problem, start, tolerance, most, self.limits, cycle)
 
     def _lower(self, judge: Judge, now: ResidualState, part: ClampedPart, d: np.ndarray, force: float) -> ResidualState:
-        """A step along d (3N,) that does not go too far, and the part settled to `force` [N] there.
+        """Return a step along d (3N,) that does not go too far, and the part settled to `force` [N] there.
 
         Its free force is not finite where no step that was tried leads on.
         """
@@ -136,7 +136,7 @@ class ClampedElimination:
         return _host(z)
 
     def _strained(self, u: np.ndarray) -> np.ndarray:
-        """The nodes (k,) of the tetrahedra that a displacement u (3N,) [m] strains most."""
+        """Return the nodes (k,) of the tetrahedra that a displacement u (3N,) [m] strains most."""
         table = self.space.table
         slope = np.einsum("tai,taj->tij", u.reshape(-1, 3)[table[:, :4]], self._slopes)
         strain = np.sqrt(np.einsum("tij,tij->t", slope, slope))
@@ -144,7 +144,10 @@ class ClampedElimination:
         return table[np.argsort(-strain)[:most]].ravel()
 
     def _left(self, g: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """The few nodes (k,) beyond these that have most of the free gradient g (3N,) there; none if no few have."""
+        """Return the few nodes (k,) beyond these that have most of the free gradient g (3N,) there.
+
+        None if no few have.
+        """
         square = (g.reshape(-1, 3).astype(np.float64) ** 2).sum(axis=1)
         square[nodes] = 0.0
         most = np.argsort(-square)[: self.size.added]

@@ -33,7 +33,7 @@ class ContactState:
         return np.isfinite(self.free) & np.isfinite(self.scale)
 
     def rows(self, stay: np.ndarray) -> ContactState:
-        """Some of the columns (k,)."""
+        """Return some of the columns (k,)."""
         parts = (self.u[:, stay], self.smooth[:, stay], self.whole[:, stay])
         return ContactState(*parts, self.free[stay], self.scale[stay])
 

@@ -242,7 +242,10 @@ class ContactDescent:
         return batch.failed >= 2 * self.limits.times
 
     def _waits(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
-        """Some columns (b,) bool have found no forces, and will be dragged more; which (b,) have tried all there is."""
+        """Return some columns (b,) bool have found no forces, and will be dragged more.
+
+        Which (b,) have tried all there is.
+        """
         times = self.limits.times
         batch.waiting = waiting
         batch.failed = np.where(waiting, batch.failed + 1, 0)
@@ -369,7 +372,7 @@ class ContactDescent:
             batch.pairs.update_history(taken[felt], moved[:, on], change[:, on], way[:, on])
 
     def _felt(self, now: ContactState) -> Any:
-        """Forces (3n, b) that balance all that is smooth, where tools touch."""
+        """Return forces (3n, b) that balance all that is smooth, where tools touch."""
         barrier, rows = self.barrier.reduced(np.arange(len(now.free))), self._rows
         own = to_double(now.smooth[rows])
         if barrier is None:
@@ -386,7 +389,7 @@ class ContactDescent:
         return out
 
     def _judged(self, judge: Judge, u: Any) -> ContactState:
-        """The states u (3N, b), as `Problem.residual` measures them."""
+        """Return the states u (3N, b), as `Problem.residual` measures them."""
         problem, device = self.problem, self.problem.device
         place, pressed = device.zeros(*u.shape), device.zeros(*u.shape)
         view(place)[:] = u

@@ -108,7 +108,7 @@ def solve_contact_forces(
     drag: np.ndarray,
     limits: ForceLimits = FORCES,
 ) -> tuple[Any, np.ndarray]:
-    """The forces f (3n, b) [N], and in which columns (b,) they have been found.
+    """Return the forces f (3n, b) [N], and in which columns (b,) they have been found.
 
     None are found where the model is not convex: its tools are sharper than its tissue is stiff, and it would go far
     astray. From where the nodes are, `here` (3n, b) [m]; w1 is `there` and f1 `known` (3n, b). They are exact to a
@@ -145,7 +145,7 @@ def _solved(
     limits: ForceLimits,
     room: int,
 ) -> tuple[Any, np.ndarray, Any]:
-    """Forces (3n, k) of some columns (k,) with room for so many touched nodes, status (k,), and places (n, k).
+    """Return forces (3n, k) of some columns (k,) with room for so many touched nodes, status (k,), and places (n, k).
 
     Of the columns' `own` here, there and known forces (3n, k), and tolerance and drag (k,) as `asked`.
     """

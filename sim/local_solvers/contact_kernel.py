@@ -60,7 +60,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         c: int,
         me: int,
     ) -> int:
-        """The nodes where x is not zero, ascending: how many, which, and each node's place among them or -1."""
+        """Return the nodes where x is not zero, ascending: how many, which, and each node's place among them or -1."""
         n = place.shape[0]
         own = (n + threads - 1) // threads
         begin, end = wp.min(me * own, n), wp.min((me + 1) * own, n)
@@ -182,7 +182,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def soften(model: ComplianceModel, m: int, s: Scratch, c: int, me: int) -> wp.float64:
-        """The compliance between m touched nodes; its mean."""
+        """Return the compliance between m touched nodes; its mean."""
         pairs = model.learnt.shape[1]
         for j in range(me, 3 * m, threads):
             row = 3 * s.touched[c, j // 3] + j % 3

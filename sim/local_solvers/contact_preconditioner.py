@@ -69,7 +69,7 @@ class ContactPreconditioner:
 def build_contact_preconditioner(
     problem: Problem, rest: Preconditioner, contact: ContactDescent | None
 ) -> Preconditioner:
-    """A preconditioner that knows what tools touch: as `contact` does where that is, or beside another barrier.
+    """Return a preconditioner that knows what tools touch: as `contact` does where that is, or beside another barrier.
 
     Where a skull lets go too, the rest counts it as half shut, and tools are as stiff as ever.
     """

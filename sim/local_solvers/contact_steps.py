@@ -201,7 +201,9 @@ class ContactSteps:
             view(self._model.own)[:] = model.own
 
     def aim(self, tolerance: float, drag: float, bent: bool = False) -> np.ndarray:
-        """Forces of the tools, exact to a tolerance, under a drag; the direction, and its longest step: `SAID` numbers.
+        """Return forces of the tools, exact to a tolerance, under a drag.
+
+        The direction, and its longest step: `SAID` numbers.
 
         The model need not be convex where it is `bent`. Where no forces were `FOUND` all else means nothing. What is
         returned is written over by what comes next.
@@ -211,7 +213,7 @@ class ContactSteps:
         return self._run("bent" if bent else "aim", lambda: self._aim(ends))
 
     def again(self, length: float) -> np.ndarray:
-        """The same of a shorter step."""
+        """Return the same of a shorter step."""
         self._up.numpy()[LENGTH] = length
         return self._run("again", self._again)
 

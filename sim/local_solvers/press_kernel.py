@@ -10,7 +10,7 @@ from ..runtime.device import Device, forward_kernel
 
 @cache
 def press_of(device: Device, entry: Any, number: Any, parts: int = 1) -> wp.Kernel:
-    """The kernel that multiplies by each column's matrix, over (part, column, row).
+    """Return the kernel that multiplies by each column's matrix, over (part, column, row).
 
     `entry` and `number` are the types of the matrix and of its products; a row is divided among so many threads.
     """

@@ -62,7 +62,7 @@ class StiffnessUpdate:
     pivots: np.ndarray
 
     def pull(self, motion: np.ndarray) -> np.ndarray:
-        """Forces (n,) [N] that a motion (3N,) [m] of the body at rest misses."""
+        """Return forces (n,) [N] that a motion (3N,) [m] of the body at rest misses."""
         return -lu_solve((self.factor, self.pivots), self.added @ motion[self.rows], check_finite=False)
 
     @property

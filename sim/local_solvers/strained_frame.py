@@ -43,7 +43,9 @@ class UpdatedModel:
 
 
 def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedModel | None:
-    """The model at u (3N, 1) [m], which the problem has begun, of a part that is prepared; None where there is none.
+    """Return the model at u (3N, 1) [m], which the problem has begun, of a part that is prepared.
+
+    None where there is none.
 
     A card is not waited for.
     """

@@ -155,7 +155,7 @@ class Lbfgs:
 
 
 def to_rows_first(array: wp.array) -> np.ndarray:
-    """A copy (b, ...) on the host of an array (..., b) in a workspace."""
+    """Return a copy (b, ...) on the host of an array (..., b) in a workspace."""
     return np.moveaxis(array.numpy(), -1, 0).copy()  # what stands in a workspace is written over
 
 

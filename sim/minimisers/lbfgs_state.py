@@ -70,7 +70,7 @@ class LbfgsState:
 
 
 def allocate_state(problem: Problem, width: int, ground: Mapping[str, wp.array]) -> LbfgsState:
-    """The state of so many columns on a ground that `allocate_ground` made for at least this width."""
+    """Return the state of so many columns on a ground that `allocate_ground` made for at least this width."""
     columns: dict[str, wp.array] = {}
     together: dict[str, wp.array] = {}
     for kind, (_, moved, written) in describe_layout(problem).items():
@@ -154,7 +154,7 @@ class Workspace:
         self.prepare()
 
     def _padded(self, stay: np.ndarray) -> np.ndarray:
-        """The last of them again, until the workspace is full."""
+        """Return the last of them again, until the workspace is full."""
         return np.append(stay, np.full(self.width - len(stay), stay[-1]))
 
     def prepare(self) -> None:
@@ -237,7 +237,7 @@ class Workspace:
 
 
 def _placed(ground: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:
-    """The numbers from the first on, as an array of any shape: views of Warp cannot skip 2^31 numbers."""
+    """Return the numbers from the first on, as an array of any shape: views of Warp cannot skip 2^31 numbers."""
     address = ground.ptr + first * wp.types.type_size_in_bytes(ground.dtype)
     return wp.array(ptr=address, dtype=ground.dtype, shape=shape, device=ground.device)
 

@@ -39,7 +39,7 @@ def spread_of(device: Device, columns: int) -> ThreadSpread:
 
 @wp.func
 def first_of(thread: int, lanes: int, each: int):
-    """The first of the rows that a thread takes; the others follow at steps of one group of neighbours."""
+    """Return the first of the rows that a thread takes; the others follow at steps of one group of neighbours."""
     return thread // lanes * lanes * each + thread % lanes
 
 
@@ -119,7 +119,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
 
 @cache
 def multiply_of(device: Device, pairs: int) -> wp.Kernel:
-    """The kernel for a column that keeps so many pairs, launched over (products, threads of rows)."""
+    """Return the kernel for a column that keeps so many pairs, launched over (products, threads of rows)."""
     scalar, m, spread = device.scalar, pairs, spread_of(device, 1)
     lanes, each = spread.lanes, spread.each
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GOLD, 2 * m + YW

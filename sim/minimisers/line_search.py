@@ -43,7 +43,7 @@ def is_step_too_long(ahead: Any, promised: Any) -> Any:
 
 
 def backtrack_by_slopes(ahead: Any, promised: Any) -> Any:
-    """The shares of steps that went too far to be tried next: where the line through both slopes is zero."""
+    """Return the shares of steps that went too far to be tried next: where the line through both slopes is zero."""
     with np.errstate(invalid="ignore", divide="ignore"):
         kept = np.divide(promised, np.add(promised, ahead))
     known = np.greater(promised, 0.0) & np.isfinite(ahead)

@@ -26,7 +26,7 @@ STEP = 0.003
 
 @cache
 def build_mixing_kernel(device: Device) -> wp.Kernel:
-    """The kernel of `mix_columns` for a device's scalar type."""
+    """Return the kernel of `mix_columns` for a device's scalar type."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -119,7 +119,7 @@ class SeriesReading:
 def expand_taylor(
     problem: Problem, at_rest: Callable[[wp.array], wp.array], loads: int, sizes: int, edge: float, orders: int
 ) -> Iterator[wp.array]:
-    """Forces f_1 ... f_n [N], whose answers at rest are the orders of the series.
+    """Yield forces f_1 ... f_n [N], whose answers at rest are the orders of the series.
 
     Under loads times s_1 ... s_m, u = K^-1 f_1 + K^-1 f_2 + ..., f_k a form of degree k in them. Of each group of m
     loads f_k has one column for each of `compute_products`: (3N, G terms).
@@ -170,7 +170,7 @@ def expand_taylor(
 
 
 def _resisting(problem: Problem, u: wp.array) -> wp.array:
-    """The free forces (3N, b) [N] with which a body resists motions (3N, b) [m], without loads."""
+    """Return the free forces (3N, b) [N] with which a body resists motions (3N, b) [m], without loads."""
     out = problem.device.zeros(*u.shape)
     for term in problem.terms:
         if not term.constant:

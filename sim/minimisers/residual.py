@@ -103,7 +103,7 @@ class ResidualState:
         return np.isfinite(self.free) & np.isfinite(self.scale)
 
     def rows(self, device: Device, stay: np.ndarray) -> ResidualState:
-        """Some of the columns (k,)."""
+        """Return some of the columns (k,)."""
         u, g = (gather_columns(device, array, stay) for array in (self.u, self.g))
         return ResidualState(u, g, self.free[stay], self.scale[stay])
 
@@ -120,7 +120,7 @@ class Judge:
     square: np.ndarray
 
     def __call__(self, u: wp.array) -> ResidualState:
-        """The states u (3N, b) [m]."""
+        """Return the states u (3N, b) [m]."""
         found = compute_balance(self.problem, u, self.constant)
         sums = found.sums.numpy()
         with np.errstate(invalid="ignore", over="ignore"):

@@ -19,7 +19,7 @@ def explain_error(error: OSError) -> str:
 
 
 def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: bool = True) -> Path:
-    """The path of a file that can be written, its folder made; asked before long work, so that none is lost.
+    """Return the path of a file that can be written, its folder made; asked before long work, so that none is lost.
 
     What an earlier run of the same output left behind when it was killed is removed, unless not to `sweep` saves
     listing a folder of very many files. Another machine's unfinished file is such a left-over after `stale` seconds.
@@ -54,7 +54,9 @@ def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: boo
 
 @contextmanager
 def write_atomically(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Path]:
-    """A name beside `path`, of the same ending, to write under; it takes the name `path` when the block ends well.
+    """Yield a name beside `path`, of the same ending, to write under.
+
+    It takes the name `path` when the block ends well.
 
     `sweep` is that of `check_output`.
 
@@ -191,7 +193,7 @@ class Stream:
         return self._raw.seek(offset, whence)
 
     def tell(self) -> int:
-        """The place."""
+        """Return the place."""
         return self._raw.tell()
 
     def flush(self) -> None:

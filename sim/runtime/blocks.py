@@ -43,13 +43,13 @@ def folded(fold: str) -> str:
 
 @wp.func_native(snippet=folded("value + other"))
 def total(value: wp.float64) -> wp.float64:
-    """The sum over the threads."""
+    """Return the sum over the threads."""
     ...
 
 
 @wp.func_native(snippet=folded("fmax(value, other)"))
 def largest(value: wp.float64) -> wp.float64:
-    """The largest of the threads' values."""
+    """Return the largest of the threads' values."""
     ...
 
 
@@ -74,7 +74,7 @@ def largest(value: wp.float64) -> wp.float64:
 """
 )
 def before(value: wp.int32) -> wp.int32:
-    """The sum over the threads before this one."""
+    """Return the sum over the threads before this one."""
     ...
 
 

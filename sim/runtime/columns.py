@@ -197,7 +197,7 @@ class Workspaces:
         self._arrays: dict[int, wp.array] = {}
 
     def of(self, columns: int) -> wp.array:
-        """The array of this width: whoever asks writes it anew. On the CPU only the last one is kept."""
+        """Return the array of this width: whoever asks writes it anew. On the CPU only the last one is kept."""
         if columns not in self._arrays:
             graphs = self._device.on_cuda
             self._arrays = {width: array for width, array in self._arrays.items() if graphs and is_kept(width)}
@@ -216,14 +216,14 @@ def add_dots(device: Device, x: wp.array, y: wp.array, out: wp.array) -> None:
 
 
 def compute_dots(device: Device, x: wp.array, y: wp.array) -> np.ndarray:
-    """The columns' inner products (b,) of x and y (rows, b), on the host."""
+    """Return the columns' inner products (b,) of x and y (rows, b), on the host."""
     out = wp.zeros(x.shape[1], dtype=wp.float64, device=device.name)
     add_dots(device, x, y, out)
     return out.numpy()
 
 
 def compute_norms(device: Device, x: wp.array) -> np.ndarray:
-    """The columns' 2-norms (b,) of x (rows, b), on the host."""
+    """Return the columns' 2-norms (b,) of x (rows, b), on the host."""
     return np.sqrt(compute_dots(device, x, x))
 
 
@@ -240,7 +240,7 @@ def combine_columns(device: Device, x: wp.array, factor: np.ndarray | float, y: 
 def gather_columns(
     device: Device, x: wp.array, columns: np.ndarray | wp.array, out: wp.array | None = None
 ) -> wp.array:
-    """A copy (..., k) of some columns (k,) of x (..., b); in `out`, if it is given."""
+    """Return a copy (..., k) of some columns (k,) of x (..., b); in `out`, if it is given."""
     index = _index(device, columns)
     if out is None:
         out = wp.empty((*x.shape[:-1], len(index)), dtype=x.dtype, device=device.name)
@@ -271,12 +271,12 @@ def _index(device: Device, columns: np.ndarray | wp.array) -> wp.array:
 
 
 def _flat(x: wp.array) -> wp.array:
-    """A view (rows, b) of x (..., b)."""
+    """Return a view (rows, b) of x (..., b)."""
     return x.reshape((int(np.prod(x.shape[:-1])), x.shape[-1]))
 
 
 def take_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array | None = None) -> wp.array:
-    """A copy (m, b) of some rows of x (n, b); in `out`, if it is given."""
+    """Return a copy (m, b) of some rows of x (n, b); in `out`, if it is given."""
     if out is None:
         out = wp.empty((len(rows), x.shape[1]), dtype=x.dtype, device=device.name)
     device.launch(build_kernels(device).take, (len(rows), x.shape[1]), [x, rows], [out])
@@ -302,7 +302,7 @@ def add_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None
 """
 )
 def summed(value: wp.float64) -> wp.float64:
-    """The sum over the threads that run in step, valid in the first of them; on the CPU the value itself.
+    """Return the sum over the threads that run in step, valid in the first of them; on the CPU the value itself.
 
     All of them must be here, which launches over multiples of `get_warp_width` see to.
     """

@@ -51,11 +51,11 @@ class Device:
         return self.name.startswith("cuda")
 
     def zeros(self, *shape: int) -> wp.array:
-        """A zeroed array of the scalar type."""
+        """Return a zeroed array of the scalar type."""
         return wp.zeros(shape, dtype=self.scalar, device=self.name)
 
     def array(self, values: np.ndarray, dtype: Any = None) -> wp.array:
-        """A copy of `values` on the device, of the scalar type unless `dtype` says otherwise."""
+        """Return a copy of `values` on the device, of the scalar type unless `dtype` says otherwise."""
         return wp.array(np.ascontiguousarray(values), dtype=dtype or self.scalar, device=self.name)
 
     def launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
@@ -81,7 +81,7 @@ def load(module: wp.Module) -> None:
 
 
 def find_device(name: str, precision: Precision) -> Device:
-    """The device called "cpu", "cuda", "cuda:1", or "auto": CUDA when there is one.
+    """Return the device called "cpu", "cuda", "cuda:1", or "auto": CUDA when there is one.
 
     Starts Warp, and silences the notes that it prints by default.
 

@@ -18,7 +18,7 @@ class Locked(Protocol):
 
 
 def lock_method(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
-    """A method of a `Locked`, in which its lock is held: other threads wait until it returns."""
+    """Return a method of a `Locked`, in which its lock is held: other threads wait until it returns."""
 
     @wraps(method)
     def held(self: Locked, *args: P.args, **kwargs: P.kwargs) -> R:

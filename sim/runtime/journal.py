@@ -98,7 +98,7 @@ class Journal:
 
 @contextmanager
 def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
-    """The journal of the run that `stated` describes, begun or gone on with; the file stays.
+    """Yield the journal of the run that `stated` describes, begun or gone on with; the file stays.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
 
 
 def run_of(path: Path) -> dict[str, str]:
-    """Description of the run whose journal a file is; empty where none can be read."""
+    """Return description of the run whose journal a file is; empty where none can be read."""
     with suppress(OSError), path.open("rb") as file:
         head = file.read(LONGEST)
         if _proved(head, 0, b"") == (RUN, 0):
@@ -209,7 +209,7 @@ def _record(batch: Batch, payload: bytes, key: bytes) -> bytes:
 
 
 def _proved(held: Held, start: int, key: bytes) -> Batch | None:
-    """The batch of the record at a place, or None where no whole record of this key is."""
+    """Return the batch of the record at a place, or None where no whole record of this key is."""
     head = held[start : start + HEAD.size]
     if len(head) < HEAD.size:
         return None

@@ -40,7 +40,7 @@ def ensure_writable_cache() -> None:
 
 
 def _usual_folder() -> Path:
-    """The folder that Warp chooses by itself."""
+    """Return the folder that Warp chooses by itself."""
     number = version("warp-lang")
     if chosen := os.environ.get(VARIABLE):
         return Path(chosen).absolute() / number

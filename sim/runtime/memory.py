@@ -90,7 +90,8 @@ def check_fits(
     if answers + alone > host:
         fitting = int((host - alone) / each)
         raise InputError(
-            f"the answers to {count} loads take about {format_gigabytes(answers)}, and {format_gigabytes(host)} are free: "
+            f"the answers to {count} loads take about {format_gigabytes(answers)}, "
+            f"and {format_gigabytes(host)} are free: "
             + (f"solve at most {fitting} at a time." if fitting > 0 else COARSER)
         ) from MemoryError()
     available = measure_free_bytes(device) if device.on_cuda else free

@@ -49,7 +49,7 @@ def remove_left_overs(
 
 
 def _host() -> str:
-    """A name of 8 characters for the machine: process numbers tell nothing of another's."""
+    """Return a name of 8 characters for the machine: process numbers tell nothing of another's."""
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
@@ -59,12 +59,15 @@ def to_unfinished_path(path: Path) -> Path:
 
 
 def to_partial_path(path: Path) -> Path:
-    """The hidden name under which this process writes `path`, a file or a folder; `remove_left_overs` knows it."""
+    """Return the hidden name under which this process writes `path`, a file or a folder.
+
+    `remove_left_overs` knows it.
+    """
     return path.with_name(f".sulcus-{_host()}-{os.getpid()}-{path.name}")
 
 
 def list_partials(path: Path) -> list[Path]:
-    """The hidden names under which any process of any machine writes `path`, or has left it unfinished."""
+    """Return the hidden names under which any process of any machine writes `path`, or has left it unfinished."""
     form = _partial_form(path.name)
     return sorted(left for left in path.parent.glob(f".sulcus-*-{glob.escape(path.name)}") if form.fullmatch(left.name))
 

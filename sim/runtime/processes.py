@@ -125,7 +125,7 @@ def map_unordered(
 
 
 def run_on_each(children: Sequence[Child], work: Callable[[Any, Task], Any], tasks: Sequence[Task]) -> list[Any]:
-    """Result of each process for its own of the tasks; all of them begin together.
+    """Return result of each process for its own of the tasks; all of them begin together.
 
     Raises
     ------

@@ -18,7 +18,7 @@ _lock, _inside = Lock(), []
 
 @cache
 def _loaded() -> ThreadpoolController:
-    """The libraries that are loaded: to look for them takes a millisecond, to tell them a hundredth."""
+    """Return the libraries that are loaded: to look for them takes a millisecond, to tell them a hundredth."""
     return ThreadpoolController()
 
 
@@ -85,7 +85,7 @@ def run_together(tasks: Sequence[Task]) -> None:
 
 @cache
 def _waiting(number: int) -> SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]]:
-    """The queue of the thread with this number."""
+    """Return the queue of the thread with this number."""
     queue: SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]] = SimpleQueue()
     Thread(target=_serve, args=(queue,), name=f"sulcus {number}", daemon=True).start()
     return queue

@@ -22,7 +22,7 @@ def time_stage(name: str) -> Iterator[None]:
 
 @contextmanager
 def listen_to_stages() -> Iterator[dict[str, float]]:
-    """The seconds of the stages inside the block, in the order in which they end first."""
+    """Yield the seconds of the stages inside the block, in the order in which they end first."""
     seconds: dict[str, float] = {}
     _listening.append(seconds)
     try:

@@ -12,7 +12,7 @@ from ..errors import InputError
 
 
 def run_script(path: str | Path) -> ModuleType:
-    """The module that a Python file makes; modules beside the file can be imported from it.
+    """Return the module that a Python file makes; modules beside the file can be imported from it.
 
     The same text at the same place is run once a process, so that its classes are the same for all who ask.
 

@@ -23,7 +23,7 @@ def get_library(device: Device) -> Any:
 
 
 def view(array: wp.array) -> Any:
-    """The same numbers, not a copy of them."""
+    """Return the same numbers, not a copy of them."""
     return wp.to_torch(array) if array.device.is_cuda else array.numpy()
 
 
@@ -34,17 +34,17 @@ def from_view(device: Device, values: Any) -> wp.array:
 
 
 def to_double(values: Any) -> Any:
-    """The same in double precision."""
+    """Return the same in double precision."""
     return values.astype(np.float64) if isinstance(values, np.ndarray) else values.double()
 
 
 def to_precision_of(other: Any, values: Any) -> Any:
-    """The same in another array's precision."""
+    """Return the same in another array's precision."""
     return values.astype(other.dtype) if isinstance(values, np.ndarray) else values.to(other.dtype)
 
 
 def pad_zeros(values: Any, more: tuple[int, ...]) -> Any:
-    """The same with so many more zeros at the end of each of the last axes."""
+    """Return the same with so many more zeros at the end of each of the last axes."""
     shape = (
         *values.shape[: -len(more)],
         *(old + new for old, new in zip(values.shape[-len(more) :], more, strict=True)),
@@ -55,7 +55,7 @@ def pad_zeros(values: Any, more: tuple[int, ...]) -> Any:
 
 
 def order_by_size(values: Any) -> Any:
-    """The rows in the order in which each column (n, b) falls."""
+    """Return the rows in the order in which each column (n, b) falls."""
     if isinstance(values, np.ndarray):
         return np.argsort(-values, axis=0, kind="stable")
     return values.argsort(dim=0, descending=True, stable=True)
@@ -79,7 +79,7 @@ def solve_dense(matrix: Any, right: Any) -> Any:
 
 
 def to_library(device: Device, values: np.ndarray) -> Any:
-    """The library's array with the same numbers; on the CPU they are these themselves."""
+    """Return the library's array with the same numbers; on the CPU they are these themselves."""
     return wp.to_torch(wp.array(np.ascontiguousarray(values), device=device.name)) if device.on_cuda else values
 
 

@@ -244,7 +244,7 @@ class CapturedFrame:
             self._knowing.load(bent)
 
     def push(self, point: np.ndarray, radius: float, force: np.ndarray, share: float) -> np.ndarray:
-        """The answer (HEAD + 3N,) to a push at point (3,) with a footprint's radius [m] and a force (3,) [N].
+        """Return the answer (HEAD + 3N,) to a push at point (3,) with a footprint's radius [m] and a force (3,) [N].
 
         From the state that stands here, moved on by a share of the way from the one before. What is returned is
         written over by the next frame.

@@ -30,7 +30,7 @@ def as_pushes(loads: Loads) -> np.ndarray | None:
 
 
 def compute_shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """a (B,) for three pushes (B, 7) in turn; zero where one of them has no force, or the last two are the same.
+    """Return a (B,) for three pushes (B, 7) in turn; zero where one of them has no force, or the last two are the same.
 
     Lengths are measured against the last footprint, forces against the last force.
     """
@@ -55,7 +55,10 @@ def has_warm_state(warm: Mapping[str, Any], last: np.ndarray) -> bool:
 
 
 def extrapolate_start(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -> np.ndarray:
-    """Starts (3N, B) [m] for loads whose last answers (3N, B) were left with it; those answers if it tells no way."""
+    """Return starts (3N, B) [m] for loads whose last answers (3N, B) were left with it.
+
+    Those answers if it tells no way.
+    """
     now = as_pushes(loads)
     if now is None or not has_warm_state(warm, last):
         return last

@@ -106,7 +106,9 @@ class FrameSequence:
         self._there: Callable[[], Kept | None] = _gone
 
     def answer(self, loads: Loads, start: Deformation, guess: Callable[[], np.ndarray]) -> Deformation | None:
-        """The answer to a push from a start; `guess` looks at it closely and makes displacements (3N, 1) [m] of it.
+        """Return the answer to a push from a start.
+
+        `guess` looks at it closely and makes displacements (3N, 1) [m] of it.
 
         None where this is not the place: anything but one push with some force, a start off the constraints or inside
         out, a descent that does not end well.

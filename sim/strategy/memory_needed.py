@@ -120,7 +120,7 @@ def compute_needed(
     free: int,
     budget: MemoryBudget = BUDGET,
 ) -> Needed:
-    """The same of elements whose preconditioner inverts so many unknowns, on a card with `free` bytes."""
+    """Return the same of elements whose preconditioner inverts so many unknowns, on a card with `free` bytes."""
     rows, width = 3 * space.count, wp.types.type_size_in_bytes(device.scalar)
     tables = FIXED + PER_NODE[space.element] * space.count * width // 4
     taken, left = _inverse_bytes(inverted, device)

@@ -92,7 +92,7 @@ class SolverPlan:
         return (*([] if first is None else [first]), SolverStep.LBFGS, SolverStep.NEWTON)
 
     def explain(self) -> tuple[str, ...]:
-        """The same in sentences."""
+        """Return the same in sentences."""
         lines = [f"The stiffness at rest is prepared once ({self.preconditioner}); every solver starts from it."]
         if self.frames:
             knows = ". It knows which tissue the last load strained" if self.strained else ""

@@ -39,7 +39,10 @@ KEPT = 3
 
 
 def quantise(steps: np.ndarray) -> np.ndarray:
-    """The powers of two (B,) [s] nearest to steps (B,) [s], by ratio; infinite for long steps, zero for none at all."""
+    """Return the powers of two (B,) [s] nearest to steps (B,) [s], by ratio.
+
+    Infinite for long steps, zero for none at all.
+    """
     within = (steps > 0.0) & (steps < LONGEST)
     powers = np.exp2(np.round(np.log2(np.where(within, steps, 1.0))))
     return np.where(within, powers, np.where(steps > 0.0, np.inf, 0.0))

@@ -101,7 +101,7 @@ def build_pushed_forces(skin: ContactSurface, device: Device, loads: Loads) -> F
 
 
 def build_nodal_forces(vertices: int, device: Device, loads: Loads) -> Forces | None:
-    """Forces given at a mesh's own vertices, of those that carry any; None without any.
+    """Return forces given at a mesh's own vertices, of those that carry any; None without any.
 
     Raises
     ------

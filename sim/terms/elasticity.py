@@ -309,5 +309,5 @@ def _single(elements: Elements) -> Elements:
 
 
 def _rows(array: wp.array, first: int, stop: int) -> wp.array:
-    """A view of some rows; of nothing, nothing."""
+    """Return a view of some rows; of nothing, nothing."""
     return array[first:stop] if len(array) else array

@@ -21,14 +21,14 @@ STANDARD_GRAVITY = 9.80665  # [m/s^2]
 
 
 def change_of_weight(effect: Gravity, space: Discretisation, device: Device) -> DeadForce:
-    """The term of `Gravity` on the nodes of `space`: dead forces, the weight now less the weight in the scan."""
+    """Return the term of `Gravity` on the nodes of `space`: dead forces, the weight now less the weight in the scan."""
     return DeadForce("gravity", build_weight_change(effect, space, device), device)
 
 
 def build_weight_change(
     effect: Gravity, space: Discretisation, device: Device, kept: int = 64
 ) -> Callable[[Loads], Forces | None]:
-    """Loads -> the nodal forces f_a = s (w_a(now) - w_a(scan)), or None without a `Posture`.
+    """Return loads -> the nodal forces f_a = s (w_a(now) - w_a(scan)), or None without a `Posture`.
 
     w_a = g d integral of (rho - rho_csf [x is under the level]) N_a(x) dV in the rest configuration, N_a the elements'
     own shape functions. The part of an element under the level is cut out exactly: the total is

@@ -82,7 +82,7 @@ class Exterior:
         """It remembers nothing."""
 
     def _multiplied(self, u: wp.array) -> tuple[wp.array, wp.array]:
-        """The rows (m, b) of u, and F times them; batches as wide as a room find both where the last one did."""
+        """Return the rows (m, b) of u, and F times them; batches as wide as a room find both where the last one did."""
         shape = (len(self._rows), u.shape[1])
         if u.shape[1] not in self._rooms:
             self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}

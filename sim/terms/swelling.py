@@ -18,7 +18,7 @@ from .laws.law import Law
 
 @cache
 def build_swollen_law(law: Law, device: Device, count: int) -> Law:
-    """The law on `count` numbers that also takes r = (1 + theta)^(1/3) - 1."""
+    """Return the law on `count` numbers that also takes r = (1 + theta)^(1/3) - 1."""
     scalar, mat = device.scalar, device.matrix
     inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1))
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
@@ -131,7 +131,7 @@ class Swelling:
         self._swells = device.array(swells.astype(np.float64))
 
     def law(self, inner: Law, count: int) -> Law:
-        """The law of what is left of the motion beside the swelling."""
+        """Return the law of what is left of the motion beside the swelling."""
         return build_swollen_law(inner, self._device, count)
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:

@@ -12,8 +12,8 @@ law parts shape from volume, as Ogden's, psi(F) - psi(J^(1/3) I) is psi(Fb), and
 others psi(Fb) must not be taken away from psi(F): it outgrows it where tissue is crushed, which then collapses.
 
 The stable neo-Hookean law is finite where J = 0, and Cb is not: whatever pulls on Cb makes it collapse. It is parted in
-its own way (`build_own_split`): mu relaxes and K does not. The step's potential is psi - (1 - f) psi_shape + C : A / 2, and S
-pulls on C = F^T F, as in finite linear viscoelasticity. Source: Christensen 1980, "A Nonlinear Theory of
+its own way (`build_own_split`): mu relaxes and K does not. The step's potential is psi - (1 - f) psi_shape + C : A / 2,
+and S pulls on C = F^T F, as in finite linear viscoelasticity. Source: Christensen 1980, "A Nonlinear Theory of
 Viscoelasticity for Application to Elastomers", J. Appl. Mech. 47:762-768.
 """
 
@@ -37,7 +37,7 @@ SIX = 6
 
 @cache
 def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
-    """The law on `count` numbers that also takes f - 1 and the components xx, yy, zz, yz, zx, xy of A [Pa]."""
+    """Return the law on `count` numbers that also takes f - 1 and the components xx, yy, zz, yz, zx, xy of A [Pa]."""
     scalar, mat = device.scalar, device.matrix
     parts = split_of(law, device)
     inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1 + SIX))
@@ -53,7 +53,7 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
 
     @wp.func
     def pull(c: whole):
-        """A."""
+        """Return a."""
         xx, yy, zz, yz, zx, xy = (
             c[count + 1],
             c[count + 2],
@@ -190,7 +190,7 @@ class Prony:
         self._shape = len(coefficients) * points, self.width
 
     def law(self, inner: Law, count: int) -> Law:
-        """The law, and its part of shape again, which relaxes."""
+        """Return the law, and its part of shape again, which relaxes."""
         return build_relaxing_law(inner, self._device, count)
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
@@ -207,5 +207,5 @@ class Prony:
         return out.numpy()
 
     def _since(self, cases: Cases) -> list[wp.array]:
-        """Steps (b,) [s] and what there was before them (b, points, 6 (n + 1))."""
+        """Return steps (b,) [s] and what there was before them (b, points, 6 (n + 1))."""
         return [self._device.array(cases.steps), self._device.array(cases.past(self._name, self._shape))]

@@ -96,7 +96,8 @@ class Dataset:
         wrong = np.flatnonzero(self.good & ~((self.residual >= 0.0) & (self.residual < np.inf)))
         if len(wrong):
             raise InputError(
-                f"{self.path}: {format_row_numbers(wrong)} of `answers` converged, but to a residual that is no number: it is "
+                f"{self.path}: {format_row_numbers(wrong)} of `answers` converged, but to a residual that is no number: "
+                "it is "
                 "damaged. Simulate again."
             )
         try:
@@ -182,7 +183,8 @@ class Dataset:
             raise InputError(_damaged(self.path, lost, group))
         if len(strange):
             raise InputError(
-                f"{self.path}: {format_row_numbers(strange)} of `{group}` move by more than the body measures, {size:.3g} m"
+                f"{self.path}: {format_row_numbers(strange)} of `{group}` move by more than the body measures, "
+                f"{size:.3g} m"
                 f"{'' if force == 1.0 else f', under {force:g} N'}: no solver made them. Simulate again."
             )
         return np.concatenate(chosen)
@@ -190,7 +192,8 @@ class Dataset:
 
 def _damaged(path: Path, lost: np.ndarray, group: str) -> str:
     return (
-        f"{path}: {format_row_numbers(lost)} of `{group}` are damaged. Give its `sulcus simulate` again: it solves those alone; "
+        f"{path}: {format_row_numbers(lost)} of `{group}` are damaged. Give its `sulcus simulate` again: "
+        "it solves those alone; "
         "simulate data of an earlier version again."
     )
 
@@ -264,7 +267,7 @@ def compute_texts_digest(stated: Mapping[str, str]) -> str:
 
 
 def read_rows(file: h5py.File, group: str, vertices: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Read rows `first` to `last` (`get_row_type`) of `answers` or `unit`, and (B,) bool: True if the checksum agrees."""
+    """Read rows `first` to `last` (`get_row_type`) of `answers` or `unit`, and (B,) bool: valid checksum."""
     here = slice(first, last)
     displacement = read_stored(file, f"{group}/displacement", "f", (None, vertices, 3))
     known = f"{group}/reaction" in file

@@ -30,7 +30,7 @@ def compute_nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
 
 
 def compute_rooted_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """Compute `compute_nodal_shares` times the root of the force: products of two are those of forces, for one newton."""
+    """Scale `compute_nodal_shares` by the root of the force: products of two are those of forces, for one newton."""
     return scale_by_root_force(compute_nodal_shares(patch, pushed), pushed)
 
 
@@ -62,7 +62,7 @@ def compute_tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
 
 
 def compute_core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """Compute a rod's or blade's pose (B, 17): `compute_tool_features` of a ball, centre of its core [m], its axes x and z.
+    """Compute a rod's or blade's pose (B, 17): `compute_tool_features` of a ball, centre of its core [m], axes x and z.
 
     Last, for relaxing tissue, as `compute_tool_features`.
 

@@ -107,8 +107,8 @@ def _split(points: np.ndarray, centres: np.ndarray, patch: Patch, radius: float)
 class Sectors(DiscSplit):
     """Held-out sectors of tangential direction.
 
-    As `DiscSplit`, but `centres` are unit directions (k, 3), and `radius` is half the width of a sector [rad]. `disc` is
-    the number of the sector that a load's force is in, and `share` a part of the circle.
+    As `DiscSplit`, but `centres` are unit directions (k, 3), and `radius` is half the width of a sector [rad]. `disc`
+    is the number of the sector that a load's force is in, and `share` a part of the circle.
     """
 
     def covers(self, points: np.ndarray) -> np.ndarray:

@@ -65,8 +65,8 @@ def check_frames(anatomy: Anatomy, frames: Sequence[Frame]) -> None:
     Raises
     ------
     InputError
-        No frames; the same frame twice; errors of `to_evidence`; clouds; tools that are off the open cortex, too wide, or
-        with an invalid force.
+        No frames; the same frame twice; errors of `to_evidence`; clouds; tools that are off the open cortex, too wide,
+        or with an invalid force.
     """
     if not frames:
         raise InputError("there is no frame to fit tissue to: give what was seen of the open cortex, a file a frame.")

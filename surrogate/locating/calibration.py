@@ -24,7 +24,8 @@ LEVEL = 0.95
 """Nominal coverage of ellipsoids."""
 RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
 """Squared radius of the 95 % ellipsoid of a Gaussian [standard deviations^2]: chi-squared, 3 degrees of freedom."""
-# Number of trials, and number of nearest trials (by `compute_likeness`) that calibrate the covariance of an observation.
+# Number of trials, and number of nearest trials (by `compute_likeness`) that calibrate the covariance of an
+# observation.
 TRIALS, NEAREST = 960, 120
 # Feature offset that separates clouds from named points (log units); weight of the extent feature.
 UNLIKE, EXTENT = 1e3, 4.0

@@ -327,7 +327,7 @@ class Learned:
         return Distance(found, self.promised(tip.bound, pushed, known, self.envelope.outside(pushed, known)))
 
     def asked(self, loads: Loads) -> Pushed:
-        """Convert loads to the model's input: pushes, or indentations of its tool's poses (`indentation.to_indentation`).
+        """Convert loads to the model's input: pushes, or indentations of its tool's poses (`to_indentation`).
 
         Raises
         ------

@@ -62,8 +62,9 @@ LYING, STANDING = 8, 17
 class RigidContact:
     """Regressor of the response to one metre of indentation.
 
-    Its input is `compute_tool_features` of a ball, or `compute_core_features` of a rod or a blade, optionally followed by `held` of the
-    previous pose of the rod or blade: the search then starts there, which takes a fraction of the time.
+    Its input is `compute_tool_features` of a ball, or `compute_core_features` of a rod or a blade, optionally followed
+    by `held` of the previous pose of the rod or blade: the search then starts there, which takes a fraction of the
+    time.
 
     The nonlinear contribution far from the tool is nearly a factor on the force that is linear in depth over radius:
     this line is all that is fitted. For relaxing tissue there is another line, in proportion to the relaxed share.

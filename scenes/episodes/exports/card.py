@@ -140,7 +140,7 @@ def list_card_files(folder: Path) -> dict[str, int]:
 
 
 def run_of(folder: Path) -> RunSettings | None:
-    """The run whose folder it is; None of a folder that is no run's, or whose note of it cannot be read."""
+    """Return the run whose folder it is; None of a folder that is no run's, or whose note of it cannot be read."""
     try:
         return read_run(folder)
     except InputError:
@@ -154,7 +154,7 @@ def is_card(path: Path) -> bool:
 
 
 def build_row(contents: EpisodeContents, folder: Path) -> dict[str, object]:
-    """An episode as a row of the table."""
+    """Return an episode as a row of the table."""
     with open_episode(contents.path) as file:
         times = read_numbers(file, contents, "time")
         solved, _, error = count_solved_frames(file, contents)
@@ -179,7 +179,7 @@ def build_row(contents: EpisodeContents, folder: Path) -> dict[str, object]:
 
 
 def format_table(rows: Sequence[dict[str, object]]) -> str:
-    """The table as CSV."""
+    """Return the table as CSV."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(COLUMNS), lineterminator="\n")
     writer.writeheader()

@@ -32,7 +32,7 @@ HELD_OUT = 10
 
 
 def describe_task(contents: EpisodeContents) -> str:
-    """The sentence for an episode's family; of one that has none, its scene's name."""
+    """Return the sentence for an episode's family; of one that has none, its scene's name."""
     return TASKS.get(contents.family, f"Play the scene {contents.family}.")
 
 
@@ -150,7 +150,7 @@ def measure_stored_size(episodes: Sequence[EpisodeContents]) -> int:
 
 
 def name_files(episodes: Sequence[EpisodeContents]) -> Mapping[EpisodeContents, str]:
-    """A name for each, its file's; where two have the same, with a number."""
+    """Return a name for each, its file's; where two have the same, with a number."""
     taken: set[str] = set()
     found = {}
     for one in episodes:
@@ -180,7 +180,10 @@ def build_twists(poses: np.ndarray) -> np.ndarray:
 
 
 def collect_texts(episodes: Sequence[EpisodeContents]) -> Mapping[str, str]:
-    """The texts by the names that they go by; those of several folders are numbered. None where there are none."""
+    """Return the texts by the names that they go by; those of several folders are numbered.
+
+    None where there are none.
+    """
     homes = dict.fromkeys(find_dataset_folder(one.path.resolve().parent) for one in episodes)
     found = {}
     for number, home in enumerate(homes):
@@ -198,5 +201,5 @@ def write_along(episodes: Sequence[EpisodeContents], folder: Path) -> None:
 
 
 def find_dataset_folder(folder: Path) -> Path:
-    """The data set's folder, of that which its episodes lie in."""
+    """Return the data set's folder, of that which its episodes lie in."""
     return folder.parent if folder.name == "episodes" and not (folder / LICENCE).exists() else folder

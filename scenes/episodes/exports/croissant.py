@@ -57,7 +57,7 @@ COLUMNS: Mapping[str, tuple[str, str]] = {
 def build_croissant_metadata(
     name: str, description: str, date: str, table: str, sha256: str, inside: str
 ) -> dict[str, Any]:
-    """The metadata, as JSON.
+    """Return the metadata, as JSON.
 
     Parameters
     ----------

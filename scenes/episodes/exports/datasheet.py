@@ -51,7 +51,7 @@ def format_variation_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str
 
 
 def format_range_row(key: str, found: Sequence[Any]) -> str:
-    """A row of what varies."""
+    """Return a row of what varies."""
     if all(is_number(one) for one in found):
         return f"| `{key}` | {cell_of(min(found))} | {cell_of(max(found))} | {len(found)} |"
     often = ", ".join(f"{text} ({count})" for text, count in Counter(map(str, found)).most_common(8))
@@ -64,7 +64,7 @@ def is_number(value: Any) -> bool:
 
 
 def cell_of(value: Any) -> str:
-    """A value in a table: whole numbers in full, others to four digits."""
+    """Return a value in a table: whole numbers in full, others to four digits."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
@@ -82,7 +82,10 @@ def list_leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 TEMPLATE, DRAWN, UNSTATED = "template", "drawn", ""
-"""Origin of an anatomy: the shipped one, the same brain with another tumour, or unknown; else the name of an own one."""
+"""Origin of an anatomy: the shipped one, the same brain with another tumour, or unknown.
+
+Else the name of an own one.
+"""
 
 
 def origin_of(contents: EpisodeContents) -> str:
@@ -134,7 +137,7 @@ def write_datasheet(
     notes: Sequence[str] = (),
     run: RunSettings | None = None,
 ) -> str:
-    """The sheet as Markdown, of what the files say: `rows` are those of the table of episodes.
+    """Return the sheet as Markdown, of what the files say: `rows` are those of the table of episodes.
 
     `notes` are sentences on what is missing or weak; `run` is the run whose folder it is.
     """
@@ -239,12 +242,12 @@ def format_counts(title: str, texts: Sequence[Any]) -> Iterator[str]:
 
 
 def format_value(episodes: Sequence[EpisodeContents], key: str) -> list[Any]:
-    """An attribute of all episodes that have it."""
+    """Return an attribute of all episodes that have it."""
     return [one.said[key] for one in episodes if key in one.said]
 
 
 def format_plans(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
-    """The plans, as they stand in the files."""
+    """Yield the plans, as they stand in the files."""
     for text in dict.fromkeys(map(str, format_value(episodes, "plan"))):
         yield f"## Plan\n\n```toml\n{text.strip()}\n```\n"
 

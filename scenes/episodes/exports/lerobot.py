@@ -177,7 +177,7 @@ def to_key(name: str) -> str:
 
 
 def build_columns(frames: int, episode: int, first: int, task: int, rate: float) -> dict[str, np.ndarray]:
-    """The columns that each LeRobot data set has."""
+    """Return the columns that each LeRobot data set has."""
     every = np.arange(frames)
     same = np.ones(frames, np.int64)
     numbers = ((every / rate).astype(np.float32), every, episode * same, first + every, task * same)

@@ -61,7 +61,7 @@ def write_xdmf(
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[h5py.File]:
-    """A new HDF5 file; a full disk ends in a sentence."""
+    """Yield a new HDF5 file; a full disk ends in a sentence."""
     with write_stream_atomically(path, ".h5") as stream, h5py.File(stream, "w") as file:
         yield file
 

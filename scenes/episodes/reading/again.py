@@ -32,7 +32,7 @@ MOST_BYTES = 8 * 1024**3
 
 
 def solve_again(report: Report, count: int, device: str = "auto") -> Report:
-    """A report with what solving `count` of its frames again found: where the tumour comes to lie elsewhere.
+    """Return a report with what solving `count` of its frames again found: where the tumour comes to lie elsewhere.
 
     Frames are spread evenly. Where the past matters, all that were solved before them are solved too, in their order.
     """
@@ -79,7 +79,7 @@ def _answers(said: Mapping[str, Any], opened: Opened, solved: np.ndarray, count:
 def validate_files(
     paths: Sequence[Path], workers: int, look: Callable[[Path], Report] = validate_episode
 ) -> Iterator[Report]:
-    """A report of each file, as they come; `workers` processes at a time.
+    """Yield a report of each file, as they come; `workers` processes at a time.
 
     What a process that was lost had begun is looked at again, each file alone.
     """

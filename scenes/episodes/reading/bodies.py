@@ -47,7 +47,7 @@ def _known(digest: str, folder: Path) -> Anatomy | None:
 
 @cache
 def _read(path: Path) -> Anatomy | None:
-    """An anatomy that can be read."""
+    """Return an anatomy that can be read."""
     try:
         return read_anatomy(path)
     except InputError:

@@ -23,7 +23,7 @@ REMEDY = f"{HINT}make it anew, or leave it out."
 
 
 def open_episode(path: Path) -> h5py.File:
-    """An episode's file; InputError where it is not there, or no HDF5."""
+    """Return an episode's file; InputError where it is not there, or no HDF5."""
     with read_as(path, "an episode", REMEDY):
         return h5py.File(path, "r")
 
@@ -53,7 +53,7 @@ class OpenFiles:
         return len(self._open)
 
     def file(self, path: Path) -> h5py.File:
-        """The open file.
+        """Return the open file.
 
         Raises
         ------
@@ -185,7 +185,7 @@ def read_attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
 
 
 def get_array(group: h5py.Group, name: str) -> h5py.Dataset:
-    """An array by its name; InputError of what is none."""
+    """Return an array by its name; InputError of what is none."""
     found = group[name]
     if not isinstance(found, h5py.Dataset):
         raise InputError(f"{name!r} is no array. {REMEDY}")

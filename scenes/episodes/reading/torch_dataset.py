@@ -35,11 +35,11 @@ class EpisodeDataset(Dataset[dict[str, Any]]):
         return len(self.episodes)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        """The window of a number, counted over all episodes."""
+        """Return the window of a number, counted over all episodes."""
         return {name: _tensor(value) for name, value in self.episodes[index].items()}
 
     def at(self, episode: int, first: int) -> dict[str, Any]:
-        """The window of an episode that begins at a frame; InputError as `Episodes.at`."""
+        """Return the window of an episode that begins at a frame; InputError as `Episodes.at`."""
         return {name: _tensor(value) for name, value in self.episodes.at(episode, first).items()}
 
 

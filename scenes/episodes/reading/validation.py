@@ -71,7 +71,7 @@ def mask_findings(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy |
 
 
 def read_episode_camera(file: h5py.File, contents: EpisodeContents, frame: int) -> Camera:
-    """The camera of a frame; ValueError where its numbers are none of a camera."""
+    """Return the camera of a frame; ValueError where its numbers are none of a camera."""
     moves = "K_of_frame" in contents.shapes
     K = (
         read_numbers(file, contents, "K_of_frame", range(frame, frame + 1))[0]

@@ -187,7 +187,7 @@ class Episodes(Sequence[dict[str, Any]]):
         return self.ends[-1]
 
     def __getitem__(self, index: int) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The window of a number, counted over all episodes; IndexError beyond the last."""
+        """Return the window of a number, counted over all episodes; IndexError beyond the last."""
         episode, first = self.place(index)
         return self.at(episode, first)
 
@@ -195,7 +195,7 @@ class Episodes(Sequence[dict[str, Any]]):
         return (self[index] for index in range(len(self)))
 
     def place(self, index: int) -> tuple[int, int]:
-        """The number of the episode of a window, and of its first frame; IndexError beyond the last."""
+        """Return the number of the episode of a window, and of its first frame; IndexError beyond the last."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
         index %= len(self)
@@ -203,7 +203,7 @@ class Episodes(Sequence[dict[str, Any]]):
         return episode, (index - (self.ends[episode - 1] if episode else 0)) * self.stride
 
     def at(self, episode: int, first: int) -> dict[str, Any]:
-        """The window of an episode that begins at a frame.
+        """Return the window of an episode that begins at a frame.
 
         Raises
         ------

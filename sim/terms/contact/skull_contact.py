@@ -273,7 +273,7 @@ class Skull:
         self._rest = sp.csc_array(sp.coo_array((blocks.ravel(), place), shape=(3 * count, 3 * count)))
 
     def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
-        """The skull stays where it is."""
+        """Return the skull stays where it is."""
         return np.ones(len(cases.loads))
 
     def gaps(self, cases: Cases) -> np.ndarray:
@@ -286,11 +286,11 @@ class Skull:
         return np.where(known, self._settings.again, self._settings.at_first) / self._bone.felt.min()
 
     def buried(self, u: wp.array) -> np.ndarray:
-        """The skull is never inside what it holds."""
+        """Return the skull is never inside what it holds."""
         return np.zeros(u.shape[1], bool)
 
     def overlaps(self, u: wp.array) -> np.ndarray:
-        """The skull is no tool."""
+        """Return the skull is no tool."""
         return np.zeros((2, u.shape[1]), bool)
 
     def widen(self, times: float) -> None:
@@ -352,5 +352,5 @@ def build_skull(
     bone: BoneSettings = BONE,
     settings: SkullBarrier = SkullBarrier(),
 ) -> Skull:
-    """The term of `SkullContact` on tissue with a shear modulus [Pa]."""
+    """Return the term of `SkullContact` on tissue with a shear modulus [Pa]."""
     return Skull(build_bone(anatomy, space, effect.gap, bone), space.count, shear, device, settings)

@@ -113,7 +113,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         c: int,
         me: int,
     ) -> wp.float64:
-        """The share of a way from x, at most 1, that may be gone; what is near is no longer known."""
+        """Return the share of a way from x, at most 1, that may be gone; what is near is no longer known."""
         far = wp.float64(0.0)
         for i in range(me, x.shape[0] // 3, threads):
             far = wp.max(far, wp.length(wp.vec3d(way[3 * i, c], way[3 * i + 1, c], way[3 * i + 2, c])))

@@ -175,7 +175,7 @@ class ToolContactTerm:
         self._launch(self._kernels.bound_step, [u, du], out, u.shape[1])
 
     def add_matrix(self, u: wp.array, definite: wp.array, place: wp.array, out: wp.array) -> None:
-        """As `Dense.add_matrix`."""
+        """As `DenseTerm.add_matrix`."""
         self._launch(self._kernels.add_matrix, [u, definite, place], out, u.shape[1])
 
     @cached_property
@@ -239,7 +239,7 @@ class ToolContactTerm:
             self._tools = self._placed(self._tools)
 
     def _placed(self, tools: Tools) -> Tools:
-        """The same, where those of a single column always are: a captured graph reads them there."""
+        """Return the same, where those of a single column always are: a captured graph reads them there."""
         if not self._single:
             self._single.append(self._brought(np.ascontiguousarray(self._pose, np.float64).tobytes()))
         for mine, its in ((self._single[0].rotation, tools.rotation), (self._single[0].origin, tools.origin)):
@@ -286,7 +286,7 @@ def build_tool_contact(
     device: Device,
     touch: ContactSampling = TOUCH,
 ) -> ToolContactTerm:
-    """The term of an effect on tissue with a shear modulus [Pa]."""
+    """Return the term of an effect on tissue with a shear modulus [Pa]."""
     contact = isinstance(effect, ToolContact)
     name, tools = ("tool contact", effect.tools) if contact else ("retraction", (effect.blade,))
     triangles = space.surface[anatomy.bare]

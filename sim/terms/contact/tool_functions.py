@@ -170,7 +170,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def seen(at: forces, tools: Tools, k: int, c: int) -> forces:
-        """The same from the middle of a core, along its axes."""
+        """Return the same from the middle of a core, along its axes."""
         R = tools.rotation[k, c]
         start = tools.origin[k, c] + R * tools.centre[k]
         out = forces()
@@ -295,7 +295,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def share_in_row(at: forces, along: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64) -> wp.float64:
-        """The share of a motion, at most 1, after which no point is as far as the middle of a core."""
+        """Return the share of a motion, at most 1, after which no point is as far as the middle of a core."""
         out, pace, most, j = wp.float64(1.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         farthest = reach_of(along)
         while j < most:

@@ -56,7 +56,7 @@ class Evaluator:
         return self.at(H, D, (of or self.of).coefficients)
 
     def at(self, H: np.ndarray, D: np.ndarray | None, coefficients: tuple[float, ...]) -> Evaluated:
-        """The same with other coefficients."""
+        """Return the same with other coefficients."""
         count, device = len(H), self.device
         energy = device.zeros(count)
         stress, change = (wp.zeros(count, dtype=device.matrix, device=device.name) for _ in range(2))
@@ -68,7 +68,7 @@ class Evaluator:
 
 @cache
 def build_evaluator(of: Tissue, precision: Precision) -> Evaluator:
-    """The functions of a tissue's law on the CPU."""
+    """Return the functions of a tissue's law on the CPU."""
     device = find_device("cpu", precision)
     scalar, mat = device.scalar, device.matrix
     constants = wp.types.vector(len(of.coefficients), scalar)
@@ -202,5 +202,5 @@ def _largest(values: np.ndarray) -> float:
 
 
 def _off(found: np.ndarray, wanted: np.ndarray) -> float:
-    """The largest difference, relative to the largest of what is wanted."""
+    """Return the largest difference, relative to the largest of what is wanted."""
     return _largest(found - wanted) / max(_largest(wanted), np.finfo(float).tiny)

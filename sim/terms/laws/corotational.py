@@ -15,7 +15,7 @@ from .law import Law
 
 @wp.func
 def axial(A: Any):
-    """The vector w with [w]x = A - A^T."""
+    """Return the vector w with [w]x = A - A^T."""
     return wp.vector(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
 
 

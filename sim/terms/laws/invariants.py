@@ -47,7 +47,7 @@ def cofactor_excess(H: Any):
 
 @wp.func
 def cofactor_change(F: Any, D: Any):
-    """Derivative of cof F in the direction D."""
+    """Return derivative of cof F in the direction D."""
     return wp.matrix_from_rows(
         wp.cross(D[1], F[2]) + wp.cross(F[1], D[2]),
         wp.cross(D[2], F[0]) + wp.cross(F[2], D[0]),
