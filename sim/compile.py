@@ -115,20 +115,17 @@ def compile_problem(
             case NodalForce():
                 from .terms.dead_force import DeadForce, build_nodal_forces
 
-                terms.append(
-                    DeadForce("nodal force", partial(build_nodal_forces, len(anatomy.mesh.nodes), device), device)
-                )
+                build = partial(build_nodal_forces, len(anatomy.mesh.nodes), device)
+                terms.append(DeadForce("nodal force", build, device))
             case Gravity():
                 from .terms.gravity import change_of_weight
 
                 terms.append(change_of_weight(effect, space, device))
             case Inertia():
-                from .terms.inertia import InertiaTerm as InertiaTerm
-                from .terms.inertia import compute_lumped_mass
+                from .terms.inertia import InertiaTerm, compute_lumped_mass
 
-                terms.append(
-                    InertiaTerm(compute_lumped_mass(effect.density, space), effect.damping, space.marks, device)
-                )
+                mass = compute_lumped_mass(effect.density, space)
+                terms.append(InertiaTerm(mass, effect.damping, space.marks, device))
             case ToolContact() | Retraction():
                 from .terms.contact.tool_contact import build_tool_contact
 

@@ -339,10 +339,8 @@ def test_phone_layout_puts_distance_and_playback_first(page):
 
 
 def test_no_new_line_parts_a_number_from_its_unit():
-    assert (
-        keep_together('<p style="top: 3 px">in 4.72 mm (95 %)')
-        == '<p style="top: 3 px">in&nbsp;4.72&nbsp;mm (95&nbsp;%)'
-    )
+    kept = keep_together('<p style="top: 3 px">in 4.72 mm (95 %)')
+    assert kept == '<p style="top: 3 px">in&nbsp;4.72&nbsp;mm (95&nbsp;%)'
 
 
 def test_a_wide_window_has_its_controls_in_two_columns(page):

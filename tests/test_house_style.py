@@ -29,13 +29,13 @@ def check(found, most):
     assert len(found) <= most, f"{len(found)} places, at most {most}: {found[:20]}"
 
 
-@pytest.mark.parametrize(("kind", "most"), [("docstring", 1292), ("comment", 215), ("help", 42)])
+@pytest.mark.parametrize(("kind", "most"), [("docstring", 424), ("comment", 59), ("help", 0)])
 def test_first_words(kind, most):
     texts = (text for path in FILES for text in find_texts(path) if text.kind == kind)
     check([f"{one.place} {one.text[:40]}" for one in texts if not begins_well(one.text)], most)
 
 
-@pytest.mark.parametrize(("kind", "most"), [("docstring", 1765), ("comment", 324), ("help", 66), ("message", 430)])
+@pytest.mark.parametrize(("kind", "most"), [("docstring", 470), ("comment", 54), ("help", 6), ("message", 216)])
 def test_banned_words(kind, most):
     texts = (text for path in FILES for text in find_texts(path) if text.kind == kind)
     check([f"{one.place} {word}" for one in texts for word in find_banned(one.text)], most)
@@ -47,33 +47,33 @@ def test_headings_of_pages_are_nouns_or_imperatives():
 
 def test_banned_words_on_pages():
     pages = {path: re.sub(r"^```.*?^```", "", path.read_text(), flags=re.M | re.S) for path in PAGES}
-    check([f"{path.name}: {word}" for path, text in pages.items() for word in find_banned(text)], 721)
+    check([f"{path.name}: {word}" for path, text in pages.items() for word in find_banned(text)], 303)
 
 
 def test_user_pages_tell_no_history():
-    check([f"{path.name}: {word}" for path in PAGES for word in HISTORY.findall(path.read_text())], 8)
+    check([f"{path.name}: {word}" for path in PAGES for word in HISTORY.findall(path.read_text())], 5)
 
 
 def test_user_pages_are_short():
     """At most 3,000 words a page and 220 kB in all."""
     pages = PAGES[1:]
-    check([path.name for path in pages if len(path.read_text().split()) > 3000], 6)
-    assert sum(path.stat().st_size for path in pages) <= 355_000
+    check([path.name for path in pages if len(path.read_text().split()) > 3000], 1)
+    assert sum(path.stat().st_size for path in pages) <= 290_000
 
 
 def test_class_names_are_unique():
-    check([f"{name} ({count})" for name, count in count_classes(FILES).items() if count > 1], 79)
+    check([f"{name} ({count})" for name, count in count_classes(FILES).items() if count > 1], 1)
 
 
 def test_public_functions_begin_with_a_verb():
     names = {name for path in FILES for name in find_functions(path)}
-    check(sorted(name for name in names if name.partition("_")[0] not in OPENERS), 1266)
+    check(sorted(name for name in names if name.partition("_")[0] not in OPENERS), 311)
 
 
 def test_names_of_tests_are_short():
     names = [name for path in TESTS for name in re.findall(r"^ *def (test_\w+)", path.read_text(), re.M)]
     assert len(names) > 2000
-    check([name for name in names if len(name) > LONGEST_TEST_NAME], 294)
+    check([name for name in names if len(name) > LONGEST_TEST_NAME], 0)
 
 
 def test_rules_find_what_they_forbid(tmp_path):

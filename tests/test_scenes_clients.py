@@ -8,14 +8,14 @@ import pytest
 from links import HOST, NOW, Peer, peers, played
 
 from scenes.link import clients as limits
-from scenes.link.clients import Clients
+from scenes.link.clients import LinkClients
 from scenes.link.frame import HEADER, BadMessageError, pack_message
 from scenes.link.messages import encode_string
 
 
 @asynccontextmanager
 async def served(receive=lambda number, header, content: None, most=16, longest=1 << 16):
-    clients = Clients(receive, lambda kind: longest if kind == "TRANSFORM" else 0, most)
+    clients = LinkClients(receive, lambda kind: longest if kind == "TRANSFORM" else 0, most)
     server = await asyncio.start_server(clients.converse, HOST, 0)
     try:
         yield clients, server.sockets[0].getsockname()[1]

@@ -65,6 +65,8 @@ class SolvedMotions:
 
 Answer = SolvedMotions | None
 """None where some moment has no equilibrium."""
+SoundDraws = list[tuple[PatientSample, tuple[np.ndarray, ...]]]
+"""Draws with an equilibrium at each moment, and their motions [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,16 +243,12 @@ def solve_ensemble(theatre: Theatre, scene: Scene, draws: Sequence[PatientSample
         yield solve_scene(theatre, apply_sample(scene, draw))
 
 
-def find_sound_draws(
-    draws: Sequence[PatientSample], answers: Iterable[Answer]
-) -> list[tuple[PatientSample, tuple[np.ndarray, ...]]]:
+def find_sound_draws(draws: Sequence[PatientSample], answers: Iterable[Answer]) -> SoundDraws:
     """Return the draws that have an equilibrium at each moment, with their motions."""
     return [(draw, answer.motions) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
 
 
-def filter_sound_draws(
-    scene: Scene, draws: Sequence[PatientSample], answers: Iterable[Answer]
-) -> list[tuple[PatientSample, tuple[np.ndarray, ...]]]:
+def filter_sound_draws(scene: Scene, draws: Sequence[PatientSample], answers: Iterable[Answer]) -> SoundDraws:
     """Return the sound draws, as `find_sound_draws`, of a scene with enough of them.
 
     Raises
@@ -329,7 +327,7 @@ def compute_worst_distances(
 def split_contributions(
     motion: np.ndarray, field: np.ndarray, draws: Sequence[PatientSample], scene: Scene
 ) -> dict[str, float]:
-    """Return the error of each contributor alone [m]: root mean square over the draws, at the worst surface point of each.
+    """Return each contributor's own error [m]: root mean square over the draws, at the worst surface point of each.
 
     A linear fit of the draws (draws, n, 3) tells the causes apart; what it leaves is of several together.
     """

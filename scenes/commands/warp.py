@@ -82,10 +82,7 @@ def load(text: str) -> tuple[float, float, float, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve, write and report.
-
-    Return 1 if the solution did not converge or the field folds (all is written nevertheless).
-    """
+    """Solve, write and report; return 1 if the solution did not converge, or if the field folds."""
     from tqdm import tqdm
 
     from sim.runtime.atomic_files import write_folder_atomically

@@ -61,7 +61,7 @@ class Hertz:
         return 1.5 * force / (np.pi * float(self.contact(np.array(force))) ** 2) if force > 0.0 else 0.0
 
     def deeper(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-        """Return the extra depth [m] of the ball's centre compared with a wider footprint (k,) [m] under equal forces (k,).
+        """Return the extra depth [m] of the ball's centre compared with a wider footprint (k,) [m] at equal forces.
 
         The middle of a footprint sqrt(1 - (s/a)^2) sinks by 3 F / (4 E' a).
         """

@@ -146,8 +146,8 @@ class PoseResponder:
         spread = compute_tip_covariance(registration, self.tool, beside)
         motion = self.motion.under(pose, spread, None if before is None else before.motion)
         known = TrackingResult(
-            to_time(stamp), TumourState.GOOD if motion.moved > 0.0 else TumourState.REST, "", NOT_SEEN, motion, None, pose,
-            spread,
+            to_time(stamp), TumourState.GOOD if motion.moved > 0.0 else TumourState.REST, "",
+            NOT_SEEN, motion, None, pose, spread,
         )  # fmt: skip
         known = replace(known, seen=known.time, felt=moment, **self._doubts(known, before))
         if known.state is TumourState.UNKNOWN:

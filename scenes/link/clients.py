@@ -66,7 +66,7 @@ class Client:
         self.news.set()
 
 
-class Clients:
+class LinkClients:
     """The clients of a server, or the one connection of a client.
 
     All methods belong to the event loop's thread.

@@ -18,7 +18,7 @@ from ar.optics.calibration import Calibration
 from ..tracked.follower import TrackingResult, TumourState, compute_radius_across
 from ..tracked.picture import Painter
 from .answer import CameraView, PoseResult, add_bound, add_lateness
-from .clients import Clients
+from .clients import LinkClients
 from .console import format_address
 from .frame import BadMessageError, Header, pack_message, to_stamp
 from .heard import ReceivedTransforms, check_status
@@ -136,7 +136,7 @@ class LinkSession:
         most: int = 16,
         note: Callable[[str], None] = lambda line: None,
     ) -> None:
-        self.clients = Clients(self._receive, self._longest, most, note)
+        self.clients = LinkClients(self._receive, self._longest, most, note)
         self._note = note
         self._answers, self._speaks, self._heard, self._eye = answers, speaks, heard, eye
         self._others: dict[str, None] = {}

@@ -45,7 +45,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     parser.add_argument(
         "--deformer",
-        help="deformation model: a trained one (linear, ann, svr, ...), fem, or guarded: the best trained one, and finite "
+        help="deformation model: a trained one (linear, ann, svr, ...), fem, or guarded: the best of them, and finite "
         "elements where it is unsure. auto: chosen by --within-mm or --within-ms. Default: the model of least error",
     )
     parser.add_argument(

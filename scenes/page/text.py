@@ -303,7 +303,8 @@ def format_cost_table(rows: Sequence[ComparisonRow]) -> str:
         what = "Medians over different loads: not comparable."
     lines = (
         f"<tr{' class=best' if row.best else ''}><td>{escape(row.name)}</td>"
-        f"<td>{row.milliseconds:.1f} ms</td><td>error {_off(row.millimetres)} mm</td><td>{format_load_count(row.loads)}</td></tr>"
+        f"<td>{row.milliseconds:.1f} ms</td><td>error {_off(row.millimetres)} mm</td>"
+        f"<td>{format_load_count(row.loads)}</td></tr>"
         for row in rows
     )
     return f'<p class="dim">{what}</p><table>{"".join(lines)}</table>'

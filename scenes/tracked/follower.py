@@ -285,7 +285,7 @@ class Follower:
     def _band(
         self, reference: Pose, middle: np.ndarray, motion: BrainMotion, shutter: float
     ) -> tuple[float, dict[str, float]]:
-        """Compute the error bound of the tumour's `middle` (3,) [m] across the line of sight, and its parts by source."""
+        """Compute the error bound of the tumour's `middle` (3,) [m] across the line of sight, and its parts."""
         place, beside = self.registration.point(middle)
         at, tracked = reference.point(place)
         turned = reference.T_camera_target[:3, :3]

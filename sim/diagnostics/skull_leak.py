@@ -38,7 +38,7 @@ def integrate_facet_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndar
 
 
 def integrate_surface_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The integral (N, 3) [m^2] of N_i n over the whole surface, as `integrate_facet_normals`: of grad N_i over the body.
+    """Integrate N_i n (N, 3) [m^2] over the whole surface, as `integrate_facet_normals`: grad N_i over the body.
 
     Engelman, Sani, Gresho 1982, "The implementation of normal and/or tangential boundary conditions in finite element
     codes for incompressible fluid flow", Int. J. Numer. Methods Fluids 2:225-238.

@@ -210,10 +210,7 @@ class ContactSurface:
 def compute_footprint_weights(
     nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray
 ) -> sp.csr_array:
-    """Weights (B, N), each row summing to one.
-
-    Parameters and errors as `ContactSurface` and `ContactSurface.press`, on the host.
-    """
+    """Compute weights (B, N) of unit row sums on the host; arguments as `ContactSurface`, `ContactSurface.press`."""
     return ContactSurface(nodes, triangles, find_device("cpu", "float64")).press(points, radii).rows(len(nodes))
 
 

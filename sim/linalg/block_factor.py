@@ -28,9 +28,7 @@ def build_functions(device: Device) -> BlockFactorFunctions:
 
     @wp.func
     def factor(a: wp.array3d(dtype=wp.float64), size: int, c: int, me: int) -> bool:
-        """Return a = L L', of whose upper half A is read: L' is left there and L in the lower.
-
-        False where A is not positive.
+        """Factorise A = L L' in place: A is read from the upper half; False if A is not positive definite.
 
         Then nothing that is left means anything.
         """

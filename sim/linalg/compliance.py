@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..discretisation.problem import Problem
-from ..runtime.views import to_double, to_host, to_library, to_precision_of, view
+from ..runtime.views import cast_like, to_double, to_host, to_library, view
 from .multifrontal import Factor
 from .pcg import Preconditioner
 
@@ -77,7 +77,7 @@ class Compliance:
         """Motion (3N, b) [m] of all nodes under forces (3n, b) [N] on the first n."""
         device, every = self._problem.device, -(-len(force) // self._width)
         out = view(device.zeros(self._problem.rows, force.shape[1]))
-        force = to_precision_of(out, force)
+        force = cast_like(out, force)
         # A card multiplies by zeros sooner than it says where they are.
         at_hand = device.on_cuda and self.known[: len(force) // 3].all() and every <= self._kept
         for block in range(every) if at_hand else self._acting(to_host((force != 0.0).any(1))):

@@ -31,16 +31,7 @@ from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from ..minimisers.line_search import backtrack_by_slopes, is_step_too_long
 from ..minimisers.residual import Judge, build_judge
 from ..runtime.device import Device
-from ..runtime.views import (
-    from_view,
-    run_in_order,
-    select_columns,
-    to_double,
-    to_host,
-    to_library,
-    to_precision_of,
-    view,
-)
+from ..runtime.views import cast_like, from_view, run_in_order, select_columns, to_double, to_host, to_library, view
 from .contact_batch import Batch, ContactState
 from .contact_forces import BENT, FORCES, ContactCompliance, ForceLimits, allocate_scratch, solve_contact_forces
 from .contact_limits import CONTACT, ContactLimits
@@ -242,10 +233,7 @@ class ContactDescent:
         return batch.failed >= 2 * self.limits.times
 
     def _waits(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
-        """Return some columns (b,) bool have found no forces, and will be dragged more.
-
-        Which (b,) have tried all there is.
-        """
+        """Increase the drag of columns (b,) bool without forces; return which (b,) have no trial left."""
         times = self.limits.times
         batch.waiting = waiting
         batch.failed = np.where(waiting, batch.failed + 1, 0)
@@ -303,11 +291,11 @@ class ContactDescent:
         assert batch.model is not None
         device, compliance = self.problem.device, self.compliance
         out, change = view(device.zeros(*batch.rest.shape)), force - batch.force
-        near = batch.rest[compliance.places] + to_precision_of(batch.rest, compliance.moved(change))
+        near = batch.rest[compliance.places] + cast_like(batch.rest, compliance.moved(change))
         own = view(batch.model.pressed(device, from_view(device, near)))
-        out[self._rows] = to_precision_of(out, change)
+        out[self._rows] = cast_like(out, change)
         out[compliance.places] += own
-        return out, to_precision_of(batch.rest, compliance.moved(own)[: len(self._rows)])
+        return out, cast_like(batch.rest, compliance.moved(own)[: len(self._rows)])
 
     def _harder(self, drag: np.ndarray) -> np.ndarray:
         return np.maximum(self.limits.drag, self.limits.growth * drag)

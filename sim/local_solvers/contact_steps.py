@@ -201,9 +201,7 @@ class ContactSteps:
             view(self._model.own)[:] = model.own
 
     def aim(self, tolerance: float, drag: float, bent: bool = False) -> np.ndarray:
-        """Return forces of the tools, exact to a tolerance, under a drag.
-
-        The direction, and its longest step: `SAID` numbers.
+        """Solve for the tools' forces under a proximal term, and their direction and longest step: `SAID` numbers.
 
         The model need not be convex where it is `bent`. Where no forces were `FOUND` all else means nothing. What is
         returned is written over by what comes next.

@@ -16,7 +16,7 @@ from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
 from ..runtime.columns import combine_columns
 from ..runtime.device import Device
-from ..runtime.views import get_library, run_in_order, solve_dense, to_library, to_precision_of, view
+from ..runtime.views import cast_like, get_library, run_in_order, solve_dense, to_library, view
 from .press_kernel import press_of
 from .strained_part import StrainedPart
 
@@ -54,19 +54,19 @@ def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedM
         if found is None:
             return None
         lib, (places, added) = get_library(device), found
-        rows = (3 * places[:, :, None] + to_precision_of(places, to_library(device, np.arange(3)))).reshape(1, -1)
+        rows = (3 * places[:, :, None] + cast_like(places, to_library(device, np.arange(3)))).reshape(1, -1)
         own, of = (
             wp.zeros(shape, dtype=dtype, device=device.name)
             for shape, dtype in ((added.shape, wp.float32), (places.shape, wp.int32))
         )
         bent, nodes = view(own), view(of)
-        added = to_precision_of(bent, added)
-        system = added @ to_precision_of(bent, part.soft(rows))
+        added = cast_like(bent, added)
+        system = added @ cast_like(bent, part.soft(rows))
         diagonal = range(rows.shape[1])
         system[:, diagonal, diagonal] += 1.0
         matrix = -solve_dense(system, added)
         bent[:] = lib.where(lib.isfinite(matrix).all(), 0.5 * (matrix + matrix.mT), 0.0 * added)
-        nodes[:] = to_precision_of(nodes, to_library(device, part.compliance.nodes))[places]
+        nodes[:] = cast_like(nodes, to_library(device, part.compliance.nodes))[places]
         return UpdatedModel(of, own)
 
 

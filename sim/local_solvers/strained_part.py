@@ -19,6 +19,7 @@ from ..discretisation.term import Strained
 from ..linalg.compliance import Compliance
 from ..runtime.device import Device
 from ..runtime.views import (
+    cast_like,
     from_view,
     get_library,
     order_by_size,
@@ -26,7 +27,6 @@ from ..runtime.views import (
     sort_columns,
     to_host,
     to_library,
-    to_precision_of,
     view,
 )
 from .press_kernel import press_of
@@ -193,7 +193,7 @@ class StrainedPart:
         if wide:
             for term, some in self._elements:
                 term.add_stiffening(some, u, picked, from_view(device, limit), place, stiffer)
-        return to_precision_of(ranks, nodes[:wide].T.clip(max=near - 1)), view(stiffer)
+        return cast_like(ranks, nodes[:wide].T.clip(max=near - 1)), view(stiffer)
 
     def soft(self, rows: Any) -> Any:
         """C (b, n, n) [m/N] between some rows (b, n) of the compliance, which are known: symmetric."""
@@ -225,6 +225,6 @@ class StrainedPart:
             most = 3 * int((nodes[some] < self._touchable).sum(-1).max())
             reach = soft[:, :, :most]
             place = rows[:, :most].clip(max=own.shape[1] - 1)
-            columns = to_precision_of(nodes, to_library(device, np.arange(count)))[some][:, None, None]
-            own[columns, place[:, :, None], place[:, None, :]] = to_precision_of(own, reach.mT @ (matrix[some] @ reach))
+            columns = cast_like(nodes, to_library(device, np.arange(count)))[some][:, None, None]
+            own[columns, place[:, :, None], place[:, None, :]] = cast_like(own, reach.mT @ (matrix[some] @ reach))
         return StrainedModel(nodes, matrix, own)

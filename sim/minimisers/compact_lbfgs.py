@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..runtime.device import Device
-from ..runtime.views import select_columns, to_host, to_library, to_precision_of, view
+from ..runtime.views import cast_like, select_columns, to_host, to_library, view
 from .lbfgs_kernels import PAIRS
 
 
@@ -127,7 +127,7 @@ class PairsOfColumns:
         own, at = to_library(self._device, columns), to_library(self._device, place)
         self._sw[own, at], self._sw[own, PAIRS + at] = s.T, w.T
         # y . H0 y' = y' . H0 y: what the new change is worth along old ones, and old changes along the new step.
-        change = to_precision_of(self._sw, y.T[:, :, None])
+        change = cast_like(self._sw, y.T[:, :, None])
         worth = to_host(self._sw[some] @ change)[:, :, 0].astype(np.float64)
         self._sy[columns, place] = 0.0
         self._sy[columns, :, place] = worth[:, :PAIRS]

@@ -38,7 +38,7 @@ def to_double(values: Any) -> Any:
     return values.astype(np.float64) if isinstance(values, np.ndarray) else values.double()
 
 
-def to_precision_of(other: Any, values: Any) -> Any:
+def cast_like(other: Any, values: Any) -> Any:
     """Return the same in another array's precision."""
     return values.astype(other.dtype) if isinstance(values, np.ndarray) else values.to(other.dtype)
 

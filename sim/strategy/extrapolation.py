@@ -55,10 +55,7 @@ def has_warm_state(warm: Mapping[str, Any], last: np.ndarray) -> bool:
 
 
 def extrapolate_start(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -> np.ndarray:
-    """Return starts (3N, B) [m] for loads whose last answers (3N, B) were left with it.
-
-    Those answers if it tells no way.
-    """
+    """Extrapolate starts (3N, B) [m] from the last solutions (3N, B); return these if there is no direction."""
     now = as_pushes(loads)
     if now is None or not has_warm_state(warm, last):
         return last

@@ -131,9 +131,7 @@ class Strategy:
         return self.lbfgs.held
 
     def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
-        """Return the equilibria of B cases, each from the first of its guesses (3N, B) [m] that will do.
-
-        From rest without.
+        """Solve for the equilibria of B cases, each from its first usable guess (3N, B) [m], or from rest.
 
         A start that lies inside out is left alone, and so is a state that does to which a start led. A body turned over
         or collapsed may be in equilibrium with itself. From rest such a state is taken as the load's doing. Where

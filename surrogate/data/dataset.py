@@ -96,9 +96,8 @@ class Dataset:
         wrong = np.flatnonzero(self.good & ~((self.residual >= 0.0) & (self.residual < np.inf)))
         if len(wrong):
             raise InputError(
-                f"{self.path}: {format_row_numbers(wrong)} of `answers` converged, but to a residual that is no number: "
-                "it is "
-                "damaged. Simulate again."
+                f"{self.path}: {format_row_numbers(wrong)} of `answers` converged, but to a residual that is not a "
+                "number: it is damaged. Simulate again."
             )
         try:
             _ = self.tool

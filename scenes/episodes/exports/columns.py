@@ -37,8 +37,7 @@ def describe_task(contents: EpisodeContents) -> str:
 
 
 def mark_held_out(episodes: Sequence[EpisodeContents]) -> list[bool]:
-    """Return which episodes are held out for validation: every tenth body, or every tenth episode if there are fewer
-    than ten bodies.
+    """Return which episodes are held out: every tenth body, or every tenth episode of fewer than ten bodies.
 
     Of two to nine episodes, the last one is held out.
     """

@@ -259,7 +259,7 @@ class ToolContactTerm:
         return out
 
     def stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
-        """As `Dense.stage`."""
+        """As `DenseTerm.stage`."""
         if self._pose is None:
             raise ValueError("no tool is there")
         out, near, name = ContactStage(), NearPairs(), self._device.name
