@@ -95,8 +95,7 @@ def compile_problem(
     terms: list[Term] = []
     own: list[Term] = []
     barriers: list[Barrier] = []
-    held = np.zeros_like(anatomy.held)
-    normal = np.zeros_like(anatomy.slide_normal)
+    held, normal = np.zeros_like(anatomy.held), np.zeros_like(anatomy.slide_normal)
     pulsation = next((effect for effect in effects if isinstance(effect, Pulsation)), None)
     for effect in effects:
         match effect:
