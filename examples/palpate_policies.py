@@ -48,10 +48,8 @@ for number in range(ROUNDS):
     best = weights[np.argsort(played(linear(weights), [number] * DRAWN)[0])[-KEPT:]]
     mean, deviation = best.mean(axis=0), best.std(axis=0) + 1.0 / (1 + number)
 
-policies = {
-    "random": lambda states: random.uniform(-1, 1, (DRAWN, 6)),
-    "scripted": lambda s: compute_scripted_actions("palpate", s),
-}
+policies = {"random": lambda states: random.uniform(-1, 1, (DRAWN, 6))}
+policies["scripted"] = lambda states: compute_scripted_actions("palpate", states)
 policies["trained"] = linear(np.tile(mean, (DRAWN, 1)))
 found = {name: played(policy, 1000) for name, policy in policies.items()}
 print("policy      mean return +- standard error    steps over a limit in 100 episodes")

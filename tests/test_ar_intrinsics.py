@@ -77,7 +77,7 @@ def test_a_view_that_does_not_fit_is_left_out_and_said():
 
 
 def test_what_determines_no_camera_is_refused():
-    with pytest.raises(ValueError, match=r"7 sharp views show the board, but 8 are needed: take 20 pictures"):
+    with pytest.raises(ValueError, match=r"7 sharp views show the board, but 8 are needed: take 20 images"):
         calibrate_intrinsics(views(poses(7), 0.1), WIDTH, HEIGHT)
     with pytest.raises(ValueError, match=r"one direction in all 14 views, to \d+ degrees\. Tilt the board"):
         calibrate_intrinsics(views(poses(14, tilt=1.0), 0.1), WIDTH, HEIGHT)

@@ -92,7 +92,7 @@ def test_pictures_that_are_no_views_of_the_board_are_refused(folder, pictures, t
     cv2.imwrite(str(some / "c.png"), pictures[0][:400])
     assert "c.png has 640 x 400 pixels, but a.png has 640 x 480" in refused([some, *out], capsys)
     (some / "c.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
-    assert "c.png: is no picture that can be read. Remove it" in refused([some, *out], capsys)
+    assert "c.png: is not a readable image. Remove it" in refused([some, *out], capsys)
     huge = bytearray(cv2.imencode(".png", pictures[0][:8, :8])[1].tobytes())
     for width, height in ((60_000, 60_000), (12_000, 9_000), (9_000, 8_000), (20_000, 10)):  # what the header says
         huge[16:24] = width.to_bytes(4, "big") + height.to_bytes(4, "big")

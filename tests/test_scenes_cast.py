@@ -225,7 +225,7 @@ def test_body_is_shown_while_fem_prepares(gated, monkeypatch):
     monkeypatch.setattr(demo.busy, "on", said.append)
     demo.wish.set(plays=False)
     with Loop(demo) as page:
-        assert wait_for(lambda: "at rest, as in the scan" in page.shown[2])
+        assert wait_for(lambda: "undeformed body, as in the scan" in page.shown[2])
         assert len(np.unique(page.shown[1])) > 20 and set(said) == {"preparing the finite elements"}
         prepared.set()
         assert wait_for(lambda: shows(page, 0) and "at rest" not in page.shown[2])

@@ -36,7 +36,7 @@ SENTENCES = {
     "honest": (False, "as if it were visible"),
     "finite": (False, "not finite"),
     "answered": (False, "solution is not good"),
-    "in_step": (False, "another moment"),
+    "in_step": (False, "at another time"),
     "covered": (0.89, "in 89% of the frames, less than 90%"),
     "removed": (-0.1, "remove -10% of the tumour's motion, less than 0%"),
 }
@@ -153,7 +153,7 @@ class TestThePictureItself:
 
     def test_of_an_earlier_frame_it_fails(self, play, frames, truth):
         late = replace(frames[2], shown=frames[1].shown)
-        assert about(self.pixels(play, frames, truth, late)[0], "does not say")
+        assert about(self.pixels(play, frames, truth, late)[0], "does not show its frame number")
         wrong = drawn(play, frames[2], play.positions(frames[0].deformation))
         assert about(self.pixels(play, frames, truth, wrong)[0], "outline")
 
@@ -167,23 +167,27 @@ class TestThePictureItself:
     def test_without_an_overlay_it_fails(self, play, frames, truth):
         bare = replace(frames[2], shown=frames[2].picture.colour)
         sentences, figures = self.pixels(play, frames, truth, bare)
-        assert about(sentences, "outline") and about(sentences, "does not say") and figures.drawn == np.inf
+        assert (
+            about(sentences, "outline")
+            and about(sentences, "does not show its frame number")
+            and figures.drawn == np.inf
+        )
 
     def test_with_another_number_it_fails(self, play, frames, truth):
         deep = frames[2].tip + 0.4e-3 * play.site.axis
         wrong = drawn(play, frames[2], play.positions(frames[2].deformation), tip=deep)
-        assert about(self.pixels(play, frames, truth, wrong)[0], "does not say")
+        assert about(self.pixels(play, frames, truth, wrong)[0], "does not show its frame number")
 
     def test_with_a_number_ten_times_too_large_it_fails(self, play, frames, truth, monkeypatch):
         monkeypatch.setattr(
-            "ar.overlay.gauge.millimetres", lambda length, error=None: format_millimetres(10.0 * length, error)
+            "ar.overlay.gauge.format_millimetres", lambda length, error=None: format_millimetres(10.0 * length, error)
         )
         wrong = drawn(play, frames[2], play.positions(frames[2].deformation))
-        assert about(self.pixels(play, frames, truth, wrong)[0], "does not say")
+        assert about(self.pixels(play, frames, truth, wrong)[0], "does not show its frame number")
 
     def test_with_another_frame_s_number_it_fails(self, play, frames, truth):
         wrong = drawn(play, replace(frames[2], number=59), play.positions(frames[2].deformation))
-        assert about(self.pixels(play, frames, truth, replace(wrong, number=60))[0], "does not say")
+        assert about(self.pixels(play, frames, truth, replace(wrong, number=60))[0], "does not show its frame number")
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
@@ -209,16 +213,16 @@ def test_a_tumour_off_by_a_millimetre_fails(play, frames, truth, direction):
 
 def test_a_stale_frame_fails(play, frames, truth):
     stale = [frames[0], replace(frames[1], deformation=frames[0].deformation), *frames[2:]]
-    assert about(broken(play, stale, truth)[0], "another moment")
+    assert about(broken(play, stale, truth)[0], "at another time")
     # Even if it claims the right time: the tumour is elsewhere.
     lying = replace(frames[0].deformation, time=np.array([frames[1].time]))
     stale[1] = replace(frames[1], deformation=lying)
     sentences = broken(play, stale, truth)[0]
-    assert about(sentences, "error") and not about(sentences, "another moment")
+    assert about(sentences, "error") and not about(sentences, "at another time")
 
 
 def test_frames_in_another_order_fail(play, frames, truth):
-    assert about(broken(play, [frames[1], frames[0], *frames[2:]], truth)[0], "another moment")
+    assert about(broken(play, [frames[1], frames[0], *frames[2:]], truth)[0], "at another time")
 
 
 @by_each

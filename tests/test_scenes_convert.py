@@ -33,7 +33,7 @@ def test_conflicting_options_give_message_and_no_file(folder, box, tmp_path, cap
         del file["T_world_tool"]
     for given, words in (([folder, wide], "convert them apart"), ([bare], "has no tool")):
         for name in ("lerobot", "robomimic"):
-            out = tmp_path / ("x.open_hdf5" if name == "robomimic" else "x")
+            out = tmp_path / ("x.hdf5" if name == "robomimic" else "x")
             assert main(["convert", *map(str, given), "--to", name, "--out", str(out)]) == 2
             assert words in capsys.readouterr().err.splitlines()[-1]
     for given in (["--to", "lerobot"], ["--to", "card", "--out", "x"]):
@@ -50,8 +50,9 @@ def test_what_is_interrupted_leaves_nothing(tmp_path):
 
 def test_what_a_killed_run_left_is_removed_and_what_runs_is_not(tmp_path):
     out, code = tmp_path / "out", (
-        "import os, sys; from pathlib import Path; from sim.runtime.atomic_files import written_folder\n"
-        "with written_folder(Path(sys.argv[1]), 10) as partial: (partial / 'a').mkdir(); os.kill(os.getpid(), 9)"
+        "import os, sys; from pathlib import Path; from sim.runtime.atomic_files import write_folder_atomically\n"
+        "with write_folder_atomically(Path(sys.argv[1]), 10) as partial: (partial / 'a').mkdir(); "
+        "os.kill(os.getpid(), 9)"
     )  # fmt: skip
     done = subprocess.run([sys.executable, "-c", code, str(out)], cwd=Path(__file__).parents[1], check=False)
     (left,) = tmp_path.iterdir()

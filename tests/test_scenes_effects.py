@@ -76,7 +76,9 @@ class TestWithoutATool:
             assert not (frame.picture.segmentation == TOOL).any()
             assert (frame.shown != frame.picture.colour).any()
         lines = []
-        monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, text, **given: lines.extend(text) or colour)
+        monkeypatch.setattr(
+            "scenes.play.scene_costs.draw_text_panel", lambda colour, text, **given: lines.extend(text) or colour
+        )
         add_cost_label(frames[-1], "fem")
         assert any(
             re.search(r"to the left \(0.87\) and the back \(0.50\), fluid up to \d+ % of the brain's height", line)

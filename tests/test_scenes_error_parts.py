@@ -100,7 +100,7 @@ def test_tool_error_is_of_a_deeper_tool_and_each_start_the_last():
 @pytest.mark.parametrize(("bound", "expected", "doubt"), [(3e-4, 3e-4, ""), (np.inf, 0.0, UNBOUND)])
 def test_model_error_without_a_bound_is_the_models_own(bound, expected, doubt, monkeypatch):
     model = SimpleNamespace(bound=bound)
-    monkeypatch.setattr("scenes.tracked.tool_motion.answering", lambda deformer, answer: model)
+    monkeypatch.setattr("scenes.tracked.tool_motion.find_first_model", lambda deformer, answer: model)
     stage = template_theatre().stage(find_scene("palpate"))
     found = ToolMotion(stage, Sinking(stage)).under(np.eye(4), np.zeros((3, 3)))
     assert (found.model, found.doubt) == (expected, doubt)

@@ -99,8 +99,8 @@ def test_a_row_has_its_turn_when_its_process_is_ready(study, tmp_path):
 def test_a_process_of_a_row_starts_without_the_notes_of_warp():
     """They would stand before the line of --json."""
     code = (
-        "from types import SimpleNamespace as Study; from scenes.report.rows import ready\n"
-        "ready('cpu', Study(on_card=False)); import warp as wp; wp.zeros(1, device='cpu')"
+        "from types import SimpleNamespace as Study; from scenes.report.rows import prepare_rows\n"
+        "prepare_rows('cpu', Study(on_card=False)); import warp as wp; wp.zeros(1, device='cpu')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == ""

@@ -138,7 +138,7 @@ def test_a_series_that_was_tabulated_is_not_tabulated_again(plan, tmp_path, monk
         with pytest.raises(InputError, match="just now"):
             make_body(tmp_path, again, 1, 0, "cpu")
     with monkeypatch.context() as held:
-        held.setattr("surrogate.training.expansion.tabulated", full)
+        held.setattr("surrogate.training.expansion.tabulate", full)
         assert make_body(tmp_path, again, 1, 0, "cpu").resumed
     assert not make_body(tmp_path / "other", again, 1, 0, "cpu").resumed
     assert files_of(tmp_path) == files_of(tmp_path / "other")

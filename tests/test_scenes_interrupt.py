@@ -45,8 +45,8 @@ sys.modules["ar.overlay.composite"] = Names(load_kernels=lambda: None)
 sys.modules["sim.runtime.device"] = Names(find_device=lambda *words: None)
 sys.modules["scenes.page.demo"] = Names(Demo=Demo)
 scene = Names(name="none", viewpoint=None, elasticity=Names(default=None, regions={}),
-              made_of=lambda tissue, element: scene, with_regions=lambda regions: scene)
-sys.modules["scenes.script.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",), demand_scene=len)
+              made_of=lambda tissue, element: scene, replace_regions=lambda regions: scene)
+sys.modules["scenes.script.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",), check_scene_exists=len)
 sys.modules["scenes.play.deformers"] = Names(open_theatre=lambda *words: theatre)
 from scenes.commands.demo import add_arguments, run
 parser = argparse.ArgumentParser()

@@ -39,31 +39,31 @@ TOOLS = cost(
     "contact.tool_kernels contact.tool_path",
     "contact.enclosure:add_angle contact.tool_kernels:add_gradient contact.tool_kernels:add_reaction "
     "contact.tool_kernels:clearance contact.tool_kernels:nearest",
-    "Contact Functions Reduced Touch",
+    "ContactSampling Reduced ToolContactTerm ToolFunctions ToolKernels",
 )
 # A new effect adds one line.
 OF_EFFECT = {
     "Elasticity": cost(
         "elasticity element_functions element_kernels laws.invariants laws.law state_source",
         "element_kernels:add_gradient",
-        "Elasticity Functions Kernels Law _Part",
+        "ElasticTerm ElementFunctions ElementKernels Law _Part",
     ),
     "Held": cost(),
     "Bonded": cost(),
     "Slide": cost(),
-    "ToolForce": cost("dead_force", "dead_force:spread dead_force:subtract", "DeadForce Forces Kernels"),
+    "ToolForce": cost("dead_force", "dead_force:spread dead_force:subtract", "DeadForce DeadForceKernels Forces"),
     "ToolDisplacement": cost(),
-    "NodalForce": cost("dead_force", "", "DeadForce"),
-    "Gravity": cost("dead_force gravity", "dead_force:subtract", "DeadForce Forces Kernels"),
-    "Inertia": cost("inertia", "inertia:add_force", "Inertia Kernels"),
-    "Pulsation": cost("swelling", "swelling:fill element_kernels:spread", "Swelling"),
+    "NodalForce": cost("dead_force", "", "DeadForce DeadForceKernels"),
+    "Gravity": cost("dead_force gravity", "dead_force:subtract", "DeadForce DeadForceKernels Forces"),
+    "Inertia": cost("inertia", "inertia:add_force", "InertiaKernels InertiaTerm"),
+    "Pulsation": cost("swelling", "swelling:fill element_kernels:spread", "Swelling SwellingKernels"),
     "Resection": cost(),
     "ToolContact": TOOLS,
     "Retraction": TOOLS,
     "SkullContact": cost(
         "contact.barrier contact.skull_contact contact.skull_surface",
         "contact.skull_contact:add_gradient",
-        "Bone BoneSettings Skull SkullBarrier",
+        "Bone BoneSettings Skull SkullBarrier SkullKernels",
     ),
 }
 OF_LAW = {
@@ -75,7 +75,7 @@ OF_LAW = {
     "prony": cost(
         "laws.isochoric_split laws.neo_hookean viscoelastic",
         "element_kernels:measure element_kernels:spread viscoelastic:advance viscoelastic:fade",
-        "Prony Kernels Split",
+        "LawSplit Prony ViscoelasticKernels",
     ),
 }
 # What a solver may do of any energy, as the load needs it.
@@ -128,7 +128,7 @@ def check(found: dict[str, set[str]], effects: list[str], law: str) -> None:
     """Nothing less, and nothing more."""
     want = expected(effects, law)
     assert found["imported"] - {"strain_kernels"} == want.modules  # a solver's, of any energy
-    assert found["living"] == want.classes
+    assert found["living"] - {"StrainKernels"} == want.classes
     assert (
         of_terms(found["launched"]) >= want.kernels if law == "prony" else want.kernels == of_terms(found["launched"])
     )

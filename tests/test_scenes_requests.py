@@ -62,7 +62,7 @@ class TestWish:
 
 @pytest.fixture
 def silent(monkeypatch):
-    monkeypatch.setattr("scenes.page.cast.Referee", Silent)
+    monkeypatch.setattr("scenes.page.cast.FemWorker", Silent)
 
 
 @pytest.fixture

@@ -60,7 +60,7 @@ np.savez(out, losses=losses, counts=[len(each) for each in sets.values()], actio
 def test_robomimic_reader_agrees_and_trains(box, tmp_path):
     for number, (frames, family) in enumerate(((7, "press"), (9, "slide"))):
         write_episode(tmp_path / f"in/episode_{number:06d}.h5", box, Wanted(frames, 3, number, family))
-    path, out = tmp_path / "set.open_hdf5", tmp_path / "read.npz"
+    path, out = tmp_path / "set.hdf5", tmp_path / "read.npz"
     assert main(["convert", str(tmp_path / "in"), "--to", "robomimic", "--out", str(path)]) == 0
     words = [str(ROBOMIMIC), "-c", READ, str(path), str(out)]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
@@ -75,7 +75,7 @@ def test_robomimic_reader_agrees_and_trains(box, tmp_path):
 
 
 def test_robomimic_has_demonstrations_and_holds_one_out(folder, tmp_path, capsys):
-    out = tmp_path / "set.open_hdf5"
+    out = tmp_path / "set.hdf5"
     words = ["convert", str(folder), "--to", "robomimic", "--out", str(out), "--json"]
     assert main(words) == 0 and main(words) == 2 and main([*words, "--force"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["held_out"] == 1

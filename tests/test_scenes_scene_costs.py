@@ -24,7 +24,9 @@ def test_the_label_is_drawn_above_the_picture(play):
 
 def test_the_label_tells_source_time_and_motion(play, monkeypatch):
     said = []
-    monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, lines, **more: said.extend(lines) or colour)
+    monkeypatch.setattr(
+        "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: said.extend(lines) or colour
+    )
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     add_cost_label(frame, "linear")
     assert said[:2] == [f"linear: tumour moved {1e3 * frame.moved:.2f} mm", f"t 1.70 s, {frame.acts}"]
@@ -36,7 +38,7 @@ def test_the_label_tells_source_time_and_motion(play, monkeypatch):
 def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch):
     shown = []
     monkeypatch.setattr(
-        "scenes.play.scene_costs.panel", lambda colour, lines, **more: shown.append(list(lines)) or colour
+        "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: shown.append(list(lines)) or colour
     )
     play = player(theatre, short(), "linear")
     for force in (0.2, 0.6):

@@ -172,7 +172,9 @@ def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
     assert np.array_equal(play.believed(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
     assert not find_ink(frame.shown, compute_ink(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
     assert np.count_nonzero(find_ink(frame.shown, compute_ink(TRUTH_COLOUR))) > 10
-    monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, lines, **more: said.extend(lines) or colour)
+    monkeypatch.setattr(
+        "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: said.extend(lines) or colour
+    )
     add_cost_label(frame, "fem")
     assert any(line == f"estimate: rejected, {found.refusal}" for line in said)
     assert "Observation rejected" in report(frame, play.stage, "fem", "", (), 100)
@@ -196,7 +198,9 @@ def test_check_says_what_the_locator_holds_against_its_answers(refused, frames):
 def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
     frame, said = frames[1], []
     found = frame.estimate
-    monkeypatch.setattr("scenes.play.scene_costs.panel", lambda colour, lines, **more: said.extend(lines) or colour)
+    monkeypatch.setattr(
+        "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: said.extend(lines) or colour
+    )
     add_cost_label(replace(frame, named=False), "fem")
     truth = 1e3 * np.linalg.norm(found.true)
     off = bound_words(found.location.p95, 1)
@@ -255,7 +259,7 @@ def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
 def test_locator_of_other_regions_is_rejected(theatre, scene):
     other = replace(theatre)
     other.__dict__["locator"] = replace(theatre.locator, regions=(Region(PART_LABELS["oedema"], 0.5),))
-    with pytest.raises(InputError, match=r"another stiffness of region 3 \(oedema\) than the scene has"):
+    with pytest.raises(InputError, match=r"another stiffness of region 3 \(oedema\) than the scene\."):
         other.stage(scene)
 
 

@@ -152,7 +152,7 @@ class TestRefusals:
         first = swapped.shot(-1, rest)
         vars(swapped)["_first_shot"] = replace(first, pictures=first.pictures[::-1])
         said = self.refusal(swapped, replace(shot, pictures=shot.pictures[::-1]))
-        assert "off the scan's" in said or "places of the cortex" in said or "pixels apart" in said
+        assert "from the scan's" in said or "places of the cortex" in said or "pixels apart" in said
 
     def test_another_calibration(self, observer, shot, rest):
         turned = shot.cameras[0], shot.cameras[1].perturb(0.08, (1.0, 0.0, 0.0))
@@ -162,7 +162,7 @@ class TestRefusals:
         crossed = observer_of()
         first = crossed.shot(-1, rest)
         vars(crossed)["_first_shot"] = replace(first, cameras=(first.cameras[0], first.cameras[1].perturb(0.1)))
-        assert "mm off the scan's" in self.refusal(crossed, shot)
+        assert "mm from the scan's" in self.refusal(crossed, shot)
 
     def test_no_texture(self, observer, shot):
         plain = observer_of(replace(EXACT, vessels=False))

@@ -16,7 +16,7 @@ def test_two_cores_find_what_one_does(monkeypatch: pytest.MonkeyPatch) -> None:
     u = device.array(np.random.default_rng(0).normal(size=(mesh.nodes.size, 3)) * 1e-3)
     found = []
     for number in (1, 2):
-        for place in ("sim.terms.elasticity.cores", "sim.linalg.multifrontal.cores"):
+        for place in ("sim.terms.elasticity.choose_threads", "sim.linalg.multifrontal.choose_threads"):
             monkeypatch.setattr(place, lambda work, number=number: number)
         problem = compile_problem((Elasticity(tissue("neo-hookean")), Held()), base_held(mesh), device)
         g, _, _ = problem.residual(u)

@@ -149,7 +149,7 @@ class TestFinished:
             (lambda file: file["anatomy/nodes"].__setitem__(3, 0.5), "anatomy inside was changed|volume"),
             (lambda file: file["loads/Pushed/force"].__setitem__(3, 0.5), "loads inside were changed"),
             (lambda file: file.attrs.modify("preset", "mixed"), "what it states of itself was changed"),
-            (lambda file: file["unit/node"].__setitem__(5, 10**6), "`unit/node` are not the nodes"),
+            (lambda file: file["unit/node"].__setitem__(5, 10**6), "`unit/node` are not the open cortex's nodes"),
             (lambda file: file["answers/outcome"].__setitem__(0, b"FINE"), "damaged"),
             (lambda file: file.__delitem__("answers/residual"), "has no array `answers/residual`"),
             (lambda file: replaced(file, "answers/residual", np.full(20, b"small")), "holds .S5"),
@@ -251,7 +251,7 @@ class TestTraining:
         path = Path(shutil.copy(enough, tmp_path))
         with h5py.File(path, "r+") as file:
             file["answers/residual"][2] = np.nan
-        with pytest.raises(InputError, match="row 2 of `answers` converged, but to a residual that is no number"):
+        with pytest.raises(InputError, match="row 2 of `answers` converged, but to a residual that is not a number"):
             read_dataset(path)
         data = read_dataset(enough)
         with pytest.raises(InputError, match="`residual` of 3"):

@@ -119,7 +119,7 @@ def test_on_a_page_each_solve_starts_from_the_last_answer(theatre):
 def test_the_limit_is_the_user_s(theatre):
     strict = replace(theatre, limit=5e-5)
     assert strict.deformer(GUARDED, small()).limit == 5e-5 and theatre.deformer(GUARDED, small()).limit == LIMIT
-    assert "where that may be over 0.05 mm off" in strict.described(GUARDED, small())
+    assert "where its error may exceed 0.05 mm" in strict.described(GUARDED, small())
     parser = argparse.ArgumentParser()
     add_theatre(parser)
     asked = parser.parse_args(["--guard-mm", "0.05", "--device", "cpu"])
@@ -131,7 +131,7 @@ def test_the_limit_is_the_user_s(theatre):
 
 
 def test_scene_model_is_named_with_description(theatre):
-    assert GUARDED in theatre.names(small()) and "where that may be over 0.2 mm off" in theatre.described(
+    assert GUARDED in theatre.names(small()) and "where its error may exceed 0.2 mm" in theatre.described(
         GUARDED, small()
     )
 

@@ -243,7 +243,7 @@ def test_a_judge_counts_each_level_by_its_own_bound(trained, fresh, box):
     weakest = np.argsort(np.linalg.norm(fresh.of(Pushed).force, axis=1))
     assert found.tenths == tuple((weakest[k : k + 6] % 4 == 0).mean() for k in range(0, 60, 6))
     some = measure_covered(np.ones(20), np.full(20, 3e-3), np.array([np.full(20, 4e-3), np.full(20, np.inf)]), 0)
-    assert some.held == (1.0, None) and "100.0 % at 95 %, nothing is promised at 99 %;" in str(some)
+    assert some.held == (1.0, None) and "100.0 % at 95 %, no guarantee at 99 %;" in str(some)
     half = np.where(np.arange(20) < 10, 2e-3, np.inf)  # what promises nothing does not hold, either
     assert measure_held(np.full(20, 3e-3), half[None]) == (0.0,)
 

@@ -52,7 +52,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
         "--guard-mm",
         type=float,
         metavar="MM",
-        help="95 % bound of the surface error of the tumour beyond which guarded uses finite elements "
+        help="95 %% bound of the surface error of the tumour beyond which guarded uses finite elements "
         "[mm] (default 0.2)",
     )
     budget = parser.add_argument_group("a budget, in place of --deformer; errors are those that models state")
