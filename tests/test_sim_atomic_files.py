@@ -19,7 +19,7 @@ from sim.runtime.atomic_files import check_disk_space, check_output, write_atomi
 
 class TestWriting:
     LEAVING = "import os, sys; from sim.runtime.atomic_files import write_atomically\n"
-    LEAVING += "with written_whole(sys.argv[1], '.txt') as p:\n"
+    LEAVING += "with write_atomically(sys.argv[1], '.txt') as p:\n"
     LEAVING += " p.write_text('half'); os.kill(os.getpid(), 9)"
 
     def test_what_a_killed_run_left_is_swept_by_the_next(self, tmp_path: Path) -> None:
