@@ -21,7 +21,7 @@ from ..runtime.atomic_files import write_atomically
 from ..runtime.file_limits import MESH_BYTES, MeshBytes, limit_memory
 from ..runtime.outside_files import read_as, to_path
 from .abaqus import AbaqusMesh, read_abaqus
-from .given_cells import assign_regions, check_cell_types, check_one_body, merge_nodes, note_pieces
+from .given_cells import check_cell_types, check_one_body, collect_regions, merge_nodes, note_pieces
 from .markups import SIGNS
 from .mesh_references import check_mesh_references
 from .vtu_size import check_vtu_size
@@ -48,7 +48,7 @@ REASONS = {
     ),
     r"\$NOD": "it is of MSH 1, of which no mesh is read: save it as MSH 4.1.",
     r"np\.float": "it has `np.float64(...)` in place of numbers, as meshio writes ASCII: save it as binary.",
-    r" string$": "it has an array of text (`encode_string`): save it without, as arrays of numbers alone are read.",
+    r" string$": "it has an array of text (`string`): save it without, as arrays of numbers alone are read.",
 }
 """Messages by a pattern in meshio's reason, or in a line that meshio cannot read."""
 UNREAD = re.compile(rb"^\$ParametricNodes|^\$NOD\b|np\.float|^\S+ \d+ \d+ string$")
@@ -141,7 +141,7 @@ def _taken(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
     dropped = sorted({f"{len(block.data)} {block.type}" for block in raw.cells if block.type not in found})
     if dropped:
         notes.append(f"dropped cells that are not tetrahedra: {', '.join(dropped)}")
-    region, said = assign_regions(raw, blocks)
+    region, said = collect_regions(raw, blocks)
     table, turned = orient_tetrahedra(raw.points, np.concatenate([raw.cells[number].data for number in blocks]))
     data, places = {name: np.asarray(field) for name, field in raw.point_data.items()}, np.asarray(raw.points, float)
     if _space_of(path) == "LPS":  # half a turn about z, which keeps orientations

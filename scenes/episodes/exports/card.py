@@ -73,7 +73,7 @@ def write_card(
     inside = "episodes/*.h5" if (folder / "episodes").is_dir() else "*.h5"
     table = format_table(rows)
     gone = len(list_failed(folder))
-    missing = [f"Of those asked for {gone} could not be made and are missing: `list_failed` says why."] if gone else []
+    missing = [f"Of those asked for {gone} could not be made and are missing: `failed` says why."] if gone else []
     notes = [*missing, *describe_weak(list_model_errors(folder))]
     sheet = write_datasheet(folder.resolve().name, episodes, rows, notes, run_of(folder))
     description = (
