@@ -13,6 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from test_house import nodes_of, tree_of
+
 FIRST_WORDS = re.compile(r"\W*(?:what|how|where|whether|which|who|whose|whom|of|as|why|by|that)\b", re.IGNORECASE)
 """Words that begin no docstring, comment, help string or heading."""
 BANNED = re.compile(
@@ -42,12 +44,6 @@ class Text(NamedTuple):
     text: str
 
 
-@cache
-def read_tree(path: Path) -> ast.Module:
-    """Parsed source of a file."""
-    return ast.parse(path.read_text())
-
-
 def is_string(node: ast.AST | None) -> bool:
     """Return True for a literal or formatted string."""
     return isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
@@ -64,7 +60,7 @@ def to_text(node: ast.AST) -> str:
 def find_texts(path: Path) -> tuple[Text, ...]:
     """Docstrings (also those under constants), comments, help strings and messages of a Python file."""
     found, used = [], set()
-    nodes = list(ast.walk(read_tree(path)))
+    nodes = nodes_of(path)
     for node in nodes:
         if isinstance(node, ast.Expr) and is_string(node.value):
             used.add(id(node.value))
@@ -114,8 +110,7 @@ def find_banned(text: str) -> list[str]:
 
 def find_functions(path: Path) -> Iterator[str]:
     """Names of public functions and methods: no properties, kernels, overloads or tests of a base class's name."""
-    tree = read_tree(path)
-    for owner in [tree, *(node for node in ast.walk(tree) if isinstance(node, ast.ClassDef))]:
+    for owner in [tree_of(path), *(node for node in nodes_of(path) if isinstance(node, ast.ClassDef))]:
         for node in owner.body:
             if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
                 marks = {ast.unparse(mark).partition("(")[0].rpartition(".")[2] for mark in node.decorator_list}
@@ -125,4 +120,4 @@ def find_functions(path: Path) -> Iterator[str]:
 
 def count_classes(paths: Iterable[Path]) -> Counter[str]:
     """Number of definitions of each class name."""
-    return Counter(node.name for path in paths for node in ast.walk(read_tree(path)) if isinstance(node, ast.ClassDef))
+    return Counter(node.name for path in paths for node in nodes_of(path) if isinstance(node, ast.ClassDef))

@@ -12,6 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from test_house import DOCS, HOUSE
 
 from scenes.cli import COMMANDS
 from scenes.episodes.episode import MEANINGS as EPISODE
@@ -23,9 +24,7 @@ from surrogate.data.array_meanings import MEANINGS as DATASET
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 
-HOUSE = Path(__file__).parents[1]
 FORMATS = (HOUSE / "docs/reference/formats.md").read_text()
-DOCS = [path for path in (HOUSE / "docs").rglob("*.md") if "generated" not in path.parts]
 LINKS = {"a": "href"}
 LOADED = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src"}
 

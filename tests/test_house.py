@@ -96,13 +96,13 @@ def name_of(path):
 
 
 @cache
-def build_tree(path):
+def tree_of(path):
     return ast.parse(path.read_text())
 
 
 @cache
 def nodes_of(path):
-    return tuple(ast.walk(build_tree(path)))
+    return tuple(ast.walk(tree_of(path)))
 
 
 @cache
@@ -251,7 +251,7 @@ def test_the_top_level_is_fixed_and_tests_are_flat():
 def test_everything_public_has_a_docstring():
     missing = []
     for path in FILES:
-        open_nodes = [(name_of(path), build_tree(path))]
+        open_nodes = [(name_of(path), tree_of(path))]
         while open_nodes:
             name, node = open_nodes.pop()
             if not ast.get_docstring(node):

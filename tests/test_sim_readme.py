@@ -1,17 +1,16 @@
 """The README's Python example runs as it stands; what the pages name is there."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
+from test_house import DOCS, HOUSE
 
 from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.deformation import Outcome
 
-HOUSE = Path(__file__).parents[1]
-PAGES = [HOUSE / "README.md", *sorted(path for path in (HOUSE / "docs").rglob("*.md") if "generated" not in path.parts)]
+PAGES = [HOUSE / "README.md", *sorted(DOCS)]
 
 
 def example():
