@@ -298,7 +298,7 @@ def get_portion(tissue: Tissue, carries: str) -> tuple[float, float]:
 
 
 def collect_coefficients(tissues: Sequence[Tissue], carries: str = "whole") -> np.ndarray:
-    """Coefficients (n, k) of a `get_portion` of n tissues of one law.
+    """Coefficients (n, k) of one portion (`get_portion`) of n tissues of one law.
 
     Shorter Ogden sums are filled up with terms (0, 1), which add 0.
 

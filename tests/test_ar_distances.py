@@ -5,7 +5,7 @@ import numpy as np
 from test_ar_styles import CAMERA, seen, tumour
 
 from ar.overlay.composite import composite
-from ar.overlay.distances import RING, RINGS, build_tree, compute_seen_distance, draw_rings, list_lines
+from ar.overlay.distances import RING, RINGS, build_tree, compute_seen_distance, draw_rings, separate_rings
 from ar.overlay.hud import FINE, FONT
 from ar.overlay.window import DARK
 
@@ -50,5 +50,5 @@ def test_rings_may_be_covered_and_their_numbers_may_not():
     distance = np.repeat(np.linspace(0.0, 8e-3, 120, dtype=np.float32)[None], 80, axis=0)
     assert draw_rings(drawn, distance, np.ones((80, 120), bool), [5e-3]) == ["5"]
     number = cv2.erode((drawn[..., 3] > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    there = list_lines(drawn[..., 3] > 0)
+    there = separate_rings(drawn[..., 3] > 0)
     assert number.any() and not there[number].any() and there[8:20].any() and there[60:72].any()

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenes import read_episodes
-from scenes.episodes.exports.columns import build_states, build_twists, mark_held_out, measure_rate
+from scenes.episodes.exports.columns import build_states, build_twists, compute_frame_rate, mark_held_out
 from scenes.episodes.reading.contents import read_contents
 from sim.errors import InputError
 
@@ -41,10 +41,10 @@ def test_rate_of_frames_is_that_of_even_steps_to_100_us(off, tmp_path):
     contents, time = SimpleNamespace(path=tmp_path / "e.h5"), 0.04 * np.arange(26)
     time[10] += off
     if off < 1e-4:
-        assert measure_rate(contents, time) == 25.0
+        assert compute_frame_rate(contents, time) == 25.0
         return
     with pytest.raises(InputError, match="not evenly spaced"):
-        measure_rate(contents, time)
+        compute_frame_rate(contents, time)
 
 
 def test_every_tenth_body_is_held_out(folder):

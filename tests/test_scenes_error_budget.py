@@ -17,7 +17,7 @@ from scenes.analysis.error_budget import (
     TECHNICAL,
     Filmed,
     compute_budget,
-    compute_errors,
+    sample_errors,
 )
 from scenes.analysis.tracking_errors import change_calibration, sample_usual_covariance
 from scenes.script.priors import OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION
@@ -56,40 +56,40 @@ def filmed(box):
 
 
 def test_nothing_is_off_where_nobody_contributes(filmed):
-    none = compute_errors(filmed, [], 20)
+    none = sample_errors(filmed, [], 20)
     for values in (none.across, none.along, none.pixels, none.worst):
         assert np.abs(values).max() < 1e-12
 
 
 def test_error_sources_have_their_stated_size(filmed):
-    moved = compute_errors(filmed, [REGISTRATION], COUNT)
+    moved = sample_errors(filmed, [REGISTRATION], COUNT)
     assert np.sqrt(np.mean(moved.middle**2)) == pytest.approx(np.sqrt(3.0) * OF_REGISTRATION.range[1], rel=0.1)
     assert np.sqrt(np.mean(moved.along**2)) == pytest.approx(OF_REGISTRATION.range[1], rel=0.15)
-    wide = compute_errors(filmed, [SEGMENTATION], COUNT)
+    wide = sample_errors(filmed, [SEGMENTATION], COUNT)
     assert np.quantile(wide.worst, 0.68) == pytest.approx(OF_SEGMENTATION.range[1], rel=0.15)
-    assert np.quantile(compute_errors(filmed, [SURROGATE], COUNT).worst, 0.95) == pytest.approx(0.3e-3, rel=0.15)
+    assert np.quantile(sample_errors(filmed, [SURROGATE], COUNT).worst, 0.95) == pytest.approx(0.3e-3, rel=0.15)
     off = 0.002 * np.abs(DEVIATES).max()
-    assert compute_errors(filmed, [MESH], COUNT).worst.max() == pytest.approx(0.05 * off, rel=0.02)
+    assert sample_errors(filmed, [MESH], COUNT).worst.max() == pytest.approx(0.05 * off, rel=0.02)
     alike = replace(filmed, bodies=np.broadcast_to(filmed.field, filmed.bodies.shape))
-    assert compute_errors(alike, [MESH, PARAMETERS], COUNT).worst.max() == pytest.approx(0.2 * off, rel=0.02)
+    assert sample_errors(alike, [MESH, PARAMETERS], COUNT).worst.max() == pytest.approx(0.2 * off, rel=0.02)
 
 
 def test_latency_costs_what_the_camera_moves_meanwhile(filmed):
     moving = replace(filmed, viewpoint=replace(VIEW, path=sideways), latency=0.02, clock=0.0)
-    found = compute_errors(moving, [LATENCY], 20)
+    found = sample_errors(moving, [LATENCY], 20)
     np.testing.assert_allclose(found.across, 0.02 * SPEED, rtol=0.05)
-    assert compute_errors(replace(moving, latency=0.0), [LATENCY], 20).worst.max() < 1e-12
-    assert compute_errors(replace(filmed, latency=0.02), [LATENCY], 20).worst.max() < 1e-12  # nothing moves
+    assert sample_errors(replace(moving, latency=0.0), [LATENCY], 20).worst.max() < 1e-12
+    assert sample_errors(replace(filmed, latency=0.02), [LATENCY], 20).worst.max() < 1e-12  # nothing moves
 
 
 def test_latency_costs_what_the_tumour_moves_meanwhile(filmed):
     sunk = replace(filmed, velocity=np.tile(SPEED * filmed.site.axis, (60, 1)), latency=0.02, clock=0.0)
-    found = compute_errors(sunk, [LATENCY], 20)
+    found = sample_errors(sunk, [LATENCY], 20)
     for each in (found.middle, found.worst):
         assert each == pytest.approx(0.02 * SPEED, rel=0.02)
-    hasty = compute_errors(replace(sunk, latency=0.0, clock=0.01), [LATENCY], COUNT)  # of either sign
+    hasty = sample_errors(replace(sunk, latency=0.0, clock=0.01), [LATENCY], COUNT)  # of either sign
     assert np.sqrt(np.mean(hasty.middle**2)) == pytest.approx(0.01 * SPEED, rel=0.1)
-    assert compute_errors(sunk, [SHUTTER], 20).worst.max() < 1e-12
+    assert sample_errors(sunk, [SHUTTER], 20).worst.max() < 1e-12
 
 
 def test_coverage_of_patients_with_other_bodies_is_low(filmed):
@@ -105,7 +105,7 @@ def test_coverage_of_patients_with_other_bodies_is_low(filmed):
 def test_worst_error_is_that_of_the_farthest_point(filmed):
     bodies = np.tile(filmed.field, (100, 1, 1))
     bodies[:, 7] += 3e-3 * filmed.site.right
-    found = compute_errors(replace(filmed, bodies=bodies, meshes=np.zeros(100)), [PARAMETERS], 10)
+    found = sample_errors(replace(filmed, bodies=bodies, meshes=np.zeros(100)), [PARAMETERS], 10)
     assert found.worst == pytest.approx(3e-3, rel=0.02) and found.middle == pytest.approx(3e-3 / 60, rel=0.05)
 
 
@@ -128,10 +128,10 @@ def test_registration_errs_along_the_axes_of_the_reference(filmed, axis):
     toward = VIEW.camera(filmed.site).T_camera_world[2, :3]
     for apart, size in ((T[:3, axis], 0.0), (T[:3, (axis + 1) % 3], 0.02)):
         registered = Registration(np.linalg.inv(T), np.diag(turn), middle - 0.05 * apart, 1e-3, 6)
-        found = compute_errors(replace(filmed, T_scan_patient=T, registration=registered), [REGISTRATION], COUNT)
+        found = sample_errors(replace(filmed, T_scan_patient=T, registration=registered), [REGISTRATION], COUNT)
         assert np.sqrt(np.mean(found.middle**2)) == pytest.approx(0.05 * size, rel=0.1, abs=2e-6)
     registered = Registration(np.linalg.inv(T), np.diag(shift), middle, 1e-3, 6)
-    found = compute_errors(replace(filmed, T_scan_patient=T, registration=registered), [REGISTRATION], COUNT)
+    found = sample_errors(replace(filmed, T_scan_patient=T, registration=registered), [REGISTRATION], COUNT)
     assert np.std(found.along) == pytest.approx(1e-3 * abs(toward @ T[:3, axis]), rel=0.15, abs=2e-6)
 
 
@@ -144,20 +144,20 @@ def test_rolling_shutter_error_from_camera_motion(filmed):
     ]
     apart = abs(rows[1] - rows[0]) / camera.height * 0.02 * SPEED
     once, twice = (
-        compute_errors(replace(moving, viewpoint=replace(moving.viewpoint, calibration=each)), [SHUTTER], 20).across
+        sample_errors(replace(moving, viewpoint=replace(moving.viewpoint, calibration=each)), [SHUTTER], 20).across
         for each in (calibration, replace(calibration, readout=0.04))
     )
     # A sheared target is taken for one that is turned, too, which takes up some of it.
     assert 0.2 * apart < np.median(once) < 2.0 * apart and np.median(twice) == pytest.approx(
         2.0 * np.median(once), rel=0.1
     )
-    still = compute_errors(replace(moving, viewpoint=replace(VIEW, calibration=calibration)), [SHUTTER], 20)
+    still = sample_errors(replace(moving, viewpoint=replace(VIEW, calibration=calibration)), [SHUTTER], 20)
     assert still.worst.max() < 1e-6
-    assert compute_errors(replace(moving, viewpoint=replace(VIEW, path=sideways)), [SHUTTER], 20).worst.max() < 1e-12
+    assert sample_errors(replace(moving, viewpoint=replace(VIEW, path=sideways)), [SHUTTER], 20).worst.max() < 1e-12
 
 
 def test_doubled_corner_noise_doubles_tumour_error(filmed):
-    once, twice = (compute_errors(replace(filmed, corner=noise), [MARKERS], COUNT).worst for noise in (0.1, 0.2))
+    once, twice = (sample_errors(replace(filmed, corner=noise), [MARKERS], COUNT).worst for noise in (0.1, 0.2))
     assert np.median(twice) == pytest.approx(2.0 * np.median(once), rel=0.1)
     # Sixteen corners 60 mm wide, 80 mm beside the tumour.
     assert 0.05e-3 < np.median(once) < 0.5e-3
@@ -168,9 +168,9 @@ def test_calibration_covariance_and_wrong_images_raise_error(filmed):
     assert (deviations[:4] > 0.05).all() and (deviations[:4] < 3.0).all()
     assert change_calibration(USUAL, np.arange(9.0)).focal == (1400.0, 1401.0)
     exact = replace(filmed, covariance=np.zeros((9, 9)))  # as of a film of `sulcus film`
-    assert np.abs(compute_errors(exact, TECHNICAL[:1], 20).worst).max() < 1e-9
-    worse = compute_errors(replace(filmed, covariance=100.0 * filmed.covariance), TECHNICAL[:1], 50)
-    assert np.median(worse.worst) > 5.0 * np.median(compute_errors(filmed, TECHNICAL[:1], 50).worst)
+    assert np.abs(sample_errors(exact, TECHNICAL[:1], 20).worst).max() < 1e-9
+    worse = sample_errors(replace(filmed, covariance=100.0 * filmed.covariance), TECHNICAL[:1], 50)
+    assert np.median(worse.worst) > 5.0 * np.median(sample_errors(filmed, TECHNICAL[:1], 50).worst)
 
 
 def test_band_covers_twins_but_not_other_bodies(filmed):
@@ -179,9 +179,9 @@ def test_band_covers_twins_but_not_other_bodies(filmed):
     )
     meshes = 0.05 * np.random.default_rng(4).normal(size=600)
     first, twins = (replace(filmed, bodies=bodies, meshes=meshes) for bodies in (here, other))
-    band = np.quantile(compute_errors(first, CLINICAL, 600).worst, 0.95)
-    assert 0.92 < (compute_errors(twins, CLINICAL, 600, 1).worst <= band).mean() < 0.98
-    assert (compute_errors(replace(twins, bodies=6.0 * other), CLINICAL, 200, 1).worst <= band).mean() < 0.8
+    band = np.quantile(sample_errors(first, CLINICAL, 600).worst, 0.95)
+    assert 0.92 < (sample_errors(twins, CLINICAL, 600, 1).worst <= band).mean() < 0.98
+    assert (sample_errors(replace(twins, bodies=6.0 * other), CLINICAL, 200, 1).worst <= band).mean() < 0.8
 
 
 def test_parts_add_up_in_quadrature_and_the_largest_is_named(filmed):
@@ -197,4 +197,4 @@ def test_a_reference_out_of_sight_is_said(filmed):
     away = filmed.T_scan_patient.copy()
     away[:3, 3] += 0.5
     with pytest.raises(InputError, match="does not see the patient's reference"):
-        compute_errors(replace(filmed, T_scan_patient=away), [MARKERS], 1)
+        sample_errors(replace(filmed, T_scan_patient=away), [MARKERS], 1)

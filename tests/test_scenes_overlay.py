@@ -19,7 +19,7 @@ from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
 from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.follower import TumourState
 from scenes.tracked.picture import Painter
-from scenes.tracked.run import Timed, draw_overlay, pace_images, read_timed
+from scenes.tracked.run import Timed, draw_overlays, pace_images, read_timed
 from scenes.tracked.tool_motion import ToolMotion
 from scenes.tracked.truth import compute_overlay_error, read_truth, summarise_errors
 from sim.errors import InputError
@@ -51,7 +51,7 @@ def pictures():
 
 @pytest.fixture(scope="module")
 def shown(follower, stage):
-    return list(draw_overlay(pictures(), follower, Painter(stage, follower.tool, "contour")))
+    return list(draw_overlays(pictures(), follower, Painter(stage, follower.tool, "contour")))
 
 
 def test_every_picture_shows_what_is_known_of_it(shown, truth):

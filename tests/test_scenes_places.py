@@ -9,7 +9,7 @@ import pytest
 from scenes.cli import main
 from scenes.warp.landmarks import list_landmarks
 from scenes.warp.moment import Cause, DeformedAnatomy
-from scenes.warp.places import ENOUGH, FINEST, find_finer_spacing, find_folds, list_fields, list_places
+from scenes.warp.places import ENOUGH, FINEST, compute_fields, find_finer_spacing, find_folds, list_places
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.errors import InputError
@@ -63,12 +63,12 @@ def test_places_in_necrosis_are_the_tumours(kinked):
 def test_a_spacing_follows_from_the_tumours_error(kinked, fields):
     finer = find_finer_spacing(kinked, fields)
     assert FINEST <= finer < fields.grid.spacing
-    found = list_fields(kinked, None, lambda more: None)
+    found = compute_fields(kinked, None, lambda more: None)
     places = list_places(kinked)
     assert places.errors(found)[places.tumour].max() <= ENOUGH and found.grid.spacing < 1e-3
     assert find_finer_spacing(kinked, found) is None
     still = choose_moment(kinked.anatomy, 1e-2 * kinked.displacement)
-    assert list_fields(still, None, lambda more: None).grid.spacing == 1e-3
+    assert compute_fields(still, None, lambda more: None).grid.spacing == 1e-3
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_folds_are_found_and_sorted_by_size(small_box):
 
 def test_a_spacing_of_too_many_nodes_is_refused(small_box):
     with pytest.raises(InputError, match="million are the most"):
-        list_fields(choose_moment(small_box, np.full_like(small_box.mesh.nodes, 40e-3)), 0.3e-3, lambda more: None)
+        compute_fields(choose_moment(small_box, np.full_like(small_box.mesh.nodes, 40e-3)), 0.3e-3, lambda more: None)
 
 
 def test_fields_avoid_folds_of_fem_and_report_them(small_box, tmp_path, capsys):

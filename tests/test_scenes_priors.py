@@ -8,9 +8,9 @@ from theatres import short
 
 from scenes.analysis.uncertainty import (
     apply_sample,
-    build_skull,
     compute_error,
     find_mesh_prior,
+    get_skull_model,
     list_skulls,
     sample_mesh_errors,
 )
@@ -47,12 +47,12 @@ class TestPriors:
 
     def test_mesh_error_grows_with_sliding_and_weight(self):
         press, sinking = find_scene("press"), find_scene("brain_shift")
-        assert build_skull(press) == "bonded" and build_skull(sinking) == "contact"
+        assert get_skull_model(press) == "bonded" and get_skull_model(sinking) == "contact"
         draws = [replace(SAME, skull=share, mesh=1.0) for share in (0.1, 0.5, 0.9)]
         np.testing.assert_allclose(sample_mesh_errors(press, draws), [0.05, 0.12, 0.12])
         np.testing.assert_allclose(sample_mesh_errors(sinking, draws), 0.25)
         loose = replace(press, effects=tuple(one for one in press.effects if one not in SKULLS.values()))
-        assert build_skull(loose) is None
+        assert get_skull_model(loose) is None
         np.testing.assert_allclose(sample_mesh_errors(loose, draws), 0.05)
         assert find_mesh_prior(sinking, "bonded").range[1] == 0.05
         motion = np.ones((3, 2, 3))

@@ -10,7 +10,7 @@ import pytest
 from test_sim_necrosis import hollowed, necrotic_labels
 
 from scenes.cli import main
-from scenes.report.finite_elements import get_tissue as tissue_of_law
+from scenes.report.finite_elements import change_law as tissue_of_law
 from scenes.report.study import ReportStudy
 from sim.accuracy import TRAIN
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL

@@ -19,7 +19,7 @@ from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.follower import Follower
 from scenes.tracked.picture import Painter
 from scenes.tracked.registration_file import read_registration
-from scenes.tracked.run import draw_overlay, read_timed
+from scenes.tracked.run import draw_overlays, read_timed
 from scenes.tracked.tool_motion import ToolMotion
 
 FILM = Path(__file__).parent / "data" / "film"
@@ -39,13 +39,13 @@ def film(count):
 
 def test_white_areas_stay_clear_and_share_is_reported(parts):
     follower, painter = parts
-    (whole,) = draw_overlay(read_timed(film(1)), follower, painter)
+    (whole,) = draw_overlays(read_timed(film(1)), follower, painter)
     camera, tumour = whole.known.camera, painter.stage.tumour_at_rest
     mask = compute_silhouette(camera, tumour.vertices, tumour.triangles)
     columns = np.flatnonzero(mask.any(axis=0))
     covered = np.zeros(mask.shape, np.uint8)
     covered[150:, : int(columns.mean())] = 255  # below the words of the head
-    (hidden,) = draw_overlay(read_timed(film(1), iter([Named("0.png", covered)])), follower, painter)
+    (hidden,) = draw_overlays(read_timed(film(1), iter([Named("0.png", covered)])), follower, painter)
     amber = [find_ink(each.colour, compute_ink((0.92, 0.50, 0.05))) for each in (whole, hidden)]
     assert amber[0][covered > 0].any() and not amber[1][covered > 0].any()
     np.testing.assert_array_equal(amber[0][covered == 0], amber[1][covered == 0])
@@ -57,7 +57,7 @@ def test_white_areas_stay_clear_and_share_is_reported(parts):
 
 def test_what_is_frozen_is_hidden_too(parts):
     follower, painter = parts
-    (shown,) = draw_overlay(read_timed(film(1)), follower, painter)
+    (shown,) = draw_overlays(read_timed(film(1)), follower, painter)
     blank = np.full(shown.colour.shape, 120, np.uint8)
     lost = follower.step(blank[..., 0], 0.1, shown.known)
     covered = np.zeros(blank.shape[:2], bool)

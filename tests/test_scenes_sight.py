@@ -11,7 +11,7 @@ from theatres import SIGHTED, short, small
 from ar.overlay.hud import FINE, NARROW, bound_words, format_millimetres, wrap_line
 from ar.overlay.outlines import compute_ink, find_ink, has_text
 from scenes.cli import main
-from scenes.page.text import compute_estimate, format_page_legend, report
+from scenes.page.text import describe_estimate, format_page_legend, report
 from scenes.play.checks import is_within_surface, list_objections, measure
 from scenes.play.deformers import Theatre, open_theatre
 from scenes.play.observer import ELLIPSOID_COLOUR
@@ -132,10 +132,10 @@ def test_an_ellipsoid_holds_what_its_covariance_says(frames):
 def test_where_nothing_moves_that_is_said(play, frames):
     found = frames[0].estimate
     assert not found.noticed and frames[0].remark.startswith("no significant motion detected; ")
-    assert "No significant motion detected." in " ".join(compute_estimate(found))
+    assert "No significant motion detected." in " ".join(describe_estimate(found))
     tried, guess = (replace(found, location=replace(found.location, calibrated=known)) for known in (True, False))
-    assert "guess" not in tried.words + " ".join(compute_estimate(tried))
-    assert "; a guess; " in guess.words and "It is a guess" in " ".join(compute_estimate(guess))
+    assert "guess" not in tried.words + " ".join(describe_estimate(tried))
+    assert "; a guess; " in guess.words and "It is a guess" in " ".join(describe_estimate(guess))
 
 
 @pytest.fixture(scope="module")
@@ -239,10 +239,10 @@ def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
     assert all(words in said for words in ("estimate", "truth", "95 %", "scan", "tip to tumour"))
     assert "estimate" not in format_page_legend(replace(play.scene, sight=None))
     found = frames[1].estimate
-    words = " ".join(compute_estimate(found))
+    words = " ".join(describe_estimate(found))
     assert f"error {1e3 * found.off:.1f} mm; the truth is inside the ellipsoid" in words
     assert f"{len(found.observation.now)} points of the cortex, and where the tool touches; no force" in words
-    assert "outside of" in " ".join(compute_estimate(replace(found, true=np.ones(3))))
+    assert "outside of" in " ".join(describe_estimate(replace(found, true=np.ones(3))))
 
 
 def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):

@@ -14,7 +14,7 @@ from boxes import box, top_forces
 from oracle import internal_forces
 from programs import main
 
-from scenes.options.tissue_options import add_tissue_arguments, assign_regions, check_stiffness, get_tissue
+from scenes.options.tissue_options import add_tissue_arguments, check_stiffness, parse_region_tissues, parse_tissue
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
@@ -29,7 +29,7 @@ TWO_TERMS = "--material", "ogden", "--ogden", "1340,-19;700,2.5", "--bulk", "2e4
 def asked(*words: str) -> Tissue:
     parser = argparse.ArgumentParser()
     add_tissue_arguments(parser)
-    return get_tissue(parser.parse_args(words))
+    return parse_tissue(parser.parse_args(words))
 
 
 @pytest.mark.parametrize(
@@ -78,16 +78,16 @@ def test_contradictions_are_refused_in_a_sentence(words: tuple[str, ...], senten
 
 
 def test_regions_obey_the_same_law() -> None:
-    found = assign_regions(["2:9000,0.3", "-1:500,0.49"], MATERIALS["seconds"].tissue)
+    found = parse_region_tissues(["2:9000,0.3", "-1:500,0.49"], MATERIALS["seconds"].tissue)
     assert found == {2: Material("neo-hookean", 9000.0, 0.3), -1: Material("neo-hookean", 500.0, 0.49)}
-    found = assign_regions(["7:500,2;300,-4;1e4"], MATERIALS["minutes"].tissue)
+    found = parse_region_tissues(["7:500,2;300,-4;1e4"], MATERIALS["minutes"].tissue)
     assert found == {7: Ogden(((500.0, 2.0), (300.0, -4.0)), 1e4)}
 
 
 @pytest.mark.parametrize(("name", "text"), [("seconds", "2:9000,0.3"), ("minutes", "2:500,2;1e4")])
 def test_regions_relax_as_the_rest_does(name: str, text: str) -> None:
     slow = replace(MATERIALS[name].tissue, prony=((0.3, 2.0),))
-    assert assign_regions([text], slow)[2].prony == ((0.3, 2.0),)
+    assert parse_region_tissues([text], slow)[2].prony == ((0.3, 2.0),)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_regions_relax_as_the_rest_does(name: str, text: str) -> None:
 )
 def test_regions_of_another_form_are_refused(text: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        assign_regions([text], MATERIALS["minutes"].tissue)
+        parse_region_tissues([text], MATERIALS["minutes"].tissue)
 
 
 def solve(folder: Path, *words: str) -> int:

@@ -48,7 +48,7 @@ def camera(tmp_path_factory):
     return str(path)
 
 
-def select_rows(path):
+def read_csv(path):
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
@@ -58,7 +58,7 @@ def test_a_folder_gives_a_row_for_each_picture(folder, camera, tools, tmp_path, 
     assert main(["track", str(folder), "--camera", camera, "--out", str(out), "--rate", "10", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["pictures"] == 5 and said["states"] == {"good": 3, "lost": 2}
-    rows = select_rows(out)
+    rows = read_csv(out)
     assert [row["state"] for row in rows] == ["good", "good", "lost", "lost", "good"]
     assert [float(row["time_s"]) for row in rows] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
     assert all(rows[2][name] == "" for name in ("x_mm", "qw", "tip_x_mm", "tip_off_mm", *COVARIANCE, "corners"))
@@ -93,12 +93,12 @@ def test_in_the_patient_s_frame_the_camera_is_of_no_account(folder, camera, tool
     assert main(wanted) == 0
     assert "in the patient's frame" in capsys.readouterr().out
     tip = np.array([1e-3, 2e-3, -0.15, 1.0])
-    for row, true in zip((row for row in select_rows(out) if row["x_mm"]), tools, strict=True):
+    for row, true in zip((row for row in read_csv(out) if row["x_mm"]), tools, strict=True):
         found = np.array([float(row[f"tip_{axis}_mm"]) for axis in "xyz"])
         off = np.linalg.norm(found - 1e3 * (np.linalg.inv(PLATE_AT) @ true @ tip)[:3])
         assert off < 4.0 * float(row["tip_off_mm"])
     assert main(["track", str(folder), "--camera", camera, "--out", str(tmp_path / "p.csv"), "--body", "patient"]) == 0
-    assert [row["state"] for row in select_rows(tmp_path / "p.csv")] == ["good"] * 5
+    assert [row["state"] for row in read_csv(tmp_path / "p.csv")] == ["good"] * 5
     capsys.readouterr()
     boardless = ["track", str(folder), "--camera", camera, "--out", str(tmp_path / "b.csv"), "--frame", "board"]
     assert main(boardless) == 1 and "60.0 %  board lost: too few corners" in capsys.readouterr().out
@@ -111,7 +111,7 @@ def test_the_camera_s_pose_is_the_inverse_of_what_it_sees(folder, camera, tmp_pa
     assert main([*words, "--out", str(other), "--body", "patient"]) == 0
     (_, found), (_, seen) = read_poses(one), read_poses(other)
     np.testing.assert_allclose(found @ seen, np.tile(np.eye(4), (5, 1, 1)), atol=1e-6)
-    assert all(float(row["tip_off_mm"]) > 0.0 and int(row["corners"]) < 99 for row in select_rows(one))
+    assert all(float(row["tip_off_mm"]) > 0.0 and int(row["corners"]) < 99 for row in read_csv(one))
 
 
 def test_a_video_has_its_own_times(pictures, camera, tmp_path):
@@ -121,7 +121,7 @@ def test_a_video_has_its_own_times(pictures, camera, tmp_path):
         writer.write(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
     writer.release()
     assert main(["track", str(film), "--camera", camera, "--out", str(out)]) == 0
-    rows = select_rows(out)
+    rows = read_csv(out)
     assert [float(row["time_s"]) for row in rows] == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8])
     assert [row["state"] for row in rows][:2] == ["good", "good"]
 
@@ -149,7 +149,7 @@ def test_what_cannot_be_followed_is_refused(folder, camera, pictures, tmp_path, 
     cv2.imwrite(str(blank / "a.png"), np.full((CAMERA.height, CAMERA.width), 120, np.uint8))
     assert main(["track", str(blank), "--camera", camera, "--out", str(out)]) == 1  # nothing is certain
     assert "100.0 %  tool lost: too few corners" in capsys.readouterr().out
-    assert select_rows(out)[0]["state"] == "lost"
+    assert read_csv(out)[0]["state"] == "lost"
 
 
 def test_a_part_of_a_pose_is_refused(tmp_path):

@@ -17,7 +17,7 @@ from scenes.analysis.uncertainty import (
     compute_worst_distances,
     coverage,
     estimate_uncertainty,
-    get_nominal,
+    solve_nominal,
     solve_scene,
     split_contributions,
 )
@@ -171,7 +171,7 @@ class TestEnsemble:
         assert solve_scene(theatre, short()).inverted == 0 and weak is not None and weak.inverted > 0
 
     def test_the_moments_of_a_scene_end_where_it_does(self, theatre):
-        still = get_nominal(theatre, short())
+        still = solve_nominal(theatre, short())
         assert still.times[0] == 0.0 and still.times[-1] == pytest.approx(0.2)
         assert [np.linalg.norm(one, axis=1).mean() > 1e-4 for one in still.fields] == [False, True, True, True, False]
         np.testing.assert_allclose(np.linalg.norm(still.normals[0], axis=1), 1.0)
@@ -349,7 +349,7 @@ def test_other_tissues_are_refused(theatre, tmp_path, monkeypatch, capsys):
     scene = short().made_of(MATERIALS["minutes"].tissue, None)
     with pytest.raises(InputError, match="Young's modulus"):
         apply_sample(scene, SAME)
-    monkeypatch.setattr("scenes.analysis.uncertainty.get_nominal", None)  # before anything is solved
+    monkeypatch.setattr("scenes.analysis.uncertainty.solve_nominal", None)  # before anything is solved
     out = tmp_path / "found.json"
     assert main(["uncertainty", "press", "--material", "minutes", "--device", "cpu", "--out", str(out)]) == 2
     assert "the scene press has another tissue: ogden" in capsys.readouterr().err

@@ -11,7 +11,7 @@ import pytest
 from boxes import quadratic
 from test_sim_meshfile import MESH, write
 
-from sim.bodies.given_cells import assign_regions
+from sim.bodies.given_cells import collect_regions
 from sim.bodies.meshfile import read_mesh
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
@@ -84,7 +84,7 @@ def test_coincident_nodes_of_different_data_are_rejected(tmp_path: Path) -> None
 )  # fmt: skip
 def test_regions_of_a_mesher_are_taken_with_a_note(changes: dict, region: np.ndarray, note: str) -> None:
     raw = meshio.Mesh(MESH.nodes, [("tetra", MESH.tets)], **changes)
-    found, (said,) = assign_regions(raw, [0])
+    found, (said,) = collect_regions(raw, [0])
     np.testing.assert_array_equal(found, region)
     assert re.search(note, said)
 

@@ -27,7 +27,7 @@ from surrogate.model.store import load, save
 from surrogate.model.tool_contact import compute_wrench
 from surrogate.regressors.rigid_contact import THICKER, RigidContact
 from surrogate.training.expansion import TOUCHED
-from surrogate.training.fem_tables import compute_unit_responses, condense_exterior
+from surrogate.training.fem_tables import compute_unit_responses, condense_contact
 from surrogate.training.train import list_learners, train
 
 BALL = choose_ball("palpation")
@@ -49,7 +49,7 @@ def bodily(anatomy: Anatomy, tissue: Material) -> Fem:
 
 @pytest.fixture(scope="module")
 def pressed(box):
-    return condense_exterior(
+    return condense_contact(
         bodily(box, SOFT), [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)]
     )
 
@@ -112,7 +112,7 @@ def test_bone_under_the_ball_bears_nothing(box, pressed):
 
 def test_how_stiff_tissue_is_does_not_matter(box, pressed):
     soft = pressed[0]
-    stiff = condense_exterior(bodily(box, replace(SOFT, young=7500.0)), [box.tumour_nodes])[0]
+    stiff = condense_contact(bodily(box, replace(SOFT, young=7500.0)), [box.tumour_nodes])[0]
     X = features(box, draw_poses("palpation", box, 10, 3))
     force, more = soft.force(X), stiff.force(X)
     np.testing.assert_allclose(2.5 * force, more, atol=1e-3 * np.abs(more).max())

@@ -31,7 +31,7 @@ from surrogate.model.relaxation import MEMORY, Relaxed, follow_relaxation
 from surrogate.model.store import load, save
 from surrogate.model.tool_contact import compute_wrench
 from surrogate.onnx_export.export import onnx_model
-from surrogate.training.fem_tables import condense_exterior
+from surrogate.training.fem_tables import condense_contact
 from surrogate.training.train import train
 
 SERIES = ((0.4, 0.5), (0.3, 20.0))
@@ -100,7 +100,7 @@ class Fading:
         self.anatomy, self.patch = anatomy, open_patch(anatomy)
         fem = Fem(anatomy, pushed_effects(anatomy, SOFT), REFERENCE, "cpu", element="p1")
         cortex = np.setdiff1d(self.patch.nodes, anatomy.tumour_nodes)
-        self.contact, self.bases = condense_exterior(fem, [anatomy.tumour_nodes, cortex], BALL)
+        self.contact, self.bases = condense_contact(fem, [anatomy.tumour_nodes, cortex], BALL)
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         pushed = to_indentation(loads, BALL, self.patch)

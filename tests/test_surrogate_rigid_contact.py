@@ -27,7 +27,7 @@ from surrogate.model.applicability import find_rejection
 from surrogate.model.store import load, save
 from surrogate.model.tool_contact import compute_wrench
 from surrogate.regressors.rigid_contact import THICKER, RigidContact
-from surrogate.training.fem_tables import condense_exterior
+from surrogate.training.fem_tables import condense_contact
 from surrogate.training.train import train
 
 ROD_OF_4 = Capsule(2e-3, 0.02)
@@ -38,7 +38,7 @@ SOFT = Material("linear", 3000.0, 0.45)
 
 def condensed_box(box: Anatomy, tool: BuiltIn | None) -> tuple[RigidContact, list[Basis]]:
     fem = Fem(box, pushed_effects(box, SOFT), REFERENCE, "cpu", element="p1")
-    return condense_exterior(fem, [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)], tool)
+    return condense_contact(fem, [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)], tool)
 
 
 def asked(box: Anatomy, loads: Loads, tool: BuiltIn) -> Indented:

@@ -24,7 +24,7 @@ from surrogate.model.learned import Learned, ModelPart
 from surrogate.model.store import load
 from surrogate.model.tool_contact import HELD, ForceModel
 from surrogate.model.training_range import compute_training_range
-from surrogate.training.fem_tables import condense_exterior, join_bases
+from surrogate.training.fem_tables import condense_contact, join_bases
 
 BLADE = Spatula(8e-3, 12e-3, 1.5e-3)
 SOFT = Material("linear", 3000.0, 0.45)
@@ -44,7 +44,7 @@ def over(body: Anatomy, *places: tuple[float, float]) -> Loads:
 def model(box):
     """Contact on linear tissue, of which nothing is learned."""
     parts = [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)]
-    contact, bases = condense_exterior(Fem(box, pushed_effects(box, SOFT), device="cpu", element="p1"), parts, BLADE)
+    contact, bases = condense_contact(Fem(box, pushed_effects(box, SOFT), device="cpu", element="p1"), parts, BLADE)
     contact = replace(contact, grip=np.array([1.0, 0.0]))
     asked = to_indentation(over(box, (0.0, 0.2), (1.0, 4.0)), BLADE, open_patch(box))
     known = compute_training_range(open_patch(box), asked)

@@ -44,7 +44,7 @@ def name_of(kernel: wp.Kernel) -> str:
     return f"{kernel.func.__module__}:{kernel.func.__name__}"
 
 
-def listen_to_stages(launch):
+def note_launches(launch):
     """`wp.launch` that notes what it launches."""
 
     def noting(kernel, *words, **more):
@@ -97,7 +97,7 @@ def played(scene: Scene) -> dict[str, list[str]]:
 
 
 if __name__ == "__main__":
-    wp.launch = listen_to_stages(wp.launch)
+    wp.launch = note_launches(wp.launch)
     for line in sys.stdin:
         child = os.fork()
         if child == 0:

@@ -114,7 +114,7 @@ def to_opencv_text(calibration: Calibration) -> str:
     storage.write("image_height", calibration.height)
     storage.write("camera_name", calibration.name)
     storage.write("camera_matrix", calibration.K)
-    storage.write("distortion_coefficients", collect_coefficients(calibration.lens)[:, None])
+    storage.write("distortion_coefficients", to_opencv_coefficients(calibration.lens)[:, None])
     if calibration.readout > 0.0:
         storage.write(READOUT, calibration.readout)
     return storage.releaseAndGetString()
@@ -125,7 +125,7 @@ def to_ros_text(calibration: Calibration) -> str:
 
     Without rectification; the projection is that of the camera matrix.
     """
-    coefficients = collect_coefficients(calibration.lens)
+    coefficients = to_opencv_coefficients(calibration.lens)
     lines = [
         f"image_width: {calibration.width}",
         f"image_height: {calibration.height}",
@@ -140,7 +140,7 @@ def to_ros_text(calibration: Calibration) -> str:
     return "\n".join(lines) + "\n"
 
 
-def collect_coefficients(lens: Lens) -> np.ndarray:
+def to_opencv_coefficients(lens: Lens) -> np.ndarray:
     """Return coefficients (5,) or, of a rational lens, (8,), in OpenCV's order."""
     return lens.coefficients if lens.coefficients[5:].any() else lens.coefficients[:5]
 

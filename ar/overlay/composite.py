@@ -15,7 +15,7 @@ from ..rendering.parallel import load
 from ..rendering.rasteriser import RasterisedSurface, rasterise_surface
 from ..rendering.renderer import Picture
 from . import distances, window
-from .distances import list_lines
+from .distances import separate_rings
 from .gauge import draw_line, write_gauge
 from .hud import FINE, FONT, HEAD, NARROW, ROW, Below, format_millimetres, lay, wrap_line
 from .legend import Entry, draw_legend, place_sheet
@@ -206,7 +206,7 @@ def _sketched(
     bare = under[..., 3] == 0
     measure.draw(under, under if above is None else above, around)
     if style == "rings":
-        thin[around] = list_lines(bare & (under[..., 3] > 0))
+        thin[around] = separate_rings(bare & (under[..., 3] > 0))
     lines = Lines(compute_ink(hidden.colour), not doubtful, under, above)
     out, taken[around] = draw_overlay(picture.drawn, around, part, hidden, found, measure.roles, style, lines)
     return Sketch(out, taken, faint, thin, around, ground)

@@ -168,7 +168,7 @@ def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels
     return list(rings)
 
 
-def list_lines(drawn: np.ndarray) -> np.ndarray:
+def separate_rings(drawn: np.ndarray) -> np.ndarray:
     """Separate rings (h, w) bool from their numbers, given the mask `drawn` (h, w) of both."""
     numbers = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_OPEN, np.ones((THICK,) * 2, np.uint8))
     return drawn & (numbers == 0)

@@ -110,11 +110,11 @@ def view(plane: SliceView, scan: Solid | None, middle: np.ndarray, cut: Cut) -> 
         edges = cv2.findContours(inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
         draw_dashes(colour, list(edges), ink, DASHED, 1)
     for layer in cut.others:
-        draw_strokes(colour, list_lines(plane, layer, middle), compute_ink(layer.colour))
+        draw_strokes(colour, cut_by_plane(plane, layer, middle), compute_ink(layer.colour))
     draw_dashes(
-        colour, [to_pixel_line(line) for line in list_lines(plane, cut.before, middle)], compute_ink(BEFORE), DOTTED
+        colour, [to_pixel_line(line) for line in cut_by_plane(plane, cut.before, middle)], compute_ink(BEFORE), DOTTED
     )
-    now = list_lines(plane, cut.now, middle)
+    now = cut_by_plane(plane, cut.now, middle)
     if cut.doubtful:
         draw_dashes(colour, [to_pixel_line(line) for line in now], ink, BROKEN)
     else:
@@ -200,7 +200,7 @@ def join_segments(segments: np.ndarray) -> list[list[int]]:
     return lines
 
 
-def list_lines(plane: SliceView, layer: Layer, middle: np.ndarray) -> list[np.ndarray]:
+def cut_by_plane(plane: SliceView, layer: Layer, middle: np.ndarray) -> list[np.ndarray]:
     """Cut a surface by a view's plane; return lines, each (n, 2) as columns and rows."""
     found = cut_surface(layer.vertices, layer.triangles, middle, plane.normal)
     return [plane.pixels(line, middle) for line in found]

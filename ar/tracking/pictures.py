@@ -228,7 +228,7 @@ def _demand_size(path: Path, width: int, height: int) -> None:
         raise ValueError(f"{path}: {TOO_LARGE}")
 
 
-def measure_rate(path: Path) -> float | None:
+def read_frame_rate(path: Path) -> float | None:
     """Return the frame rate [1/s] in a video's metadata; None for a folder, or if not given."""
     if not path.is_file():
         return None

@@ -9,7 +9,7 @@ from dataclasses import asdict
 import numpy as np
 
 from scenes.options.shared_options import add_anatomy, add_device, add_json, to_json_line
-from scenes.options.tissue_options import add_tissue_arguments, get_tissue
+from scenes.options.tissue_options import add_tissue_arguments, parse_tissue
 from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy
 from sim.elements import ELEMENTS, RECOMMENDED
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     anatomy, found = read_anatomy(args.anatomy or template_path()), []
     print(f"{where}\n\n| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", file=table)
     depths = [depth / 1e3 for depth in args.depths]
-    for row in rows(anatomy, args.elements, depths, args.ball / 1e3, get_tissue(args), args.device):
+    for row in rows(anatomy, args.elements, depths, args.ball / 1e3, parse_tissue(args), args.device):
         force = f"{row.element} | {1e3 * row.depth:g} | {1e3 * row.along.mean():.1f}"
         shares = f"{row.share:+.1%} | {row.scatter:.1%} | {(row.sideways / row.along).max():.1%}"
         print(f"| {force} | {shares} | {row.seconds:.1f} | {row.fine_seconds:.1f} |", file=table, flush=True)

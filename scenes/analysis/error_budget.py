@@ -138,7 +138,7 @@ class OverlayErrors:
         return np.hypot(self.across, self.along)
 
 
-def compute_errors(filmed: Filmed, contributors: Sequence[str], count: int, seed: int = 0) -> OverlayErrors:
+def sample_errors(filmed: Filmed, contributors: Sequence[str], count: int, seed: int = 0) -> OverlayErrors:
     """Sample the overlay error caused by the contributors, all others being exact.
 
     The same seed gives the same random numbers for any set of contributors.
@@ -277,12 +277,12 @@ def compute_budget(
     progress: Callable[[Sequence[str]], Iterable[str]] = iter,
 ) -> ErrorBudget:
     """Compute the budget from `count` samples; `twins`, other bodies, test its band with other random numbers."""
-    alone = {name: compute_errors(filmed, [name], count, seed) for name in progress(CLINICAL)}
-    technical, clinical = (compute_errors(filmed, names, count, seed) for names in (TECHNICAL, CLINICAL))
+    alone = {name: sample_errors(filmed, [name], count, seed) for name in progress(CLINICAL)}
+    technical, clinical = (sample_errors(filmed, names, count, seed) for names in (TECHNICAL, CLINICAL))
     budget = ErrorBudget(alone, technical, clinical)
     if twins is None:
         return budget
-    within = compute_errors(twins, CLINICAL, count, seed + 1).worst <= budget.band
+    within = sample_errors(twins, CLINICAL, count, seed + 1).worst <= budget.band
     return replace(budget, held=_share(within, [_begun(twins, seed + 1, number)[2] for number in range(count)]))
 
 

@@ -115,7 +115,7 @@ def list_skulls(scene: Scene) -> tuple[str, ...]:
     return tuple(name for name in SKULLS if not (lets_go and name == "bonded"))
 
 
-def build_skull(scene: Scene) -> str | None:
+def get_skull_model(scene: Scene) -> str | None:
     """Return the skull model of a scene; None if it is not simulated."""
     own = next((type(effect) for effect in scene.effects if isinstance(effect, SKULL_EFFECTS)), None)
     return next((name for name, skull in SKULLS.items() if type(skull) is own), None)
@@ -135,7 +135,7 @@ def sample_mesh_errors(scene: Scene, draws: Sequence[PatientSample]) -> np.ndarr
 
 def estimate_mesh_deviations(scene: Scene, draws: Sequence[PatientSample]) -> np.ndarray:
     """Return the standard deviation (draws,) of each draw's mesh error, relative to its motion."""
-    if build_skull(scene) is None:
+    if get_skull_model(scene) is None:
         return np.full(len(draws), find_mesh_prior(scene, None).range[1])
     skulls = list_skulls(scene)
     return np.array([find_mesh_prior(scene, choose_name(draw.skull, skulls)).range[1] for draw in draws])
@@ -187,7 +187,7 @@ def list_moments(scene: Scene) -> tuple[float, ...]:
     return tuple(np.linspace(0.0, scene.duration, MOMENTS).tolist())
 
 
-def get_nominal(theatre: Theatre, scene: Scene) -> SurfaceMotions:
+def solve_nominal(theatre: Theatre, scene: Scene) -> SurfaceMotions:
     """Solve the scene as it is.
 
     Raises
@@ -350,7 +350,7 @@ def collect_contributor_values(draws: Sequence[PatientSample], scene: Scene) -> 
     poisson = get_tissue(scene).poisson
     table = np.array([[np.log(one.stiffness), one.poisson - poisson, np.log(one.ratio), *one.tip] for one in draws])
     found = {STIFFNESS.name: table[:, :1], POISSON.name: table[:, 1:2], RATIO.name: table[:, 2:3]}
-    skull = build_skull(scene)
+    skull = get_skull_model(scene)
     others = [name for name in list_skulls(scene) if name != skull]
     names = [choose_name(draw.skull, list_skulls(scene)) for draw in draws]
     if skull is not None:

@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
         What cannot be read, numbers out of range, or a scene that cannot be solved.
     """
     from ..analysis.error_budget import Filmed, choose_moment, compute_budget, compute_velocity
-    from ..analysis.uncertainty import get_nominal, sample_mesh_errors, split_contributions
+    from ..analysis.uncertainty import sample_mesh_errors, solve_nominal, split_contributions
     from ..play.deformers import open_theatre
     from ..play.stage import Stage
     from ..tracked.filming import place_reference
@@ -127,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
     if args.registration is not None:
         registration = read_registration(args.registration)
         describe_other_mesh(registration, theatre.anatomy, args.registration)
-    still = get_nominal(theatre, scene)
+    still = solve_nominal(theatre, scene)
     bodies = _bodies(args, theatre, scene, args.draws, args.seed)
     draws = [draw for draw, _ in bodies]
     number = choose_moment(still, [answer for _, answer in bodies], sample_mesh_errors(scene, draws))
@@ -225,10 +225,10 @@ def _bodies(args: argparse.Namespace, theatre: Theatre, scene: Scene, count: int
 
 def _at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the tumour's surface motion in each body at one time, and the errors of their meshes."""
-    from ..analysis.uncertainty import build_skull, find_mesh_prior, sample_mesh_errors
+    from ..analysis.uncertainty import find_mesh_prior, get_skull_model, sample_mesh_errors
 
     draws = [draw for draw, _ in bodies]
-    own = find_mesh_prior(scene, build_skull(scene)).range[1] * np.array([draw.mesh for draw in draws])
+    own = find_mesh_prior(scene, get_skull_model(scene)).range[1] * np.array([draw.mesh for draw in draws])
     return np.stack([answer[number] for _, answer in bodies]), sample_mesh_errors(scene, draws), own
 
 

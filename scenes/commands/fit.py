@@ -15,7 +15,7 @@ from sim.material import BRAIN
 
 from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_device, add_json, add_seed, to_json_line
-from ..options.tissue_options import add_region_argument, assign_regions
+from ..options.tissue_options import add_region_argument, parse_region_tissues
 from .locate import describe_left_out
 from .locator import REGIONS, find_locator
 
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     frames = _frames(args)
     anatomy = read_anatomy(args.anatomy)
     check_frames(anatomy, frames)  # bad frames need not wait for a locator
-    if TUMOUR_LABEL in assign_regions(args.region, BRAIN, anatomy.mesh):
+    if TUMOUR_LABEL in parse_region_tissues(args.region, BRAIN, anatomy.mesh):
         raise InputError("--region tumour: its stiffness is what `sulcus fit` finds. Give other regions alone.")
     locator = find_locator(args, anatomy, small=True)
     left_out = find_unsupported(locator, frames)

@@ -16,7 +16,7 @@ from sim.material import BRAIN
 
 from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_device, add_json, add_seed
-from ..options.tissue_options import AS_LEARNED, add_region_argument, assign_regions
+from ..options.tissue_options import AS_LEARNED, add_region_argument, parse_region_tissues
 
 if TYPE_CHECKING:
     from sim.anatomy import Anatomy
@@ -123,7 +123,7 @@ def list_regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Regi
     Raises
     ------
     InputError
-        As `assign_regions` and `list_known_regions`; a statement that is no tissue.
+        As `parse_region_tissues` and `list_known_regions`; a statement that is no tissue.
     """
     from sim.effects import Elasticity
     from surrogate.locating.regions import list_known_regions
@@ -132,7 +132,7 @@ def list_regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Regi
     from ..play.deformers import to_model_path
 
     if args.region:
-        return list_known_regions(Elasticity(BRAIN, assign_regions(args.region, BRAIN, anatomy.mesh)))
+        return list_known_regions(Elasticity(BRAIN, parse_region_tissues(args.region, BRAIN, anatomy.mesh)))
     models = to_model_path(Path(args.anatomy))
     learned = read_learned_tissue(models, anatomy) if models.is_file() else None
     return list_known_regions(learned) if learned is not None else ()

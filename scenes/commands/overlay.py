@@ -274,16 +274,16 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
 def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:
     """Draw all frames, into a video if requested; return them without their colours."""
     from ar.screen import write_film
-    from ar.tracking.pictures import measure_rate, read_video
+    from ar.tracking.pictures import read_frame_rate, read_video
 
-    from ..tracked.run import draw_overlay, read_timed
+    from ..tracked.run import draw_overlays, read_timed
 
     shown: list[Shown] = []
 
     def pictures() -> Iterator[np.ndarray]:
         masks = None if args.covered is None else read_video(args.covered, args.rate)
         film = read_timed(read_video(Path(args.pictures), args.rate, colour=True), masks)
-        for each in draw_overlay(film, parts.follower, parts.painter, args.live):
+        for each in draw_overlays(film, parts.follower, parts.painter, args.live):
             shown.append(each.drop_image())
             yield each.colour
 
@@ -292,7 +292,7 @@ def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Sh
             for _ in pictures():
                 pass
         else:
-            write_film(out, pictures(), measure_rate(Path(args.pictures)) or args.rate)
+            write_film(out, pictures(), read_frame_rate(Path(args.pictures)) or args.rate)
     except ValueError as error:
         raise InputError(str(error)) from error
     except OSError as error:

@@ -34,7 +34,7 @@ from ..options.placement_options import (
 )
 from ..options.shared_options import add_devices, add_json
 from ..options.subject_options import add_label_arguments, label_words, parse_regions, parse_sources
-from ..options.tissue_options import OWN, add_element_argument, add_region_argument, assign_regions
+from ..options.tissue_options import OWN, add_element_argument, add_region_argument, parse_region_tissues
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; the same command resumes an interrupted run."""
     # Report problems now, not after minutes of reading and meshing.
     plan = MeshPlan(args.nodes, 1e-3 * args.craniotomy, fine_opening=args.fine_opening)
-    regions = assign_regions(args.region, replace(BRAIN, law=args.material))
+    regions = parse_region_tissues(args.region, replace(BRAIN, law=args.material))
     strange = set(regions) - set(REGION_NAMES.values())
     if strange:
         raise InputError(f"--region {min(strange)}: a patient has no such region. Choose from {', '.join(OWN)}.")

@@ -41,8 +41,8 @@ from ..options.tissue_options import (
     add_element_argument,
     add_skull_argument,
     add_tissue_arguments,
-    get_tissue,
     parse_elasticity,
+    parse_tissue,
 )
 from ..script.shipped_files import template_path
 from .interrupt import INTERRUPTED, interrupt_on_termination
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
         if not len(anatomy.tumour_nodes):
             print(f"{args.anatomy}: has no tumour: `sulcus train` will reject the data.", file=sys.stderr)
         elasticity = parse_elasticity(args, anatomy.mesh)
-        tissue = get_tissue(args)
+        tissue = parse_tissue(args)
         tool, loads = _drawn(args, anatomy, tissue)
     precision = "float32" if args.tolerance >= 1e-4 else "float64"
     accuracy = Accuracy(args.tolerance, precision=precision, limit_strain=args.preset not in BEYOND_TISSUE)

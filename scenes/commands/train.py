@@ -19,7 +19,7 @@ from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.splits import APART
 from surrogate.data.tool_loads import compute_rejected_share, describe_rejected
 from surrogate.evaluation.score import find_best, format_scores
-from surrogate.model.guarded import compute_error, describe_error
+from surrogate.model.guarded import describe_error, get_held_out_error
 from surrogate.model.learned import Learned
 from surrogate.model.store import save
 from surrogate.training.expansion import EXPANDED, Expansion
@@ -135,7 +135,7 @@ def _calibration(trained: Trained) -> str:
 
 def _stated(model: Learned) -> dict[str, object]:
     """Describe the model's own reported errors, next to its score."""
-    known = compute_error(model)
+    known = get_held_out_error(model)
     discs = None if known.left_out is None else asdict(known.left_out)
     return {"bound_mm": 1e3 * known.bound, "discs": discs, "weak": known.weak}
 

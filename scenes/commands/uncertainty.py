@@ -69,11 +69,11 @@ def run(args: argparse.Namespace) -> int:
     from ..analysis.uncertainty import (
         coverage,
         estimate_uncertainty,
-        get_nominal,
         get_tissue,
         get_tumour_tissue,
         list_skulls,
         solve_ensemble,
+        solve_nominal,
     )
     from ..play.deformers import open_theatre
     from ..script.priors import sample_from_fit, sample_priors
@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
     for scene in scenes:
         bar = partial(tqdm, unit="body", desc=scene.name, leave=False, file=sys.stderr)
         draws, twins = (draws_of(scene, *each) for each in ((args.draws, args.seed), (args.twins, args.seed + 1)))
-        still = get_nominal(theatre, scene)
+        still = solve_nominal(theatre, scene)
         found = estimate_uncertainty(
             theatre, scene, still, draws, bar(solve_ensemble(theatre, scene, draws), total=len(draws)), args.seed
         )

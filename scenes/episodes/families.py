@@ -260,7 +260,7 @@ def sample_drain_scenario(chance: ScenarioInputs) -> Scenario:
     return Scenario(effects=(Gravity(),), lying=lie, lets_go=True)
 
 
-def debulk_tumour(chance: ScenarioInputs) -> Scenario:
+def sample_debulk_scenario(chance: ScenarioInputs) -> Scenario:
     """Return the act of `Debulk`."""
     count, fluid = round(chance.values["steps"]), chance.values["fluid"]
     lie = build_drained_turn(0.3 * chance.seconds, 0.0, 1.0, 0.0, fluid)
@@ -271,7 +271,7 @@ def debulk_tumour(chance: ScenarioInputs) -> Scenario:
 FAMILIES: dict[str, Callable[[ScenarioInputs], Scenario]] = {
     "press": sample_press_scenario, "slide": sample_slide_scenario, "draw": sample_draw_scenario,
     "reach": sample_reach_scenario, "walk": walk, "palpate": sample_palpate_scenario,
-    "retract": sample_retract_scenario, "drain": sample_drain_scenario, "debulk": debulk_tumour,
+    "retract": sample_retract_scenario, "drain": sample_drain_scenario, "debulk": sample_debulk_scenario,
 }  # fmt: skip
 """Scenario of each family of `FamilyMotions`."""
 

@@ -15,7 +15,7 @@ from .observation import FELT, SEEN, TRACKED, compute_states
 from .pictures import Seen
 from .setting import TaskSetting
 from .tasks import OVER, SECONDS, Goal
-from .tool_motion import RobotTool, add_tremor, build_tool_frame, compute_lever, lay_tool, move_tool
+from .tool_motion import RobotTool, build_tool_frame, compute_lever, lay_tool, move_tool, shift_pose
 from .touched import TissueRequest, Touched
 
 STEP, OVER_LIMIT, DONE, ENDED = 0.01, 0.5, 10.0, -10.0
@@ -142,7 +142,7 @@ class Episode:
     def _asked(self, drawn: ResetSample) -> TissueRequest:
         task = self.setting.task
         offset = drawn.tremor * self.frame @ sample_wandering(drawn.seed, SECONDS * self.step)[:3]
-        self.actual = add_tremor(self.hand, offset)
+        self.actual = shift_pose(self.hand, offset)
         fluid = 1.0 - (1.0 - drawn.goal.fluid) * smooth(self.step / DRAINS)
         return TissueRequest(self.actual.pose(task.tool), self.touched, fluid, self.done)
 
@@ -228,7 +228,7 @@ class Episode:
         task, goal = self.setting.task, self.drawn.goal
         cortex = touched.motion[np.searchsorted(touched.nodes, self.setting.cortex)].mean(axis=0)
         noise = self.random.standard_normal((3, 3))
-        tracked = add_tremor(self.actual, TRACKED * noise[0])
+        tracked = shift_pose(self.actual, TRACKED * noise[0])
         sensed = np.stack([touched.force, cortex]) + np.array([[FELT], [SEEN]]) * noise[1:]
         done = self.cut / goal.amount if task.cuts else self.held / task.held
         time = SECONDS * self.step

@@ -72,6 +72,6 @@ def move_tool(
     return RobotTool(place, np.asarray(turned))
 
 
-def add_tremor(hand: RobotTool, offset: np.ndarray) -> RobotTool:
+def shift_pose(hand: RobotTool, offset: np.ndarray) -> RobotTool:
     """Return the pose shifted by (3,) [m]."""
     return replace(hand, place=hand.place + offset)

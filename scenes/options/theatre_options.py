@@ -150,10 +150,10 @@ def choose_deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene) ->
             print(f"{args.program}: finite elements play {scene.name}, no learned model: {why}", file=sys.stderr)
         best = theatre.best(scene)
         if args.deformer is None and best in theatre.models:
-            from surrogate.model.guarded import compute_error, describe_error
+            from surrogate.model.guarded import describe_error, get_held_out_error
 
             model = theatre.models[best]
-            if compute_error(model).weak:
+            if get_held_out_error(model).weak:
                 print(f"{args.program}: on left-out cortex {best} is {describe_error(model)}", file=sys.stderr)
         return args.deformer or theatre.usual(scene)
     if args.deformer not in (None, "auto"):

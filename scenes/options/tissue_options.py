@@ -110,7 +110,7 @@ def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMEND
     )
 
 
-def get_tissue(args: argparse.Namespace) -> Tissue:
+def parse_tissue(args: argparse.Namespace) -> Tissue:
     """Return the tissue asked for.
 
     Raises
@@ -166,17 +166,17 @@ def parse_elasticity(args: argparse.Namespace, mesh: TetMesh) -> Elasticity:
     Raises
     ------
     InputError
-        As `get_tissue` and `assign_regions`.
+        As `parse_tissue` and `parse_region_tissues`.
     """
-    tissue = get_tissue(args)
-    return Elasticity(tissue, assign_regions(args.region, tissue, mesh))
+    tissue = parse_tissue(args)
+    return Elasticity(tissue, parse_region_tissues(args.region, tissue, mesh))
 
 
 def parse_optional_tissue(args: argparse.Namespace) -> Tissue | None:
     """Return the tissue asked for, or None where no option of it is given."""
     constants = (args.young, args.poisson, args.ogden, args.bulk, args.prony)
     given = args.material != "default" or any(value is not None for value in constants)
-    return get_tissue(args) if given else None
+    return parse_tissue(args) if given else None
 
 
 def refuse(given: Mapping[str, object], material: str, owner: str) -> None:
@@ -196,13 +196,13 @@ def apply_tissue_options(args: argparse.Namespace, scene: Scene, theatre: Theatr
     Raises
     ------
     InputError
-        As `get_tissue`, `assign_regions` and `Scene.made_of`.
+        As `parse_tissue`, `parse_region_tissues` and `Scene.made_of`.
     """
     from ..play.learned_regions import find_learned_regions
 
     made = scene.made_of(parse_optional_tissue(args), args.element)
     here = made.elasticity
-    own = assign_regions(args.region, here.default or BRAIN, theatre.anatomy.mesh)
+    own = parse_region_tissues(args.region, here.default or BRAIN, theatre.anatomy.mesh)
     kept = find_learned_regions(here, theatre.learned_tissue, own)
     if own and kept:
         print(
@@ -211,7 +211,7 @@ def apply_tissue_options(args: argparse.Namespace, scene: Scene, theatre: Theatr
     return made.replace_regions(dict(sorted({**own, **kept}.items())))
 
 
-def assign_regions(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | None = None) -> dict[int, Tissue]:
+def parse_region_tissues(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | None = None) -> dict[int, Tissue]:
     """Tissues by region label, of the law of `tissue`.
 
     Raises

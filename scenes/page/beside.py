@@ -37,12 +37,12 @@ def sample_of(frame: Frame, scene: Scene, now: float) -> Sample:
         known = frame.estimate.location if frame.estimate is not None else None
         error = frame.tumour_error.bound if known is None else known.p95
         return Sample(now, (1e3 * frame.moved,), (_scaled(error, 1e3),))
-    force, force_error = fit_force_model(frame.loads, frame.deformation)
+    force, force_error = get_tool_force(frame.loads, frame.deformation)
     distance = _scaled(frame.distance, 1e3), _scaled(frame.distance_error, 1e3)
     return Sample(now, (distance[0], force), (distance[1], force_error))
 
 
-def fit_force_model(loads: Loads, answer: Deformation) -> tuple[float | None, float | None]:
+def get_tool_force(loads: Loads, answer: Deformation) -> tuple[float | None, float | None]:
     """Return the tool force and its error [N]: a prescribed force has none; None: not known."""
     pushed = loads.every(Pushed)
     if pushed:

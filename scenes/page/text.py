@@ -230,7 +230,7 @@ def report(
         ]
     off = None if frame.doubt else frame.tumour_error.bound
     parts = [] if frame.distance is None else [format_tip_distance(frame.distance, off, frame.inside)]
-    number, *found = [""] if frame.estimate is None else compute_estimate(frame.estimate)
+    number, *found = [""] if frame.estimate is None else describe_estimate(frame.estimate)
     # A narrow window shows the first lines alone: both errors are among them.
     parts += [number, format_trust(frame.deformation, name), format_tumour_trust(frame.tumour_error), *found]
     parts.append(f"<p>{escape('; '.join(facts))}</p>")
@@ -255,7 +255,7 @@ def format_motion(frame: Frame) -> str:
     return f"{said} ({off})"
 
 
-def compute_estimate(found: TumourEstimate) -> list[str]:
+def describe_estimate(found: TumourEstimate) -> list[str]:
     """Describe an estimate, its error and its input; or the reason of its rejection."""
     truth = f"truly {format_unbroken(found.truly)}"
     if found.location is None:

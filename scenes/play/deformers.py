@@ -26,7 +26,7 @@ from surrogate.locating.locator import Locator
 from surrogate.locating.locator_store import load_locator, to_locator_path
 from surrogate.locating.regions import find_differing_regions
 from surrogate.model.applicability import find_rejection
-from surrogate.model.guarded import Guarded, compute_error
+from surrogate.model.guarded import Guarded, get_held_out_error
 from surrogate.model.learned import Learned
 from surrogate.model.left_out import LIMIT
 from surrogate.model.store import load
@@ -163,7 +163,7 @@ class Theatre:
         A model of tissue that relaxes is used without guard, with its bound: see `_guardable`.
         """
         name = self.best(scene)
-        return GUARDED if self._guardable(scene) and compute_error(self.models[name]).weak else name
+        return GUARDED if self._guardable(scene) and get_held_out_error(self.models[name]).weak else name
 
     def _guardable(self, scene: Scene) -> bool:
         """Return True if FEM can serve as fallback of the best model.

@@ -169,7 +169,7 @@ class Observer:
         `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is observed.
         """
         begun = clock.perf_counter()
-        return compute_estimate(
+        return locate_tumour(
             self.site.anatomy, self.locator, lambda: self.seen(number, positions, tool), positions, begun
         )
 
@@ -251,7 +251,7 @@ def find_touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> n
     return place[[away.argmin()]] if away.min() < TOUCHES else NOTHING.now
 
 
-def compute_estimate(
+def locate_tumour(
     anatomy: Anatomy, locator: Locator, see: Callable[[], Observation], positions: np.ndarray, begun: float
 ) -> TumourEstimate:
     """Locate the tumour from an observation, and compare with the truth at `positions` (V, 3) [m]; rejections are kept.

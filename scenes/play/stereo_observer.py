@@ -12,7 +12,7 @@ from surrogate.locating.locator import Locator
 from surrogate.locating.observation import Observation
 
 from ..script.sight import StereoSight
-from .observer import NOTHING, RigidError, TumourEstimate, compute_estimate, find_touched, sample_rigid_error
+from .observer import NOTHING, RigidError, TumourEstimate, find_touched, locate_tumour, sample_rigid_error
 from .stage import Stage
 from .stereo_update import First, StereoPair, observe_first, observe_point_cloud, observe_points
 
@@ -34,7 +34,7 @@ class StereoObserver:
         tips = NOTHING.now if tool is None else find_touched(anatomy, positions, tool)
         _ = self._first_shot  # to draw it takes long
         begun = clock.perf_counter()
-        return compute_estimate(anatomy, self.locator, lambda: self.seen(shot, tips), positions, begun)
+        return locate_tumour(anatomy, self.locator, lambda: self.seen(shot, tips), positions, begun)
 
     def seen(self, shot: StereoPair, tips: np.ndarray) -> Observation:
         """Extract the observation from a stereo pair, with contact points of a tool, `tips` (k, 3) [m].

@@ -95,13 +95,13 @@ def _adapt(study: ReportStudy, spec: FemVariant, load: Loads) -> float:
 
 def _fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:
     """Set up for single loads."""
-    effects = pushed_effects(body, get_tissue(study.get_tissue_on(body), spec.law))
+    effects = pushed_effects(body, change_law(study.get_tissue_on(body), spec.law))
     return Fem(body, effects, spec.accuracy, study.device, None, spec.element or study.element, live=True)
 
 
 def describe_difference(study: ReportStudy, spec: FemVariant) -> str:
     """Describe the kind of difference from the reference."""
-    if get_tissue(study.tissue, spec.law) != study.tissue:
+    if change_law(study.tissue, spec.law) != study.tissue:
         return DIFFERENCE
     same = (spec.element or study.element) == "p2" and spec.mesh == (HALVED if study.fine else OWN)
     return TOLERANCE_ALONE if same else ERROR
@@ -129,7 +129,7 @@ def get_law_name(tissue: Elasticity) -> str | None:
     return None if tissue.default is None else tissue.default.law
 
 
-def get_tissue(tissue: Elasticity, law: str | None) -> Elasticity:
+def change_law(tissue: Elasticity, law: str | None) -> Elasticity:
     """Return the tissue, in all regions, with another law of the same constants.
 
     Raises

@@ -28,7 +28,7 @@ AT_REST = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
 FAR = 1.0
 
 
-def select_rows(film: Iterable[Named], calibration: Calibration, body: str, frame: str) -> Iterator[TrackedRow]:
+def track_rows(film: Iterable[Named], calibration: Calibration, body: str, frame: str) -> Iterator[TrackedRow]:
     """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `frame` of a visible one of them.
 
     Raises
@@ -62,7 +62,7 @@ def follow_body(path: Path, calibration: Calibration, body: str, frame: str, rat
     count = 0
     with read_as(path, "a video", GIVE):
         try:
-            for row in select_rows(map(_at_its_time, read_video(path, rate)), calibration, body, frame):
+            for row in track_rows(map(_at_its_time, read_video(path, rate)), calibration, body, frame):
                 count += 1
                 yield row
         except ValueError as error:
@@ -218,9 +218,9 @@ def estimate_video_clock(
     Raises
     ------
     ValueError
-        As `estimate_clock_by_motion` and `select_rows`.
+        As `estimate_clock_by_motion` and `track_rows`.
     """
-    film_rows = select_rows(film, calibration, build_tool_cube().name, build_patient_reference().name)
+    film_rows = track_rows(film, calibration, build_tool_cube().name, build_patient_reference().name)
     seen = [(row.time, row.pose) for row in film_rows if row.pose is not None]
     times, places = [time for time, _ in seen], [pose.T_camera_target[:3, 3] for _, pose in seen]
     both = [

@@ -133,7 +133,7 @@ def pace_images(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
         waiting = newer
 
 
-def draw_overlay(film: Iterator[Timed], follower: Follower, painter: Painter, live: bool = False) -> Iterator[Shown]:
+def draw_overlays(film: Iterator[Timed], follower: Follower, painter: Painter, live: bool = False) -> Iterator[Shown]:
     """Yield every image with its overlay; `live`: in real time, so that late images are skipped and old ones marked.
 
     Raises

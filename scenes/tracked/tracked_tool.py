@@ -26,7 +26,7 @@ LONGEST = 100_000
 SQUARE, FARTHEST = 1e-3, 1.0
 
 
-def get_nominal() -> np.ndarray:
+def build_nominal_cube() -> np.ndarray:
     """T_cube_tool (4, 4) of a cube whose axes are the tool's, the tip below its middle."""
     T = np.eye(4)
     T[2, 3] = -TIP
@@ -48,7 +48,7 @@ class TrackedTool:
     """
 
     shape: BuiltIn
-    T_cube_tool: np.ndarray = field(default_factory=get_nominal)
+    T_cube_tool: np.ndarray = field(default_factory=build_nominal_cube)
     tip_covariance: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
 
     @cached_property

@@ -21,7 +21,7 @@ from .markups import write_markups
 from .meshes import build_surface_mesh, write_glb, write_stl, write_vtp
 from .moment import DeformedAnatomy
 from .nrrd_files import write_field_nrrd, write_field_sequence, write_segmentation
-from .places import ENOUGH, Folded, SamplePlaces, find_folds, list_fields, list_places
+from .places import ENOUGH, Folded, SamplePlaces, compute_fields, find_folds, list_places
 from .readme import write_readme
 
 LOOKS = {
@@ -40,7 +40,7 @@ SEQUENCE_SPACING, MOST_NUMBERS = 3e-3, 400_000_000
 
 @dataclass(frozen=True)
 class WarpSettings:
-    """Settings of fields and images: spacing of the fields [m] (None: as `list_fields`), and interpolation of images.
+    """Settings of fields and images: spacing [m] (None: as `compute_fields`), and interpolation of images.
 
     `source` is the name of the anatomy's file; `step` receives the number of newly finished parts.
     """
@@ -65,10 +65,10 @@ def write_warp(
     Raises
     ------
     InputError
-        As `list_fields`; a sequence that is too long.
+        As `compute_fields`; a sequence that is too long.
     """
     begun = process_time()
-    fields = list_fields(moment, asked.spacing, asked.step)
+    fields = compute_fields(moment, asked.spacing, asked.step)
     seconds = process_time() - begun
     write_field_nifti(place / "field_resampling.nii.gz", fields.grid, fields.backward)
     write_field_nrrd(place / "field_modeling.nrrd", fields.grid, fields.forward, "modeling")

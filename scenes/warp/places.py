@@ -114,11 +114,11 @@ def find_folds(moment: DeformedAnatomy, fields: WarpFields) -> tuple[Folded, ...
 
 
 def count_steps(spacing: float | None) -> int:
-    """Return the number of steps of `list_fields`: two fields for each tried spacing."""
+    """Return the number of steps of `compute_fields`: two fields for each tried spacing."""
     return 2 * (1 + (TIMES if spacing is None else 0))
 
 
-def list_fields(moment: DeformedAnatomy, spacing: float | None, step: Callable[[int], object]) -> WarpFields:
+def compute_fields(moment: DeformedAnatomy, spacing: float | None, step: Callable[[int], object]) -> WarpFields:
     """Compute the fields of a moment at a spacing [m]; None: 1 mm, or finer until tumour and landmarks are accurate.
 
     `step` receives the number of newly finished steps of `count_steps`.

@@ -126,7 +126,7 @@ def _inside_others(points: np.ndarray, tets: np.ndarray) -> int:
     return len(np.unique(probe[(least > INSIDE) & (probe != which)]))
 
 
-def assign_regions(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
+def collect_regions(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Region (T,) of each tetrahedron in some blocks of cells, and a note where it is not cell data `region`.
 
     Without such data it is the one array of whole numbers that varies, or the sets of cells.

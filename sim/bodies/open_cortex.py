@@ -76,7 +76,7 @@ class OpenCortex:
     @cached_property
     def clearance(self) -> float:
         """Radius of the largest circle round the origin, across the axis, that it fills [m]."""
-        rim = find_opening_edge(self.anatomy.mesh.nodes, self.anatomy.open_surface) - self.origin
+        rim = find_border_edges(self.anatomy.mesh.nodes, self.anatomy.open_surface) - self.origin
         return float(compute_distances(rim - (rim @ self.axis)[..., None] * self.axis, np.zeros((1, 3)))[0])
 
     @cached_property
@@ -107,7 +107,7 @@ class OpenCortex:
             if given.shape != ():
                 raise InputError(f"{name} has shape {given.shape}: give one number, in millimetres.")
         found = self.nearest(self.origin + 1e-3 * (right_mm * self.right + up_mm * self.up))
-        rim = find_opening_edge(self.anatomy.mesh.nodes, self.anatomy.open_surface)
+        rim = find_border_edges(self.anatomy.mesh.nodes, self.anatomy.open_surface)
         if not compute_distances(rim, found.point[None])[0] > ON_RIM:
             raise InputError(
                 f"the place {right_mm:g} mm right, {up_mm:g} mm up lies outside the open cortex: stay within "
@@ -140,7 +140,7 @@ def open_cortex(anatomy: Anatomy) -> OpenCortex:
     return OpenCortex(anatomy, find_closest_points(middle[None], corners).point[0], axis, right, np.cross(right, axis))
 
 
-def find_opening_edge(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def find_border_edges(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Edges (E, 2, 3) [m] that belong to one only of triangles (S, 3) of points (V, 3) [m]."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, count = np.unique(edges, axis=0, return_counts=True)

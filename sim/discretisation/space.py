@@ -149,7 +149,7 @@ def recommend_element(mesh: TetMesh) -> str:
 def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
     """Return the nodes and elements of type `element`, one of `ELEMENTS`, over a mesh.
 
-    None: the `recommend_element` one.
+    None: that of `recommend_element`.
 
     Raises
     ------

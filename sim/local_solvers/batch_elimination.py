@@ -33,7 +33,7 @@ from ..minimisers.lbfgs import Descended, Lbfgs
 from ..minimisers.residual import Judge, ResidualState
 from ..runtime.columns import combine_columns, put_rows, take_rows
 from ..runtime.dense_product import build_product
-from .outer_loop import USUAL, CycleLimits, eliminate_unknowns
+from .outer_loop import USUAL, CycleLimits, run_cycles
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class BatchElimination:
         def cycle(judge: Judge, now: ResidualState, force: np.ndarray) -> ResidualState:
             return judge(self._corrected(now.u, now.g, force))
 
-        return eliminate_unknowns(self.problem, start, tolerance, most, self.limits, cycle)
+        return run_cycles(self.problem, start, tolerance, most, self.limits, cycle)
 
     def _corrected(self, u: wp.array, g: wp.array, force: np.ndarray) -> wp.array:
         """Return the next state (3N, b), from the free gradient g (3N, b) at u (3N, b).

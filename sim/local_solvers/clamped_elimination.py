@@ -25,7 +25,7 @@ from ..minimisers.line_search import backtrack_by_slopes, is_step_too_long
 from ..minimisers.residual import Judge, ResidualState
 from ..runtime.columns import combine_columns
 from .clamped_part import ClampedPart
-from .outer_loop import CycleLimits, eliminate_unknowns
+from .outer_loop import CycleLimits, run_cycles
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class ClampedElimination:
             z = after
             return new
 
-        return eliminate_unknowns(self.problem, start, tolerance, most, self.limits, cycle)
+        return run_cycles(self.problem, start, tolerance, most, self.limits, cycle)
 
     def _lower(self, judge: Judge, now: ResidualState, part: ClampedPart, d: np.ndarray, force: float) -> ResidualState:
         """Return a step along d (3N,) that does not go too far, and the part settled to `force` [N] there.

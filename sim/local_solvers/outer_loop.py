@@ -48,7 +48,7 @@ Cycle = Callable[[Judge, ResidualState, np.ndarray], ResidualState]
 on has a free force that is not finite."""
 
 
-def eliminate_unknowns(
+def run_cycles(
     problem: Problem, start: wp.array, tolerance: np.ndarray, most: int, limits: CycleLimits, cycle: Cycle
 ) -> Descended:
     """Go on from start (3N, b) [m], as `Lbfgs.descend`, in at most `most` cycles; nothing is learnt.

@@ -232,7 +232,7 @@ class CapturedFrame:
         for name, rows_first in learnt.items():
             columns[name].assign(np.moveaxis(rows_first, 0, -1).reshape(columns[name].shape))
 
-    def update_history(self, steps: float) -> None:
+    def update_model(self, steps: float) -> None:
         """After an answer in so many steps: know what is strained there, unless what was known has served."""
         if self.part is not None and steps > SERVED:
             self._know(update_model_at(self.part, self._device, self._workspace.columns["u"]))

@@ -135,7 +135,7 @@ class FrameSequence:
         found = self._frame.push(point, radius, force, share)
         if found[STATUS] != DONE or self._inversion.doubtful(found[INVERTED]):
             return None
-        self._frame.update_history(found[STEPS])
+        self._frame.update_model(found[STEPS])
         warm = Kept(way, self._frame.state, self._lock, self._frame.bent)
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
         displacement = found[HEAD:].reshape(1, -1, 3).copy()

@@ -67,7 +67,7 @@ def get_row_type(vertices: int, tools: int = 0) -> np.dtype:
     )
 
 
-def select_rows(answer: Deformation, unit: float, tools: int = 0) -> np.ndarray:
+def to_rows(answer: Deformation, unit: float, tools: int = 0) -> np.ndarray:
     """Convert results at every vertex to rows (B,), with displacements in units of `unit` [m].
 
     The reactions of `tools` moved by pose are NaN if the result does not have them.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.bodies.open_cortex import compute_distances, find_opening_edge
+from sim.bodies.open_cortex import compute_distances, find_border_edges
 from sim.errors import InputError
 from sim.geometry.surface import compute_areas, compute_vertex_normals
 
@@ -67,7 +67,7 @@ class Patch:
     @cached_property
     def rim(self) -> np.ndarray:
         """Edges (E, 2, 3) [m] that belong to one triangle only."""
-        return find_opening_edge(self.points, self.triangles)
+        return find_border_edges(self.points, self.triangles)
 
     def compute_edge_distance(self, points: np.ndarray) -> np.ndarray:
         """Compute distances (B,) [m] from `points` (B, 3) to the edge."""

@@ -13,7 +13,7 @@ from sim.loads import Loads, Nodal, Touching
 from sim.runtime.journal import Batch
 from sim.runtime.processes import Child, map_unordered
 
-from .answer_rows import select_rows
+from .answer_rows import to_rows
 from .cortex_patch import open_patch
 
 # Far inside the small-strain range: 1 uN on one node of brain tissue strains its elements by some 1e-5, so that one
@@ -53,7 +53,7 @@ def solve_batch(deformer: Deformer, task: LoadBatch) -> bytes:
     unit = task.loads is None
     loads = build_unit_loads(anatomy, task.rows) if task.loads is None else task.loads
     answer = deformer.deform(loads).at(np.arange(len(anatomy.mesh.nodes)))
-    return select_rows(answer, UNIT_FORCE if unit else 1.0, 0 if unit else count_posed_tools(loads)).tobytes()
+    return to_rows(answer, UNIT_FORCE if unit else 1.0, 0 if unit else count_posed_tools(loads)).tobytes()
 
 
 def count_posed_tools(loads: Loads) -> int:

@@ -86,14 +86,14 @@ class Guarded:
         return find_handed_over(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
 
 
-def compute_error(model: Learned) -> HeldOutError:
+def get_held_out_error(model: Learned) -> HeldOutError:
     """Return a model's reported errors on held-out cortex."""
     return HeldOutError(model.bound, model.left_out)
 
 
 def describe_error(model: Learned) -> str:
     """Describe a model's reported errors, and the deformer used in scenes: see `Guarded`."""
-    stated = compute_error(model)
+    stated = get_held_out_error(model)
     guarded = "it plays alone nevertheless, as its tissue relaxes" if model.series else "scenes play it guarded"
     return f"{model.left_out or stated}: {guarded if stated.weak else 'it may answer alone'}"
 

@@ -37,7 +37,7 @@ from ..regressors.force_series import FACTORS, SPANS, ForcePairs, Series, fill_t
 from ..regressors.protocol import Linear
 from ..regressors.rigid_contact import RigidContact
 from .examples import Examples, compute_residual_responses
-from .fem_tables import add_edge_midpoints, choose_radii, condense_exterior, find_disc_nodes, join_bases, tabulate
+from .fem_tables import add_edge_midpoints, choose_radii, condense_contact, find_disc_nodes, join_bases, tabulate
 
 # Truncation tolerance and maximum number of modes of a model's basis; of the series' contribution beyond the exact
 # orders, a fiftieth of the motion; tolerance of compliance.
@@ -207,7 +207,7 @@ class Expansion:
             Data without a tissue.
         """
         begun = time.perf_counter()
-        contact, bases = condense_exterior(self.fem(), self._known, self.data.tool)
+        contact, bases = condense_contact(self.fem(), self._known, self.data.tool)
         return contact, bases, time.perf_counter() - begun
 
     def _compliance(self, nodes: np.ndarray) -> ModelPart:

@@ -26,7 +26,7 @@ STRIP = 64
 TOLERANCE = 1e-4
 
 
-def condense_exterior(
+def condense_contact(
     fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None
 ) -> tuple[RigidContact, list[Basis]]:
     """Condense the contact of a tool with an undeformed body; return it with a basis for each of `parts`, vertex sets.

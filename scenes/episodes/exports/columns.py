@@ -92,7 +92,7 @@ def list_shared_numbers(episodes: Sequence[EpisodeContents]) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def measure_rate(contents: EpisodeContents, time: np.ndarray) -> float:
+def compute_frame_rate(contents: EpisodeContents, time: np.ndarray) -> float:
     """Frames a second.
 
     Raises

@@ -25,10 +25,10 @@ from ..reading.windows import read_image_bytes, read_one_image
 from .columns import (
     SPACE,
     collect_numbers,
+    compute_frame_rate,
     describe_task,
     list_shared_images,
     list_shared_numbers,
-    measure_rate,
     measure_stored_size,
     name_axes,
     split_into_blocks,
@@ -119,7 +119,7 @@ def write_lerobot(
             for number, contents in enumerate(progress(episodes)):
                 with open_episode(contents.path) as file:
                     numbers = collect_numbers(file, contents, names)
-                    rates.add(measure_rate(contents, numbers.pop("time")))
+                    rates.add(compute_frame_rate(contents, numbers.pop("time")))
                     if len(rates) > 1:
                         slow, fast = sorted(rates)
                         raise InputError(f"{contents.path}: {slow:g} and {fast:g} frames a second: convert them apart.")
@@ -163,7 +163,7 @@ def write_lerobot(
         write_json(
             partial / "meta/stats.json", {name: to_lerobot_statistics(name, spread) for name, spread in whole.items()}
         )
-        features = {**compute_features(shapes), **describe_image_features(episodes[0], pictures)}
+        features = {**describe_features(shapes), **describe_image_features(episodes[0], pictures)}
         described = build_info(len(episodes), first, len(tasks), rates.pop(), features)
         write_json(partial / "meta/info.json", described)
         write_json(partial / "meta/spaces.json", {"spaces": SPACE})
@@ -279,8 +279,8 @@ def build_task_table(tasks: Sequence[str]) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(described)})
 
 
-def compute_features(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
-    """Numbers as `build_info.json` describes them."""
+def describe_features(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+    """Numbers as `info.json` describes them."""
     kinds = {name: "float32" if name not in COUNTED or name == "timestamp" else "int64" for name in shapes}
     return {
         name: {"dtype": kinds[name], "shape": list(shape) or [1], "names": name_axes(name.rpartition(".")[2])}
@@ -289,7 +289,7 @@ def compute_features(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
 
 
 def describe_image_features(contents: EpisodeContents, pictures: Sequence[str]) -> dict[str, Any]:
-    """Describe images for `build_info.json`; for depth its step, and its range [m]."""
+    """Describe images for `info.json`; for depth its step, and its range [m]."""
     width, height = contents.size
     found = {}
     for name in pictures:
@@ -310,7 +310,7 @@ def describe_image_features(contents: EpisodeContents, pictures: Sequence[str]) 
 
 
 def build_info(episodes: int, frames: int, tasks: int, rate: float, features: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the contents of `build_info.json`."""
+    """Return the contents of `info.json`."""
     return {
         "codebase_version": VERSION,
         "robot_type": "simulated hand-held tool",

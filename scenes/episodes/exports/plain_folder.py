@@ -15,7 +15,7 @@ from sim.runtime.atomic_files import write_folder_atomically
 
 from ..reading.contents import EpisodeContents, open_episode
 from ..reading.schema import ARRAYS, PICTURES, SOLVED, get_suffix
-from ..reading.windows import read_image_bytes, read_numbers, select_rows
+from ..reading.windows import read_image_bytes, read_numbers, read_rows
 from .columns import measure_stored_size, name_files, write_along
 
 WIDE = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")
@@ -62,7 +62,7 @@ def write_tables(place: Path, file: h5py.File, contents: EpisodeContents) -> Non
         described = ARRAYS.get(name)
         if described is None or name == "fem_frames" or not (described.framed or described.axes[0] == SOLVED):
             continue
-        rows = select_rows(file, contents, name)
+        rows = read_rows(file, contents, name)
         if name in WIDE:
             flat = np.asarray(rows).reshape(contents.frames, -1)
             axes = [f"{node}{axis}" for node in range(flat.shape[1] // 3) for axis in ("_x", "_y", "_z")]

@@ -20,11 +20,11 @@ from .columns import (
     SPACE,
     collect_numbers,
     collect_texts,
+    compute_frame_rate,
     describe_task,
     list_shared_images,
     list_shared_numbers,
     mark_held_out,
-    measure_rate,
     measure_stored_size,
     split_into_blocks,
 )
@@ -55,7 +55,7 @@ def write_robomimic(
             demo = data.create_group(f"demo_{number}")
             with open_episode(contents.path) as file:
                 numbers = collect_numbers(file, contents, names)
-                rates.append(measure_rate(contents, numbers.pop("time")))
+                rates.append(compute_frame_rate(contents, numbers.pop("time")))
                 obs = demo.create_group("obs")
                 write_demo(demo, obs, contents, numbers)
                 write_pictures(obs, file, contents, pictures, stream)

@@ -22,7 +22,7 @@ from .schema import ARRAYS, COLOUR, DEPTH, PICTURES, SOLVED
 Rows = np.ndarray | list[str]
 
 
-def select_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> Rows:
+def read_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> Rows:
     """Read the rows of some frames, or of all: (frames, ...) numbers or decoded images, or a list of texts.
 
     An array without frames is read whole.
@@ -46,8 +46,8 @@ def select_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: r
 
 
 def read_numbers(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> np.ndarray:
-    """Read rows as `select_rows`, from an array without texts."""
-    return np.asarray(select_rows(file, contents, name, frames))
+    """Read rows as `read_rows`, from an array without texts."""
+    return np.asarray(read_rows(file, contents, name, frames))
 
 
 def read_one_image(file: h5py.File, contents: EpisodeContents, name: str, frame: int) -> np.ndarray:
@@ -56,7 +56,7 @@ def read_one_image(file: h5py.File, contents: EpisodeContents, name: str, frame:
     Raises
     ------
     InputError
-        As `select_rows`.
+        As `read_rows`.
     """
     code = read_image_bytes(file, contents, name, frame)
     width, height = contents.size
@@ -215,7 +215,7 @@ class Episodes(Sequence[dict[str, Any]]):
             raise InputError(f"{contents.path}: no {self.span} of its {contents.frames} frames begin at {first}.")
         frames = range(first, first + self.span, self.step)
         file = self.files.file(contents.path)
-        found: dict[str, Any] = {name: select_rows(file, contents, name, frames) for name in self.keys}
+        found: dict[str, Any] = {name: read_rows(file, contents, name, frames) for name in self.keys}
         if any(name in ARRAYS and ARRAYS[name].axes[0] == SOLVED for name in self.keys):
             found[FEM_KNOWN] = np.isin(np.asarray(frames), contents.fem_frames)
         return {**found, "episode": episode, "frame": np.asarray(frames)}
