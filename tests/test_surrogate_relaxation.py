@@ -199,7 +199,9 @@ def test_it_plays_alone_frame_by_frame(model, box):
     theatre = Theatre(box, None, {"contact": model}, "cpu")
     scene = replace(scene, element="p1")
     assert theatre.names(scene) == ("contact", "fem") and theatre.usual(scene) == "contact"
-    assert describe_error(replace(model, bound=1e-3)).endswith(": it plays alone nevertheless, as its tissue relaxes")
+    assert describe_error(replace(model, bound=1e-3)).endswith(
+        "1 mm in 95 % of loads (limit 0.2 mm): it plays alone nevertheless, as its tissue relaxes"
+    )
     with pytest.raises(InputError, match="its tissue relaxes, so that finite elements would have to solve"):
         theatre.deformer(GUARDED, scene)
     with pytest.raises(InputError, match="would need every earlier frame"):
