@@ -2,19 +2,18 @@
 
 import ast
 import builtins
-import io
 import re
-import tokenize
 import tomllib
 from pathlib import Path
 
 import pytest
+from style_rules import find_texts
+from test_house import FILES, HOUSE, nodes_of
 
 from sim.runtime import versions
 from sim.runtime.optional_packages import install_hint
 from sim.runtime.versions import DISTRIBUTION, get_version
 
-HOUSE = Path(__file__).parents[1]
 PROJECT = tomllib.loads((HOUSE / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 SUFFIXES = {".py", ".md", ".toml", ".yml", ".cfg", ".cff", ".txt", ""}
@@ -90,30 +89,15 @@ FOREIGN = {
 def texts_and_names():
     """Docstrings and comments of the packages with their places, and every name and word of their code."""
     said, known = [], {*dir(builtins), *FOREIGN}
-    for path in [
-        path
-        for room in ("sim", "surrogate", "ar", "scenes", "benchmarks")
-        for path in sorted((HOUSE / room).rglob("*.py"))
-    ]:
-        text, docs = path.read_text(), set()
-        tree = ast.parse(text)
+    for path in FILES:
         known |= {path.stem, *path.relative_to(HOUSE).parts[:-1]}
-        for node in ast.walk(tree):
+        docs = {id(node.value) for node in nodes_of(path) if isinstance(node, ast.Expr)}
+        for node in nodes_of(path):
             names = [getattr(node, kind, None) for kind in ("id", "attr", "arg", "name", "asname", "module")]
             known |= {part for name in names if isinstance(name, str) for part in name.split(".")}
-            if (
-                isinstance(node, ast.Expr)
-                and isinstance(node.value, ast.Constant)
-                and isinstance(node.value.value, str)
-            ):
-                docs.add(node.value)
-                said.append((f"{path.relative_to(HOUSE)}:{node.lineno}", node.value.value))
-        strings = (node for node in ast.walk(tree) if isinstance(node, ast.Constant) and node not in docs)
-        known |= {word for node in strings if isinstance(node.value, str) for word in re.findall(r"\w+", node.value)}
-        tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-        said += [
-            (f"{path.relative_to(HOUSE)}:{one.start[0]}", one.string) for one in tokens if one.type == tokenize.COMMENT
-        ]
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs:
+                known |= set(re.findall(r"\w+", node.value))
+        said += [(one.place, one.text) for one in find_texts(path) if one.kind in ("docstring", "comment")]
     return said, known
 
 
